@@ -1,0 +1,1 @@
+"""MAVLink: bytes into vehicle state, commands into calls; knows nothing of recon."""

@@ -1,0 +1,1 @@
+"""Reconstruction mathematics: arrays in, arrays out; no clock, file, socket or environment."""

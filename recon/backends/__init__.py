@@ -1,0 +1,59 @@
+"""The heavy operations behind one protocol: one module a backend, one line in the table.
+
+Arrays enter and leave as NumPy; a backend moves them to its device at its own edge. Every
+operation has a short NumPy reference that the tests compare every backend against.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Protocol
+
+from recon.belief_propagation import BeliefPropagationConfig
+from recon.registration import IcpConfig
+from recon.types import F64, U8, DepthMap, DisparityMap, Registration
+from recon.upsampling import UpsamplingConfig
+
+
+class Backend(Protocol):
+    """What a backend offers to the pipeline."""
+
+    name: str
+    device: str
+
+    def belief_propagation(
+        self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
+    ) -> DisparityMap:
+        """Labels (real valued, 0 to labels - 1) of the left view, (h, w); Eq. 1."""
+        ...
+
+    def upsample(
+        self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig
+    ) -> DisparityMap:
+        """``coarse`` (h, w) at the size of ``guide`` (H, W, 3), values unscaled; Eq. 2."""
+        ...
+
+    def register(
+        self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
+    ) -> Registration:
+        """Projective point-to-plane ICP from the given start."""
+        ...
+
+
+BACKENDS: dict[str, str] = {
+    "cpu": "recon.backends.cpu:CpuBackend",
+}
+"""Name to ``module:class``; imported on first use."""
+
+
+def load_backend(name: str) -> Backend:
+    """The backend called ``name``, ready to run.
+
+    Raises ValueError for a name that is not in the table, and whatever the backend raises
+    when it cannot run here (ImportError, RuntimeError), with the reason.
+    """
+    if name not in BACKENDS:
+        raise ValueError(f"no backend {name!r}; there are {', '.join(sorted(BACKENDS))}")
+    module, _, cls = BACKENDS[name].partition(":")
+    backend: Backend = getattr(import_module(module), cls)()
+    return backend

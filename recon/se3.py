@@ -1,0 +1,151 @@
+"""Rigid motions: SO(3) and SE(3) exponentials, inverses, quaternions, averages.
+
+A twist is (6,): rotation in rad first, translation in m second. Perturbations act on the
+left: ``exp(twist) @ T``. Formulas: Barfoot, State Estimation for Robotics (2017), ch. 7.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon.types import F64
+
+
+def hat(w: F64) -> F64:
+    """(3, 3) cross-product matrix of (3,) ``w``."""
+    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+
+
+def so3_exp(w: F64) -> F64:
+    """(3, 3) rotation of the (3,) rotation vector ``w`` in rad (Rodrigues)."""
+    angle = float(np.linalg.norm(w))
+    W = hat(w)
+    if angle < 1e-7:
+        return np.asarray(np.eye(3) + W + 0.5 * W @ W)
+    return np.asarray(
+        np.eye(3) + np.sin(angle) / angle * W + (1 - np.cos(angle)) / angle**2 * W @ W
+    )
+
+
+def so3_log(R: F64) -> F64:
+    """(3,) rotation vector in rad, of length at most pi, of the (3, 3) rotation ``R``."""
+    q = quaternion_from_rotation(R)
+    n = float(np.linalg.norm(q[1:]))
+    if n < 1e-12:
+        return np.asarray(2.0 * q[1:])
+    return np.asarray(2.0 * np.arctan2(n, q[0]) / n * q[1:])
+
+
+def _left_jacobian(w: F64) -> F64:
+    angle = float(np.linalg.norm(w))
+    W = hat(w)
+    if angle < 1e-6:
+        return np.asarray(np.eye(3) + 0.5 * W + W @ W / 6.0)
+    return np.asarray(
+        np.eye(3)
+        + (1 - np.cos(angle)) / angle**2 * W
+        + (angle - np.sin(angle)) / angle**3 * W @ W
+    )
+
+
+def exp(twist: F64) -> F64:
+    """(4, 4) motion of the (6,) ``twist``."""
+    T = np.eye(4)
+    T[:3, :3] = so3_exp(twist[:3])
+    T[:3, 3] = _left_jacobian(twist[:3]) @ twist[3:]
+    return T
+
+
+def log(T: F64) -> F64:
+    """(6,) twist of the (4, 4) motion ``T``."""
+    w = so3_log(T[:3, :3])
+    return np.concatenate([w, np.linalg.solve(_left_jacobian(w), T[:3, 3])])
+
+
+def inverse(T: F64) -> F64:
+    """(4, 4) inverse of the motion ``T``: T_b_a of T_a_b."""
+    out = np.eye(4)
+    out[:3, :3] = T[:3, :3].T
+    out[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    return out
+
+
+def compose(R: F64, t: F64) -> F64:
+    """(4, 4) motion with rotation ``R`` (3, 3) and translation ``t`` (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = t
+    return T
+
+
+def adjoint(T: F64) -> F64:
+    """(6, 6) matrix that takes a twist in b to the same motion's twist in a, for T_a_b."""
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = T[:3, :3]
+    out[3:, :3] = hat(T[:3, 3]) @ T[:3, :3]
+    return out
+
+
+def transform(T: F64, points: F64) -> F64:
+    """(N, 3) ``points`` of frame b in frame a, for T_a_b."""
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+
+def rotation_from_quaternion(q_wxyz: F64) -> F64:
+    """(3, 3) rotation of the quaternion (w, x, y, z), normalised first.
+
+    Raises ValueError when the quaternion has no length or is not finite.
+    """
+    n = float(np.linalg.norm(q_wxyz))
+    if not np.isfinite(n) or n < 1e-9:
+        raise ValueError(f"quaternion has no direction: {q_wxyz}")
+    w, x, y, z = np.asarray(q_wxyz, dtype=np.float64) / n
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_from_rotation(R: F64) -> F64:
+    """(4,) quaternion w, x, y, z with w >= 0 of the (3, 3) rotation ``R`` (Shepperd)."""
+    trace = float(np.trace(R))
+    pivots = np.array([trace, R[0, 0], R[1, 1], R[2, 2]])
+    i = int(np.argmax(pivots))
+    if i == 0:
+        q = np.array([1 + trace, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    elif i == 1:
+        q = np.array(
+            [R[2, 1] - R[1, 2], 1 + 2 * R[0, 0] - trace, R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]]
+        )
+    elif i == 2:
+        q = np.array(
+            [R[0, 2] - R[2, 0], R[0, 1] + R[1, 0], 1 + 2 * R[1, 1] - trace, R[1, 2] + R[2, 1]]
+        )
+    else:
+        q = np.array(
+            [R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], 1 + 2 * R[2, 2] - trace]
+        )
+    q = q / np.linalg.norm(q)
+    return np.asarray(q if q[0] >= 0 else -q)
+
+
+def slerp(q0_wxyz: F64, q1_wxyz: F64, share: float) -> F64:
+    """(4,) quaternion at ``share`` of the shorter way from q0 to q1."""
+    R0 = rotation_from_quaternion(q0_wxyz)
+    R1 = rotation_from_quaternion(q1_wxyz)
+    return quaternion_from_rotation(R0 @ so3_exp(share * so3_log(R0.T @ R1)))
+
+
+def average(T_a: F64, covariance_a: F64, T_b: F64, covariance_b: F64) -> tuple[F64, F64]:
+    """Weighted mean of two estimates of one motion, and its (6, 6) covariance.
+
+    Both covariances are of left perturbations in the same frame. First-order (one
+    Gauss-Newton step about ``T_a``), exact for small differences.
+    """
+    info_a, info_b = np.linalg.inv(covariance_a), np.linalg.inv(covariance_b)
+    covariance = np.linalg.inv(info_a + info_b)
+    step = covariance @ info_b @ log(T_b @ inverse(T_a))
+    return np.asarray(exp(step) @ T_a), np.asarray(covariance)

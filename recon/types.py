@@ -1,0 +1,145 @@
+"""The records that the stages hand to each other.
+
+Every record is frozen; arrays in it are shared, so treat them as read-only. Frames of
+reference and the meaning of ``T_a_b`` are in :mod:`recon.frames`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+F64 = npt.NDArray[np.float64]
+F32 = npt.NDArray[np.float32]
+U8 = npt.NDArray[np.uint8]
+Bool = npt.NDArray[np.bool_]
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """A pinhole camera with Brown-Conrady distortion (``plumb_bob``: k1 k2 p1 p2 k3)."""
+
+    K: F64  # (3, 3) px
+    distortion: F64  # (5,) k1 k2 p1 p2 k3; zeros for an undistorted image
+    size_px: tuple[int, int]  # (W, H)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One picture of the camera, as it came (still distorted)."""
+
+    image: U8  # (H, W, 3) BGR
+    time_ns: int  # mid-exposure; companion monotonic live, unix nanoseconds in a replay
+    seq: int
+    camera: Camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosePrior:
+    """What telemetry says of the camera's pose; a missing part is None."""
+
+    R_world_camera: F64 | None = None  # (3, 3)
+    sigma_tilt_rad: float = 0.02  # roll and pitch, 1 sigma
+    sigma_yaw_rad: float = 0.1
+    position_m: F64 | None = None  # (3,) ENU about the scan's origin
+    sigma_position_m: F64 | None = None  # (3,) ENU, 1 sigma
+    agl_m: float | None = None  # height of the camera above the ground below it
+    sigma_agl_m: float = 5.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """A camera pose with its uncertainty and what it was made from."""
+
+    T_world_camera: F64  # (4, 4) m
+    covariance: F64  # (6, 6) left perturbation in the world frame: rotation rad, translation m
+    sources: tuple[str, ...] = ()  # of "vision", "attitude", "altitude", "gnss"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoPair:
+    """Two frames rectified as left and right views of a virtual stereo camera.
+
+    A left pixel (u, v) with label ``l`` (0 <= l < labels, real valued) has its partner at
+    ``right[v, u - l]``. The true disparity ``d`` (of the two pinhole views, before the right
+    image was shifted onto the ground plane) is ``d(u, v) = plane . (u, v, 1) + slope * l``,
+    and the depth along the rectified left camera's z is ``K[0, 0] * baseline_m / d``.
+    """
+
+    left: U8  # (h, w) grey, rectified
+    right: U8  # (h, w) grey, rectified, shifted by the disparity plane
+    baseline_m: float
+    K: F64  # (3, 3) px of the rectified left view at (w, h)
+    labels: int
+    plane: F64  # (3,) disparity of label 0 as an affine function of the left pixel
+    slope: float  # d(disparity) / d(label)
+    T_world_left: F64  # (4, 4) pose of the rectified left camera
+    R_left_keyframe: F64  # (3, 3) keyframe camera to rectified left camera
+    guide: U8 | None = None  # (H, W, 3) rectified left in colour, at guidance resolution
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DisparityMap:
+    """Disparity of the left view, in pixels of its own grid; NaN where unknown."""
+
+    px: F32  # (h, w), NaN = unknown
+    confidence: F32  # (h, w), 0 to 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthMap:
+    """Depth along the camera's z with one sigma per pixel; NaN where unknown."""
+
+    depth_m: F32  # (h, w), NaN = unknown
+    sigma_m: F32  # (h, w), NaN where depth is
+    views: U8  # (h, w) how many stereo pairs agree; 0 where depth is NaN
+    K: F64  # (3, 3) px of this grid, no distortion
+    T_world_camera: F64  # (4, 4)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keyframe:
+    """A posed depth image in colour: the unit of the map and of the datalink."""
+
+    seq: int
+    time_ns: int
+    depth: DepthMap
+    bgr: U8  # (h, w, 3) of the same grid as the depth
+    pose: Pose
+    fresh: Bool  # (h, w) surface that is new or better than what was kept before
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointCloud:
+    """Points with colour and uncertainty."""
+
+    xyz_m: F32  # (N, 3)
+    rgb: U8  # (N, 3)
+    sigma_m: F32  # (N,)
+    views: U8  # (N,)
+    frame: str = "world"
+
+    def __len__(self) -> int:
+        return int(self.xyz_m.shape[0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """The outcome of aligning a source cloud onto a target cloud."""
+
+    T_target_source: F64  # (4, 4)
+    covariance: F64  # (6, 6) left perturbation in the target frame: rotation rad, translation m
+    verdict: str  # "converged", "degenerate" (some directions not observed) or "rejected"
+    rms_m: float  # point-to-plane, inliers
+    inlier_share: float  # of the source's valid points
+    iterations: int = 0
+    weak_directions: F64 = field(default_factory=lambda: np.zeros((0, 6)))  # (k, 6) unit rows
+
+    @property
+    def converged(self) -> bool:
+        """True when the alignment may be used, at least in its strong directions."""
+        return self.verdict != "rejected"

@@ -1,0 +1,1 @@
+"""What touches the world: cameras, files, the datalink, the command line; joins recon and mavlink."""
