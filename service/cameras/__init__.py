@@ -1,0 +1,67 @@
+"""Cameras behind one table: each line is a word before the colon and who opens what follows it.
+
+A source is written ``word:rest``, as in ``file:flight.mp4``, ``images:DIR`` or ``pipe:-``. A
+bare path is a file or a folder of pictures, a bare ``-`` is standard input. Options follow a
+question mark: ``pipe:-?format=rawvideo&video_size=1280x720``.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from pathlib import Path
+from urllib.parse import parse_qsl
+
+from service.cameras.source import CameraFrame, CameraSource, GeoTag
+from service.errors import InputError
+
+__all__ = ["CAMERAS", "CameraFrame", "CameraSource", "GeoTag", "open_camera"]
+
+CAMERAS: dict[str, str] = {
+    "file": "service.cameras.file:open_file",
+    "images": "service.cameras.images:open_images",
+    "pipe": "service.cameras.pipe:open_pipe",
+}
+"""Word to ``module:function(rest, options) -> CameraSource``; imported on first use."""
+
+
+def open_camera(source: str) -> CameraSource:
+    """The camera that ``source`` names, open and with its first picture seen.
+
+    Raises InputError when there is no such source or it holds no pictures, OutsideError when
+    a device or a link does not answer.
+    """
+    word, rest, options = parse_source(source)
+    module, _, function = CAMERAS[word].partition(":")
+    opener: Callable[[str, Mapping[str, str]], CameraSource]
+    opener = getattr(import_module(module), function)
+    return opener(rest, options)
+
+
+def parse_source(source: str) -> tuple[str, str, dict[str, str]]:
+    """(word of the table, what follows it, options) of a source as a person writes it."""
+    if not source:
+        raise InputError("no camera source given; name a video, a folder of pictures or '-'")
+    if source == "-":
+        return "pipe", "-", {}
+    path = Path(source)
+    if path.exists():
+        return ("images" if path.is_dir() else "file"), source, {}
+    word, colon, rest = source.partition(":")
+    if colon and word in CAMERAS:
+        rest, _, query = rest.partition("?") if not Path(rest).exists() else (rest, "", "")
+        return word, rest, dict(parse_qsl(query, keep_blank_values=True))
+    if colon and "/" not in word and "." not in word and len(word) > 1:
+        near = difflib.get_close_matches(word, CAMERAS, n=1)
+        hint = f"did you mean '{near[0]}:'?" if near else f"there are {', '.join(CAMERAS)}"
+        raise InputError(f"no camera source '{word}:'; {hint}")
+    raise InputError(f"no such file or folder: {source}")
+
+
+def reject_options(source: str, options: Mapping[str, str], known: tuple[str, ...] = ()) -> None:
+    """Raise InputError when ``options`` holds a key that ``source`` does not know."""
+    for key in options:
+        if key not in known:
+            listing = ", ".join(known) if known else "none"
+            raise InputError(f"{source}: no option '{key}'; there are: {listing}")

@@ -1,0 +1,183 @@
+"""When and where a still was taken: EXIF, DJI's XMP block, or its file name.
+
+EXIF 2.32 (CIPA DC-008-2019) sections 4.6.5 and 4.6.6; XMP names as DJI writes them.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from service.cameras.source import GeoTag
+
+XMP_BYTES = 1 << 18  # DJI's block sits in the first 64 KiB
+DEFAULT_SIGMA_H_M = 5.0
+NAME_TIME = re.compile(r"(?<!\d)(20\d{6})[T_-]?(\d{6})[._]?(\d{1,3})?Z(?![A-Za-z0-9])")
+EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
+
+
+@dataclass(frozen=True, slots=True)
+class Tags:
+    """What a still says of itself; times in ns, None where it does not say."""
+
+    size_px: tuple[int, int]
+    local_ns: int | None = None  # camera's clock, as if it were UTC
+    offset_ns: int | None = None  # camera's clock minus UTC, when the zone is written
+    gps_unix_ns: int | None = None  # UTC of the last GPS fix, often whole seconds
+    name_unix_ns: int | None = None  # UTC in the file name
+    sub_second: bool = False  # local_ns is finer than a second
+    geotag: GeoTag | None = None
+
+
+def read_tags(path: Path) -> Tags:
+    """The tags of the picture at ``path``; raises OSError when it is not a picture."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        size_px = (int(image.width), int(image.height))
+        exif = image.getexif()
+        photo, gps = dict(exif.get_ifd(0x8769)), dict(exif.get_ifd(0x8825))
+    xmp = _xmp(path)
+    text = str(photo.get(36867) or photo.get(36868) or exif.get(306) or "")
+    sub = str(photo.get(37521) or photo.get(37522) or photo.get(37520) or "").strip("\0 ")
+    return Tags(
+        size_px=size_px,
+        local_ns=_local_ns(text, sub),
+        offset_ns=_offset_ns(str(photo.get(36881) or photo.get(36880) or "")),
+        gps_unix_ns=_gps_unix_ns(gps),
+        name_unix_ns=name_unix_ns(path.name),
+        sub_second=sub.isdigit(),
+        geotag=_geotag(gps, xmp),
+    )
+
+
+def name_unix_ns(name: str) -> int | None:
+    """UTC in a file name like 2018080501004480Z: date, time, fraction of a second, Z."""
+    found = NAME_TIME.search(name)
+    if found is None:
+        return None
+    day, time, fraction = found.groups()
+    try:
+        moment = datetime.strptime(day + time, "%Y%m%d%H%M%S").replace(tzinfo=timezone.utc)
+    except ValueError:
+        return None
+    return _unix_ns(moment) + round(float(f"0.{fraction or 0}") * 1_000_000_000)
+
+
+def _local_ns(text: str, sub: str) -> int | None:
+    try:
+        moment = datetime.strptime(text.strip("\0 ")[:19], "%Y:%m:%d %H:%M:%S")
+    except ValueError:
+        return None
+    fraction = round(float(f"0.{sub}") * 1_000_000_000) if sub.isdigit() else 0
+    return _unix_ns(moment.replace(tzinfo=timezone.utc)) + fraction
+
+
+def _offset_ns(text: str) -> int | None:
+    found = re.match(r"([+-])(\d\d):(\d\d)", text.strip("\0 "))
+    if found is None:
+        return None
+    sign = -1 if found[1] == "-" else 1
+    return sign * (int(found[2]) * 3600 + int(found[3]) * 60) * 1_000_000_000
+
+
+def _gps_unix_ns(gps: dict[int, Any]) -> int | None:
+    clock = _numbers(gps.get(7), 3)
+    try:
+        day = datetime.strptime(str(gps.get(29, "")).strip("\0 "), "%Y:%m:%d")
+    except ValueError:
+        return None
+    if clock is None:
+        return None
+    seconds = clock[0] * 3600 + clock[1] * 60 + clock[2]
+    return _unix_ns(day.replace(tzinfo=timezone.utc)) + round(seconds * 1_000_000_000)
+
+
+def _geotag(gps: dict[int, Any], xmp: dict[str, str]) -> GeoTag | None:
+    lat = _degrees(gps.get(2), gps.get(1), "S")
+    lon = _degrees(gps.get(4), gps.get(3), "W")
+    if lat is None or lon is None:
+        lat, lon = (
+            _xmp_number(xmp, "GpsLatitude"),
+            _xmp_number(xmp, "GpsLongitude", "GpsLongtitude"),
+        )
+    if lat is None or lon is None or abs(lat) > 90 or abs(lon) > 180 or (lat == 0 and lon == 0):
+        return None
+    altitude = _number(gps.get(6))
+    if altitude is not None and gps.get(5) in (1, b"\x01"):
+        altitude = -altitude
+    rtk = [_xmp_number(xmp, "RtkStdLat"), _xmp_number(xmp, "RtkStdLon")]
+    stated = max((s for s in rtk if s), default=None) or _number(gps.get(31))
+    return GeoTag(
+        lat_deg=lat,
+        lon_deg=lon,
+        alt_amsl_m=altitude if altitude is not None else _xmp_number(xmp, "AbsoluteAltitude"),
+        sigma_h_m=stated if stated and 0 < stated < 1000 else DEFAULT_SIGMA_H_M,
+        ypr_deg=_gimbal_ypr_deg(xmp),
+        relative_alt_m=_xmp_number(xmp, "RelativeAltitude"),
+    )
+
+
+def _gimbal_ypr_deg(xmp: dict[str, str]) -> tuple[float, float, float] | None:
+    yaw = _xmp_number(xmp, "GimbalYawDegree")
+    pitch = _xmp_number(xmp, "GimbalPitchDegree")
+    roll = _xmp_number(xmp, "GimbalRollDegree")
+    if yaw is None or pitch is None:
+        return None
+    return yaw, pitch, roll or 0.0
+
+
+def _xmp(path: Path) -> dict[str, str]:
+    """The drone-dji values of the XMP block, written as attributes or as elements."""
+    with path.open("rb") as stream:
+        head = stream.read(XMP_BYTES)
+    if b"drone-dji:" not in head:
+        return {}
+    text = head.decode("latin-1")
+    pairs = re.findall(r"drone-dji:(\w+)=\"([^\"]*)\"", text)
+    pairs += re.findall(r"<drone-dji:(\w+)>([^<]*)</", text)
+    return dict(pairs)
+
+
+def _xmp_number(xmp: dict[str, str], *names: str) -> float | None:
+    for name in names:
+        value = _number(xmp.get(name))
+        if value is not None:
+            return value
+    return None
+
+
+def _degrees(value: Any, reference: Any, negative: str) -> float | None:
+    parts = _numbers(value, 3)
+    if parts is None:
+        return None
+    degrees = parts[0] + parts[1] / 60 + parts[2] / 3600
+    return -degrees if str(reference).strip("\0 ").upper() == negative else degrees
+
+
+def _numbers(value: Any, count: int) -> list[float] | None:
+    try:
+        numbers = [_number(part) for part in value]
+    except TypeError:
+        return None
+    if len(numbers) != count or any(n is None for n in numbers):
+        return None
+    return [n for n in numbers if n is not None]
+
+
+def _number(value: Any) -> float | None:
+    """A finite float of an EXIF rational or a text; None for x/0 and the like."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _unix_ns(moment: datetime) -> int:
+    since = moment - EPOCH
+    return (since.days * 86_400 + since.seconds) * 1_000_000_000 + since.microseconds * 1000
