@@ -1,0 +1,303 @@
+"""The configuration: strict TOML composed of frozen dataclasses, one per section.
+
+Every key has a default that works and one line of documentation beside it, which
+``skyrelief config default`` prints. Unknown keys are errors with a suggestion.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import difflib
+import re
+import socket
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args, get_type_hints
+
+import msgspec
+import msgspec.toml
+
+from service.errors import InputError
+
+T = TypeVar("T")
+
+
+def key(default: T, doc: str, live: bool = False) -> T:
+    """A field with its documentation; ``live`` keys may change while the daemon runs."""
+    field: T = dataclasses.field(default=default, metadata={"doc": doc, "live": live})
+    return field
+
+
+@dataclass(frozen=True, slots=True)
+class CameraConfig:
+    """[camera]: where pictures come from and how the camera hangs."""
+
+    source: str = key("", "file:V.mp4, images:DIR, pipe:-, rtsp://…, v4l2:/dev/video0, gst:…, sim:")
+    model: str = key("", "camera model, ROS camera_info YAML as 'skyrelief calibrate' writes it")
+    mount: Literal["auto", "gimbal", "fixed"] = key(
+        "auto", "auto: gimbal attitude when telemetry has it, else fixed to the body"
+    )
+    mount_roll_deg: float = key(0.0, "fixed mount: roll of the optical axis in the body frame")
+    mount_pitch_deg: float = key(-90.0, "fixed mount: -90 looks straight down, 0 looks ahead")
+    mount_yaw_deg: float = key(0.0, "fixed mount: 0 puts the picture's top towards the nose")
+    latency_ms: float = key(0.0, "from mid-exposure to the picture's time stamp")
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        _within("camera.mount_roll_deg", self.mount_roll_deg, -180, 180)
+        _within("camera.mount_pitch_deg", self.mount_pitch_deg, -180, 180)
+        _within("camera.mount_yaw_deg", self.mount_yaw_deg, -360, 360)
+        _within("camera.latency_ms", self.latency_ms, -10_000, 10_000)
+
+
+@dataclass(frozen=True, slots=True)
+class MavlinkConfig:
+    """[mavlink]: links to the autopilot and who we are on them."""
+
+    links: tuple[str, ...] = key(
+        (), "as pymavlink writes them: serial:/dev/…:921600, udpin:…, tcp:…"
+    )
+    system_id: int = key(0, "the vehicle's system id; 0 takes the first autopilot that is heard")
+    gimbal_yaw_frame: Literal["auto", "vehicle", "earth"] = key(
+        "auto", "what the gimbal's yaw refers to; auto trusts the flags that the gimbal sends"
+    )
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        _within("mavlink.system_id", self.system_id, 0, 255)
+
+
+@dataclass(frozen=True, slots=True)
+class ScanConfig:
+    """[scan]: what is recorded and how densely."""
+
+    folder: str = key("/var/lib/skyrelief/scans", "each scan becomes a folder in here")
+    drone: str = key("", "name of this aircraft in scans and on the datalink; empty: host name")
+    start: Literal["on-command", "on-boot", "on-arm"] = key("on-command", "when a scan starts")
+    baseline: float | str = key(
+        "auto", "auto: by altitude; or metres; or 'n/m', frames as in the paper: '2/10'", live=True
+    )
+    base_to_height: float = key(0.1, "auto baseline: metres of baseline per metre above ground")
+    assumed_agl_m: float | None = key(
+        None, "height above ground when telemetry has none; gives the scan its scale"
+    )
+    keyframe_overlap: float = key(0.8, "a new keyframe when less of the last one is still seen")
+    keep_debug: bool = key(False, "keep what 'skyrelief inspect' shows of every stage")
+
+    def __post_init__(self) -> None:
+        """Check ranges and the notation of the baseline."""
+        _within("scan.base_to_height", self.base_to_height, 0.005, 1.0)
+        _within("scan.keyframe_overlap", self.keyframe_overlap, 0.1, 0.99)
+        if self.assumed_agl_m is not None:
+            _within("scan.assumed_agl_m", self.assumed_agl_m, 0.5, 10_000)
+        parse_baseline(self.baseline)
+
+    @property
+    def drone_name(self) -> str:
+        """``drone``, or this machine's name when that is empty."""
+        return self.drone or socket.gethostname()
+
+
+@dataclass(frozen=True, slots=True)
+class ComputeConfig:
+    """[compute]: where and how finely it is computed."""
+
+    backend: str = key("auto", "auto, cpu, torch or onnx; one that is named must run")
+    threads: int = key(0, "threads of the CPU backend; 0: one per core")
+    stereo_width: int = key(320, "width of the stereo pair in pixels; the paper's is 320")
+    labels: int = key(16, "least number of disparity labels; the paper's is 16")
+    iterations: int = key(5, "belief propagation's iterations per level; the paper's is 5")
+    guide_width: int = key(1280, "width of the picture that guides the upsampling")
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        _within("compute.threads", self.threads, 0, 1024)
+        _within("compute.stereo_width", self.stereo_width, 64, 4096)
+        _within("compute.labels", self.labels, 2, 256)
+        _within("compute.iterations", self.iterations, 1, 100)
+        _within("compute.guide_width", self.guide_width, 64, 8192)
+        if self.guide_width < self.stereo_width:
+            raise ValueError(
+                f"compute.guide_width {self.guide_width} is less than compute.stereo_width "
+                f"{self.stereo_width}; the guide must be the finer one"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class DatalinkConfig:
+    """[datalink]: Zenoh endpoints and what the link may carry."""
+
+    connect: tuple[str, ...] = key((), "ground stations to call: tcp/192.168.144.11:7447")
+    listen: tuple[str, ...] = key((), "endpoints to be called on")
+    budget_kbit_s: float = key(1000.0, "what all of ours together may use of the link", live=True)
+    drain_s: float = key(20.0, "after a replay, wait so long for the ground to fetch the rest")
+
+    def __post_init__(self) -> None:
+        """Check ranges and the form of the endpoints."""
+        _within("datalink.budget_kbit_s", self.budget_kbit_s, 1, 10_000_000)
+        _within("datalink.drain_s", self.drain_s, 0, 86_400)
+        for endpoint in (*self.connect, *self.listen):
+            if not re.fullmatch(r"[a-z]+/.+", endpoint):
+                raise ValueError(f"datalink endpoint {endpoint!r} is not like tcp/HOST:7447")
+
+
+@dataclass(frozen=True, slots=True)
+class FusionConfig:
+    """[fusion]: which parts of the telemetry may move the poses."""
+
+    gnss: bool = key(True, "use positions")
+    attitude: bool = key(True, "use roll, pitch and yaw")
+    altitude: bool = key(True, "use the height above ground")
+
+
+@dataclass(frozen=True, slots=True)
+class HealthConfig:
+    """[health]: who may ask how it goes."""
+
+    http: str = key("127.0.0.1:9560", "address of /healthz, /status and /metrics; empty: off")
+
+    def __post_init__(self) -> None:
+        """Check the form of the address."""
+        if self.http and not re.fullmatch(r"(\[[0-9a-fA-F:]+\]|[^:\s]+):\d{1,5}", self.http):
+            raise ValueError(f"health.http {self.http!r} is not HOST:PORT")
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """All sections; the defaults replay a recording with nothing else said."""
+
+    camera: CameraConfig = dataclasses.field(default_factory=CameraConfig)
+    mavlink: MavlinkConfig = dataclasses.field(default_factory=MavlinkConfig)
+    scan: ScanConfig = dataclasses.field(default_factory=ScanConfig)
+    compute: ComputeConfig = dataclasses.field(default_factory=ComputeConfig)
+    datalink: DatalinkConfig = dataclasses.field(default_factory=DatalinkConfig)
+    fusion: FusionConfig = dataclasses.field(default_factory=FusionConfig)
+    health: HealthConfig = dataclasses.field(default_factory=HealthConfig)
+
+    def to_dict(self) -> dict[str, dict[str, Any]]:
+        """Sections of plain values, fit for JSON."""
+        plain: dict[str, dict[str, Any]] = msgspec.to_builtins(self)
+        return plain
+
+
+def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
+    """The configuration of ``path`` (None: defaults) with ``section.key=value`` overrides.
+
+    Raises InputError, in one line, for a file that cannot be read, is not TOML, or holds a
+    key, type or value that is not known.
+    """
+    data = _read(path) if path is not None else {}
+    where = str(path) if path is not None else "configuration"
+    _check_keys(data, where)
+    config = _convert(data, where)
+    for override in overrides:
+        config = _override(config, override)
+    return config
+
+
+def parse_baseline(value: float | str) -> tuple[Literal["auto", "metres", "frames"], float, int]:
+    """("auto", 0, 0), ("metres", m, 0) or ("frames", n, m) of ``scan.baseline``.
+
+    "n/m" is the paper's notation: a pair is n frames apart, one pair every m frames.
+    Raises ValueError for anything else.
+    """
+    if isinstance(value, str) and value.strip() == "auto":
+        return "auto", 0.0, 0
+    frames = re.fullmatch(r"\s*(\d+)\s*/\s*(\d+)\s*", str(value))
+    if frames and int(frames[1]) >= 1 and int(frames[2]) >= 1:
+        return "frames", float(frames[1]), int(frames[2])
+    try:
+        metres = float(value)
+    except ValueError:
+        metres = -1.0
+    if not 0.0 < metres <= 1000.0:
+        raise ValueError(f"scan.baseline {value!r} is not 'auto', metres, or frames like '2/10'")
+    return "metres", metres, 0
+
+
+def keys() -> Iterator[tuple[str, dataclasses.Field[Any]]]:
+    """(section, field) of every key, in the order of the file."""
+    for section in dataclasses.fields(Config):
+        kind = get_type_hints(Config)[section.name]
+        for field in dataclasses.fields(kind):
+            yield section.name, field
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return msgspec.toml.decode(path.read_bytes(), type=dict[str, Any])
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from error
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is not TOML: {error}") from error
+
+
+def _check_keys(data: Mapping[str, Any], where: str) -> None:
+    known: dict[str, list[str]] = {f.name: [] for f in dataclasses.fields(Config)}
+    for section, field in keys():
+        known[section].append(field.name)
+    for section, values in data.items():
+        if section not in known:
+            raise InputError(f"{where}: no section [{section}]{_suggest(section, known)}")
+        if not isinstance(values, dict):
+            raise InputError(f"{where}: [{section}] must be a section, not {values!r}")
+        for name in values:
+            if name not in known[section]:
+                raise InputError(
+                    f"{where}: no key {section}.{name}{_suggest(name, known[section])}"
+                )
+
+
+def _suggest(name: str, known: Mapping[str, Any] | list[str]) -> str:
+    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f"; did you mean {near[0]!r}?" if near else f"; there are {', '.join(known)}"
+
+
+def _convert(data: Mapping[str, Any], where: str) -> Config:
+    try:
+        return msgspec.convert(data, Config)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{where}: {_in_words(error)}") from error
+
+
+def _in_words(error: msgspec.ValidationError) -> str:
+    """The error with the key before the fault: ``scan.start: Invalid enum value 'x'``."""
+    text, _, place = str(error).partition(" - at `$")
+    name = place.rstrip("`").lstrip(".")
+    if not name or name in text:
+        return text
+    if text.startswith("Invalid enum value"):
+        section, _, key_name = name.partition(".")
+        hints = get_type_hints(get_type_hints(Config)[section])
+        text += f"; there are {', '.join(get_args(hints[key_name]))}"
+    return f"{name}: {text}"
+
+
+def _override(config: Config, override: str) -> Config:
+    """``config`` with one ``section.key=value``; bare words and single items are understood."""
+    name, equals, text = override.partition("=")
+    section, dot, field = name.strip().partition(".")
+    where = f"--set {override}"
+    if not equals or not dot:
+        raise InputError(f"{where}: write section.key=value")
+    text = text.strip()
+    data: dict[str, dict[str, Any]] = config.to_dict()
+    readings: list[Any] = [text, [text]]  # a name made of digits; one item of a list
+    with contextlib.suppress(msgspec.DecodeError):
+        readings.insert(0, msgspec.toml.decode(f"value = {text}", type=dict[str, Any])["value"])
+    _check_keys({section: {field: readings[0]}}, where)
+    faults = []
+    for reading in readings:
+        data[section][field] = reading
+        try:
+            return _convert(data, where)
+        except InputError as error:
+            faults.append(error)
+    raise faults[0]
+
+
+def _within(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise ValueError(f"{name} = {value:g} is outside {low:g} to {high:g}")
