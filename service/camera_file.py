@@ -1,0 +1,157 @@
+"""Camera models on disk: the YAML that ROS's ``camera_info_manager`` and ``calibrate`` write.
+
+Keys: ``image_width``, ``image_height``, ``camera_matrix.data`` (9, row by row),
+``distortion_model: plumb_bob``, ``distortion_coefficients.data`` (k1 k2 p1 p2 k3). Other keys
+of the format are allowed and not read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from recon.camera_model import check_camera
+from recon.types import F64, Camera
+from service.errors import InputError, OutsideError
+
+MODEL = "plumb_bob"
+REQUIRED = (
+    "image_width",
+    "image_height",
+    "camera_matrix",
+    "distortion_model",
+    "distortion_coefficients",
+)
+LARGEST_FILE_BYTES = 1 << 20
+
+
+def load_camera(path: str | Path) -> Camera:
+    """The camera of a camera_info YAML file; InputError, in one line, when it is not usable."""
+    path = Path(path)
+    document = _read(path)
+    missing = [key for key in REQUIRED if key not in document]
+    if missing:
+        raise InputError(
+            f"camera model {path}: missing {', '.join(missing)}; expected ROS camera_info YAML"
+        )
+    if document["distortion_model"] != MODEL:
+        raise InputError(
+            f"camera model {path}: distortion_model is {document['distortion_model']!r}, "
+            f"only {MODEL!r} is supported; calibrate again with `skyrelief calibrate`"
+        )
+    size = _size(path, document)
+    K = _numbers(path, document, "camera_matrix", 9).reshape(3, 3)
+    distortion = _numbers(path, document, "distortion_coefficients", 5)
+    camera = Camera(K, distortion, size)
+    try:
+        _check_matrix(K)
+        check_camera(camera)
+    except ValueError as error:
+        raise InputError(f"camera model {path}: {error}; calibrate again") from error
+    return camera
+
+
+def save_camera(
+    path: str | Path,
+    camera: Camera,
+    name: str = "camera",
+    extra: Mapping[str, Any] | None = None,
+) -> None:
+    """Write ``camera`` as camera_info YAML; ``extra`` keys (plain values) go after the model.
+
+    Raises ValueError for an unusable camera or an extra key that the format already has, and
+    OutsideError when the file cannot be written.
+    """
+    check_camera(camera)
+    K = np.asarray(camera.K, dtype=np.float64)
+    document: dict[str, Any] = {
+        "image_width": int(camera.size_px[0]),
+        "image_height": int(camera.size_px[1]),
+        "camera_name": name,
+        "camera_matrix": _matrix(K),
+        "distortion_model": MODEL,
+        "distortion_coefficients": _matrix(np.asarray(camera.distortion).reshape(1, 5)),
+        "rectification_matrix": _matrix(np.eye(3)),
+        "projection_matrix": _matrix(np.hstack([K, np.zeros((3, 1))])),
+    }
+    clash = sorted(set(document) & set(extra or {}))
+    if clash:
+        raise ValueError(f"extra keys of the camera model already exist: {', '.join(clash)}")
+    document.update(extra or {})
+    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
+    try:
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutsideError(f"camera model {path} cannot be written: {error.strerror}") from error
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The mapping at the top of the YAML file."""
+    try:
+        if path.stat().st_size > LARGEST_FILE_BYTES:
+            raise InputError(f"camera model {path}: not a camera_info YAML file (over 1 MiB)")
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"camera model {path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"camera model {path}: cannot be read ({error.strerror})") from error
+    except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
+        raise InputError(f"camera model {path}: not a YAML file ({_one_line(error)})") from error
+    if not isinstance(document, dict):
+        raise InputError(f"camera model {path}: not a camera_info YAML file (no keys at its top)")
+    return document
+
+
+def _one_line(error: Exception) -> str:
+    """The text of ``error`` on one line, shortened."""
+    mark = getattr(error, "problem_mark", None)
+    if mark is not None:
+        return f"line {mark.line + 1}: {getattr(error, 'problem', None) or 'syntax error'}"
+    return " ".join(str(error).split())[:120]
+
+
+def _size(path: Path, document: Mapping[str, Any]) -> tuple[int, int]:
+    """(W, H) of the image, whole positive numbers."""
+    values = []
+    for key in ("image_width", "image_height"):
+        value = document[key]
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= 100_000:
+            raise InputError(f"camera model {path}: {key} must be a whole number of pixels")
+        values.append(value)
+    return values[0], values[1]
+
+
+def _numbers(path: Path, document: Mapping[str, Any], key: str, count: int) -> F64:
+    """(count,) finite numbers of ``key``'s ``data``."""
+    entry = document[key]
+    data = entry.get("data") if isinstance(entry, dict) else None
+    if not isinstance(data, Sequence) or isinstance(data, str):
+        raise InputError(f"camera model {path}: {key}.data is missing or not a list")
+    if len(data) != count:
+        raise InputError(
+            f"camera model {path}: {key}.data has {len(data)} numbers, expected {count}"
+        )
+    for value in data:
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise InputError(f"camera model {path}: {key}.data holds {value!r}, not a number")
+        if not math.isfinite(value):
+            raise InputError(f"camera model {path}: {key}.data holds {value}, not a finite number")
+    return np.array([float(value) for value in data])
+
+
+def _check_matrix(K: F64) -> None:
+    """Raise ValueError unless ``K`` has the form of a pinhole matrix without skew."""
+    fixed = [K[0, 1], K[1, 0], K[2, 0], K[2, 1]]
+    if any(abs(value) > 1e-9 for value in fixed) or abs(K[2, 2] - 1.0) > 1e-9:
+        raise ValueError("camera_matrix is not of the form [fx 0 cx; 0 fy cy; 0 0 1]")
+
+
+def _matrix(M: F64) -> dict[str, Any]:
+    """OpenCV's YAML form of a matrix."""
+    rows, cols = M.shape
+    return {"rows": rows, "cols": cols, "data": [float(value) for value in M.ravel()]}

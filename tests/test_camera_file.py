@@ -1,0 +1,147 @@
+"""Camera model files: round trip, OpenCV as an independent reader, and every kind of bad file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from recon.types import Camera
+from service.camera_file import load_camera, save_camera
+from service.errors import InputError, OutsideError
+
+CAMERA = Camera(
+    np.array([[560.25, 0.0, 651.125], [0.0, 561.5, 499.0], [0.0, 0.0, 1.0]]),
+    np.array([-0.2327, 0.0616, 1e-17, 0.0001, -0.0072]),
+    (1280, 960),
+)
+
+TYPICAL = """\
+image_width: 640
+image_height: 480
+camera_name: narrow_stereo
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [438.0, 0, 305.5, 0, 437.0, 243.7, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.361976, 0.110510, 0.001014, 0.000505, 0.000000]
+"""
+
+
+def document() -> dict[str, Any]:
+    loaded = yaml.safe_load(TYPICAL)
+    assert isinstance(loaded, dict)
+    return loaded
+
+
+def test_round_trip_is_exact(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    save_camera(path, CAMERA, "gopro", {"calibration": {"rms_px": 0.59}})
+    back = load_camera(path)
+    np.testing.assert_array_equal(back.K, CAMERA.K)
+    np.testing.assert_array_equal(back.distortion, CAMERA.distortion)
+    assert back.size_px == CAMERA.size_px
+
+
+def test_yaml_written_by_ros_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "ros.yaml"
+    path.write_text(TYPICAL)
+    camera = load_camera(path)
+    assert camera.size_px == (640, 480)
+    assert camera.K.ravel().tolist() == [438, 0, 305.5, 0, 437, 243.7, 0, 0, 1]
+    assert camera.distortion.tolist() == [-0.361976, 0.110510, 0.001014, 0.000505, 0]
+
+
+def test_written_file_has_the_ros_form(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    save_camera(path, CAMERA)
+    text = path.read_text()
+    raw = yaml.safe_load(text)
+    assert raw["distortion_model"] == "plumb_bob"
+    assert raw["camera_matrix"]["rows"] == 3 and raw["projection_matrix"]["cols"] == 4
+    # An independent YAML reader, of the matrices as nested maps.
+    storage = cv2.FileStorage(
+        "%YAML:1.0\n---\n" + text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
+    )
+    data = storage.getNode("camera_matrix").getNode("data")
+    assert [data.at(i).real() for i in range(9)] == list(CAMERA.K.ravel())
+
+
+BAD: dict[str, tuple[dict[str, Any], str]] = {
+    "negative focal length": (
+        {"camera_matrix": {"data": [-438, 0, 305, 0, 437, 243, 0, 0, 1]}},
+        "positive",
+    ),
+    "nan": ({"camera_matrix": {"data": [float("nan"), 0, 305, 0, 437, 243, 0, 0, 1]}}, "finite"),
+    "infinity": ({"distortion_coefficients": {"data": [float("inf"), 0, 0, 0, 0]}}, "finite"),
+    "text in numbers": ({"distortion_coefficients": {"data": ["a", 0, 0, 0, 0]}}, "not a number"),
+    "short matrix": ({"camera_matrix": {"data": [438, 0, 305]}}, "expected 9"),
+    "four coefficients": ({"distortion_coefficients": {"data": [0, 0, 0, 0]}}, "expected 5"),
+    "matrix is a list": ({"camera_matrix": [1, 2]}, "camera_matrix.data"),
+    "fisheye": ({"distortion_model": "equidistant"}, "equidistant"),
+    "skew": ({"camera_matrix": {"data": [438, 9, 305, 0, 437, 243, 0, 0, 1]}}, "form"),
+    "width of zero": ({"image_width": 0}, "image_width"),
+    "width in words": ({"image_width": "wide"}, "image_width"),
+    "principal point outside": (
+        {"camera_matrix": {"data": [438, 0, 9305, 0, 437, 243, 0, 0, 1]}},
+        "principal point",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_nonsense_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    changes, word = BAD[name]
+    path = tmp_path / "bad.yaml"
+    path.write_text(yaml.safe_dump(document() | changes))
+    with pytest.raises(InputError, match=word) as caught:
+        load_camera(path)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["image_width", "camera_matrix", "distortion_model"])
+def test_missing_key_is_named(key: str, tmp_path: Path) -> None:
+    raw = document()
+    del raw[key]
+    path = tmp_path / "bad.yaml"
+    path.write_text(yaml.safe_dump(raw))
+    with pytest.raises(InputError, match=f"missing {key}"):
+        load_camera(path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"\x00\x01\xff\xfe", b"{a: [1, 2", b"- 1\n- 2\n", b"just words", b"[" * 3000],
+    ids=["empty", "bytes", "broken", "list", "words", "deep"],
+)
+def test_not_a_camera_file(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        load_camera(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_file_and_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        load_camera(tmp_path / "none.yaml")
+    with pytest.raises(InputError, match="cannot be read"):
+        load_camera(tmp_path)
+
+
+def test_save_checks_what_it_writes(tmp_path: Path) -> None:
+    bad = Camera(CAMERA.K * -1.0, CAMERA.distortion, CAMERA.size_px)
+    with pytest.raises(ValueError, match="positive"):
+        save_camera(tmp_path / "c.yaml", bad)
+    with pytest.raises(ValueError, match="image_width"):
+        save_camera(tmp_path / "c.yaml", CAMERA, extra={"image_width": 3})
+    with pytest.raises(OutsideError, match="cannot be written"):
+        save_camera(tmp_path / "no" / "folder" / "c.yaml", CAMERA)
