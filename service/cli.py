@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 import sys
 from importlib import import_module
+from typing import Any
 
-import click
 import typer
 import typer.core
+import typer.main
 
 from service.errors import SkyreliefError
 
@@ -27,24 +28,41 @@ COMMANDS: dict[str, tuple[str, str]] = {
 
 
 class LazyCommands(typer.core.TyperGroup):
-    """A command group that imports a subcommand's module only when it is asked for."""
+    """A command group that imports a subcommand's module only when it is called.
 
-    def list_commands(self, ctx: click.Context) -> list[str]:
+    Contexts and commands are ``Any``: some typer releases bring their own copy of click.
+    """
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Names in the order of the table."""
         return list(COMMANDS)
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """What the overview shows of a command, without importing it; None for no such name."""
         if cmd_name not in COMMANDS:
             return None
-        target, text = COMMANDS[cmd_name]
-        module, _, function = target.partition(":")
-        single = typer.Typer(add_completion=False)
-        single.command(cmd_name, help=None)(getattr(import_module(module), function))
-        command = typer.main.get_command(single)
-        command.short_help = text
-        return command
+        return typer.core.TyperCommand(cmd_name, help=COMMANDS[cmd_name][1])
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """(name, command, its arguments) of what was typed."""
+        name, _, rest = super().resolve_command(ctx, args)
+        return name, load_command(str(name)), rest
 
 
-app = typer.Typer(cls=LazyCommands, no_args_is_help=True, add_completion=False)
+def load_command(name: str) -> Any:
+    """The command called ``name`` in the table, imported."""
+    module, _, function = COMMANDS[name][0].partition(":")
+    single = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    single.command(name)(getattr(import_module(module), function))
+    return typer.main.get_command(single)
+
+
+app = typer.Typer(
+    cls=LazyCommands,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
 
 
 @app.callback()
