@@ -1,0 +1,131 @@
+"""The scan's local frame on the globe: ENU metres to latitude and longitude, and to UTM.
+
+ENU here is the tangent plane at the scan's origin (EPSG method 9837, geocentric/topocentric),
+so one kilometre out the ground lies 8 cm below it. The way to UTM goes through geodetic
+coordinates: scale, meridian convergence and the curvature of the Earth are all in it.
+
+Heights are above mean sea level, as autopilots report them, and go through the ellipsoidal
+formulas as they are: no geoid model is needed, because the origin and the points carry the
+same offset. What remains is the offset over the Earth's radius, at most 17 mm per kilometre.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from recon.types import F64, Array
+
+if TYPE_CHECKING:
+    from pyproj import Transformer
+
+
+@dataclass(frozen=True, slots=True)
+class LocalFrame:
+    """East-north-up metres about an origin on WGS 84."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for an origin that is not on the globe."""
+        utm_epsg(self.lat_deg, self.lon_deg)
+        if not np.isfinite(self.alt_amsl_m):
+            raise ValueError(f"altitude of the origin is {self.alt_amsl_m}, not a finite number")
+
+    @property
+    def epsg(self) -> int:
+        """EPSG code of the origin's UTM zone (or polar stereographic zone) on WGS 84."""
+        return utm_epsg(self.lat_deg, self.lon_deg)
+
+    def to_enu(self, geodetic: Array) -> F64:
+        """(N, 3) ENU metres of (N, 3) rows of latitude, longitude (degrees) and AMSL metres."""
+        g = _rows(geodetic)
+        return _apply(self._geodetic_enu(), g[:, 1], g[:, 0], g[:, 2], inverse=False)
+
+    def to_geodetic(self, enu_m: Array) -> F64:
+        """(N, 3) latitude, longitude (degrees) and AMSL metres of (N, 3) ENU metres."""
+        e = _rows(enu_m)
+        out = _apply(self._geodetic_enu(), e[:, 0], e[:, 1], e[:, 2], inverse=True)
+        return out[:, [1, 0, 2]]
+
+    def to_utm(self, enu_m: Array) -> F64:
+        """(N, 3) easting, northing and AMSL metres in the zone ``epsg`` of (N, 3) ENU metres."""
+        g = self.to_geodetic(enu_m)
+        return _apply(_geodetic_projected(self.epsg), g[:, 1], g[:, 0], g[:, 2], inverse=False)
+
+    def from_utm(self, utm_m: Array) -> F64:
+        """(N, 3) ENU metres of (N, 3) easting, northing and AMSL metres: undoes to_utm."""
+        u = _rows(utm_m)
+        out = _apply(_geodetic_projected(self.epsg), u[:, 0], u[:, 1], u[:, 2], inverse=True)
+        return self.to_enu(out[:, [1, 0, 2]])
+
+    def _geodetic_enu(self) -> Transformer:
+        return _topocentric(self.lat_deg, self.lon_deg, self.alt_amsl_m)
+
+
+def utm_epsg(lat_deg: float, lon_deg: float) -> int:
+    """EPSG code on WGS 84 of the UTM zone at a place, or of the polar zone (UPS).
+
+    South-west Norway (zone 32V) and Svalbard (31X, 33X, 35X, 37X) have their wider zones.
+    North of 84 and south of -80 degrees it is 32661 or 32761. Raises ValueError when the
+    place is not on the globe.
+    """
+    if not (abs(lat_deg) <= 90.0 and abs(lon_deg) <= 360.0):
+        raise ValueError(f"latitude {lat_deg}, longitude {lon_deg} are not on the globe")
+    if lat_deg >= 84.0:
+        return 32661
+    if lat_deg < -80.0:
+        return 32761
+    lon = (lon_deg + 180.0) % 360.0 - 180.0
+    zone = int((lon + 180.0) // 6.0) + 1
+    if 56.0 <= lat_deg < 64.0 and 3.0 <= lon < 12.0:
+        zone = 32
+    if lat_deg >= 72.0 and 0.0 <= lon < 42.0:
+        zone = 31 if lon < 9.0 else 33 if lon < 21.0 else 35 if lon < 33.0 else 37
+    return (32600 if lat_deg >= 0.0 else 32700) + zone
+
+
+def _rows(points: Array) -> F64:
+    """(N, 3) float64, or ValueError."""
+    out = np.asarray(points, np.float64)
+    if out.ndim != 2 or out.shape[1] != 3:
+        raise ValueError(f"expected points of shape (N, 3), got {out.shape}")
+    return out
+
+
+def _apply(transformer: Transformer, x: F64, y: F64, z: F64, inverse: bool) -> F64:
+    """(N, 3) of the transformed columns."""
+    from pyproj.enums import TransformDirection
+
+    way = TransformDirection.INVERSE if inverse else TransformDirection.FORWARD
+    if len(x) == 1:  # pyproj warns at arrays of one element
+        return np.array(
+            [transformer.transform(float(x[0]), float(y[0]), float(z[0]), direction=way)]
+        )
+    return np.column_stack(transformer.transform(x, y, z, direction=way))
+
+
+@lru_cache(maxsize=16)
+def _topocentric(lat_deg: float, lon_deg: float, alt_m: float) -> Transformer:
+    """Longitude, latitude (degrees), height to ENU about the origin."""
+    from pyproj import Transformer
+
+    return Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad"
+        " +step +proj=cart +ellps=WGS84"
+        f" +step +proj=topocentric +ellps=WGS84 +lat_0={lat_deg!r} +lon_0={lon_deg!r}"
+        f" +h_0={alt_m!r}"
+    )
+
+
+@lru_cache(maxsize=16)
+def _geodetic_projected(epsg: int) -> Transformer:
+    """Longitude, latitude (degrees) to easting, northing; the height passes through."""
+    from pyproj import Transformer
+
+    return Transformer.from_crs("EPSG:4979", f"EPSG:{epsg}", always_xy=True)
