@@ -1,0 +1,300 @@
+"""The planes of a keyframe (mask, depth, sigma, views, colour) as coded sections, and back.
+
+Decoders return None for anything malformed. They read the size that an embedded picture
+claims before opening it, so no more is allocated than the caller's own grid needs.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import cv2
+import imagecodecs
+import numpy as np
+import numpy.typing as npt
+
+from recon.types import F32, U8, Array, Bool
+
+U16 = npt.NDArray[np.uint16]
+
+METHOD_JPEG_LS = 1
+SIGMA_BLOCK_PX = 4
+SIGMA_UNIT_M = 0.001
+SIGMA_STEPS_PER_OCTAVE = 4
+VIEWS_BLOCK_PX = 2
+MAX_VIEWS = 15
+MAX_CODE = 65535
+SPREAD = 0.03
+"""A coarse pixel whose inverse depths differ by more than this share (rms) takes the middle
+pixel instead of the mean, so that no point hangs in the air between roof and ground."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Planes:
+    """What a layer carries, pixel by pixel; all but ``known`` is arbitrary where not known."""
+
+    depth_m: F32  # (h, w)
+    sigma_m: F32  # (h, w)
+    views: U8  # (h, w)
+    bgr: U8  # (h, w, 3)
+    known: Bool  # (h, w)
+
+    def crop(self, box: tuple[int, int, int, int]) -> Planes:
+        """The part inside ``box`` (x, y, w, h)."""
+        x, y, w, h = box
+        cut = np.s_[y : y + h, x : x + w]
+        return Planes(
+            self.depth_m[cut], self.sigma_m[cut], self.views[cut], self.bgr[cut], self.known[cut]
+        )
+
+
+def bounding_box(known: Bool) -> tuple[int, int, int, int]:
+    """(x, y, w, h) of the known pixels; all zero when there is none."""
+    columns = np.flatnonzero(known.any(axis=0))
+    rows = np.flatnonzero(known.any(axis=1))
+    if columns.size == 0:
+        return 0, 0, 0, 0
+    x, y = int(columns[0]), int(rows[0])
+    return x, y, int(columns[-1]) - x + 1, int(rows[-1]) - y + 1
+
+
+def block_mean(plane: F32, factor: int) -> F32:
+    """Mean of each factor x factor block, zeros beyond the edge counted in."""
+    h, w = plane.shape[:2]
+    rows, columns = -(-h // factor), -(-w // factor)
+    padded = cv2.copyMakeBorder(
+        plane, 0, rows * factor - h, 0, columns * factor - w, cv2.BORDER_CONSTANT, value=0
+    )
+    return np.asarray(cv2.resize(padded, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _mean_known(plane: F32, weight: F32, share: F32, factor: int) -> F32:
+    """Block mean of ``plane`` over the pixels of ``weight`` 1; zero where there are none."""
+    return np.asarray(block_mean(plane * weight, factor) / np.maximum(share, 1e-6), np.float32)
+
+
+def _middle(plane: Array, factor: int) -> Array:
+    """The pixel in the middle of each block (the last one where the block is cut off)."""
+    h, w = plane.shape[:2]
+    v = np.minimum(np.arange(0, h, factor) + factor // 2, h - 1)
+    u = np.minimum(np.arange(0, w, factor) + factor // 2, w - 1)
+    return np.asarray(plane[v[:, None], u[None, :]])
+
+
+def reduce(full: Planes, factor: int) -> Planes:
+    """``full`` at 1/factor of its size; a block is known when a quarter of it is."""
+    weight = full.known.astype(np.float32)
+    share = block_mean(weight, factor)
+    inverse = np.where(full.known, 1.0 / np.where(full.known, full.depth_m, 1.0), 0.0)
+    inverse = inverse.astype(np.float32)
+    mean = _mean_known(inverse, weight, share, factor)
+    spread = _mean_known(inverse**2, weight, share, factor) - mean**2
+    torn = (spread > (SPREAD * mean) ** 2) & np.asarray(_middle(full.known, factor), np.bool_)
+    mean = np.where(torn, _middle(inverse, factor), mean)
+    known = (share >= 0.25) & (mean > 0)
+    sigma = _mean_known(_finite_sigma(full), weight, share, factor)
+    views = np.asarray(np.rint(_mean_known(full.views.astype(np.float32), weight, share, factor)))
+    bgr = block_mean(full.bgr * weight[..., None], factor) / np.maximum(share, 1e-6)[..., None]
+    return Planes(
+        np.asarray(1.0 / np.where(known, mean, 1.0), np.float32),
+        sigma,
+        np.clip(views, 1, MAX_VIEWS).astype(np.uint8),
+        np.clip(np.rint(bgr), 0, 255).astype(np.uint8),
+        known,
+    )
+
+
+def _finite_sigma(planes: Planes) -> F32:
+    good = planes.known & (planes.sigma_m > 0) & (planes.sigma_m < 1e6)
+    return np.where(good, planes.sigma_m, np.float32(0)).astype(np.float32)
+
+
+def _fill_back(values: Array, known: Bool) -> Array:
+    """``values`` with each unknown pixel replaced by the last known one in scan order."""
+    index = np.where(known.ravel(), np.arange(known.size), 0)
+    index = np.maximum.accumulate(index)
+    index[index == 0] = int(np.argmax(known))
+    return np.asarray(values.reshape(known.size)[index].reshape(known.shape))
+
+
+# Mask: rows packed to bits (most significant first), then zlib.
+
+
+def encode_mask(known: Bool) -> bytes:
+    """The section that says which pixels of the box are known; empty when all are."""
+    return b"" if known.all() else zlib.compress(np.packbits(known, axis=1).tobytes(), 6)
+
+
+def decode_mask(data: bytes, w: int, h: int) -> Bool | None:
+    """(h, w) known pixels."""
+    if not data:
+        return np.ones((h, w), np.bool_)
+    size = h * (-(-w // 8))
+    try:
+        raw = zlib.decompressobj().decompress(data, size + 1)
+    except zlib.error:
+        return None
+    if len(raw) != size:
+        return None
+    rows = np.frombuffer(raw, np.uint8).reshape(h, -1)
+    return np.unpackbits(rows, axis=1, count=w).astype(np.bool_)
+
+
+# Depth: codes of inverse depth.
+
+
+def quantise(planes: Planes, step: float) -> tuple[U16, float, float]:
+    """Codes of inverse depth, and the inverse depth of code 0 and the step, in 1/m.
+
+    Unknown pixels repeat the last known one. The step grows when 65536 codes are too few.
+    """
+    inverse = 1.0 / _fill_back(planes.depth_m, planes.known).astype(np.float64)
+    low, high = float(inverse.min()), float(inverse.max())
+    low32 = np.float32(low)
+    step32 = np.float32(max(step, (high - low) / (MAX_CODE - 1)))
+    codes = np.rint((inverse - float(low32)) / float(step32))
+    return np.clip(codes, 0, MAX_CODE).astype(np.uint16), float(low32), float(step32)
+
+
+def encode_depth(codes: U16) -> bytes:
+    """The codes as one JPEG-LS picture: 8 bits deep when they fit, else 16."""
+    picture = codes.astype(np.uint8) if codes.max() < 256 else codes
+    return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(picture)))
+
+
+def decode_depth(data: bytes, w: int, h: int, low: float, step: float) -> F32 | None:
+    """(h, w) depth in metres."""
+    codes = _open_jpeg_ls(data, w, h)
+    if codes is None:
+        return None
+    return np.asarray(1.0 / (low + step * codes.astype(np.float64)), np.float32)
+
+
+# Sigma: geometric mean of 4x4 blocks on a logarithmic scale; 0 is unknown.
+
+
+def encode_sigma(planes: Planes) -> bytes:
+    """The section of sigma: one code per block of SIGMA_BLOCK_PX."""
+    sigma = _finite_sigma(planes)
+    weight = (sigma > 0).astype(np.float32)
+    share = block_mean(weight, SIGMA_BLOCK_PX)
+    octaves = np.log2(np.maximum(sigma, SIGMA_UNIT_M) / SIGMA_UNIT_M)
+    mean = _mean_known(octaves, weight, share, SIGMA_BLOCK_PX)
+    codes = np.clip(np.rint(mean * SIGMA_STEPS_PER_OCTAVE) + 1, 1, 255).astype(np.uint8)
+    has = share > 0
+    if not has.any():
+        return b""
+    return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(_fill_back(codes, has))))
+
+
+def decode_sigma(data: bytes, w: int, h: int) -> F32 | None:
+    """(h, w) sigma in metres; an empty section means that none is known (NaN)."""
+    if not data:
+        return np.full((h, w), np.nan, np.float32)
+    codes = _open_jpeg_ls(data, -(-w // SIGMA_BLOCK_PX), -(-h // SIGMA_BLOCK_PX))
+    if codes is None:
+        return None
+    table = SIGMA_UNIT_M * 2.0 ** ((np.arange(256) - 1) / SIGMA_STEPS_PER_OCTAVE)
+    table[0] = np.nan
+    return _enlarge(table.astype(np.float32)[np.minimum(codes, 255)], SIGMA_BLOCK_PX, w, h)
+
+
+# Views: least count of 2x2 blocks.
+
+
+def encode_views(planes: Planes) -> bytes:
+    """The section of views: one count per block of VIEWS_BLOCK_PX, at most MAX_VIEWS."""
+    h, w = planes.known.shape
+    views = np.where(planes.known, np.clip(planes.views, 1, MAX_VIEWS), 255).astype(np.uint8)
+    padded = cv2.copyMakeBorder(views, 0, h % 2, 0, w % 2, cv2.BORDER_CONSTANT, value=255)
+    least = np.minimum(padded[::2], padded[1::2])
+    least = np.minimum(least[:, ::2], least[:, 1::2])
+    return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(_fill_back(least, least != 255))))
+
+
+def decode_views(data: bytes, w: int, h: int) -> U8 | None:
+    """(h, w) counts of views."""
+    codes = _open_jpeg_ls(data, -(-w // VIEWS_BLOCK_PX), -(-h // VIEWS_BLOCK_PX))
+    if codes is None:
+        return None
+    return _enlarge(np.clip(codes, 1, MAX_VIEWS).astype(np.uint8), VIEWS_BLOCK_PX, w, h)
+
+
+# Colour: a baseline JPEG of the box.
+
+
+def encode_colour(planes: Planes, quality: int) -> bytes:
+    """The box as a JPEG; blocks without known pixels are flat, so they cost next to nothing."""
+    picture = planes.bgr if planes.known.all() else _calm(planes.bgr, planes.known)
+    ok, data = cv2.imencode(
+        ".jpg",
+        np.ascontiguousarray(picture),
+        [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1],
+    )
+    if not ok:
+        raise ValueError(f"JPEG refused a picture of shape {picture.shape}")
+    return data.tobytes()
+
+
+def decode_colour(data: bytes, w: int, h: int) -> U8 | None:
+    """(h, w, 3) BGR."""
+    if picture_size(data) != (w, h):
+        return None
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error:
+        return None
+    if picture is None or picture.shape != (h, w, 3):
+        return None
+    return np.asarray(picture, np.uint8)
+
+
+def _calm(bgr: U8, known: Bool) -> U8:
+    """``bgr`` with unknown pixels set to the mean of the known ones in their 16x16 block."""
+    weight = known.astype(np.float32)
+    share = block_mean(weight, 16)
+    mean = block_mean(bgr * weight[..., None], 16) / np.maximum(share, 1e-6)[..., None]
+    has = share > 0
+    for k in range(3):
+        mean[..., k] = _fill_back(np.ascontiguousarray(mean[..., k]), has)
+    h, w = known.shape
+    flat = _enlarge(np.clip(np.rint(mean), 0, 255).astype(np.uint8), 16, w, h)
+    return np.where(known[..., None], bgr, flat)
+
+
+def _enlarge(blocks: Array, factor: int, w: int, h: int) -> Array:
+    return np.repeat(np.repeat(blocks, factor, axis=0), factor, axis=1)[:h, :w]
+
+
+def picture_size(data: bytes) -> tuple[int, int] | None:
+    """(w, h) that a JPEG or JPEG-LS picture claims in its frame header; None if it has none."""
+    at = 2
+    if data[:2] != b"\xff\xd8":
+        return None
+    while at + 9 <= len(data):
+        if data[at] != 0xFF:
+            return None
+        marker = data[at + 1]
+        if marker in (0xC0, 0xC1, 0xC2, 0xF7):
+            return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(
+                data[at + 5 : at + 7], "big"
+            )
+        if marker in (0xD9, 0xDA):
+            return None
+        length = int.from_bytes(data[at + 2 : at + 4], "big")
+        at += 2 + max(length, 2)
+    return None
+
+
+def _open_jpeg_ls(data: bytes, w: int, h: int) -> Array | None:
+    """(h, w) codes of a JPEG-LS picture of exactly that size and one component."""
+    if picture_size(data) != (w, h):
+        return None
+    try:
+        codes = imagecodecs.jpegls_decode(data)
+    except (imagecodecs.JpeglsError, ValueError, RuntimeError):
+        return None
+    if codes.shape != (h, w) or codes.dtype not in (np.uint8, np.uint16):
+        return None
+    return np.asarray(codes)

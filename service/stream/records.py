@@ -1,0 +1,239 @@
+"""The small records of a scan: header, poses, re-poses; each with its form on the wire.
+
+Poses and re-poses are fixed little-endian structures with a CRC-32 at their end; the scan
+header is JSON. ``docs/wire.md`` is the reference. Decoders return None for anything that is
+not a valid record: they never raise and never allocate more than the record itself.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from recon import se3
+from recon.types import F64
+
+MAX_HEADER_BYTES = 262_144
+"""A scan header larger than this is refused."""
+
+SOURCES = ("vision", "attitude", "altitude", "gnss", "exif")
+"""Bit k of a ``sources`` byte on the wire stands for name k."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanHeader:
+    """What a scan is: who flew it, about which origin, with which camera and settings."""
+
+    scan_id: str
+    drone: str
+    started_unix_ns: int
+    origin_lat_deg: float | None = None
+    origin_lon_deg: float | None = None
+    origin_alt_amsl_m: float | None = None
+    epsg: int | None = None
+    camera: dict[str, Any] = field(default_factory=dict)
+    configuration: dict[str, Any] = field(default_factory=dict)
+    software: str = ""
+    georeference: str = "none"  # "gnss", "exif" or "none"
+    notes: tuple[str, ...] = ()
+
+    def to_json(self) -> bytes:
+        """The header as a JSON object."""
+        return msgspec.json.encode(self)
+
+
+def header_from_json(data: bytes) -> ScanHeader | None:
+    """The header in ``data``, or None when it is none or larger than MAX_HEADER_BYTES."""
+    if len(data) > MAX_HEADER_BYTES:
+        return None
+    try:
+        return msgspec.json.decode(data, type=ScanHeader)
+    except (msgspec.DecodeError, msgspec.ValidationError, UnicodeDecodeError, RecursionError):
+        return None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseRecord:
+    """Where the camera was at one time, in the world and on the globe, and how surely."""
+
+    time_unix_ns: int
+    T_world_camera: F64  # (4, 4) m
+    covariance: F64  # (6, 6) left perturbation in the world frame: rotation rad, translation m
+    lat_deg: float | None = None
+    lon_deg: float | None = None
+    alt_amsl_m: float | None = None
+    agl_m: float | None = None
+    roll_rad: float = 0.0
+    pitch_rad: float = 0.0
+    yaw_rad: float = 0.0
+    speed_m_s: float = 0.0
+    distance_m: float = 0.0
+    turn_rate_rad_s: float = 0.0
+    sources: tuple[str, ...] = ()
+    sigma_m: float = 0.0
+    keyframe_seq: int | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Repose:
+    """A better pose of a keyframe that was sent before; the highest revision holds."""
+
+    seq: int
+    revision: int
+    T_world_camera: F64  # (4, 4) m
+    scale: float  # the keyframe's depth and sigma are multiplied by this
+    covariance: F64  # (6, 6) left perturbation in the world frame: rotation rad, translation m
+
+
+_POSE = struct.Struct("<2sBBqi3d4d21f3d8f")
+_REPOSE = struct.Struct("<2sBBII3d4d21ff")
+_CRC = struct.Struct("<I")
+_UPPER = np.triu_indices(6)
+
+
+def source_bits(sources: Sequence[str]) -> int:
+    """One byte with bit k set for ``SOURCES[k]``; names outside the table are not carried."""
+    return sum(1 << k for k, name in enumerate(SOURCES) if name in sources)
+
+
+def sources_of(bits: int) -> tuple[str, ...]:
+    """The names that the byte ``bits`` stands for."""
+    return tuple(name for k, name in enumerate(SOURCES) if bits >> k & 1)
+
+
+def pack_covariance(covariance: F64) -> list[float]:
+    """21 numbers: the upper triangle of a (6, 6) covariance, row by row, finite in float32."""
+    upper = np.nan_to_num(np.asarray(covariance, np.float64)[_UPPER], posinf=1e30, neginf=-1e30)
+    return [float(v) for v in np.clip(upper, -1e30, 1e30)]
+
+
+def unpack_covariance(upper: Sequence[float] | F64) -> F64:
+    """(6, 6) covariance from its 21 numbers."""
+    out = np.zeros((6, 6))
+    out[_UPPER] = upper
+    return np.asarray(out + np.triu(out, 1).T)
+
+
+def pack_motion(T: F64) -> list[float]:
+    """Seven numbers of the (4, 4) motion ``T``: x y z, then the quaternion w x y z."""
+    q = se3.quaternion_from_rotation(T[:3, :3])
+    return [float(v) for v in (*T[:3, 3], *q)]
+
+
+def unpack_motion(seven: Sequence[float] | F64) -> F64 | None:
+    """(4, 4) motion of x y z, qw qx qy qz; None unless finite and with a real quaternion."""
+    v = np.asarray(seven, np.float64)
+    if not np.isfinite(v).all() or np.abs(v[:3]).max() > 1e9:
+        return None
+    if not 0.5 < float(np.linalg.norm(v[3:])) < 2.0:
+        return None
+    return se3.compose(se3.rotation_from_quaternion(v[3:]), v[:3])
+
+
+def _seal(body: bytes) -> bytes:
+    return body + _CRC.pack(zlib.crc32(body))
+
+
+def _unseal(data: bytes, layout: struct.Struct, magic: bytes) -> tuple[Any, ...] | None:
+    if len(data) != layout.size + _CRC.size or data[:3] != magic + b"\x01":
+        return None
+    if zlib.crc32(data[: layout.size]) != _CRC.unpack_from(data, layout.size)[0]:
+        return None
+    return layout.unpack_from(data)
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _or_none(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def pack_pose(pose: PoseRecord) -> bytes:
+    """``pose`` as it travels and as it is stored."""
+    seq = -1 if pose.keyframe_seq is None else pose.keyframe_seq
+    body = _POSE.pack(
+        b"SP",
+        1,
+        source_bits(pose.sources),
+        pose.time_unix_ns,
+        seq,
+        *pack_motion(pose.T_world_camera),
+        *pack_covariance(pose.covariance),
+        _or_nan(pose.lat_deg),
+        _or_nan(pose.lon_deg),
+        _or_nan(pose.alt_amsl_m),
+        _or_nan(pose.agl_m),
+        pose.roll_rad,
+        pose.pitch_rad,
+        pose.yaw_rad,
+        pose.speed_m_s,
+        pose.distance_m,
+        pose.turn_rate_rad_s,
+        pose.sigma_m,
+    )
+    return _seal(body)
+
+
+def unpack_pose(data: bytes) -> PoseRecord | None:
+    """The pose in ``data``, or None when it is not a valid pose record."""
+    fields = _unseal(data, _POSE, b"SP")
+    if fields is None:
+        return None
+    motion = unpack_motion(fields[5:12])
+    if motion is None:
+        return None
+    lat, lon, alt, agl, roll, pitch, yaw, speed, distance, turn, sigma = fields[33:44]
+    return PoseRecord(
+        time_unix_ns=fields[3],
+        T_world_camera=motion,
+        covariance=unpack_covariance(fields[12:33]),
+        lat_deg=_or_none(lat),
+        lon_deg=_or_none(lon),
+        alt_amsl_m=_or_none(alt),
+        agl_m=_or_none(agl),
+        roll_rad=roll,
+        pitch_rad=pitch,
+        yaw_rad=yaw,
+        speed_m_s=speed,
+        distance_m=distance,
+        turn_rate_rad_s=turn,
+        sources=sources_of(fields[2]),
+        sigma_m=sigma,
+        keyframe_seq=None if fields[4] < 0 else fields[4],
+    )
+
+
+def pack_repose(repose: Repose) -> bytes:
+    """``repose`` as it travels and as it is stored."""
+    body = _REPOSE.pack(
+        b"SR",
+        1,
+        0,
+        repose.seq,
+        repose.revision,
+        *pack_motion(repose.T_world_camera),
+        *pack_covariance(repose.covariance),
+        repose.scale,
+    )
+    return _seal(body)
+
+
+def unpack_repose(data: bytes) -> Repose | None:
+    """The re-pose in ``data``, or None when it is not a valid record."""
+    fields = _unseal(data, _REPOSE, b"SR")
+    if fields is None:
+        return None
+    motion = unpack_motion(fields[5:12])
+    scale = fields[33]
+    if motion is None or not 1e-6 < scale < 1e6:
+        return None
+    return Repose(fields[3], fields[4], motion, scale, unpack_covariance(fields[12:33]))

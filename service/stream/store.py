@@ -1,0 +1,409 @@
+"""The scan on disk: one SQLite file, the same onboard and on the ground.
+
+Everything produced is committed here before it is offered to the link. Write-ahead logging
+with full synchronisation: a killed process loses at most the transaction in the making.
+Chunks are coded layers, keyed by keyframe and layer; poses and re-poses carry the number
+that the drone gave them, so that both ends can name what is missing.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sqlite3
+import threading
+import time
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recon.types import DepthMap, Keyframe, Pose
+from service.errors import InputError, OutsideError
+from service.stream import codec, layer
+from service.stream.records import (
+    PoseRecord,
+    Repose,
+    ScanHeader,
+    header_from_json,
+    pack_pose,
+    pack_repose,
+    unpack_pose,
+    unpack_repose,
+)
+
+log = logging.getLogger(__name__)
+
+SCHEMA_VERSION = 1
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS chunks (
+    seq INTEGER NOT NULL, layer INTEGER NOT NULL, layers INTEGER NOT NULL,
+    time_unix_ns INTEGER NOT NULL, crc INTEGER NOT NULL, stored_unix_ns INTEGER NOT NULL,
+    data BLOB NOT NULL, PRIMARY KEY (seq, layer));
+CREATE TABLE IF NOT EXISTS poses (
+    id INTEGER PRIMARY KEY, time_unix_ns INTEGER NOT NULL, data BLOB NOT NULL);
+CREATE TABLE IF NOT EXISTS reposes (
+    id INTEGER PRIMARY KEY, seq INTEGER NOT NULL, revision INTEGER NOT NULL,
+    data BLOB NOT NULL);
+CREATE INDEX IF NOT EXISTS reposes_by_seq ON reposes (seq, revision);
+CREATE TABLE IF NOT EXISTS held (
+    peer TEXT NOT NULL, kind TEXT NOT NULL, ranges TEXT NOT NULL, PRIMARY KEY (peer, kind));
+"""
+
+
+class ScanStore:
+    """One scan's database. Safe for one writer and several readers, in threads.
+
+    ``chunks`` of a keyframe that exceed ``quota_bytes`` are kept coarse only; :attr:`refused`
+    counts what was not stored. A full disk raises OutsideError and leaves the file sound.
+    """
+
+    def __init__(self, path: Path, header: ScanHeader | None, quota_bytes: int | None) -> None:
+        self.path = path
+        self.quota_bytes = quota_bytes
+        self.refused = 0
+        self._lock = threading.RLock()
+        self._changed = threading.Condition(self._lock)
+        self._version = 0
+        try:
+            self._db = sqlite3.connect(path, check_same_thread=False, timeout=10.0)
+            self._db.execute("PRAGMA journal_mode=WAL")
+            self._db.execute("PRAGMA synchronous=FULL")
+            self._db.executescript(_SCHEMA)
+            if header is not None:
+                self._set("schema", str(SCHEMA_VERSION))
+                self._set("header", header.to_json().decode())
+            self._header = self._read_header()
+        except sqlite3.Error as error:
+            raise InputError(f"{path} is not a scan database ({error})") from error
+        row = self._db.execute("SELECT TOTAL(LENGTH(data)) FROM chunks").fetchone()
+        self.chunk_bytes = int(row[0])
+
+    @classmethod
+    def create(
+        cls, path: Path | str, header: ScanHeader, quota_bytes: int | None = None
+    ) -> ScanStore:
+        """A new store; raises InputError when ``path`` exists or cannot be written."""
+        path = Path(path)
+        if path.exists():
+            raise InputError(f"{path} exists; open it or choose another folder")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot make {path.parent} ({error.strerror})") from error
+        return cls(path, header, quota_bytes)
+
+    @classmethod
+    def open(cls, path: Path | str, quota_bytes: int | None = None) -> ScanStore:
+        """An existing store, whatever state a crash left it in; what is sound is kept.
+
+        Raises InputError when there is no such file or it holds no scan.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise InputError(f"{path} does not exist; it should be a scan.db")
+        return cls(path, None, quota_bytes)
+
+    def close(self) -> None:
+        """Fold the write-ahead log into the file and close it."""
+        with self._lock:
+            try:
+                self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            except sqlite3.Error as error:
+                log.debug("no checkpoint of %s: %s", self.path, error)
+            self._db.close()
+
+    def __enter__(self) -> ScanStore:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # Header and summary
+
+    @property
+    def header(self) -> ScanHeader:
+        """What the scan is."""
+        return self._header
+
+    def update_header(self, **fields: Any) -> None:
+        """Replace fields of the header, such as the origin once it is known."""
+        self.put_header(replace(self._header, **fields))
+
+    def put_header(self, header: ScanHeader) -> None:
+        """Replace the whole header."""
+        with self._lock:
+            self._write([("INSERT OR REPLACE INTO meta VALUES (?, ?)", _header_row(header))])
+            self._header = header
+
+    @property
+    def summary(self) -> dict[str, Any] | None:
+        """What :meth:`finish` was given; None while the scan goes on."""
+        text = self._get("summary")
+        return None if text is None else dict(json.loads(text))
+
+    @property
+    def finished(self) -> bool:
+        """True once the drone closed the scan."""
+        return self._get("summary") is not None
+
+    def finish(self, summary: dict[str, Any]) -> None:
+        """Close the scan with its ``summary`` (must be JSON)."""
+        row = ("summary", json.dumps(summary, sort_keys=True))
+        self._write([("INSERT OR REPLACE INTO meta VALUES (?, ?)", row)])
+
+    # Chunks
+
+    def add_keyframe(self, seq: int, layers: Sequence[bytes]) -> int:
+        """Store the coded ``layers`` of keyframe ``seq`` at once; how many were new.
+
+        Over the quota only the coarse layer is kept. Raises ValueError for bytes that are no
+        layer of this keyframe, OutsideError when the disk is full.
+        """
+        heads = [layer.peek(data) for data in layers]
+        if any(head is None or head.seq != seq for head in heads):
+            raise ValueError(f"not the layers of keyframe {seq}")
+        with self._lock:
+            before = self._db.total_changes
+            room = self._room(sum(map(len, layers)))
+            kept = layers if room else layers[:1]
+            self.refused += len(layers) - len(kept)
+            self._write([_chunk_row(data) for data in kept])
+            return self._db.total_changes - before
+
+    def add_chunk(self, data: bytes) -> bool:
+        """Store one coded layer; False when it is there already, unsound or over the quota."""
+        head = layer.peek(data)
+        if head is None:
+            return False
+        with self._lock:
+            if head.layer > 0 and not self._room(len(data)):
+                self.refused += 1
+                return False
+            before = self._db.total_changes
+            self._write([_chunk_row(data)])
+            return self._db.total_changes > before
+
+    def chunk(self, seq: int, number: int) -> bytes | None:
+        """The coded layer ``number`` of keyframe ``seq``."""
+        sql = "SELECT data FROM chunks WHERE seq = ? AND layer = ?"
+        row = self._one(sql, (seq, number))
+        return None if row is None else bytes(row[0])
+
+    def keyframe(self, seq: int) -> Keyframe | None:
+        """Keyframe ``seq`` at its finest stored layer, with the newest re-pose applied."""
+        sql = "SELECT data FROM chunks WHERE seq = ? ORDER BY layer DESC"
+        with self._lock:
+            rows = self._db.execute(sql, (seq,)).fetchall()
+        for (data,) in rows:
+            decoded = codec.decode([bytes(data)])
+            if decoded is not None:
+                return _reposed(decoded, self.repose(seq))
+        return None
+
+    def keyframes(self) -> Iterator[Keyframe]:
+        """All keyframes in order of their number, as :meth:`keyframe` gives them."""
+        for seq in self.seqs():
+            found = self.keyframe(seq)
+            if found is not None:
+                yield found
+
+    def seqs(self) -> list[int]:
+        """Numbers of the keyframes of which any layer is stored."""
+        return [row[0] for row in self._all("SELECT DISTINCT seq FROM chunks ORDER BY seq")]
+
+    @property
+    def next_seq(self) -> int:
+        """The number for the next keyframe, also after a restart."""
+        row = self._one("SELECT MAX(seq) FROM chunks", ())
+        return 0 if row is None or row[0] is None else int(row[0]) + 1
+
+    # Poses and re-poses
+
+    def add_pose(self, pose: PoseRecord) -> int:
+        """Store a pose under the next number, which is returned."""
+        with self._lock:
+            number = self._next_id("poses")
+            self.put_pose(number, pack_pose(pose))
+            return number
+
+    def put_pose(self, number: int, data: bytes) -> bool:
+        """Store a packed pose under the number the drone gave it; False if it is no news."""
+        pose = unpack_pose(data)
+        if pose is None:
+            return False
+        row = (number, pose.time_unix_ns, data)
+        return self._write([("INSERT OR IGNORE INTO poses VALUES (?, ?, ?)", row)]) > 0
+
+    def poses(self) -> Iterator[PoseRecord]:
+        """All poses in order of time."""
+        for (data,) in self._all("SELECT data FROM poses ORDER BY time_unix_ns, id"):
+            pose = unpack_pose(bytes(data))
+            if pose is not None:
+                yield pose
+
+    def add_repose(self, repose: Repose) -> int:
+        """Store a re-pose under the next number, which is returned."""
+        with self._lock:
+            number = self._next_id("reposes")
+            self.put_repose(number, pack_repose(repose))
+            return number
+
+    def put_repose(self, number: int, data: bytes) -> bool:
+        """Store a packed re-pose under the drone's number; False if it is no news."""
+        repose = unpack_repose(data)
+        if repose is None:
+            return False
+        row = (number, repose.seq, repose.revision, data)
+        return self._write([("INSERT OR IGNORE INTO reposes VALUES (?, ?, ?, ?)", row)]) > 0
+
+    def repose(self, seq: int) -> Repose | None:
+        """The newest re-pose of keyframe ``seq``."""
+        sql = "SELECT data FROM reposes WHERE seq = ? ORDER BY revision DESC, id DESC LIMIT 1"
+        row = self._one(sql, (seq,))
+        return None if row is None else unpack_repose(bytes(row[0]))
+
+    # What the link asks
+
+    def record(self, kind: str, number: int) -> bytes | None:
+        """The stored bytes of item ``number`` of a kind: "pose", "repose", "k0", "k1" …"""
+        if kind.startswith("k"):
+            return self.chunk(number, int(kind[1:]))
+        table = {"pose": "poses", "repose": "reposes"}[kind]
+        row = self._one(f"SELECT data FROM {table} WHERE id = ?", (number,))
+        return None if row is None else bytes(row[0])
+
+    def numbers(self) -> dict[str, list[int]]:
+        """Kind to the sorted numbers of what is stored; of re-poses only those in force."""
+        newest = "SELECT id FROM reposes r WHERE revision = (SELECT MAX(revision) FROM reposes"
+        with self._lock:
+            out = {
+                "pose": [r[0] for r in self._all("SELECT id FROM poses ORDER BY id")],
+                "repose": [r[0] for r in self._all(f"{newest} WHERE seq = r.seq) ORDER BY id")],
+            }
+            for seq, number in self._all("SELECT seq, layer FROM chunks ORDER BY seq"):
+                out.setdefault(f"k{number}", []).append(seq)
+        return out
+
+    def set_held(self, peer: str, ranges: dict[str, list[tuple[int, int]]]) -> None:
+        """Note what ``peer`` says it holds: kind to inclusive ranges of numbers."""
+        sql = "INSERT OR REPLACE INTO held VALUES (?, ?, ?)"
+        self._write(
+            [(sql, (peer, kind, json.dumps(value))) for kind, value in ranges.items()],
+            news=False,
+        )
+
+    def held(self) -> dict[str, dict[str, list[tuple[int, int]]]]:
+        """Peer to what it said it holds."""
+        out: dict[str, dict[str, list[tuple[int, int]]]] = {}
+        for peer, kind, text in self._all("SELECT peer, kind, ranges FROM held"):
+            out.setdefault(peer, {})[kind] = [(a, b) for a, b in json.loads(text)]
+        return out
+
+    @property
+    def version(self) -> int:
+        """A count that grows with every change made through this object."""
+        with self._lock:
+            return self._version
+
+    def wait(self, version: int, timeout_s: float) -> int:
+        """The present version, once it differs from ``version`` or the time is up."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._version != version, timeout_s)
+            return self._version
+
+    # SQL
+
+    def _room(self, size: int) -> bool:
+        return self.quota_bytes is None or self.chunk_bytes + size <= self.quota_bytes
+
+    def _read_header(self) -> ScanHeader:
+        text = self._get("header")
+        schema = self._get("schema")
+        header = None if text is None else header_from_json(text.encode())
+        if header is None or schema is None:
+            raise InputError(f"{self.path} holds no scan header; it is not a scan database")
+        if int(schema) > SCHEMA_VERSION:
+            raise InputError(f"{self.path} was written by a newer version; update skyrelief")
+        return header
+
+    def _get(self, key: str) -> str | None:
+        row = self._one("SELECT value FROM meta WHERE key = ?", (key,))
+        return None if row is None else str(row[0])
+
+    def _set(self, key: str, value: str) -> None:
+        self._write([("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, value))])
+
+    def _next_id(self, table: str) -> int:
+        row = self._one(f"SELECT MAX(id) FROM {table}", ())
+        return 1 if row is None or row[0] is None else int(row[0]) + 1
+
+    def _one(self, sql: str, values: tuple[Any, ...]) -> tuple[Any, ...] | None:
+        with self._lock:
+            row: tuple[Any, ...] | None = self._db.execute(sql, values).fetchone()
+            return row
+
+    def _all(self, sql: str) -> list[tuple[Any, ...]]:
+        with self._lock:
+            return self._db.execute(sql).fetchall()
+
+    def _write(self, statements: list[tuple[str, tuple[Any, ...]]], news: bool = True) -> int:
+        """Run the statements in one transaction; how many rows changed."""
+        with self._changed:
+            before = self._db.total_changes
+            try:
+                with self._db:
+                    for sql, values in statements:
+                        changed = self._db.execute(sql, values).rowcount
+                        if changed > 0 and "INTO chunks" in sql:
+                            self.chunk_bytes += len(values[-1])
+            except sqlite3.OperationalError as error:
+                raise OutsideError(
+                    f"cannot write {self.path} ({error}); free some space or check the disk"
+                ) from error
+            if news:
+                self._version += 1
+                self._changed.notify_all()
+            return self._db.total_changes - before
+
+
+def _header_row(header: ScanHeader) -> tuple[str, str]:
+    return ("header", header.to_json().decode())
+
+
+def _chunk_row(data: bytes) -> tuple[str, tuple[Any, ...]]:
+    head = layer.peek(data)
+    if head is None:
+        raise ValueError("not a coded layer")
+    return "INSERT OR IGNORE INTO chunks VALUES (?, ?, ?, ?, ?, ?, ?)", (
+        head.seq,
+        head.layer,
+        head.layers,
+        head.time_unix_ns,
+        zlib.crc32(data),
+        time.time_ns(),
+        data,
+    )
+
+
+def _reposed(keyframe: Keyframe, repose: Repose | None) -> Keyframe:
+    """``keyframe`` at the pose, scale and covariance of ``repose``."""
+    if repose is None:
+        return keyframe
+    scale = np.float32(repose.scale)
+    depth = keyframe.depth
+    return replace(
+        keyframe,
+        depth=DepthMap(
+            depth.depth_m * scale,
+            depth.sigma_m * scale,
+            depth.views,
+            depth.K,
+            repose.T_world_camera,
+        ),
+        pose=Pose(repose.T_world_camera, repose.covariance, keyframe.pose.sources),
+    )

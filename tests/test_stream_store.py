@@ -1,0 +1,157 @@
+"""The scan store: what goes in comes out, once, also after a crash."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.types import DepthMap, Keyframe, Pose
+from service.errors import InputError
+from service.stream import codec
+from service.stream.records import PoseRecord, Repose, ScanHeader
+from service.stream.store import ScanStore
+
+HEADER = ScanHeader("scan-1", "drone-a", 1_700_000_000_000_000_000, camera={"width": 320})
+
+
+def keyframe(seq: int, w: int = 96, h: int = 54) -> Keyframe:
+    rng = np.random.default_rng(seq)
+    T = se3.exp(rng.normal(0, 0.3, 6))
+    depth = DepthMap(
+        rng.uniform(40, 60, (h, w)).astype(np.float32),
+        rng.uniform(0.1, 0.2, (h, w)).astype(np.float32),
+        np.full((h, w), 3, np.uint8),
+        np.array([[80.0, 0, 47.5], [0, 80.0, 26.5], [0, 0, 1]]),
+        T,
+    )
+    bgr = rng.integers(0, 255, (h, w, 3), np.uint8)
+    fresh = rng.random((h, w)) > 0.3
+    return Keyframe(seq, 5, depth, bgr, Pose(T, np.eye(6) * 1e-4, ("vision",)), fresh)
+
+
+def pose(k: int) -> PoseRecord:
+    return PoseRecord(1000 + k, se3.exp(np.full(6, 0.1 * k)), np.eye(6) * 0.01, lat_deg=47.0)
+
+
+def test_what_goes_in_comes_out(tmp_path: Path) -> None:
+    with ScanStore.create(tmp_path / "a" / "scan.db", HEADER) as store:
+        layers = codec.encode(keyframe(7), 123)
+        assert store.add_keyframe(7, layers) == 2
+        store.add_pose(pose(2))
+        store.add_pose(pose(1))
+        store.update_header(origin_lat_deg=47.5, epsg=32632)
+        store.finish({"points": 9})
+    with ScanStore.open(tmp_path / "a" / "scan.db") as store:
+        assert store.header.origin_lat_deg == 47.5 and store.header.camera == {"width": 320}
+        assert store.finished and store.summary == {"points": 9}
+        assert [p.time_unix_ns for p in store.poses()] == [1001, 1002]
+        (back,) = store.keyframes()
+        direct = codec.decode(layers)
+        assert direct is not None and back.time_ns == 123
+        np.testing.assert_array_equal(back.depth.depth_m, direct.depth.depth_m)
+        assert store.next_seq == 8
+
+
+def test_duplicates_and_order_do_not_matter(tmp_path: Path) -> None:
+    chunks = [data for seq in range(4) for data in codec.encode(keyframe(seq), seq)]
+    with (
+        ScanStore.create(tmp_path / "a.db", HEADER) as a,
+        ScanStore.create(tmp_path / "b.db", HEADER) as b,
+    ):
+        assert all(a.add_chunk(data) for data in chunks)
+        for data in reversed(chunks):
+            assert b.add_chunk(data)
+            assert not b.add_chunk(data)
+        assert (
+            a.numbers()
+            == b.numbers()
+            == {"pose": [], "repose": [], "k0": [0, 1, 2, 3], "k1": [0, 1, 2, 3]}
+        )
+        for left, right in zip(a.keyframes(), b.keyframes(), strict=True):
+            np.testing.assert_array_equal(left.depth.depth_m, right.depth.depth_m)
+            np.testing.assert_array_equal(left.bgr, right.bgr)
+
+
+def test_damaged_chunks_are_refused(tmp_path: Path) -> None:
+    data = bytearray(codec.encode(keyframe(0), 0)[0])
+    data[-1] ^= 1
+    with ScanStore.create(tmp_path / "a.db", HEADER) as store:
+        assert not store.add_chunk(bytes(data))
+        assert not store.add_chunk(b"")
+        assert not store.put_pose(1, b"nothing")
+        with pytest.raises(ValueError, match="keyframe 3"):
+            store.add_keyframe(3, codec.encode(keyframe(2), 0))
+        assert store.seqs() == []
+
+
+def test_newest_repose_moves_and_scales(tmp_path: Path) -> None:
+    with ScanStore.create(tmp_path / "a.db", HEADER) as store:
+        store.add_keyframe(0, codec.encode(keyframe(0), 0))
+        plain = store.keyframe(0)
+        T = se3.exp(np.array([0.1, 0, 0, 5.0, 0, 0]))
+        store.add_repose(Repose(0, 2, T, 1.5, np.eye(6)))
+        store.add_repose(Repose(0, 1, np.eye(4), 9.0, np.eye(6)))
+        moved = store.keyframe(0)
+        assert plain is not None and moved is not None
+        np.testing.assert_allclose(moved.depth.T_world_camera, T, atol=1e-12)
+        np.testing.assert_allclose(moved.depth.depth_m, plain.depth.depth_m * 1.5, rtol=1e-6)
+        np.testing.assert_allclose(moved.depth.sigma_m, plain.depth.sigma_m * 1.5, rtol=1e-6)
+        assert store.numbers()["repose"] == [1]
+
+
+def test_over_the_quota_only_the_coarse_layer_is_kept(tmp_path: Path) -> None:
+    layers = codec.encode(keyframe(0), 0)
+    with ScanStore.create(tmp_path / "a.db", HEADER, quota_bytes=len(layers[1])) as store:
+        assert store.add_keyframe(0, layers) == 1
+        assert store.refused == 1 and store.numbers()["k0"] == [0]
+        assert "k1" not in store.numbers()
+
+
+def test_wrong_files_are_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "text.db").write_text("hello " * 500)
+    for name in ("absent.db", "text.db"):
+        with pytest.raises(InputError) as caught:
+            ScanStore.open(tmp_path / name)
+        assert "\n" not in str(caught.value)
+    ScanStore.create(tmp_path / "a.db", HEADER).close()
+    with pytest.raises(InputError, match="exists"):
+        ScanStore.create(tmp_path / "a.db", HEADER)
+
+
+WRITER = """
+import sys
+from service.stream.store import ScanStore
+from service.stream.records import ScanHeader, PoseRecord
+import numpy as np
+store = ScanStore.create(sys.argv[1], ScanHeader("s", "d", 1))
+k = 0
+while True:
+    print(store.add_pose(PoseRecord(k, np.eye(4), np.eye(6))), flush=True)
+    k += 1
+"""
+
+
+def test_a_killed_writer_loses_nothing_it_acknowledged(tmp_path: Path) -> None:
+    path = tmp_path / "scan.db"
+    root = str(Path(__file__).resolve().parents[1])
+    writer = subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": root},
+    )
+    assert writer.stdout is not None
+    acknowledged = [int(writer.stdout.readline()) for _ in range(20)]
+    writer.send_signal(signal.SIGKILL)
+    acknowledged += [int(line) for line in writer.stdout.read().split("\n")[:-1]]
+    writer.wait()
+    with ScanStore.open(path) as store:
+        assert store.numbers()["pose"][: len(acknowledged)] == acknowledged
+        store.add_pose(pose(1))
