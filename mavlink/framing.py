@@ -1,0 +1,123 @@
+"""Bytes into whole MAVLink packets; anything else is skipped and counted.
+
+Works on MAVLink 1 and 2. A packet whose checksum fails is not skipped as a whole: the search
+goes on one byte further, so that a packet inside the damage is found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from mavlink.wire import dialect, x25crc
+
+MAGIC_V1 = 0xFE
+MAGIC_V2 = 0xFD
+SIGNATURE_LENGTH = 13
+SIGNED = 0x01
+MAX_PACKET = 280
+
+Message = Any
+"""A message object of a pymavlink dialect."""
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One packet with a right checksum, or of a kind whose checksum nobody here can know."""
+
+    data: bytes
+    message_id: int
+    system: int
+    component: int
+    known: bool  # the dialect has this message, so the checksum was verified
+
+    @property
+    def is_signed(self) -> bool:
+        """True when a signature of 13 bytes ends the packet."""
+        return self.data[0] == MAGIC_V2 and bool(self.data[2] & SIGNED)
+
+
+def packet_length(data: bytes | bytearray, at: int) -> int | None:
+    """Length in bytes of the packet that starts at ``at``; 0 when no packet can start there.
+
+    None when there are too few bytes to say.
+    """
+    if at >= len(data):
+        return None
+    magic = data[at]
+    if magic == MAGIC_V1:
+        return data[at + 1] + 8 if at + 1 < len(data) else None
+    if magic != MAGIC_V2:
+        return 0
+    if at + 2 >= len(data):
+        return None
+    if data[at + 2] & ~SIGNED:
+        return 0  # an incompatible flag that we do not know
+    return data[at + 1] + 12 + (SIGNATURE_LENGTH if data[at + 2] & SIGNED else 0)
+
+
+def check_packet(data: bytes) -> Packet | None:
+    """The packet that fills ``data``, or None when its checksum is wrong."""
+    if data[0] == MAGIC_V1:
+        message_id, system, component, end = data[5], data[3], data[4], len(data)
+    else:
+        message_id = data[7] | data[8] << 8 | data[9] << 16
+        system, component = data[5], data[6]
+        end = len(data) - (SIGNATURE_LENGTH if data[2] & SIGNED else 0)
+    kind = dialect.mavlink_map.get(message_id)
+    if kind is None:
+        return Packet(data, message_id, system, component, False)
+    crc = x25crc(data[1 : end - 2] + bytes((kind.crc_extra,))).crc
+    if crc != data[end - 2] | data[end - 1] << 8:
+        return None
+    return Packet(data, message_id, system, component, True)
+
+
+class Decoder:
+    """Packets into message objects; never raises."""
+
+    def __init__(self) -> None:
+        self._parser = dialect.MAVLink(None)
+        self.undecodable = 0
+
+    def message(self, packet: Packet) -> Message | None:
+        """The message object, or None when the payload cannot be one."""
+        if not packet.known:
+            return None
+        try:
+            return self._parser.decode(bytearray(packet.data))
+        except (dialect.MAVError, ValueError, TypeError):
+            self.undecodable += 1
+            return None
+
+
+class Framer:
+    """Splits a byte stream into packets; keeps at most one unfinished packet."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self.packets = 0
+        self.skipped_bytes = 0
+        self.bad_checksums = 0
+
+    def feed(self, data: bytes) -> list[Packet]:
+        """The packets completed by ``data``, in order."""
+        buffer = self._buffer
+        buffer += data
+        found: list[Packet] = []
+        at = 0
+        while True:
+            length = packet_length(buffer, at)
+            if length is None or (length and at + length > len(buffer)):
+                break
+            packet = check_packet(bytes(buffer[at : at + length])) if length else None
+            if packet is None:
+                self.bad_checksums += bool(length)
+                self.skipped_bytes += 1
+                at += 1
+            else:
+                found.append(packet)
+                at += length
+        del buffer[:at]
+        self.packets += len(found)
+        return found

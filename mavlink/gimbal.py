@@ -1,0 +1,201 @@
+"""Gimbal messages into attitudes of the head in NED.
+
+GIMBAL_DEVICE_ATTITUDE_STATUS says by its flags what its quaternion refers to (MAVLink gimbal
+protocol v2): bit 64 earth, bit 32 the vehicle's heading, neither: earth when yaw is locked
+(16), else the vehicle's heading. Some senders claim what is not so: ArduPilot's servo mounts
+send servo angles with flags 44, which claim the horizon. Hence the override by configuration,
+:func:`steadiest_frame` (by telemetry alone) and :func:`judge_frame` (by the pictures).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mavlink.quaternion import (
+    Quaternion,
+    angle_between,
+    from_rpy,
+    multiply,
+    normalised,
+    to_rpy,
+    yaw_of,
+)
+from mavlink.samples import GimbalFrame, GimbalSample
+
+YAW_LOCK = 16
+YAW_IN_VEHICLE_FRAME = 32
+YAW_IN_EARTH_FRAME = 64
+
+TILT_LAG = 10  # samples
+TILTED_RAD = math.radians(1.0)
+
+YAW_FRAMES = ("auto", "vehicle", "earth", "body", "servo")
+
+
+@dataclass(frozen=True, slots=True)
+class GimbalConfig:
+    """How gimbal messages are read."""
+
+    yaw_frame: str = "auto"  # auto: as the flags say, unless it cannot be
+    mount_rpy_deg: tuple[float, float, float] | None = None  # fixed mount, used without messages
+
+    def __post_init__(self) -> None:
+        if self.yaw_frame not in YAW_FRAMES:
+            raise ValueError(
+                f"gimbal yaw_frame is {self.yaw_frame!r}; use one of {', '.join(YAW_FRAMES)}"
+            )
+        rpy = self.mount_rpy_deg
+        if rpy is not None and not (len(rpy) == 3 and all(map(math.isfinite, rpy))):
+            raise ValueError(f"mount_rpy_deg is {rpy!r}; give roll, pitch and yaw in degrees")
+
+    @property
+    def mount(self) -> Quaternion | None:
+        """``q_body_gimbal`` of the fixed mount."""
+        if self.mount_rpy_deg is None:
+            return None
+        roll, pitch, yaw = map(math.radians, self.mount_rpy_deg)
+        return from_rpy(roll, pitch, yaw)
+
+
+def from_device_status(m: Any) -> GimbalSample | None:
+    """The sample in a GIMBAL_DEVICE_ATTITUDE_STATUS (285)."""
+    q = normalised(m.q)
+    if q is None:
+        return None
+    return GimbalSample(m.time_boot_ms, q, frame_of_flags(m.flags), m.get_srcComponent(), 0)
+
+
+def from_mount_orientation(m: Any) -> GimbalSample | None:
+    """The sample in a MOUNT_ORIENTATION (265): degrees, earth yaw when it sends one."""
+    if not all(map(math.isfinite, (m.roll, m.pitch))):
+        return None
+    absolute = float(getattr(m, "yaw_absolute", math.nan))
+    # A sender of the short form leaves the extension zero although it points elsewhere.
+    earth = math.isfinite(absolute) and absolute != 0.0
+    yaw = absolute if earth else m.yaw
+    if not math.isfinite(yaw):
+        return None
+    q = from_rpy(*map(math.radians, (m.roll, m.pitch, yaw)))
+    frame = GimbalFrame.EARTH if earth else GimbalFrame.VEHICLE
+    return GimbalSample(m.time_boot_ms, q, frame, m.get_srcComponent(), 1)
+
+
+def from_mount_status(m: Any) -> GimbalSample | None:
+    """The sample in an old MOUNT_STATUS (158): hundredths of a degree, vehicle's heading."""
+    roll, pitch, yaw = (math.radians(a * 0.01) for a in (m.pointing_b, m.pointing_a, m.pointing_c))
+    q = from_rpy(roll, pitch, yaw)
+    return GimbalSample(None, q, GimbalFrame.VEHICLE, m.get_srcComponent(), 2)
+
+
+def frame_of_flags(flags: int) -> GimbalFrame:
+    """What the quaternion refers to, by the flags of GIMBAL_DEVICE_ATTITUDE_STATUS."""
+    if flags & YAW_IN_EARTH_FRAME:
+        return GimbalFrame.EARTH
+    if flags & YAW_IN_VEHICLE_FRAME:
+        return GimbalFrame.VEHICLE
+    return GimbalFrame.EARTH if flags & YAW_LOCK else GimbalFrame.VEHICLE
+
+
+def to_earth(q: Quaternion, frame: GimbalFrame, q_ned_body: Quaternion) -> Quaternion:
+    """``q_ned_gimbal`` of a quaternion in any frame and the body's attitude at its instant."""
+    if frame is GimbalFrame.EARTH:
+        return q
+    if frame is GimbalFrame.BODY:
+        return multiply(q_ned_body, q)
+    if frame is GimbalFrame.SERVO:
+        return multiply(q_ned_body, _of_servos(q))
+    return multiply(from_rpy(0.0, 0.0, yaw_of(q_ned_body)), q)
+
+
+def _of_servos(q: Quaternion) -> Quaternion:
+    """``q_body_gimbal`` of servo angles that were sent as if they were yaw, pitch, roll.
+
+    The servos sit the other way round: pan on the body, roll on the pan, tilt on the roll.
+    """
+    roll, pitch, yaw = to_rpy(q)
+    return multiply(from_rpy(roll, 0.0, yaw), from_rpy(0.0, pitch, 0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class FrameVerdict:
+    """Which frame agrees with the pictures, and by how much."""
+
+    frame: GimbalFrame
+    rms_rad: float  # disagreement of the frame chosen, per step
+    runner_up_rms_rad: float
+    decided: bool  # the turns told the frames apart
+
+
+def judge_frame(
+    q_sent: Sequence[Quaternion],
+    q_ned_body: Sequence[Quaternion],
+    q_seen_steps: Iterable[Quaternion],
+) -> FrameVerdict | None:
+    """The frame of a gimbal's quaternions that agrees with the rotation seen by the camera.
+
+    ``q_sent`` and ``q_ned_body`` are N attitudes at the instants of N pictures;
+    ``q_seen_steps`` the N-1 rotations ``q_head(k)_head(k+1)`` measured between the pictures,
+    in the head's axes. None when there is nothing to compare. ``decided`` needs the best
+    frame to be right within half a degree more clearly than the next one, twice over.
+    """
+    steps = list(q_seen_steps)
+    if len(q_sent) != len(q_ned_body) or len(steps) != len(q_sent) - 1:
+        raise ValueError(
+            f"judge_frame needs N, N and N-1 rotations, got "
+            f"{len(q_sent)}, {len(q_ned_body)} and {len(steps)}"
+        )
+    if not steps:
+        return None
+    scores: list[tuple[float, GimbalFrame]] = []
+    for frame in GimbalFrame:
+        head = [to_earth(q, frame, body) for q, body in zip(q_sent, q_ned_body, strict=True)]
+        total = 0.0
+        for a, b, seen in zip(head, head[1:], steps, strict=False):
+            conj = (a[0], -a[1], -a[2], -a[3])
+            total += angle_between(multiply(conj, b), seen) ** 2
+        scores.append((math.sqrt(total / len(steps)), frame))
+    scores.sort(key=lambda score: score[0])
+    (best, frame), (second, _) = scores[0], scores[1]
+    decided = second > 2.0 * best and second - best > math.radians(0.05)
+    return FrameVerdict(frame, best, second, decided)
+
+
+def steadiest_frame(
+    q_sent: Sequence[Quaternion], q_ned_body: Sequence[Quaternion]
+) -> GimbalFrame | None:
+    """BODY or SERVO when a head that claims the horizon moves as only such a mount does.
+
+    A mount that keeps the horizon shows a steady tilt while the body's tilt changes. When the
+    tilt it sends changes against the body's instead, so that only the one composed with the
+    body's attitude is steady, its angles are relative to the body. Looks at pairs of samples
+    between which the body tilted by a degree; None when the claim stands, or when there are
+    too few pairs to tell.
+    """
+    pairs = [
+        (i, i + TILT_LAG)
+        for i in range(len(q_sent) - TILT_LAG)
+        if math.dist(_down(q_ned_body[i]), _down(q_ned_body[i + TILT_LAG])) > TILTED_RAD
+    ]
+    if len(pairs) < 20:
+        return None
+    scores: dict[GimbalFrame, float] = {}
+    for frame in (GimbalFrame.VEHICLE, GimbalFrame.BODY, GimbalFrame.SERVO):
+        heads = [to_earth(q, frame, body) for q, body in zip(q_sent, q_ned_body, strict=True)]
+        scores[frame] = _change(heads, pairs)
+    best = min(scores, key=lambda frame: scores[frame])
+    return best if scores[best] < 0.5 * scores[GimbalFrame.VEHICLE] else None
+
+
+def _change(heads: Sequence[Quaternion], pairs: Sequence[tuple[int, int]]) -> float:
+    """Median change of tilt in rad over pairs: jumps of the target drop out."""
+    steps = sorted(math.dist(_down(heads[i]), _down(heads[j])) for i, j in pairs)
+    return steps[len(steps) // 2]
+
+
+def _down(q: Quaternion) -> tuple[float, float, float]:
+    """The horizon's down direction in the head's axes: blind to heading."""
+    w, x, y, z = q
+    return (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))

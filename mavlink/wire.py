@@ -1,0 +1,17 @@
+"""The dialect spoken: every message of ``common`` and ArduPilot's own, from pymavlink.
+
+pymavlink carries no types, so this is the one place that says so.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega  # type: ignore[import-untyped]
+from pymavlink.generator import mavcrc  # type: ignore[import-untyped]
+
+dialect: Any = ardupilotmega
+"""Message classes, enums as module constants, ``mavlink_map`` from number to class."""
+
+x25crc: Any = mavcrc.x25crc
+"""CRC-16/MCRF4XX; compiled when fastcrc is installed."""
