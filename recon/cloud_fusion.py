@@ -1,0 +1,192 @@
+"""Many clouds fused into one: inverse-variance means per voxel, lone contradicted points left out.
+
+The voxel keys are those of :mod:`recon.voxel_map`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numba import njit
+
+from recon.types import F32, F64, U8, Bool, PointCloud
+from recon.voxel_map import I32, I64, find_slot, rehash, voxel_key
+
+CORRELATED_SHARE = 0.5
+"""Sigma of a mean over keyframes never falls below this share of its best member's: their
+errors share frames, poses and texture, so they do not average out any further."""
+
+LONE_NEIGHBOURS = 3
+"""A point with fewer occupied voxels than this among the 26 around it stands alone."""
+
+
+def fuse(clouds: Iterable[PointCloud], voxel_m: float) -> PointCloud:
+    """One point per voxel of ``voxel_m``: mean position, colour and sigma, views summed.
+
+    Points count by the inverse of their variance. Points of one cloud in one voxel are
+    neighbours in one depth image, so together they count as the best of them for sigma and
+    views; clouds count as independent down to CORRELATED_SHARE. A single-view point that
+    stands alone is left out when surface seen more often, above or below it, contradicts it.
+    Order is that of the voxel keys, whatever the order of points in a cloud. Raises
+    ValueError for a voxel size that is not positive.
+    """
+    if not (np.isfinite(voxel_m) and voxel_m > 0.0):
+        raise ValueError(f"voxel_m is {voxel_m}, must be positive")
+    sums = _Sums()
+    frame = "world"
+    for number, cloud in enumerate(clouds):
+        frame = cloud.frame
+        sums.add(cloud, number, 1.0 / voxel_m)
+    return sums.cloud(frame)
+
+
+class _Sums:
+    """The running sums of ``fuse``, in dense arrays found through a hash of voxel keys."""
+
+    def __init__(self) -> None:
+        self.keys: I64 = np.full(1 << 16, -1, np.int64)
+        self.ids: I32 = np.zeros(1 << 16, np.int32)
+        self.count = 0
+        self._grow(1 << 15)
+
+    def _grow(self, rows: int) -> None:
+        old = self.count
+        names = (("xyzw", 4, np.float64), ("rgb", 3, np.float32), ("info", 3, np.float64))
+        for name, width, dtype in names:
+            new = np.zeros((rows, width), dtype)
+            if old:
+                new[:old] = getattr(self, name)[:old]
+            setattr(self, name, new)
+        tags = np.zeros((rows, 3), np.int32)
+        if old:
+            tags[:old] = self.tags[:old]
+        self.tags = tags
+
+    xyzw: F64  # sum of w x, w y, w z, w over points
+    rgb: F32  # sum of w colour
+    info: F64  # sum over clouds of the best w; best w of the last cloud; best w of all
+    tags: I32  # last cloud; sum over clouds of the most views; most views in the last cloud
+
+    def add(self, cloud: PointCloud, number: int, inverse: float) -> None:
+        """Add one cloud's points."""
+        while len(self.tags) < self.count + len(cloud):
+            self._grow(2 * len(self.tags))
+        slots = len(self.keys)
+        while slots < 2 * (self.count + len(cloud)):
+            slots *= 2
+        if slots > len(self.keys):
+            self.keys, self.ids = rehash(self.keys, self.ids, slots)
+        self.count = _accumulate(
+            self.keys,
+            self.ids,
+            self.count,
+            number + 1,
+            np.ascontiguousarray(cloud.xyz_m, np.float32),
+            np.ascontiguousarray(cloud.rgb, np.uint8),
+            np.ascontiguousarray(cloud.sigma_m, np.float32),
+            np.ascontiguousarray(cloud.views, np.uint8),
+            inverse,
+            self.xyzw,
+            self.rgb,
+            self.info,
+            self.tags,
+        )
+
+    def cloud(self, frame: str) -> PointCloud:
+        """The means."""
+        at = np.flatnonzero(self.keys != -1)
+        at = at[np.argsort(self.keys[at])]
+        keys, rows = self.keys[at], self.ids[at]
+        weight = self.xyzw[rows, 3]
+        xyz = (self.xyzw[rows, :3] / weight[:, None]).astype(np.float32)
+        rgb = np.clip(np.rint(self.rgb[rows] / weight[:, None]), 0, 255).astype(np.uint8)
+        best = 1.0 / np.sqrt(self.info[rows, 2])
+        sigma = np.maximum(1.0 / np.sqrt(self.info[rows, 0]), CORRELATED_SHARE * best)
+        sigma = sigma.astype(np.float32)
+        views = np.minimum(self.tags[rows, 1], 255).astype(np.uint8)
+        keep = ~_lone_contradicted(keys, xyz, sigma, views)
+        return PointCloud(xyz[keep], rgb[keep], sigma[keep], views[keep], frame)
+
+
+@njit(cache=True, nogil=True)
+def _accumulate(
+    keys: I64,
+    ids: I32,
+    count: int,
+    number: int,
+    xyz: F32,
+    rgb: U8,
+    sigma: F32,
+    views: U8,
+    inverse: float,
+    xyzw: F64,
+    colour: F32,
+    info: F64,
+    tags: I32,
+) -> int:
+    """Add points to the sums; the new number of voxels. Points without a sigma are left out."""
+    for n in range(xyz.shape[0]):
+        s = sigma[n]
+        if not (s > 0.0 and s < 1e6):
+            continue
+        x, y, z = float(xyz[n, 0]), float(xyz[n, 1]), float(xyz[n, 2])
+        key = voxel_key(x, y, z, inverse)
+        if key == -1:
+            continue
+        t = find_slot(keys, key)
+        if keys[t] == -1:
+            keys[t] = key
+            ids[t] = count
+            count += 1
+        r = ids[t]
+        w = 1.0 / (float(s) * float(s))
+        xyzw[r, 0] += w * x
+        xyzw[r, 1] += w * y
+        xyzw[r, 2] += w * z
+        xyzw[r, 3] += w
+        for c in range(3):
+            colour[r, c] += w * rgb[n, c]
+        if tags[r, 0] != number:
+            tags[r, 0] = number
+            tags[r, 2] = 0
+            info[r, 1] = 0.0
+        if w > info[r, 1]:
+            info[r, 0] += w - info[r, 1]
+            info[r, 1] = w
+        if w > info[r, 2]:
+            info[r, 2] = w
+        if views[n] > tags[r, 2]:
+            tags[r, 1] += views[n] - tags[r, 2]
+            tags[r, 2] = views[n]
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _lone_contradicted(keys: I64, xyz: F32, sigma: F32, views: U8) -> Bool:
+    """(N,) lone single-view points with better, more often seen surface above or below.
+
+    ``keys`` are sorted, so a column of voxels is one run of rows.
+    """
+    n = keys.shape[0]
+    out = np.zeros(n, np.bool_)
+    low = (1 << 21) - 1
+    for p in range(n):
+        if views[p] > 1:
+            continue
+        neighbours = -1  # the point itself
+        contradicted = False
+        height = keys[p] & low
+        for di in range(-1, 2):
+            for dj in range(-1, 2):
+                column = (keys[p] & ~low) + (np.int64(di) << 42) + (np.int64(dj) << 21)
+                q = np.searchsorted(keys, column)
+                while q < n and (keys[q] & ~low) == column:
+                    if abs((keys[q] & low) - height) <= 1:
+                        neighbours += 1
+                    if views[q] > 1 and sigma[q] < sigma[p]:
+                        apart = abs(xyz[q, 2] - xyz[p, 2])
+                        contradicted |= apart > 3.0 * (sigma[p] + sigma[q])
+                    q += 1
+        out[p] = contradicted and neighbours < LONE_NEIGHBOURS
+    return out

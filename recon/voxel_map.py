@@ -1,0 +1,296 @@
+"""What surface is known already: voxels in a hash.
+
+A voxel is named by its three indices, packed into one 64-bit key. Keys live in an open
+addressing table with linear probing that points into dense arrays, so memory grows with the
+area flown and not with its bounding box (Niessner et al. 2013, doi:10.1145/2508363.2508374,
+without the blocks).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from recon.types import F32, F64, Bool, DepthMap
+
+I64 = npt.NDArray[np.int64]
+I32 = npt.NDArray[np.int32]
+
+EMPTY = np.int64(-1)
+_OFFSET = 1 << 20
+LARGEST_INDEX = _OFFSET - 1
+"""Voxel indices reach this far from the origin on each axis; points beyond are left out."""
+
+
+@dataclass(frozen=True, slots=True)
+class VoxelMapConfig:
+    """How finely the map remembers, and when surface counts as better.
+
+    ``voxel_m`` of about twice the ground sample distance keeps the gaps between the pixels of
+    two keyframes from looking like new surface.
+    """
+
+    voxel_m: float = 0.25
+    better_ratio: float = 1.5
+    """Surface is better when its sigma, times this, is still below the held one."""
+    reach_sigma: float = 2.0
+    """Held surface within this many sigma along the pixel's ray is the same surface."""
+    largest_reach_voxels: int = 6
+    largest_voxels: int = 8_000_000
+    """Above this the half that was seen longest ago is forgotten (it would be sent again)."""
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.voxel_m) and self.voxel_m > 0.0):
+            raise ValueError(f"voxel_m is {self.voxel_m}, must be positive")
+        if self.better_ratio < 1.0:
+            raise ValueError(f"better_ratio is {self.better_ratio}, must be at least 1")
+        if self.reach_sigma < 0.0 or self.largest_reach_voxels < 0:
+            raise ValueError("reach_sigma and largest_reach_voxels must not be negative")
+        if self.largest_voxels < 1000:
+            raise ValueError(f"largest_voxels is {self.largest_voxels}, must be at least 1000")
+
+
+@njit(cache=True, nogil=True, inline="always")
+def voxel_key(x: float, y: float, z: float, inverse: float) -> int:
+    """The packed key of the voxel at (x, y, z) m, or EMPTY when it is out of range."""
+    i, j, k = np.floor(x * inverse), np.floor(y * inverse), np.floor(z * inverse)
+    if not (abs(i) < LARGEST_INDEX and abs(j) < LARGEST_INDEX and abs(k) < LARGEST_INDEX):
+        return -1  # also NaN and infinity
+    return ((int(i) + _OFFSET) << 42) | ((int(j) + _OFFSET) << 21) | (int(k) + _OFFSET)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def find_slot(keys: I64, key: int) -> int:
+    """Where ``key`` is in the table, or the empty slot where it would go."""
+    mask = keys.shape[0] - 1
+    h = key * -7046029254386353131  # 2**64 / golden ratio, odd
+    h ^= (h >> 32) & 0xFFFFFFFF
+    s = h & mask
+    while keys[s] != -1 and keys[s] != key:
+        s = (s + 1) & mask
+    return s
+
+
+@njit(cache=True, nogil=True)
+def rehash(old: I64, ids: I32, size: int) -> tuple[I64, I32]:
+    """A table of ``size`` slots (a power of two) with the same keys."""
+    keys = np.full(size, -1, np.int64)
+    out = np.zeros(size, np.int32)
+    for s in range(old.shape[0]):
+        if old[s] != -1:
+            t = find_slot(keys, old[s])
+            keys[t] = old[s]
+            out[t] = ids[s]
+    return keys, out
+
+
+class VoxelMap:
+    """Remembers the best sigma of the surface in each voxel.
+
+    One thread at a time. Answers are about surface along the camera's rays: noise that lifts
+    a known roof into the next voxel does not make it new.
+    """
+
+    def __init__(self, config: VoxelMapConfig | None = None) -> None:
+        self.config = config or VoxelMapConfig()
+        self._turn = 0
+        self._count: int = 0
+        self._clear(1 << 16)
+
+    def __len__(self) -> int:
+        """Number of voxels that hold surface."""
+        return self._count
+
+    def fresh(self, depth: DepthMap) -> Bool:
+        """(h, w) pixels whose surface is new, or clearly better than what is held."""
+        c = self.config
+        return np.asarray(
+            _fresh(
+                self._keys,
+                self._ids,
+                self._sigma,
+                *_arrays(depth),
+                1.0 / c.voxel_m,
+                c.better_ratio,
+                c.reach_sigma,
+                c.largest_reach_voxels,
+            )
+        )
+
+    def insert(self, depth: DepthMap, mask: Bool | None = None) -> int:
+        """Remember the surface of ``depth``, where ``mask`` if given; how many voxels are new."""
+        self._turn += 1
+        self._make_room(depth.depth_m.size)
+        mask_ = np.ones(depth.depth_m.shape, np.bool_) if mask is None else mask
+        if mask_.shape != depth.depth_m.shape:
+            raise ValueError(f"mask is {mask_.shape}, depth is {depth.depth_m.shape}")
+        before = self._count
+        self._count = int(
+            _insert(
+                self._keys,
+                self._ids,
+                self._sigma,
+                self._seen,
+                self._count,
+                self._turn,
+                *_arrays(depth),
+                mask_,
+                1.0 / self.config.voxel_m,
+            )
+        )
+        return self._count - before
+
+    def _clear(self, slots: int) -> None:
+        self._keys: I64 = np.full(slots, -1, np.int64)
+        self._ids: I32 = np.zeros(slots, np.int32)
+        self._sigma: F32 = np.zeros(slots // 2, np.float32)
+        self._seen: I32 = np.zeros(slots // 2, np.int32)
+        self._count = 0
+
+    def _make_room(self, more: int) -> None:
+        """Room for ``more`` voxels at a load of one half; forgets the oldest at the limit."""
+        if self._count > self.config.largest_voxels:
+            self._forget_half()
+        need = self._count + more
+        slots = len(self._keys)
+        while slots < 2 * need:
+            slots *= 2
+        if slots == len(self._keys):
+            return
+        self._keys, self._ids = rehash(self._keys, self._ids, slots)
+        self._sigma = np.resize(self._sigma, slots // 2)
+        self._seen = np.resize(self._seen, slots // 2)
+
+    def _forget_half(self) -> None:
+        turn = int(np.median(self._seen[: self._count]))
+        at = np.flatnonzero(self._keys != EMPTY)
+        ids = self._ids[at]
+        kept = self._seen[ids] > turn
+        keys, sigma, seen = self._keys[at][kept], self._sigma[ids][kept], self._seen[ids][kept]
+        slots = 1 << 16
+        while slots < 4 * len(keys):
+            slots *= 2
+        self._clear(slots)
+        self._count = len(keys)
+        self._sigma[: len(keys)], self._seen[: len(keys)] = sigma, seen
+        _place(self._keys, self._ids, keys)
+
+
+def _arrays(depth: DepthMap) -> tuple[F32, F32, F64, F64]:
+    """Depth, sigma, K and pose with the layout that the kernels are compiled for."""
+    return (
+        np.ascontiguousarray(depth.depth_m, np.float32),
+        np.ascontiguousarray(depth.sigma_m, np.float32),
+        np.ascontiguousarray(depth.K, np.float64),
+        np.ascontiguousarray(depth.T_world_camera, np.float64),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _place(keys: I64, ids: I32, new: I64) -> None:
+    """Write ``new`` keys with ids 0, 1, 2 ... into an empty table."""
+    for n in range(new.shape[0]):
+        s = find_slot(keys, new[n])
+        keys[s] = new[n]
+        ids[s] = n
+
+
+@njit(cache=True, nogil=True, fastmath=False)
+def _fresh(
+    keys: I64,
+    ids: I32,
+    held: F32,
+    depth: F32,
+    sigma: F32,
+    K: F64,
+    T: F64,
+    inverse: float,
+    better: float,
+    reach_sigma: float,
+    largest_reach: int,
+) -> Bool:
+    """See VoxelMap.fresh; the ray is sampled every voxel, nearest samples first."""
+    h, w = depth.shape
+    out = np.zeros((h, w), np.bool_)
+    for v in range(h):
+        b = (v - K[1, 2]) / K[1, 1]
+        for u in range(w):
+            z, s = depth[v, u], sigma[v, u]
+            if not (z > 0.0 and s > 0.0):
+                continue
+            a = (u - K[0, 2]) / K[0, 0]
+            # The ray per metre of depth; samples are one voxel apart along it.
+            dx = T[0, 0] * a + T[0, 1] * b + T[0, 2]
+            dy = T[1, 0] * a + T[1, 1] * b + T[1, 2]
+            dz = T[2, 0] * a + T[2, 1] * b + T[2, 2]
+            step = 1.0 / (inverse * np.sqrt(dx * dx + dy * dy + dz * dz))
+            # Held surface may be as uncertain as this one: sqrt(2) of its sigma.
+            reach = min(int(np.ceil(reach_sigma * 1.4142 * s / step)), largest_reach)
+            reach = max(reach, min(1, largest_reach))
+            known = False
+            for n in range(2 * reach + 1):
+                offset = (n + 1) // 2 if n % 2 else -(n // 2)
+                r = z + offset * step
+                key = voxel_key(T[0, 3] + r * dx, T[1, 3] + r * dy, T[2, 3] + r * dz, inverse)
+                if key == -1:
+                    known = True
+                    break
+                t = find_slot(keys, key)
+                if keys[t] == key and held[ids[t]] <= s * better:
+                    known = True
+                    break
+            out[v, u] = not known
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _insert(
+    keys: I64,
+    ids: I32,
+    held: F32,
+    seen: I32,
+    count: int,
+    turn: int,
+    depth: F32,
+    sigma: F32,
+    K: F64,
+    T: F64,
+    mask: Bool,
+    inverse: float,
+) -> int:
+    """See VoxelMap.insert; the new number of voxels."""
+    h, w = depth.shape
+    for v in range(h):
+        b = (v - K[1, 2]) / K[1, 1]
+        for u in range(w):
+            z, s = depth[v, u], sigma[v, u]
+            if not (z > 0.0 and s > 0.0 and mask[v, u]):
+                continue
+            a = (u - K[0, 2]) / K[0, 0]
+            key = voxel_key(
+                T[0, 3] + z * (T[0, 0] * a + T[0, 1] * b + T[0, 2]),
+                T[1, 3] + z * (T[1, 0] * a + T[1, 1] * b + T[1, 2]),
+                T[2, 3] + z * (T[2, 0] * a + T[2, 1] * b + T[2, 2]),
+                inverse,
+            )
+            if key == -1:
+                continue
+            t = find_slot(keys, key)
+            if keys[t] == -1:
+                keys[t] = key
+                ids[t] = count
+                held[count] = s
+                count += 1
+            elif s < held[ids[t]]:
+                held[ids[t]] = s
+            seen[ids[t]] = turn
+    return count
+
+
+def ground_sample_m(depth: DepthMap) -> float | None:
+    """Metres of surface per pixel: median depth over focal length; None without any depth."""
+    known = depth.depth_m[np.isfinite(depth.depth_m)]
+    return float(np.median(known) / depth.K[0, 0]) if known.size else None
