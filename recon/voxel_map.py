@@ -71,7 +71,7 @@ def find_slot(keys: I64, key: int) -> int:
     s = h & mask
     while keys[s] != -1 and keys[s] != key:
         s = (s + 1) & mask
-    return s
+    return int(s)
 
 
 @njit(cache=True, nogil=True)
