@@ -1,0 +1,51 @@
+# make demo | test | lint | types | bench | trials | clean. The first call makes .venv.
+
+PYTHON ?= python3
+VENV   ?= .venv
+EXTRAS ?= gpu,onnx,ground,logs,dev
+# For instance PIP_FLAGS='--extra-index-url https://download.pytorch.org/whl/cpu' where there
+# is no NVIDIA GPU: it saves some gigabytes of download.
+PIP_FLAGS ?=
+ARGS ?=
+
+BIN := $(VENV)/bin
+STAMP := $(VENV)/installed
+
+.PHONY: demo test lint types check bench trials format clean
+
+demo: $(STAMP)
+	$(BIN)/skyrelief demo --out demo-output $(ARGS)
+
+test: $(STAMP)
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+
+types: $(STAMP)
+	$(BIN)/mypy
+
+check: lint types test
+
+bench: $(STAMP)
+	$(BIN)/skyrelief bench $(ARGS)
+
+trials: $(STAMP)
+	$(BIN)/python -m pytest -m trial $(ARGS)
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf demo-output build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+
+# Installed again only when what is installed changes.
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' || \
+	  { echo "skyrelief needs Python 3.10 to 3.13; say which with: make $(MAKECMDGOALS) PYTHON=python3.12" >&2; exit 2; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt $(PIP_FLAGS) -e '.[$(EXTRAS)]'
+	@touch $(STAMP)
