@@ -114,7 +114,7 @@ def global_shift(gray_a: U8, gray_b: U8) -> GlobalShift | None:
     if min(float(small_a.std()), float(small_b.std())) < 1.0:
         return None
     correlator = _Correlator(small_a, small_b)
-    turns = np.arange(_TURNS) * (2 * np.pi / _TURNS)
+    turns = np.linspace(0.0, 2 * np.pi, _TURNS, endpoint=False)
     heights, _ = correlator.peaks(turns, np.ones(_TURNS))
     best = int(heights.argmax())
     apart = np.abs((np.arange(_TURNS) - best + _TURNS // 2) % _TURNS - _TURNS // 2) > 2
