@@ -7,12 +7,14 @@ operation has a short NumPy reference that the tests compare every backend again
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from recon.belief_propagation import BeliefPropagationConfig
-from recon.registration import IcpConfig
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration
 from recon.upsampling import UpsamplingConfig
+
+if TYPE_CHECKING:
+    from recon.registration import IcpConfig
 
 
 class Backend(Protocol):
@@ -27,9 +29,7 @@ class Backend(Protocol):
         """Labels (real valued, 0 to labels - 1) of the left view, (h, w); Eq. 1."""
         ...
 
-    def upsample(
-        self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig
-    ) -> DisparityMap:
+    def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
         """``coarse`` (h, w) at the size of ``guide`` (H, W, 3), values unscaled; Eq. 2."""
         ...
 

@@ -1,0 +1,59 @@
+"""The heavy operations on the processor's cores, compiled by numba."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from recon.belief_propagation import BeliefPropagationConfig, belief_propagation
+from recon.types import F64, U8, DepthMap, DisparityMap, Registration
+from recon.upsampling import UpsamplingConfig, upsample
+
+if TYPE_CHECKING:
+    from recon.registration import IcpConfig
+
+
+class CpuBackend:
+    """Runs everywhere; several threads may call it at once."""
+
+    name = "cpu"
+    device = "cpu"
+
+    def belief_propagation(
+        self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
+    ) -> DisparityMap:
+        """Labels of the left view, (h, w); Eq. 1."""
+        return belief_propagation(left, right, labels, config)
+
+    def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
+        """``coarse`` (h, w) at the size of ``guide`` (H, W, 3), values unscaled; Eq. 2."""
+        return upsample(coarse, guide, config)
+
+    def register(
+        self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
+    ) -> Registration:
+        """Projective point-to-plane ICP from the given start."""
+        from recon.registration import register_projective
+
+        return register_projective(source, target, T_target_source, config)
+
+
+def warm_up() -> None:
+    """Compile every kernel, or load it from numba's cache on disk; seconds once, then less."""
+    from recon.registration import IcpConfig
+
+    rng = np.random.default_rng(0)
+    guide = rng.integers(0, 256, (64, 96, 3), np.uint8)
+    grey = np.ascontiguousarray(guide[:, :, 0])
+    backend = CpuBackend()
+    found = backend.belief_propagation(grey, grey, 4, BeliefPropagationConfig(levels=2))
+    backend.upsample(found, guide, UpsamplingConfig())
+    depth = DepthMap(
+        np.full((64, 96), 50, np.float32),
+        np.full((64, 96), 0.1, np.float32),
+        np.ones((64, 96), np.uint8),
+        np.array([[80.0, 0, 48], [0, 80, 32], [0, 0, 1]]),
+        np.eye(4),
+    )
+    backend.register(depth, depth, np.eye(4), IcpConfig())
