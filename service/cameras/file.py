@@ -27,6 +27,8 @@ def open_file(rest: str, options: Mapping[str, str]) -> VideoSource:
         container = av.open(str(path))
     except av.error.InvalidDataError as error:
         raise InputError(_not_video(path)) from error
+    except av.error.EOFError as error:
+        raise InputError(f"{path} ends before its first picture; it was cut off") from error
     except (av.error.FFmpegError, OSError) as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
     return VideoSource(container, str(path))

@@ -5,6 +5,7 @@ Shared by the sources whose pictures come out of a container or a stream: a file
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Iterator
 from datetime import datetime, timezone
@@ -63,8 +64,10 @@ class VideoSource:
         last_ns = -1
         seq = 0
         decoded = 0
-        frames = self._chain(first)
-        for picture in frames:
+        for picture in itertools.chain((first,), self._decoded):
+            if picture.is_corrupt:  # pieced together from other pictures: no measurement
+                self._damaged += 1
+                continue
             decoded += 1
             time_ns = self._time_ns(picture, last_ns)
             if time_ns <= last_ns:
@@ -89,10 +92,6 @@ class VideoSource:
         if self._open:
             self._open = False
             self._container.close()
-
-    def _chain(self, first: av.VideoFrame) -> Iterator[av.VideoFrame]:
-        yield first
-        yield from self._decoded
 
     def _decode(self) -> Iterator[av.VideoFrame]:
         """Decode packet by packet, so that a damaged packet costs itself only."""
@@ -135,7 +134,7 @@ class VideoSource:
 
     def _tell_losses(self, decoded: int) -> None:
         if self._damaged:
-            self._warn(f"{self._damaged} damaged packets were skipped")
+            self._warn(f"{self._damaged} damaged pictures were left out")
         if self._unordered:
             self._warn(f"{self._unordered} pictures whose time does not go forward were left out")
         if self._expected > decoded:

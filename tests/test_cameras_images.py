@@ -1,0 +1,242 @@
+"""Folders of stills: times and places from EXIF, XMP and file names."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
+from service.cameras import open_camera
+from service.cameras.exif import name_unix_ns, read_tags
+from service.cameras.images import natural_key
+from service.errors import InputError
+
+DEMO = Path(__file__).resolve().parents[1] / "demo" / "caliterra" / "frames"
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+NOON_UTC_NS = 1_717_243_200_000_000_000  # 2024-06-01T12:00:00Z
+
+
+def write_still(
+    path: Path,
+    local: str | None = None,
+    sub: str | None = None,
+    offset: str | None = None,
+    gps: dict[int, Any] | None = None,
+    size_px: tuple[int, int] = (64, 48),
+    xmp: str = "",
+    orientation: int | None = None,
+) -> None:
+    """A grey JPEG with the given tags."""
+    image = Image.fromarray(np.full((size_px[1], size_px[0], 3), 90, np.uint8))
+    exif = Image.Exif()
+    photo = exif.get_ifd(0x8769)
+    if local:
+        photo[36867] = local
+    if sub:
+        photo[37521] = sub
+    if offset:
+        photo[36881] = offset
+    if gps:
+        exif.get_ifd(0x8825).update(gps)
+    if orientation:
+        exif[274] = orientation
+    image.save(path, exif=exif, xmp=xmp.encode() if xmp else b"")
+
+
+def gps_tags(
+    lat: float, lon: float, alt: float, clock: tuple[int, int, int], day: str = "2024:06:01"
+) -> dict[int, Any]:
+    """A GPS block as cameras write it: unsigned degrees, minutes, seconds and letters."""
+
+    def dms(degrees: float) -> tuple[IFDRational, ...]:
+        degrees = abs(degrees)
+        minutes = (degrees % 1) * 60
+        seconds = Fraction((minutes % 1) * 60).limit_denominator(100_000)
+        return (
+            IFDRational(int(degrees)),
+            IFDRational(int(minutes)),
+            IFDRational(seconds.numerator, seconds.denominator),
+        )
+
+    return {
+        1: "N" if lat >= 0 else "S",
+        2: dms(lat),
+        3: "E" if lon >= 0 else "W",
+        4: dms(lon),
+        5: b"\0" if alt >= 0 else b"\1",
+        6: IFDRational(round(abs(alt) * 10), 10),
+        7: tuple(IFDRational(x) for x in clock),
+        29: day,
+    }
+
+
+def test_zone_comes_from_the_gps_time(tmp_path: Path) -> None:
+    for i in range(3):
+        gps = gps_tags(-33.5, 151.25, 42.5, (12, 0, 2 * i))
+        write_still(tmp_path / f"IMG_{i}.jpg", f"2024:06:01 22:00:0{2 * i + 1}", "25", gps=gps)
+    source = open_camera(str(tmp_path))
+    frames = list(source)
+    assert source.epoch_unix_ns == NOON_UTC_NS + 1_250_000_000
+    assert [f.time_ns for f in frames] == [0, 2_000_000_000, 4_000_000_000]
+    assert source.fps == pytest.approx(0.5)
+    tag = frames[0].geotag
+    assert tag is not None
+    assert (tag.lat_deg, tag.lon_deg) == pytest.approx((-33.5, 151.25), abs=1e-7)
+    assert tag.alt_amsl_m == pytest.approx(42.5)
+    assert tag.sigma_h_m == 5.0
+    assert tag.ypr_deg is None
+    assert source.warnings == []
+
+
+def test_written_zone_wins_and_a_wrong_clock_is_corrected(tmp_path: Path) -> None:
+    written = tmp_path / "written"
+    written.mkdir()
+    write_still(written / "a.jpg", "2024:06:01 14:00:00", offset="+02:00")
+    assert open_camera(str(written)).epoch_unix_ns == NOON_UTC_NS
+    wrong = tmp_path / "wrong"
+    wrong.mkdir()
+    for i in range(3):  # this camera's clock runs 5 minutes ahead of UTC
+        gps = gps_tags(10, 20, 30, (12, 0, i))
+        write_still(wrong / f"{i}.jpg", f"2024:06:01 12:05:0{i}", gps=gps)
+    assert open_camera(str(wrong)).epoch_unix_ns == NOON_UTC_NS
+
+
+def test_no_zone_keeps_relative_time_only(tmp_path: Path) -> None:
+    for i in range(3):
+        write_still(tmp_path / f"{i}.jpg", f"2024:06:01 12:00:0{i}")
+    source = open_camera(str(tmp_path))
+    assert source.epoch_unix_ns is None
+    assert [f.time_ns for f in source] == [0, 10**9, 2 * 10**9]
+    assert any("time zone" in w for w in source.warnings)
+
+
+def test_stills_of_one_second_are_spread_over_it(tmp_path: Path) -> None:
+    for i in range(4):
+        write_still(tmp_path / f"{i}.jpg", f"2024:06:01 12:00:0{i // 2}", offset="+00:00")
+    assert [f.time_ns for f in open_camera(str(tmp_path))] == [0, 5 * 10**8, 10**9, 15 * 10**8]
+
+
+def test_order_is_of_time_not_of_names(tmp_path: Path) -> None:
+    for i, name in enumerate(["IMG_9999.jpg", "IMG_0001.jpg", "IMG_0002.jpg"]):
+        write_still(tmp_path / name, f"2024:06:01 12:00:0{i}", offset="+00:00")
+    names = [f.name for f in open_camera(str(tmp_path))]
+    assert names == ["IMG_9999.jpg", "IMG_0001.jpg", "IMG_0002.jpg"]
+
+
+def test_names_order_and_space_stills_without_times(tmp_path: Path) -> None:
+    for i in (10, 9, 100):
+        write_still(tmp_path / f"f{i}.png")
+    source = open_camera(str(tmp_path))
+    assert [(f.name, f.time_ns) for f in source] == [
+        ("f9.png", 0),
+        ("f10.png", 10**9),
+        ("f100.png", 2 * 10**9),
+    ]
+    assert any("name no time" in w for w in source.warnings)
+    spaced = open_camera(f"images:{tmp_path}?interval_s=2.5")
+    assert [f.time_ns for f in spaced] == [0, 2_500_000_000, 5_000_000_000]
+    assert spaced.warnings == []
+    with pytest.raises(InputError, match="interval_s"):
+        open_camera(f"images:{tmp_path}?interval_s=soon")
+
+
+@pytest.mark.parametrize(
+    ("name", "unix_ns"),
+    [
+        ("2018080501004480Z.jpg", 1_533_430_844_800_000_000),
+        ("20180805T010044Z.jpg", 1_533_430_844_000_000_000),
+        ("cam1_20180805_010044.123Z.jpg", 1_533_430_844_123_000_000),
+        ("2018080501004480.jpg", None),  # no Z: not known to be UTC
+        ("2018139901004480Z.jpg", None),
+        ("IMG_9375.jpg", None),
+    ],
+)
+def test_times_in_names(name: str, unix_ns: int | None) -> None:
+    assert name_unix_ns(name) == unix_ns
+
+
+def test_dji_xmp_gives_attitude_height_and_accuracy(tmp_path: Path) -> None:
+    xmp = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description '
+        'drone-dji:AbsoluteAltitude="+129.56" drone-dji:RelativeAltitude="+60.02" '
+        'drone-dji:GimbalRollDegree="+0.00" drone-dji:GimbalYawDegree="-91.30" '
+        'drone-dji:RtkStdLon="0.012" drone-dji:RtkStdLat="0.015">'
+        "<drone-dji:GimbalPitchDegree>-89.90</drone-dji:GimbalPitchDegree>"
+        "</rdf:Description></x:xmpmeta>"
+    )
+    path = tmp_path / "DJI_0001.jpg"
+    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(47, 8, 129.5, (12, 0, 0)), xmp=xmp)
+    tag = read_tags(path).geotag
+    assert tag is not None
+    assert tag.ypr_deg == (-91.3, -89.9, 0.0)
+    assert tag.relative_alt_m == 60.02
+    assert tag.sigma_h_m == 0.015
+
+
+def test_useless_gps_is_no_position(tmp_path: Path) -> None:
+    broken = gps_tags(10, 20, 30, (1, 2, 3))
+    broken[2] = (IFDRational(10), IFDRational(0, 0), IFDRational(0))
+    cases = {"zero": gps_tags(0, 0, 0, (0, 0, 0)), "broken": broken, "none": {}}
+    for name, gps in cases.items():
+        path = tmp_path / f"{name}.jpg"
+        write_still(path, gps=gps)
+        assert read_tags(path).geotag is None, name
+
+
+def test_stored_pixels_are_not_turned(tmp_path: Path) -> None:
+    write_still(tmp_path / "a.jpg", orientation=6)
+    (frame,) = open_camera(str(tmp_path))
+    assert frame.image.shape == (48, 64, 3)
+
+
+def test_odd_ones_are_left_out_and_told(tmp_path: Path) -> None:
+    for i in range(3):
+        write_still(tmp_path / f"{i}.jpg", f"2024:06:01 12:00:0{i}", offset="+00:00")
+    write_still(tmp_path / "wide.jpg", "2024:06:01 12:00:09", size_px=(96, 48))
+    (tmp_path / "bad.jpg").write_bytes(b"no picture")
+    (tmp_path / "empty.jpg").touch()
+    whole = (tmp_path / "1.jpg").read_bytes()
+    (tmp_path / "1.jpg").write_bytes(whole[: whole.index(b"\xff\xda")])  # tags, but no pixels
+    (tmp_path / "notes.txt").write_text("not looked at")
+    source = open_camera(str(tmp_path))
+    assert [(f.seq, f.name) for f in source] == [(0, "0.jpg"), (1, "2.jpg")]
+    told = "\n".join(source.warnings)
+    for name in ("bad.jpg", "empty.jpg", "1.jpg", "not 64x48"):
+        assert name in told
+
+
+def test_folders_without_pictures_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no pictures"):
+        open_camera(str(tmp_path))
+    with pytest.raises(InputError, match="no such folder"):
+        open_camera(f"images:{tmp_path / 'none'}")
+
+
+def test_natural_order() -> None:
+    names = ["b2.jpg", "b10.jpg", "a.jpg", "b1.jpg", "10.jpg", "9.jpg"]
+    ordered = sorted((Path(n) for n in names), key=natural_key)
+    assert [p.name for p in ordered] == ["9.jpg", "10.jpg", "a.jpg", "b1.jpg", "b2.jpg", "b10.jpg"]
+
+
+def test_demo_flight_is_tagged() -> None:
+    source = open_camera(str(DEMO))
+    frames = list(source)
+    assert len(frames) == 16
+    assert source.size_px == (1600, 1200)
+    assert source.epoch_unix_ns == 1_413_742_872_000_000_000  # 13:21:12 local, UTC-5
+    assert all(f.geotag is not None for f in frames)
+    assert source.warnings == []
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="needs ../shared/data")
+def test_named_stills_get_utc() -> None:
+    source = open_camera(str(DATA / "cuav_cmac_20180805" / "frames"))
+    times = [f.time_ns for f in source]
+    assert source.epoch_unix_ns == 1_533_430_844_800_000_000
+    assert len(times) == 18
+    assert times[-1] == 14_780_000_000
