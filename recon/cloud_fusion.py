@@ -10,7 +10,7 @@ from collections.abc import Iterable
 import numpy as np
 from numba import njit
 
-from recon.types import F32, F64, U8, Bool, PointCloud
+from recon.types import F32, F64, U8, Bool, DepthMap, PointCloud
 from recon.voxel_map import I32, I64, find_slot, rehash, voxel_key
 
 CORRELATED_SHARE = 0.5
@@ -190,3 +190,22 @@ def _lone_contradicted(keys: I64, xyz: F32, sigma: F32, views: U8) -> Bool:
                     q += 1
         out[p] = contradicted and neighbours < LONE_NEIGHBOURS
     return out
+
+
+def cloud_of(depth: DepthMap, bgr: U8, mask: Bool | None = None) -> PointCloud:
+    """World points of the pixels with depth, in row order, where ``mask`` if given.
+
+    ``bgr`` is (h, w, 3) on the grid of the depth. Raises ValueError when sizes differ.
+    """
+    if bgr.shape[:2] != depth.depth_m.shape:
+        raise ValueError(f"colour is {bgr.shape}, depth is {depth.depth_m.shape}")
+    known = np.isfinite(depth.depth_m) & (depth.depth_m > 0.0) & np.isfinite(depth.sigma_m)
+    if mask is not None:
+        known &= mask
+    v, u = np.nonzero(known)
+    z = depth.depth_m[known].astype(np.float64)
+    K, T = depth.K, depth.T_world_camera
+    camera = np.column_stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z])
+    xyz = (camera @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+    rgb = np.ascontiguousarray(bgr[known][:, ::-1])
+    return PointCloud(xyz, rgb, depth.sigma_m[known], depth.views[known])

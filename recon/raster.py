@@ -1,0 +1,227 @@
+"""Surface model and orthophoto on a north-up grid, from points.
+
+Cells hold the upper surface: of the points in a cell those within the noise of the highest
+count, each by the inverse of its variance, so flat ground is averaged and a roof above it
+is not mixed with it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+
+from recon.types import F32, F64, U8, Bool, PointCloud
+
+TOP_SIGMAS = 4.0
+"""Points this many of its sigmas below the highest point of a cell are its surface too."""
+
+LARGEST_CELLS = 200_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """A north-up grid: cell (row, col) spans west + col * cell_m ... , north - row * cell_m ..."""
+
+    west_m: float
+    north_m: float
+    cell_m: float
+    shape: tuple[int, int]  # (rows, columns)
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.cell_m) and self.cell_m > 0.0):
+            raise ValueError(f"cell_m is {self.cell_m}, must be positive")
+        if self.shape[0] * self.shape[1] > LARGEST_CELLS:
+            raise ValueError(
+                f"a grid of {self.shape[0]} x {self.shape[1]} cells is too large; take larger cells"
+            )
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """(west, south, east, north) in metres."""
+        rows, cols = self.shape
+        return (
+            self.west_m,
+            self.north_m - rows * self.cell_m,
+            self.west_m + cols * self.cell_m,
+            self.north_m,
+        )
+
+    def pixels(self, xy_m: F64) -> F64:
+        """(N, 2) column and row, real-valued with whole numbers at cell centres, of (N, 2) m."""
+        xy = np.asarray(xy_m, np.float64)
+        col = (xy[:, 0] - self.west_m) / self.cell_m - 0.5
+        row = (self.north_m - xy[:, 1]) / self.cell_m - 0.5
+        return np.column_stack([col, row])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Raster:
+    """Height and colour of the upper surface on a grid; height is NaN where nothing is known."""
+
+    grid: Grid
+    height_m: F32  # (rows, cols), NaN = unknown
+    sigma_m: F32  # (rows, cols), NaN = unknown
+    rgb: U8  # (rows, cols, 3), black where unknown
+
+    @property
+    def known(self) -> Bool:
+        """(rows, cols) cells with a height."""
+        return np.isfinite(self.height_m)
+
+    @property
+    def area_m2(self) -> float:
+        """Ground area of the cells with a height."""
+        return float(self.known.sum()) * self.grid.cell_m**2
+
+
+def grid_over(xy_m: F64, cell_m: float, margin_cells: int = 0) -> Grid:
+    """The grid of ``cell_m`` that covers (N, 2) points, its edges on multiples of the cell."""
+    xy = np.asarray(xy_m, np.float64)
+    if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
+        raise ValueError(f"expected points of shape (N, 2) with N > 0, got {xy.shape}")
+    low = np.floor(xy.min(axis=0) / cell_m) - margin_cells
+    high = np.floor(xy.max(axis=0) / cell_m) + 1 + margin_cells
+    cols, rows = (high - low).astype(int)
+    return Grid(float(low[0] * cell_m), float(high[1] * cell_m), cell_m, (int(rows), int(cols)))
+
+
+def rasterise(cloud: PointCloud, grid: Grid) -> Raster:
+    """Upper surface of ``cloud`` on ``grid``; points outside are not used, holes stay."""
+    return rasterise_points(cloud.xyz_m, cloud.rgb, cloud.sigma_m, grid)
+
+
+def rasterise_points(xyz_m: F64 | F32, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:
+    """As :func:`rasterise` for arrays: (N, 3) m in any frame with z up, (N, 3), (N,)."""
+    rows, cols = grid.shape
+    local = np.asarray(xyz_m, np.float64) - np.array([grid.west_m, grid.north_m, 0.0])
+    height, sigma, colour = _top_surface(
+        np.ascontiguousarray(local),
+        np.ascontiguousarray(rgb, np.uint8),
+        np.ascontiguousarray(sigma_m, np.float32),
+        1.0 / grid.cell_m,
+        rows,
+        cols,
+    )
+    return Raster(grid, height, sigma, colour)
+
+
+@njit(cache=True, nogil=True)
+def _top_surface(
+    xyz: F64, rgb: U8, sigma: F32, inverse: float, rows: int, cols: int
+) -> tuple[F32, F32, U8]:
+    """Height, sigma and colour per cell in two passes: the highest point, then its layer."""
+    floor = np.full((rows, cols), -np.inf)  # lowest height that still is the top surface
+    top = np.full((rows, cols), -np.inf)
+    n = xyz.shape[0]
+    for p in range(n):
+        c, r = int(np.floor(xyz[p, 0] * inverse)), int(np.floor(-xyz[p, 1] * inverse))
+        if 0 <= r < rows and 0 <= c < cols and xyz[p, 2] > top[r, c]:
+            top[r, c] = xyz[p, 2]
+            floor[r, c] = xyz[p, 2] - TOP_SIGMAS * max(float(sigma[p]), 1e-6)
+    sums = np.zeros((rows, cols, 5))
+    for p in range(n):
+        c, r = int(np.floor(xyz[p, 0] * inverse)), int(np.floor(-xyz[p, 1] * inverse))
+        if 0 <= r < rows and 0 <= c < cols and xyz[p, 2] >= floor[r, c]:
+            w = 1.0 / max(float(sigma[p]), 1e-6) ** 2
+            sums[r, c, 0] += w
+            sums[r, c, 1] += w * xyz[p, 2]
+            for k in range(3):
+                sums[r, c, 2 + k] += w * rgb[p, k]
+    height = np.full((rows, cols), np.nan, np.float32)
+    spread = np.full((rows, cols), np.nan, np.float32)
+    colour = np.zeros((rows, cols, 3), np.uint8)
+    for r in range(rows):
+        for c in range(cols):
+            w = sums[r, c, 0]
+            if w > 0.0:
+                height[r, c] = sums[r, c, 1] / w
+                spread[r, c] = 1.0 / np.sqrt(w)
+                for k in range(3):
+                    colour[r, c, k] = int(sums[r, c, 2 + k] / w + 0.5)
+    return height, spread, colour
+
+
+def fill_holes(raster: Raster, largest_cells: int = 4) -> Raster:
+    """``raster`` with its holes up to ``largest_cells`` wide filled from their surroundings.
+
+    Only holes are closed: the outline of the surveyed area does not grow into the unknown.
+    Filled cells carry the sigma of their surroundings, doubled.
+    """
+    known = raster.known
+    if largest_cells < 1 or known.all() or not known.any():
+        return raster
+    size = largest_cells + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    pad = size
+    mask = np.pad(known, pad).astype(np.uint8)
+    closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel)[pad:-pad, pad:-pad] > 0
+    holes = closed & ~known
+    layers = np.dstack(
+        [np.nan_to_num(raster.height_m), np.nan_to_num(raster.sigma_m), raster.rgb]
+    ).astype(np.float32)
+    smooth, reached = _normalised_blur(layers, known, largest_cells)
+    fill = holes & reached
+    height, sigma, rgb = raster.height_m.copy(), raster.sigma_m.copy(), raster.rgb.copy()
+    height[fill] = smooth[fill, 0]
+    sigma[fill] = 2.0 * smooth[fill, 1]
+    rgb[fill] = np.clip(np.rint(smooth[fill, 2:]), 0, 255).astype(np.uint8)
+    return Raster(raster.grid, height, sigma, rgb)
+
+
+def _normalised_blur(layers: F32, known: Bool, largest_cells: int) -> tuple[F32, Bool]:
+    """Mean of the known cells around each cell, from the smallest window that has any."""
+    out = layers.copy()
+    reached = known.copy()
+    weight = known.astype(np.float32)
+    weighted = layers * weight[..., None]
+    for radius in range(1, largest_cells + 1):
+        window = (2 * radius + 1, 2 * radius + 1)
+        total = cv2.boxFilter(weight, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        new = ~reached & (total > 0.5)
+        if new.any():
+            sums = cv2.boxFilter(
+                weighted, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT
+            )
+            out[new] = sums[new] / total[new][:, None]
+            reached |= new
+    return out, reached
+
+
+def hillshade(
+    height_m: F32, cell_m: float, azimuth_deg: float = 315.0, elevation_deg: float = 45.0
+) -> F32:
+    """(rows, cols) brightness 0 to 1 of the surface lit by a distant sun; NaN where unknown.
+
+    Lambertian shading of the surface normal (Horn 1981, doi:10.1109/PROC.1981.11918), with
+    slopes from differences to the known neighbours.
+    """
+    dz_east = _slope(height_m, axis=1) / cell_m
+    dz_north = -_slope(height_m, axis=0) / cell_m
+    azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
+    sun = (
+        math.sin(azimuth) * math.cos(elevation),
+        math.cos(azimuth) * math.cos(elevation),
+        math.sin(elevation),
+    )
+    dot = -dz_east * sun[0] - dz_north * sun[1] + sun[2]
+    shade = np.clip(dot / np.sqrt(1.0 + dz_east**2 + dz_north**2), 0.0, 1.0)
+    shade[~np.isfinite(height_m)] = np.nan
+    return np.asarray(shade, np.float32)
+
+
+def _slope(height_m: F32, axis: int) -> F32:
+    """Height difference per cell along ``axis``: central where both neighbours are known."""
+    step = np.diff(height_m, axis=axis)
+    widths = [(0, 0), (0, 0)]
+    widths[axis] = (1, 0)
+    before = np.pad(step, widths, constant_values=np.nan)
+    widths[axis] = (0, 1)
+    after = np.pad(step, widths, constant_values=np.nan)
+    both = 0.5 * (before + after)
+    one = np.where(np.isfinite(before), before, after)
+    out = np.where(np.isfinite(both), both, one)
+    return np.asarray(np.nan_to_num(out), np.float32)

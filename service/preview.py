@@ -1,0 +1,172 @@
+"""The scan's picture from above: colour over shaded relief, and height over shaded relief.
+
+Both panels are north-up at the same scale, with the track, a scale bar, a north arrow and
+the key figures in a line below.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from recon.raster import Grid, Raster, fill_holes, hillshade
+from recon.types import F32, F64, U8, Bool
+
+BACKGROUND = (250, 248, 246)  # BGR
+INK = (40, 36, 32)
+TRACK = (40, 60, 235)
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+MARGIN = 16
+LINE_PX = 24
+
+
+def draw_preview(raster: Raster, track_m: F64, lines: Sequence[str], largest_px: int = 1400) -> U8:
+    """(h, w, 3) BGR picture of ``raster`` with the (N, 2 or 3) track in the raster's frame.
+
+    Each panel's longer side is at most ``largest_px``; ``lines`` are the key figures.
+    """
+    shown = fill_holes(raster)
+    shade = _relief(shown)
+    colour = _fit(_colour_panel(shown, shade), largest_px)
+    height = _fit(_height_panel(shown, shade), largest_px)
+    scale = colour.shape[1] / raster.grid.shape[1]
+    for panel in (colour, height):
+        _draw_track(panel, raster.grid, track_m, scale)
+        _draw_scale_bar(panel, raster.grid.cell_m / scale)
+        _draw_north(panel)
+    _draw_height_legend(height, shown)
+    axis = 0 if colour.shape[1] > 1.3 * colour.shape[0] else 1
+    widths = [(0, 0), (0, 0), (0, 0)]
+    widths[axis] = (MARGIN, 0)
+    height = np.stack(
+        [np.pad(height[..., k], widths[:2], constant_values=BACKGROUND[k]) for k in range(3)], -1
+    )
+    return _with_lines(np.concatenate([colour, height], axis=axis), lines)
+
+
+def blank_preview(lines: Sequence[str]) -> U8:
+    """The picture of a scan without any surface: only its key figures."""
+    return _with_lines(np.full((120, 640, 3), BACKGROUND, np.uint8), lines)
+
+
+def _relief(raster: Raster) -> F32:
+    """Shading of the smoothed surface, about 1 on level ground; NaN where unknown."""
+    height = _smooth(raster.height_m, raster.known)
+    level = math.sin(math.radians(45.0))
+    return np.asarray(hillshade(height, raster.grid.cell_m) / level, np.float32)
+
+
+def _smooth(height_m: F32, known: Bool) -> F32:
+    """Median of 3x3 cells: takes out single noisy cells and keeps steps."""
+    filled = np.where(known, height_m, np.float32(np.nanmedian(height_m)))
+    smooth = cv2.medianBlur(filled.astype(np.float32), 3)
+    return np.asarray(np.where(known, smooth, np.float32(np.nan)), np.float32)
+
+
+def _colour_panel(raster: Raster, shade: F32) -> U8:
+    """Colour times shading, softened so that the picture stays readable."""
+    light = np.clip(0.45 + 0.55 * np.nan_to_num(shade, nan=1.0), 0.0, 1.35)
+    bgr = raster.rgb[..., ::-1] * light[..., None]
+    return _on_background(np.clip(bgr, 0, 255).astype(np.float32), raster.known)
+
+
+def _height_panel(raster: Raster, shade: F32) -> U8:
+    """Height as hue times shading."""
+    low, high = _height_range(raster)
+    unit = (np.nan_to_num(raster.height_m, nan=low) - low) / (high - low)
+    tone = np.clip(np.rint(255 * unit), 0, 255).astype(np.uint8)
+    bgr = cv2.applyColorMap(tone, cv2.COLORMAP_VIRIDIS).astype(np.float32)
+    light = np.clip(np.nan_to_num(shade, nan=1.0), 0.15, 1.3)
+    return _on_background(
+        np.clip((0.25 * 255 + 0.75 * bgr) * light[..., None], 0, 255), raster.known
+    )
+
+
+def _height_range(raster: Raster) -> tuple[float, float]:
+    """Heights of the ends of the colour scale: 2nd and 98th percentile, at least 1 m apart."""
+    known = raster.height_m[raster.known]
+    low, high = (float(p) for p in np.percentile(known, [2, 98]))
+    middle = 0.5 * (low + high)
+    half = max(0.5 * (high - low), 0.5)
+    return middle - half, middle + half
+
+
+def _on_background(bgr: F64 | F32, known: Bool) -> U8:
+    return np.asarray(np.where(known[..., None], bgr, np.array(BACKGROUND)), np.uint8)
+
+
+def _fit(panel: U8, largest_px: int) -> U8:
+    """The panel at a size good to look at: enlarged in whole steps, or reduced by area."""
+    h, w = panel.shape[:2]
+    scale = largest_px / max(h, w)
+    if scale >= 1.0:
+        whole = min(int(scale), 8)
+        return panel.repeat(whole, axis=0).repeat(whole, axis=1)
+    size = (max(1, round(w * scale)), max(1, round(h * scale)))
+    return np.asarray(cv2.resize(panel, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _draw_track(panel: U8, grid: Grid, track_m: F64, scale: float) -> None:
+    """The way flown, with a ring where it began."""
+    if not len(track_m):
+        return
+    px = (grid.pixels(track_m[:, :2]) + 0.5) * scale
+    path = np.rint(np.clip(px, -1e6, 1e6) * 8).astype(np.int32)
+    cv2.polylines(panel, [path[:, None]], False, TRACK, 1, cv2.LINE_AA, shift=3)
+    x, y = (round(float(v)) for v in np.clip(px[0], -1e6, 1e6))
+    cv2.circle(panel, (x, y), 5, TRACK, 1, cv2.LINE_AA)
+
+
+def _draw_scale_bar(panel: U8, metres_per_px: float) -> None:
+    """A bar of 1, 2 or 5 times a power of ten metres, about a fifth of the panel wide."""
+    target = panel.shape[1] * metres_per_px / 5.0
+    power = 10.0 ** math.floor(math.log10(target))
+    length_m = max(m * power for m in (1.0, 2.0, 5.0) if m * power <= target)
+    length_px = round(length_m / metres_per_px)
+    x, y = 12, panel.shape[0] - 14
+    for colour, thick in ((BACKGROUND, 5), (INK, 2)):
+        cv2.line(panel, (x, y), (x + length_px, y), colour, thick, cv2.LINE_AA)
+    _text(panel, f"{length_m:g} m", (x, y - 8), 0.45)
+
+
+def _draw_north(panel: U8) -> None:
+    x, y = panel.shape[1] - 20, 14
+    for colour, thick in ((BACKGROUND, 5), (INK, 2)):
+        cv2.arrowedLine(panel, (x, y + 26), (x, y), colour, thick, cv2.LINE_AA, tipLength=0.35)
+    _text(panel, "N", (x - 5, y + 42), 0.45)
+
+
+def _draw_height_legend(panel: U8, raster: Raster) -> None:
+    """The colour scale with its two heights."""
+    low, high = _height_range(raster)
+    length = min(120, panel.shape[0] // 3)
+    tones = np.linspace(255, 0, length).astype(np.uint8)[:, None].repeat(10, axis=1)
+    bar = 0.25 * 255 + 0.75 * cv2.applyColorMap(tones, cv2.COLORMAP_VIRIDIS).astype(np.float32)
+    width = min(10, panel.shape[1] - 12)
+    if width <= 0 or length <= 0:
+        return
+    panel[12 : 12 + length, 12 : 12 + width] = bar[:, :width].astype(np.uint8)
+    _text(panel, f"{high:.1f} m", (28, 22), 0.4)
+    _text(panel, f"{low:.1f} m", (28, 12 + length), 0.4)
+
+
+def _text(image: U8, text: str, at: tuple[int, int], size: float) -> None:
+    """Dark letters with a light rim, readable on any ground."""
+    cv2.putText(image, text, at, FONT, size, BACKGROUND, 3, cv2.LINE_AA)
+    cv2.putText(image, text, at, FONT, size, INK, 1, cv2.LINE_AA)
+
+
+def _with_lines(picture: U8, lines: Sequence[str]) -> U8:
+    """The picture in a margin, wide enough for the lines of text below it."""
+    widest = max((cv2.getTextSize(t, FONT, 0.5, 1)[0][0] for t in lines), default=0)
+    h, w = picture.shape[:2]
+    size = (h + 2 * MARGIN + LINE_PX * len(lines) + 6, max(w, widest) + 2 * MARGIN, 3)
+    out = np.full(size, BACKGROUND, np.uint8)
+    out[MARGIN : MARGIN + h, MARGIN : MARGIN + w] = picture
+    for n, text in enumerate(lines):
+        at = (MARGIN, h + 2 * MARGIN + 10 + LINE_PX * n)
+        cv2.putText(out, text, at, FONT, 0.5, INK, 1, cv2.LINE_AA)
+    return out

@@ -1,0 +1,126 @@
+"""Rasters against dictionaries of cells, planes with known shading, and holes with known edges."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from recon.raster import Grid, Raster, fill_holes, grid_over, hillshade, rasterise
+from recon.types import F32, F64, PointCloud
+
+
+def cloud(xyz: F64, sigma_m: float = 0.05, grey: int = 100) -> PointCloud:
+    n = len(xyz)
+    return PointCloud(
+        np.asarray(xyz, np.float32),
+        np.full((n, 3), grey, np.uint8),
+        np.full(n, sigma_m, np.float32),
+        np.ones(n, np.uint8),
+    )
+
+
+def raster_of(height: F32, cell_m: float = 1.0) -> Raster:
+    rgb = np.full((*height.shape, 3), 120, np.uint8)
+    sigma = np.where(np.isfinite(height), np.float32(0.1), np.float32(np.nan))
+    return Raster(Grid(0.0, 0.0, cell_m, height.shape), height, sigma, rgb)
+
+
+def test_grid_covers_its_points_on_whole_multiples() -> None:
+    xy = np.array([[-3.2, 10.1], [4.9, 20.0]])
+    grid = grid_over(xy, 0.5)
+    west, south, east, north = grid.bounds
+    assert (west, south, east, north) == (-3.5, 10.0, 5.0, 20.5)
+    px = grid.pixels(np.array([[-3.25, 20.25]]))
+    np.testing.assert_allclose(px, [[0.0, 0.0]])
+
+
+def test_a_cell_is_the_weighted_mean_of_its_top_layer() -> None:
+    rng = np.random.default_rng(0)
+    n = 4000
+    xyz = np.column_stack([rng.uniform(0, 10, (n, 2)), rng.normal(3.0, 0.05, n)])
+    sigma = rng.uniform(0.03, 0.08, n).astype(np.float32)
+    points = PointCloud(
+        xyz.astype(np.float32),
+        rng.integers(0, 255, (n, 3), dtype=np.uint8),
+        sigma,
+        np.ones(n, np.uint8),
+    )
+    raster = rasterise(points, grid_over(points.xyz_m[:, :2].astype(float), 1.0))
+    for row in range(raster.grid.shape[0]):
+        for col in range(raster.grid.shape[1]):
+            x, y = points.xyz_m[:, 0], points.xyz_m[:, 1]
+            north = raster.grid.north_m - row
+            inside = (np.floor(x) == raster.grid.west_m + col) & (np.floor(y) == north - 1)
+            z = points.xyz_m[inside, 2].astype(float)
+            s = sigma[inside].astype(float)
+            top = z.argmax()
+            layer = z >= z[top] - 4.0 * s[top]
+            w = 1 / s[layer] ** 2
+            assert raster.height_m[row, col] == pytest.approx(w @ z[layer] / w.sum(), abs=1e-4)
+            mean = w @ points.rgb[inside][layer] / w.sum()
+            assert np.abs(raster.rgb[row, col] - mean).max() <= 1.0
+
+
+def test_a_roof_is_not_mixed_with_the_ground_below_it() -> None:
+    xy = np.array([[0.5, 0.5]] * 30)
+    z = np.r_[np.zeros(25), np.full(5, 6.0)]
+    raster = rasterise(cloud(np.column_stack([xy, z])), Grid(0.0, 1.0, 1.0, (1, 1)))
+    assert raster.height_m[0, 0] == pytest.approx(6.0)
+
+
+def test_north_is_up_and_points_outside_are_left_out() -> None:
+    xyz = np.array([[0.5, 9.5, 1.0], [9.5, 0.5, 2.0], [50.0, 50.0, 9.0]])
+    raster = rasterise(cloud(xyz), Grid(0.0, 10.0, 1.0, (10, 10)))
+    assert raster.height_m[0, 0] == 1.0
+    assert raster.height_m[9, 9] == 2.0
+    assert raster.known.sum() == 2
+    assert raster.area_m2 == 2.0
+
+
+def test_small_holes_are_filled_and_the_outline_stays() -> None:
+    height = np.full((60, 60), np.nan, np.float32)
+    _, cols = np.mgrid[10:50, 10:50]
+    height[10:50, 10:50] = 0.1 * cols
+    whole = height.copy()
+    height[20:22, 20:22] = np.nan
+    height[30:44, 30:44] = np.nan
+    filled = fill_holes(raster_of(height), largest_cells=4)
+    assert np.abs(filled.height_m[20:22, 20:22] - whole[20:22, 20:22]).max() < 0.15
+    assert not filled.known[36:38, 36:38].any()  # too wide to guess
+    outside = np.ones((60, 60), bool)
+    outside[10:50, 10:50] = False
+    assert not filled.known[outside].any()
+    assert filled.sigma_m[20, 20] == pytest.approx(0.2)
+    kept = np.isfinite(height)
+    np.testing.assert_array_equal(filled.height_m[kept], height[kept])
+
+
+@pytest.mark.parametrize(("east", "north"), [(0.0, 0.0), (0.3, 0.0), (0.0, -0.5), (0.2, 0.4)])
+def test_shading_of_a_plane_is_the_cosine_to_the_sun(east: float, north: float) -> None:
+    rows, cols = np.mgrid[0:20, 0:30].astype(float)
+    cell = 0.5
+    height = (east * cols * cell - north * rows * cell).astype(np.float32)
+    shade = hillshade(height, cell, azimuth_deg=315.0, elevation_deg=45.0)
+    normal = np.array([-east, -north, 1.0]) / math.sqrt(1 + east**2 + north**2)
+    h = math.sqrt(0.5)
+    sun = np.array([-math.sqrt(0.5) * h, math.sqrt(0.5) * h, h])
+    np.testing.assert_allclose(shade, max(normal @ sun, 0.0), atol=1e-4)
+
+
+def test_unknown_cells_have_no_shade_and_do_not_spoil_their_neighbours() -> None:
+    height = np.zeros((9, 9), np.float32)
+    height[4, 4] = np.nan
+    shade = hillshade(height, 1.0)
+    assert np.isnan(shade[4, 4])
+    np.testing.assert_allclose(shade[np.isfinite(height)], math.sqrt(0.5), atol=1e-6)
+
+
+def test_grids_are_checked() -> None:
+    with pytest.raises(ValueError, match="too large"):
+        Grid(0.0, 0.0, 0.1, (100_000, 100_000))
+    with pytest.raises(ValueError, match="cell_m"):
+        Grid(0.0, 0.0, 0.0, (1, 1))
+    with pytest.raises(ValueError, match=r"\(N, 2\)"):
+        grid_over(np.zeros((0, 2)), 1.0)
