@@ -32,19 +32,17 @@ def draw_preview(raster: Raster, track_m: F64, lines: Sequence[str], largest_px:
     shade = _relief(shown)
     colour = _fit(_colour_panel(shown, shade), largest_px)
     height = _fit(_height_panel(shown, shade), largest_px)
-    scale = colour.shape[1] / raster.grid.shape[1]
+    scale = _scale(raster.grid.shape, largest_px)
     for panel in (colour, height):
         _draw_track(panel, raster.grid, track_m, scale)
         _draw_scale_bar(panel, raster.grid.cell_m / scale)
         _draw_north(panel)
     _draw_height_legend(height, shown)
-    axis = 0 if colour.shape[1] > 1.3 * colour.shape[0] else 1
-    widths = [(0, 0), (0, 0), (0, 0)]
-    widths[axis] = (MARGIN, 0)
-    height = np.stack(
-        [np.pad(height[..., k], widths[:2], constant_values=BACKGROUND[k]) for k in range(3)], -1
-    )
-    return _with_lines(np.concatenate([colour, height], axis=axis), lines)
+    h, w = colour.shape[:2]
+    stacked = w > 1.3 * h
+    gap = np.full((MARGIN, w, 3) if stacked else (h, MARGIN, 3), BACKGROUND, np.uint8)
+    both = np.concatenate([colour, gap, height], axis=0 if stacked else 1)
+    return _with_lines(both, lines)
 
 
 def blank_preview(lines: Sequence[str]) -> U8:
@@ -101,12 +99,27 @@ def _on_background(bgr: F64 | F32, known: Bool) -> U8:
 def _fit(panel: U8, largest_px: int) -> U8:
     """The panel at a size good to look at: enlarged in whole steps, or reduced by area."""
     h, w = panel.shape[:2]
-    scale = largest_px / max(h, w)
+    scale = _scale((h, w), largest_px)
     if scale >= 1.0:
-        whole = min(int(scale), 8)
-        return panel.repeat(whole, axis=0).repeat(whole, axis=1)
+        return _at_least(panel.repeat(int(scale), axis=0).repeat(int(scale), axis=1))
     size = (max(1, round(w * scale)), max(1, round(h * scale)))
-    return np.asarray(cv2.resize(panel, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return _at_least(np.asarray(cv2.resize(panel, size, interpolation=cv2.INTER_AREA), np.uint8))
+
+
+def _scale(shape: tuple[int, int], largest_px: int) -> float:
+    """Picture pixels per cell: a whole number up to 8, or less than one."""
+    scale = largest_px / max(shape)
+    return float(min(int(scale), 8)) if scale >= 1.0 else scale
+
+
+def _at_least(panel: U8, smallest_px: int = 160) -> U8:
+    """The panel with background to its right and below, so that the labels have room."""
+    h, w = panel.shape[:2]
+    if min(h, w) >= smallest_px:
+        return panel
+    out = np.full((max(h, smallest_px), max(w, smallest_px), 3), BACKGROUND, np.uint8)
+    out[:h, :w] = panel
+    return out
 
 
 def _draw_track(panel: U8, grid: Grid, track_m: F64, scale: float) -> None:
@@ -145,17 +158,16 @@ def _draw_height_legend(panel: U8, raster: Raster) -> None:
     length = min(120, panel.shape[0] // 3)
     tones = np.linspace(255, 0, length).astype(np.uint8)[:, None].repeat(10, axis=1)
     bar = 0.25 * 255 + 0.75 * cv2.applyColorMap(tones, cv2.COLORMAP_VIRIDIS).astype(np.float32)
-    width = min(10, panel.shape[1] - 12)
-    if width <= 0 or length <= 0:
-        return
-    panel[12 : 12 + length, 12 : 12 + width] = bar[:, :width].astype(np.uint8)
+    panel[12 : 12 + length, 12:22] = bar.astype(np.uint8)
     _text(panel, f"{high:.1f} m", (28, 22), 0.4)
     _text(panel, f"{low:.1f} m", (28, 12 + length), 0.4)
 
 
 def _text(image: U8, text: str, at: tuple[int, int], size: float) -> None:
-    """Dark letters with a light rim, readable on any ground."""
-    cv2.putText(image, text, at, FONT, size, BACKGROUND, 3, cv2.LINE_AA)
+    """Dark letters on a light label, readable on any ground."""
+    (w, h), below = cv2.getTextSize(text, FONT, size, 1)
+    x, y = at
+    cv2.rectangle(image, (x - 2, y - h - 2), (x + w + 1, y + below), BACKGROUND, cv2.FILLED)
     cv2.putText(image, text, at, FONT, size, INK, 1, cv2.LINE_AA)
 
 

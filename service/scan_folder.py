@@ -61,8 +61,8 @@ def write_deliverables(
     """Write the scan folder's files from ``store``; returns what scan.json holds.
 
     Args:
-        extra: figures of the run, kept under ``run`` in scan.json. Give the store's own
-            summary where the files shall be the same at both ends.
+        extra: more figures of the run, kept with those of the store under ``run`` in
+            scan.json; nothing here where the files shall be the same at both ends.
         voxel_m: size of the fused voxels; by default the ground sample distance.
 
     Raises OutsideError when the folder cannot be written.
@@ -72,7 +72,8 @@ def write_deliverables(
     poses = latest(store.poses())
     fused = fused_cloud(store, voxel_m)
     raster = surface(fused)
-    summary = _summary(header, frame, poses, fused, raster, extra, store.finished)
+    run = (store.summary or {}) | extra
+    summary = _summary(header, frame, poses, fused, raster, run, store.finished)
     with writing(folder / CLOUD) as part:
         write_laz(part, fused.cloud, frame, header.started_unix_ns)
     with writing(folder / TUM) as part:
