@@ -14,6 +14,7 @@ import typer.main
 from service.errors import SkyreliefError
 
 COMMANDS: dict[str, tuple[str, str]] = {
+    "demo": ("service.commands.demo:demo", "A real flight through both ends, here."),
     "replay": ("service.commands.replay:replay", "Recorded video through the onboard path."),
     "run": ("service.commands.run:run", "The daemon."),
     "ground": ("service.commands.ground:ground", "Receive scans from drones."),

@@ -1,0 +1,190 @@
+"""``skyrelief demo``: a real flight through both ends, onboard and ground, on this machine."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from service.errors import InputError, OutsideError
+
+FLIGHT = Path("demo") / "caliterra"
+MARKER = ".skyrelief-demo"
+READY_S = 60.0
+DRAIN_S = 120.0
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="folder for what the demo makes")] = Path("demo-output"),
+    flight: Annotated[
+        Path | None, typer.Option(help="folder with frames/ and camera.yaml; else the repo's own")
+    ] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="section.key=value for the replay")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
+) -> None:
+    """Replay a small real flight onboard while the ground receiver takes it over the datalink."""
+    source = _flight(flight)
+    _prepare(out)
+    began = time.monotonic()
+    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    ground = _start_ground(out, endpoint)
+    try:
+        _wait_until_listening(ground, endpoint, out)
+        _replay(source, out, endpoint, set_ or [])
+        received = _wait_for_ground(out / "ground")
+    finally:
+        _stop(ground)
+    report = _figures(out, received, time.monotonic() - began)
+    print(json.dumps(report) if as_json else _in_words(report))
+    if report["ground_points"] != report["points"]:
+        raise OutsideError(
+            f"the ground holds {report['ground_points']} of {report['points']} points; "
+            f"see {out / 'ground.log'}"
+        )
+
+
+def _flight(flight: Path | None) -> Path:
+    """The folder with the pictures and the camera model."""
+    folder = flight or Path(__file__).resolve().parents[2] / FLIGHT
+    if not (folder / "frames").is_dir() or not (folder / "camera.yaml").is_file():
+        raise InputError(
+            f"{folder} holds no frames/ and camera.yaml; run the demo from a clone of the "
+            "repository or name a flight with --flight"
+        )
+    return folder
+
+
+def _prepare(out: Path) -> None:
+    """Make ``out`` empty but for the marker; only what an earlier demo made is removed."""
+    if out.exists() and any(out.iterdir()) and not (out / MARKER).exists():
+        raise InputError(f"{out} is not empty and not of an earlier demo; give another --out")
+    try:
+        if out.exists():
+            shutil.rmtree(out)
+        out.mkdir(parents=True)
+        (out / MARKER).touch()
+    except OSError as error:
+        raise InputError(
+            f"{out} cannot be written: {error.strerror}; give another --out"
+        ) from error
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _skyrelief(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "service.cli", *arguments]
+
+
+def _start_ground(out: Path, endpoint: str) -> subprocess.Popen[bytes]:
+    command = _skyrelief("ground", "--store", str(out / "ground"), "--listen", endpoint)
+    with (out / "ground.log").open("wb") as log:
+        return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+
+
+def _wait_until_listening(ground: subprocess.Popen[bytes], endpoint: str, out: Path) -> None:
+    host, _, port = endpoint.partition("/")[2].partition(":")
+    deadline = time.monotonic() + READY_S
+    while time.monotonic() < deadline and ground.poll() is None:
+        try:
+            socket.create_connection((host, int(port)), timeout=1.0).close()
+        except OSError:
+            time.sleep(0.1)
+        else:
+            return
+    raise OutsideError(f"the ground receiver did not start; see {out / 'ground.log'}")
+
+
+def _replay(flight: Path, out: Path, endpoint: str, overrides: list[str]) -> None:
+    settings = [f'datalink.connect=["{endpoint}"]', "datalink.budget_kbit_s=20000", *overrides]
+    command = _skyrelief(
+        "replay",
+        str(flight / "frames"),
+        "--camera-model",
+        str(flight / "camera.yaml"),
+        "--out",
+        str(out / "onboard"),
+        *(part for setting in settings for part in ("--set", setting)),
+    )
+    code = subprocess.run(
+        command, stdin=subprocess.DEVNULL, stdout=sys.stderr, check=False
+    ).returncode
+    if code != 0:
+        raise OutsideError(f"the replay ended with exit code {code}; its message stands above")
+
+
+def _wait_for_ground(folder: Path) -> Path:
+    """The scan folder at the ground, once it is finished."""
+    deadline = time.monotonic() + DRAIN_S
+    while time.monotonic() < deadline:
+        for path in folder.rglob("scan.json"):
+            if _read(path).get("finished"):
+                return path.parent
+        time.sleep(0.2)
+    raise OutsideError(
+        f"the ground did not finish its scan within {DRAIN_S:.0f} s; see {folder.parent}/ground.log"
+    )
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is not None:
+        return
+    process.send_signal(signal.SIGINT)
+    try:
+        process.wait(timeout=20.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def _figures(out: Path, received: Path, seconds: float) -> dict[str, Any]:
+    onboard, ground = _read(out / "onboard" / "scan.json"), _read(received / "scan.json")
+    quality = onboard["quality"]
+    return {
+        "scan_folder": str(out / "onboard"),
+        "ground_folder": str(received),
+        "keyframes": onboard["counts"]["keyframes"],
+        "points": onboard["counts"]["points"],
+        "ground_points": ground["counts"]["points"],
+        "area_m2": quality["area_m2"],
+        "sigma_median_m": quality["sigma_median_m"],
+        "distance_m": quality["distance_m"],
+        "epsg": onboard["epsg"],
+        "seconds": round(seconds, 1),
+    }
+
+
+def _in_words(report: dict[str, Any]) -> str:
+    onboard, ground = report["scan_folder"], report["ground_folder"]
+    return f"""
+Scan made onboard:    {onboard}
+Received at ground:   {ground}
+  {report["points"]:,} points from {report["keyframes"]} keyframes over {report["area_m2"]:,.0f} m2,
+  {report["distance_m"]:.0f} m flown, median sigma {report["sigma_median_m"]:.2f} m, \
+{report["seconds"]:.0f} s in all; the ground holds {report["ground_points"]:,} points
+Look at it:
+  {onboard}/preview.jpg   colour and relief from above; any picture viewer
+  {onboard}/cloud.laz     coloured points, EPSG:{report["epsg"]}, metres above sea level;
+                          CloudCompare, QGIS, Potree
+  {onboard}/trajectory.csv and scan.json: where the camera was, what was used, how good it is"""
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return document
