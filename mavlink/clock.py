@@ -172,8 +172,16 @@ class BootClock:
             self._previous_ns, self._current_ns = self._current_ns, offset
             self._window_end_ns = received_ns + WINDOW_NS
         self._current_ns = min(self._current_ns, offset)
+        best = self.offset_ns
+        assert best is not None
+        return min(received_ns, round(boot_ns) + best)
+
+    @property
+    def offset_ns(self) -> int | None:
+        """Our clock minus the boot clock; None before anything was heard."""
         if self.timesync_offset_ns is not None:
-            best = float(self.timesync_offset_ns)
-        else:
-            best = min(self._current_ns, self._previous_ns or self._current_ns)
-        return min(received_ns, round(boot_ns + best))
+            return self.timesync_offset_ns
+        if self._current_ns is None:
+            return None
+        previous = self._current_ns if self._previous_ns is None else self._previous_ns
+        return round(min(self._current_ns, previous))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from mavlink.wire import dialect, x25crc
+from mavlink.wire import CRC_EXTRA, dialect, x25crc
 
 MAGIC_V1 = 0xFE
 MAGIC_V2 = 0xFD
@@ -29,7 +29,7 @@ class Packet:
     message_id: int
     system: int
     component: int
-    known: bool  # the dialect has this message, so the checksum was verified
+    known: bool  # its checksum can be, and was, verified
 
     @property
     def is_signed(self) -> bool:
@@ -64,10 +64,10 @@ def check_packet(data: bytes) -> Packet | None:
         message_id = data[7] | data[8] << 8 | data[9] << 16
         system, component = data[5], data[6]
         end = len(data) - (SIGNATURE_LENGTH if data[2] & SIGNED else 0)
-    kind = dialect.mavlink_map.get(message_id)
-    if kind is None:
+    extra = CRC_EXTRA.get(message_id)
+    if extra is None:
         return Packet(data, message_id, system, component, False)
-    crc = x25crc(data[1 : end - 2] + bytes((kind.crc_extra,))).crc
+    crc = x25crc(data[1 : end - 2] + bytes((extra,))).crc
     if crc != data[end - 2] | data[end - 1] << 8:
         return None
     return Packet(data, message_id, system, component, True)
@@ -82,7 +82,7 @@ class Decoder:
 
     def message(self, packet: Packet) -> Message | None:
         """The message object, or None when the payload cannot be one."""
-        if not packet.known:
+        if packet.message_id not in dialect.mavlink_map:
             return None
         try:
             return self._parser.decode(bytearray(packet.data))

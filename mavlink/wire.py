@@ -15,3 +15,9 @@ dialect: Any = ardupilotmega
 
 x25crc: Any = mavcrc.x25crc
 """CRC-16/MCRF4XX; compiled when fastcrc is installed."""
+
+COMMAND_CANCEL = 80
+
+CRC_EXTRA: dict[int, int] = {n: kind.crc_extra for n, kind in dialect.mavlink_map.items()}
+"""Message number to the byte that its checksum ends with."""
+CRC_EXTRA.setdefault(COMMAND_CANCEL, 14)  # of common.xml; pymavlink's dialect lacks it

@@ -18,9 +18,8 @@ from mavlink.wire import dialect
 
 STAMP = 8
 BLOCK = 1 << 16
-EARLIEST_USEC = 0
 LATEST_USEC = 4_102_444_800 * 10**6  # the year 2100
-STEP_USEC = 7 * 86_400 * 10**6  # a log does not jump by more than a week between packets
+STEP_USEC = 3_600 * 10**6  # a longer way between two packets wants confirmation
 HEARTBEAT = 0
 NO_AUTOPILOT = 8
 
@@ -55,10 +54,10 @@ def packets(file: BinaryIO, counts: Counter[str]) -> Iterator[tuple[int, Packet]
                 return
             length = 0  # a torn end
         usec = int.from_bytes(buffer[at : at + STAMP], "big")
-        if length and _plausible(usec, last_usec):
+        if length and usec < LATEST_USEC:
             end = at + STAMP + length
             packet = check_packet(bytes(buffer[at + STAMP : end]))
-            if packet is not None and (packet.known or _next_plausible(buffer, end, usec)):
+            if packet is not None and _stamp_stands(packet, usec, last_usec, buffer, end):
                 last_usec, at = usec, end
                 yield usec * 1000, packet
                 continue
@@ -67,18 +66,21 @@ def packets(file: BinaryIO, counts: Counter[str]) -> Iterator[tuple[int, Packet]
         at += 1
 
 
-def _plausible(usec: int, last_usec: int | None) -> bool:
-    if not EARLIEST_USEC <= usec < LATEST_USEC:
-        return False
-    return last_usec is None or abs(usec - last_usec) < STEP_USEC
+def _stamp_stands(
+    packet: Packet, usec: int, last_usec: int | None, buffer: bytearray, end: int
+) -> bool:
+    """True when the stamp goes on from the last one, or the next stamp goes on from it.
 
-
-def _next_plausible(buffer: bytearray, end: int, usec: int) -> bool:
-    """True when a stamped packet, or the end of what was read, follows an unknown packet."""
-    if end + STAMP >= len(buffer):
+    So a clock that was set in mid-log is followed and a damaged stamp is not. A packet of a
+    kind without a checksum known here must be followed by another one as well.
+    """
+    steady = last_usec is not None and abs(usec - last_usec) < STEP_USEC
+    if steady and packet.known:
         return True
+    if end + STAMP >= len(buffer):
+        return steady or last_usec is None
     following = int.from_bytes(buffer[end : end + STAMP], "big")
-    return packet_length(buffer, end + STAMP) != 0 and _plausible(following, usec)
+    return packet_length(buffer, end + STAMP) != 0 and abs(following - usec) < STEP_USEC
 
 
 def load(path: Path, config: HistoryConfig) -> TelemetryLog:

@@ -1,0 +1,272 @@
+"""The companion computer on the vehicle's network: packets in, messages out.
+
+No sockets and no clocks: ``receive(link, packet, now_ns)``, ``tick(now_ns)``, ``take()`` and
+``next_timer()``. :mod:`mavlink.vehicle` puts it on real links.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from mavlink import status as texts
+from mavlink.camera import CAPTURE_STATUS, CameraComponent, CameraConfig, KeyframeReport
+from mavlink.clock import BootClock
+from mavlink.command_desk import CommandDesk, decode_call
+from mavlink.commands import load_commands
+from mavlink.control import Answer, ScanControl
+from mavlink.decode import READERS, decode
+from mavlink.framing import Decoder, Packet
+from mavlink.history import VehicleHistory
+from mavlink.messages import CAMERA, ONBOARD, Address, Outbox, Outgoing
+from mavlink.parameters import Parameters
+from mavlink.presence import Presence
+from mavlink.rates import WANTED_HZ, RateKeeper
+from mavlink.status import ComputerLoad, StatusTexts, computer_status, motion_values
+from mavlink.streams import Streams
+from mavlink.timesync import TimesyncFilter
+from mavlink.wire import COMMAND_CANCEL, dialect
+
+S = 1_000_000_000
+MS = 1_000_000
+COMPONENTS = (ONBOARD, CAMERA)
+HEARTBEAT, TIMESYNC = 0, 111
+LOAD_STATUS, MOTION = 390, 251
+LOST_NS = 5 * S
+
+
+@dataclass(frozen=True, slots=True)
+class CompanionConfig:
+    """What the companion asks for and offers."""
+
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    wanted_hz: Mapping[str, float] = field(default_factory=lambda: dict(WANTED_HZ))
+    load_every_s: float = 2.0
+    motion_every_s: float = 1.0
+
+
+class Companion:
+    """Everything that our two components say and do, apart from their heartbeats."""
+
+    def __init__(
+        self,
+        config: CompanionConfig,
+        control: ScanControl,
+        presence: Presence,
+        history: VehicleHistory,
+        now_ns: int,
+        kept_parameters: Mapping[str, float] | None = None,
+    ) -> None:
+        self.config = config
+        self.control = control
+        self.presence = presence
+        self.history = history
+        self.counts: Counter[str] = Counter()
+        self.load = ComputerLoad()
+        self.unix_us: Callable[[], int] = lambda: 0
+        self._start_ns = self._now_ns = now_ns
+        self._outbox = Outbox()
+        self._decoder = Decoder()
+        self._clocks: dict[int, BootClock] = {}  # component of our system to its boot clock
+        self.timesync = TimesyncFilter()
+        self.rates = RateKeeper(config.wanted_hz)
+        self.streams = Streams(self._outbox)
+        self.texts = StatusTexts(self._outbox)
+        self.parameters = Parameters(self._outbox, control.parameter_changed, kept_parameters)
+        self.camera = CameraComponent(
+            config.camera, control, self._outbox, self.streams, self._boot_ms
+        )
+        self.desk = CommandDesk(load_commands(), self._outbox, self, self._warn)
+        self.streams.add(ONBOARD, LOAD_STATUS, round(config.load_every_s * 1e6), self._send_load)
+        self.streams.add(ONBOARD, MOTION, round(config.motion_every_s * 1e6), self._send_motion)
+        self._lost = False
+
+    # In.
+
+    def receive(self, link: int, packet: Packet, now_ns: int) -> None:
+        """Take in one packet that arrived on a link at ``now_ns`` (monotonic)."""
+        self._now_ns = max(self._now_ns, now_ns)
+        self.counts["packets"] += 1
+        if packet.message_id == COMMAND_CANCEL:
+            self._cancel(packet, now_ns)
+            return
+        message = self._decoder.message(packet)
+        if message is None:
+            self.counts["not understood"] += 1
+            return
+        name = message.get_type()
+        if packet.message_id == HEARTBEAT:
+            self.presence.hear(message, now_ns)
+        elif name in READERS:
+            self._hear_vehicle(name, message, packet, now_ns)
+        elif name.startswith("COMMAND_"):
+            self._hear_command(message, link, now_ns)
+        elif name.startswith("PARAM_"):
+            self._hear_parameter(message)
+        elif packet.message_id == TIMESYNC:
+            self._hear_timesync(message, packet, link, now_ns)
+
+    def _hear_vehicle(self, name: str, message: Any, packet: Packet, now_ns: int) -> None:
+        if packet.system != self.presence.system:
+            return
+        autopilot = self.presence.autopilot
+        if autopilot is not None and packet.component == autopilot[1]:
+            self.rates.heard(name)
+        sample = decode(message)
+        if sample is None:
+            return
+        self.counts["samples"] += 1
+        if sample.boot_ms is None:
+            self.history.add(sample, now_ns)
+            return
+        clock = self._clocks.setdefault(packet.component, BootClock())
+        reboots = clock.reboots
+        time_ns = clock.time_of(sample.boot_ms, now_ns)
+        if clock.reboots != reboots:
+            self._rebooted(packet.component)
+        self.history.add(sample, time_ns)
+
+    def _rebooted(self, component: int) -> None:
+        autopilot = self.presence.autopilot
+        if autopilot is None or component != autopilot[1]:
+            return
+        self.history.clear()
+        self.timesync.reset()
+        self.rates.restart()
+        self.say(texts.WARNING, "Autopilot restarted; telemetry starts over")
+
+    def _hear_command(self, message: Any, link: int, now_ns: int) -> None:
+        call = decode_call(message, link)
+        if call is None or not self._is_for_us(call.target):
+            return
+        self.counts["commands"] += 1
+        self.desk.receive(call, COMPONENTS, now_ns)
+
+    def _is_for_us(self, target: Address) -> bool:
+        ours = target.system in (0, self.presence.system)
+        return ours and (target.component == 0 or target.component in COMPONENTS)
+
+    def _cancel(self, packet: Packet, now_ns: int) -> None:
+        # uint16 command, uint8 target system, uint8 target component; zeros at the end are cut.
+        payload = packet.data[10 : 10 + packet.data[1]] if packet.data[0] == 0xFD else b""
+        payload = payload.ljust(4, b"\0")
+        number = payload[0] | payload[1] << 8
+        if self._is_for_us(Address(payload[2], payload[3])):
+            self.desk.cancel(number, Address(packet.system, packet.component), now_ns)
+
+    def _hear_parameter(self, message: Any) -> None:
+        target = getattr(message, "target_system", None)
+        if target is None or target not in (0, self.presence.system):
+            return
+        if message.target_component not in (0, ONBOARD):
+            return
+        answer = self.parameters.receive(message)
+        if isinstance(answer, Answer) and answer.text:
+            self._warn(answer.text)
+
+    def _hear_timesync(self, message: Any, packet: Packet, link: int, now_ns: int) -> None:
+        if message.tc1 == 0:  # a question; we answer with our own time since boot
+            reply = dialect.MAVLink_timesync_message(now_ns, message.ts1)
+            if (packet.system, packet.component) == self.presence.autopilot:
+                self._outbox.put(ONBOARD, reply, link)
+            return
+        if (packet.system, packet.component) != self.presence.autopilot:
+            return
+        if self.timesync.answer(message.tc1, message.ts1, now_ns):
+            clock = self._clocks.setdefault(packet.component, BootClock())
+            clock.timesync_offset_ns = self.timesync.offset_ns
+
+    # Out.
+
+    def take(self) -> list[Outgoing]:
+        """Messages to send now, in order."""
+        return self._outbox.take()
+
+    def tick(self, now_ns: int) -> None:
+        """Do what time asks for."""
+        self._now_ns = max(self._now_ns, now_ns)
+        for text in self.presence.take_news():
+            self.say(texts.WARNING, text)
+        self.camera.tick(now_ns)
+        self.desk.tick(now_ns)
+        self.streams.tick(now_ns)
+        self.texts.tick(now_ns)
+        self._watch_autopilot(now_ns)
+
+    def _watch_autopilot(self, now_ns: int) -> None:
+        autopilot, seen = self.presence.autopilot, self.presence.autopilot_seen_ns
+        if autopilot is None or seen is None:
+            return
+        lost = now_ns - seen > LOST_NS
+        if lost and not self._lost:
+            self.say(texts.WARNING, "Telemetry of the autopilot is lost")
+        elif self._lost and not lost:
+            self.rates.restart()
+            self.say(texts.NOTICE, "Telemetry of the autopilot is back")
+        self._lost = lost
+        if lost:
+            return
+        for message in self.rates.tick(*autopilot, now_ns):
+            self._outbox.put(ONBOARD, message)
+        request = self.timesync.request(now_ns)
+        if request is not None:
+            self._outbox.put(ONBOARD, request)
+
+    def next_timer(self) -> int:
+        """When :meth:`tick` should be called next, in ns."""
+        times = [
+            t
+            for t in (self.camera.next_timer(), self.desk.next_timer(), self.streams.next_timer())
+            if t is not None
+        ]
+        if self.presence.autopilot is not None:
+            times += [self.timesync.next_timer(), self.rates.next_timer()]
+        return min([*times, self._now_ns + S])
+
+    def say(self, severity: int, text: str) -> None:
+        """Tell the operator."""
+        self.texts.say(severity, text, self._now_ns)
+
+    def _warn(self, text: str) -> None:
+        self.say(texts.WARNING, text)
+
+    def report(self, keyframe: KeyframeReport) -> int:
+        """Tell of a keyframe; its index comes back."""
+        return self.camera.report(keyframe)
+
+    def send(self, message: Any) -> None:
+        """Send a message of the onboard computer to everyone."""
+        self._outbox.put(ONBOARD, message)
+
+    def send_requested(self, component: int, number: int, index: int, link: int) -> bool:
+        """Send a message that was asked for; False when the component has no such message."""
+        if component == CAMERA:
+            message = self.camera.message(number, index)
+        elif number == LOAD_STATUS:
+            message = computer_status(self.load, self.unix_us(), self._boot_ms())
+        else:
+            message = None
+        if message is None:
+            return False
+        if number == CAPTURE_STATUS:
+            self.camera.send_capture_status()  # everyone's button follows it
+        else:
+            self._outbox.put(component, message, link)
+        return True
+
+    def _send_load(self) -> None:
+        self.send(computer_status(self.load, self.unix_us(), self._boot_ms()))
+
+    def _send_motion(self) -> None:
+        for message in motion_values(self.control.status(), self._boot_ms()):
+            self.send(message)
+
+    def _boot_ms(self) -> int:
+        return ((self._now_ns - self._start_ns) // MS) & 0xFFFFFFFF
+
+    def boot_clock(self) -> BootClock | None:
+        """The autopilot's clock; None before it was heard."""
+        autopilot = self.presence.autopilot
+        return None if autopilot is None else self._clocks.get(autopilot[1])

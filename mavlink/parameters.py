@@ -1,0 +1,145 @@
+"""What an operator tunes in flight: the PARAM_* protocol on the onboard computer.
+
+All values are REAL32: ArduPilot and PX4 encode other types differently.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mavlink.control import Answer, Result
+from mavlink.gimbal import YAW_FRAMES
+from mavlink.messages import ONBOARD, Outbox
+from mavlink.wire import dialect
+
+REAL32 = 9  # MAV_PARAM_TYPE
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One tunable value."""
+
+    name: str  # at most 16 characters
+    default: float
+    low: float
+    high: float
+    text: str
+    options: tuple[str, ...] = ()  # names of the values 0, 1, 2 ...
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.name) <= 16 or not self.name.isascii():
+            raise ValueError(f"parameter name {self.name!r} must have 1 to 16 ASCII characters")
+        if not self.low <= self.default <= self.high:
+            raise ValueError(f"parameter {self.name}: default {self.default} is out of range")
+
+    def accepts(self, value: float) -> bool:
+        """True for a value in range; whole numbers only where values have names."""
+        if not math.isfinite(value) or not self.low <= value <= self.high:
+            return False
+        return not self.options or value == round(value)
+
+
+PARAMETERS: tuple[Parameter, ...] = (
+    Parameter("SR_BASELINE_M", 0.0, 0.0, 200.0, "Stereo baseline, 0 follows altitude", unit="m"),
+    Parameter("SR_RESOLUTION_M", 0.1, 0.01, 5.0, "Map resolution", unit="m"),
+    Parameter("SR_LINK_KBIT_S", 1000.0, 0.0, 100_000.0, "Datalink budget", unit="kbit/s"),
+    Parameter(
+        "SR_YAW_FRAME", 0.0, 0.0, len(YAW_FRAMES) - 1.0, "Gimbal yaw frame", options=YAW_FRAMES
+    ),
+    Parameter("SR_CAM_LATENCY", 0.0, -500.0, 2000.0, "Camera latency", unit="ms"),
+)
+"""The next parameter is one line here and one case in the service."""
+
+
+class Parameters:
+    """Values of parameters, and the protocol to read and set them."""
+
+    def __init__(
+        self,
+        outbox: Outbox,
+        on_change: Callable[[str, float], Answer],
+        kept: Mapping[str, float] | None = None,
+        table: Sequence[Parameter] = PARAMETERS,
+    ) -> None:
+        self._outbox = outbox
+        self._on_change = on_change
+        self.table = tuple(table)
+        self._index = {p.name: i for i, p in enumerate(self.table)}
+        self._values = [p.default for p in self.table]
+        self.revision = 0  # grows with every change, so that a keeper knows when to save
+        for name, value in (kept or {}).items():
+            i = self._index.get(name)
+            if i is not None and self.table[i].accepts(value):
+                self._values[i] = _real32(value)
+
+    def __getitem__(self, name: str) -> float:
+        return self._values[self._index[name]]
+
+    def values(self) -> dict[str, float]:
+        """Every value by name."""
+        return {p.name: v for p, v in zip(self.table, self._values, strict=True)}
+
+    def change(self, name: str, value: float) -> Answer:
+        """Set a value, unless it is out of range or the service refuses it."""
+        i = self._index.get(name)
+        if i is None:
+            return Answer(Result.DENIED, f"no parameter {name}")
+        parameter = self.table[i]
+        if not parameter.accepts(value):
+            span = f"{parameter.low:g} to {parameter.high:g}"
+            return Answer(Result.DENIED, f"{name} refused: {value:g} is not {span}")
+        answer = self._on_change(name, value)
+        if answer.result is Result.ACCEPTED and self._values[i] != _real32(value):
+            self._values[i] = _real32(value)
+            self.revision += 1
+            self._send(i)
+        return answer
+
+    def reset(self) -> None:
+        """Every value back to its default."""
+        for parameter in self.table:
+            self.change(parameter.name, parameter.default)
+
+    def receive(self, message: Any) -> Answer | None:
+        """Serve a PARAM_* message that is meant for the onboard computer.
+
+        The answer of a PARAM_SET, for the operator; None for the rest.
+        """
+        kind = message.get_type()
+        if kind == "PARAM_REQUEST_LIST":
+            for i in range(len(self.table)):
+                self._send(i)
+        elif kind == "PARAM_REQUEST_READ":
+            i = int(message.param_index)
+            i = self._index.get(_text(message.param_id), -1) if i < 0 else i
+            if 0 <= i < len(self.table):
+                self._send(i)
+        elif kind == "PARAM_SET":
+            name = _text(message.param_id)
+            before = self.revision
+            answer = self.change(name, message.param_value)
+            if self.revision == before and name in self._index:
+                self._send(self._index[name])  # tells the asker what stands
+            return answer
+        return None
+
+    def _send(self, i: int) -> None:
+        name = self.table[i].name.encode()
+        count = len(self.table)
+        message = dialect.MAVLink_param_value_message(name, self._values[i], REAL32, count, i)
+        self._outbox.put(ONBOARD, message)
+
+
+def _real32(value: float) -> float:
+    rounded: float = struct.unpack("<f", struct.pack("<f", value))[0]
+    return rounded
+
+
+def _text(raw: str | bytes) -> str:
+    text = raw.decode("ascii", "replace") if isinstance(raw, bytes) else raw
+    return text.partition("\0")[0]

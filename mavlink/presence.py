@@ -1,0 +1,174 @@
+"""Heartbeats of our two components, tied to the health of the service.
+
+Also who else is there: which system we belong to, whether it is armed, and whether another
+companion uses our ids. Called from a thread of its own, so it guards its state with a lock.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from mavlink.messages import CAMERA, ONBOARD, Outgoing
+from mavlink.wire import dialect
+
+S = 1_000_000_000
+PERIOD_NS = S
+ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
+NO_AUTOPILOT = 8
+TYPE_GCS = 6
+TYPES = {ONBOARD: 18, CAMERA: 30}  # MAV_TYPE_ONBOARD_CONTROLLER, MAV_TYPE_CAMERA
+
+
+class Health(IntEnum):
+    """MAV_STATE of our components."""
+
+    BOOT = 1
+    STANDBY = 3
+    ACTIVE = 4
+    CRITICAL = 5
+
+
+@dataclass(frozen=True, slots=True)
+class PresenceConfig:
+    """Our place on the network."""
+
+    system: int | None = None  # None: the autopilot's, once heard
+    latch_s: float = 3.0  # several autopilots within this time after the first: none is ours
+    stale_s: float = 5.0  # health not confirmed for longer is CRITICAL
+    dead_s: float = 20.0  # not confirmed for longer: no heartbeat any more
+    boot_s: float = 120.0  # the same for a service that has not come up
+
+    def __post_init__(self) -> None:
+        if self.system is not None and not 1 <= self.system <= 255:
+            raise ValueError(f"system id is {self.system}; it must be 1 to 255, or none given")
+        if not 0.0 < self.stale_s < self.dead_s:
+            raise ValueError("presence needs 0 < stale_s < dead_s")
+
+
+class Presence:
+    """What we say of ourselves every second, and what others say of themselves."""
+
+    def __init__(self, config: PresenceConfig, token: int, now_ns: int) -> None:
+        self.config = config
+        self._token = token  # in custom_mode: tells our echo from another companion
+        self._lock = threading.Lock()
+        self._health = Health.BOOT
+        self._confirmed_ns = now_ns
+        self._next_ns = now_ns
+        self._system = config.system or 1
+        self._candidates: set[int] = set()
+        self._first_autopilot_ns: int | None = None
+        self._settled = config.system is not None
+        self._armed = False
+        self._autopilot: tuple[int, int] | None = None
+        self._autopilot_seen_ns: int | None = None
+        self._intruder = False
+        self._news: list[str] = []
+
+    @property
+    def system(self) -> int:
+        """The system id that we use."""
+        return self._system
+
+    @property
+    def autopilot(self) -> tuple[int, int] | None:
+        """(system, component) of our autopilot; None before it was heard."""
+        return self._autopilot
+
+    @property
+    def autopilot_seen_ns(self) -> int | None:
+        """When the autopilot's heartbeat was heard last."""
+        return self._autopilot_seen_ns
+
+    @property
+    def is_armed(self) -> bool:
+        """True while the autopilot says so."""
+        return self._armed
+
+    def confirm(self, health: Health, now_ns: int) -> None:
+        """The service is alive and this is its state; to be said again every few seconds."""
+        with self._lock:
+            self._health = health
+            self._confirmed_ns = now_ns
+
+    def health(self, now_ns: int) -> Health | None:
+        """What the heartbeat says now; None once the service must be taken for dead."""
+        with self._lock:
+            return self._state(now_ns)
+
+    def _state(self, now_ns: int) -> Health | None:
+        silent = (now_ns - self._confirmed_ns) / S
+        if self._health is Health.BOOT:
+            return Health.BOOT if silent < self.config.boot_s else None
+        if silent < self.config.stale_s:
+            return self._health
+        return Health.CRITICAL if silent < self.config.dead_s else None
+
+    def due(self, now_ns: int) -> list[Outgoing]:
+        """The heartbeats to send now; the first call gives them at once."""
+        with self._lock:
+            if now_ns < self._next_ns:
+                return []
+            late = now_ns - self._next_ns
+            self._next_ns = now_ns + PERIOD_NS - (late if late < PERIOD_NS else 0)
+            state = self._state(now_ns)
+            if state is None:
+                return []
+            return [Outgoing(c, self._heartbeat(c, state)) for c in (ONBOARD, CAMERA)]
+
+    def _heartbeat(self, component: int, state: Health) -> Any:
+        kind = TYPES[component]
+        return dialect.MAVLink_heartbeat_message(kind, NO_AUTOPILOT, 0, self._token, int(state), 3)
+
+    def next_timer(self) -> int:
+        """When :meth:`due` has something again, in ns."""
+        return self._next_ns
+
+    def hear(self, message: Any, now_ns: int) -> None:
+        """Take in anyone's heartbeat."""
+        system, component = message.get_srcSystem(), message.get_srcComponent()
+        with self._lock:
+            if message.autopilot != NO_AUTOPILOT and message.type != TYPE_GCS:
+                self._hear_autopilot(system, component, message.base_mode, now_ns)
+            elif system == self._system and component in TYPES:
+                self._hear_namesake(component, message.custom_mode)
+
+    def _hear_autopilot(self, system: int, component: int, base_mode: int, now_ns: int) -> None:
+        if not self._settled:
+            self._latch(system, now_ns)
+        if system != self._system:
+            return
+        armed = bool(base_mode & ARMED)
+        self._armed = armed
+        self._autopilot = (system, component)
+        self._autopilot_seen_ns = now_ns
+
+    def _latch(self, system: int, now_ns: int) -> None:
+        if self._first_autopilot_ns is None:
+            self._first_autopilot_ns = now_ns
+        elif now_ns - self._first_autopilot_ns > self.config.latch_s * S:
+            self._settled = True
+            return
+        self._candidates.add(system)
+        if len(self._candidates) == 1:
+            self._system = system
+            return
+        self._system = 1
+        self._settled = True
+        names = ", ".join(map(str, sorted(self._candidates)))
+        self._news.append(f"Several autopilots ({names}): using system 1, set mavlink.system")
+
+    def _hear_namesake(self, component: int, token: int) -> None:
+        if token == self._token or self._intruder:
+            return
+        self._intruder = True
+        self._news.append(f"Another companion uses component {component} of this vehicle")
+
+    def take_news(self) -> list[str]:
+        """What the operator must be told, each once."""
+        with self._lock:
+            news, self._news = self._news, []
+        return news

@@ -1,0 +1,136 @@
+"""What the operator reads: status texts, the companion's load, speed and distance."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+from mavlink.control import ScanStatus
+from mavlink.messages import ONBOARD, Outbox
+from mavlink.wire import dialect
+
+S = 1_000_000_000
+TEXT = 50  # bytes in one STATUSTEXT
+LONGEST = 200
+AGAIN_NS = 30 * S  # the same text is not said again within this time
+SPACING_NS = S
+BURST = 3  # texts that may go out at once after a quiet time
+
+EMERGENCY, ALERT, CRITICAL, ERROR, WARNING, NOTICE, INFO, DEBUG = range(8)
+
+
+class StatusTexts:
+    """Texts to the operator: at most one a second, the same one only now and then."""
+
+    def __init__(self, outbox: Outbox) -> None:
+        self._outbox = outbox
+        self._waiting: deque[tuple[int, str]] = deque(maxlen=20)
+        self._said: dict[str, int] = {}
+        self._credit_ns = BURST * SPACING_NS
+        self._last_ns: int | None = None
+        self._next_id = 1
+
+    def say(self, severity: int, text: str, now_ns: int) -> None:
+        """Queue a text; it is dropped when it was said a moment ago."""
+        self._said = {t: at for t, at in self._said.items() if now_ns - at < AGAIN_NS}
+        if not text or text in self._said or len(self._said) > 100:
+            return
+        self._said[text] = now_ns
+        self._waiting.append((severity, text))
+        self.tick(now_ns)
+
+    def tick(self, now_ns: int) -> None:
+        """Send what may go out now."""
+        passed = 0 if self._last_ns is None else max(0, now_ns - self._last_ns)
+        self._last_ns = now_ns
+        self._credit_ns = min(BURST * SPACING_NS, self._credit_ns + passed)
+        while self._waiting and self._credit_ns >= SPACING_NS:
+            self._credit_ns -= SPACING_NS
+            self._send(*self._waiting.popleft())
+
+    @property
+    def is_waiting(self) -> bool:
+        """True while texts wait for their turn."""
+        return bool(self._waiting)
+
+    def _send(self, severity: int, text: str) -> None:
+        raw = text.encode("ascii", "replace")[:LONGEST]
+        chunks = [raw[i : i + TEXT] for i in range(0, len(raw), TEXT)]
+        number = self._next_id if len(chunks) > 1 else 0
+        if number:
+            self._next_id = self._next_id % 65535 + 1
+        for k, chunk in enumerate(chunks):
+            message = dialect.MAVLink_statustext_message(severity, chunk, number, k)
+            self._outbox.put(ONBOARD, message)
+        if number and len(raw) % TEXT == 0:  # a text ends with a zero byte somewhere
+            last = dialect.MAVLink_statustext_message(severity, b"", number, len(chunks))
+            self._outbox.put(ONBOARD, last)
+
+
+@dataclass(frozen=True, slots=True)
+class ComputerLoad:
+    """The companion's load as the service measures it; None where it does not know."""
+
+    cpu_percent: tuple[int, ...] = ()  # per core, the first eight are sent
+    gpu_percent: int | None = None
+    temperature_c: int | None = None
+    ram_used_mib: int | None = None
+    ram_total_mib: int | None = None
+    storage_used_mib: int | None = None
+    storage_total_mib: int | None = None
+    link_tx_kib_s: int | None = None
+    link_max_kib_s: int | None = None
+    throttled: bool = False
+    disk_full: bool = False
+
+
+def computer_status(load: ComputerLoad, unix_us: int, uptime_ms: int) -> Any:
+    """The ONBOARD_COMPUTER_STATUS of a load."""
+    u8, u32 = 255, 0xFFFFFFFF
+
+    def first(value: int | None, unknown: int, count: int) -> list[int]:
+        return [unknown if value is None else max(0, min(unknown, value))] + [unknown] * (count - 1)
+
+    cores = [max(0, min(100, c)) for c in load.cpu_percent[:8]]
+    mean = round(sum(cores) / len(cores)) if cores else u8
+    temperature = 127 if load.temperature_c is None else max(-127, min(126, load.temperature_c))
+    flags = (4 if load.throttled else 0) | (8 if load.disk_full else 0)
+    return dialect.MAVLink_onboard_computer_status_message(
+        unix_us,
+        uptime_ms & u32,
+        0,
+        cores + [u8] * (8 - len(cores)),
+        [mean] + [u8] * 9,
+        first(load.gpu_percent, u8, 4),
+        [u8] * 10,
+        temperature,
+        [127] * 8,
+        [32767] * 4,
+        first(load.ram_used_mib, u32, 1)[0],
+        first(load.ram_total_mib, u32, 1)[0],
+        [u32] * 4,
+        first(load.storage_used_mib, u32, 4),
+        first(load.storage_total_mib, u32, 4),
+        [u32] * 6,
+        first(load.link_tx_kib_s, u32, 6),
+        [u32] * 6,
+        first(load.link_max_kib_s, u32, 6),
+        [u32] * 6,
+        flags,
+    )
+
+
+def motion_values(status: ScanStatus, boot_ms: int) -> list[Any]:
+    """NAMED_VALUE_FLOAT of speed (m/s), distance (m) and turn rate (rad/s) by vision."""
+    named = (
+        (b"SR_SPEED", status.speed_m_s),
+        (b"SR_DIST", status.distance_m),
+        (b"SR_TURN", status.turn_rate_rad_s),
+    )
+    return [
+        dialect.MAVLink_named_value_float_message(boot_ms, name, value)
+        for name, value in named
+        if math.isfinite(value)
+    ]

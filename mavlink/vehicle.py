@@ -1,0 +1,309 @@
+"""The vehicle as the service uses it: links, two components, history, all in one object.
+
+Threads: two per link, one for the protocol, one for heartbeats. Everything that the service
+calls here returns at once; what :class:`~mavlink.control.ScanControl` is asked is asked in the
+protocol's thread.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import queue
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mavlink import status as texts
+from mavlink.camera import KeyframeReport
+from mavlink.companion import Companion, CompanionConfig
+from mavlink.control import ScanControl
+from mavlink.framing import Framer, Packet
+from mavlink.history import HistoryConfig, VehicleHistory
+from mavlink.link import Link, LinkSpec, parse_link
+from mavlink.messages import Outgoing
+from mavlink.packer import Packer
+from mavlink.presence import Health, Presence, PresenceConfig
+from mavlink.recorder import Recorder
+from mavlink.signing import Signing, read_key
+from mavlink.status import ComputerLoad
+
+log = logging.getLogger(__name__)
+
+S = 1_000_000_000
+SAVE_EVERY_NS = 30 * S
+BACKLOG = 10_000  # packets waiting for the protocol's thread
+BATCH = 200  # of them served before the next look at the timers
+STUCK_NS = 10 * S
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleConfig:
+    """Links and how we behave on them."""
+
+    links: tuple[str, ...] = ()
+    presence: PresenceConfig = field(default_factory=PresenceConfig)
+    companion: CompanionConfig = field(default_factory=CompanionConfig)
+    history: HistoryConfig = field(default_factory=lambda: HistoryConfig(keep_s=120.0))
+    signing_key: Path | None = None  # 32 bytes, mode 600
+    state_dir: Path | None = None  # where parameters and the signing time are kept
+
+    def __post_init__(self) -> None:
+        for link in self.links:
+            parse_link(link)
+
+
+@dataclass(frozen=True, slots=True)
+class LinkReport:
+    """How one link does."""
+
+    name: str
+    is_up: bool
+    opened: int
+    received_bytes: int
+    sent_bytes: int
+    packets: int
+    skipped_bytes: int
+    last_error: str
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleReport:
+    """How the connection to the vehicle does."""
+
+    links: tuple[LinkReport, ...]
+    system: int
+    autopilot: tuple[int, int] | None
+    autopilot_age_s: float | None
+    is_armed: bool
+    timesync_round_trip_ms: float | None
+    unverified: int  # packets refused for their signature
+    dropped: int  # packets that the protocol's thread could not take in time
+
+
+class VehicleLink:
+    """Start it, feed it with health, and read ``history``."""
+
+    def __init__(self, config: VehicleConfig, control: ScanControl) -> None:
+        self.config = config
+        now_ns = time.monotonic_ns()
+        self.history = VehicleHistory(config.history)
+        self.recorder = Recorder()
+        self._memory = _Memory(config.state_dir)
+        self._signing = self._make_signing()
+        self.presence = Presence(config.presence, secrets.randbits(32) or 1, now_ns)
+        self._companion = Companion(
+            config.companion, control, self.presence, self.history, now_ns, self._memory.parameters
+        )
+        self._companion.unix_us = lambda: time.time_ns() // 1000
+        self._jobs: queue.Queue[Callable[[], object]] = queue.Queue(BACKLOG)
+        self._stop = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._dropped = 0
+        self._alive_ns = now_ns
+        specs = [parse_link(text) for text in config.links]
+        self._framers = [Framer() for _ in specs]
+        self._packers = [Packer(i, self._signing) for i in range(len(specs))]
+        self._links = [self._make_link(i, spec) for i, spec in enumerate(specs)]
+
+    def _make_signing(self) -> Signing | None:
+        if self.config.signing_key is None:
+            return None
+        return Signing(read_key(self.config.signing_key), self._memory.signing_timestamp)
+
+    def _make_link(self, index: int, spec: LinkSpec) -> Link:
+        return Link(spec, lambda data, now_ns: self._on_data(index, data, now_ns))
+
+    # The service's side.
+
+    def start(self) -> None:
+        """Open the links; the first heartbeat goes out before anything else."""
+        for target in (self._beat, self._run):
+            thread = threading.Thread(target=target, name=f"mavlink {target.__name__}", daemon=True)
+            self._threads.append(thread)
+            thread.start()
+        for link in self._links:
+            link.start()
+
+    def stop(self) -> None:
+        """Say what is left to say, then close everything."""
+        self._stop.set()
+        with contextlib.suppress(queue.Full):
+            self._jobs.put_nowait(lambda: None)
+        for thread in self._threads:
+            thread.join(timeout=5.0)
+        for link in self._links:
+            link.stop()
+        self.recorder.close()
+        self._save()
+
+    def set_health(self, health: Health) -> None:
+        """Confirm that the service lives; call it at least every second."""
+        self.presence.confirm(health, time.monotonic_ns())
+
+    def set_load(self, load: ComputerLoad) -> None:
+        """The companion's load, for the operator."""
+        self._companion.load = load
+
+    def statustext(self, text: str, severity: int = texts.INFO) -> None:
+        """Tell the operator; repetitions and floods are held back."""
+        self._do(lambda: self._companion.say(severity, text))
+
+    def report_keyframe(self, keyframe: KeyframeReport) -> None:
+        """Tell ground stations of a keyframe."""
+        self._do(lambda: self._companion.report(keyframe))
+
+    def send(self, message: object) -> None:
+        """Send a message of the onboard computer to everyone, such as an odometry."""
+        self._do(lambda: self._companion.send(message))
+
+    def parameter(self, name: str) -> float:
+        """The value of a parameter."""
+        return self._companion.parameters[name]
+
+    def record(self, path: Path | None) -> None:
+        """Keep a .tlog of all links in a file from now on; None ends it."""
+        if path is None:
+            self.recorder.close()
+        else:
+            self.recorder.open(path)
+
+    def boot_time_us(self, time_ns: int) -> int | None:
+        """The autopilot's boot clock in us at one of our monotonic times; None when unknown."""
+        clock = self._companion.boot_clock()
+        offset = None if clock is None else clock.offset_ns
+        return None if offset is None else (time_ns - offset) // 1000
+
+    def report(self) -> VehicleReport:
+        """A snapshot for health pages and ``doctor``."""
+        seen = self.presence.autopilot_seen_ns
+        round_trip = self._companion.timesync.round_trip_ns
+        return VehicleReport(
+            tuple(
+                LinkReport(
+                    link.spec.name,
+                    link.is_up,
+                    link.opened,
+                    link.received_bytes,
+                    link.sent_bytes,
+                    framer.packets,
+                    framer.skipped_bytes,
+                    link.last_error,
+                )
+                for link, framer in zip(self._links, self._framers, strict=True)
+            ),
+            self.presence.system,
+            self.presence.autopilot,
+            None if seen is None else (time.monotonic_ns() - seen) / S,
+            self.presence.is_armed,
+            None if round_trip is None else round_trip * 1e-6,
+            0 if self._signing is None else self._signing.refused,
+            self._dropped,
+        )
+
+    # Threads.
+
+    def _on_data(self, index: int, data: bytes, now_ns: int) -> None:
+        for packet in self._framers[index].feed(data):
+            self.recorder.write(packet.data, now_ns)
+            self._do(lambda packet=packet: self._hear(index, packet, now_ns))  # type: ignore[misc]
+
+    def _hear(self, index: int, packet: Packet, now_ns: int) -> None:
+        if self._signing is not None and not self._signing.accepts(packet):
+            return
+        self._companion.receive(index, packet, now_ns)
+
+    def _do(self, job: Callable[[], object]) -> None:
+        try:
+            self._jobs.put_nowait(job)
+        except queue.Full:
+            self._dropped += 1
+
+    def _run(self) -> None:
+        """The protocol's thread, the only one that touches the companion."""
+        save_ns = time.monotonic_ns() + SAVE_EVERY_NS
+        while not self._stop.is_set():
+            wait_s = max(0.0, (self._companion.next_timer() - time.monotonic_ns()) / S)
+            try:
+                with contextlib.suppress(queue.Empty):
+                    self._jobs.get(timeout=min(1.0, wait_s) or 1e-4)()
+                    for _ in range(BATCH):
+                        self._jobs.get_nowait()()
+                self._companion.tick(time.monotonic_ns())
+            except Exception:
+                # A fault in what the service does on a command must not cost the link.
+                log.exception("a fault while serving MAVLink")
+            now_ns = self._alive_ns = time.monotonic_ns()
+            self._send(self._companion.take())
+            if now_ns >= save_ns or self._memory.is_stale(self._companion.parameters.revision):
+                save_ns = now_ns + SAVE_EVERY_NS
+                self._save()
+        self._send(self._companion.take())
+
+    def _beat(self) -> None:
+        """The heartbeats' thread."""
+        while not self._stop.is_set():
+            now_ns = time.monotonic_ns()
+            due = self.presence.due(now_ns)
+            if now_ns - self._alive_ns < STUCK_NS:  # else nobody would answer: say nothing
+                self._send(due)
+            self._stop.wait(max(0.001, (self.presence.next_timer() - time.monotonic_ns()) / S))
+
+    def _send(self, messages: list[Outgoing]) -> None:
+        if not messages:
+            return
+        now_ns, unix_ns = time.monotonic_ns(), time.time_ns()
+        system = self.presence.system
+        for outgoing in messages:
+            for i, link in enumerate(self._links):
+                if outgoing.link is not None and outgoing.link != i:
+                    continue
+                data = self._packers[i].pack(system, outgoing, unix_ns)
+                if data is not None:
+                    link.write(data)
+                    self.recorder.write(data, now_ns)
+
+    def _save(self) -> None:
+        parameters = self._companion.parameters
+        timestamp = 0 if self._signing is None else self._signing.timestamp
+        self._memory.save(parameters.values(), parameters.revision, timestamp)
+
+
+class _Memory:
+    """Parameters and signing time, kept in a file over restarts."""
+
+    def __init__(self, folder: Path | None) -> None:
+        self._path = None if folder is None else folder / "mavlink.json"
+        self._revision = 0
+        self.parameters: dict[str, float] = {}
+        self.signing_timestamp = 0
+        if self._path is None or not self._path.is_file():
+            return
+        try:
+            kept = json.loads(self._path.read_text())
+            self.parameters = {str(k): float(v) for k, v in kept["parameters"].items()}
+            self.signing_timestamp = int(kept["signing_timestamp"])
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            log.warning("%s is not used: %s", self._path, error)
+
+    def is_stale(self, revision: int) -> bool:
+        """True when parameters have changed since the last save."""
+        return self._path is not None and revision != self._revision
+
+    def save(self, values: dict[str, float], revision: int, timestamp: int) -> None:
+        """Keep them; a full disk is logged, not raised."""
+        self._revision = revision
+        if self._path is None:
+            return
+        fresh = self._path.with_suffix(".new")
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            fresh.write_text(json.dumps({"parameters": values, "signing_timestamp": timestamp}))
+            os.replace(fresh, self._path)
+        except OSError as error:
+            log.error("parameters could not be kept: %s", error)
