@@ -131,13 +131,19 @@ class DatalinkConfig:
 
     connect: tuple[str, ...] = key((), "ground stations to call: tcp/192.168.144.11:7447")
     listen: tuple[str, ...] = key((), "endpoints to be called on")
-    budget_kbit_s: float = key(1000.0, "what all of ours together may use of the link", live=True)
+    budget_kbit_s: float = key(1000.0, "rate of the link to the ground", live=True)
+    share: float = key(0.65, "of that rate, how much all of ours together may use", live=True)
+    plain: bool = key(False, "allow endpoints without TLS beyond this machine")
+    tls_ca: str = key("", "fleet's certificate authority (PEM), from 'skyrelief keys'")
+    tls_certificate: str = key("", "this aircraft's certificate (PEM)")
+    tls_key: str = key("", "this aircraft's private key (PEM)")
     drain_s: float = key(20.0, "after a replay, wait so long for the ground to fetch the rest")
 
     def __post_init__(self) -> None:
         """Check ranges and the form of the endpoints."""
         _within("datalink.budget_kbit_s", self.budget_kbit_s, 1, 10_000_000)
         _within("datalink.drain_s", self.drain_s, 0, 86_400)
+        _within("datalink.share", self.share, 0.01, 1.0)
         for endpoint in (*self.connect, *self.listen):
             if not re.fullmatch(r"[a-z]+/.+", endpoint):
                 raise ValueError(f"datalink endpoint {endpoint!r} is not like tcp/HOST:7447")

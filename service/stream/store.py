@@ -14,7 +14,7 @@ import sqlite3
 import threading
 import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ import numpy as np
 from recon.types import DepthMap, Keyframe, Pose
 from service.errors import InputError, OutsideError
 from service.stream import codec, layer
+from service.stream.ranges import RangeSet
 from service.stream.records import (
     PoseRecord,
     Repose,
@@ -37,6 +38,7 @@ from service.stream.records import (
 
 log = logging.getLogger(__name__)
 
+Listener = Callable[[str, int], None]
 SCHEMA_VERSION = 1
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
@@ -67,8 +69,7 @@ class ScanStore:
         self.quota_bytes = quota_bytes
         self.refused = 0
         self._lock = threading.RLock()
-        self._changed = threading.Condition(self._lock)
-        self._version = 0
+        self._listeners: list[Listener] = []
         try:
             self._db = sqlite3.connect(path, check_same_thread=False, timeout=10.0)
             self._db.execute("PRAGMA journal_mode=WAL")
@@ -82,6 +83,7 @@ class ScanStore:
             raise InputError(f"{path} is not a scan database ({error})") from error
         row = self._db.execute("SELECT TOTAL(LENGTH(data)) FROM chunks").fetchone()
         self.chunk_bytes = int(row[0])
+        self._load_numbers()
 
     @classmethod
     def create(
@@ -137,7 +139,7 @@ class ScanStore:
     def put_header(self, header: ScanHeader) -> None:
         """Replace the whole header."""
         with self._lock:
-            self._write([("INSERT OR REPLACE INTO meta VALUES (?, ?)", _header_row(header))])
+            self._set_whole("header", header.to_json())
             self._header = header
 
     @property
@@ -153,8 +155,7 @@ class ScanStore:
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Close the scan with its ``summary`` (must be JSON)."""
-        row = ("summary", json.dumps(summary, sort_keys=True))
-        self._write([("INSERT OR REPLACE INTO meta VALUES (?, ?)", row)])
+        self._set_whole("summary", json.dumps(summary, sort_keys=True).encode())
 
     # Chunks
 
@@ -168,12 +169,10 @@ class ScanStore:
         if any(head is None or head.seq != seq for head in heads):
             raise ValueError(f"not the layers of keyframe {seq}")
         with self._lock:
-            before = self._db.total_changes
             room = self._room(sum(map(len, layers)))
             kept = layers if room else layers[:1]
             self.refused += len(layers) - len(kept)
-            self._write([_chunk_row(data) for data in kept])
-            return self._db.total_changes - before
+            return self._put_chunks(kept)
 
     def add_chunk(self, data: bytes) -> bool:
         """Store one coded layer; False when it is there already, unsound or over the quota."""
@@ -184,9 +183,22 @@ class ScanStore:
             if head.layer > 0 and not self._room(len(data)):
                 self.refused += 1
                 return False
-            before = self._db.total_changes
-            self._write([_chunk_row(data)])
-            return self._db.total_changes > before
+            return self._put_chunks([data]) > 0
+
+    def _put_chunks(self, layers: Sequence[bytes]) -> int:
+        heads = [head for data in layers if (head := layer.peek(data)) is not None]
+        sql = "INSERT OR IGNORE INTO chunks VALUES (?, ?, ?, ?, ?, ?, ?)"
+        with self._lock:
+            fresh = [
+                (head, data)
+                for head, data in zip(heads, layers, strict=True)
+                if head.seq not in self._numbers.setdefault(f"k{head.layer}", RangeSet())
+            ]
+            self._write([(sql, _chunk_row(head, data)) for head, data in fresh])
+            for head, data in fresh:
+                self.chunk_bytes += len(data)
+                self._note(f"k{head.layer}", head.seq)
+            return len(fresh)
 
     def chunk(self, seq: int, number: int) -> bytes | None:
         """The coded layer ``number`` of keyframe ``seq``."""
@@ -236,12 +248,20 @@ class ScanStore:
         pose = unpack_pose(data)
         if pose is None:
             return False
-        row = (number, pose.time_unix_ns, data)
-        return self._write([("INSERT OR IGNORE INTO poses VALUES (?, ?, ?)", row)]) > 0
+        with self._lock:
+            if number in self._numbers["pose"]:
+                return False
+            row = (number, pose.time_unix_ns, data)
+            self._write([("INSERT INTO poses VALUES (?, ?, ?)", row)])
+            self._note("pose", number)
+            return True
 
     def poses(self) -> Iterator[PoseRecord]:
-        """All poses in order of time."""
-        for (data,) in self._all("SELECT data FROM poses ORDER BY time_unix_ns, id"):
+        """All poses in order of time; of several for one time the newest, which corrects it."""
+        newest = "SELECT MAX(id) FROM poses GROUP BY time_unix_ns"
+        for (data,) in self._all(
+            f"SELECT data FROM poses WHERE id IN ({newest}) ORDER BY time_unix_ns"
+        ):
             pose = unpack_pose(bytes(data))
             if pose is not None:
                 yield pose
@@ -258,8 +278,24 @@ class ScanStore:
         repose = unpack_repose(data)
         if repose is None:
             return False
-        row = (number, repose.seq, repose.revision, data)
-        return self._write([("INSERT OR IGNORE INTO reposes VALUES (?, ?, ?, ?)", row)]) > 0
+        with self._lock:
+            if number in self._known_reposes:
+                return False
+            row = (number, repose.seq, repose.revision, data)
+            self._write([("INSERT INTO reposes VALUES (?, ?, ?, ?)", row)])
+            self._enforce(number, repose.seq, repose.revision)
+            return True
+
+    def _enforce(self, number: int, seq: int, revision: int) -> None:
+        """Note a re-pose; of each keyframe only the one in force is offered to the link."""
+        self._known_reposes.add(number)
+        before = self._in_force.get(seq)
+        if before is not None and before[0] > revision:
+            return
+        if before is not None:
+            self._numbers["repose"].discard(before[1])
+        self._in_force[seq] = (revision, number)
+        self._note("repose", number)
 
     def repose(self, seq: int) -> Repose | None:
         """The newest re-pose of keyframe ``seq``."""
@@ -270,51 +306,101 @@ class ScanStore:
     # What the link asks
 
     def record(self, kind: str, number: int) -> bytes | None:
-        """The stored bytes of item ``number`` of a kind: "pose", "repose", "k0", "k1" …"""
+        """The stored bytes of item ``number`` of a kind of :mod:`service.stream.parts`.
+
+        Header and summary are numbered by the CRC-32 of their JSON, so that a change shows.
+        """
+        if kind in ("header", "summary"):
+            text = self._get(kind)
+            data = b"" if text is None else text.encode()
+            return data if zlib.crc32(data) == number else None
         if kind.startswith("k"):
             return self.chunk(number, int(kind[1:]))
         table = {"pose": "poses", "repose": "reposes"}[kind]
         row = self._one(f"SELECT data FROM {table} WHERE id = ?", (number,))
         return None if row is None else bytes(row[0])
 
-    def numbers(self) -> dict[str, list[int]]:
-        """Kind to the sorted numbers of what is stored; of re-poses only those in force."""
-        newest = "SELECT id FROM reposes r WHERE revision = (SELECT MAX(revision) FROM reposes"
-        with self._lock:
-            out = {
-                "pose": [r[0] for r in self._all("SELECT id FROM poses ORDER BY id")],
-                "repose": [r[0] for r in self._all(f"{newest} WHERE seq = r.seq) ORDER BY id")],
-            }
-            for seq, number in self._all("SELECT seq, layer FROM chunks ORDER BY seq"):
-                out.setdefault(f"k{number}", []).append(seq)
-        return out
+    def put_record(self, kind: str, number: int, data: bytes) -> bool:
+        """Store what :meth:`record` gave at the other end; False if unsound or no news."""
+        if kind == "pose":
+            return self.put_pose(number, data)
+        if kind == "repose":
+            return self.put_repose(number, data)
+        if kind in ("header", "summary"):
+            return self._put_whole(kind, number, data)
+        return self.add_chunk(data)
 
-    def set_held(self, peer: str, ranges: dict[str, list[tuple[int, int]]]) -> None:
-        """Note what ``peer`` says it holds: kind to inclusive ranges of numbers."""
+    def _put_whole(self, kind: str, number: int, data: bytes) -> bool:
+        with self._lock:
+            if number in self._numbers[kind] or zlib.crc32(data) != number:
+                return False
+            header = header_from_json(data) if kind == "header" else self._header
+            if header is None or not _is_object(data):
+                return False
+            self._set_whole(kind, data)
+            self._header = header
+            return True
+
+    def numbers(self) -> dict[str, RangeSet]:
+        """Kind to the numbers of what is stored; of re-poses only those in force."""
+        with self._lock:
+            return {kind: ranges.copy() for kind, ranges in self._numbers.items() if ranges}
+
+    def numbers_of(self, kind: str) -> RangeSet:
+        """The numbers of what is stored of one kind; not to be changed."""
+        return self._numbers.get(kind, RangeSet())
+
+    def listen(self, listener: Listener) -> None:
+        """Have ``listener(kind, number)`` called after each new item, by the writing thread."""
+        with self._lock:
+            self._listeners.append(listener)
+
+    def unlisten(self, listener: Listener) -> None:
+        """End what :meth:`listen` began."""
+        with self._lock:
+            self._listeners.remove(listener)
+
+    def _note(self, kind: str, number: int) -> None:
+        self._numbers[kind].add(number)
+        for listener in self._listeners:
+            listener(kind, number)
+
+    def _set_whole(self, kind: str, data: bytes) -> None:
+        with self._lock:
+            self._set(kind, data.decode())
+            self._note_whole(kind, data)
+
+    def _note_whole(self, kind: str, data: bytes) -> None:
+        self._numbers[kind] = RangeSet()
+        self._note(kind, zlib.crc32(data))
+
+    def _load_numbers(self) -> None:
+        self._numbers: dict[str, RangeSet] = {"header": RangeSet(), "summary": RangeSet()}
+        self._numbers["pose"] = RangeSet.of(r[0] for r in self._all("SELECT id FROM poses"))
+        self._numbers["repose"] = RangeSet()
+        self._known_reposes = RangeSet()
+        self._in_force: dict[int, tuple[int, int]] = {}
+        for number, seq, revision in self._all("SELECT id, seq, revision FROM reposes ORDER BY id"):
+            self._enforce(number, seq, revision)
+        for kind in ("header", "summary"):
+            text = self._get(kind)
+            if text is not None:
+                self._note_whole(kind, text.encode())
+        for seq, number in self._all("SELECT seq, layer FROM chunks ORDER BY layer, seq"):
+            self._numbers.setdefault(f"k{number}", RangeSet()).add(seq)
+
+    def set_held(self, peer: str, numbers: dict[str, RangeSet]) -> None:
+        """Note what ``peer`` says it holds."""
         sql = "INSERT OR REPLACE INTO held VALUES (?, ?, ?)"
-        self._write(
-            [(sql, (peer, kind, json.dumps(value))) for kind, value in ranges.items()],
-            news=False,
-        )
+        rows = [(peer, kind, json.dumps(ranges.pairs())) for kind, ranges in numbers.items()]
+        self._write([(sql, row) for row in rows])
 
-    def held(self) -> dict[str, dict[str, list[tuple[int, int]]]]:
+    def held(self) -> dict[str, dict[str, RangeSet]]:
         """Peer to what it said it holds."""
-        out: dict[str, dict[str, list[tuple[int, int]]]] = {}
+        out: dict[str, dict[str, RangeSet]] = {}
         for peer, kind, text in self._all("SELECT peer, kind, ranges FROM held"):
-            out.setdefault(peer, {})[kind] = [(a, b) for a, b in json.loads(text)]
+            out.setdefault(peer, {})[kind] = RangeSet((a, b) for a, b in json.loads(text))
         return out
-
-    @property
-    def version(self) -> int:
-        """A count that grows with every change made through this object."""
-        with self._lock:
-            return self._version
-
-    def wait(self, version: int, timeout_s: float) -> int:
-        """The present version, once it differs from ``version`` or the time is up."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._version != version, timeout_s)
-            return self._version
 
     # SQL
 
@@ -351,35 +437,21 @@ class ScanStore:
         with self._lock:
             return self._db.execute(sql).fetchall()
 
-    def _write(self, statements: list[tuple[str, tuple[Any, ...]]], news: bool = True) -> int:
-        """Run the statements in one transaction; how many rows changed."""
-        with self._changed:
-            before = self._db.total_changes
+    def _write(self, statements: list[tuple[str, tuple[Any, ...]]]) -> None:
+        """Run the statements in one transaction."""
+        with self._lock:
             try:
                 with self._db:
                     for sql, values in statements:
-                        changed = self._db.execute(sql, values).rowcount
-                        if changed > 0 and "INTO chunks" in sql:
-                            self.chunk_bytes += len(values[-1])
-            except sqlite3.OperationalError as error:
+                        self._db.execute(sql, values)
+            except sqlite3.Error as error:
                 raise OutsideError(
                     f"cannot write {self.path} ({error}); free some space or check the disk"
                 ) from error
-            if news:
-                self._version += 1
-                self._changed.notify_all()
-            return self._db.total_changes - before
 
 
-def _header_row(header: ScanHeader) -> tuple[str, str]:
-    return ("header", header.to_json().decode())
-
-
-def _chunk_row(data: bytes) -> tuple[str, tuple[Any, ...]]:
-    head = layer.peek(data)
-    if head is None:
-        raise ValueError("not a coded layer")
-    return "INSERT OR IGNORE INTO chunks VALUES (?, ?, ?, ?, ?, ?, ?)", (
+def _chunk_row(head: layer.LayerHead, data: bytes) -> tuple[Any, ...]:
+    return (
         head.seq,
         head.layer,
         head.layers,
@@ -388,6 +460,14 @@ def _chunk_row(data: bytes) -> tuple[str, tuple[Any, ...]]:
         time.time_ns(),
         data,
     )
+
+
+def _is_object(data: bytes) -> bool:
+    """Whether ``data`` is a JSON object in UTF-8."""
+    try:
+        return isinstance(json.loads(data), dict)
+    except (ValueError, RecursionError):
+        return False
 
 
 def _reposed(keyframe: Keyframe, repose: Repose | None) -> Keyframe:

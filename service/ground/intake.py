@@ -1,0 +1,194 @@
+"""The ground's side of the datalink for one scan, without sockets or clocks.
+
+It knows what the drone says it has, stores what comes, and says what to ask for: what was
+not on its way a moment ago, small records first, then the newest and coarsest.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from dataclasses import dataclass, field
+
+from service.stream.messages import Ask, Head, Held, Numbers, missing
+from service.stream.parts import Assembler, parse
+from service.stream.ranges import RangeSet
+from service.stream.store import ScanStore
+
+log = logging.getLogger(__name__)
+
+SMALL, FINE = range(2)
+"""The two requests that may be under way: small records and coarse layers; fine layers."""
+
+GRACE_S = 1.0
+"""An item the drone has had for less than this may still come by itself."""
+STALL_S = 8.0
+REST_S = 2.0
+"""Pause after a request that brought nothing."""
+
+BATCH = {"header": 1, "summary": 1, "repose": 64, "pose": 64, "k0": 8}
+"""How many items of a kind one request names; the order is that of asking."""
+FINE_BATCH = 2
+
+
+@dataclass(slots=True)
+class Progress:
+    """How a scan's reception goes."""
+
+    received_bytes: int = 0
+    duplicates: int = 0  # records that came although held
+    unsound: int = 0  # records that did not hold together
+    lag_s: dict[str, deque[float]] = field(default_factory=dict)  # by kind, the last 200
+    asked: int = 0  # requests made
+
+
+@dataclass(slots=True)
+class _Request:
+    kind: str
+    numbers: RangeSet
+    serial: int
+    news_at: float
+    brought: int = 0
+
+
+class ScanIntake:
+    """Reception of one scan. Times are the caller's: seconds, monotonic."""
+
+    def __init__(self, store: ScanStore, peer: str) -> None:
+        self.store = store
+        self.progress = Progress()
+        self.head: Head | None = None
+        self.head_at = -1e9
+        self._peer = peer
+        self._assembler = Assembler()
+        self._heads: deque[tuple[float, Head]] = deque()
+        self._seen: dict[tuple[str, int], float] = {}
+        self._requests: dict[int, _Request] = {}
+        self._rest_until: dict[int, float] = {}
+        self._given_up: Numbers = {}
+
+    # What comes
+
+    def on_head(self, head: Head, now: float) -> None:
+        """The drone says what it has."""
+        held = self.store.numbers()
+        for kind, numbers in missing(head.numbers, held).items():
+            if kind.startswith("k"):
+                for number in numbers:
+                    self._seen.setdefault((kind, number), now)
+        self.head, self.head_at = head, now
+        self._heads.append((now, head))
+
+    def on_items(self, message: bytes, now: float) -> bool:
+        """Parts of records; True when something new was stored.
+
+        Raises OutsideError when the disk is full; the records will be asked for again.
+        """
+        self.progress.received_bytes += len(message)
+        news = False
+        for part in parse(message):
+            if part.number in self.store.numbers_of(part.kind):
+                self.progress.duplicates += part.index == 0
+                continue
+            for request in self._requests.values():
+                request.news_at = now if request.kind == part.kind else request.news_at
+            record = self._assembler.add(part, now)
+            if record is not None:
+                news = self._store(part.kind, part.number, record, now) or news
+        return news
+
+    def _store(self, kind: str, number: int, record: bytes, now: float) -> bool:
+        refused = self.store.refused
+        if not self.store.put_record(kind, number, record):
+            if self.store.refused > refused:
+                log.warning("quota reached: %s %d of %s is not kept", kind, number, self.store.path)
+            else:
+                self.progress.unsound += 1
+            self._given_up.setdefault(kind, RangeSet()).add(number)
+            return False
+        for request in self._requests.values():
+            request.brought += request.kind == kind
+        seen = self._seen.pop((kind, number), now)
+        self.progress.lag_s.setdefault(kind, deque(maxlen=200)).append(now - seen)
+        return True
+
+    # What to say
+
+    def held(self) -> Held:
+        """The report for the drone."""
+        return Held(self.store.numbers(), self.progress.received_bytes)
+
+    def missing(self) -> Numbers:
+        """What the drone has and this side lacks, as far as it can be had."""
+        if self.head is None:
+            return {}
+        return missing(missing(self.head.numbers, self.store.numbers()), self._given_up)
+
+    @property
+    def complete(self) -> bool:
+        """Whether the scan is finished and all of it is here that can be had."""
+        return self.head is not None and self.head.finished and not self.missing()
+
+    def next_ask(self, slot: int, now: float) -> tuple[str, RangeSet, Ask] | None:
+        """What to ask for in a slot that is free: kind, numbers, and what goes with it."""
+        if not self._free(slot, now):
+            return None
+        due = self._due(now)
+        fine = sorted(kind for kind in due if kind.startswith("k") and kind != "k0")
+        for kind in BATCH if slot == SMALL else fine:
+            numbers = self._newest(kind, due.get(kind, RangeSet()), now)
+            if not numbers:
+                continue
+            first = next(iter(numbers.newest_first()))
+            parts = self._assembler.missing_parts(kind, first)
+            ask = Ask(self._peer)
+            if parts:
+                numbers = RangeSet([(first, first)])
+                ask = Ask(self._peer, RangeSet.of(parts), self._assembler.count(kind, first))
+            self.progress.asked += 1
+            self._requests[slot] = _Request(kind, numbers, self.progress.asked, now)
+            return kind, numbers, ask
+        return None
+
+    def answered(self, slot: int, serial: int, now: float) -> None:
+        """The ``serial``-th request, made in ``slot``, is over, answered or not."""
+        request = self._requests.get(slot)
+        if request is None or request.serial != serial:
+            return
+        del self._requests[slot]
+        if request.brought == 0:
+            self._rest_until[slot] = now + REST_S
+
+    def _free(self, slot: int, now: float) -> bool:
+        request = self._requests.get(slot)
+        if request is not None:
+            if now - request.news_at < STALL_S:
+                return False
+            self.answered(slot, request.serial, now)
+        return now >= self._rest_until.get(slot, 0.0)
+
+    def _due(self, now: float) -> Numbers:
+        """Missing items that the drone has had for a while and is not about to send itself."""
+        if self.head is None:
+            return {}
+        while len(self._heads) > 1 and self._heads[1][0] <= now - GRACE_S:
+            self._heads.popleft()
+        at, ripe = self._heads[0]
+        due = self.missing()
+        if now - at < GRACE_S:
+            return {kind: due[kind] for kind in ("header", "summary") if kind in due}
+        young = missing(self.head.numbers, ripe.numbers)
+        young.pop("header", None)
+        young.pop("summary", None)
+        return missing(missing(due, young), self.head.live)
+
+    def _newest(self, kind: str, due: RangeSet, now: float) -> RangeSet:
+        out = RangeSet()
+        room = BATCH.get(kind, FINE_BATCH)
+        for number in due.newest_first():
+            touched = self._assembler.touched(kind, number)
+            if touched is None or now - touched >= GRACE_S:
+                out.add(number)
+            if len(out) >= room:
+                break
+        return out

@@ -1,0 +1,255 @@
+"""The drone's end of the datalink: offers what the store gets to whoever listens."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from service.config import DatalinkConfig
+from service.errors import OutsideError, SkyreliefError
+from service.stream.lanes import Outgoing
+from service.stream.messages import unpack_ask, unpack_held
+from service.stream.outbox import Outbox
+from service.stream.ranges import ranges_from_text
+from service.stream.session import ROOT, SessionConfig, check_endpoints, check_name, open_session
+from service.stream.store import ScanStore
+
+if TYPE_CHECKING:
+    import zenoh
+
+log = logging.getLogger(__name__)
+
+MAX_WAITING_EVENTS = 100_000
+RETRY_S = 1.0
+
+PRIORITIES = ("REAL_TIME", "INTERACTIVE_HIGH", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND")
+"""Zenoh's priority of each lane of the outbox."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkProgress:
+    """How far the datalink has got with the scans it offers."""
+
+    connected: bool  # to a router
+    listened: bool  # a ground station was heard of late
+    items: int  # in the stores: poses, layers …
+    lacking: dict[str, int] = field(default_factory=dict)  # by kind, at the best ground station
+    sent_bytes: int = 0
+    left_for_later: int = 0  # live items that made way; a ground station asks for them
+
+    @property
+    def complete(self) -> bool:
+        """Whether a ground station holds everything."""
+        return self.items > 0 and not self.lacking
+
+
+class DatalinkSender:
+    """Publishes a scan while it grows, and answers what ground stations ask for.
+
+    All puts happen on a thread of its own. Without endpoints in ``config`` nothing is opened.
+    Raises InputError when an endpoint or a name cannot be used; a ground station that is not
+    there yet is waited for.
+    """
+
+    def __init__(self, store: ScanStore, config: DatalinkConfig) -> None:
+        self._config = config
+        self._drone = check_name(store.header.drone, "drone")
+        self._session_config = SessionConfig(
+            mode="router" if config.listen or len(config.connect) > 1 else "client",
+            connect=config.connect,
+            listen=config.listen,
+            plain=config.plain,
+            tls_ca=config.tls_ca,
+            tls_certificate=config.tls_certificate,
+            tls_key=config.tls_key,
+        )
+        check_endpoints(self._session_config)
+        self._lock = threading.Lock()  # of the outbox
+        self._outbox = Outbox(_rate(config.budget_kbit_s, config.share), time.monotonic())
+        self._stores: list[tuple[ScanStore, Callable[[str, int], None]]] = []
+        self._events: deque[Callable[[float], None]] = deque(maxlen=MAX_WAITING_EVENTS)
+        self._wake = threading.Event()
+        self._stop = threading.Event()
+        self._connected = False
+        self._queries: dict[int, Any] = {}
+        self._thread: threading.Thread | None = None
+        self.add(store)
+        if config.connect or config.listen:
+            self._thread = threading.Thread(target=self._run, name="datalink", daemon=True)
+            self._thread.start()
+
+    # The scan's side
+
+    def add(self, store: ScanStore) -> None:
+        """Offer another scan of this drone too, such as one that the ground still lacks."""
+        scan_id = check_name(store.header.scan_id, "scan")
+
+        def news(kind: str, number: int) -> None:
+            self._post(lambda now: self._outbox.news(scan_id, kind, number, now))
+
+        with self._lock:
+            self._outbox.add(store, time.monotonic())
+        store.listen(news)
+        self._stores.append((store, news))
+        self._wake.set()
+
+    def set_budget(self, budget_kbit_s: float, share: float | None = None) -> None:
+        """Change the link's rate, in flight."""
+        rate = _rate(budget_kbit_s, self._config.share if share is None else share)
+        self._post(lambda now: self._outbox.bucket.set_rate(rate, now))
+
+    @property
+    def progress(self) -> LinkProgress:
+        """Where things stand."""
+        with self._lock:
+            items = 0
+            lacking: dict[str, int] = {}
+            for store, _ in self._stores:
+                items += sum(map(len, store.numbers().values()))
+                for kind, numbers in self._outbox.lacking(store.header.scan_id).items():
+                    lacking[kind] = lacking.get(kind, 0) + len(numbers)
+            return LinkProgress(
+                self._connected,
+                self._outbox.listened(time.monotonic()),
+                items,
+                lacking,
+                self._outbox.sent_bytes,
+                self._outbox.skipped,
+            )
+
+    def drain(self, timeout_s: float) -> bool:
+        """Wait until a ground station holds everything; False when the time is up."""
+        deadline = time.monotonic() + timeout_s
+        while not self.progress.complete:
+            if self._thread is None or time.monotonic() >= deadline:
+                return False
+            time.sleep(0.05)
+        return True
+
+    def close(self) -> None:
+        """Stop sending; the stores stay open."""
+        self._stop.set()
+        self._wake.set()
+        if self._thread is not None:
+            self._thread.join(timeout=5.0)
+            self._thread = None
+        for store, news in self._stores:
+            store.unlisten(news)
+        self._stores.clear()
+
+    def _post(self, event: Callable[[float], None]) -> None:
+        self._events.append(event)
+        self._wake.set()
+
+    # The link's side
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                session = open_session(self._session_config)
+            except OutsideError as error:
+                log.debug("%s", error)
+                self._stop.wait(RETRY_S)
+                continue
+            except SkyreliefError as error:
+                log.error("datalink stays closed: %s", error)
+                return
+            log.info("datalink open")
+            try:
+                self._serve(session)
+            finally:
+                self._connected = False
+                session.close()
+
+    def _serve(self, session: zenoh.Session) -> None:
+        import zenoh
+
+        base = f"{ROOT}/{self._drone}"
+        subscriber = session.declare_subscriber(f"{base}/*/held/*", self._on_held)
+        queryable = session.declare_queryable(f"{base}/*/item/*/*", self._on_query)
+        heads = session.declare_queryable(f"{base}/*/head", self._on_look)
+        try:
+            while not self._stop.is_set() and not session.is_closed():
+                self._connected = True
+                self._wake.clear()
+                with self._lock:
+                    while self._events:
+                        self._events.popleft()(time.monotonic())
+                    todo = self._outbox.next(time.monotonic())
+                if isinstance(todo, Outgoing):
+                    self._send(session, todo)
+                else:
+                    self._wake.wait(todo)
+        finally:
+            try:
+                subscriber.undeclare()
+                queryable.undeclare()
+                heads.undeclare()
+            except zenoh.ZError as error:
+                log.debug("datalink closing: %s", error)
+
+    def _send(self, session: zenoh.Session, message: Outgoing) -> None:
+        import zenoh
+
+        key = f"{ROOT}/{self._drone}/{message.scan_id}/{message.topic}"
+        try:
+            if message.token is None:
+                session.put(
+                    key,
+                    message.payload,
+                    priority=getattr(zenoh.Priority, PRIORITIES[message.lane]),
+                    congestion_control=zenoh.CongestionControl.DROP,
+                    express=message.lane < 2,
+                )
+                return
+            query = self._queries.get(int(str(message.token)))
+            if query is not None and message.payload:
+                query.reply(key, message.payload)
+        except zenoh.ZError as error:
+            log.debug("datalink dropped %s: %s", key, error)
+        if message.last:
+            self._end(int(str(message.token)))
+
+    def _end(self, token: int) -> None:
+        query = self._queries.pop(token, None)
+        if query is not None:
+            query.drop()
+
+    # Zenoh's threads
+
+    def _on_held(self, sample: zenoh.Sample) -> None:
+        held = unpack_held(sample.payload.to_bytes())
+        parts = str(sample.key_expr).split("/")
+        if held is not None and len(parts) == 5:
+            scan_id, peer = parts[2], parts[4]
+            self._post(lambda now: self._outbox.held(scan_id, peer, held, now))
+
+    def _on_look(self, query: zenoh.Query) -> None:
+        query.drop()
+        self._post(self._outbox.tell)
+
+    def _on_query(self, query: zenoh.Query) -> None:
+        parts = str(query.key_expr).split("/")
+        ask = unpack_ask(query.payload.to_bytes()) if query.payload is not None else None
+        numbers = ranges_from_text(parts[5]) if len(parts) == 6 else None
+        if ask is None or numbers is None:
+            query.drop()
+            return
+        scan_id, kind = parts[2], parts[4]
+
+        def asked(now: float) -> None:
+            token = id(query)
+            self._queries[token] = query
+            for ended in self._outbox.ask(scan_id, kind, numbers, ask, token, now):
+                self._end(int(str(ended)))
+
+        self._post(asked)
+
+
+def _rate(budget_kbit_s: float, share: float) -> float:
+    return budget_kbit_s * 1000 / 8 * share

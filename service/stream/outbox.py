@@ -1,0 +1,185 @@
+"""The drone's side of the datalink, without sockets or clocks: what to send next, and when.
+
+Lanes in order: status, pose, coarse live, small records and coarse layers asked for, fine
+live, fine layers asked for. Everything is paid from one token bucket. Live lanes are short
+and newest first: what does not fit waits in the store until a ground station asks for it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Hashable
+from dataclasses import dataclass, field, replace
+from itertools import islice
+
+from service.stream.budget import TokenBucket, wire_bytes
+from service.stream.lanes import MAX_ASKED, AskedLane, LiveLane, Outgoing, Request
+from service.stream.messages import Ask, Head, Held, Numbers, missing, pack_head
+from service.stream.ranges import RangeSet
+from service.stream.store import ScanStore
+
+STATUS, POSE, COARSE, ASKED, FINE, BACKFILL = range(6)
+"""The lanes, most urgent first."""
+
+PEER_TIMEOUT_S = 8.0
+HEAD_AFTER_NEWS_S = 0.5
+HEAD_IDLE_S = 2.0
+HEAD_COMPLETE_S = 10.0
+
+
+@dataclass(slots=True, eq=False)
+class _Feed:
+    """One scan on offer."""
+
+    store: ScanStore
+    head_due: float
+    head_sent: float = -1e9
+    held: dict[str, Numbers] = field(default_factory=dict)
+
+
+class Outbox:
+    """Decides what the drone sends. All times are the caller's: seconds, monotonic."""
+
+    def __init__(self, rate_bytes_s: float, now: float) -> None:
+        self.bucket = TokenBucket(rate_bytes_s, now)
+        self.sent_bytes = 0  # on the wire, as the bucket counts
+        self._feeds: dict[str, _Feed] = {}
+        self._live = {POSE: LiveLane(64), COARSE: LiveLane(16), FINE: LiveLane(2)}
+        self._asked = {ASKED: AskedLane(), BACKFILL: AskedLane()}
+        self._heard: dict[str, float] = {}
+        self._head: Outgoing | None = None
+
+    def add(self, store: ScanStore, now: float) -> None:
+        """Offer a scan; one with the same id takes the place of the former."""
+        self._feeds[store.header.scan_id] = _Feed(store, head_due=now)
+
+    def remove(self, scan_id: str) -> None:
+        """Offer a scan no more."""
+        self._feeds.pop(scan_id, None)
+
+    @property
+    def skipped(self) -> int:
+        """Live items that made way and wait in the store."""
+        return sum(lane.skipped for lane in self._live.values())
+
+    # What happens
+
+    def news(self, scan_id: str, kind: str, number: int, now: float) -> None:
+        """The store of ``scan_id`` has a new item."""
+        feed = self._feeds.get(scan_id)
+        if feed is None:
+            return
+        feed.head_due = min(feed.head_due, max(now, feed.head_sent + HEAD_AFTER_NEWS_S))
+        if kind in ("header", "summary") or not self.listened(now):
+            return
+        lane = POSE if kind in ("pose", "repose") else COARSE if kind == "k0" else FINE
+        self._live[lane].push(feed.store, kind, number)
+
+    def held(self, scan_id: str, peer: str, report: Held, now: float) -> None:
+        """A ground station reports what it holds."""
+        self._hear(peer, now)
+        feed = self._feeds.get(scan_id)
+        if feed is not None:
+            feed.held[peer] = report.numbers
+
+    def ask(
+        self, scan_id: str, kind: str, numbers: RangeSet, ask: Ask, token: Hashable, now: float
+    ) -> list[Hashable]:
+        """A ground station asks for items; the tokens of requests that are over by this.
+
+        A request takes the place of the same station's former one in its lane.
+        """
+        self._hear(ask.peer, now)
+        feed = self._feeds.get(scan_id)
+        if feed is None:
+            return [token]
+        left: deque[int] = deque()
+        for number in islice(numbers.newest_first(), MAX_ASKED):
+            if not any(lane.sending(feed.store, kind, number) for lane in self._live.values()):
+                left.append(number)
+            for lane in self._live.values():
+                lane.discard(feed.store, kind, number)
+        small = kind == "k0" or not kind.startswith("k")
+        topic = f"item/{kind}/{numbers.text()}"
+        request = Request(feed.store, ask, kind, topic, left, token)
+        replaced = self._asked[ASKED if small else BACKFILL].push(request)
+        return [] if replaced is None else [replaced]
+
+    def tell(self, now: float) -> None:
+        """Send the heads as soon as may be: somebody new looks around."""
+        for feed in self._feeds.values():
+            feed.head_due = min(feed.head_due, max(now, feed.head_sent + HEAD_AFTER_NEWS_S))
+
+    def _hear(self, peer: str, now: float) -> None:
+        if not self.listened(now):
+            self.tell(now)
+        self._heard[peer] = now
+
+    # What to do
+
+    def next(self, now: float) -> Outgoing | float:
+        """The message to send now, or the seconds to wait; any event may shorten the wait."""
+        if not self.listened(now):
+            for lane in self._live.values():
+                lane.clear()
+        part_bytes = self.bucket.part_bytes
+        for number in range(6):
+            message = self._peek(number, part_bytes, now)
+            if message is None:
+                continue
+            size = wire_bytes(len(message.payload))
+            wait = self.bucket.ready_in(size, now)
+            if wait > 0:
+                return wait
+            self.bucket.take(size, now)
+            self.sent_bytes += size
+            self._pop(number)
+            return replace(message, lane=number)
+        due = min((feed.head_due for feed in self._feeds.values()), default=now + 1.0)
+        return min(1.0, max(0.001, due - now))
+
+    def _peek(self, lane: int, part_bytes: int, now: float) -> Outgoing | None:
+        if lane == STATUS:
+            return self._peek_head(now)
+        return (self._live.get(lane) or self._asked[lane]).peek(part_bytes)
+
+    def _pop(self, lane: int) -> None:
+        if lane == STATUS:
+            self._head = None
+        else:
+            (self._live.get(lane) or self._asked[lane]).pop()
+
+    def _peek_head(self, now: float) -> Outgoing | None:
+        if self._head is None:
+            for scan_id, feed in self._feeds.items():
+                if feed.head_due <= now:
+                    feed.head_sent = now
+                    feed.head_due = now + (
+                        HEAD_COMPLETE_S if self.complete(scan_id) else HEAD_IDLE_S
+                    )
+                    self._head = Outgoing(scan_id, "head", pack_head(self.head(scan_id)))
+                    break
+        return self._head
+
+    def head(self, scan_id: str) -> Head:
+        """What the drone has of a scan it offers. Raises KeyError for another."""
+        store = self._feeds[scan_id].store
+        live: Numbers = {}
+        for lane in self._live.values():
+            live.update(lane.numbers(store))
+        return Head(store.numbers(), live, store.finished)
+
+    def listened(self, now: float) -> bool:
+        """Whether any ground station was heard of late."""
+        return any(now - at < PEER_TIMEOUT_S for at in self._heard.values())
+
+    def lacking(self, scan_id: str) -> Numbers:
+        """What the best supplied ground station still lacks of a scan on offer."""
+        feed = self._feeds[scan_id]
+        numbers = feed.store.numbers()
+        lacks = [missing(numbers, held) for held in feed.held.values()]
+        return min(lacks, key=lambda m: sum(map(len, m.values())), default=numbers)
+
+    def complete(self, scan_id: str) -> bool:
+        """Whether some ground station holds everything that the scan has so far."""
+        return not self.lacking(scan_id)

@@ -1,0 +1,161 @@
+"""Records cut into paced parts, and put together again.
+
+A message on the datalink is a run of parts; a part carries a piece of one record (a chunk
+layer, a pose …). Bytes are in ``docs/wire.md``. Foreign bytes are dropped and counted.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+_HEAD = struct.Struct("<2sBBIHHIII")
+HEAD_BYTES = _HEAD.size
+MAGIC = b"SK"
+VERSION = 1
+MAX_RECORD_BYTES = 1 << 24
+MAX_PARTS = 65_535
+MAX_OPEN_RECORDS = 64
+MAX_OPEN_BYTES = 1 << 26
+"""Unfinished records beyond either limit make way, the stalest first."""
+
+KINDS = {0: "header", 1: "summary", 2: "pose", 3: "repose"} | {16 + k: f"k{k}" for k in range(8)}
+"""Code of a part to the kind of its record: ``k0`` is the coarsest layer of a keyframe."""
+CODES = {name: code for code, name in KINDS.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A piece of a record."""
+
+    kind: str
+    number: int
+    index: int
+    count: int
+    total_bytes: int
+    crc: int  # of the whole record
+    payload: bytes
+
+    def pack(self) -> bytes:
+        """The part as bytes."""
+        return (
+            _HEAD.pack(
+                MAGIC,
+                VERSION,
+                CODES[self.kind],
+                self.number,
+                self.index,
+                self.count,
+                self.total_bytes,
+                self.crc,
+                len(self.payload),
+            )
+            + self.payload
+        )
+
+
+def split(kind: str, number: int, record: bytes, part_bytes: int) -> list[Part]:
+    """The parts of ``record``, each of at most ``part_bytes`` of it."""
+    step = max(part_bytes, -(-len(record) // MAX_PARTS), 1)
+    count = max(1, -(-len(record) // step))
+    crc = zlib.crc32(record)
+    return [
+        Part(kind, number, k, count, len(record), crc, record[k * step : (k + 1) * step])
+        for k in range(count)
+    ]
+
+
+def parse(message: bytes) -> Iterator[Part]:
+    """The parts in a message, up to the first byte that does not belong."""
+    at = 0
+    while at + HEAD_BYTES <= len(message):
+        magic, version, code, number, index, count, total, crc, size = _HEAD.unpack_from(
+            message, at
+        )
+        at += HEAD_BYTES
+        if magic != MAGIC or version != VERSION or code not in KINDS or at + size > len(message):
+            return
+        if not (index < count and total <= MAX_RECORD_BYTES and size <= total):
+            return
+        yield Part(KINDS[code], number, index, count, total, crc, message[at : at + size])
+        at += size
+
+
+@dataclass(slots=True)
+class _Open:
+    count: int
+    total_bytes: int
+    crc: int
+    pieces: dict[int, bytes]
+    held_bytes: int = 0
+    touched: float = 0.0
+
+    def same(self, part: Part) -> bool:
+        return (part.count, part.total_bytes, part.crc) == (self.count, self.total_bytes, self.crc)
+
+
+class Assembler:
+    """Collects parts in any order and gives each record once it is whole and sound."""
+
+    def __init__(self) -> None:
+        self._open: dict[tuple[str, int], _Open] = {}
+        self._bytes = 0
+        self.spoiled = 0  # records whose checksum failed
+        self.repeated = 0  # parts that came twice
+
+    def add(self, part: Part, now: float) -> bytes | None:
+        """The record that ``part`` completes, or None."""
+        key = (part.kind, part.number)
+        entry = self._open.get(key)
+        if entry is None or not entry.same(part):
+            self.forget(*key)
+            entry = self._open[key] = _Open(part.count, part.total_bytes, part.crc, {})
+        entry.touched = now
+        if part.index in entry.pieces:
+            self.repeated += 1
+            return None
+        entry.pieces[part.index] = part.payload
+        entry.held_bytes += len(part.payload)
+        self._bytes += len(part.payload)
+        if len(entry.pieces) < entry.count:
+            self._make_room(key)
+            return None
+        record = b"".join(entry.pieces[k] for k in range(entry.count))
+        self.forget(*key)
+        if len(record) != entry.total_bytes or zlib.crc32(record) != entry.crc:
+            self.spoiled += 1
+            return None
+        return record
+
+    def missing_parts(self, kind: str, number: int) -> list[int] | None:
+        """The parts still to come of a record that has begun; None when it has not."""
+        entry = self._open.get((kind, number))
+        if entry is None:
+            return None
+        return [k for k in range(entry.count) if k not in entry.pieces]
+
+    def count(self, kind: str, number: int) -> int:
+        """How many parts a record that has begun is cut into; 0 when it has not."""
+        entry = self._open.get((kind, number))
+        return 0 if entry is None else entry.count
+
+    def touched(self, kind: str, number: int) -> float | None:
+        """When a part of the record came last; None when it has not begun."""
+        entry = self._open.get((kind, number))
+        return None if entry is None else entry.touched
+
+    def forget(self, kind: str, number: int) -> None:
+        """Drop what came of a record."""
+        entry = self._open.pop((kind, number), None)
+        if entry is not None:
+            self._bytes -= entry.held_bytes
+
+    def _make_room(self, keep: tuple[str, int]) -> None:
+        while len(self._open) > MAX_OPEN_RECORDS or self._bytes > MAX_OPEN_BYTES:
+            stalest: Iterable[tuple[str, int]] = (key for key in self._open if key != keep)
+            key = min(stalest, key=lambda k: self._open[k].touched, default=keep)
+            self.forget(*key)
+            if key == keep:
+                return

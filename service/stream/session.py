@@ -1,0 +1,136 @@
+"""Zenoh sessions as the datalink needs them: no shared memory, small buffers, TLS, rights."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from service.errors import InputError, OutsideError
+
+if TYPE_CHECKING:
+    import zenoh
+
+ROOT = "skyrelief"
+"""Keys are ``skyrelief/<drone>/<scan>/<topic>``."""
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+"""What a drone, scan or station may be called."""
+
+ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws)/(\[[0-9A-Fa-f:.%]+\]|[^/:#?\s]+):(\d{1,5})([#?].*)?")
+_ENCRYPTED = ("tls", "quic")
+_LOOPBACK = ("localhost", "[::1]")
+
+SEND_BUFFER_BYTES = 16_384
+BATCH_BYTES = 8_192
+LEASE_MS = 8_000
+
+
+@dataclass(frozen=True, slots=True)
+class SessionConfig:
+    """How one end joins the link; the TLS files are PEM."""
+
+    mode: str = "client"  # "client" or "router"
+    connect: tuple[str, ...] = ()
+    listen: tuple[str, ...] = ()
+    plain: bool = False  # allow endpoints without TLS beyond this machine
+    tls_ca: str = ""
+    tls_certificate: str = ""
+    tls_key: str = ""
+
+
+def check_name(name: str, what: str) -> str:
+    """``name`` if it may be part of a key; raises InputError when not."""
+    if not NAME.fullmatch(name):
+        raise InputError(
+            f"{what} {name!r} cannot travel on the datalink; "
+            "use at most 64 letters, digits, dots, dashes and underscores"
+        )
+    return name
+
+
+def check_endpoints(config: SessionConfig) -> None:
+    """Raise InputError for endpoints that are malformed, plain beyond this machine, or lack
+    their certificates."""
+    for endpoint in (*config.connect, *config.listen):
+        match = ENDPOINT.fullmatch(endpoint)
+        if match is None:
+            raise InputError(f"endpoint {endpoint!r} is not like tls/HOST:7447 or tcp/HOST:7447")
+        protocol, host = match[1], match[2]
+        local = host in _LOOPBACK or host.startswith("127.")
+        if protocol not in _ENCRYPTED and not local and not config.plain:
+            raise InputError(
+                f"endpoint {endpoint} is not encrypted; make keys with 'skyrelief keys' and use "
+                "tls/…, or allow it with datalink.plain=true (ground: --plain)"
+            )
+        if protocol in _ENCRYPTED:
+            _check_files(endpoint, config)
+
+
+def _check_files(endpoint: str, config: SessionConfig) -> None:
+    for what, path in (
+        ("certificate authority", config.tls_ca),
+        ("certificate", config.tls_certificate),
+        ("private key", config.tls_key),
+    ):
+        if not path:
+            raise InputError(f"endpoint {endpoint} needs a {what}; make one with 'skyrelief keys'")
+        if not Path(path).is_file():
+            raise InputError(f"{what} {path} does not exist; make one with 'skyrelief keys'")
+
+
+def open_session(config: SessionConfig) -> zenoh.Session:
+    """A new session; raises InputError for its settings, OutsideError when it cannot open."""
+    import zenoh
+
+    check_endpoints(config)
+    settings = zenoh_config(config)
+    try:
+        return zenoh.open(settings)
+    except zenoh.ZError as error:
+        reason = str(error).split(" at ", 1)[0][:200]
+        where = ", ".join((*config.listen, *config.connect))
+        raise OutsideError(f"datalink does not open at {where}: {reason}") from error
+
+
+def zenoh_config(config: SessionConfig) -> zenoh.Config:
+    """The Zenoh settings for ``config``."""
+    import zenoh
+
+    settings: dict[str, Any] = {
+        "mode": config.mode,
+        "connect/endpoints": [_small_buffer(e) for e in config.connect],
+        "connect/timeout_ms": 0,
+        "connect/exit_on_failure": config.mode == "client",
+        "listen/endpoints": list(config.listen),
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        # Between processes of one machine Zenoh would bypass the link, its rate and its rules.
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/lease": LEASE_MS,
+        "transport/link/tx/batch_size": BATCH_BYTES,
+        "adminspace/enabled": False,
+    }
+    if config.tls_ca:
+        settings |= {
+            "transport/link/tls/root_ca_certificate": config.tls_ca,
+            "transport/link/tls/listen_certificate": config.tls_certificate,
+            "transport/link/tls/listen_private_key": config.tls_key,
+            "transport/link/tls/connect_certificate": config.tls_certificate,
+            "transport/link/tls/connect_private_key": config.tls_key,
+            "transport/link/tls/enable_mtls": True,
+            "transport/link/tls/close_link_on_expiration": True,
+        }
+    out: zenoh.Config = zenoh.Config()
+    for key, value in settings.items():
+        out.insert_json5(key, json.dumps(value))
+    return out
+
+
+def _small_buffer(endpoint: str) -> str:
+    """A small send buffer keeps control from waiting behind bulk in the kernel."""
+    if "#" in endpoint or not endpoint.startswith(("tcp/", "tls/")):
+        return endpoint
+    return f"{endpoint}#so_sndbuf={SEND_BUFFER_BYTES}"

@@ -1,0 +1,236 @@
+"""Drone and ground over a real link on this machine: the two scan folders end equal."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.types import DepthMap, Keyframe, Pose
+from service.config import DatalinkConfig
+from service.errors import InputError, OutsideError
+from service.ground import receiver as receiver_module
+from service.ground.receiver import Receiver, ReceiverConfig
+from service.stream import codec
+from service.stream.link import DatalinkSender
+from service.stream.records import PoseRecord, Repose, ScanHeader
+from service.stream.session import SessionConfig
+from service.stream.store import ScanStore
+
+pytest.importorskip("zenoh")
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def keyframe(seq: int) -> Keyframe:
+    w, h = 160, 90
+    rng = np.random.default_rng(seq)
+    T = se3.exp(rng.normal(0, 0.3, 6))
+    depth = DepthMap(
+        rng.uniform(40, 60, (h, w)).astype(np.float32),
+        rng.uniform(0.1, 0.2, (h, w)).astype(np.float32),
+        np.full((h, w), 3, np.uint8),
+        np.array([[130.0, 0, 79.5], [0, 130.0, 44.5], [0, 0, 1]]),
+        T,
+    )
+    bgr = rng.integers(0, 255, (h, w, 3), np.uint8)
+    return Keyframe(
+        seq, 5, depth, bgr, Pose(T, np.eye(6) * 1e-4, ("vision",)), np.ones((h, w), bool)
+    )
+
+
+def new_store(folder: Path, drone: str = "drone-a", scan_id: str = "scan-1") -> ScanStore:
+    return ScanStore.create(folder / "scan.db", ScanHeader(scan_id, drone, 1, notes=("hello",)))
+
+
+def fly(store: ScanStore, first: int, last: int) -> None:
+    for seq in range(first, last):
+        store.add_keyframe(seq, codec.encode(keyframe(seq), seq))
+        store.add_pose(PoseRecord(1000 * seq, np.eye(4), np.eye(6), keyframe_seq=seq))
+
+
+def wait_for(condition: Callable[[], bool], timeout_s: float = 20.0) -> bool:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.05)
+    return True
+
+
+def start_ground(folder: Path, endpoint: str, name: str = "") -> Receiver:
+    session = SessionConfig(mode="router", listen=(endpoint,))
+    ground = Receiver(ReceiverConfig(folder, session, name=name))
+    ground.start()
+    return ground
+
+
+def assert_equal(onboard: ScanStore, path: Path) -> None:
+    with ScanStore.open(path) as ground:
+        assert ground.numbers() == onboard.numbers()
+        assert ground.header == onboard.header and ground.summary == onboard.summary
+        for a, b in zip(onboard.keyframes(), ground.keyframes(), strict=True):
+            np.testing.assert_array_equal(a.depth.depth_m, b.depth.depth_m)
+            np.testing.assert_array_equal(a.bgr, b.bgr)
+            np.testing.assert_array_equal(a.depth.T_world_camera, b.depth.T_world_camera)
+
+
+@pytest.fixture(autouse=True)
+def written(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """The folders whose deliverables were asked for; the files are another module's matter."""
+    folders: list[Path] = []
+    monkeypatch.setattr(receiver_module, "_deliver", lambda folder, _: folders.append(folder))
+    return folders
+
+
+def fast(endpoint: str) -> DatalinkConfig:
+    return DatalinkConfig(connect=(endpoint,), budget_kbit_s=100_000.0)
+
+
+def test_a_scan_arrives_whole_with_its_corrections(tmp_path: Path, written: list[Path]) -> None:
+    endpoint = free_endpoint()
+    onboard = new_store(tmp_path / "air")
+    link = DatalinkSender(onboard, fast(endpoint))
+    ground = start_ground(tmp_path / "ground", endpoint)
+    try:
+        fly(onboard, 0, 12)
+        onboard.update_header(epsg=32632)
+        onboard.add_repose(Repose(3, 1, se3.exp(np.full(6, 0.1)), 1.01, np.eye(6)))
+        onboard.finish({"points": 12})
+        assert link.drain(20.0)
+        folder = ground.folder("drone-a", "scan-1")
+        assert wait_for(lambda: folder in written)
+        (entry,) = ground.progress()
+        assert entry["complete"] and not entry["missing"]
+    finally:
+        link.close()
+        ground.close()
+    assert_equal(onboard, folder / "scan.db")
+    onboard.close()
+
+
+def test_what_was_flown_before_the_ground_came_is_fetched_once(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    onboard = new_store(tmp_path / "air")
+    fly(onboard, 0, 20)
+    onboard.finish({})
+    link = DatalinkSender(onboard, fast(endpoint))
+    ground = start_ground(tmp_path / "ground", endpoint)
+    try:
+        assert link.drain(20.0)
+        (entry,) = ground.progress()
+        assert entry["duplicates"] == 0
+    finally:
+        link.close()
+        ground.close()
+    assert_equal(onboard, tmp_path / "ground" / "drone-a" / "scan-1" / "scan.db")
+    onboard.close()
+
+
+def test_both_ends_may_restart(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    config = fast(endpoint)
+    onboard = new_store(tmp_path / "air")
+    link = DatalinkSender(onboard, config)
+    ground = start_ground(tmp_path / "ground", endpoint)
+    fly(onboard, 0, 5)
+    assert wait_for(lambda: link.progress.complete)
+    ground.close()
+    fly(onboard, 5, 10)
+    ground = start_ground(tmp_path / "ground", endpoint)
+    fly(onboard, 10, 12)
+    link.close()
+    onboard.close()
+    onboard = ScanStore.open(tmp_path / "air" / "scan.db")
+    link = DatalinkSender(onboard, config)
+    try:
+        fly(onboard, onboard.next_seq, 15)
+        onboard.finish({"points": 1})
+        assert link.drain(30.0)
+    finally:
+        link.close()
+        ground.close()
+    assert_equal(onboard, tmp_path / "ground" / "drone-a" / "scan-1" / "scan.db")
+    onboard.close()
+
+
+def test_two_drones_with_the_same_scan_id_and_a_late_second_ground(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    stores = [new_store(tmp_path / name, name) for name in ("red", "blue")]
+    links = [DatalinkSender(s, fast(endpoint)) for s in stores]
+    ground = start_ground(tmp_path / "ground", endpoint, "first")
+    for k, store in enumerate(stores):
+        fly(store, 0, 4 + k)
+        store.finish({})
+    late_session = SessionConfig(mode="client", connect=(endpoint,))
+    late = Receiver(ReceiverConfig(tmp_path / "late", late_session, name="second"))
+    try:
+        assert all(link.drain(20.0) for link in links)
+        late.start()
+        assert wait_for(lambda: len(late.progress()) == 2)
+        assert wait_for(lambda: all(e["complete"] for e in late.progress()))
+    finally:
+        for link in links:
+            link.close()
+        late.close()
+        ground.close()
+    for store in stores:
+        for folder in ("ground", "late"):
+            assert_equal(store, tmp_path / folder / store.header.drone / "scan-1" / "scan.db")
+        store.close()
+
+
+def test_over_the_quota_the_ground_keeps_coarse_layers_and_says_so(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    onboard = new_store(tmp_path / "air")
+    fly(onboard, 0, 6)
+    onboard.finish({})
+    session = SessionConfig(mode="router", listen=(endpoint,))
+    ground = Receiver(ReceiverConfig(tmp_path / "ground", session, quota_bytes=60_000))
+    ground.start()
+    link = DatalinkSender(onboard, fast(endpoint))
+    try:
+        assert wait_for(lambda: any(e["complete"] for e in ground.progress()))
+        (entry,) = ground.progress()
+        assert entry["held"]["k0"] == 6 and 0 < entry["refused"] < 6
+        assert entry["held"].get("k1", 0) + entry["refused"] == 6
+    finally:
+        link.close()
+        ground.close()
+        onboard.close()
+
+
+def test_no_endpoint_opens_nothing(tmp_path: Path) -> None:
+    onboard = new_store(tmp_path / "air")
+    link = DatalinkSender(onboard, DatalinkConfig())
+    assert not link.drain(0.0) and not link.progress.connected
+    link.close()
+    onboard.close()
+
+
+def test_plain_endpoints_beyond_this_machine_need_a_word(tmp_path: Path) -> None:
+    onboard = new_store(tmp_path / "air")
+    for endpoint in ("tcp/192.168.144.11:7447", "tcp/nonsense", "tls/192.168.144.11:7447"):
+        with pytest.raises(InputError) as caught:
+            DatalinkSender(onboard, DatalinkConfig(connect=(endpoint,)))
+        assert "\n" not in str(caught.value)
+    onboard.close()
+
+
+def test_a_busy_port_is_said_at_once(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    ground = start_ground(tmp_path / "a", endpoint)
+    try:
+        with pytest.raises(OutsideError, match="does not open"):
+            start_ground(tmp_path / "b", endpoint)
+    finally:
+        ground.close()
