@@ -1,0 +1,321 @@
+"""Windowed bundle adjustment: camera poses and landmarks from their pixels.
+
+DEVIATION: the paper avoids bundle adjustment and keeps the EPnP pose of every frame. A
+window of a few keyframes costs milliseconds here and takes most of the drift away, because
+a landmark seen from several keyframes ties their scale together.
+
+Minimises the Huber cost of the reprojection error over poses and points by
+Levenberg-Marquardt with the Schur complement on the points (Triggs et al., Bundle
+Adjustment - A Modern Synthesis, 2000, doi:10.1007/3-540-44480-7_21).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from recon.types import F64, Bool
+
+I64 = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BundleResult:
+    """Refined poses and points; ``converged`` is False when no step lowered the cost."""
+
+    T_camera_world: F64  # (C, 4, 4)
+    points_m: F64  # (N, 3) world
+    residual_px: F64  # (M,) length of the reprojection error, inf behind the camera
+    covariance: F64  # (C, 6, 6) left perturbation of T_camera_world; zero for fixed cameras
+    converged: bool
+
+
+@njit(cache=True, nogil=True)
+def _se3_exp(d: F64, out: F64) -> None:
+    """``out`` (4, 4) motion of the twist ``d`` (rotation, translation)."""
+    wx, wy, wz = d[0], d[1], d[2]
+    a2 = wx * wx + wy * wy + wz * wz
+    a = np.sqrt(a2)
+    if a < 1e-8:
+        s, c, e = 1.0, 0.5, 1.0 / 6.0
+    else:
+        s, c, e = np.sin(a) / a, (1 - np.cos(a)) / a2, (a - np.sin(a)) / (a2 * a)
+    W = np.array([[0.0, -wz, wy], [wz, 0.0, -wx], [-wy, wx, 0.0]])
+    W2 = W @ W
+    out[:, :] = 0.0
+    out[3, 3] = 1.0
+    for i in range(3):
+        for j in range(3):
+            eye = 1.0 if i == j else 0.0
+            out[i, j] = eye + s * W[i, j] + c * W2[i, j]
+            out[i, 3] += (eye + c * W[i, j] + e * W2[i, j]) * d[3 + j]
+
+
+@njit(cache=True, nogil=True)
+def _cost(T: F64, X: F64, cam: I64, pt: I64, uv: F64, k: F64, huber: float, res: F64) -> float:
+    """Huber cost of all observations; ``res`` (M,) receives the error lengths in pixels."""
+    total = 0.0
+    for m in range(cam.size):
+        P = T[cam[m]]
+        x = X[pt[m]]
+        z = P[2, 0] * x[0] + P[2, 1] * x[1] + P[2, 2] * x[2] + P[2, 3]
+        if z < 1e-6:
+            res[m] = np.inf
+            total += huber * 1e3
+            continue
+        u = k[0] * (P[0, 0] * x[0] + P[0, 1] * x[1] + P[0, 2] * x[2] + P[0, 3]) / z + k[2]
+        v = k[1] * (P[1, 0] * x[0] + P[1, 1] * x[1] + P[1, 2] * x[2] + P[1, 3]) / z + k[3]
+        r = np.sqrt((u - uv[m, 0]) ** 2 + (v - uv[m, 1]) ** 2)
+        res[m] = r
+        total += 0.5 * r * r if r <= huber else huber * (r - 0.5 * huber)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _linearise(
+    P: F64, x: F64, uv: F64, k: F64, huber: float, Jc: F64, Jp: F64, r: F64
+) -> float:
+    """Fill the (2, 6) and (2, 3) Jacobians and the error ``r``; return the Huber weight."""
+    X0 = P[0, 0] * x[0] + P[0, 1] * x[1] + P[0, 2] * x[2] + P[0, 3]
+    X1 = P[1, 0] * x[0] + P[1, 1] * x[1] + P[1, 2] * x[2] + P[1, 3]
+    X2 = P[2, 0] * x[0] + P[2, 1] * x[1] + P[2, 2] * x[2] + P[2, 3]
+    if X2 < 1e-6:
+        return 0.0
+    iz = 1.0 / X2
+    a, b = X0 * iz, X1 * iz
+    r[0] = k[0] * a + k[2] - uv[0]
+    r[1] = k[1] * b + k[3] - uv[1]
+    fx, fy = k[0], k[1]
+    Jc[0, 0], Jc[0, 1], Jc[0, 2] = -fx * a * b, fx * (1 + a * a), -fx * b
+    Jc[1, 0], Jc[1, 1], Jc[1, 2] = -fy * (1 + b * b), fy * a * b, fy * a
+    Jc[0, 3], Jc[0, 4], Jc[0, 5] = fx * iz, 0.0, -fx * a * iz
+    Jc[1, 3], Jc[1, 4], Jc[1, 5] = 0.0, fy * iz, -fy * b * iz
+    for j in range(3):
+        Jp[0, j] = Jc[0, 3] * P[0, j] + Jc[0, 5] * P[2, j]
+        Jp[1, j] = Jc[1, 4] * P[1, j] + Jc[1, 5] * P[2, j]
+    length = np.sqrt(r[0] * r[0] + r[1] * r[1])
+    return 1.0 if length <= huber else huber / length
+
+
+@njit(cache=True, nogil=True)
+def _normal_equations(
+    T: F64,
+    X: F64,
+    cam: I64,
+    start: I64,
+    uv: F64,
+    k: F64,
+    huber: float,
+    slot: I64,
+    n_free: int,
+    damping: float,
+    S: F64,
+    g: F64,
+    Hpp_inv: F64,
+    bp: F64,
+    W: F64,
+) -> None:
+    """Reduced camera system ``S`` (6F, 6F), ``g`` (6F,) and what back-substitution needs."""
+    S[:, :] = 0.0
+    g[:] = 0.0
+    Jc = np.zeros((2, 6))
+    Jp = np.zeros((2, 3))
+    r = np.zeros(2)
+    for p in range(X.shape[0]):
+        H = np.zeros((3, 3))
+        b = np.zeros(3)
+        for m in range(start[p], start[p + 1]):
+            W[m] = 0.0
+            w = _linearise(T[cam[m]], X[p], uv[m], k, huber, Jc, Jp, r)
+            if w == 0.0:
+                continue
+            s = slot[cam[m]]
+            for i in range(3):
+                b[i] -= w * (Jp[0, i] * r[0] + Jp[1, i] * r[1])
+                for j in range(3):
+                    H[i, j] += w * (Jp[0, i] * Jp[0, j] + Jp[1, i] * Jp[1, j])
+            if s < 0:
+                continue
+            for i in range(6):
+                g[6 * s + i] -= w * (Jc[0, i] * r[0] + Jc[1, i] * r[1])
+                for j in range(6):
+                    S[6 * s + i, 6 * s + j] += w * (Jc[0, i] * Jc[0, j] + Jc[1, i] * Jc[1, j])
+                for j in range(3):
+                    W[m, i, j] = w * (Jc[0, i] * Jp[0, j] + Jc[1, i] * Jp[1, j])
+        for i in range(3):
+            H[i, i] += damping * H[i, i] + 1e-9
+        Hpp_inv[p] = np.linalg.inv(H)
+        bp[p] = b
+    for i in range(6 * n_free):
+        S[i, i] += damping * S[i, i] + 1e-9
+    for p in range(X.shape[0]):
+        for m in range(start[p], start[p + 1]):
+            s = slot[cam[m]]
+            if s < 0:
+                continue
+            A = W[m] @ Hpp_inv[p]
+            Ab = A @ bp[p]
+            for i in range(6):
+                g[6 * s + i] -= Ab[i]
+            for n in range(start[p], start[p + 1]):
+                t = slot[cam[n]]
+                if t < 0:
+                    continue
+                for i in range(6):
+                    for j in range(6):
+                        S[6 * s + i, 6 * t + j] -= (
+                            A[i, 0] * W[n, j, 0] + A[i, 1] * W[n, j, 1] + A[i, 2] * W[n, j, 2]
+                        )
+
+
+@njit(cache=True, nogil=True)
+def _adjust(
+    T: F64,
+    X: F64,
+    cam: I64,
+    start: I64,
+    uv: F64,
+    k: F64,
+    huber: float,
+    slot: I64,
+    n_free: int,
+    iterations: int,
+) -> tuple[F64, F64, F64, F64, bool]:
+    M, N = cam.size, X.shape[0]
+    pt = np.empty(M, np.int64)
+    for p in range(N):
+        pt[start[p] : start[p + 1]] = p
+    S = np.zeros((6 * n_free, 6 * n_free))
+    g = np.zeros(6 * n_free)
+    Hpp_inv = np.zeros((N, 3, 3))
+    bp = np.zeros((N, 3))
+    W = np.zeros((M, 6, 3))
+    res = np.zeros(M)
+    step = np.zeros((4, 4))
+    cost = _cost(T, X, cam, pt, uv, k, huber, res)
+    damping = 1e-4
+    improved = False
+    for _ in range(iterations):
+        _normal_equations(T, X, cam, start, uv, k, huber, slot, n_free, damping, S, g, Hpp_inv, bp, W)
+        dc = np.linalg.solve(S, g)
+        T_new = T.copy()
+        for c in range(T.shape[0]):
+            if slot[c] >= 0:
+                _se3_exp(dc[6 * slot[c] : 6 * slot[c] + 6], step)
+                T_new[c] = step @ T[c]
+        X_new = X.copy()
+        for p in range(N):
+            b = bp[p].copy()
+            for m in range(start[p], start[p + 1]):
+                s = slot[cam[m]]
+                if s >= 0:
+                    b -= W[m].T @ dc[6 * s : 6 * s + 6]
+            X_new[p] += Hpp_inv[p] @ b
+        cost_new = _cost(T_new, X_new, cam, pt, uv, k, huber, res)
+        if cost_new < cost:
+            gain = (cost - cost_new) / max(cost, 1e-12)
+            T, X, cost = T_new, X_new, cost_new
+            improved = True
+            damping = max(damping * 0.2, 1e-9)
+            if gain < 1e-5:
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e4:
+                break
+    _cost(T, X, cam, pt, uv, k, huber, res)
+    _normal_equations(T, X, cam, start, uv, k, huber, slot, n_free, 0.0, S, g, Hpp_inv, bp, W)
+    return T, X, res, S, improved
+
+
+def adjust(
+    T_camera_world: F64,
+    points_m: F64,
+    camera_index: I64,
+    point_index: I64,
+    uv_px: F64,
+    K: F64,
+    free: Bool,
+    *,
+    huber_px: float = 1.0,
+    sigma_px: float = 0.3,
+    iterations: int = 8,
+) -> BundleResult:
+    """Poses and points that explain the pixels best.
+
+    Args:
+        T_camera_world: (C, 4, 4) start poses; the world frame is kept by the fixed cameras.
+        points_m: (N, 3) start points in the world frame; each needs an observation or more.
+        camera_index, point_index: (M,) which camera saw which point.
+        uv_px: (M, 2) where, in undistorted pixels.
+        K: (3, 3) intrinsics shared by the cameras.
+        free: (C,) True for the cameras that may move.
+        huber_px: error at which the quadratic cost turns linear.
+        sigma_px: pixel noise that the covariances are scaled with.
+        iterations: most Levenberg-Marquardt steps.
+
+    Raises ValueError when the shapes do not match or no camera is free.
+    """
+    M = camera_index.shape[0]
+    if point_index.shape != (M,) or uv_px.shape != (M, 2) or free.shape != T_camera_world.shape[:1]:
+        raise ValueError(
+            f"shapes do not match: {camera_index.shape}, {point_index.shape}, {uv_px.shape}, "
+            f"{free.shape}, {T_camera_world.shape}"
+        )
+    n_free = int(free.sum())
+    if n_free == 0:
+        raise ValueError("no free camera to adjust")
+    order = np.argsort(point_index, kind="stable")
+    start = np.searchsorted(point_index[order], np.arange(points_m.shape[0] + 1)).astype(np.int64)
+    slot = np.where(free, np.cumsum(free) - 1, -1).astype(np.int64)
+    k = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+    T, X, residual, S, improved = _adjust(
+        np.ascontiguousarray(T_camera_world, dtype=np.float64),
+        np.ascontiguousarray(points_m, dtype=np.float64),
+        np.ascontiguousarray(camera_index[order], dtype=np.int64),
+        start,
+        np.ascontiguousarray(uv_px[order], dtype=np.float64),
+        k,
+        huber_px,
+        slot,
+        n_free,
+        iterations,
+    )
+    covariance = np.zeros((T.shape[0], 6, 6))
+    full = np.linalg.pinv(S, hermitian=True) * sigma_px**2
+    for c in np.flatnonzero(free):
+        i = 6 * slot[c]
+        covariance[c] = full[i : i + 6, i : i + 6]
+    back = np.empty(M)
+    back[order] = residual
+    return BundleResult(T, X, back, covariance, bool(improved))
+
+
+def triangulate(
+    T_a_world: F64, T_b_world: F64, K: F64, uv_a: F64, uv_b: F64
+) -> tuple[F64, F64]:
+    """(N, 3) world points between two rays each, and (N,) parallax angles in rad.
+
+    Midpoint of the shortest segment between the rays (T_x_world are camera-from-world).
+    Points behind a camera come back as NaN.
+    """
+    centre_a = -T_a_world[:3, :3].T @ T_a_world[:3, 3]
+    centre_b = -T_b_world[:3, :3].T @ T_b_world[:3, 3]
+    K_inv = np.linalg.inv(K)
+    one = np.ones((uv_a.shape[0], 1))
+    da = np.hstack([uv_a, one]) @ K_inv.T @ T_a_world[:3, :3]
+    db = np.hstack([uv_b, one]) @ K_inv.T @ T_b_world[:3, :3]
+    da /= np.linalg.norm(da, axis=1, keepdims=True)
+    db /= np.linalg.norm(db, axis=1, keepdims=True)
+    w = centre_b - centre_a
+    ab = np.sum(da * db, axis=1)
+    aw, bw = da @ w, db @ w
+    den = np.maximum(1.0 - ab**2, 1e-12)
+    sa = (aw - ab * bw) / den
+    sb = (ab * aw - bw) / den
+    points = 0.5 * (centre_a + sa[:, None] * da + centre_b + sb[:, None] * db)
+    points[(sa <= 0) | (sb <= 0)] = np.nan
+    return points, np.arctan2(np.linalg.norm(np.cross(da, db), axis=1), ab)

@@ -1,0 +1,694 @@
+"""Where the camera is: Harris + ZSSD tracks, EPnP against landmarks, a window refined.
+
+Section 2.3 of the paper: corners of two earlier views (the left and right image of the
+virtual stereo camera) are found again in the new frame, each view gives a pose by EPnP
+(Eq. 6-7) and the two are averaged. Between the frames that become keyframes, landmarks are
+triangulated and the last keyframes are adjusted together (:mod:`recon.bundle`).
+
+The odometry works in a frame of its own that starts at the first telemetry pose; scale,
+heading and position are corrected afterwards by :mod:`recon.alignment`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from recon import bundle, matching, pnp, se3, two_view
+from recon.camera_model import rays
+from recon.types import F64, U8, Bool, Camera, PosePrior
+
+I64 = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryConfig:
+    """Parameters of the odometry; angles are in rad, shares are of the image width."""
+
+    base_to_height: float = 0.1  # motion between keyframes over the distance to the ground
+    least_base_to_height: float = 0.03  # under it two frames are not triangulated
+    window: int = 8  # keyframes adjusted together
+    search_share: float = 0.03  # ZSSD search radius around a good prediction
+    wide_search_share: float = 0.09  # and around a poor one
+    min_tracks: int = 40  # fewer inliers: lost
+    min_track_share: float = 0.25  # of the corners that should be visible
+    max_tilt_error_rad: float = 0.35  # vision against attitude: more is a false solution
+    lost_after: int = 8  # frames in a row without a pose before a new segment starts
+    least_shift_confidence: float = 1.4  # of the global shift between two pictures
+    still_gap_s: float = 0.7  # frames further apart are stills: no motion model holds
+    matching: matching.MatchingConfig = field(default_factory=matching.MatchingConfig)
+    pnp: pnp.PnpConfig = field(default_factory=pnp.PnpConfig)
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.least_base_to_height <= self.base_to_height < 1.0:
+            raise ValueError("0 < least_base_to_height <= base_to_height < 1 must hold")
+        if self.window < 3:
+            raise ValueError(f"window must hold 3 keyframes or more, got {self.window}")
+
+
+@dataclass(slots=True, eq=False)
+class OdometryKeyframe:
+    """A keyframe inside the odometry; its pose is refined while it is in the window."""
+
+    seq: int
+    time_ns: int
+    segment: int
+    T_camera_odom: F64  # (4, 4)
+    covariance: F64  # (6, 6) left perturbation of T_camera_odom
+    prior: PosePrior
+    pyramid: matching.Pyramid
+    uv: F64  # (N, 2) corners
+    landmark: I64  # (N,) row in the landmark table, -1 none yet
+
+    @property
+    def T_odom_camera(self) -> F64:
+        return se3.inverse(self.T_camera_odom)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """What one frame gave."""
+
+    state: str  # "started", "waiting", "tracked", "keyframe" or "lost"
+    segment: int
+    T_odom_camera: F64 | None = None  # (4, 4)
+    covariance: F64 | None = None  # (6, 6) left perturbation of the camera-from-odom pose
+    tracks: int = 0
+    base_to_height: float = 0.0  # against the last keyframe
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Located:
+    """A frame's pose and the keyframe's corners found in it."""
+
+    pose: pnp.PnpResult  # camera from odometry
+    uv: F64  # (N, 2) of the keyframe's corners
+    ok: Bool  # (N,) found, and not contradicted by the pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Prediction:
+    uv: F64  # (N, 2) where the corners should be
+    warp: F64  # (N, 2, 2) or (2, 2) offsets in the keyframe to offsets in the frame
+    radius_px: float
+
+
+class Odometry:
+    """Follows one camera without distortion; feed it every frame in order."""
+
+    def __init__(self, camera: Camera, config: OdometryConfig | None = None) -> None:
+        """``camera`` has no distortion and the size of the frames to come."""
+        self.camera = camera
+        self.K = camera.K
+        self.config = config or OdometryConfig()
+        self.keyframes: list[OdometryKeyframe] = []  # of the current segment
+        self.segment = -1
+        self.points = np.zeros((0, 3))  # landmarks in the odometry's frame, NaN = dropped
+        self._metric = False  # the current segment has landmarks
+        self._lost = 0
+        self._last: tuple[int, F64, PosePrior] | None = None  # time, T_odom_camera, prior
+        self._velocity = np.zeros(3)
+
+    # ---- one frame -------------------------------------------------------------------
+
+    def track(
+        self, grey: U8, seq: int, time_ns: int, prior: PosePrior, mask: U8 | None = None
+    ) -> Tracked:
+        """Pose of a new frame, or why there is none.
+
+        Args:
+            grey: (H, W) undistorted picture.
+            prior: telemetry's word on this frame; parts may be missing.
+            mask: (H, W) non-zero where the picture is valid.
+        """
+        pyramid = matching.Pyramid.build(grey, self.config.matching.search_levels)
+        if not self.keyframes:
+            return self._start(grey, pyramid, seq, time_ns, prior, mask)
+        if not self._metric:
+            return self._second_view(grey, pyramid, seq, time_ns, prior, mask)
+        found = self._locate(grey, pyramid, time_ns, prior)
+        if isinstance(found, str):
+            return self._missed(grey, pyramid, seq, time_ns, prior, mask, found)
+        return self._accept(grey, pyramid, seq, time_ns, prior, mask, found)
+
+    def _missed(
+        self,
+        grey: U8,
+        pyramid: matching.Pyramid,
+        seq: int,
+        time_ns: int,
+        prior: PosePrior,
+        mask: U8 | None,
+        reason: str,
+    ) -> Tracked:
+        """Count a frame without a pose; after too many, or at a still, begin a new segment."""
+        self._lost += 1
+        still = time_ns - self.keyframes[-1].time_ns > 1e9 * self.config.still_gap_s
+        if self._lost >= (2 if still else self.config.lost_after):
+            self._start(grey, pyramid, seq, time_ns, prior, mask)
+        return Tracked("lost", self.segment, reason=reason)
+
+    def _start(
+        self,
+        grey: U8,
+        pyramid: matching.Pyramid,
+        seq: int,
+        time_ns: int,
+        prior: PosePrior,
+        mask: U8 | None,
+    ) -> Tracked:
+        """Begin a segment at this frame."""
+        corners = matching.harris_grid(grey, self.config.matching, mask)
+        if corners.uv_px.shape[0] < 2 * self.config.min_tracks:
+            self.keyframes = []
+            return Tracked("lost", self.segment, reason="too little texture")
+        self.segment += 1
+        self._metric, self._lost = False, 0
+        self._velocity = np.zeros(3)
+        R = prior.R_world_camera if prior.R_world_camera is not None else np.diag([1.0, -1, -1])
+        t = prior.position_m if prior.position_m is not None else np.zeros(3)
+        T_odom_camera = se3.compose(R, t)
+        self.points = np.zeros((0, 3))
+        uv = corners.uv_px.astype(np.float64)
+        self.keyframes = [
+            OdometryKeyframe(
+                seq,
+                time_ns,
+                self.segment,
+                se3.inverse(T_odom_camera),
+                np.zeros((6, 6)),
+                prior,
+                pyramid,
+                uv,
+                np.full(len(uv), -1, np.int64),
+            )
+        ]
+        self._last = (time_ns, T_odom_camera, prior)
+        return Tracked("started", self.segment, T_odom_camera, np.zeros((6, 6)))
+
+    # ---- the second view --------------------------------------------------------------
+
+    def _second_view(
+        self,
+        grey: U8,
+        pyramid: matching.Pyramid,
+        seq: int,
+        time_ns: int,
+        prior: PosePrior,
+        mask: U8 | None,
+    ) -> Tracked:
+        """Wait until the camera has moved enough, then make the first landmarks."""
+        first = self.keyframes[0]
+        R_b_a = _relative_rotation(first.prior, prior)
+        uv, ok = self._match_without_map(grey, pyramid, first, prior, R_b_a)
+        if ok.sum() < 2 * self.config.min_tracks:
+            return self._missed(
+                grey, pyramid, seq, time_ns, prior, mask, "too few matches with the first frame"
+            )
+        self._lost = 0
+        if _base_to_height(first.uv[ok], uv[ok], self.K, R_b_a) < 0.7 * self.config.base_to_height:
+            return Tracked("waiting", self.segment, tracks=int(ok.sum()), reason="too little motion")
+        up_a = first.T_camera_odom[:3, 2]
+        turn = 0.12 if R_b_a is not None else np.pi
+        view = two_view.solve(first.uv[ok], uv[ok], self.K, R_b_a, turn, up_a)
+        if view is None or view.parallax_rad < self.config.least_base_to_height:
+            return self._missed(
+                grey, pyramid, seq, time_ns, prior, mask, "no certain motion between two frames"
+            )
+        matched = np.flatnonzero(ok)
+        ok[matched[~view.inliers]] = False
+        scale = self._first_landmarks(view, matched[view.inliers], prior)
+        second = se3.compose(view.T_b_a[:3, :3], view.T_b_a[:3, 3] * scale)
+        T_camera_odom = second @ first.T_camera_odom
+        self._metric = True
+        self._add_keyframe(grey, pyramid, seq, time_ns, prior, mask, T_camera_odom, uv, ok)
+        self._update_motion(time_ns, self.keyframes[-1].T_odom_camera, prior)
+        return Tracked(
+            "keyframe", self.segment, self.keyframes[-1].T_odom_camera,
+            self.keyframes[-1].covariance, int(ok.sum()), view.parallax_rad,
+        )
+
+    def _first_landmarks(self, view: two_view.TwoView, rows: I64, prior: PosePrior) -> float:
+        """Enter the two-view points into the table; return metres per unit of the baseline."""
+        first = self.keyframes[0]
+        T_odom_a = first.T_odom_camera
+        scale = _metric_scale(view, first.prior, prior, T_odom_a)
+        first.landmark[rows] = np.arange(len(rows))
+        self.points = se3.transform(T_odom_a, view.points[view.inliers] * scale)
+        return scale
+
+    def _match_without_map(
+        self,
+        grey: U8,
+        pyramid: matching.Pyramid,
+        first: OdometryKeyframe,
+        prior: PosePrior,
+        R_b_a: F64 | None,
+    ) -> tuple[F64, Bool]:
+        """(N, 2) pixels and (N,) success of the first frame's corners in a new frame."""
+        best: tuple[F64, Bool] | None = None
+        for prediction in self._predictions_2d(grey, first, prior, R_b_a):
+            found = matching.match(
+                first.pyramid,
+                first.uv.astype(np.float32),
+                pyramid,
+                prediction.uv.astype(np.float32),
+                prediction.radius_px,
+                prediction.warp.astype(np.float32),
+                self.config.matching,
+            )
+            if best is None or found.ok.sum() > best[1].sum():
+                best = (found.uv_px.astype(np.float64), found.ok)
+            if best[1].sum() > 0.5 * len(first.uv):
+                break
+        assert best is not None
+        return best
+
+    def _predictions_2d(
+        self, grey: U8, key: OdometryKeyframe, prior: PosePrior, R_b_a: F64 | None
+    ) -> list[_Prediction]:
+        """Guesses of where a keyframe's corners went, best first, without landmarks."""
+        W = self.camera.size_px[0]
+        out = []
+        if R_b_a is not None:
+            height = prior.agl_m or 0.0
+            t = np.zeros(3)
+            if prior.position_m is not None and key.prior.position_m is not None and height > 0:
+                R_a = key.prior.R_world_camera
+                assert R_a is not None
+                t = R_b_a @ R_a.T @ (key.prior.position_m - prior.position_m) / height
+            n = key.T_camera_odom[:3, 2]  # up, seen from the camera
+            H = self.K @ (R_b_a - np.outer(t, n)) @ np.linalg.inv(self.K)
+            out.append(self._by_homography(H, key.uv, self.config.wide_search_share * W))
+        shift = matching.global_shift(key.pyramid.levels[0], grey)
+        if shift.confidence > self.config.least_shift_confidence:
+            H = np.eye(3)
+            H[:2, :2], H[:2, 2] = shift.A, shift.shift_px
+            out.append(self._by_homography(H, key.uv, self.config.wide_search_share * W))
+        if not out:
+            out.append(self._by_homography(np.eye(3), key.uv, self.config.wide_search_share * W))
+        return out
+
+    def _by_homography(self, H: F64, uv: F64, radius_px: float) -> _Prediction:
+        there = cv2.perspectiveTransform(uv[:, None], H)[:, 0].astype(np.float64)
+        return _Prediction(there, _local_affine(H, uv, there), radius_px)
+
+    # ---- the pose of a frame against landmarks ----------------------------------------
+
+    def _locate(
+        self, grey: U8, pyramid: matching.Pyramid, time_ns: int, prior: PosePrior
+    ) -> _Located | str:
+        """The frame against the last keyframe, averaged with the one before; or why not."""
+        right = self.keyframes[-1]
+        reason = "no match"
+        for T_camera_odom, share in self._predicted_poses(grey, time_ns, prior, right):
+            found = self._pose_from(right, pyramid, T_camera_odom, share)
+            if isinstance(found, str):
+                reason = found
+                continue
+            T = found.pose.T_camera_points
+            if not self._agrees(T, prior, right):
+                reason = "vision and attitude disagree"
+                continue
+            if len(self.keyframes) > 1:
+                left = self._pose_from(
+                    self.keyframes[-2], pyramid, T, 0.5 * self.config.search_share, stride=3
+                )
+                if isinstance(left, _Located):
+                    found = replace(found, pose=_averaged(left.pose, found.pose))
+            return found
+        return reason
+
+    def _predicted_poses(
+        self, grey: U8, time_ns: int, prior: PosePrior, key: OdometryKeyframe
+    ) -> list[tuple[F64, float]]:
+        """Start poses T_camera_odom with their search radius share, most trusted first."""
+        assert self._last is not None
+        last_ns, T_last, last_prior = self._last
+        dt = (time_ns - last_ns) * 1e-9
+        R = T_last[:3, :3]
+        turn = _relative_rotation(last_prior, prior)
+        if turn is not None:
+            R = R @ turn.T
+        t = T_last[:3, 3] + self._velocity * dt
+        still = dt > self.config.still_gap_s
+        share = self.config.wide_search_share if still else self.config.search_share
+        by_motion = (se3.inverse(se3.compose(R, t)), share)
+        by_picture: list[tuple[F64, float]] = []
+        if still or self._lost > 0:
+            by_picture = self._pose_by_picture(grey, key, turn, R)
+        if still and turn is None:
+            return [*by_picture, by_motion]
+        wide = (by_motion[0], self.config.wide_search_share)
+        return [by_motion, *by_picture] if still else [by_motion, *by_picture, wide]
+
+    def _pose_by_picture(
+        self, grey: U8, key: OdometryKeyframe, turn: F64 | None, R_odom_camera: F64
+    ) -> list[tuple[F64, float]]:
+        """A start pose from the global shift between the keyframe's picture and this one."""
+        shift = matching.global_shift(key.pyramid.levels[0], grey)
+        if shift.confidence < self.config.least_shift_confidence:
+            return []
+        known = np.flatnonzero(key.landmark >= 0)
+        points = self.points[key.landmark[known]]
+        there = shift.apply(key.uv[known])
+        W, H = self.camera.size_px
+        inside = np.isfinite(points[:, 0]) & np.all((there > 0) & (there < [W, H]), axis=1)
+        if inside.sum() < 12:
+            return []
+        ok, rvec, tvec = cv2.solvePnP(
+            points[inside], there[inside], self.K, np.zeros(5), flags=cv2.SOLVEPNP_SQPNP
+        )
+        if not ok:
+            return []
+        R, _ = cv2.Rodrigues(rvec)
+        return [(se3.compose(np.asarray(R), np.asarray(tvec).ravel()), 0.07)]
+
+    def _pose_from(
+        self,
+        key: OdometryKeyframe,
+        pyramid: matching.Pyramid,
+        T_camera_odom: F64,
+        share: float,
+        stride: int = 1,
+    ) -> _Located | str:
+        """EPnP pose of the frame from one keyframe's landmarks, or why there is none."""
+        prediction, visible = self._predict_3d(key, T_camera_odom, share)
+        if stride > 1:
+            visible &= (key.landmark >= 0) & (np.arange(len(visible)) % stride == 0)
+        index = np.flatnonzero(visible)
+        need = self.config.min_tracks // stride
+        if index.size < need:
+            return "the view left the map"
+        found = matching.match(
+            key.pyramid,
+            key.uv[index].astype(np.float32),
+            pyramid,
+            prediction.uv[index].astype(np.float32),
+            prediction.radius_px,
+            prediction.warp[index].astype(np.float32),
+            self.config.matching,
+        )
+        ok = np.zeros(len(key.uv), np.bool_)
+        ok[index] = found.ok
+        uv = prediction.uv.copy()
+        uv[index] = found.uv_px
+        known = np.flatnonzero(ok & (key.landmark >= 0))
+        expected = int((visible & (key.landmark >= 0)).sum())
+        if known.size < max(need, self.config.min_track_share * expected):
+            return "too few matches"
+        points = self.points[key.landmark[known]]
+        solved = pnp.solve(points, uv[known], self.K, self.config.pnp, T_camera_odom)
+        if solved is None or solved.inliers.sum() < max(need, 0.5 * known.size):
+            return "no pose fits the matches"
+        ok[known[~solved.inliers]] = False
+        return _Located(solved, uv, ok)
+
+    def _predict_3d(
+        self, key: OdometryKeyframe, T_camera_odom: F64, share: float
+    ) -> tuple[_Prediction, Bool]:
+        """Where the keyframe's corners fall for a start pose; corners without a landmark
+        are taken to lie on the plane through the landmarks."""
+        T_new_key = T_camera_odom @ key.T_odom_camera
+        known = key.landmark >= 0
+        P_key = se3.transform(key.T_camera_odom, self.points[key.landmark[known]])
+        known[np.flatnonzero(known)[~np.isfinite(P_key[:, 0])]] = False
+        P_key = P_key[np.isfinite(P_key[:, 0])]
+        plane = _inverse_depth_plane(self.K, P_key)
+        H = self.K @ (T_new_key[:3, :3] + np.outer(T_new_key[:3, 3], plane)) @ np.linalg.inv(self.K)
+        uv = cv2.perspectiveTransform(key.uv[:, None], H)[:, 0].astype(np.float64)
+        warp = _local_affine(H, key.uv, uv)
+        P_new = se3.transform(T_new_key, P_key)
+        uv[known] = P_new[:, :2] / P_new[:, 2:] * [self.K[0, 0], self.K[1, 1]] + self.K[:2, 2]
+        W, Hh = self.camera.size_px
+        visible = np.all((uv > 8) & (uv < [W - 8, Hh - 8]), axis=1) & np.isfinite(uv[:, 0])
+        return _Prediction(uv, warp, share * W), visible
+
+    def _agrees(self, T_camera_odom: F64, prior: PosePrior, key: OdometryKeyframe) -> bool:
+        """False when vision turned otherwise than telemetry since the keyframe."""
+        turn = _relative_rotation(key.prior, prior)
+        if turn is None:
+            return True
+        seen = T_camera_odom[:3, :3] @ key.T_odom_camera[:3, :3]
+        return float(np.linalg.norm(se3.so3_log(seen @ turn.T))) < self.config.max_tilt_error_rad
+
+    # ---- keyframes ---------------------------------------------------------------------
+
+    def _accept(
+        self,
+        grey: U8,
+        pyramid: matching.Pyramid,
+        seq: int,
+        time_ns: int,
+        prior: PosePrior,
+        mask: U8 | None,
+        found: _Located,
+    ) -> Tracked:
+        """Keep the pose; make the frame a keyframe when it has moved enough."""
+        key, ok = self.keyframes[-1], found.ok
+        T_camera_odom, covariance = found.pose.T_camera_points, found.pose.covariance
+        moved = T_camera_odom @ key.T_odom_camera
+        depth = self.median_depth(key)
+        base = float(np.linalg.norm(moved[:3, 3])) / max(depth, 1e-6)
+        share = ok.sum() / max(len(key.uv), 1)
+        turned = float(np.linalg.norm(se3.so3_log(moved[:3, :3])))
+        T_odom_camera = se3.inverse(T_camera_odom)
+        self._update_motion(time_ns, T_odom_camera, prior)
+        self._lost = 0
+        if base < self.config.base_to_height and share > 0.45 and turned < 0.25:
+            return Tracked("tracked", self.segment, T_odom_camera, covariance, int(ok.sum()), base)
+        self._add_keyframe(grey, pyramid, seq, time_ns, prior, mask, T_camera_odom, found.uv, ok)
+        last = self.keyframes[-1]
+        self._last = (time_ns, last.T_odom_camera, prior)
+        return Tracked(
+            "keyframe", self.segment, last.T_odom_camera, last.covariance, int(ok.sum()), base
+        )
+
+    def _update_motion(self, time_ns: int, T_odom_camera: F64, prior: PosePrior) -> None:
+        if self._last is not None and time_ns > self._last[0]:
+            dt = (time_ns - self._last[0]) * 1e-9
+            velocity = (T_odom_camera[:3, 3] - self._last[1][:3, 3]) / dt
+            keep = 0.5 if dt < 0.3 and np.any(self._velocity) else 0.0
+            self._velocity = keep * self._velocity + (1 - keep) * velocity
+        self._last = (time_ns, T_odom_camera, prior)
+
+    def _add_keyframe(
+        self,
+        grey: U8,
+        pyramid: matching.Pyramid,
+        seq: int,
+        time_ns: int,
+        prior: PosePrior,
+        mask: U8 | None,
+        T_camera_odom: F64,
+        uv: F64,
+        ok: Bool,
+    ) -> None:
+        """Append a keyframe: tracked corners, new landmarks, fresh corners; adjust the window."""
+        key = self.keyframes[-1]
+        self._triangulate(key, T_camera_odom, uv, ok)
+        kept = np.flatnonzero(ok)
+        fresh = _fresh_corners(grey, uv[kept], self.config.matching, mask)
+        new = OdometryKeyframe(
+            seq,
+            time_ns,
+            self.segment,
+            T_camera_odom,
+            np.zeros((6, 6)),
+            prior,
+            pyramid,
+            np.vstack([uv[kept], fresh]),
+            np.concatenate([key.landmark[kept], np.full(len(fresh), -1, np.int64)]),
+        )
+        self.keyframes.append(new)
+        self._adjust_window()
+        for old in self.keyframes[: -self.config.window - 2]:
+            old.pyramid = matching.Pyramid(())
+
+    def _triangulate(
+        self, key: OdometryKeyframe, T_camera_odom: F64, uv: F64, ok: Bool
+    ) -> None:
+        """Landmarks for the keyframe's matched corners that have none yet."""
+        rows = np.flatnonzero(ok & (key.landmark < 0))
+        if rows.size == 0:
+            return
+        points, angle = bundle.triangulate(
+            key.T_camera_odom, T_camera_odom, self.K, key.uv[rows], uv[rows]
+        )
+        error = np.maximum(
+            two_view.reprojection_error(key.T_camera_odom, points, self.K, key.uv[rows]),
+            two_view.reprojection_error(T_camera_odom, points, self.K, uv[rows]),
+        )
+        good = (error < 1.5) & (angle > 0.5 * self.config.least_base_to_height)
+        key.landmark[rows[good]] = len(self.points) + np.arange(int(good.sum()))
+        self.points = np.vstack([self.points, points[good]])
+        ok[rows[~good & (error >= 1.5)]] = False
+
+    def _adjust_window(self) -> None:
+        """Bundle-adjust the last keyframes; the two oldest of them hold the frame and scale."""
+        window = self.keyframes[-self.config.window - 2 :]
+        fixed = 1 if len(window) == 2 else 2
+        cam, pt, uv = [], [], []
+        for c, key in enumerate(window):
+            rows = np.flatnonzero(key.landmark >= 0)
+            rows = rows[np.isfinite(self.points[key.landmark[rows], 0])]
+            cam.append(np.full(rows.size, c, np.int64))
+            pt.append(key.landmark[rows])
+            uv.append(key.uv[rows])
+        point = np.concatenate(pt)
+        ids, index, counts = np.unique(point, return_inverse=True, return_counts=True)
+        use = counts[index] >= 2
+        ids, index = np.unique(point[use], return_inverse=True)
+        base = self._baseline(window)
+        free = np.arange(len(window)) >= fixed
+        result = bundle.adjust(
+            np.stack([k.T_camera_odom for k in window]),
+            self.points[ids],
+            np.concatenate(cam)[use],
+            index.astype(np.int64),
+            np.concatenate(uv)[use],
+            self.K,
+            free,
+        )
+        for c in np.flatnonzero(free):
+            window[c].T_camera_odom = result.T_camera_world[c]
+            window[c].covariance = result.covariance[c]
+        self.points[ids] = result.points_m
+        self._drop_outliers(window, ids, index, np.concatenate(cam)[use], result.residual_px)
+        if len(window) == 2:
+            self._restore_baseline(window, base)
+
+    @staticmethod
+    def _baseline(window: list[OdometryKeyframe]) -> float:
+        moved = window[1].T_camera_odom @ window[0].T_odom_camera
+        return float(np.linalg.norm(moved[:3, 3]))
+
+    def _restore_baseline(self, window: list[OdometryKeyframe], base: float) -> None:
+        """Two views leave the scale open; put it back to where it was."""
+        factor = base / max(self._baseline(window), 1e-9)
+        origin = window[0].T_odom_camera[:3, 3]
+        self.points = origin + (self.points - origin) * factor
+        T = window[1].T_odom_camera
+        T[:3, 3] = origin + (T[:3, 3] - origin) * factor
+        window[1].T_camera_odom = se3.inverse(T)
+
+    def _drop_outliers(
+        self,
+        window: list[OdometryKeyframe],
+        ids: I64,
+        index: I64,
+        cam: I64,
+        residual_px: F64,
+    ) -> None:
+        """Remove observations over 2.5 px; a landmark left with one view is dropped."""
+        bad = residual_px > 2.5
+        for c in np.unique(cam[bad]):
+            gone = ids[index[bad & (cam == c)]]
+            key = window[c]
+            key.landmark[np.isin(key.landmark, gone)] = -1
+        good = np.bincount(index[~bad], minlength=len(ids))
+        self.points[ids[good < 2]] = np.nan
+
+    # ---- what the dense stages ask -----------------------------------------------------
+
+    def median_depth(self, key: OdometryKeyframe) -> float:
+        """Median depth of the keyframe's landmarks, in odometry units; NaN without any."""
+        _, depth = self.landmarks(key)
+        return float(np.median(depth)) if depth.size else float("nan")
+
+    def landmarks(self, key: OdometryKeyframe) -> tuple[F64, F64]:
+        """(N, 3) points in the keyframe's camera and (N,) their depths, in odometry units."""
+        ids = key.landmark[key.landmark >= 0]
+        points = self.points[ids]
+        points = points[np.isfinite(points[:, 0])]
+        P = se3.transform(key.T_camera_odom, points)
+        P = P[P[:, 2] > 0]
+        return P, P[:, 2]
+
+
+def _averaged(left: pnp.PnpResult, right: pnp.PnpResult) -> pnp.PnpResult:
+    """The right view's pose averaged with the left's, both of one frame in one map."""
+    mean = pnp.average_left_right(left, right, np.eye(4))
+    return replace(right, T_camera_points=mean.T_camera_points, covariance=mean.covariance)
+
+
+def _relative_rotation(a: PosePrior, b: PosePrior) -> F64 | None:
+    """R_b_a from two attitudes; None when one is missing or only assumed from the mount."""
+    if a.R_world_camera is None or b.R_world_camera is None:
+        return None
+    if max(a.sigma_yaw_rad, b.sigma_yaw_rad) > 1.0:
+        return None
+    return np.asarray(b.R_world_camera.T @ a.R_world_camera)
+
+
+def _base_to_height(uv_a: F64, uv_b: F64, K: F64, R_b_a: F64 | None) -> float:
+    """Median motion of the matches in focal lengths, with the turn taken out when known.
+
+    Without an attitude the turn about the optical axis and the mean shift that a tilt would
+    give cannot be told from motion; the shift is then counted as motion.
+    """
+    a, b = rays(K, uv_a), rays(K, uv_b)
+    if R_b_a is not None:
+        a = a @ R_b_a.T
+        a = a / a[:, 2:]
+        return float(np.median(np.linalg.norm(b - a, axis=1)))
+    A, _ = cv2.estimateAffinePartial2D(
+        np.ascontiguousarray(a[:, :2]), np.ascontiguousarray(b[:, :2]), ransacReprojThreshold=0.01
+    )
+    return float(np.linalg.norm(A[:, 2])) if A is not None else 0.0
+
+
+def _metric_scale(
+    view: two_view.TwoView, first: PosePrior, second: PosePrior, T_odom_a: F64
+) -> float:
+    """Metres per baseline: from the height above ground, else from the distance flown."""
+    if first.agl_m is not None and first.agl_m > 0:
+        up_a = T_odom_a[:3, :3].T[:, 2]
+        height = -float(np.median(view.points[view.inliers] @ up_a))
+        if height > 0:
+            return first.agl_m / height
+    if first.position_m is not None and second.position_m is not None:
+        flown = float(np.linalg.norm(second.position_m - first.position_m))
+        if flown > 0:
+            return flown
+    return 1.0
+
+
+def _local_affine(H: F64, uv: F64, there: F64) -> F64:
+    """(N, 2, 2) Jacobian of the homography at each pixel."""
+    w = uv @ H[2, :2] + H[2, 2]
+    return np.asarray((H[None, :2, :2] - there[:, :, None] * H[2, :2]) / w[:, None, None])
+
+
+def _inverse_depth_plane(K: F64, P: F64) -> F64:
+    """(3,) q with ``1 / z = q . ray`` for the plane through camera points (N, 3)."""
+    if len(P) < 3:
+        return np.array([0.0, 0.0, 1.0 / max(float(np.median(P[:, 2])) if len(P) else 1.0, 1e-6)])
+    ray = P / P[:, 2:]
+    target = 1.0 / P[:, 2]
+    weights = np.ones(len(P))
+    q = np.zeros(3)
+    for _ in range(5):
+        A = ray * weights[:, None]
+        q = np.linalg.solve(A.T @ ray + 1e-9 * np.eye(3), A.T @ target)
+        error = np.abs(ray @ q - target)
+        scale = max(1.4826 * float(np.median(error)), 1e-9)
+        weights = 1.0 / (1.0 + (error / (2 * scale)) ** 2)
+    return np.asarray(q)
+
+
+def _fresh_corners(
+    grey: U8, kept: F64, config: matching.MatchingConfig, mask: U8 | None
+) -> F64:
+    """(N, 2) corners in grid cells that no kept track occupies."""
+    corners = matching.harris_grid(grey, config, mask).uv_px.astype(np.float64)
+    H, W = grey.shape
+    taken = np.zeros((config.grid, config.grid), np.bool_)
+    cell = (kept / [W, H] * config.grid).astype(np.int64).clip(0, config.grid - 1)
+    taken[cell[:, 1], cell[:, 0]] = True
+    cell = (corners / [W, H] * config.grid).astype(np.int64).clip(0, config.grid - 1)
+    return np.asarray(corners[~taken[cell[:, 1], cell[:, 0]]])

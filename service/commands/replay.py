@@ -1,0 +1,218 @@
+"""``skyrelief replay``: recorded video as a fake camera through the whole onboard path."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import time
+from pathlib import Path
+from threading import Event
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from mavlink.logs import TelemetryLog
+    from recon.types import Camera
+    from service.cameras.source import CameraSource
+    from service.config import Config
+    from service.scan import Scan
+
+
+def replay(
+    video: Annotated[str, typer.Argument(help="a video, a folder of pictures, or - for a pipe")],
+    telemetry: Annotated[
+        Path | None, typer.Option(help="flight log: .tlog, .BIN, .ulg or .SRT")
+    ] = None,
+    camera_model: Annotated[
+        Path | None, typer.Option(help="camera_info YAML of 'skyrelief calibrate'")
+    ] = None,
+    video_epoch: Annotated[
+        float | None, typer.Option(help="unix seconds of the video's first instant")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="scan folder to make")] = None,
+    backend: Annotated[str | None, typer.Option(help="auto, cpu, torch or onnx")] = None,
+    realtime: Annotated[
+        bool, typer.Option("--realtime", help="at the video's pace, dropping what comes too fast")
+    ] = False,
+    config: Annotated[Path | None, typer.Option(help="configuration file (TOML)")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="section.key=value, may be repeated")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
+) -> None:
+    """Recorded video, a folder of pictures or a pipe through the onboard path into a scan."""
+    from service.cameras import open_camera
+    from service.config import load_config
+
+    overrides = list(set_ or [])
+    if backend is not None:
+        overrides.append(f"compute.backend={backend}")
+    chosen = load_config(config, overrides)
+    camera = _load_model(camera_model, chosen)
+    log = _load_telemetry(telemetry)
+    source = open_camera(video)
+    try:
+        summary = _replay(source, camera, log, video_epoch, out, chosen, realtime, as_json)
+    finally:
+        source.close()
+    _report(summary, as_json)
+
+
+def _load_model(path: Path | None, config: Config) -> Camera | None:
+    from service.camera_file import load_camera
+
+    chosen = path or (Path(config.camera.model) if config.camera.model else None)
+    return None if chosen is None else load_camera(chosen)
+
+
+def _load_telemetry(path: Path | None) -> TelemetryLog | None:
+    from mavlink.logs import load_telemetry
+    from service.errors import InputError
+
+    if path is None:
+        return None
+    try:
+        return load_telemetry(path)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+
+
+def _replay(
+    source: CameraSource,
+    camera: Camera | None,
+    log: TelemetryLog | None,
+    video_epoch: float | None,
+    out: Path | None,
+    config: Config,
+    realtime: bool,
+    as_json: bool,
+) -> dict[str, Any]:
+    from recon.backends import load_backend
+    from service.cameras.pace import paced
+    from service.datalink import open_datalink
+    from service.errors import InputError
+    from service.scan import Scan, ScanInputs, create_store
+    from service.scan_folder import write_deliverables
+
+    notes: list[str] = []
+    if camera is None:
+        camera = _assumed_camera(source, notes)
+    elif camera.size_px != source.size_px:
+        W, H = source.size_px
+        raise InputError(
+            f"the camera model is for {camera.size_px[0]}x{camera.size_px[1]} pictures, "
+            f"{source.description} has {W}x{H}; calibrate at that size"
+        )
+    epoch_ns = _epoch(source, log, video_epoch, notes)
+    scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(epoch_ns / 1e9))
+    folder = out or Path(f"scan-{scan_id}")
+    chosen = load_backend(config.compute.backend)
+    notes += log.warnings if log is not None else ()
+    inputs = ScanInputs(
+        paced(source) if realtime else source,
+        camera,
+        config,
+        chosen,
+        folder,
+        scan_id,
+        epoch_ns,
+        history=log.history if log is not None else None,
+        notes=tuple(notes),
+        extra={"backend": chosen.name, "source": source.description},
+    )
+    store = create_store(inputs)
+    link = open_datalink(store, config)
+    scan = Scan(inputs, store)
+    stop = _stop_on_signals()
+    try:
+        scan.run(stop, None if as_json or not sys.stderr.isatty() else _progress)
+    finally:
+        summary = scan.close()
+        if link is not None:
+            summary["datalink_complete"] = link.drain(config.datalink.drain_s)
+            link.close()
+        summary |= write_deliverables(folder, store, {})
+        store.close()
+    return summary | {"scan_folder": str(folder)}
+
+
+def _assumed_camera(source: CameraSource, notes: list[str]) -> Camera:
+    """A pinhole of 70 degrees across, with a note that says so."""
+    import numpy as np
+
+    from recon.types import Camera
+
+    W, H = source.size_px
+    f = W / 2 / np.tan(np.radians(35.0))
+    notes.append(
+        "no camera model given: a lens of 70 degrees without distortion is assumed; "
+        "make one with 'skyrelief calibrate' for shapes to be true"
+    )
+    K = np.array([[f, 0.0, (W - 1) / 2], [0.0, f, (H - 1) / 2], [0.0, 0.0, 1.0]])
+    return Camera(K, np.zeros(5), (W, H))
+
+
+def _epoch(
+    source: CameraSource, log: TelemetryLog | None, video_epoch: float | None, notes: list[str]
+) -> int:
+    """Unix ns of the source's time 0: as given, the container's, the log's start, or now."""
+    from service.errors import InputError
+
+    if video_epoch is not None:
+        epoch_ns = round(video_epoch * 1e9)
+    elif source.epoch_unix_ns is not None:
+        epoch_ns = source.epoch_unix_ns
+    elif log is not None:
+        epoch_ns = log.first_ns
+        notes.append("the video does not say when it began: taken as the start of the log")
+    else:
+        epoch_ns = time.time_ns()
+        notes.append("the video does not say when it began: taken as the time of the replay")
+    if log is not None and not log.first_ns - 600e9 < epoch_ns < log.last_ns:
+        raise InputError(
+            f"the telemetry covers {_utc(log.first_ns)} to {_utc(log.last_ns)}, the video begins "
+            f"at {_utc(epoch_ns)}: they do not overlap; give the right --video-epoch"
+        )
+    return epoch_ns
+
+
+def _utc(time_ns: int) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(time_ns / 1e9))
+
+
+def _stop_on_signals() -> Event:
+    """An event that Ctrl-C or a TERM signal sets, so that the scan is closed properly."""
+    stop = Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
+def _progress(scan: Scan) -> None:
+    r = scan.recorder
+    print(
+        f"\r{r.frames} frames, {scan.pipeline.pairs} pairs, {r.clouds} clouds, "
+        f"{r.points / 1e6:.2f} M points, {r.distance_m:.0f} m flown ",
+        end="",
+        file=sys.stderr,
+        flush=True,
+    )
+
+
+def _report(summary: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(summary))
+        return
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+    for warning in summary["warnings"]:
+        print(f"note: {warning}")
+    refused = ", ".join(f"{k} ({n})" for k, n in summary["refusals"].items()) or "none"
+    print(
+        f"{summary['scan_folder']}: {summary['frames']} frames, {summary['pairs']} pairs, "
+        f"{summary['clouds']} clouds, {summary['points']} points, "
+        f"{summary['distance_m']:.0f} m flown in {summary['segments']} segment(s), "
+        f"{summary['clouds_per_second']:g} clouds/s\nnot used: {refused}"
+    )

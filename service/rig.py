@@ -1,0 +1,137 @@
+"""How the camera hangs on the vehicle, and what telemetry therefore says of its pose."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from mavlink.state import VehicleState
+from recon import se3
+from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
+from recon.types import F64, PosePrior
+from service.cameras.source import GeoTag
+from service.config import CameraConfig, FusionConfig, ScanConfig
+from service.georeference import LocalFrame
+
+ASSUMED_AGL_M = 50.0
+"""Height above ground that gives a scan its scale when nothing else does (stated in it)."""
+
+MOUNT_TILT_SIGMA_RAD = math.radians(6.0)
+"""How far a camera may lean from its nominal mount when no attitude is known."""
+
+NO_YAW_RAD = 3.0
+"""Sigma of a heading that is not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """A position on the globe with its uncertainty."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float | None
+    sigma_h_m: float
+    sigma_v_m: float
+
+
+class Rig:
+    """Turns vehicle states and picture tags into priors on the camera's pose.
+
+    The scan's origin is the first position heard; until then positions are left out.
+    """
+
+    def __init__(self, camera: CameraConfig, scan: ScanConfig, fusion: FusionConfig) -> None:
+        self._camera, self._scan, self._fusion = camera, scan, fusion
+        self.frame: LocalFrame | None = None
+        self.georeference = "none"
+        self._R_body_camera = (
+            rotation_from_rpy(
+                math.radians(camera.mount_roll_deg),
+                math.radians(camera.mount_pitch_deg),
+                math.radians(camera.mount_yaw_deg),
+            )
+            @ R_GIMBAL_CAMERA
+        )
+
+    def prior(self, state: VehicleState | None, tag: GeoTag | None) -> PosePrior:
+        """The prior of one frame from telemetry, else from the picture's own tag.
+
+        Without an attitude the nominal mount of a level vehicle heading north is given, with
+        a sigma that says so; without a height the configured or assumed one, likewise.
+        """
+        R, tilt, yaw = self._rotation(state, tag)
+        fix = self._fix(state, tag)
+        position, sigma = self._position(fix)
+        agl, sigma_agl = self._agl(state, tag)
+        return PosePrior(R, tilt, yaw, position, sigma, agl, sigma_agl)
+
+    def _rotation(self, state: VehicleState | None, tag: GeoTag | None) -> tuple[F64, float, float]:
+        if state is not None and self._fusion.attitude:
+            gimbal = state.q_ned_gimbal_wxyz
+            if gimbal is not None and self._camera.mount != "fixed":
+                R = R_ENU_NED @ se3.rotation_from_quaternion(gimbal) @ R_GIMBAL_CAMERA
+                return R, state.sigma_gimbal_rad or 0.02, state.sigma_yaw_rad or 0.1
+            body = state.q_ned_body_wxyz
+            if body is not None and self._camera.mount != "gimbal":
+                R = R_ENU_NED @ se3.rotation_from_quaternion(body) @ self._R_body_camera
+                return R, state.sigma_attitude_rad or 0.02, state.sigma_yaw_rad or 0.1
+        if tag is not None and tag.ypr_deg is not None and self._fusion.attitude:
+            yaw, pitch, roll = (math.radians(a) for a in tag.ypr_deg)
+            R = R_ENU_NED @ rotation_from_rpy(roll, pitch, yaw) @ R_GIMBAL_CAMERA
+            return R, math.radians(1.5), math.radians(5.0)
+        return R_ENU_NED @ self._R_body_camera, MOUNT_TILT_SIGMA_RAD, NO_YAW_RAD
+
+    def _fix(self, state: VehicleState | None, tag: GeoTag | None) -> Fix | None:
+        if not self._fusion.gnss:
+            return None
+        if state is not None and state.lat_deg is not None and state.lon_deg is not None:
+            self.georeference = "gnss"
+            return Fix(
+                state.lat_deg,
+                state.lon_deg,
+                state.alt_amsl_m,
+                state.sigma_h_m or 2.0,
+                state.sigma_v_m or 4.0,
+            )
+        if state is None and tag is not None and self.georeference != "gnss":
+            self.georeference = "exif"
+            return Fix(tag.lat_deg, tag.lon_deg, tag.alt_amsl_m, tag.sigma_h_m, 50.0)
+        return None
+
+    def _position(self, fix: Fix | None) -> tuple[F64 | None, F64 | None]:
+        """(3,) ENU metres about the origin and their sigmas."""
+        if fix is None:
+            return None, None
+        altitude = fix.alt_amsl_m
+        if self.frame is None:
+            self.frame = LocalFrame(fix.lat_deg, fix.lon_deg, altitude or 0.0)
+        if altitude is None:
+            altitude = self.frame.alt_amsl_m
+        enu = self.frame.to_enu(np.array([[fix.lat_deg, fix.lon_deg, altitude]]))[0]
+        return enu, np.array([fix.sigma_h_m, fix.sigma_h_m, fix.sigma_v_m])
+
+    def _agl(self, state: VehicleState | None, tag: GeoTag | None) -> tuple[float, float]:
+        """Height above ground and its sigma in metres."""
+        if self._scan.assumed_agl_m is not None:
+            return self._scan.assumed_agl_m, 0.1 * self._scan.assumed_agl_m
+        if state is not None and state.alt_agl_m is not None and state.alt_agl_m > 1.0:
+            if self._fusion.altitude:
+                spread = state.sigma_agl_m or 3.0
+                return state.alt_agl_m, max(spread, 0.03 * state.alt_agl_m)
+        elif tag is not None and tag.relative_alt_m is not None and tag.relative_alt_m > 1.0:
+            return tag.relative_alt_m, 0.1 * tag.relative_alt_m + 2.0
+        return ASSUMED_AGL_M, 0.5 * ASSUMED_AGL_M
+
+    def height_known(self, state: VehicleState | None, tag: GeoTag | None) -> bool:
+        """False when the scan's scale rests on :data:`ASSUMED_AGL_M`."""
+        agl, _ = self._agl(state, tag)
+        return agl != ASSUMED_AGL_M
+
+
+def attitude_of(T_world_camera: F64) -> tuple[float, float, float]:
+    """(roll, pitch, yaw) rad of the optical head (gimbal axes) in NED: pitch -pi/2 is nadir."""
+    from recon.frames import rpy_from_rotation
+
+    return rpy_from_rotation(R_ENU_NED @ T_world_camera[:3, :3] @ R_GIMBAL_CAMERA.T)

@@ -1,0 +1,153 @@
+"""One scan from first frame to closed folder: a camera, the pipeline, the store, the link."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Event
+from typing import Any, Protocol
+
+from mavlink.history import VehicleHistory
+from recon.backends import Backend
+from recon.types import Camera, Frame
+from service.cameras.source import CameraFrame, CameraSource
+from service.config import Config
+from service.errors import InputError
+from service.pipeline import Pipeline, Step
+from service.recorder import Recorder
+from service.rig import ASSUMED_AGL_M
+from service.stream.records import ScanHeader
+from service.stream.store import ScanStore
+from service.version import software
+
+log = logging.getLogger(__name__)
+
+
+class Datalink(Protocol):
+    """The sending end, as a scan needs it."""
+
+    def drain(self, timeout_s: float) -> bool:
+        """Wait until the ground holds everything; False when the time is up."""
+        ...
+
+    def close(self) -> None:
+        """Stop sending."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanInputs:
+    """What a scan is made from."""
+
+    source: CameraSource
+    camera: Camera
+    config: Config
+    backend: Backend
+    folder: Path
+    scan_id: str
+    epoch_ns: int  # of the frames' time 0, on the history's clock
+    unix_offset_ns: int = 0  # history's clock to unix time
+    history: VehicleHistory | None = None
+    notes: tuple[str, ...] = ()
+    extra: dict[str, Any] = field(default_factory=dict)  # goes into scan.json
+
+
+def create_store(inputs: ScanInputs) -> ScanStore:
+    """The scan's folder and database; InputError when it holds a scan already."""
+    path = inputs.folder / "scan.db"
+    if path.exists():
+        raise InputError(
+            f"{inputs.folder} already holds a scan; give another --out, nothing was changed"
+        )
+    W, H = inputs.camera.size_px
+    header = ScanHeader(
+        scan_id=inputs.scan_id,
+        drone=inputs.config.scan.drone_name,
+        started_unix_ns=inputs.epoch_ns + inputs.unix_offset_ns,
+        camera={
+            "width": W,
+            "height": H,
+            "K": inputs.camera.K.ravel().tolist(),
+            "distortion": inputs.camera.distortion.tolist(),
+        },
+        configuration=inputs.config.to_dict(),
+        software=software(),
+        notes=inputs.notes,
+    )
+    return ScanStore.create(path, header)
+
+
+class Scan:
+    """Runs frames through the pipeline into the store until the source ends or a stop."""
+
+    def __init__(self, inputs: ScanInputs, store: ScanStore) -> None:
+        self.inputs, self.store = inputs, store
+        self.pipeline = Pipeline(inputs.camera, inputs.config, inputs.backend)
+        self.recorder = Recorder(store, self.pipeline, inputs.unix_offset_ns)
+        self.tagged = self.odd_sized = self.heights = 0
+        self._started = time.monotonic()
+
+    def feed(self, frame: CameraFrame) -> Step | None:
+        """One frame through the pipeline; None when its size is not the camera's."""
+        inputs = self.inputs
+        H, W = frame.image.shape[:2]
+        if (W, H) != inputs.camera.size_px:
+            self.odd_sized += 1
+            return None
+        time_ns = inputs.epoch_ns + frame.time_ns
+        exposed_ns = time_ns - round(inputs.config.camera.latency_ms * 1e6)
+        state = inputs.history.state_at(exposed_ns) if inputs.history is not None else None
+        self.tagged += state is not None
+        self.heights += self.pipeline.rig.height_known(state, frame.geotag)
+        step = self.pipeline.step(
+            Frame(frame.image, exposed_ns, frame.seq, inputs.camera), state, frame.geotag
+        )
+        self.recorder.write(step, exposed_ns, state.alt_agl_m if state is not None else None)
+        return step
+
+    def run(self, stop: Event, progress: Callable[[Scan], None] | None = None) -> None:
+        """Feed every frame of the source until it ends or ``stop`` is set."""
+        for frame in self.inputs.source:
+            if stop.is_set():
+                log.info("stopped; closing the scan")
+                break
+            self.feed(frame)
+            if progress is not None:
+                progress(self)
+
+    def close(self) -> dict[str, Any]:
+        """Write what is left and close the scan in the store; return its figures."""
+        elapsed = max(time.monotonic() - self._started, 1e-9)
+        extra = {
+            "frames_tagged": self.tagged,
+            "frames_of_another_size": self.odd_sized,
+            "seconds": round(elapsed, 2),
+            "warnings": [*self.inputs.notes, *self.inputs.source.warnings, *self._doubts()],
+        }
+        summary = self.recorder.close(extra | self.inputs.extra)
+        summary["clouds_per_second"] = round(summary["clouds"] / elapsed, 2)
+        self.store.finish(summary)
+        return summary
+
+    def _doubts(self) -> list[str]:
+        """What the reader of this scan must know."""
+        out = []
+        if self.odd_sized:
+            W, H = self.inputs.camera.size_px
+            out.append(f"{self.odd_sized} frames were not {W}x{H} like the camera model: left out")
+        if self.inputs.history is not None and self.tagged == 0 and self.recorder.frames:
+            out.append("no frame lies inside the telemetry: poses rest on vision alone")
+        frames = self.recorder.frames
+        if frames and self.heights == 0 and self.pipeline.rig.georeference == "none":
+            out.append(
+                f"no telemetry: the scale assumes {ASSUMED_AGL_M:g} m above ground; "
+                "set scan.assumed_agl_m to the true height"
+            )
+        if frames and self.recorder.clouds == 0:
+            top = self.pipeline.refusals.most_common(2)
+            why = "; ".join(f"{reason} ({n})" for reason, n in top) or "too few frames"
+            out.append(f"nothing was reconstructed: {why}")
+        return out

@@ -1,0 +1,13 @@
+"""Which software this is."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+
+
+def software() -> str:
+    """``skyrelief X.Y.Z``."""
+    try:
+        return f"skyrelief {version('skyrelief')}"
+    except PackageNotFoundError:
+        return "skyrelief (not installed)"

@@ -1,0 +1,107 @@
+"""Which frames become views of the virtual stereo camera, and which of them pair up.
+
+Three ways, as the operator sets ``scan.baseline``: "auto" takes the odometry's keyframes,
+spaced by base-to-height; metres takes a frame every so far along the track; "k/m" takes k of
+every m frames, evenly, as the paper does (two of every ten).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon import se3
+from recon.odometry import OdometryKeyframe, Tracked
+from recon.types import F64, U8, Frame, PosePrior
+from service.config import ScanConfig, parse_baseline
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Viewpoint:
+    """A picture that takes part in stereo; its pose follows its odometry keyframe's."""
+
+    seq: int
+    time_ns: int
+    bgr: U8  # (H, W, 3) undistorted
+    key: OdometryKeyframe
+    T_key_camera: F64  # (4, 4)
+    prior: PosePrior
+
+    @property
+    def T_odom_camera(self) -> F64:
+        """(4, 4) as refined by now."""
+        return np.asarray(self.key.T_odom_camera @ self.T_key_camera)
+
+
+class Viewpoints:
+    """Selects views from tracked frames and remembers the last few as partners."""
+
+    def __init__(self, config: ScanConfig, kept: int = 6, partners: int = 4) -> None:
+        """``kept`` views are remembered; at most ``partners`` pair up with one of them."""
+        self._mode, self._amount, every = parse_baseline(config.baseline)
+        self._stride = frames_apart(int(self._amount), every) if self._mode == "frames" else 0
+        self._kept: deque[Viewpoint] = deque(maxlen=kept)
+        self._partners = partners if self._mode == "auto" else 1
+        self._wanted = config.base_to_height
+
+    @property
+    def least_base_to_height(self) -> float:
+        """The shortest baseline that stereo should accept: an operator's choice is kept."""
+        return 0.03 if self._mode == "auto" else 0.002
+
+    def offer(
+        self,
+        frame: Frame,
+        picture: U8,
+        tracked: Tracked,
+        key: OdometryKeyframe,
+        prior: PosePrior,
+    ) -> Viewpoint | None:
+        """The frame as a view, when it is to be one."""
+        assert tracked.T_odom_camera is not None
+        if not self._wants(frame.seq, tracked):
+            return None
+        T_key_camera = se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera
+        view = Viewpoint(frame.seq, frame.time_ns, picture, key, T_key_camera, prior)
+        self._kept.append(view)
+        return view
+
+    def _wants(self, seq: int, tracked: Tracked) -> bool:
+        if tracked.state == "started" or not self._kept:
+            return tracked.state in ("started", "keyframe")
+        last = self._kept[-1]
+        if self._mode == "auto" or last.key.segment != tracked.segment:
+            return tracked.state == "keyframe"
+        if self._mode == "frames":
+            return seq - last.seq >= self._stride
+        assert tracked.T_odom_camera is not None
+        moved = tracked.T_odom_camera[:3, 3] - last.T_odom_camera[:3, 3]
+        return bool(np.linalg.norm(moved) >= self._amount)
+
+    def ready(self, view: Viewpoint) -> bool:
+        """True when a later view has come, so that the view has partners on both sides."""
+        return bool(self._kept) and self._kept[-1] is not view
+
+    def partners(self, view: Viewpoint) -> list[Viewpoint]:
+        """The views to pair it with, the best first.
+
+        Automatic: those nearest to the wanted base-to-height, from both sides; a fixed
+        baseline: the neighbour after it, or before it at the end of a segment.
+        """
+        others = [v for v in self._kept if v is not view and v.key.segment == view.key.segment]
+        if self._mode != "auto":
+            others.sort(key=lambda v: (v.seq < view.seq, abs(v.seq - view.seq)))
+            return others[:1]
+        centre = view.T_odom_camera[:3, 3]
+        others.sort(key=lambda v: float(np.linalg.norm(v.T_odom_camera[:3, 3] - centre)))
+        return others[: self._partners]
+
+
+def frames_apart(chosen: int, every: int) -> int:
+    """Frames between two views when ``chosen`` of ``every`` frames take part, evenly spread.
+
+    Two of every ten are ten frames apart: at 60 frames a second and 3 m/s the paper's 0.5 m.
+    """
+    return max(1, round(every / max(chosen - 1, 1)))
