@@ -55,6 +55,35 @@ def _gappy_fit(inverse: Any, v: int, u: int, fit: Any) -> bool:
 
 
 @njit(cache=True, nogil=True)
+def _full_fits(inverse: Any, v: int, column: Any, fits: Any) -> None:
+    """Fill ``fits`` (4, w) of row ``v``: value, slopes, mean square residual; NaN near holes.
+
+    A hole is NaN and spoils every sum that it is part of, so no pixel needs to be asked.
+    """
+    h, w = inverse.shape
+    fits[:] = np.nan
+    if v < REACH or v >= h - REACH:
+        return
+    r0, r1, r2, r3, r4 = (
+        inverse[v - 2], inverse[v - 1], inverse[v], inverse[v + 1], inverse[v + 2]
+    )  # fmt: skip
+    sums, slopes, squares = column[0], column[1], column[2]
+    for u in range(w):
+        a, b, c, d, e = r0[u], r1[u], r2[u], r3[u], r4[u]
+        sums[u] = a + b + c + d + e
+        slopes[u] = 2.0 * (e - a) + d - b
+        squares[u] = a * a + b * b + c * c + d * d + e * e
+    value, along, across, rest = fits[0], fits[1], fits[2], fits[3]
+    for u in range(REACH, w - REACH):
+        s0 = sums[u - 2] + sums[u - 1] + sums[u] + sums[u + 1] + sums[u + 2]
+        s1 = slopes[u - 2] + slopes[u - 1] + slopes[u] + slopes[u + 1] + slopes[u + 2]
+        s2 = squares[u - 2] + squares[u - 1] + squares[u] + squares[u + 1] + squares[u + 2]
+        sx = 2.0 * (sums[u + 2] - sums[u - 2]) + sums[u + 1] - sums[u - 1]
+        value[u], along[u], across[u] = s0 * (1 / 25), sx * (1 / 50), s1 * (1 / 50)
+        rest[u] = (s2 - s0 * s0 * (1 / 25) - (sx * sx + s1 * s1) * (1 / 50)) * (1 / 22)
+
+
+@njit(cache=True, nogil=True)
 def surface_elements(
     depth: Any, sigma: Any, fx: float, fy: float, cx: float, cy: float, edge: float, elements: Any
 ) -> None:
@@ -67,48 +96,29 @@ def surface_elements(
     inverse = np.empty((h, w), np.float64)
     for v in range(h):
         for u in range(w):
-            z = depth[v, u]
-            inverse[v, u] = 1.0 / z if z > 0 else np.nan
-    n, slope_norm = 25.0, 50.0
+            inverse[v, u] = 1.0 / depth[v, u] if depth[v, u] > 0 else np.nan
+    column, fits, fit = np.empty((3, w)), np.empty((4, w)), np.empty(4)
     for v in range(h):
-        line = np.full((4, w), np.nan)
-        if v >= REACH and v < h - REACH:
-            line[:] = 0.0
-            for dv in range(-REACH, REACH + 1):
-                row = inverse[v + dv]
-                for u in range(w):
-                    line[0, u] += row[u]
-                    line[1, u] += dv * row[u]
-                    line[2, u] += row[u] * row[u]
-        fit = np.empty(4)
+        _full_fits(inverse, v, column, fits)
         for u in range(w):
-            elements[v, u, 4] = 0.0
-            if np.isnan(inverse[v, u]):
-                continue
-            s0 = np.nan
-            if u >= REACH and u < w - REACH:
-                s0 = line[0, u - 2] + line[0, u - 1] + line[0, u] + line[0, u + 1] + line[0, u + 2]
-            if not np.isnan(s0):
-                s1 = line[1, u - 2] + line[1, u - 1] + line[1, u] + line[1, u + 1] + line[1, u + 2]
-                s2 = line[2, u - 2] + line[2, u - 1] + line[2, u] + line[2, u + 1] + line[2, u + 2]
-                sx = 2 * (line[0, u + 2] - line[0, u - 2]) + line[0, u + 1] - line[0, u - 1]
-                fit[0], fit[1], fit[2] = s0 / n, sx / slope_norm, s1 / slope_norm
-                rest = s2 - s0 * s0 / n - (sx * sx + s1 * s1) / slope_norm
-                fit[3] = max(rest, 0.0) / (n - 3)
-            elif not _gappy_fit(inverse, v, u, fit):
-                continue
+            element = elements[v, u]
+            element[4] = 0.0
             z = depth[v, u]
-            rms = np.sqrt(fit[3]) * z * z
+            if not (z > 0 and sigma[v, u] > 0):
+                continue
+            if np.isnan(fits[0, u]):
+                if not _gappy_fit(inverse, v, u, fit):
+                    continue
+                fits[0, u], fits[1, u], fits[2, u], fits[3, u] = fit[0], fit[1], fit[2], fit[3]
+            rms = np.sqrt(max(fits[3, u], 0.0)) * z * z
             if rms > edge * z and rms > 3 * sigma[v, u]:
                 continue
-            a, b = fit[1] * fx, fit[2] * fy
-            c = fit[0] - fit[1] * (u - cx) - fit[2] * (v - cy)
-            length = np.sqrt(a * a + b * b + c * c)
-            if not length > 0:
-                continue
-            elements[v, u, 0], elements[v, u, 1] = a / length, b / length
-            elements[v, u, 2], elements[v, u, 3] = c / length, 1.0 / length
-            elements[v, u, 4], elements[v, u, 5] = sigma[v, u], rms
+            # A plane's inverse depth at (u, v) is normal . ray / distance.
+            a, b = fits[1, u] * fx, fits[2, u] * fy
+            c = fits[0, u] - fits[1, u] * (u - cx) - fits[2, u] * (v - cy)
+            length = 1.0 / np.sqrt(a * a + b * b + c * c)
+            element[0], element[1], element[2] = a * length, b * length, c * length
+            element[3], element[4], element[5] = length, sigma[v, u], rms
 
 
 @njit(cache=True, nogil=True, fastmath=True)

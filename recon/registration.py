@@ -27,7 +27,7 @@ _CLOUD_CORRELATION = 2.0
 class IcpConfig:
     """Parameters of the alignment."""
 
-    strides: tuple[int, ...] = (4, 2)  # pixels between the source points, level by level
+    strides: tuple[int, ...] = (6, 3)  # pixels between the source points, level by level
     iterations: tuple[int, ...] = (8, 6)  # of each level, at most
     gate_share: float = 0.05  # residuals above this share of the depth are no partners
     edge_share: float = 0.004  # a 5x5 window that bends more than this holds a depth edge
@@ -187,6 +187,7 @@ def register_surfaces(
     T = np.array(T_target_source, dtype=np.float64)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise ValueError("T_target_source must be (4, 4) finite numbers")
+    problem: _Problem | None = None
     done = 0
     last = len(config.strides) - 1
     for level, (stride, limit) in enumerate(zip(config.strides, config.iterations, strict=True)):
@@ -197,11 +198,9 @@ def register_surfaces(
             step = problem.step()
             T = step @ T
             done += 1
-            if problem.settled(step, 0.2 if level == last else 1.0):
+            if problem.settled(step, 0.3 if level == last else 1.0):
                 break
-    problem = _problem(source, target, T, config.strides[-1], True, config)
-    if problem is None:
-        return _no_overlap(T_target_source, done)
+    assert problem is not None
     grid = source.elements[stride // 2 :: stride, stride // 2 :: stride, 4]
     available = int(np.count_nonzero(grid))
     depth = float(problem.centre[2])
