@@ -64,7 +64,7 @@ class Companion:
         self.presence = presence
         self.history = history
         self.counts: Counter[str] = Counter()
-        self.load = ComputerLoad()
+        self.load: ComputerLoad | None = None  # not measured yet
         self.unix_us: Callable[[], int] = lambda: 0
         self._start_ns = self._now_ns = now_ns
         self._outbox = Outbox()
@@ -244,7 +244,7 @@ class Companion:
         """Send a message that was asked for; False when the component has no such message."""
         if component == CAMERA:
             message = self.camera.message(number, index)
-        elif number == LOAD_STATUS:
+        elif number == LOAD_STATUS and self.load is not None:
             message = computer_status(self.load, self.unix_us(), self._boot_ms())
         else:
             message = None
@@ -257,7 +257,8 @@ class Companion:
         return True
 
     def _send_load(self) -> None:
-        self.send(computer_status(self.load, self.unix_us(), self._boot_ms()))
+        if self.load is not None:
+            self.send(computer_status(self.load, self.unix_us(), self._boot_ms()))
 
     def _send_motion(self) -> None:
         for message in motion_values(self.control.status(), self._boot_ms()):

@@ -131,9 +131,6 @@ class ScanControl(Protocol):
     def capture_keyframe(self) -> Handled:
         """Make the next frame a keyframe and report it."""
 
-    def set_baseline(self, baseline_m: float | None) -> Handled:
-        """Fix the virtual stereo baseline; None lets it follow the altitude."""
-
     def pause(self) -> Handled:
         """Stop adding to the scan without closing it."""
 
@@ -156,4 +153,7 @@ class ScanControl(Protocol):
         """Reboot or shut down; asked only while disarmed."""
 
     def parameter_changed(self, name: str, value: float) -> Answer:
-        """Take a new value of a parameter, or refuse it."""
+        """Take a new value of a parameter (:data:`mavlink.parameters.PARAMETERS`), or refuse it.
+
+        The baseline comes this way, whatever command set it: ``SR_BASELINE_M``, 0 automatic.
+        """

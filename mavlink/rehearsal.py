@@ -18,7 +18,6 @@ class RehearsalControl:
         default_factory=lambda: ScanStatus(storage_total_mib=1000.0, storage_free_mib=750.0)
     )
     asked: list[str] = field(default_factory=list)
-    baseline_m: float | None = None
     works: dict[str, Work] = field(default_factory=dict)  # answers that take a while, by name
     answers: dict[str, Answer] = field(default_factory=dict)  # answers other than ACCEPTED
 
@@ -44,11 +43,6 @@ class RehearsalControl:
     def capture_keyframe(self) -> Handled:
         """Take note of it."""
         return self._ask("capture_keyframe")
-
-    def set_baseline(self, baseline_m: float | None) -> Handled:
-        """Keep it."""
-        self.baseline_m = baseline_m
-        return self._ask("set_baseline")
 
     def pause(self) -> Handled:
         """Pause."""

@@ -1,0 +1,198 @@
+"""The operator's side of MAVLink: commands to the companion, by mavsdk (extra ``ground``)."""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from service.errors import InputError, OutsideError
+
+ONBOARD, CAMERA = 191, 100
+START_SCAN, STOP_SCAN, CAPTURE, BASELINE, USER_1, REQUEST = 2500, 2501, 2000, 206, 31010, 512
+GROUND_STATION = (245, 190)
+POLL_S = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What an action of ``ctl`` sends."""
+
+    number: int
+    component: int
+    params: tuple[float, ...] = ()
+    takes_metres: int = 0  # which parameter holds the metres given by the operator
+
+
+ORDERS: Mapping[str, Order] = {
+    "start": Order(START_SCAN, CAMERA),
+    "stop": Order(STOP_SCAN, CAMERA),
+    "photo": Order(CAPTURE, CAMERA, (0, 0, 1)),
+    "baseline": Order(BASELINE, CAMERA, takes_metres=1),
+    "pause": Order(USER_1, ONBOARD, (1,)),
+    "resume": Order(USER_1, ONBOARD, (2,)),
+    "clear": Order(USER_1, ONBOARD, (3,)),
+    "finalise": Order(USER_1, ONBOARD, (5,)),
+    "selftest": Order(USER_1, ONBOARD, (6,)),
+}
+"""Action to command. The next action is one line."""
+
+RESULTS = (
+    "accepted",
+    "rejected for now",
+    "denied",
+    "not supported",
+    "failed",
+    "in progress",
+    "cancelled",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Ack:
+    """Who answered a command, and what."""
+
+    system: int
+    component: int
+    result: int
+
+    @property
+    def text(self) -> str:
+        """The result in words."""
+        return RESULTS[self.result] if self.result < len(RESULTS) else f"result {self.result}"
+
+
+class Operator:
+    """A connection to one vehicle with our companion on it; use it in a ``with``."""
+
+    def __init__(self, endpoint: str, system: int | None, timeout_s: float) -> None:
+        try:
+            from mavsdk import (  # type: ignore[import-untyped, unused-ignore]
+                ComponentType,
+                Configuration,
+                Mavsdk,
+            )
+            from mavsdk.plugins.mavlink_direct import (  # type: ignore[import-untyped, unused-ignore]
+                mavlink_direct,
+            )
+        except ImportError as error:
+            raise OutsideError("ctl needs mavsdk; pip install 'skyrelief[ground]'") from error
+        self._direct_module = mavlink_direct
+        kind = ComponentType.GROUND_STATION
+        self._mavsdk = Mavsdk(Configuration.create_with_component_type(kind))
+        self._direct: Any = None
+        try:
+            self._connect(endpoint)
+            self._system = self._find(system, endpoint, timeout_s)
+        except (InputError, OutsideError):
+            self._mavsdk.destroy()
+            raise
+        self._direct = mavlink_direct.MavlinkDirect(self._system)
+
+    def _connect(self, endpoint: str) -> None:
+        from mavsdk import ConnectionResult
+
+        result = self._mavsdk.add_any_connection(endpoint)
+        if result != ConnectionResult.SUCCESS:
+            raise InputError(
+                f"{endpoint}: no connection ({getattr(result, 'name', result)}); "
+                "use udpin://0.0.0.0:14550, tcpout://HOST:PORT or serial:///dev/ttyUSB0:57600"
+            )
+
+    def _find(self, system: int | None, endpoint: str, timeout_s: float) -> Any:
+        deadline = time.monotonic() + timeout_s
+        heard: set[int] = set()
+        while time.monotonic() < deadline:
+            for candidate in self._mavsdk.get_systems():
+                number = candidate.get_system_id()
+                heard.add(number)
+                components = candidate.component_ids()
+                if system in (None, number) and ONBOARD in components and CAMERA in components:
+                    return candidate
+            time.sleep(POLL_S)
+        who = f"systems {', '.join(map(str, sorted(heard)))}, but no companion" if heard else "none"
+        raise OutsideError(
+            f"{endpoint}: no skyrelief companion heard in {timeout_s:g} s (heard {who}); "
+            "is the daemon running and its link to the autopilot forwarded?"
+        )
+
+    def __enter__(self) -> Operator:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._direct.destroy()
+        self._mavsdk.destroy()
+
+    @property
+    def system(self) -> int:
+        """The vehicle's system id."""
+        number: int = self._system.get_system_id()
+        return number
+
+    def command(self, number: int, component: int, params: tuple[float, ...] = ()) -> Ack:
+        """Send a command and wait for its final answer, whoever gives it."""
+        padded = [*params, *[0.0] * (7 - len(params))]
+        fields = {
+            "target_system": self.system,
+            "target_component": component,
+            "command": number,
+            "confirmation": 0,
+            **{f"param{k}": value for k, value in enumerate(padded, 1)},
+        }
+        module = self._direct_module
+        message = module.MavlinkMessage(
+            "COMMAND_LONG", *GROUND_STATION, self.system, component, json.dumps(fields)
+        )
+        try:
+            answer = self._direct.send_command(message)
+        except module.MavlinkDirectError as error:
+            raise OutsideError(
+                f"no answer from component {component} of system {self.system}; "
+                "the link to the vehicle may be down"
+            ) from error
+        ack = Ack(answer.system_id, answer.component_id, json.loads(answer.fields_json)["result"])
+        if (ack.system, ack.component) != (self.system, component):
+            raise OutsideError(
+                f"component {ack.component} of system {ack.system} answered ({ack.text}) instead "
+                f"of component {component}: the autopilot does not know the companion's link"
+            )
+        return ack
+
+    def subscribe(self, name: str, callback: Callable[[int, dict[str, Any]], None]) -> None:
+        """Call back with (component, fields) for every message of a name; "" is all."""
+
+        def on_message(message: Any, _: Any = None) -> None:
+            callback(message.component_id, parse_fields(message.fields_json))
+
+        self._direct.subscribe_message(name, on_message)
+
+    def request(self, number: int, name: str, component: int, wait_s: float) -> dict[str, Any]:
+        """One message of a kind, asked for; empty when it does not come in time."""
+        found: dict[str, Any] = {}
+        there = threading.Event()
+
+        def take(sender: int, fields: dict[str, Any]) -> None:
+            if sender == component:
+                found.update(fields)
+                there.set()
+
+        self.subscribe(name, take)
+        ack = self.command(REQUEST, component, (float(number),))
+        if ack.result == 0:
+            there.wait(wait_s)
+        return dict(found)
+
+
+def parse_fields(text: str) -> dict[str, Any]:
+    """The fields of a message in mavsdk's JSON; unreadable text has none. ``null`` is NaN."""
+    try:
+        fields = json.loads(text)
+    except ValueError:
+        return {}
+    if not isinstance(fields, dict):
+        return {}
+    return {k: math.nan if v is None else v for k, v in fields.items()}
