@@ -39,6 +39,7 @@ class SessionConfig:
     tls_ca: str = ""
     tls_certificate: str = ""
     tls_key: str = ""
+    fleet_rights: bool = False  # enforce, as a router, what fleet.json beside tls_key allows
 
 
 def check_name(name: str, what: str) -> str:
@@ -122,7 +123,13 @@ def zenoh_config(config: SessionConfig) -> zenoh.Config:
             "transport/link/tls/connect_private_key": config.tls_key,
             "transport/link/tls/enable_mtls": True,
             "transport/link/tls/close_link_on_expiration": True,
+            # Ground stations change addresses; only their certificates may serve.
+            "transport/link/tls/verify_name_on_connect": False,
         }
+    if config.fleet_rights:
+        from service.stream.keys import FLEET, access_control, load_fleet
+
+        settings["access_control"] = access_control(load_fleet(Path(config.tls_key).parent / FLEET))
     out: zenoh.Config = zenoh.Config()
     for key, value in settings.items():
         out.insert_json5(key, json.dumps(value))

@@ -1,0 +1,112 @@
+"""``skyrelief ground``: receive the scans of drones into scan folders."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import time
+from pathlib import Path
+from threading import Event
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from service.ground.receiver import Receiver
+
+DEFAULT_PORT = 7447
+
+
+def ground(
+    connect: Annotated[
+        list[str] | None, typer.Option(help="router to join: tls/HOST:7447; may be repeated")
+    ] = None,
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(help="where drones call: tls/0.0.0.0:7447; default: this machine only"),
+    ] = None,
+    store: Annotated[Path, typer.Option(help="folder of received scans")] = Path("ground-scans"),
+    keys: Annotated[
+        Path | None, typer.Option(help="this station's keys, a folder of 'skyrelief keys'")
+    ] = None,
+    plain: Annotated[
+        bool, typer.Option("--plain", help="allow endpoints without TLS beyond this machine")
+    ] = False,
+    quota_mb: Annotated[
+        float | None, typer.Option(help="of one scan; beyond it only coarse layers are kept")
+    ] = None,
+    once: Annotated[bool, typer.Option("--once", help="end when a scan is complete")] = False,
+    idle_exit_s: Annotated[
+        float | None, typer.Option(help="end when nothing new came for so many seconds")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
+) -> None:
+    """Receive scans from drones; end with Ctrl-C. Scans lie in STORE/DRONE/SCAN."""
+    from service.ground.receiver import Receiver, ReceiverConfig
+    from service.stream.keys import tls_files
+    from service.stream.session import SessionConfig
+
+    ca, certificate, key = tls_files(keys) if keys is not None else ("", "", "")
+    if not connect and not listen:
+        host = "tls/0.0.0.0" if keys is not None else "tcp/127.0.0.1"
+        listen = [f"{host}:{DEFAULT_PORT}"]
+    session = SessionConfig(
+        mode="router" if listen or len(connect or ()) > 1 else "client",
+        connect=tuple(connect or ()),
+        listen=tuple(listen or ()),
+        plain=plain,
+        tls_ca=ca,
+        tls_certificate=certificate,
+        tls_key=key,
+        fleet_rights=keys is not None and bool(listen),
+    )
+    quota = None if quota_mb is None else int(quota_mb * 1e6)
+    receiver = Receiver(ReceiverConfig(store, session, quota))
+    receiver.start()
+    where = ", ".join((*session.listen, *session.connect))
+    print(f"ground station at {where}, scans in {store}", file=sys.stderr, flush=True)
+    try:
+        _watch(receiver, once, idle_exit_s)
+    finally:
+        receiver.close()
+    _report(receiver, as_json)
+
+
+def _watch(receiver: Receiver, once: bool, idle_exit_s: float | None) -> None:
+    """Return on a signal, or when what the options name has come about."""
+    stop = Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    shown = 0.0
+    while not stop.wait(0.2):
+        entries = receiver.progress()
+        if once and any(entry["complete"] for entry in entries):
+            stop.wait(1.5)  # let the report reach the drone
+            return
+        if idle_exit_s is not None and time.monotonic() - receiver.last_news_at > idle_exit_s:
+            return
+        if sys.stderr.isatty() and time.monotonic() - shown > 2.0:
+            shown = time.monotonic()
+            for entry in entries:
+                print(_line(entry), file=sys.stderr)
+
+
+def _report(receiver: Receiver, as_json: bool) -> None:
+    entries = receiver.progress()
+    if as_json:
+        print(json.dumps({"scans": entries, "dropped": receiver.dropped}))
+        return
+    for entry in entries:
+        print(f"{_line(entry)}; {entry['folder']}")
+    if not entries:
+        print("no scan was received")
+
+
+def _line(entry: dict[str, Any]) -> str:
+    held, missing = entry["held"], sum(entry["missing"].values())
+    state = "complete" if entry["complete"] else f"{missing} missing" if missing else "up to date"
+    return (
+        f"{entry['drone']}/{entry['scan']}: {held.get('k0', 0)} keyframes, "
+        f"{held.get('pose', 0)} poses, {entry['received_bytes'] / 1e6:.2f} MB, {state}"
+    )

@@ -1,0 +1,240 @@
+"""Keys of a fleet: one authority, a certificate per drone, ground station and viewer.
+
+A certificate's common name is ``<role>.<name>``. Only ground stations may be called (server
+use), so a drone's stolen key cannot pose as a ground station. ``fleet.json`` in a ground
+station's folder names the members; from it come the rights that its router enforces.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from service.errors import InputError, OutsideError
+from service.stream.session import ROOT, check_name
+
+if TYPE_CHECKING:
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
+
+CA, CERTIFICATE, KEY, FLEET = "ca.pem", "certificate.pem", "key.pem", "fleet.json"
+ROLES = ("drone", "ground", "viewer")
+CA_DAYS = 3650
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """The members of a fleet by role."""
+
+    members: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def with_members(self, role: str, names: Sequence[str]) -> Fleet:
+        """The fleet with more members of a role."""
+        merged = tuple(sorted({*self.members.get(role, ()), *names}))
+        return Fleet({**self.members, role: merged})
+
+
+def tls_files(folder: Path) -> tuple[str, str, str]:
+    """Authority, certificate and key in a member's folder; raises InputError when missing."""
+    paths = [folder / name for name in (CA, CERTIFICATE, KEY)]
+    for path in paths:
+        if not path.is_file():
+            raise InputError(f"{path} does not exist; make it with 'skyrelief keys'")
+    return str(paths[0]), str(paths[1]), str(paths[2])
+
+
+def load_fleet(path: Path) -> Fleet:
+    """The fleet that a ``fleet.json`` names; raises InputError when there is none."""
+    try:
+        raw = json.loads(path.read_text(encoding="utf-8"))
+        members = {role: tuple(map(str, raw[role])) for role in ROLES if role in raw}
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{path} names no fleet; make it with 'skyrelief keys'") from error
+    for names in members.values():
+        for name in names:
+            check_name(name, "fleet member")
+    return Fleet(members)
+
+
+def access_control(fleet: Fleet) -> dict[str, Any]:
+    """Zenoh's access control for a ground station's router.
+
+    A drone reaches only what lies under its own key. A viewer only reads. A ground station
+    reads, asks and reports. Whoever is not of the fleet may do nothing.
+    """
+    rules: list[dict[str, Any]] = []
+    subjects: list[dict[str, Any]] = []
+    policies: list[dict[str, Any]] = []
+
+    def grant(role: str, name: str, *rights: tuple[str, Sequence[str], str]) -> None:
+        subject = f"{role}.{name}"
+        subjects.append({"id": subject, "cert_common_names": [subject]})
+        ids = []
+        for k, (flow, messages, key) in enumerate(rights):
+            ids.append(f"{subject}.{k}")
+            rules.append(
+                {
+                    "id": ids[-1],
+                    "permission": "allow",
+                    "flows": [flow],
+                    "messages": list(messages),
+                    "key_exprs": [key],
+                }
+            )
+        policies.append({"rules": ids, "subjects": [subject]})
+
+    everything = ("put", "query", "reply", "declare_subscriber", "declare_queryable")
+    for name in fleet.members.get("drone", ()):
+        own = f"{ROOT}/{name}/**"
+        grant("drone", name, ("ingress", everything, own), ("egress", everything, own))
+    for name in fleet.members.get("viewer", ()):
+        grant(
+            "viewer",
+            name,
+            ("ingress", ("declare_subscriber",), f"{ROOT}/**"),
+            ("egress", ("put",), f"{ROOT}/**"),
+        )
+    for name in fleet.members.get("ground", ()):
+        grant(
+            "ground",
+            name,
+            ("ingress", ("put",), f"{ROOT}/*/*/held/*"),
+            ("ingress", ("declare_subscriber", "query"), f"{ROOT}/**"),
+            ("egress", everything, f"{ROOT}/**"),
+        )
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
+
+
+def make_keys(
+    folder: Path, members: Mapping[str, Sequence[str]], days: int = 365, now: float | None = None
+) -> list[Path]:
+    """Certificates for new ``members`` (role to names) under ``folder``; their folders.
+
+    The authority is made the first time and used again after. Members that have keys keep
+    them. Raises InputError for bad names, OutsideError without the ``cryptography`` package.
+    """
+    for names in members.values():
+        for name in names:
+            check_name(name, "fleet member")
+    start = datetime.datetime.fromtimestamp(
+        now if now is not None else datetime.datetime.now().timestamp(), datetime.timezone.utc
+    )
+    try:
+        authority = _authority(folder / "authority", start)
+        made = []
+        for role, names in members.items():
+            for name in names:
+                home = folder / role / name
+                if not (home / KEY).exists():
+                    _member(home, f"{role}.{name}", role == "ground", authority, start, days)
+                    made.append(home)
+        _write_fleet(folder, members)
+    except OSError as error:
+        raise InputError(f"cannot write keys in {folder}: {error.strerror}") from error
+    return made
+
+
+def _write_fleet(folder: Path, members: Mapping[str, Sequence[str]]) -> None:
+    path = folder / FLEET
+    fleet = load_fleet(path) if path.exists() else Fleet()
+    for role, names in members.items():
+        fleet = fleet.with_members(role, names)
+    text = json.dumps(fleet.members, indent=2) + "\n"
+    for home in (folder, *(folder / "ground" / name for name in fleet.members.get("ground", ()))):
+        if home.is_dir():
+            (home / FLEET).write_text(text, encoding="utf-8")
+
+
+def _authority(
+    folder: Path, start: datetime.datetime
+) -> tuple[x509.Certificate, EllipticCurvePrivateKey]:
+    try:
+        from cryptography import x509
+        from cryptography.hazmat.primitives import hashes, serialization
+        from cryptography.hazmat.primitives.asymmetric import ec
+    except ImportError as error:
+        raise OutsideError(
+            "keys need the package 'cryptography'; install skyrelief with the extra 'ground'"
+        ) from error
+    if (folder / KEY).exists():
+        key = serialization.load_pem_private_key((folder / KEY).read_bytes(), None)
+        if not isinstance(key, ec.EllipticCurvePrivateKey):
+            raise InputError(f"{folder / KEY} is not a key of 'skyrelief keys'")
+        return x509.load_pem_x509_certificate((folder / CA).read_bytes()), key
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "skyrelief fleet authority")])
+    certificate = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(start - datetime.timedelta(days=1))
+        .not_valid_after(start + datetime.timedelta(days=CA_DAYS))
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_key(folder / KEY, key)
+    (folder / CA).write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+    return certificate, key
+
+
+def _member(
+    home: Path,
+    common_name: str,
+    server: bool,
+    authority: tuple[x509.Certificate, EllipticCurvePrivateKey],
+    start: datetime.datetime,
+    days: int,
+) -> None:
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.x509.oid import ExtendedKeyUsageOID
+
+    usages = [ExtendedKeyUsageOID.CLIENT_AUTH]
+    if server:
+        usages.append(ExtendedKeyUsageOID.SERVER_AUTH)
+    key = ec.generate_private_key(ec.SECP256R1())
+    certificate = (
+        x509.CertificateBuilder()
+        .subject_name(x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, common_name)]))
+        .issuer_name(authority[0].subject)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(start - datetime.timedelta(days=1))
+        .not_valid_after(start + datetime.timedelta(days=days))
+        .add_extension(x509.SubjectAlternativeName([x509.DNSName(common_name)]), critical=False)
+        .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .sign(authority[1], hashes.SHA256())
+    )
+    home.mkdir(parents=True, exist_ok=True)
+    _write_key(home / KEY, key)
+    pem = serialization.Encoding.PEM
+    (home / CERTIFICATE).write_bytes(certificate.public_bytes(pem))
+    (home / CA).write_bytes(authority[0].public_bytes(pem))
+
+
+def _write_key(path: Path, key: EllipticCurvePrivateKey) -> None:
+    from cryptography.hazmat.primitives import serialization
+
+    data = key.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    )
+    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        file.write(data)

@@ -1,0 +1,170 @@
+"""Fleet keys: who may join, who may write, who may only read."""
+
+from __future__ import annotations
+
+import socket
+import stat
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.config import DatalinkConfig
+from service.errors import InputError, OutsideError
+from service.ground import receiver as receiver_module
+from service.ground.receiver import Receiver, ReceiverConfig
+from service.stream.keys import access_control, load_fleet, make_keys, tls_files
+from service.stream.link import DatalinkSender
+from service.stream.records import ScanHeader
+from service.stream.session import SessionConfig, open_session
+from service.stream.store import ScanStore
+
+pytest.importorskip("cryptography")
+zenoh = pytest.importorskip("zenoh")
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("fleet")
+    make_keys(folder, {"drone": ["red", "blue"], "ground": ["base"], "viewer": ["eye"]})
+    return folder
+
+
+def session_config(home: Path, **more: object) -> SessionConfig:
+    ca, certificate, key = tls_files(home)
+    return SessionConfig(tls_ca=ca, tls_certificate=certificate, tls_key=key, **more)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def ground(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[Receiver, str]]:
+    monkeypatch.setattr(receiver_module, "_deliver", lambda *_: None)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tls/127.0.0.1:{probe.getsockname()[1]}"
+    config = session_config(
+        fleet / "ground" / "base", mode="router", listen=(endpoint,), fleet_rights=True
+    )
+    receiver = Receiver(ReceiverConfig(tmp_path / "ground", config))
+    receiver.start()
+    yield receiver, endpoint
+    receiver.close()
+
+
+def sender(fleet: Path, folder: Path, member: str, claims: str, endpoint: str) -> DatalinkSender:
+    ca, certificate, key = tls_files(fleet / member)
+    store = ScanStore.create(folder / f"{claims}.db", ScanHeader("scan-1", claims, 1))
+    store.finish({})
+    config = DatalinkConfig(
+        connect=(endpoint,), tls_ca=ca, tls_certificate=certificate, tls_key=key
+    )
+    return DatalinkSender(store, config)
+
+
+def test_a_drone_writes_under_its_own_key_and_under_no_other(
+    fleet: Path, tmp_path: Path, ground: tuple[Receiver, str]
+) -> None:
+    receiver, endpoint = ground
+    own = sender(fleet, tmp_path, "drone/red", "red", endpoint)
+    foreign = sender(fleet, tmp_path, "drone/red", "blue", endpoint)
+    try:
+        assert own.drain(15.0)
+        assert not foreign.drain(2.0)
+        assert foreign.progress.connected
+        assert [entry["drone"] for entry in receiver.progress()] == ["red"]
+    finally:
+        own.close()
+        foreign.close()
+
+
+def test_a_viewer_reads_and_cannot_write(
+    fleet: Path, tmp_path: Path, ground: tuple[Receiver, str]
+) -> None:
+    receiver, endpoint = ground
+    seen: list[str] = []
+    viewer = open_session(session_config(fleet / "viewer" / "eye", connect=(endpoint,)))
+    viewer.declare_subscriber("skyrelief/**", lambda s: seen.append(str(s.key_expr)))
+    link = sender(fleet, tmp_path, "drone/red", "red", endpoint)
+    try:
+        assert link.drain(15.0)
+        deadline = time.monotonic() + 10
+        while not seen and time.monotonic() < deadline:
+            link._post(link._outbox.tell)
+            time.sleep(0.3)
+        assert "skyrelief/red/scan-1/head" in seen
+        viewer.put("skyrelief/red/scan-9/head", b'{"v":1,"numbers":{},"live":{},"finished":false}')
+        time.sleep(0.5)
+        assert [entry["scan"] for entry in receiver.progress()] == ["scan-1"]
+    finally:
+        link.close()
+        viewer.close()
+
+
+@pytest.mark.parametrize("fault", ["another fleet", "expired", "no certificate", "drone serves"])
+def test_who_is_not_of_the_fleet_does_not_get_in(
+    fault: str, fleet: Path, tmp_path: Path, ground: tuple[Receiver, str]
+) -> None:
+    _, endpoint = ground
+    if fault == "another fleet":
+        make_keys(tmp_path / "other", {"drone": ["red"]})
+        home = tmp_path / "other" / "drone" / "red"
+        (home / "ca.pem").write_bytes((fleet / "drone" / "red" / "ca.pem").read_bytes())
+    elif fault == "expired":
+        make_keys(fleet, {"drone": ["old"]}, days=1, now=time.time() - 90 * 86400)
+        home = fleet / "drone" / "old"
+    else:
+        home = fleet / "drone" / "red"
+    config = session_config(home, connect=(endpoint,))
+    if fault == "no certificate":
+        client = zenoh.Config()
+        client.insert_json5("mode", '"client"')
+        client.insert_json5("connect/endpoints", f'["{endpoint}"]')
+        client.insert_json5("connect/timeout_ms", "0")
+        client.insert_json5("scouting/multicast/enabled", "false")
+        client.insert_json5("transport/link/tls/root_ca_certificate", f'"{home / "ca.pem"}"')
+        with pytest.raises(zenoh.ZError):
+            zenoh.open(client)
+        return
+    if fault == "drone serves":
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            false_endpoint = f"tls/127.0.0.1:{probe.getsockname()[1]}"
+        impostor = open_session(session_config(home, mode="router", listen=(false_endpoint,)))
+        try:
+            config = session_config(fleet / "drone" / "blue", connect=(false_endpoint,))
+            with pytest.raises(OutsideError):
+                open_session(config)
+        finally:
+            impostor.close()
+        return
+    with pytest.raises(OutsideError):
+        open_session(config)
+
+
+def test_keys_are_private_and_stay(fleet: Path) -> None:
+    key = fleet / "drone" / "red" / "key.pem"
+    assert stat.S_IMODE(key.stat().st_mode) == 0o600
+    before = key.read_bytes()
+    assert make_keys(fleet, {"drone": ["red"], "ground": ["base"]}) == []
+    assert key.read_bytes() == before
+    assert set(load_fleet(fleet / "ground" / "base" / "fleet.json").members) == {
+        "drone", "ground", "viewer",
+    }  # fmt: skip
+
+
+def test_rights_name_every_member_and_deny_the_rest(fleet: Path) -> None:
+    rights = access_control(load_fleet(fleet / "fleet.json"))
+    assert rights["default_permission"] == "deny"
+    names = {name for subject in rights["subjects"] for name in subject["cert_common_names"]}
+    assert {"drone.red", "drone.blue", "ground.base", "viewer.eye"} <= names
+
+
+def test_bad_names_and_missing_files_are_said_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot travel"):
+        make_keys(tmp_path, {"drone": ["../x"]})
+    with pytest.raises(InputError, match="skyrelief keys"):
+        tls_files(tmp_path)
+    with pytest.raises(InputError, match="skyrelief keys"):
+        load_fleet(tmp_path / "fleet.json")
