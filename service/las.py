@@ -62,12 +62,24 @@ def write_laz(
     with open(path, "wb") as file, laspy.open(file, "w", header=header, **kind) as out:
         for at in range(0, len(xyz), CHUNK_POINTS):
             cut = slice(at, at + CHUNK_POINTS)
-            record = laspy.ScaleAwarePointRecord.zeros(len(xyz[cut]), header=header)
-            record.x, record.y, record.z = xyz[cut].T
-            for channel, name in enumerate(("red", "green", "blue")):
-                setattr(record, name, cloud.rgb[cut, channel].astype(np.uint16) * 257)
-            record["return_number"] = np.ones(len(record), np.uint8)
-            record["number_of_returns"] = np.ones(len(record), np.uint8)
-            record["sigma_m"] = cloud.sigma_m[cut]
-            record["views"] = cloud.views[cut]
-            out.write_points(record)
+            part = PointCloud(
+                cloud.xyz_m[cut], cloud.rgb[cut], cloud.sigma_m[cut], cloud.views[cut]
+            )
+            out.write_points(point_record(header, xyz[cut], part))
+
+
+def point_record(
+    header: laspy.LasHeader, xyz_m: F64, cloud: PointCloud
+) -> laspy.ScaleAwarePointRecord:
+    """The cloud's points as LAS records, at the places ``xyz_m`` (N, 3)."""
+    import laspy
+
+    record = laspy.ScaleAwarePointRecord.zeros(len(xyz_m), header=header)
+    record.x, record.y, record.z = xyz_m.T
+    for channel, name in enumerate(("red", "green", "blue")):
+        setattr(record, name, cloud.rgb[:, channel].astype(np.uint16) * 257)
+    record["return_number"] = np.ones(len(record), np.uint8)
+    record["number_of_returns"] = np.ones(len(record), np.uint8)
+    record["sigma_m"] = cloud.sigma_m
+    record["views"] = cloud.views
+    return record

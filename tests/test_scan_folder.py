@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import laspy
@@ -14,95 +15,29 @@ from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
 from recon import se3
-from recon.types import F64, DepthMap, Keyframe, Pose
+from recon.types import F64
 from service.errors import OutsideError
 from service.georeference import LocalFrame
 from service.scan_folder import CLOUD, CSV, PREVIEW, SUMMARY, TUM, latest, write_deliverables
-from service.stream.codec import encode
-from service.stream.records import PoseRecord, Repose, ScanHeader
+from service.stream.records import Repose, ScanHeader
 from service.stream.store import ScanStore
 
-K = np.array([[140.0, 0.0, 79.5], [0.0, 140.0, 44.5], [0.0, 0.0, 1.0]])
-NADIR = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
-HEIGHT_M = 40.0
-START_NS = 1_700_000_000_123_456_789
-ORIGIN = (47.39, 8.54, 408.0)
+if TYPE_CHECKING:
+    from conftest import HouseFlight
 
 
-def roof_m(x: F64, y: F64) -> F64:
-    """Flat ground with a 12 m x 8 m house, 6 m high, about (10, 2)."""
-    return np.where((np.abs(x - 10.0) < 6.0) & (np.abs(y - 2.0) < 4.0), 6.0, 0.0)
-
-
-def keyframe(seq: int, east_m: float, sigma_m: float = 0.05) -> Keyframe:
-    """What an exact nadir camera at (east, 0, 40) sees of the ground and the house."""
-    h, w = 90, 160
-    u, v = np.meshgrid(np.arange(w), np.arange(h))
-    a, b = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
-    on_roof = HEIGHT_M - 6.0
-    top = roof_m(east_m + a * on_roof, -b * on_roof)
-    depth = HEIGHT_M - top
-    x, y = east_m + a * depth, -b * depth
-    bgr = np.full((h, w, 3), (60, 120, 70), np.uint8)
-    bgr[top > 0] = (40, 40, 200)
-    bgr[((np.floor(x / 4) + np.floor(y / 4)) % 2 == 0) & (top == 0)] = (90, 150, 110)
-    T = se3.compose(NADIR, np.array([east_m, 0.0, HEIGHT_M]))
-    depth_map = DepthMap(
-        depth.astype(np.float32),
-        np.full((h, w), sigma_m, np.float32),
-        np.full((h, w), 2, np.uint8),
-        K,
-        T,
-    )
-    pose = Pose(T, np.eye(6) * 1e-4, ("vision",))
-    return Keyframe(seq, START_NS + seq * 10**9, depth_map, bgr, pose, np.ones((h, w), np.bool_))
-
-
-def record(seq: int, east_m: float) -> PoseRecord:
-    return PoseRecord(
-        time_unix_ns=START_NS + seq * 10**9,
-        T_world_camera=se3.compose(NADIR, np.array([east_m, 0.0, HEIGHT_M])),
-        covariance=np.eye(6) * 1e-4,
-        lat_deg=ORIGIN[0],
-        lon_deg=ORIGIN[1],
-        alt_amsl_m=ORIGIN[2] + HEIGHT_M,
-        pitch_rad=-np.pi / 2,
-        speed_m_s=5.0,
-        distance_m=5.0 * seq,
-        sources=("vision", "gnss"),
-        sigma_m=0.3,
-        keyframe_seq=seq,
-    )
-
-
-def flown(folder: Path, origin: tuple[float, float, float] | None = ORIGIN) -> ScanStore:
-    """A store of five keyframes flown east over the house."""
-    header = ScanHeader("test-1", "drone-1", START_NS, camera={"fx": 140.0}, software="0.0")
-    store = ScanStore.create(folder / "scan.db", header)
-    if origin is not None:
-        lat, lon, alt = origin
-        store.update_header(
-            origin_lat_deg=lat, origin_lon_deg=lon, origin_alt_amsl_m=alt, georeference="gnss"
-        )
-    for seq in range(5):
-        one = keyframe(seq, 5.0 * seq)
-        store.add_keyframe(seq, encode(one, one.time_ns))
-        store.add_pose(record(seq, 5.0 * seq))
-    return store
-
-
-def enu_of(cloud: laspy.LasData) -> F64:
+def enu_of(cloud: laspy.LasData, house: HouseFlight) -> F64:
     """(N, 3) ENU metres of a UTM cloud, by pyproj's own pipeline."""
     utm = np.column_stack([cloud.x, cloud.y, cloud.z])
     epsg = cloud.header.parse_crs().to_epsg()
     lon, lat, alt = Transformer.from_crs(f"EPSG:{epsg}", "EPSG:4979", always_xy=True).transform(
         *utm.T
     )
-    return LocalFrame(*ORIGIN).to_enu(np.column_stack([lat, lon, alt]))
+    return LocalFrame(*house.origin).to_enu(np.column_stack([lat, lon, alt]))
 
 
-def test_cloud_is_where_the_house_stands(tmp_path: Path) -> None:
-    with flown(tmp_path) as store:
+def test_cloud_is_where_the_house_stands(tmp_path: Path, house: HouseFlight) -> None:
+    with house.flown(tmp_path) as store:
         summary = write_deliverables(tmp_path, store, {})
     cloud = laspy.read(tmp_path / CLOUD)
     assert (cloud.header.version.major, cloud.header.version.minor) == (1, 4)
@@ -110,8 +45,8 @@ def test_cloud_is_where_the_house_stands(tmp_path: Path) -> None:
     assert cloud.header.are_points_compressed
     assert cloud.header.parse_crs().to_epsg() == 32632 == summary["epsg"]
     assert cloud.header.creation_date.isoformat() == "2023-11-14"
-    enu = enu_of(cloud)
-    np.testing.assert_allclose(enu[:, 2], roof_m(enu[:, 0], enu[:, 1]), atol=6.01)
+    enu = enu_of(cloud, house)
+    np.testing.assert_allclose(enu[:, 2], house.roof_m(enu[:, 0], enu[:, 1]), atol=6.01)
     inside = (np.abs(enu[:, 0] - 10) < 5.5) & (np.abs(enu[:, 1] - 2) < 3.5)
     outside = (np.abs(enu[:, 0] - 10) > 6.5) | (np.abs(enu[:, 1] - 2) > 4.5)
     assert np.abs(enu[inside, 2] - 6.0).max() < 0.03
@@ -129,8 +64,8 @@ def test_cloud_is_where_the_house_stands(tmp_path: Path) -> None:
     )
 
 
-def test_voxels_are_as_fine_as_the_pixels_on_the_ground(tmp_path: Path) -> None:
-    with flown(tmp_path) as store:
+def test_voxels_are_as_fine_as_the_pixels_on_the_ground(tmp_path: Path, house: HouseFlight) -> None:
+    with house.flown(tmp_path) as store:
         summary = write_deliverables(tmp_path, store, {})
         coarse = write_deliverables(tmp_path, store, {}, voxel_m=1.0)
     assert summary["quality"]["voxel_m"] == pytest.approx(40 / 140, abs=1e-3)
@@ -138,8 +73,8 @@ def test_voxels_are_as_fine_as_the_pixels_on_the_ground(tmp_path: Path) -> None:
     assert coarse["counts"]["points"] < summary["counts"]["points"] / 5
 
 
-def test_both_ends_write_the_same_bytes(tmp_path: Path) -> None:
-    with flown(tmp_path / "air") as air:
+def test_both_ends_write_the_same_bytes(tmp_path: Path, house: HouseFlight) -> None:
+    with house.flown(tmp_path / "air") as air:
         ground = ScanStore.create(tmp_path / "ground" / "scan.db", air.header)
         for kind, numbers in air.numbers().items():
             for number in sorted(numbers, reverse=True):
@@ -158,14 +93,16 @@ def test_both_ends_write_the_same_bytes(tmp_path: Path) -> None:
         assert (tmp_path / "air" / name).read_bytes() == (tmp_path / "ground" / name).read_bytes()
 
 
-def test_trajectory_files(tmp_path: Path) -> None:
-    with flown(tmp_path) as store:
+def test_trajectory_files(tmp_path: Path, house: HouseFlight) -> None:
+    with house.flown(tmp_path) as store:
         write_deliverables(tmp_path, store, {})
     rows = [line.split() for line in (tmp_path / TUM).read_text().splitlines()]
     assert rows[1][0] == "1700000001.123456789"
     numbers = np.array(rows, float)
     np.testing.assert_allclose(numbers[:, 1], 5.0 * np.arange(5))
-    np.testing.assert_allclose(Rotation.from_quat(numbers[0, 4:]).as_matrix(), NADIR, atol=1e-9)
+    np.testing.assert_allclose(
+        Rotation.from_quat(numbers[0, 4:]).as_matrix(), house.nadir, atol=1e-9
+    )
     with open(tmp_path / CSV, newline="") as file:
         table = list(csv.DictReader(file))
     assert len(table) == 5
@@ -175,9 +112,9 @@ def test_trajectory_files(tmp_path: Path) -> None:
     assert table[0]["sources"] == "vision+gnss"
 
 
-def test_a_pose_written_again_replaces_the_first(tmp_path: Path) -> None:
-    with flown(tmp_path) as store:
-        store.add_pose(record(2, 11.5))
+def test_a_pose_written_again_replaces_the_first(tmp_path: Path, house: HouseFlight) -> None:
+    with house.flown(tmp_path) as store:
+        store.add_pose(house.record(2, 11.5))
         poses = latest(store.poses())
         write_deliverables(tmp_path, store, {})
     assert len(poses) == 5
@@ -185,18 +122,20 @@ def test_a_pose_written_again_replaces_the_first(tmp_path: Path) -> None:
     np.testing.assert_allclose(numbers[:, 1], [0.0, 5.0, 11.5, 15.0, 20.0])
 
 
-def test_a_reposed_keyframe_moves_its_points(tmp_path: Path) -> None:
-    with flown(tmp_path) as store:
+def test_a_reposed_keyframe_moves_its_points(tmp_path: Path, house: HouseFlight) -> None:
+    with house.flown(tmp_path) as store:
         for seq in range(5):
-            T = se3.compose(NADIR, np.array([5.0 * seq + 100.0, 0.0, HEIGHT_M]))
+            T = se3.compose(house.nadir, np.array([5.0 * seq + 100.0, 0.0, house.height_m]))
             store.add_repose(Repose(seq, 1, T, 1.0, np.eye(6)))
         write_deliverables(tmp_path, store, {})
-    enu = enu_of(laspy.read(tmp_path / CLOUD))
+    enu = enu_of(laspy.read(tmp_path / CLOUD), house)
     assert np.median(enu[enu[:, 2] > 5.5, 0]) == pytest.approx(110.0, abs=0.3)
 
 
-def test_without_georeference_the_cloud_is_local_and_says_so(tmp_path: Path) -> None:
-    with flown(tmp_path, origin=None) as store:
+def test_without_georeference_the_cloud_is_local_and_says_so(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    with house.flown(tmp_path, georeferenced=False) as store:
         summary = write_deliverables(tmp_path, store, {"drops": 3})
     cloud = laspy.read(tmp_path / CLOUD)
     assert cloud.header.parse_crs() is None
@@ -209,8 +148,8 @@ def test_without_georeference_the_cloud_is_local_and_says_so(tmp_path: Path) -> 
     assert written["run"] == {"drops": 3}
 
 
-def test_an_empty_scan_still_makes_every_file(tmp_path: Path) -> None:
-    store = ScanStore.create(tmp_path / "scan.db", ScanHeader("empty", "d", START_NS))
+def test_an_empty_scan_still_makes_every_file(tmp_path: Path, house: HouseFlight) -> None:
+    store = ScanStore.create(tmp_path / "scan.db", ScanHeader("empty", "d", house.start_ns))
     summary = write_deliverables(tmp_path, store, {})
     store.close()
     assert summary["counts"] == {
@@ -224,8 +163,8 @@ def test_an_empty_scan_still_makes_every_file(tmp_path: Path) -> None:
     assert cv2.imread(str(tmp_path / PREVIEW)) is not None
 
 
-def test_nothing_half_written_is_left(tmp_path: Path) -> None:
-    with flown(tmp_path) as store:
+def test_nothing_half_written_is_left(tmp_path: Path, house: HouseFlight) -> None:
+    with house.flown(tmp_path) as store:
         (tmp_path / "blocked").mkdir()
         (tmp_path / "blocked" / CLOUD).mkdir()  # a folder where the file should go
         with pytest.raises(OutsideError, match=CLOUD):

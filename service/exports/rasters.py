@@ -1,0 +1,140 @@
+"""Surface model, orthophoto and contours, as Cloud Optimized GeoTIFF and GeoJSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from recon.raster import Grid, Raster, fill_holes
+from recon.types import F64, Array
+from service.exports.view import ExportOptions, ScanView
+from service.scan_folder import writing
+
+NODATA_M = -9999.0
+SHORTEST_CONTOUR_CELLS = 12
+
+
+def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """Heights in AMSL metres (float32, -9999 where unknown); band 2 holds their sigma."""
+    raster = fill_holes(scan.raster(options.cell_m))
+    known = raster.known
+    bands = np.stack(
+        [np.where(known, raster.height_m, NODATA_M), np.where(known, raster.sigma_m, NODATA_M)]
+    ).astype(np.float32)
+    _write_cog(scan, out, raster.grid, bands, ("height AMSL, m", "sigma, m"), nodata=NODATA_M)
+
+
+def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """Red, green, blue and opacity, one byte each; seen from straight above everywhere."""
+    raster = fill_holes(scan.raster(options.cell_m))
+    opacity = np.where(raster.known, 255, 0).astype(np.uint8)
+    bands = np.concatenate([raster.rgb.transpose(2, 0, 1), opacity[None]])
+    _write_cog(scan, out, raster.grid, bands, ("red", "green", "blue", "opacity"))
+
+
+def _write_cog(
+    scan: ScanView,
+    out: Path,
+    grid: Grid,
+    bands: Array,
+    names: tuple[str, ...],
+    nodata: float | None = None,
+) -> None:
+    """(bands, rows, cols) as Cloud Optimized GeoTIFF in the scan's UTM zone."""
+    import rasterio
+    from rasterio.enums import ColorInterp
+    from rasterio.io import MemoryFile
+    from rasterio.shutil import copy
+    from rasterio.transform import from_origin
+
+    profile: dict[str, Any] = {
+        "driver": "GTiff",
+        "height": grid.shape[0],
+        "width": grid.shape[1],
+        "count": len(bands),
+        "dtype": bands.dtype,
+        "transform": from_origin(grid.west_m, grid.north_m, grid.cell_m, grid.cell_m),
+        "nodata": nodata,
+    }
+    if scan.frame is not None:
+        profile["crs"] = rasterio.crs.CRS.from_epsg(scan.frame.epsg)
+    heights = "metres above mean sea level" if scan.frame else "metres above the scan's origin"
+    with writing(out) as part, MemoryFile() as memory:
+        with memory.open(**profile) as image:
+            image.write(bands)
+            image.descriptions = names
+            image.update_tags(SCAN=scan.store.header.scan_id, HEIGHTS=heights)
+            if len(bands) == 4:
+                kinds = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
+                image.colorinterp = kinds
+        with memory.open() as image:
+            predictor = "YES" if bands.dtype.kind == "f" else "STANDARD"
+            copy(image, str(part), driver="COG", compress="DEFLATE", predictor=predictor)
+
+
+def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """Height contours as GeoJSON lines (longitude, latitude), with their height AMSL.
+
+    Drawn on the surface smoothed over a few cells; lines shorter than a few cells are noise
+    and left out.
+    """
+    frame = scan.needs_place("a contour map")
+    raster = fill_holes(scan.raster(options.cell_m))
+    features = []
+    for height_m, line in contour_lines(raster, options.contour_m):
+        geodetic = frame.to_geodetic(
+            frame.from_utm(np.column_stack([line, np.full(len(line), height_m)]))
+        )
+        features.append(
+            {
+                "type": "Feature",
+                "properties": {"height_amsl_m": round(height_m, 3)},
+                "geometry": {
+                    "type": "LineString",
+                    "coordinates": [[round(p[1], 8), round(p[0], 8)] for p in geodetic],
+                },
+            }
+        )
+    with writing(out) as part:
+        part.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+
+
+def contour_lines(raster: Raster, step_m: float) -> Iterator[tuple[float, F64]]:
+    """(height, (N, 2) x y) of the closed or open contours at whole multiples of ``step_m``.
+
+    A contour is the border of the cells at or above its height, cut where it runs along
+    unknown ground.
+    """
+    known = raster.known
+    if not known.any():
+        return
+    filled = np.where(known, raster.height_m, np.float32(np.nanmedian(raster.height_m)))
+    smooth = cv2.GaussianBlur(filled.astype(np.float32), (0, 0), 1.5)
+    low, high = float(smooth[known].min()), float(smooth[known].max())
+    inner = cv2.erode(np.pad(known, 1).astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1]
+    for n in range(math.ceil(low / step_m), math.floor(high / step_m) + 1):
+        above = ((smooth >= n * step_m) & known).astype(np.uint8)
+        loops, _ = cv2.findContours(above, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        for loop in loops:
+            for run in _inside_runs(loop[:, 0], inner > 0):
+                if len(run) >= SHORTEST_CONTOUR_CELLS:
+                    x = raster.grid.west_m + (run[:, 0] + 0.5) * raster.grid.cell_m
+                    y = raster.grid.north_m - (run[:, 1] + 0.5) * raster.grid.cell_m
+                    yield n * step_m, np.column_stack([x, y])
+
+
+def _inside_runs(loop: Array, inside: Array) -> list[Array]:
+    """The stretches of a closed loop of (col, row) that lie inside the known ground."""
+    ok = inside[loop[:, 1], loop[:, 0]]
+    if ok.all():
+        return [np.concatenate([loop, loop[:1]])]
+    start = int(np.argmin(ok))
+    loop, ok = np.roll(loop, -start, axis=0), np.roll(ok, -start)
+    edges = np.flatnonzero(np.diff(np.r_[False, ok, False].astype(np.int8)))
+    return [loop[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -1,0 +1,266 @@
+"""Every deliverable opened by a reader of its own, and its place checked against the truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import laspy
+import numpy as np
+import pytest
+from pyproj import Transformer
+from typer.testing import CliRunner
+
+from recon.types import F64
+from service.cli import app
+from service.errors import InputError
+from service.exports import EXPORTERS
+from service.exports.copc import octree
+from service.exports.view import ExportOptions, ScanView, export
+from service.georeference import LocalFrame
+
+if TYPE_CHECKING:
+    from conftest import HouseFlight
+
+
+@pytest.fixture
+def scan_dir(tmp_path: Path, house: HouseFlight) -> Path:
+    folder = tmp_path / "scan"
+    house.flown(folder).close()
+    return folder
+
+
+def written(folder: Path, kind: str, options: ExportOptions | None = None) -> Path:
+    with ScanView(folder) as scan:
+        return export(scan, kind, None, options or ExportOptions())
+
+
+def to_enu(utm: F64, epsg: int, house: HouseFlight) -> F64:
+    """ENU metres by pyproj and the closed-form frame."""
+    back = Transformer.from_crs(f"EPSG:{epsg}", "EPSG:4979", always_xy=True)
+    lon, lat, alt = back.transform(*np.asarray(utm, float).T)
+    return LocalFrame(*house.origin).to_enu(np.column_stack([lat, lon, alt]))
+
+
+def assert_is_the_house(enu: F64, house: HouseFlight, tolerance_m: float = 0.05) -> None:
+    """Away from its walls every point lies on the true surface, and all of it is there."""
+    x, y, z = enu.T
+    from_wall = np.maximum(np.abs(x - 10) - 6.0, np.abs(y - 2) - 4.0)
+    clear = np.abs(from_wall) > 0.6
+    assert np.abs(z[clear] - house.roof_m(x, y)[clear]).max() < tolerance_m
+    assert ((from_wall < -0.6) & (z > 5)).sum() > 300
+    assert np.ptp(x) == pytest.approx(160 / 140 * 40 + 20, abs=1.5)
+
+
+def test_ply_by_open3d(scan_dir: Path, house: HouseFlight) -> None:
+    o3d = pytest.importorskip("open3d")
+    path = written(scan_dir, "ply")
+    cloud = o3d.io.read_point_cloud(str(path))
+    assert_is_the_house(to_enu(np.asarray(cloud.points), 32632, house), house)
+    assert b"comment EPSG:32632, AMSL metres" in path.read_bytes()[:300]
+
+
+@pytest.mark.parametrize("name", ["a.las", "a.laz"])
+def test_las_and_laz(scan_dir: Path, tmp_path: Path, house: HouseFlight, name: str) -> None:
+    with ScanView(scan_dir) as scan:
+        export(scan, "laz", tmp_path / name, ExportOptions())
+    cloud = laspy.read(tmp_path / name)
+    assert cloud.header.are_points_compressed == name.endswith("laz")
+    assert_is_the_house(to_enu(np.column_stack([cloud.x, cloud.y, cloud.z]), 32632, house), house)
+
+
+def test_copc_by_laspy(scan_dir: Path, house: HouseFlight) -> None:
+    pytest.importorskip("copclib")
+    path = written(scan_dir, "copc")
+    with laspy.CopcReader.open(path) as reader:
+        everything = reader.query()
+        assert reader.header.parse_crs().to_epsg() == 32632
+        coarse = reader.query(resolution=5.0)
+    with ScanView(scan_dir) as scan:
+        assert len(everything) == len(scan.fused.cloud)
+        np.testing.assert_allclose(
+            np.sort(everything["sigma_m"]), np.sort(scan.fused.cloud.sigma_m), rtol=1e-6
+        )
+    assert 0 < len(coarse) <= len(everything)
+    xyz = np.column_stack([everything.x, everything.y, everything.z])
+    assert_is_the_house(to_enu(xyz, 32632, house), house)
+    assert laspy.read(path).header.point_count == len(everything)
+
+
+def test_octree_holds_every_point_once_inside_its_node() -> None:
+    rng = np.random.default_rng(4)
+    xyz = rng.normal(0, [30, 30, 2], (120_000, 3))
+    low, side = xyz.min(axis=0) - 0.1, float(np.ptp(xyz, axis=0).max()) + 0.2
+    seen = np.zeros(len(xyz), int)
+    depths = set()
+    for (depth, *index), rows in octree(xyz, low, side):
+        seen[rows] += 1
+        depths.add(depth)
+        size = side / 2**depth
+        corner = low + np.array(index) * size
+        assert (xyz[rows] >= corner - 1e-9).all() and (xyz[rows] <= corner + size + 1e-9).all()
+    assert (seen == 1).all()
+    assert depths == set(range(len(depths))) and len(depths) > 1
+
+
+def test_dsm_by_rasterio(scan_dir: Path, house: HouseFlight) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    path = written(scan_dir, "dsm", ExportOptions(cell_m=0.5))
+    with rasterio.open(path) as image:
+        assert image.crs.to_epsg() == 32632
+        assert image.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        height = image.read(1, masked=True)
+        rows, cols = np.nonzero(image.read_masks(1))
+        east, north = rasterio.transform.xy(image.transform, rows, cols)
+    utm = np.column_stack([east, north, height[rows, cols]])
+    enu = to_enu(utm, 32632, house)
+    # A wall falls somewhere within a cell, and a cell's upper surface is the roof.
+    from_wall = np.maximum(np.abs(enu[:, 0] - 10) - 6.0, np.abs(enu[:, 1] - 2) - 4.0)
+    clear = np.abs(from_wall) > 1.0
+    error = enu[clear, 2] - house.roof_m(enu[clear, 0], enu[clear, 1])
+    assert np.sqrt(np.mean(error**2)) < 0.05
+    assert clear.sum() * 0.25 > 1500
+
+
+def test_ortho_by_rasterio(scan_dir: Path, house: HouseFlight) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    with rasterio.open(written(scan_dir, "ortho")) as image:
+        red, _, blue, opacity = image.read()
+        assert image.crs.to_epsg() == 32632
+        house_rows, house_cols = np.nonzero((red > 150) & (blue < 90) & (opacity > 0))
+        east, north = rasterio.transform.xy(image.transform, house_rows, house_cols)
+    alt = np.full(len(east), house.origin[2])
+    enu = to_enu(np.column_stack([east, north, alt]), 32632, house)
+    assert np.median(enu[:, 0]) == pytest.approx(10.0, abs=0.3)
+    assert np.median(enu[:, 1]) == pytest.approx(2.0, abs=0.3)
+
+
+def test_contours_run_around_the_house(scan_dir: Path, house: HouseFlight) -> None:
+    lines = json.loads(written(scan_dir, "contours", ExportOptions(contour_m=3.0)).read_text())
+    heights = {f["properties"]["height_amsl_m"] for f in lines["features"]}
+    assert heights == {411.0}
+    frame = LocalFrame(*house.origin)
+    around = 0.0
+    for feature in lines["features"]:
+        place = np.array(feature["geometry"]["coordinates"])
+        enu = frame.to_enu(np.column_stack([place[:, 1], place[:, 0], np.full(len(place), 411.0)]))
+        from_wall = np.maximum(np.abs(enu[:, 0] - 10) - 6.0, np.abs(enu[:, 1] - 2) - 4.0)
+        assert np.abs(from_wall).max() < 1.2
+        around += float(np.linalg.norm(np.diff(enu[:, :2], axis=0), axis=1).sum())
+    assert 25.0 < around < 44.0  # 40 m of wall; where the ground behind it is hidden, none
+
+
+def test_geojson_and_kml_follow_the_flight(scan_dir: Path, house: HouseFlight) -> None:
+    features = json.loads(written(scan_dir, "geojson").read_text())["features"]
+    track = np.array(features[0]["geometry"]["coordinates"])
+    enu = LocalFrame(*house.origin).to_enu(track[:, [1, 0, 2]])
+    np.testing.assert_allclose(enu[:, 0], [0, 5, 10, 15, 20], atol=0.01)
+    np.testing.assert_allclose(enu[:, 2], 40.0, atol=0.01)
+    assert [f["properties"]["keyframe"] for f in features[1:]] == [0, 1, 2, 3, 4]
+    text = written(scan_dir, "kml").read_text()
+    assert text.count("<gx:coord>") == text.count("<when>") == 5
+    assert "2023-11-14T22:13:20.123Z" in text
+
+
+def test_colmap_projects_the_points_onto_their_pixels(scan_dir: Path, house: HouseFlight) -> None:
+    folder = written(scan_dir, "colmap")
+    camera = (folder / "sparse/0/cameras.txt").read_text().split()
+    assert camera[1] == "PINHOLE"
+    fx, fy, cx, cy = map(float, camera[4:8])
+    points = np.loadtxt(folder / "sparse/0/points3D.txt")
+    lines = (folder / "sparse/0/images.txt").read_text().splitlines()[::2]
+    assert len(lines) == 5
+    parts = lines[2].split()
+    w, x, y, z = map(float, parts[1:5])
+    from scipy.spatial.transform import Rotation
+
+    local = points[:, 1:4] @ Rotation.from_quat([x, y, z, w]).as_matrix().T
+    local += np.array(parts[5:8], float)
+    u, v = fx * local[:, 0] / local[:, 2] + cx, fy * local[:, 1] / local[:, 2] + cy
+    image = cv2.imread(str(folder / "images" / parts[9]))
+    assert image is not None
+    inside = (u > 2) & (u < 158) & (v > 2) & (v < 88)
+    roof = inside & (points[:, 3] > 5.5)
+    pixels = image[np.floor(v[roof]).astype(int), np.floor(u[roof]).astype(int)].astype(int)
+    assert (pixels[:, 2] > 120).mean() > 0.97
+
+
+def test_3d_tiles_hold_all_points_on_the_globe(scan_dir: Path, house: HouseFlight) -> None:
+    pytest.importorskip("py3dtiles")
+    from py3dtiles.tileset.tileset import TileSet
+
+    folder = written(scan_dir, "3dtiles")
+    tileset = TileSet.from_file(folder / "tileset.json")
+    tiles = list(tileset.root_tile.get_all_children())
+    leaves = [t for t in tiles if not t.children]
+    count = 0
+    for tile in leaves:
+        content: Any = tile.get_or_fetch_content(folder)
+        count += content.body.feature_table.header.points_length
+    with ScanView(scan_dir) as scan:
+        assert count == len(scan.fused.cloud)
+    T = np.array(tileset.root_tile.transform).reshape(4, 4)
+    place = [float(v) for v in (T[3, :3] if np.abs(T[3, :3]).max() > 1e3 else T[:3, 3])]
+    globe = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    lon, lat, _ = globe.transform(place[0], place[1], place[2])
+    assert lat == pytest.approx(house.origin[0], abs=1e-3)
+    assert lon == pytest.approx(house.origin[1], abs=1e-3)
+
+
+def test_an_old_deliverable_stays_until_the_new_one_is_whole(scan_dir: Path) -> None:
+    first = written(scan_dir, "colmap")
+    (first / "mine.txt").write_text("old")
+    written(scan_dir, "colmap")
+    assert not (first / "mine.txt").exists()
+    assert not [p for p in scan_dir.iterdir() if p.name.startswith(".")]
+
+
+def test_without_georeference_local_files_are_written_and_maps_refused(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    pytest.importorskip("rasterio")
+    house.flown(tmp_path / "s", georeferenced=False).close()
+    for kind in ("ply", "laz", "dsm", "ortho", "colmap"):
+        assert written(tmp_path / "s", kind).exists()
+    for kind in ("contours", "geojson", "kml", "3dtiles"):
+        with pytest.raises(InputError, match="no georeference"):
+            written(tmp_path / "s", kind)
+
+
+def test_every_line_of_the_table_can_be_loaded() -> None:
+    from importlib import import_module
+
+    for target, _, text in EXPORTERS.values():
+        module, _, name = target.partition(":")
+        assert callable(getattr(import_module(module), name))
+        assert len(text) < 60
+
+
+def test_the_command(scan_dir: Path, tmp_path: Path) -> None:
+    run = CliRunner().invoke
+    done = run(app, ["export", str(scan_dir), "--to", "laz", "--to", "kml", "--json"])
+    assert done.exit_code == 0
+    names = json.loads(done.stdout.splitlines()[-1])["written"]
+    assert Path(names["laz"]).is_file() and Path(names["kml"]).is_file()
+    for bad, text in [
+        (["export", str(scan_dir), "--to", "docx"], "there are ply"),
+        (["export", str(tmp_path), "--to", "laz"], "scan.db"),
+        (["export", str(tmp_path / "none"), "--to", "laz"], "not a folder"),
+        (["export", str(scan_dir), "--to", "laz", "--to", "ply", "--out", "x"], "one file"),
+        (["export", str(scan_dir), "--to", "dsm", "--cell-m", "-1"], "positive"),
+        (["export", str(scan_dir), "--to", "dsm", "--cell-m", "0.0001"], "too large"),
+    ]:
+        failed = run(app, bad)
+        assert isinstance(failed.exception, InputError)
+        assert text in str(failed.exception)
+
+
+def test_an_empty_scan_is_refused(tmp_path: Path) -> None:
+    from service.stream.records import ScanHeader
+    from service.stream.store import ScanStore
+
+    ScanStore.create(tmp_path / "scan.db", ScanHeader("x", "d", 0)).close()
+    with pytest.raises(InputError, match="no points"):
+        written(tmp_path, "laz")
