@@ -48,9 +48,7 @@ class Anchor:
     height: float | None  # of the camera above the ground seen, in odometry units
 
 
-def _residuals(
-    R: F64, t: F64, log_scale: float, anchors: Sequence[Anchor]
-) -> tuple[F64, F64, F64]:
+def _residuals(R: F64, t: F64, log_scale: float, anchors: Sequence[Anchor]) -> tuple[F64, F64, F64]:
     """Whitened residuals (M,), Jacobian (M, 7) and the row's group for robust weights (M,)."""
     scale = float(np.exp(log_scale))
     rows: list[F64] = []
@@ -149,7 +147,8 @@ def _turn_to_fixes(R: F64, x: F64, y: F64, anchors: Sequence[Anchor]) -> tuple[F
         return R, x
     dx, dy = x[:, :2] - x[:, :2].mean(0), y[:, :2] - y[:, :2].mean(0)
     turn = np.arctan2(
-        np.sum(dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]), np.sum(dx[:, 0] * dy[:, 0] + dx[:, 1] * dy[:, 1])
+        np.sum(dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]),
+        np.sum(dx[:, 0] * dy[:, 0] + dx[:, 1] * dy[:, 1]),
     )
     Rz = se3.so3_exp(np.array([0.0, 0.0, float(turn)]))
     return Rz @ R, x @ Rz.T

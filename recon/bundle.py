@@ -75,9 +75,7 @@ def _cost(T: F64, X: F64, cam: I64, pt: I64, uv: F64, k: F64, huber: float, res:
 
 
 @njit(cache=True, nogil=True)
-def _linearise(
-    P: F64, x: F64, uv: F64, k: F64, huber: float, Jc: F64, Jp: F64, r: F64
-) -> float:
+def _linearise(P: F64, x: F64, uv: F64, k: F64, huber: float, Jc: F64, Jp: F64, r: F64) -> float:
     """Fill the (2, 6) and (2, 3) Jacobians and the error ``r``; return the Huber weight."""
     X0 = P[0, 0] * x[0] + P[0, 1] * x[1] + P[0, 2] * x[2] + P[0, 3]
     X1 = P[1, 0] * x[0] + P[1, 1] * x[1] + P[1, 2] * x[2] + P[1, 3]
@@ -145,12 +143,14 @@ def _normal_equations(
                     S[6 * s + i, 6 * s + j] += w * (Jc[0, i] * Jc[0, j] + Jc[1, i] * Jc[1, j])
                 for j in range(3):
                     W[m, i, j] = w * (Jc[0, i] * Jp[0, j] + Jc[1, i] * Jp[1, j])
+        ridge = 1e-9 * (H[0, 0] + H[1, 1] + H[2, 2]) + 1e-9  # far points have no depth
         for i in range(3):
-            H[i, i] += damping * H[i, i] + 1e-9
+            H[i, i] += damping * H[i, i] + ridge
         Hpp_inv[p] = np.linalg.inv(H)
         bp[p] = b
+    ridge = 1e-10 * np.trace(S) / (6 * n_free) + 1e-9
     for i in range(6 * n_free):
-        S[i, i] += damping * S[i, i] + 1e-9
+        S[i, i] += damping * S[i, i] + ridge
     for p in range(X.shape[0]):
         for m in range(start[p], start[p + 1]):
             s = slot[cam[m]]
@@ -199,7 +199,9 @@ def _adjust(
     damping = 1e-4
     improved = False
     for _ in range(iterations):
-        _normal_equations(T, X, cam, start, uv, k, huber, slot, n_free, damping, S, g, Hpp_inv, bp, W)
+        _normal_equations(
+            T, X, cam, start, uv, k, huber, slot, n_free, damping, S, g, Hpp_inv, bp, W
+        )
         dc = np.linalg.solve(S, g)
         T_new = T.copy()
         for c in range(T.shape[0]):
@@ -294,9 +296,7 @@ def adjust(
     return BundleResult(T, X, back, covariance, bool(improved))
 
 
-def triangulate(
-    T_a_world: F64, T_b_world: F64, K: F64, uv_a: F64, uv_b: F64
-) -> tuple[F64, F64]:
+def triangulate(T_a_world: F64, T_b_world: F64, K: F64, uv_a: F64, uv_b: F64) -> tuple[F64, F64]:
     """(N, 3) world points between two rays each, and (N,) parallax angles in rad.
 
     Midpoint of the shortest segment between the rays (T_x_world are camera-from-world).

@@ -18,6 +18,7 @@ class FusionConfig:
 
     agree_sigmas: float = 2.5  # pairs agree within that many combined sigmas
     single_view_sigma: float = 1.5  # factor on the sigma of a point that one pair saw alone
+    most_sigma_share: float = 0.04  # of the depth; a worse reading says nothing
     least_sigma_share: float = 0.0005  # of the depth; no pair is better than this
 
 
@@ -46,7 +47,9 @@ def onto_keyframe(
     ray = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
     there = ray @ pair.R_left_keyframe.T
     z = there[..., 2]
-    Kd = scaled_K(pair.K, depth_m.shape[1] / pair.left.shape[1], depth_m.shape[0] / pair.left.shape[0])
+    Kd = scaled_K(
+        pair.K, depth_m.shape[1] / pair.left.shape[1], depth_m.shape[0] / pair.left.shape[0]
+    )
     safe = np.where(z > 1e-3, z, 1.0)
     map_x = (Kd[0, 0] * there[..., 0] / safe + Kd[0, 2]).astype(np.float32)
     map_y = (Kd[1, 1] * there[..., 1] / safe + Kd[1, 2]).astype(np.float32)
@@ -64,9 +67,7 @@ def onto_keyframe(
     )
 
 
-def fuse(
-    pairs: Sequence[PairDepth], K: F64, T_world_camera: F64, config: FusionConfig
-) -> DepthMap:
+def fuse(pairs: Sequence[PairDepth], K: F64, T_world_camera: F64, config: FusionConfig) -> DepthMap:
     """One depth map of all pairs: at each pixel the largest group that agrees, averaged.
 
     The mean is over inverse depth (whose error is nearly Gaussian) with weights 1/sigma^2;
@@ -77,7 +78,8 @@ def fuse(
         raise ValueError("no stereo pair to fuse")
     inverse = np.stack([1.0 / p.depth_m for p in pairs]).astype(np.float64)
     sigma = np.stack([p.sigma_m / p.depth_m**2 for p in pairs]).astype(np.float64)
-    known = np.isfinite(inverse) & np.isfinite(sigma) & (inverse > 0)
+    with np.errstate(invalid="ignore"):
+        known = (inverse > 0) & (sigma < config.most_sigma_share * inverse)
     inverse, sigma = np.where(known, inverse, 0.0), np.where(known, sigma, 1.0)
     members = _largest_group(inverse, sigma, known, config.agree_sigmas)
     weight = np.where(members, 1.0 / sigma**2, 0.0)
@@ -91,9 +93,7 @@ def fuse(
     s = np.where(views == 1, s * config.single_view_sigma, s)
     depth[views == 0] = np.nan
     sigma_m = np.maximum(s * depth**2, config.least_sigma_share * depth)
-    return DepthMap(
-        depth.astype(np.float32), sigma_m.astype(np.float32), views, K, T_world_camera
-    )
+    return DepthMap(depth.astype(np.float32), sigma_m.astype(np.float32), views, K, T_world_camera)
 
 
 def _largest_group(inverse: F64, sigma: F64, known: Bool, agree_sigmas: float) -> Bool:

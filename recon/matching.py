@@ -148,8 +148,9 @@ def _warps(warp: npt.ArrayLike | None, count: int) -> tuple[F64, F64]:
     determinant = matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0]
     usable = np.isfinite(matrices).all(axis=(1, 2)) & (np.abs(determinant) > 1e-3)
     matrices[~usable] = np.eye(2)
-    inverse = np.linalg.inv(matrices) if count else matrices
-    return matrices.reshape(count, 4), np.ascontiguousarray(inverse.reshape(count, 4))
+    a, b, c, d = matrices.reshape(count, 4).T
+    inverse = np.stack([d, -b, -c, a], axis=1) / (a * d - b * c)[:, None]
+    return matrices.reshape(count, 4), np.ascontiguousarray(inverse)
 
 
 @dataclass(slots=True, eq=False)
@@ -188,7 +189,8 @@ def _consensus(uv: F64, residual: F64, good: Bool, tolerance_px: float) -> F64 |
     if np.count_nonzero(good) < 12:
         return None
     basis = np.column_stack([np.ones(len(uv)), uv / 1000.0])
-    x, y = basis[good], residual[good]
+    some = np.flatnonzero(good)[:: max(np.count_nonzero(good) // 300, 1)]
+    x, y = basis[some], residual[some]
     trend = np.zeros((3, 2))
     trend[0] = np.median(y, axis=0)
     weight = np.zeros(len(y))
@@ -253,8 +255,9 @@ def match(
             uv[lost] = predicted[lost] + trend[lost]
             active = everyone.copy()
     while level > 0:
-        level = max(level - 2, 0)
-        uv, score, _ = forward.at(level, uv, active, 3)
+        finer = max(level - 2, 0)
+        uv, score, _ = forward.at(finer, uv, active, 1 + level - finer)
+        level = finer
     uv, score, contrast = forward.refined(uv, active & (score > 0))
     ok = active & (2.0 * (1.0 - score) <= config.max_zssd) & (contrast >= config.min_contrast)
 

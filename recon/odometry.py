@@ -211,7 +211,9 @@ class Odometry:
             )
         self._lost = 0
         if _base_to_height(first.uv[ok], uv[ok], self.K, R_b_a) < 0.7 * self.config.base_to_height:
-            return Tracked("waiting", self.segment, tracks=int(ok.sum()), reason="too little motion")
+            return Tracked(
+                "waiting", self.segment, tracks=int(ok.sum()), reason="too little motion"
+            )
         up_a = first.T_camera_odom[:3, 2]
         turn = 0.12 if R_b_a is not None else np.pi
         view = two_view.solve(first.uv[ok], uv[ok], self.K, R_b_a, turn, up_a)
@@ -228,8 +230,12 @@ class Odometry:
         self._add_keyframe(grey, pyramid, seq, time_ns, prior, mask, T_camera_odom, uv, ok)
         self._update_motion(time_ns, self.keyframes[-1].T_odom_camera, prior)
         return Tracked(
-            "keyframe", self.segment, self.keyframes[-1].T_odom_camera,
-            self.keyframes[-1].covariance, int(ok.sum()), view.parallax_rad,
+            "keyframe",
+            self.segment,
+            self.keyframes[-1].T_odom_camera,
+            self.keyframes[-1].covariance,
+            int(ok.sum()),
+            view.parallax_rad,
         )
 
     def _first_landmarks(self, view: two_view.TwoView, rows: I64, prior: PosePrior) -> float:
@@ -509,9 +515,7 @@ class Odometry:
         for old in self.keyframes[: -self.config.window - 2]:
             old.pyramid = matching.Pyramid(())
 
-    def _triangulate(
-        self, key: OdometryKeyframe, T_camera_odom: F64, uv: F64, ok: Bool
-    ) -> None:
+    def _triangulate(self, key: OdometryKeyframe, T_camera_odom: F64, uv: F64, ok: Bool) -> None:
         """Landmarks for the keyframe's matched corners that have none yet."""
         rows = np.flatnonzero(ok & (key.landmark < 0))
         if rows.size == 0:
@@ -681,9 +685,7 @@ def _inverse_depth_plane(K: F64, P: F64) -> F64:
     return np.asarray(q)
 
 
-def _fresh_corners(
-    grey: U8, kept: F64, config: matching.MatchingConfig, mask: U8 | None
-) -> F64:
+def _fresh_corners(grey: U8, kept: F64, config: matching.MatchingConfig, mask: U8 | None) -> F64:
     """(N, 2) corners in grid cells that no kept track occupies."""
     corners = matching.harris_grid(grey, config, mask).uv_px.astype(np.float64)
     H, W = grey.shape

@@ -160,10 +160,16 @@ def _scores(
     n, S, pitch = 2 * radius + 1, 2 * reach + 1, scores.shape[1]
     u0, v0 = cu - reach - radius, cv - reach - radius
     side = S + n - 1
+    # Less 128, sums of squares stay exact in float32 up to a radius of 15.
     for y in range(side):
         row = image[min(max(v0 + y, 0), H - 1)]
-        for x in range(side):
-            window[y * pitch + x] = row[min(max(u0 + x, 0), W - 1)]
+        line = window[y * pitch : y * pitch + side]
+        if u0 >= 0 and u0 + side <= W:
+            for x in range(side):
+                line[x] = np.float32(row[u0 + x]) - np.float32(128)
+        else:
+            for x in range(side):
+                line[x] = np.float32(row[min(max(u0 + x, 0), W - 1)]) - np.float32(128)
     flat = scores.reshape(-1)
     length = (S - 1) * pitch + S
     flat[:length] = np.float32(0)
@@ -179,37 +185,48 @@ def _scores(
             run = window[y * pitch + x :]
             for i in range(length):
                 flat[i] += t0 * run[i] + t1 * run[i + 1] + t2 * run[i + 2] + t3 * run[i + 3]
-    sums = np.zeros((2, side), np.int64)
-    for y in range(n - 1):
-        for x in range(side):
-            value = int(window[y * pitch + x])
-            sums[0, x] += value
-            sums[1, x] += value * value
-    floor = min_contrast * min_contrast * n * n
+    _divide_by_contrast(window, pitch, S, n, min_contrast, scores)
+    # Centres whose patch leaves the image.
     for y in range(S):
-        for x in range(side):
-            value = int(window[(y + n - 1) * pitch + x])
-            sums[0, x] += value
-            sums[1, x] += value * value
-        s1, s2 = 0, 0
-        for x in range(n - 1):
-            s1 += sums[0, x]
-            s2 += sums[1, x]
-        row_inside = v0 + y >= 0 and v0 + y + n <= H
         for x in range(S):
-            s1 += sums[0, x + n - 1]
-            s2 += sums[1, x + n - 1]
-            power = s2 - s1 * s1 / (n * n)
-            if row_inside and u0 + x >= 0 and u0 + x + n <= W and power > floor:
-                scores[y, x] /= np.float32(np.sqrt(power))
-            else:
+            if v0 + y < 0 or v0 + y + n > H or u0 + x < 0 or u0 + x + n > W:
                 scores[y, x] = np.float32(NO_SCORE)
-            s1 -= sums[0, x]
-            s2 -= sums[1, x]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _divide_by_contrast(
+    window: Any, pitch: int, S: int, n: int, min_contrast: float, scores: Any
+) -> None:
+    """Divide every score by the length of the zero-mean patch under it, by running sums."""
+    side = S + n - 1
+    sums, squares = np.zeros(side, np.float32), np.zeros(side, np.float32)
+    for y in range(n - 1):
+        line = window[y * pitch : y * pitch + side]
         for x in range(side):
-            value = int(window[y * pitch + x])
-            sums[0, x] -= value
-            sums[1, x] -= value * value
+            sums[x] += line[x]
+            squares[x] += line[x] * line[x]
+    area = np.float32(1.0 / (n * n))
+    floor = np.float32(min_contrast * min_contrast * n * n)
+    for y in range(S):
+        old, new = window[y * pitch :], window[(y + n - 1) * pitch :]
+        for x in range(side):
+            sums[x] += new[x]
+            squares[x] += new[x] * new[x]
+        s1, s2 = np.float32(0), np.float32(0)
+        for x in range(n - 1):
+            s1 += sums[x]
+            s2 += squares[x]
+        line = scores[y]
+        for x in range(S):
+            s1 += sums[x + n - 1]
+            s2 += squares[x + n - 1]
+            power = s2 - s1 * s1 * area
+            line[x] = line[x] / np.sqrt(power) if power > floor else np.float32(NO_SCORE)
+            s1 -= sums[x]
+            s2 -= squares[x]
+        for x in range(side):
+            sums[x] -= old[x]
+            squares[x] -= old[x] * old[x]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -406,6 +423,6 @@ def refine(
                 if abs(u - uv_b[p, 0]) > 1.5 or abs(v - uv_b[p, 1]) > 1.5:
                     score[p] = NO_SCORE
                     break
-                if abs(du) < 0.01 and abs(dv) < 0.01:
+                if abs(du) < 0.02 and abs(dv) < 0.02:
                     break
             uv_b[p, 0], uv_b[p, 1] = u, v

@@ -69,9 +69,7 @@ def _candidates(
     return out
 
 
-def _refine(
-    R: F64, t: F64, uv_a: F64, uv_b: F64, K: F64, max_error_px: float
-) -> TwoView | None:
+def _refine(R: F64, t: F64, uv_a: F64, uv_b: F64, K: F64, max_error_px: float) -> TwoView | None:
     """Bundle-adjusted candidate with the baseline set back to one, or None."""
     T_b_a = se3.compose(R, t)
     for _ in range(2):

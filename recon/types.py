@@ -80,6 +80,8 @@ class StereoPair:
     T_world_left: F64  # (4, 4) pose of the rectified left camera
     R_left_keyframe: F64  # (3, 3) keyframe camera to rectified left camera
     guide: U8 | None = None  # (H, W, 3) rectified left in colour, at guidance resolution
+    left_seen: Bool | None = None  # (h, w) False where the left picture has nothing
+    right_seen: Bool | None = None  # (h, w) the same of the shifted right picture
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,7 +15,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import scaled_K
-from recon.types import F32, F64, U8, DepthMap, StereoPair
+from recon.types import F32, F64, U8, Bool, DepthMap, DisparityMap, StereoPair
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class View:
     bgr: U8  # (H, W, 3)
     K: F64  # (3, 3) px of that picture
     T_odom_camera: F64  # (4, 4)
-    sharpness: float = 1.0  # of the picture, relative to its neighbours
+    seen: U8 | None = None  # (H, W) zero where the picture has nothing; None: all of it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +129,7 @@ def rectify(
         return window
     plane, labels = window
     R_rect_right = R_rect_left @ T_left_right[:3, :3]
-    scale = config.guide_width_px / config.width_px
+    scale = max(1.0, config.guide_width_px / config.width_px)
     return StereoPair(
         left=_grey(_warp(left, R_rect_left, K, size, 2)),
         right=_grey(_warp(right, R_rect_right, K, size, 2, plane)),
@@ -140,7 +140,25 @@ def rectify(
         slope=1.0 - float(plane[0]),
         T_world_left=left.T_odom_camera @ se3.compose(R_rect_left.T, np.zeros(3)),
         R_left_keyframe=R_rect_left,
-        guide=_warp(left, R_rect_left, K, size, max(1.0, scale), area=False),
+        guide=_warp(left, R_rect_left, K, size, scale, area=False),
+        left_seen=_seen(left, R_rect_left, K, size),
+        right_seen=_seen(right, R_rect_right, K, size, plane),
+    )
+
+
+def drop_unseen(labels: DisparityMap, pair: StereoPair) -> DisparityMap:
+    """``labels`` (h, w) of the pair without those that rest on nothing in either picture."""
+    h, w = labels.px.shape
+    if pair.left_seen is None or pair.right_seen is None:
+        return labels
+    known = np.isfinite(labels.px)
+    partner = np.rint(np.arange(w) - np.where(known, labels.px, 0.0)).astype(np.int64)
+    inside = known & pair.left_seen & (partner >= 0) & (partner < w)
+    rows = np.arange(h)[:, None]
+    inside &= pair.right_seen[rows, np.clip(partner, 0, w - 1)]
+    return DisparityMap(
+        np.where(inside, labels.px, np.nan).astype(np.float32),
+        np.where(inside, labels.confidence, 0.0).astype(np.float32),
     )
 
 
@@ -213,6 +231,42 @@ def _fit_plane(u: F64, v: F64, d: F64) -> tuple[F64, F64]:
     return np.asarray(plane), np.asarray(d - A @ plane)
 
 
+def _maps(
+    view: View,
+    R_rect_view: F64,
+    K: F64,
+    size: tuple[int, int],
+    oversample: float,
+    plane: F64 | None,
+) -> tuple[F32, F32]:
+    """Where in the view each pixel of the rectified picture (``oversample`` finer) lies."""
+    w, h = int(size[0] * oversample), int(size[1] * oversample)
+    x = (np.arange(w, dtype=np.float32) + 0.5) / oversample - 0.5
+    y = (np.arange(h, dtype=np.float32) + 0.5) / oversample - 0.5
+    xx, yy = np.meshgrid(x, y)
+    if plane is not None:
+        xx = xx - (np.float32(plane[0]) * xx + np.float32(plane[1]) * yy + np.float32(plane[2]))
+    M = (view.K @ R_rect_view.T @ np.linalg.inv(K)).astype(np.float32)
+    den = M[2, 0] * xx + M[2, 1] * yy + M[2, 2]
+    den = np.where(den > 1e-6, den, np.float32(np.nan))
+    map_x = (M[0, 0] * xx + M[0, 1] * yy + M[0, 2]) / den
+    map_y = (M[1, 0] * xx + M[1, 1] * yy + M[1, 2]) / den
+    return map_x.astype(np.float32), map_y.astype(np.float32)
+
+
+def _seen(
+    view: View, R_rect_view: F64, K: F64, size: tuple[int, int], plane: F64 | None = None
+) -> Bool:
+    """(h, w) True where the rectified picture shows something, a pixel inside the border."""
+    map_x, map_y = _maps(view, R_rect_view, K, size, 1.0, plane)
+    H, W = view.bgr.shape[:2]
+    rim = 1.0 + view.K[0, 0] / K[0, 0]
+    inside = (map_x >= rim) & (map_x <= W - 1 - rim) & (map_y >= rim) & (map_y <= H - 1 - rim)
+    if view.seen is not None:
+        inside &= cv2.remap(view.seen, map_x, map_y, cv2.INTER_NEAREST) > 0
+    return np.asarray(inside)
+
+
 def _warp(
     view: View,
     R_rect_view: F64,
@@ -226,20 +280,12 @@ def _warp(
     """The view's picture as the rectified camera sees it, shifted by the disparity plane.
 
     With ``area`` the picture is made ``oversample`` times larger and averaged down to
-    ``size`` (no aliasing); without, it stays that much larger.
+    ``size`` (no aliasing); without, it stays that much larger. Beyond the picture its edge
+    is repeated: a black rim would be matched with the other view's.
     """
-    w, h = int(size[0] * oversample), int(size[1] * oversample)
-    x = (np.arange(w, dtype=np.float32) + 0.5) / oversample - 0.5
-    y = (np.arange(h, dtype=np.float32) + 0.5) / oversample - 0.5
-    xx, yy = np.meshgrid(x, y)
-    if plane is not None:
-        xx = xx - (np.float32(plane[0]) * xx + np.float32(plane[1]) * yy + np.float32(plane[2]))
-    M = (view.K @ R_rect_view.T @ np.linalg.inv(K)).astype(np.float32)
-    den = M[2, 0] * xx + M[2, 1] * yy + M[2, 2]
-    map_x = (M[0, 0] * xx + M[0, 1] * yy + M[0, 2]) / den
-    map_y = (M[1, 0] * xx + M[1, 1] * yy + M[1, 2]) / den
-    source, map_x, map_y = _prefilter(view, K[0, 0] * oversample, map_x, map_y)
-    out = cv2.remap(source, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    maps = _maps(view, R_rect_view, K, size, oversample, plane)
+    source, map_x, map_y = _prefilter(view, K[0, 0] * oversample, *maps)
+    out = cv2.remap(source, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     if area and oversample > 1:
         out = cv2.resize(out, size, interpolation=cv2.INTER_AREA)
     return np.asarray(out, dtype=np.uint8)

@@ -35,7 +35,14 @@ from recon.types import (
     StereoPair,
 )
 from recon.upsampling import UpsamplingConfig
-from recon.virtual_stereo import Refusal, View, VirtualStereoConfig, plane_relief, rectify
+from recon.virtual_stereo import (
+    Refusal,
+    View,
+    VirtualStereoConfig,
+    drop_unseen,
+    plane_relief,
+    rectify,
+)
 from recon.voxel_map import VoxelMap, VoxelMapConfig
 from service.cameras.source import GeoTag
 from service.config import Config
@@ -185,6 +192,7 @@ class Pipeline:
         self.pairs += 1
         with self.stopwatch("belief propagation"):  # Eq. 1
             coarse = self._backend.belief_propagation(pair.left, pair.right, pair.labels, self._bp)
+            coarse = drop_unseen(coarse, pair)
         with self.stopwatch("upsample"):  # Eq. 2
             fine = self._backend.upsample(coarse, pair.guide, self._jbu)
         with self.stopwatch("reproject"):  # Eq. 3
@@ -272,6 +280,7 @@ class Pipeline:
             viewpoint.bgr,
             self.undistorter.camera.K,
             viewpoint.T_odom_camera,
+            self.undistorter.valid,
         )
 
     def place(self, anchor: Anchorage) -> Placed:
