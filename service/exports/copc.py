@@ -34,13 +34,13 @@ def write_copc(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
     header = las_header(scan.xyz_m, scan.frame, scan.store.header.started_unix_ns)
     record = point_record(header, scan.xyz_m, scan.fused.cloud)
-    raw = np.frombuffer(record.memoryview(), np.uint8).reshape(len(record), -1)
+    raw = np.frombuffer(record.memoryview(), np.int8).reshape(len(record), -1)
     xyz = np.column_stack([record.x, record.y, record.z])
     centre, half = _cube(xyz)
     with writing(out) as part:
         writer = copclib.FileWriter(str(part), _config(header, scan, xyz, centre, half))
         for key, rows in octree(xyz, centre - half, 2.0 * half):
-            data = copclib.VectorChar(raw[rows].tobytes())
+            data = copclib.VectorChar(raw[rows].ravel())
             writer.AddNode(copclib.VoxelKey(*key), data)
         writer.Close()
 
