@@ -22,6 +22,10 @@ CAMERAS: dict[str, str] = {
     "file": "service.cameras.file:open_file",
     "images": "service.cameras.images:open_images",
     "pipe": "service.cameras.pipe:open_pipe",
+    "rtsp": "service.cameras.stream:open_rtsp",
+    "v4l2": "service.cameras.stream:open_v4l2",
+    "gst": "service.cameras.stream:open_gst",
+    "stream": "service.cameras.stream:open_stream",
 }
 """Word to ``module:function(rest, options) -> CameraSource``; imported on first use."""
 
@@ -50,7 +54,9 @@ def parse_source(source: str) -> tuple[str, str, dict[str, str]]:
         return ("images" if path.is_dir() else "file"), source, {}
     word, colon, rest = source.partition(":")
     if colon and word in CAMERAS:
-        rest, _, query = rest.partition("?") if not Path(rest).exists() else (rest, "", "")
+        if "://" in source or word == "gst" or Path(rest).exists():
+            return word, rest, {}  # a URL's own query, or a name with a question mark
+        rest, _, query = rest.partition("?")
         return word, rest, dict(parse_qsl(query, keep_blank_values=True))
     if colon and "/" not in word and "." not in word and len(word) > 1:
         near = difflib.get_close_matches(word, CAMERAS, n=1)

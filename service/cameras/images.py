@@ -31,6 +31,7 @@ class ImagesSource:
         """Read the tags of every still; ``interval_s`` spaces stills by name instead of tags."""
         self.description = str(folder)
         self.is_live = False
+        self.start_monotonic_ns: int | None = None
         self.warnings: list[str] = []
         tagged = self._same_size(self._read(folder))
         times, self.epoch_unix_ns = self._times(tagged, interval_s)

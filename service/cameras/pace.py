@@ -1,4 +1,4 @@
-"""A recording at its own pace: what comes faster than it is taken is dropped, oldest first."""
+"""Pictures when they are due: what comes faster than it is taken is dropped, oldest first."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from service.cameras.source import CameraFrame, CameraSource
 class Paced:
     """A source that gives each picture when its presentation time has come, as a camera does.
 
+    A live source is not held back: it is only emptied, so that its newest pictures are used.
     At most ``kept`` pictures wait; :attr:`dropped` counts those that were too late.
     """
 
@@ -26,6 +27,7 @@ class Paced:
         self.dropped = 0
         self.description, self.size_px = source.description, source.size_px
         self.epoch_unix_ns, self.fps = source.epoch_unix_ns, source.fps
+        self.start_monotonic_ns = source.start_monotonic_ns
         self.is_live = True
         self.warnings = source.warnings
 
@@ -52,7 +54,7 @@ class Paced:
         try:
             for frame in self._source:
                 wait_ns = frame.time_ns - (time.monotonic_ns() - start)
-                if wait_ns > 0:
+                if wait_ns > 0 and not self._source.is_live:
                     time.sleep(wait_ns * 1e-9)
                 with self._news:
                     self._waiting.append(frame)

@@ -40,6 +40,7 @@ class CameraSource(Protocol):
     description: str  # for a log line and scan.json
     size_px: tuple[int, int]  # (W, H)
     epoch_unix_ns: int | None  # UTC of time_ns = 0, when the source tells
+    start_monotonic_ns: int | None  # this machine's monotonic clock at time_ns = 0, if live
     fps: float | None  # mean pictures per second, when the source tells
     is_live: bool  # True: pictures that are not fetched in time are lost
     warnings: list[str]  # one line each; grows while pictures are fetched

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import datetime, timezone
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
@@ -34,6 +34,7 @@ class VideoSource:
         """Take over ``container``; raises InputError when it shows no picture."""
         self.description = description
         self.is_live = False
+        self.start_monotonic_ns: int | None = None
         self.warnings: list[str] = []
         self._container = container
         self._damaged = 0
@@ -45,7 +46,7 @@ class VideoSource:
         self._stream = container.streams.video[0]
         self._stream.thread_type = "AUTO"
         self._expected = self._stream.frames
-        self._decoded = self._decode()
+        self._decoded = decoded_pictures(container, self._stream, self._warn, self._damage)
         self._first = next(self._decoded, None)
         if self._first is None:
             self.close()
@@ -65,9 +66,6 @@ class VideoSource:
         seq = 0
         decoded = 0
         for picture in itertools.chain((first,), self._decoded):
-            if picture.is_corrupt:  # pieced together from other pictures: no measurement
-                self._damaged += 1
-                continue
             decoded += 1
             time_ns = self._time_ns(picture, last_ns)
             if time_ns <= last_ns:
@@ -80,7 +78,7 @@ class VideoSource:
                     f"{time_ns / 1e9:.2f} s; what follows is left out"
                 )
                 break
-            yield CameraFrame(_bgr(picture), time_ns, seq, None, f"frame {seq}")
+            yield CameraFrame(picture_bgr(picture), time_ns, seq, None, f"frame {seq}")
             last_ns = time_ns
             seq += 1
         else:
@@ -93,36 +91,9 @@ class VideoSource:
             self._open = False
             self._container.close()
 
-    def _decode(self) -> Iterator[av.VideoFrame]:
-        """Decode packet by packet, so that a damaged packet costs itself only."""
-        import av.error
-
-        packets = self._container.demux(self._stream)
-        while self._open:
-            try:
-                packet = next(packets)
-            except StopIteration:
-                return
-            except (av.error.FFmpegError, OSError) as error:
-                self._warn(f"the recording breaks off: {error}")
-                yield from self._flush()
-                return
-            try:
-                frames = packet.decode()
-            except av.error.FFmpegError as error:
-                self._damaged += 1
-                log.debug("%s: packet dropped: %s", self.description, error)
-                continue
-            yield from frames
-
-    def _flush(self) -> Iterator[av.VideoFrame]:
-        """Yield the pictures that the decoder still holds after its input broke off."""
-        import av.error
-
-        try:
-            yield from self._stream.codec_context.decode(None)
-        except av.error.FFmpegError as error:
-            log.debug("%s: nothing more to decode: %s", self.description, error)
+    def _damage(self, error: Exception) -> None:
+        self._damaged += 1
+        log.debug("%s: picture dropped: %s", self.description, error)
 
     def _time_ns(self, picture: av.VideoFrame, last_ns: int) -> int:
         """Presentation time; a picture without one follows the last by the mean interval."""
@@ -146,6 +117,42 @@ class VideoSource:
     def _warn(self, text: str) -> None:
         self.warnings.append(text)
         log.warning("%s: %s", self.description, text)
+
+
+def decoded_pictures(
+    container: av.container.InputContainer,
+    stream: av.VideoStream,
+    broke_off: Callable[[str], None],
+    damaged: Callable[[Exception], None],
+) -> Iterator[av.VideoFrame]:
+    """Every whole picture of ``stream``, packet by packet: a damaged one costs itself only.
+
+    ``broke_off`` is told when the container ends with an error, ``damaged`` of each picture
+    that does not decode or that the decoder pieced together from others.
+    """
+    import av.error
+
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets, None)
+        except (av.error.FFmpegError, OSError) as error:
+            broke_off(f"the recording breaks off: {error}")
+            packet = None
+        try:
+            pictures = stream.codec_context.decode(None) if packet is None else packet.decode()
+        except av.error.EOFError:
+            pictures = []  # the decoder was emptied before
+        except av.error.FFmpegError as error:
+            damaged(error)
+            pictures = []
+        for picture in pictures:
+            if picture.is_corrupt:
+                damaged(ValueError("concealed by the decoder"))
+            else:
+                yield picture
+        if packet is None:
+            return
 
 
 def creation_unix_ns(container: Any, stream: Any) -> int | None:
@@ -185,7 +192,8 @@ def _start_s(stream: av.VideoStream, first: av.VideoFrame) -> Fraction:
     return Fraction(0)
 
 
-def _bgr(picture: av.VideoFrame) -> U8:
+def picture_bgr(picture: av.VideoFrame) -> U8:
+    """(H, W, 3) BGR of a decoded picture."""
     return np.ascontiguousarray(picture.to_ndarray(format="bgr24"), dtype=np.uint8)
 
 

@@ -1,0 +1,198 @@
+"""A camera that never ends: arrival times smoothed, stalls and frozen pictures found out.
+
+The stream is opened again, with growing pauses, when it ends, fails, stalls or repeats one
+picture. Pictures keep one time axis through all of that: ns since the source was opened, on the
+machine's monotonic clock.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from threading import Event
+from typing import TYPE_CHECKING
+
+from recon.types import U8
+from service.cameras.source import CameraFrame
+from service.cameras.video import decoded_pictures, picture_bgr
+from service.errors import OutsideError
+
+if TYPE_CHECKING:
+    import av
+    import av.container
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class LiveConfig:
+    """When a live camera counts as gone, and how it is called back."""
+
+    stall_s: float = 3.0  # no picture for so long: open again
+    frozen_s: float = 8.0  # one and the same picture for so long: open again
+    first_retry_s: float = 0.25
+    longest_retry_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        if not 0 < self.first_retry_s <= self.longest_retry_s:
+            raise ValueError("live camera: 0 < first_retry_s <= longest_retry_s must hold")
+        if self.stall_s <= 0 or self.frozen_s <= 0:
+            raise ValueError("live camera: stall_s and frozen_s must be positive")
+
+
+class StampFilter:
+    """Arrival times without their jitter: presentation time plus the least delay seen of late.
+
+    Queues and decoders only ever delay a picture, so the lower envelope of arrival minus
+    presentation time is the best estimate of the clocks' offset. It may rise by 200 ppm, which
+    is more than two crystals drift apart.
+    """
+
+    RISE = 200e-6
+
+    def __init__(self) -> None:
+        """Start with no estimate."""
+        self._offset_ns: float | None = None
+        self._last_pts_ns = 0
+
+    def time_ns(self, pts_ns: int, arrival_ns: int) -> int:
+        """The picture's time on the clock of ``arrival_ns``; never later than its arrival."""
+        step_ns = pts_ns - self._last_pts_ns
+        if self._offset_ns is None or not 0 <= step_ns < 10_000_000_000:
+            self._offset_ns = float(arrival_ns - pts_ns)  # first picture, or a new time line
+        else:
+            self._offset_ns = min(self._offset_ns + self.RISE * step_ns, arrival_ns - pts_ns)
+        self._last_pts_ns = pts_ns
+        return pts_ns + round(self._offset_ns)
+
+
+class LiveSource:
+    """Pictures of a stream that is opened again whenever it is lost."""
+
+    def __init__(
+        self,
+        open_container: Callable[[float], av.container.InputContainer],
+        description: str,
+        config: LiveConfig | None = None,
+    ) -> None:
+        """Open the stream by ``open_container(stall_s)`` and see its first picture.
+
+        Raises OutsideError when the camera gives none now; nothing is retried here.
+        """
+        self.description = description
+        self.config = config or LiveConfig()
+        self.is_live = True
+        self.fps: float | None = None
+        self.warnings: list[str] = []
+        self.losses = 0
+        self.misfits = 0  # pictures of another size, dropped
+        self.epoch_unix_ns: int | None = time.time_ns()
+        self._start_ns = time.monotonic_ns()
+        self.start_monotonic_ns: int | None = self._start_ns
+        self._open_container = open_container
+        self._closed = Event()
+        self._pictures = self._connect()
+        first = next(self._pictures, None)
+        if first is None:
+            raise OutsideError(f"{description}: gives no picture; is the camera on and streaming?")
+        self.size_px = (first[0].shape[1], first[0].shape[0])
+        self._first = first
+
+    def __iter__(self) -> Iterator[CameraFrame]:
+        """Yield pictures until :meth:`close`."""
+        seq = 0
+        last_ns = -1
+        for image, time_ns in itertools.chain((self._first,), self._endless()):
+            if (image.shape[1], image.shape[0]) != self.size_px:
+                self._tell_misfit(image)
+                continue
+            if time_ns > last_ns:
+                yield CameraFrame(image, time_ns, seq, None, f"frame {seq}")
+                seq += 1
+                last_ns = time_ns
+
+    def close(self) -> None:
+        """End the iteration at the next picture, and the waiting for a lost camera at once."""
+        self._closed.set()
+
+    def _endless(self) -> Iterator[tuple[U8, int]]:
+        """Every (picture, time) of every connection, with pauses that grow between failures."""
+        retry_s = self.config.first_retry_s
+        while not self._closed.is_set():
+            for found in self._pictures:
+                retry_s = self.config.first_retry_s
+                yield found
+                if self._closed.is_set():
+                    return
+            if self._closed.is_set():
+                return
+            self.losses += 1
+            self._closed.wait(retry_s)
+            retry_s = min(2.0 * retry_s, self.config.longest_retry_s)
+            self._pictures = self._connect()
+
+    def _connect(self) -> Iterator[tuple[U8, int]]:
+        """The (picture, time) of one connection; ends, with a log line, when it is lost."""
+        import av.error
+
+        try:
+            container = self._open_container(self.config.stall_s)
+        except (av.error.FFmpegError, OSError, ValueError) as error:
+            self._tell(f"cannot be opened: {error}")
+            return
+        try:
+            if not container.streams.video:
+                self._tell("holds no video stream")
+                return
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            rate = stream.average_rate or stream.guessed_rate
+            self.fps = float(rate) if rate else None
+            log.info("%s: connected", self.description)
+            yield from self._watch(decoded_pictures(container, stream, self._tell, self._damage))
+        finally:
+            container.close()
+
+    def _watch(self, pictures: Iterator[av.VideoFrame]) -> Iterator[tuple[U8, int]]:
+        """Stamp the pictures; end when one picture is repeated for too long."""
+        stamps = StampFilter()
+        print_of_last, changed_ns = 0, time.monotonic_ns()
+        for picture in pictures:
+            if self._closed.is_set():
+                return
+            arrival_ns = time.monotonic_ns()
+            image = picture_bgr(picture)
+            fingerprint = zlib.crc32(image[::16, ::16].tobytes())
+            if fingerprint != print_of_last:
+                print_of_last, changed_ns = fingerprint, arrival_ns
+            elif arrival_ns - changed_ns > self.config.frozen_s * 1e9:
+                self._tell(f"the picture is frozen since {self.config.frozen_s:g} s")
+                return
+            time_ns = arrival_ns
+            if picture.pts is not None and picture.time_base is not None:
+                pts_ns = round(picture.pts * picture.time_base * 1_000_000_000)
+                time_ns = stamps.time_ns(pts_ns, arrival_ns)
+            yield image, time_ns - self._start_ns
+
+    def _damage(self, error: Exception) -> None:
+        log.debug("%s: packet dropped: %s", self.description, error)
+
+    def _tell_misfit(self, image: U8) -> None:
+        if self.misfits == 0:
+            self._tell(
+                f"now gives {image.shape[1]}x{image.shape[0]} pictures instead of "
+                f"{self.size_px[0]}x{self.size_px[1]}; they are dropped: the camera model does "
+                "not fit them"
+            )
+        self.misfits += 1
+
+    def _tell(self, text: str) -> None:
+        if not self._closed.is_set():
+            if text not in self.warnings:
+                self.warnings.append(text)
+            log.warning("%s: %s", self.description, text)

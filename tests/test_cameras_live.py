@@ -1,0 +1,335 @@
+"""Live cameras: one time axis through every loss; stalls, frozen pictures and misfits found."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import shlex
+import shutil
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+from service.cameras import CameraFrame, open_camera
+from service.cameras.live import LiveConfig, LiveSource, StampFilter
+from service.cameras.pace import paced
+from service.cameras.stream import _without_password
+from service.errors import InputError, OutsideError
+
+needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs the ffmpeg command")
+QUICK = LiveConfig(stall_s=1.0, frozen_s=0.05, first_retry_s=0.01, longest_retry_s=0.05)
+
+
+def clip(n: int, size_px: tuple[int, int] = (64, 48), moving: bool = True) -> bytes:
+    """``n`` Matroska pictures of noise, 20 ms apart; all the same unless ``moving``."""
+    data = io.BytesIO()
+    with av.open(data, "w", format="matroska") as out:
+        stream: Any = out.add_stream("ffv1", rate=50)
+        stream.width, stream.height = size_px
+        stream.pix_fmt = "yuv420p"
+        for i in range(n):
+            noise = np.random.default_rng(i if moving else 0)
+            image = noise.integers(0, 256, (size_px[1], size_px[0], 3), np.uint8)
+            frame = av.VideoFrame.from_ndarray(image, format="bgr24")
+            frame.pts, frame.time_base = i, Fraction(1, 50)
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode(None))
+    return data.getvalue()
+
+
+def opener(*connections: bytes | Exception) -> Callable[[float], Any]:
+    """An opener that gives one connection after the other, the last one again and again."""
+    left = list(connections)
+
+    def open_container(stall_s: float) -> Any:
+        found = left.pop(0) if len(left) > 1 else left[0]
+        if isinstance(found, Exception):
+            raise found
+        return av.open(io.BytesIO(found))
+
+    return open_container
+
+
+def take(source: LiveSource, n: int) -> list[CameraFrame]:
+    frames = []
+    for frame in source:
+        frames.append(frame)
+        if len(frames) == n:
+            source.close()
+    return frames
+
+
+def test_stamps_shed_jitter_and_follow_drift() -> None:
+    rng = np.random.default_rng(7)
+    pts = (np.arange(3000) * 33_333_333).astype(np.int64)
+    true = 5_000_000_000 + (pts * (1 + 50e-6)).astype(np.int64)  # crystals 50 ppm apart
+    arrival = true + (rng.exponential(0.020, pts.size) * 1e9).astype(np.int64)
+    stamps = StampFilter()
+    found = np.array([stamps.time_ns(int(p), int(a)) for p, a in zip(pts, arrival, strict=True)])
+    assert (found <= arrival).all()
+    late_ms = (found - true)[300:] / 1e6
+    assert abs(late_ms).max() < 10.0
+    assert late_ms.std() < 0.2 * ((arrival - true)[300:] / 1e6).std()
+
+
+def test_stamps_begin_again_on_a_new_time_line() -> None:
+    stamps = StampFilter()
+    assert stamps.time_ns(1_000, 500_000_000) == 500_000_000
+    assert stamps.time_ns(20_000_000, 520_000_000) < 521_000_000
+    assert stamps.time_ns(0, 900_000_000) == 900_000_000  # presentation time went back
+    assert stamps.time_ns(10**15, 950_000_000) == 950_000_000  # or jumped far ahead
+
+
+def test_one_time_axis_through_losses() -> None:
+    source = LiveSource(opener(clip(5), OSError("gone"), OSError("gone"), clip(5)), "test", QUICK)
+    assert source.is_live
+    assert source.size_px == (64, 48)
+    frames = take(source, 12)
+    assert [f.seq for f in frames] == list(range(12))
+    times = [f.time_ns for f in frames]
+    assert all(b > a for a, b in itertools.pairwise(times))
+    assert source.losses >= 3
+    assert any("cannot be opened" in w for w in source.warnings)
+
+
+def test_absent_camera_is_told_at_once() -> None:
+    with pytest.raises(OutsideError, match="gives no picture"):
+        LiveSource(opener(OSError("no route")), "test", QUICK)
+
+
+def test_pictures_of_another_size_are_dropped() -> None:
+    source = LiveSource(opener(clip(3), clip(4, (96, 64)), clip(50)), "test", QUICK)
+    frames = take(source, 6)
+    assert all(f.image.shape == (48, 64, 3) for f in frames)
+    assert source.misfits == 4
+    assert any("96x64" in w for w in source.warnings)
+
+
+def test_frozen_picture_is_found_out() -> None:
+    config = LiveConfig(stall_s=1.0, frozen_s=1e-6, first_retry_s=0.01, longest_retry_s=0.05)
+    source = LiveSource(opener(clip(100, moving=False), clip(50)), "test", config)
+    frames = take(source, 10)
+    assert source.losses == 1
+    assert any("frozen" in w for w in source.warnings)
+    assert len({f.image.tobytes() for f in frames}) >= 8
+
+
+def test_live_pictures_are_not_held_back() -> None:
+    """A live source that was opened an hour before it is read gives its pictures at once."""
+    source = LiveSource(opener(clip(5)), "test", QUICK)
+    source._first = (source._first[0], 3600 * 10**9)
+    paces = paced(source)
+    frame = next(iter(paces))
+    paces.close()
+    assert frame.time_ns == 3600 * 10**9
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"first_retry_s": 9.0}, {"stall_s": 0.0}, {"frozen_s": -1.0}, {"first_retry_s": 0.0}]
+)
+def test_nonsense_settings_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="live camera"):
+        LiveConfig(**wrong)
+
+
+def test_passwords_stay_out_of_logs() -> None:
+    assert _without_password("rtsp://me:secret@10.0.0.2/main") == "rtsp://…@10.0.0.2/main"
+    assert _without_password("rtsp://10.0.0.2/main") == "rtsp://10.0.0.2/main"
+
+
+def test_wrong_live_sources_are_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    with pytest.raises(OutsideError, match="no such camera device"):
+        open_camera(f"v4l2:{tmp_path / 'video7'}")
+    with pytest.raises(InputError, match="no option 'fps'"):
+        open_camera("v4l2:/dev/video0?fps=3")
+    with pytest.raises(InputError, match="is not like"):
+        open_camera("stream:10.0.0.2")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(OutsideError, match="gst-launch"):
+        open_camera("gst:videotestsrc")
+
+
+def free_udp_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def send_udp(port: int) -> subprocess.Popen[bytes]:
+    """A moving test picture in H.264 over MPEG-TS, 20 a second, for ever."""
+    return subprocess.Popen(
+        shlex.split(
+            "ffmpeg -v error -re -f lavfi -i testsrc2=size=160x120:rate=20 -c:v libx264 "
+            "-preset ultrafast -tune zerolatency -g 5 "
+            f"-f mpegts udp://127.0.0.1:{port}?pkt_size=1316"
+        ),
+        stdin=subprocess.DEVNULL,
+    )
+
+
+@needs_ffmpeg
+def test_stream_survives_the_death_of_its_sender() -> None:
+    port = free_udp_port()
+    senders = [send_udp(port)]
+    source_lost: list[bool] = []
+    frames: list[CameraFrame] = []
+
+    def open_container(stall_s: float) -> Any:
+        if source_lost:
+            senders.append(send_udp(port))
+        source_lost.append(True)
+        return av.open(f"udp://127.0.0.1:{port}", timeout=(10.0, stall_s))
+
+    try:
+        source = LiveSource(open_container, "udp", QUICK)
+        for frame in source:
+            frames.append(frame)
+            if len(frames) == 20:
+                senders[0].kill()
+            if len(frames) == 40:
+                source.close()
+    finally:
+        for sender in senders:
+            sender.kill()
+            sender.wait()
+    assert source.losses >= 1
+    times = np.array([f.time_ns for f in frames])
+    assert (np.diff(times) > 0).all()
+    # Twenty a second: evenly stamped although they arrive in bursts.
+    assert np.median(np.diff(times)) == pytest.approx(50e6, rel=0.1)
+
+
+@needs_ffmpeg
+def test_gstreamer_pipeline_is_run_and_ended(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The launcher is stood in for by a script that does what gst-launch's y4menc does."""
+    launcher = tmp_path / "gst-launch-1.0"
+    launcher.write_text(
+        f'#!/bin/sh\necho $$ > {tmp_path}/pid\necho "$@" > {tmp_path}/arguments\n'
+        "exec ffmpeg -v error -re -f lavfi -i testsrc2=size=160x120:rate=30 "
+        "-pix_fmt yuv420p -f yuv4mpegpipe -\n"
+    )
+    launcher.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    source = open_camera("gst:nvarguscamerasrc ! nvvidconv")
+    frames = iter(source)
+    assert [next(frames).image.shape for _ in range(3)] == [(120, 160, 3)] * 3
+    assert "nvarguscamerasrc ! nvvidconv ! videoconvert" in (tmp_path / "arguments").read_text()
+    source.close()
+    pid = int((tmp_path / "pid").read_text())
+    deadline = time.monotonic() + 20.0
+    while Path(f"/proc/{pid}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{pid}").exists()
+
+
+@needs_ffmpeg
+def test_rtsp_camera_is_read(tmp_path: Path) -> None:
+    """A small RTSP server of our own serves one H.264 stream over TCP to FFmpeg's client."""
+    source_clip = tmp_path / "v.h264"
+    subprocess.run(
+        shlex.split(
+            "ffmpeg -v error -f lavfi -i testsrc2=size=160x120:rate=25:duration=2 -c:v libx264 "
+            f"-preset ultrafast -g 5 -bf 0 -x264-params slices=1 {source_clip}"
+        ),
+        check=True,
+    )
+    with RtspServer(source_clip.read_bytes()) as server:
+        source = open_camera(f"rtsp://127.0.0.1:{server.port}/main?x=1")
+        frames: Iterator[CameraFrame] = iter(source)
+        first = next(frames)
+        assert first.image.shape == (120, 160, 3)
+        assert source.is_live
+        assert source.epoch_unix_ns is not None
+        source.close()
+    assert server.asked == "/main?x=1"
+
+
+class RtspServer:
+    """The least of RFC 2326 and RFC 6184 that an interleaved H.264 client needs."""
+
+    def __init__(self, annex_b: bytes) -> None:
+        self._units = [u.rstrip(b"\0") for u in annex_b.split(b"\0\0\1")[1:]]
+        self._socket = socket.create_server(("127.0.0.1", 0))
+        self.port = self._socket.getsockname()[1]
+        self.asked = ""
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+
+    def __enter__(self) -> RtspServer:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._socket.close()
+        self._thread.join(10.0)
+
+    def _serve(self) -> None:
+        try:
+            client, _ = self._socket.accept()
+            with client:
+                self._talk(client)
+        except OSError:
+            return
+
+    def _talk(self, client: socket.socket) -> None:
+        requests = client.makefile("rb")
+        while line := requests.readline().decode():
+            method, url, _ = line.split()
+            headers = {}
+            while (header := requests.readline().decode().strip()) != "":
+                key, _, value = header.partition(":")
+                headers[key.lower()] = value.strip()
+            self.asked = self.asked or "/" + url.split("/", 3)[3]
+            body, more = "", ""
+            if method == "DESCRIBE":
+                body = "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=t\r\nt=0 0\r\nm=video 0 RTP/AVP 96\r\n"
+                body += "a=rtpmap:96 H264/90000\r\na=fmtp:96 packetization-mode=1\r\n"
+                more = f"Content-Type: application/sdp\r\nContent-Length: {len(body)}\r\n"
+            elif method == "SETUP":
+                more = "Transport: RTP/AVP/TCP;unicast;interleaved=0-1\r\nSession: 7\r\n"
+            elif method == "PLAY":
+                more = "Session: 7\r\n"
+            answer = f"RTSP/1.0 200 OK\r\nCSeq: {headers['cseq']}\r\n{more}\r\n{body}"
+            client.sendall(answer.encode())
+            if method == "PLAY":
+                self._play(client)
+                return
+
+    def _play(self, client: socket.socket) -> None:
+        seq, stamp = 0, 0
+        for unit in self._units:
+            picture = unit[0] & 31 in (1, 5)
+            pieces = [unit] if len(unit) < 1200 else self._fragments(unit)
+            for i, piece in enumerate(pieces):
+                marker = 0x80 if picture and i == len(pieces) - 1 else 0
+                packet = bytes((0x80, 96 | marker)) + seq.to_bytes(2, "big")
+                packet += stamp.to_bytes(4, "big") + b"\0\0\0\1" + piece
+                client.sendall(b"$\0" + len(packet).to_bytes(2, "big") + packet)
+                seq += 1
+            if picture:
+                stamp += 3600
+                if self._ended.wait(0.04):
+                    return
+
+    @staticmethod
+    def _fragments(unit: bytes) -> list[bytes]:
+        """FU-A pieces of one NAL unit (RFC 6184 section 5.8)."""
+        head, body = unit[0], unit[1:]
+        pieces = [body[i : i + 1200] for i in range(0, len(body), 1200)]
+        out = []
+        for i, piece in enumerate(pieces):
+            flags = (0x80 if i == 0 else 0) | (0x40 if i == len(pieces) - 1 else 0)
+            out.append(bytes(((head & 0xE0) | 28, flags | (head & 31))) + piece)
+        return out
