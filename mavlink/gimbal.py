@@ -17,6 +17,7 @@ from typing import Any
 from mavlink.quaternion import (
     Quaternion,
     angle_between,
+    conjugate,
     from_rpy,
     multiply,
     normalised,
@@ -29,8 +30,11 @@ YAW_LOCK = 16
 YAW_IN_VEHICLE_FRAME = 32
 YAW_IN_EARTH_FRAME = 64
 
-TILT_LAG = 10  # samples
+STRAIGHT_RAD = math.radians(0.05)
+TILT_LAG = 30  # samples
 TILTED_RAD = math.radians(1.0)
+SAME_RAD = math.radians(0.3)
+CLEAR_RAD = math.radians(0.05)
 
 YAW_FRAMES = ("auto", "vehicle", "earth", "body", "servo")
 
@@ -113,10 +117,24 @@ def to_earth(q: Quaternion, frame: GimbalFrame, q_ned_body: Quaternion) -> Quate
 def _of_servos(q: Quaternion) -> Quaternion:
     """``q_body_gimbal`` of servo angles that were sent as if they were yaw, pitch, roll.
 
-    The servos sit the other way round: pan on the body, roll on the pan, tilt on the roll.
+    The servos sit the other way round: pan on the body, roll on the pan, tilt on the roll. A
+    tilt beyond straight down comes back as one before it with the rest turned by half a circle;
+    straight down, where roll and yaw cannot be told apart, the turn is taken as roll, for few
+    servo mounts can pan.
     """
     roll, pitch, yaw = to_rpy(q)
-    return multiply(from_rpy(roll, 0.0, yaw), from_rpy(0.0, pitch, 0.0))
+    if abs(pitch) > math.pi / 2 - STRAIGHT_RAD:
+        turn = roll - yaw if pitch > 0.0 else roll + yaw
+        return multiply(from_rpy(turn, 0.0, 0.0), _tilt(pitch))
+    if abs(roll) > math.pi / 2:
+        roll -= math.copysign(math.pi, roll)
+        yaw -= math.copysign(math.pi, yaw)
+        pitch = math.copysign(math.pi, pitch) - pitch
+    return multiply(from_rpy(roll, 0.0, yaw), _tilt(pitch))
+
+
+def _tilt(pitch_rad: float) -> Quaternion:
+    return from_rpy(0.0, pitch_rad, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +157,7 @@ def judge_frame(
     ``q_sent`` and ``q_ned_body`` are N attitudes at the instants of N pictures;
     ``q_seen_steps`` the N-1 rotations ``q_head(k)_head(k+1)`` measured between the pictures,
     in the head's axes. None when there is nothing to compare. ``decided`` needs the best
-    frame to be right within half a degree more clearly than the next one, twice over.
+    frame to disagree less than half as much as the next one that means something else.
     """
     steps = list(q_seen_steps)
     if len(q_sent) != len(q_ned_body) or len(steps) != len(q_sent) - 1:
@@ -149,18 +167,30 @@ def judge_frame(
         )
     if not steps:
         return None
-    scores: list[tuple[float, GimbalFrame]] = []
-    for frame in GimbalFrame:
-        head = [to_earth(q, frame, body) for q, body in zip(q_sent, q_ned_body, strict=True)]
-        total = 0.0
-        for a, b, seen in zip(head, head[1:], steps, strict=False):
-            conj = (a[0], -a[1], -a[2], -a[3])
-            total += angle_between(multiply(conj, b), seen) ** 2
-        scores.append((math.sqrt(total / len(steps)), frame))
-    scores.sort(key=lambda score: score[0])
-    (best, frame), (second, _) = scores[0], scores[1]
-    decided = second > 2.0 * best and second - best > math.radians(0.05)
-    return FrameVerdict(frame, best, second, decided)
+    heads = {
+        frame: [to_earth(q, frame, body) for q, body in zip(q_sent, q_ned_body, strict=True)]
+        for frame in GimbalFrame
+    }
+    rms = {frame: _disagreement(heads[frame], steps) for frame in GimbalFrame}
+    best = min(rms, key=lambda frame: rms[frame])
+    # A frame that means the same attitudes all along is no rival.
+    rivals = [rms[f] for f in GimbalFrame if _largest_angle(heads[f], heads[best]) > SAME_RAD]
+    second = min(rivals, default=math.inf)
+    decided = second > 2.0 * rms[best] and second - rms[best] > CLEAR_RAD
+    return FrameVerdict(best, rms[best], second, decided and bool(rivals))
+
+
+def _disagreement(heads: Sequence[Quaternion], steps: Sequence[Quaternion]) -> float:
+    """Root mean square angle in rad between the steps of the heads and those seen."""
+    squares = [
+        angle_between(multiply(conjugate(a), b), seen) ** 2
+        for a, b, seen in zip(heads, heads[1:], steps, strict=False)
+    ]
+    return math.sqrt(sum(squares) / len(squares))
+
+
+def _largest_angle(a: Sequence[Quaternion], b: Sequence[Quaternion]) -> float:
+    return max(angle_between(p, q) for p, q in zip(a, b, strict=True))
 
 
 def steadiest_frame(

@@ -1,0 +1,429 @@
+"""Interpolation of the vehicle's past against SciPy and closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from mavlink import quaternion
+from mavlink.gimbal import (
+    GimbalConfig,
+    frame_of_flags,
+    judge_frame,
+    steadiest_frame,
+    to_earth,
+)
+from mavlink.history import M_PER_DEG, HistoryConfig, VehicleHistory
+from mavlink.quaternion import Quaternion
+from mavlink.samples import (
+    AccuracySample,
+    AttitudeSample,
+    GimbalFrame,
+    GimbalSample,
+    PositionSample,
+    RangeSample,
+    TerrainSample,
+)
+from mavlink.state import F64
+from mavlink.track import Track
+
+MS = 1_000_000
+S = 1_000_000_000
+T0 = 1_700_000_000 * S
+
+
+def scipy_of(q: Quaternion | F64) -> Rotation:
+    w, x, y, z = q
+    return Rotation.from_quat([x, y, z, w])
+
+
+def of_scipy(r: Rotation) -> Quaternion:
+    x, y, z, w = r.as_quat()
+    return (float(w), float(x), float(y), float(z))
+
+
+def angle(a: Quaternion | F64, b: Quaternion | F64) -> float:
+    return float((scipy_of(a).inv() * scipy_of(b)).magnitude())
+
+
+def position(lat: float, lon: float, alt: float, v: tuple[float, float, float]) -> PositionSample:
+    return PositionSample(None, lat, lon, alt, alt - 500.0, v)
+
+
+# Quaternions
+
+
+def test_quaternion_algebra_agrees_with_scipy() -> None:
+    rotations = Rotation.random(50, random_state=1)
+    for a, b in zip(rotations[:25], rotations[25:], strict=True):
+        qa, qb = of_scipy(a), of_scipy(b)
+        assert angle(quaternion.multiply(qa, qb), of_scipy(a * b)) < 1e-7
+        assert quaternion.angle_between(qa, qb) == pytest.approx((a.inv() * b).magnitude())
+        yaw, pitch, roll = a.as_euler("ZYX")
+        assert np.allclose(quaternion.to_rpy(qa), (roll, pitch, yaw), atol=1e-9)
+        assert angle(quaternion.from_rpy(roll, pitch, yaw), qa) < 1e-7
+        assert quaternion.down_component(qa) == pytest.approx(a.as_matrix()[2, 2])
+        for u in (0.0, 0.25, 0.9, 1.0):
+            truth = Slerp([0, 1], Rotation.concatenate([a, b]))(u)
+            assert angle(quaternion.slerp(qa, qb, u), of_scipy(truth)) < 1e-7
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_rpy_at_the_pole_carries_the_whole_turn_in_yaw(sign: float) -> None:
+    q = quaternion.from_rpy(0.0, sign * math.pi / 2, 0.7)
+    roll, pitch, yaw = quaternion.to_rpy(q)
+    assert (roll, pitch) == (0.0, pytest.approx(sign * math.pi / 2))
+    assert yaw == pytest.approx(0.7)
+    assert angle(quaternion.from_rpy(roll, pitch, yaw), q) < 1e-6
+
+
+def test_normalised_refuses_what_is_no_rotation() -> None:
+    assert quaternion.normalised([0.0, 0.0, 0.0, 0.0]) is None
+    assert quaternion.normalised([math.nan, 0.0, 0.0, 1.0]) is None
+    assert quaternion.normalised([math.inf, 0.0, 0.0, 1.0]) is None
+    assert quaternion.normalised([1.0, 0.0]) is None
+    assert quaternion.normalised([1.01, 0.0, 0.0, 0.0]) == (1.0, 0.0, 0.0, 0.0)
+
+
+# Tracks
+
+
+def test_track_sorts_replaces_and_forgets() -> None:
+    track = Track()
+    for t in (30, 10, 20, 10):
+        track.add(t * MS, (float(t),))
+    assert [t for t, _ in track.items()] == [10 * MS, 20 * MS, 30 * MS]
+    for t in range(40, 400):
+        track.add(t * MS, (0.0,))
+    track.forget_before(399 * MS)
+    assert track.first_ns == 399 * MS
+
+
+def test_track_extrapolates_twenty_milliseconds_and_no_more() -> None:
+    track = Track()
+    track.add(0, (0.0,))
+    track.add(100 * MS, (1.0,))
+    at = track.around(120 * MS)
+    assert at is not None and at.fraction == pytest.approx(1.2)
+    assert track.around(120 * MS + 1) is None
+    before = track.around(-20 * MS)
+    assert before is not None and before.fraction == pytest.approx(-0.2)
+    assert track.around(-20 * MS - 1) is None
+
+
+def test_extrapolation_does_not_magnify_two_close_samples() -> None:
+    track = Track()
+    for t in (0, 99 * MS, 100 * MS):
+        track.add(t, (float(t),))
+    at = track.around(115 * MS)
+    assert at is not None and at.before_ns == 0 and at.after_ns == 100 * MS
+
+
+def test_track_leaves_gaps_of_over_a_second_open() -> None:
+    track = Track()
+    track.add(0, (0.0,))
+    track.add(1001 * MS, (1.0,))
+    assert track.around(500 * MS) is None
+    near = track.around(15 * MS)
+    assert near is not None and near.before == near.after == (0.0,)
+    track.add(1000 * MS, (1.0,))
+    assert track.around(500 * MS) is not None
+
+
+# Attitude
+
+
+def test_attitude_is_interpolated_along_the_shorter_arc_and_covered_by_its_sigma() -> None:
+    def truth(t: float) -> Quaternion:
+        return quaternion.from_rpy(
+            0.15 * math.sin(2.0 * t), 0.1 * math.cos(1.5 * t), 3.0 + 0.8 * math.sin(0.7 * t)
+        )
+
+    for rate_hz in (50.0, 10.0, 3.5):
+        history = VehicleHistory()
+        for k in range(int(10 * rate_hz)):
+            t = k / rate_hz
+            q = truth(t)
+            flip = -1.0 if k % 2 else 1.0  # both signs mean the same rotation
+            sample = AttitudeSample(None, (flip * q[0], flip * q[1], flip * q[2], flip * q[3]))
+            history.add(sample, T0 + round(t * S))
+        ratios = []
+        for t in np.linspace(0.3, 9.0, 200):
+            state = history.state_at(T0 + round(float(t) * S))
+            assert state is not None and state.q_ned_body_wxyz is not None
+            assert state.sigma_attitude_rad is not None
+            error = angle(state.q_ned_body_wxyz, truth(float(t)))
+            ratios.append(error / state.sigma_attitude_rad)
+            assert state.sources == ("attitude",)
+        assert max(ratios) < 1.0  # this smooth a flight bends less than the sigma allows for
+
+
+def test_attitude_sigma_grows_with_the_gap() -> None:
+    sigmas = []
+    for gap_ms in (20, 200, 400, 800, 1000):
+        history = VehicleHistory()
+        for k in range(3):
+            history.add(AttitudeSample(None, quaternion.IDENTITY), T0 + k * gap_ms * MS)
+        state = history.state_at(T0 + gap_ms * MS * 3 // 2)
+        assert state is not None and state.sigma_attitude_rad and state.sigma_yaw_rad
+        sigmas.append(state.sigma_attitude_rad)
+        assert state.sigma_yaw_rad > state.sigma_attitude_rad
+        assert state.age_ms["attitude"] == pytest.approx(gap_ms / 2)
+    assert sigmas[0] == pytest.approx(HistoryConfig().sigma_tilt_rad, rel=0.01)
+    assert sigmas == sorted(sigmas) and sigmas[4] > 5 * sigmas[1]
+
+
+def test_nothing_is_known_of_an_empty_history_or_another_time() -> None:
+    history = VehicleHistory()
+    assert history.state_at(T0) is None
+    assert history.first_ns is None and history.last_ns is None
+    history.add(AttitudeSample(None, quaternion.IDENTITY), T0)
+    assert history.state_at(T0 + 21 * MS) is None
+    assert history.state_at(T0 - 21 * MS) is None
+    assert history.state_at(T0 + 20 * MS) is not None
+    history.clear()
+    assert history.state_at(T0) is None
+
+
+# Position
+
+
+def test_position_follows_a_curve_exactly_and_crosses_the_date_line() -> None:
+    # A parabola is a cubic: Hermite interpolation is exact up to the local plane's curvature.
+    lat0, lon0, acceleration = -35.0, 179.99999, 3.0
+    per_lon = M_PER_DEG * math.cos(math.radians(lat0))
+
+    def truth(t: float) -> tuple[float, float, float]:
+        return 12.0 * t, 5.0 * t + 0.5 * acceleration * t * t, 600.0 + 2.0 * t - t * t
+
+    history = VehicleHistory()
+    for k in range(8):
+        t = 0.5 * k
+        north, east, alt = truth(t)
+        lon = (lon0 + east / per_lon + 180.0) % 360.0 - 180.0
+        v = (12.0, 5.0 + acceleration * t, -(2.0 - 2.0 * t))
+        history.add(position(lat0 + north / M_PER_DEG, lon, alt, v), T0 + round(t * S))
+    for t in np.linspace(0.0, 3.5, 71):
+        state = history.state_at(T0 + round(float(t) * S))
+        assert state is not None and state.lat_deg is not None and state.lon_deg is not None
+        north, east, alt = truth(float(t))
+        assert (state.lat_deg - lat0) * M_PER_DEG == pytest.approx(north, abs=0.01)
+        d_lon = (state.lon_deg - lon0 + 180.0) % 360.0 - 180.0
+        assert d_lon * per_lon == pytest.approx(east, abs=0.01)
+        assert state.alt_amsl_m == pytest.approx(alt, abs=0.01)
+        assert state.v_ned_m_s is not None
+        assert state.v_ned_m_s[1] == pytest.approx(5.0 + acceleration * float(t), abs=1e-6)
+
+
+def test_position_is_straight_when_velocity_contradicts_the_way() -> None:
+    history = VehicleHistory()
+    history.add(position(50.0, 8.0, 600.0, (80.0, 0.0, 0.0)), T0)
+    history.add(position(50.0001, 8.0, 600.0, (-80.0, 0.0, 0.0)), T0 + S // 2)
+    history.add(position(50.0002, 8.0, 600.0, (-80.0, 0.0, 0.0)), T0 + S)
+    state = history.state_at(T0 + S * 3 // 4)
+    assert state is not None and state.lat_deg == pytest.approx(50.00015, abs=1e-9)
+
+
+def test_receiver_accuracy_becomes_the_sigma_and_no_fix_no_position() -> None:
+    history = VehicleHistory()
+    for k in range(40):
+        history.add(position(50.0, 8.0, 580.0, (0.0, 0.0, 0.0)), T0 + k * 100 * MS)
+    state = history.state_at(T0 + 5 * MS)
+    assert state is not None and state.sigma_h_m == pytest.approx(5.0, rel=1e-3)
+    history.add(AccuracySample(None, True, 0.02, 0.03), T0 + 100 * MS)
+    state = history.state_at(T0 + 100 * MS)
+    assert state is not None and state.sigma_h_m == pytest.approx(0.02)
+    assert state.sigma_v_m == pytest.approx(0.03)
+    history.add(AccuracySample(None, False, 50.0, 50.0), T0 + 2 * S)
+    state = history.state_at(T0 + 2 * S)
+    assert state is not None and state.lat_deg is None and "gnss" not in state.sources
+    assert state.alt_agl_m == pytest.approx(80.0)  # above home by the barometer still stands
+
+
+# Height above ground
+
+
+def test_height_above_ground_comes_from_the_best_source_there_is() -> None:
+    history = VehicleHistory()
+    tilt = math.radians(20.0)
+    for k in range(30):
+        t = T0 + k * 100 * MS
+        history.add(position(50.0, 8.0, 580.0, (0.0, 0.0, 0.0)), t)
+        history.add(AttitudeSample(None, quaternion.from_rpy(tilt, 0.0, 1.0)), t)
+        if k < 20:
+            history.add(TerrainSample(None, 75.0, 5.0), t)
+        if k < 10:
+            history.add(RangeSample(None, 70.0), t)
+
+    def agl(k: int) -> tuple[str, float]:
+        state = history.state_at(T0 + k * 100 * MS)
+        assert state is not None and state.alt_agl_m is not None and state.sigma_agl_m
+        return state.sources[-1], state.alt_agl_m
+
+    for k, source, height in (
+        (5, "rangefinder", 70.0 * math.cos(tilt)),
+        (15, "terrain", 75.0),
+        (25, "relative", 80.0),
+    ):
+        assert agl(k)[0] == source
+        assert agl(k)[1] == pytest.approx(height)
+
+
+def test_height_below_home_is_left_out() -> None:
+    history = VehicleHistory()
+    history.add(PositionSample(None, 50.0, 8.0, 480.0, -20.0, None), T0)
+    state = history.state_at(T0)
+    assert state is not None and state.alt_agl_m is None and state.alt_amsl_m == 480.0
+    assert state.v_ned_m_s is None
+
+
+# Gimbals
+
+
+def test_flags_say_what_the_quaternion_refers_to() -> None:
+    assert frame_of_flags(64) is GimbalFrame.EARTH
+    assert frame_of_flags(32) is GimbalFrame.VEHICLE
+    assert frame_of_flags(16) is GimbalFrame.EARTH
+    assert frame_of_flags(0) is GimbalFrame.VEHICLE
+    assert frame_of_flags(32 | 16) is GimbalFrame.VEHICLE
+    assert frame_of_flags(44) is GimbalFrame.VEHICLE
+    assert frame_of_flags(28) is GimbalFrame.EARTH
+
+
+def test_every_gimbal_frame_leads_to_the_same_attitude() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        roll, pitch, yaw = rng.uniform(-0.4, 0.4), rng.uniform(-0.4, 0.4), rng.uniform(-3, 3)
+        body = Rotation.from_euler("ZYX", [yaw, pitch, roll])
+        pan, tilt = rng.uniform(-1.0, 1.0), rng.uniform(-1.5, 0.3)
+        head = Rotation.from_euler("ZYX", [yaw + pan, tilt, 0.0])
+        sent = {
+            GimbalFrame.EARTH: head,
+            GimbalFrame.VEHICLE: Rotation.from_euler("ZYX", [pan, tilt, 0.0]),
+            GimbalFrame.BODY: body.inv() * head,
+        }
+        for frame, rotation in sent.items():
+            earth = to_earth(of_scipy(rotation), frame, of_scipy(body))
+            assert angle(earth, of_scipy(head)) < 1e-6, frame
+
+
+@pytest.mark.parametrize("tilt_deg", [-30.0, -89.0, -90.0, -95.0])
+def test_servo_angles_are_composed_in_the_order_of_the_servos(tilt_deg: float) -> None:
+    roll, tilt = 0.2, math.radians(tilt_deg)
+    sent = quaternion.from_rpy(roll, tilt, 0.0)  # as ArduPilot encodes servo angles
+    truth = Rotation.from_euler("X", roll) * Rotation.from_euler("Y", tilt)
+    got = to_earth(sent, GimbalFrame.SERVO, quaternion.IDENTITY)
+    assert angle(got, of_scipy(truth)) < 1e-5
+
+
+def sway(k: int) -> Quaternion:
+    return quaternion.from_rpy(0.1 * math.sin(0.03 * k), 0.08 * math.cos(0.02 * k), 0.5)
+
+
+def gimbal_history(frame: GimbalFrame, config: GimbalConfig) -> VehicleHistory:
+    """A head at 60 degrees down by a mount that really keeps the horizon, sent in a frame."""
+    history = VehicleHistory(HistoryConfig(gimbal=config))
+    head = quaternion.from_rpy(0.0, -1.0, 0.5)
+    for k in range(400):
+        body = sway(k)
+        q = head
+        if frame is GimbalFrame.BODY:
+            q = quaternion.multiply(quaternion.conjugate(body), head)
+        elif frame is GimbalFrame.VEHICLE:
+            q = quaternion.from_rpy(0.0, -1.0, 0.0)
+        history.add(AttitudeSample(None, body), T0 + k * 100 * MS)
+        claimed = GimbalFrame.EARTH if frame is GimbalFrame.EARTH else GimbalFrame.VEHICLE
+        history.add(GimbalSample(None, q, claimed, 1, 0), T0 + k * 100 * MS)
+    return history
+
+
+@pytest.mark.parametrize("frame", [GimbalFrame.EARTH, GimbalFrame.VEHICLE, GimbalFrame.BODY])
+def test_auto_sees_through_a_wrong_claim(frame: GimbalFrame) -> None:
+    history = gimbal_history(frame, GimbalConfig())
+    for k in (50, 155, 333):
+        state = history.state_at(T0 + k * 100 * MS + 40 * MS)
+        assert state is not None and state.q_ned_gimbal_wxyz is not None
+        assert angle(state.q_ned_gimbal_wxyz, quaternion.from_rpy(0.0, -1.0, 0.5)) < 2e-3
+        assert "gimbal" in state.sources
+
+
+def test_configuration_overrides_every_claim() -> None:
+    history = gimbal_history(GimbalFrame.BODY, GimbalConfig(yaw_frame="vehicle"))
+    state = history.state_at(T0 + 5 * S)
+    assert state is not None and state.q_ned_gimbal_wxyz is not None
+    wrong = to_earth(
+        quaternion.multiply(quaternion.conjugate(sway(50)), quaternion.from_rpy(0.0, -1.0, 0.5)),
+        GimbalFrame.VEHICLE,
+        sway(50),
+    )
+    assert angle(state.q_ned_gimbal_wxyz, wrong) < 1e-6
+    with pytest.raises(ValueError, match="yaw_frame"):
+        GimbalConfig(yaw_frame="north")
+    with pytest.raises(ValueError, match="mount_rpy_deg"):
+        GimbalConfig(mount_rpy_deg=(0.0, math.nan, 0.0))
+
+
+def test_too_little_sway_decides_nothing() -> None:
+    level = [quaternion.IDENTITY] * 200
+    assert steadiest_frame(level, level) is None
+
+
+def test_the_gimbal_itself_is_believed_before_its_relay_and_before_older_messages() -> None:
+    history = VehicleHistory()
+    for t in (T0, T0 + 100 * MS):
+        history.add(AttitudeSample(None, quaternion.IDENTITY), t)
+        for component, rank, pitch in ((1, 0, -0.1), (154, 0, -0.2), (154, 1, -0.3)):
+            q = quaternion.from_rpy(0.0, pitch, 0.0)
+            history.add(GimbalSample(None, q, GimbalFrame.EARTH, component, rank), t)
+    state = history.state_at(T0 + 50 * MS)
+    assert state is not None and state.q_ned_gimbal_wxyz is not None
+    truth = quaternion.from_rpy(0.0, -0.2, 0.0)
+    assert angle(state.q_ned_gimbal_wxyz, truth) < 1e-7
+
+
+def test_a_fixed_mount_stands_in_when_no_gimbal_speaks() -> None:
+    config = HistoryConfig(gimbal=GimbalConfig(mount_rpy_deg=(0.0, -90.0, 0.0)))
+    history = VehicleHistory(config)
+    body = quaternion.from_rpy(0.1, 0.2, 0.3)
+    history.add(AttitudeSample(None, body), T0)
+    state = history.state_at(T0)
+    assert state is not None and state.q_ned_gimbal_wxyz is not None
+    truth = scipy_of(body) * Rotation.from_euler("Y", -math.pi / 2)
+    assert angle(state.q_ned_gimbal_wxyz, of_scipy(truth)) < 1e-7
+    assert "mount" in state.sources
+
+
+def test_the_pictures_decide_between_frames() -> None:
+    rng = np.random.default_rng(5)
+    bodies = [
+        Rotation.from_euler("ZYX", [0.02 * k, 0.1 * math.sin(k), 0.1 * math.cos(2 * k)])
+        for k in range(40)
+    ]
+    # A camera fixed to the body, whose "gimbal" reports a constant body-relative attitude.
+    mount = Rotation.from_euler("Y", -1.2)
+    heads = [body * mount for body in bodies]
+    noise = [Rotation.from_rotvec(rng.normal(0, 1e-3, 3)) for _ in heads]
+    steps = [of_scipy(a.inv() * b * n) for a, b, n in zip(heads, heads[1:], noise, strict=False)]
+    verdict = judge_frame([of_scipy(mount)] * 40, [of_scipy(b) for b in bodies], steps)
+    assert verdict is not None and verdict.decided
+    assert verdict.frame in (GimbalFrame.BODY, GimbalFrame.SERVO)
+    assert verdict.rms_rad < 0.003
+
+
+def test_judging_needs_matching_lists() -> None:
+    with pytest.raises(ValueError, match="N, N and N-1"):
+        judge_frame([quaternion.IDENTITY], [], [])
+    assert judge_frame([quaternion.IDENTITY], [quaternion.IDENTITY], []) is None
+
+
+def test_a_live_history_forgets_and_a_wrong_sample_is_refused() -> None:
+    history = VehicleHistory(HistoryConfig(keep_s=2.0))
+    for k in range(2000):
+        history.add(AttitudeSample(None, quaternion.IDENTITY), T0 + k * 10 * MS)
+    assert len(history) < 700
+    assert history.state_at(T0 + 19 * S) is not None
+    with pytest.raises(ValueError, match="positive"):
+        HistoryConfig(keep_s=0.0)
