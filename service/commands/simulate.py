@@ -1,0 +1,129 @@
+"""``skyrelief simulate``: a synthetic flight with exact truth."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from service.errors import InputError
+
+PAIR = re.compile(r"^(-?[0-9.]+):(-?[0-9.]+)$")
+
+
+def simulate(
+    out: Annotated[Path, typer.Option("--out", help="Folder for the flight and its truth.")],
+    seed: Annotated[int, typer.Option(help="Decides the place and every random number.")] = 1,
+    duration_s: Annotated[float, typer.Option(help="Length of the video.")] = 30.0,
+    height_m: Annotated[float, typer.Option(help="Height above the ground at the start.")] = 60.0,
+    speed_m_s: Annotated[float, typer.Option(help="Speed over ground.")] = 5.0,
+    pattern: Annotated[str, typer.Option(help="nadir, oblique, legs, orbit or hover.")] = "nadir",
+    legs: Annotated[int, typer.Option(help="Parallel legs of the pattern 'legs'.")] = 3,
+    spacing_m: Annotated[float | None, typer.Option(help="Between legs.")] = None,
+    heading_deg: Annotated[float, typer.Option(help="First leg, from north over east.")] = 35.0,
+    camera_pitch_deg: Annotated[float | None, typer.Option(help="-90 is straight down.")] = None,
+    size: Annotated[str, typer.Option(help="Width x height in pixels.")] = "1280x720",
+    fps: Annotated[float, typer.Option(help="Frames per second.")] = 30.0,
+    focal: Annotated[float, typer.Option(help="Focal length over image width.")] = 0.75,
+    distortion: Annotated[bool, typer.Option(help="Barrel distortion of the lens.")] = True,
+    wobble_deg: Annotated[float, typer.Option(help="Unsteadiness of the gimbal.")] = 1.0,
+    sway_m: Annotated[float, typer.Option(help="Unsteadiness of the path.")] = 0.15,
+    relief_m: Annotated[float, typer.Option(help="Height of the hills; 0 is flat.")] = 8.0,
+    density: Annotated[float, typer.Option(help="Houses and trees; 0 is open country.")] = 1.0,
+    photos: Annotated[Path | None, typer.Option(help="Aerial photos as the ground.")] = None,
+    gps_noise_m: Annotated[float, typer.Option(help="Wander of the GPS.")] = 1.0,
+    baro_noise_m: Annotated[float, typer.Option(help="Wander of the altitude.")] = 0.5,
+    attitude_noise_deg: Annotated[float, typer.Option(help="Wander of roll and pitch.")] = 0.3,
+    yaw_noise_deg: Annotated[float, typer.Option(help="Wander of the heading.")] = 1.0,
+    image_noise: Annotated[float, typer.Option(help="Sensor noise in grey levels.")] = 1.5,
+    telemetry: Annotated[bool, typer.Option(help="Write flight.tlog.")] = True,
+    gimbal_frame: Annotated[str, typer.Option(help="Yaw of the gimbal: earth, vehicle.")] = "earth",
+    rangefinder: Annotated[bool, typer.Option(help="Send DISTANCE_SENSOR.")] = True,
+    telemetry_gap: Annotated[str, typer.Option(help="FROM:TO seconds without packets.")] = "",
+    blank: Annotated[list[str] | None, typer.Option(help="FRAME:COUNT black frames.")] = None,
+    exposure: Annotated[list[str] | None, typer.Option(help="SECOND:GAIN brightness step.")] = None,
+    depth_frames: Annotated[int, typer.Option(help="How many depth maps to keep.")] = 12,
+    crf: Annotated[int, typer.Option(help="H.264 quality; lower is better.")] = 18,
+    as_json: Annotated[bool, typer.Option("--json", help="Report as one JSON object.")] = False,
+) -> None:
+    """A rendered flight: flight.mp4, flight.tlog, camera.yaml, and truth/ to score against."""
+    from service.sim import recording
+    from service.sim.flight import FlightPlan, SensorNoise
+    from service.sim.render import Look
+    from service.sim.telemetry import TelemetryOptions
+
+    started = time.monotonic()
+    try:
+        options = recording.SimulationOptions(
+            FlightPlan(
+                pattern, duration_s, height_m, speed_m_s, heading_deg, camera_pitch_deg, legs,
+                spacing_m, wobble_deg, sway_m,
+            ),
+            SensorNoise(
+                gps_m=gps_noise_m, baro_m=baro_noise_m, attitude_deg=attitude_noise_deg,
+                yaw_deg=yaw_noise_deg,
+            ),
+            TelemetryOptions(
+                gimbal_frame, rangefinder,
+                _pair(telemetry_gap, "--telemetry-gap") if telemetry_gap else None,
+            ),
+            Look(noise=image_noise),
+            recording.Faults(
+                tuple((int(a), int(b)) for a, b in (_pair(v, "--blank") for v in blank or [])),
+                tuple(sorted(_pair(v, "--exposure") for v in exposure or [])),
+            ),
+            seed, _size(size), fps, focal,
+            recording.DISTORTION if distortion else (0.0, 0.0, 0.0, 0.0, 0.0),
+            relief_m, density, photos, depth_frames, crf, telemetry,
+        )  # fmt: skip
+        simulation = recording.prepare(options)
+    except ValueError as error:
+        raise InputError(f"simulate: {error}") from error
+    show = _progress if sys.stderr.isatty() else None
+    result = recording.write(simulation, out, show)
+    _report(out, result, time.monotonic() - started, as_json)
+
+
+def _pair(text: str, option: str) -> tuple[float, float]:
+    """Two numbers of ``A:B``."""
+    found = PAIR.match(text.strip())
+    try:
+        if found is not None:
+            return float(found[1]), float(found[2])
+    except ValueError:
+        pass
+    raise InputError(f"{option} {text!r}: expected two numbers with a colon, such as 10:2.5")
+
+
+def _size(text: str) -> tuple[int, int]:
+    """(W, H) of ``WxH``."""
+    found = re.match(r"^(\d+)x(\d+)$", text.strip())
+    if found is None:
+        raise InputError(f"--size {text!r}: expected width x height, such as 1280x720")
+    return int(found[1]), int(found[2])
+
+
+def _progress(done: int, total: int) -> None:
+    print(f"\rframe {done} of {total}", end="\n" if done == total else "", file=sys.stderr)
+
+
+def _report(out: Path, result: dict[str, Any], seconds: float, as_json: bool) -> None:
+    if as_json:
+        keys = ("frames", "packets", "path_m", "median_agl_m", "triangles")
+        report = {key: result[key] for key in keys} | {"folder": str(out), "seconds": seconds}
+        print(json.dumps(report))
+        return
+    print(
+        f"{out}: {result['frames']} frames, {result['packets']} MAVLink packets, "
+        f"{result['path_m']:.0f} m at {result['median_agl_m']:.0f} m above ground, "
+        f"in {seconds:.0f} s"
+    )
+    telemetry = f"--telemetry {out / 'flight.tlog'} " if result["packets"] else ""
+    print(f"next: skyrelief replay {out / 'flight.mp4'} {telemetry}"
+          f"--camera-model {out / 'camera.yaml'} --out SCAN")  # fmt: skip
+    print(f"then: skyrelief score SCAN {out / 'truth'}")

@@ -1,0 +1,261 @@
+"""A simulated flight on disk: video, telemetry, camera model and the exact truth."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from datetime import datetime, timezone
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+
+from recon.se3 import quaternion_from_rotation
+from recon.types import F64, U8, Camera
+from service.camera_file import save_camera
+from service.errors import InputError, OutsideError
+from service.georeference import LocalFrame
+from service.sim import flight as flights
+from service.sim import picture, scene
+from service.sim.flight import Flight, FlightPlan, SensorNoise, Sensors
+from service.sim.mosaic import patchwork
+from service.sim.render import Look, Renderer
+from service.sim.surface_file import write_surface
+from service.sim.telemetry import TelemetryOptions, packets, write_tlog
+from service.sim.terrain import Area
+
+log = logging.getLogger(__name__)
+
+EPOCH_UNIX_S = 1_777_629_600  # 2026-05-01 10:00:00 UTC: containers keep whole seconds
+ORIGIN = LocalFrame(47.3977, 8.5456, 488.0)
+DISTORTION = (-0.12, 0.03, 0.0, 0.0, 0.0)
+LARGEST_TEXELS = 120_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Faults:
+    """What goes wrong on purpose."""
+
+    blank: tuple[tuple[int, int], ...] = ()  # (first frame, count) black pictures
+    exposure: tuple[tuple[float, float], ...] = ()  # (from second, gain)
+
+
+@dataclass(frozen=True, slots=True)
+class SimulationOptions:
+    """Everything that decides a simulated flight."""
+
+    plan: FlightPlan = field(default_factory=FlightPlan)
+    noise: SensorNoise = field(default_factory=SensorNoise)
+    telemetry: TelemetryOptions = field(default_factory=TelemetryOptions)
+    look: Look = field(default_factory=Look)
+    faults: Faults = field(default_factory=Faults)
+    seed: int = 1
+    size_px: tuple[int, int] = (1280, 720)
+    fps: float = 30.0
+    focal_share: float = 0.75  # focal length over image width
+    distortion: tuple[float, float, float, float, float] = DISTORTION
+    relief_m: float = 8.0
+    density: float = 1.0
+    photos: Path | None = None
+    depth_frames: int = 12
+    crf: int = 18
+    with_telemetry: bool = True
+
+    def __post_init__(self) -> None:
+        W, H = self.size_px
+        if not (64 <= W <= 7680 and 64 <= H <= 4320) or W % 2 or H % 2:
+            raise ValueError(f"size {W}x{H} must be even and within 64x64 to 7680x4320")
+        if not 0.1 <= self.fps <= 240:
+            raise ValueError(f"{self.fps:g} frames per second are not within 0.1 to 240")
+        if not 0.2 <= self.focal_share <= 10:
+            raise ValueError(f"focal length of {self.focal_share:g} widths is not within 0.2 to 10")
+        if not (0 <= self.relief_m <= 200 and 0 <= self.density <= 3):
+            raise ValueError("relief must be 0 to 200 m and density 0 to 3")
+        if not (0 <= self.depth_frames <= 10000 and 0 <= self.crf <= 51):
+            raise ValueError("depth frames must be 0 to 10000 and crf 0 to 51")
+
+    @property
+    def camera(self) -> Camera:
+        """The simulated camera; its principal point is a little off the centre."""
+        W, H = self.size_px
+        f = self.focal_share * W
+        cx, cy = 0.5 * (W - 1) + 0.003 * W, 0.5 * (H - 1) - 0.004 * H
+        K = np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
+        return Camera(K, np.array(self.distortion), (W, H))
+
+    @property
+    def frames(self) -> int:
+        """Number of frames in the video."""
+        return max(1, round(self.plan.duration_s * self.fps))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulation:
+    """A flight that is ready to be rendered, frame by frame."""
+
+    options: SimulationOptions
+    flight: Flight
+    scene: scene.Scene
+    renderer: Renderer
+    times_s: F64  # (F,) of the frames
+    poses: F64  # (F, 4, 4) T_world_camera
+
+    def frame(self, index: int) -> U8:
+        """(H, W, 3) BGR frame ``index``, with the faults asked for."""
+        options = self.options
+        if any(first <= index < first + count for first, count in options.faults.blank):
+            return np.zeros((options.size_px[1], options.size_px[0], 3), np.uint8)
+        gain = options.look.exposure
+        for start, factor in options.faults.exposure:
+            if self.times_s[index] >= start:
+                gain = factor
+        look = Look(options.look.noise, options.look.vignette, gain)
+        return self.renderer.frame(self.poses[index], index, look)
+
+    def surface_height(self, x_m: F64, y_m: F64) -> F64:
+        """(N,) height of the highest surface at (N,) positions; the terrain's beside the scene."""
+        top = float(self.scene.grid.bounds[5]) + 1.0
+        origins = np.column_stack([x_m, y_m, np.full(len(x_m), top)])
+        t, _ = self.scene.grid.cast(origins, np.tile([0.0, 0.0, -1.0], (len(x_m), 1)))
+        return np.asarray(np.where(np.isfinite(t), top - t, self.scene.terrain.height(x_m, y_m)))
+
+    def sensors(self) -> Sensors:
+        """The drone's sensors, fresh from their seed."""
+        rng = np.random.default_rng(self.options.seed + 3)
+        return Sensors(self.flight, self.options.noise, rng)
+
+
+def prepare(options: SimulationOptions) -> Simulation:
+    """Lay out the place under the flight and colour it; ValueError for a flight too large."""
+    flight = flights.fly(options.plan, options.seed)
+    times = np.arange(options.frames) / options.fps
+    poses = flight.T_world_camera(times)
+    area = _area(flight, options)
+    texel = 0.75 * options.plan.height_m / options.camera.K[0, 0]
+    texel = max(texel, float(np.sqrt(area.size_m[0] * area.size_m[1] / LARGEST_TEXELS)))
+    if area.size_m[0] * area.size_m[1] > 25e6:
+        raise ValueError(
+            f"the flight would cover {area.size_m[0]:.0f} x {area.size_m[1]:.0f} m; "
+            "make it shorter, slower or lower"
+        )
+    place = scene.make(area, options.relief_m, options.density, options.seed)
+    mosaic = None
+    if options.photos is not None:
+        size = [max(4, int(np.ceil(s / texel))) for s in area.size_m]
+        mosaic = patchwork(options.photos, (size[0], size[1]), options.seed)
+    renderer = Renderer(place, picture.make(place, texel, mosaic), options.camera)
+    return Simulation(options, flight, place, renderer, times, poses)
+
+
+def _area(flight: Flight, options: SimulationOptions) -> Area:
+    """The ground that the camera can see, with a rim; the horizon itself stays empty."""
+    plan = options.plan
+    t = np.linspace(0.0, plan.duration_s, 200)
+    xy = flight.position(t)[:, :2]
+    W, H = options.size_px
+    diagonal = np.arctan(0.55 * np.hypot(W, H) / (options.focal_share * W))
+    tilt = np.radians(90.0 + plan.pitch_deg)
+    steepest = min(tilt + diagonal + np.radians(3.0 * plan.wobble_deg), np.radians(74.0))
+    reach = (plan.height_m + options.relief_m) * np.tan(steepest) + 12.0
+    low, high = xy.min(axis=0) - reach, xy.max(axis=0) + reach
+    return Area(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+
+
+def write(
+    simulation: Simulation, folder: Path, progress: Callable[[int, int], None] | None = None
+) -> dict[str, Any]:
+    """Write the flight and its truth into ``folder`` and return the parameters written there.
+
+    InputError when the folder already holds a flight; OutsideError when it cannot be written.
+    """
+    truth = folder / "truth"
+    if (folder / "flight.mp4").exists():
+        raise InputError(f"{folder} already holds a flight; give another folder with --out")
+    try:
+        truth.mkdir(parents=True, exist_ok=True)
+        options = simulation.options
+        save_camera(folder / "camera.yaml", options.camera, "simulated")
+        packet_count = 0
+        if options.with_telemetry:
+            stream = packets(
+                simulation.sensors(), ORIGIN, EPOCH_UNIX_S,
+                simulation.surface_height, options.telemetry,
+            )  # fmt: skip
+            packet_count = write_tlog(folder / "flight.tlog", EPOCH_UNIX_S, stream)
+        _write_truth(simulation, truth)
+        parameters = _parameters(simulation, packet_count)
+        (truth / "params.json").write_text(json.dumps(parameters, indent=2) + "\n")
+        _write_video(simulation, folder / "flight.mp4", progress)
+    except OSError as error:
+        raise OutsideError(f"{folder} cannot be written: {error.strerror or error}") from error
+    return parameters
+
+
+def _write_truth(simulation: Simulation, truth: Path) -> None:
+    """Origin, surface, trajectory and some depth maps."""
+    origin = {"lat_deg": ORIGIN.lat_deg, "lon_deg": ORIGIN.lon_deg, "alt_amsl_m": ORIGIN.alt_amsl_m}
+    (truth / "origin.json").write_text(json.dumps(origin) + "\n")
+    write_surface(truth / "surface.ply", simulation.scene.vertices, simulation.scene.triangles)
+    with (truth / "trajectory.tum").open("w") as out:
+        for t, T in zip(simulation.times_s, simulation.poses, strict=True):
+            q = quaternion_from_rotation(T[:3, :3])
+            row = [*T[:3, 3], q[1], q[2], q[3], q[0]]
+            out.write(f"{EPOCH_UNIX_S + t:.6f} " + " ".join(f"{v:.9f}" for v in row) + "\n")
+    count = min(simulation.options.depth_frames, len(simulation.times_s))
+    for k in np.unique(np.linspace(0, len(simulation.times_s) - 1, count).astype(int)):
+        np.savez_compressed(
+            truth / f"depth_{k:06d}.npz",
+            depth_m=simulation.renderer.depth(simulation.poses[k]),
+            K=simulation.options.camera.K,
+            T_world_camera=simulation.poses[k],
+            time_unix_ns=np.int64(round((EPOCH_UNIX_S + simulation.times_s[k]) * 1e9)),
+        )
+
+
+def _parameters(simulation: Simulation, packet_count: int) -> dict[str, Any]:
+    """What made the flight, for people and for ``score``."""
+    options = simulation.options
+    t = simulation.times_s
+    at = simulation.poses[:, :3, 3]
+    agl = at[:, 2] - simulation.scene.terrain.height(at[:, 0], at[:, 1])
+    values = asdict(options)
+    values["photos"] = options.photos.name if options.photos else None
+    return {
+        "options": values,
+        "video_epoch_unix_s": EPOCH_UNIX_S,
+        "frames": len(t),
+        "packets": packet_count,
+        "K": options.camera.K.tolist(),
+        "distortion": list(options.distortion),
+        "size_px": list(options.size_px),
+        "median_agl_m": float(np.median(agl)),
+        "path_m": float(np.linalg.norm(np.diff(at, axis=0), axis=1).sum()),
+        "triangles": len(simulation.scene.triangles),
+    }
+
+
+def _write_video(
+    simulation: Simulation, path: Path, progress: Callable[[int, int], None] | None
+) -> None:
+    """H.264 in MP4 with a constant frame rate and the time of the first frame."""
+    options = simulation.options
+    created = datetime.fromtimestamp(EPOCH_UNIX_S, timezone.utc)
+    rate = Fraction(options.fps).limit_denominator(1001)
+    with av.open(str(path), "w") as container:
+        container.metadata["creation_time"] = created.strftime("%Y-%m-%dT%H:%M:%S.000000Z")
+        stream = container.add_stream("libx264", rate=rate)
+        stream.width, stream.height = options.size_px
+        stream.pix_fmt = "yuv420p"
+        stream.options = {"crf": str(options.crf), "preset": "veryfast"}
+        for index in range(len(simulation.times_s)):
+            picture_ = av.VideoFrame.from_ndarray(simulation.frame(index), format="bgr24")
+            for packet in stream.encode(picture_):
+                container.mux(packet)
+            if progress is not None:
+                progress(index + 1, len(simulation.times_s))
+        for packet in stream.encode():
+            container.mux(packet)

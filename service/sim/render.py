@@ -1,0 +1,245 @@
+"""Frames of the scene: one exact ray per pixel through the distorted lens, smooth at edges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit, prange
+
+from recon.camera_model import check_camera
+from recon.triangle_grid import first_hit
+from recon.types import F32, F64, U8, Camera
+from service.sim import shapes
+from service.sim.noise import normal
+from service.sim.picture import AMBIENT, SUN_STRENGTH, Picture, crown_shade, wall_colour
+from service.sim.scene import Scene
+from service.sim.shapes import CROWN, TREE_B, TREE_SEED, WALL
+
+SKY = (225.0, 205.0, 185.0)
+
+
+def camera_rays(camera: Camera) -> F64:
+    """(H, W, 3) ray with z = 1 of every pixel of the distorted image, in the camera frame.
+
+    Raises ValueError when the lens model cannot be inverted over the whole image.
+    """
+    check_camera(camera)
+    W, H = camera.size_px
+    u, v = np.meshgrid(np.arange(W, dtype=np.float64), np.arange(H, dtype=np.float64))
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1)
+    xy0 = (pixels - camera.K[:2, 2]) / [camera.K[0, 0], camera.K[1, 1]]
+    k1, k2, p1, p2, k3 = camera.distortion
+    xy = xy0.copy()
+    for _ in range(100):  # fixed point of Brown's model
+        x, y, r2 = xy[:, 0], xy[:, 1], (xy**2).sum(axis=1)
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        before, xy = xy, (xy0 - np.stack([dx, dy], axis=1)) / radial[:, None]
+        if np.abs(xy - before).max() < 1e-14:
+            break
+    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    back = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.K, camera.distortion)[0]
+    error = float(np.abs(back.reshape(-1, 2) - pixels).max())
+    if not error < 1e-3:
+        raise ValueError(f"the lens model does not invert over {W}x{H} (off by {error:.2g} px)")
+    return np.asarray(rays.reshape(H, W, 3))
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What happens to the light on its way to the file."""
+
+    noise: float = 1.5  # sensor noise, grey levels, 1 sigma
+    vignette: float = 0.12  # share of light lost in the corners
+    exposure: float = 1.0  # gain
+
+
+class Renderer:
+    """Renders one scene through one camera."""
+
+    def __init__(self, scene: Scene, picture: Picture, camera: Camera) -> None:
+        """Prepare the rays and tables; raises ValueError for an unusable camera."""
+        self.scene, self.picture, self.camera = scene, picture, camera
+        self.rays = camera_rays(camera)
+        plain = Camera(camera.K, np.zeros(5), camera.size_px)
+        self._straight = camera_rays(plain)
+        self._normals = scene.grid.normals()
+        self._owner = scene.owner
+        self._blocks = scene.blocks if len(scene.blocks) else np.zeros((1, shapes.COLUMNS))
+        self._trees = scene.trees if len(scene.trees) else np.zeros((1, 8))
+
+    def frame(self, T_world_camera: F64, index: int, look: Look) -> U8:
+        """(H, W, 3) BGR picture as the distorted camera takes it."""
+        H, W = self.rays.shape[:2]
+        colour = np.empty((H, W, 3), np.float32)
+        depth = np.empty((H, W))
+        body = np.empty((H, W), np.int32)
+        tables = self._tables()
+        R, c = np.ascontiguousarray(T_world_camera[:3, :3]), T_world_camera[:3, 3].copy()
+        focal = float(0.5 * (self.camera.K[0, 0] + self.camera.K[1, 1]))
+        _render(*self.scene.grid.arrays(), *tables, self.rays, R, c, focal, colour, depth, body)
+        _smooth_edges(
+            *self.scene.grid.arrays(), *tables, self.rays, R, c, focal, colour, depth, body
+        )
+        out = np.empty((H, W, 3), np.uint8)
+        _develop(colour, self.rays, look.noise, look.vignette, look.exposure, index, out)
+        return out
+
+    def depth(self, T_world_camera: F64) -> F32:
+        """(H, W) depth along z of the camera without distortion; NaN where nothing is hit."""
+        H, W = self._straight.shape[:2]
+        directions = self._straight.reshape(-1, 3) @ T_world_camera[:3, :3].T
+        t, _ = self.scene.grid.cast(T_world_camera[:3, 3], directions)
+        return np.asarray(t.reshape(H, W), np.float32)
+
+    def _tables(self) -> tuple[object, ...]:
+        p = self.picture
+        return (
+            self._normals, self.scene.material, self._owner, self._blocks, self._trees,
+            p.bgr, p.levels, p.x0, p.y0, p.texel_m, p.sun,
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _texel(bgr, levels, level, x0, y0, texel_m, x, y):  # type: ignore[no-untyped-def]
+    """(b, g, r) of one level of the picture from above, bilinear."""
+    offset, rows, cols = levels[level, 0], levels[level, 1], levels[level, 2]
+    size = texel_m * (1 << level)
+    u = min(max((x - x0) / size - 0.5, 0.0), cols - 1.001)
+    v = min(max((y - y0) / size - 0.5, 0.0), rows - 1.001)
+    i, j = int(u), int(v)
+    fu, fv = u - i, v - j
+    k = offset + j * cols + i
+    wa, wb = (1 - fu) * (1 - fv), fu * (1 - fv)
+    wc, wd = (1 - fu) * fv, fu * fv
+    m = k + cols
+    b = wa * bgr[k, 0] + wb * bgr[k + 1, 0] + wc * bgr[m, 0] + wd * bgr[m + 1, 0]
+    g = wa * bgr[k, 1] + wb * bgr[k + 1, 1] + wc * bgr[m, 1] + wd * bgr[m + 1, 1]
+    r = wa * bgr[k, 2] + wb * bgr[k + 1, 2] + wc * bgr[m, 2] + wd * bgr[m + 1, 2]
+    return b, g, r
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _seen(  # type: ignore[no-untyped-def]
+    corners, start, items, column_z, block_z, bounds, cell_m,
+    normals, material, owner, blocks, trees, bgr, levels, x0, y0, texel_m, sun,
+    c, dx, dy, dz, pixel,
+):  # fmt: skip
+    """(b, g, r, t, body) along one ray; ``pixel`` is the angle of a pixel in rad.
+
+    ``t`` counts in lengths of the direction; body 0 is the ground, -1 the sky.
+    """
+    t, m = first_hit(
+        corners, start, items, column_z, block_z, bounds, cell_m, c[0], c[1], c[2], dx, dy, dz
+    )
+    if m < 0:
+        return SKY[0], SKY[1], SKY[2], np.inf, -1
+    x, y, z = c[0] + t * dx, c[1] + t * dy, c[2] + t * dz
+    nx, ny, nz = normals[m, 0], normals[m, 1], normals[m, 2]
+    length = np.sqrt(dx * dx + dy * dy + dz * dz)
+    slant = max(0.08, abs(nx * dx + ny * dy + nz * dz) / length)
+    size = t * length * pixel / np.sqrt(slant)
+    kind = material[m]
+    if kind in (WALL, CROWN):
+        facing = max(0.0, nx * sun[0] + ny * sun[1] + nz * sun[2])
+        bright = AMBIENT + SUN_STRENGTH * facing
+        k = owner[m]
+        if kind == WALL:
+            b, g, r = wall_colour(blocks[k], x, y, z, nx, ny, size)
+            return b * bright, g * bright, r * bright, t, 1 + k
+        shade = bright * crown_shade(x, y, z, int(trees[k, TREE_SEED]), size)
+        body = 1 + len(blocks) + k
+        return (
+            trees[k, TREE_B] * shade, trees[k, TREE_B + 1] * shade, trees[k, TREE_B + 2] * shade,
+            t, body,
+        )  # fmt: skip
+    level = min(max(np.log2(size / texel_m), 0.0), len(levels) - 1.001)
+    low = int(level)
+    b, g, r = _texel(bgr, levels, low, x0, y0, texel_m, x, y)
+    b2, g2, r2 = _texel(bgr, levels, low + 1, x0, y0, texel_m, x, y)
+    f = level - low
+    return b + f * (b2 - b), g + f * (g2 - g), r + f * (r2 - r), t, 1 + owner[m]
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def _render(  # type: ignore[no-untyped-def]
+    corners, start, items, column_z, block_z, bounds, cell_m,
+    normals, material, owner, blocks, trees, bgr, levels, x0, y0, texel_m, sun,
+    rays, R, c, focal, colour, depth, body,
+):  # fmt: skip
+    for v in prange(rays.shape[0]):
+        for u in range(rays.shape[1]):
+            a, b = rays[v, u, 0], rays[v, u, 1]
+            cb, cg, cr, t, m = _seen(
+                corners, start, items, column_z, block_z, bounds, cell_m,
+                normals, material, owner, blocks, trees, bgr, levels, x0, y0, texel_m, sun, c,
+                R[0, 0] * a + R[0, 1] * b + R[0, 2], R[1, 0] * a + R[1, 1] * b + R[1, 2],
+                R[2, 0] * a + R[2, 1] * b + R[2, 2], 1.0 / focal,
+            )  # fmt: skip
+            colour[v, u, 0], colour[v, u, 1], colour[v, u, 2] = cb, cg, cr
+            depth[v, u], body[v, u] = t, m
+
+
+@njit(cache=True, nogil=True)
+def _is_edge(depth, body, u, v):  # type: ignore[no-untyped-def]
+    """True where a neighbour belongs to another body or lies at another depth."""
+    for dv, du in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        a, b = v + dv, u + du
+        if 0 <= a < depth.shape[0] and 0 <= b < depth.shape[1]:
+            if body[a, b] != body[v, u]:
+                return True
+            if body[v, u] > 0 and abs(depth[a, b] - depth[v, u]) > 0.004 * depth[v, u]:
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def _smooth_edges(  # type: ignore[no-untyped-def]
+    corners, start, items, column_z, block_z, bounds, cell_m,
+    normals, material, owner, blocks, trees, bgr, levels, x0, y0, texel_m, sun,
+    rays, R, c, focal, colour, depth, body,
+):  # fmt: skip
+    """Average a rotated square of four rays wherever an outline crosses the pixel."""
+    H, W = rays.shape[0], rays.shape[1]
+    for v in prange(H):
+        for u in range(W):
+            if not _is_edge(depth, body, u, v):
+                continue
+            un, vn = (u + 1 if u + 1 < W else u - 1), (v + 1 if v + 1 < H else v - 1)
+            su, sv = un - u, vn - v
+            ax, ay = su * (rays[v, un, 0] - rays[v, u, 0]), su * (rays[v, un, 1] - rays[v, u, 1])
+            bx, by = sv * (rays[vn, u, 0] - rays[v, u, 0]), sv * (rays[vn, u, 1] - rays[v, u, 1])
+            tb, tg, tr = 0.0, 0.0, 0.0
+            for n in range(4):
+                p = 0.375 if n == 0 else (-0.125 if n == 1 else (-0.375 if n == 2 else 0.125))
+                q = 0.125 if n == 0 else (0.375 if n == 1 else (-0.125 if n == 2 else -0.375))
+                a = rays[v, u, 0] + p * ax + q * bx
+                b = rays[v, u, 1] + p * ay + q * by
+                cb, cg, cr, _, _ = _seen(
+                    corners, start, items, column_z, block_z, bounds, cell_m,
+                    normals, material, owner, blocks, trees, bgr, levels, x0, y0, texel_m, sun,
+                    c,
+                    R[0, 0] * a + R[0, 1] * b + R[0, 2], R[1, 0] * a + R[1, 1] * b + R[1, 2],
+                    R[2, 0] * a + R[2, 1] * b + R[2, 2], 1.0 / focal,
+                )  # fmt: skip
+                tb, tg, tr = tb + cb, tg + cg, tr + cr
+            colour[v, u, 0], colour[v, u, 1], colour[v, u, 2] = 0.25 * tb, 0.25 * tg, 0.25 * tr
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def _develop(colour, rays, noise, vignette, exposure, index, out):  # type: ignore[no-untyped-def]
+    """Vignetting, exposure and sensor noise."""
+    H, W = colour.shape[0], colour.shape[1]
+    corner = rays[0, 0, 0] ** 2 + rays[0, 0, 1] ** 2
+    for v in prange(H):
+        for u in range(W):
+            r2 = (rays[v, u, 0] ** 2 + rays[v, u, 1] ** 2) / corner
+            gain = exposure * (1.0 - vignette * r2)
+            for k in range(3):
+                value = gain * colour[v, u, k]
+                if noise > 0.0:
+                    value += noise * normal(u, v, 3 * index + k)
+                out[v, u, k] = min(255.0, max(0.0, value + 0.5))

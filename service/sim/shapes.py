@@ -1,0 +1,144 @@
+"""Triangles of the things that stand on the ground: blocks with flat or gabled roofs, crowns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.types import F64
+from service.sim.noise import value3
+
+I32 = npt.NDArray[np.int32]
+
+GROUND, TOP, WALL, CROWN = 0, 1, 2, 3
+"""Materials of triangles: GROUND and TOP show the picture from above, the others are solid."""
+
+# Columns of the block table, one row per block.
+KIND, X, Y, COS, SIN, HALF_L, HALF_W, BASE, EAVE, RIDGE = range(10)
+TOP_B, TOP_G, TOP_R, WALL_B, WALL_G, WALL_R, SEED = range(10, 17)
+COLUMNS = 17
+FLAT, GABLED, VEHICLE, PLAIN = 0.0, 1.0, 2.0, 3.0
+"""Kinds of block; PLAIN has no windows and its top is a plain colour (chimney, trunk)."""
+
+# Columns of the tree table.
+TREE_X, TREE_Y, TREE_Z, TREE_R, TREE_B, TREE_G, TREE_RED, TREE_SEED = range(8)
+
+
+@dataclass(slots=True)
+class MeshParts:
+    """Triangles as they are collected; :meth:`joined` makes the arrays."""
+
+    vertices: list[F64] = field(default_factory=list)
+    triangles: list[I32] = field(default_factory=list)
+    material: list[npt.NDArray[np.uint8]] = field(default_factory=list)
+    owner: list[I32] = field(default_factory=list)
+    count: int = 0
+
+    def add(self, vertices: F64, triangles: I32, material: int, owner: int) -> None:
+        """Append one body; ``owner`` is its row in the block or tree table."""
+        self.vertices.append(vertices)
+        self.triangles.append(triangles.astype(np.int32) + np.int32(self.count))
+        self.material.append(np.full(len(triangles), material, np.uint8))
+        self.owner.append(np.full(len(triangles), owner, np.int32))
+        self.count += len(vertices)
+
+    def joined(self) -> tuple[F64, I32, npt.NDArray[np.uint8], I32]:
+        """(vertices (N, 3), triangles (M, 3), material (M,), owner (M,))."""
+        return (
+            np.concatenate(self.vertices),
+            np.concatenate(self.triangles),
+            np.concatenate(self.material),
+            np.concatenate(self.owner),
+        )
+
+
+def footprint(block: F64, grow_m: float = 0.0) -> F64:
+    """(4, 2) corners of a block's outline, counter-clockwise, grown by ``grow_m``."""
+    l, w = block[HALF_L] + grow_m, block[HALF_W] + grow_m
+    local = np.array([[-l, -w], [l, -w], [l, w], [-l, w]])
+    turn = np.array([[block[COS], block[SIN]], [-block[SIN], block[COS]]])
+    return np.asarray(local @ turn + block[[X, Y]])
+
+
+def inside(block: F64, x_m: F64, y_m: F64, shrink_m: float = 0.0) -> npt.NDArray[np.bool_]:
+    """True where positions lie within a block's outline, shrunk by ``shrink_m``."""
+    dx, dy = x_m - block[X], y_m - block[Y]
+    u = dx * block[COS] + dy * block[SIN]
+    v = -dx * block[SIN] + dy * block[COS]
+    return np.asarray(
+        (np.abs(u) < block[HALF_L] - shrink_m) & (np.abs(v) < block[HALF_W] - shrink_m)
+    )
+
+
+def add_block(parts: MeshParts, block: F64, owner: int) -> None:
+    """Walls and roof of one block; outward normals, no floor."""
+    corners = footprint(block)
+    bottom = np.column_stack([corners, np.full(4, block[BASE])])
+    eave = np.column_stack([corners, np.full(4, block[EAVE])])
+    walls = np.vstack([bottom, eave])
+    quads = [[i, (i + 1) % 4, 4 + (i + 1) % 4, 4 + i] for i in range(4)]
+    parts.add(walls, _split(quads), WALL, owner)
+    if block[KIND] != GABLED:
+        parts.add(eave, _split([[0, 1, 2, 3]]), TOP, owner)
+        return
+    west = np.append(0.5 * (corners[0] + corners[3]), block[RIDGE])
+    east = np.append(0.5 * (corners[1] + corners[2]), block[RIDGE])
+    roof = np.vstack([eave, east, west])  # 4 = east end of the ridge, 5 = west end
+    parts.add(roof, _split([[0, 1, 4, 5], [2, 3, 5, 4]]), TOP, owner)
+    parts.add(roof, np.array([[1, 2, 4], [3, 0, 5]], np.int32), WALL, owner)
+
+
+def _split(quads: list[list[int]]) -> I32:
+    """Two triangles for each counter-clockwise quadrangle."""
+    return np.array([t for a, b, c, d in quads for t in ([a, b, c], [a, c, d])], np.int32)
+
+
+def icosphere(subdivisions: int) -> tuple[F64, I32]:
+    """Unit sphere: vertices (N, 3) and triangles (M, 3), outward."""
+    g = (1 + 5**0.5) / 2
+    v = [
+        [-1, g, 0], [1, g, 0], [-1, -g, 0], [1, -g, 0], [0, -1, g], [0, 1, g],
+        [0, -1, -g], [0, 1, -g], [g, 0, -1], [g, 0, 1], [-g, 0, -1], [-g, 0, 1],
+    ]  # fmt: skip
+    f = [
+        [0, 11, 5], [0, 5, 1], [0, 1, 7], [0, 7, 10], [0, 10, 11], [1, 5, 9], [5, 11, 4],
+        [11, 10, 2], [10, 7, 6], [7, 1, 8], [3, 9, 4], [3, 4, 2], [3, 2, 6], [3, 6, 8],
+        [3, 8, 9], [4, 9, 5], [2, 4, 11], [6, 2, 10], [8, 6, 7], [9, 8, 1],
+    ]  # fmt: skip
+    points = [np.array(p) / np.linalg.norm(p) for p in v]
+    for _ in range(subdivisions):
+        middle: dict[tuple[int, int], int] = {}
+        finer = []
+        for a, b, c in f:
+            ids = []
+            for i, j in ((a, b), (b, c), (c, a)):
+                key = (min(i, j), max(i, j))
+                if key not in middle:
+                    p = points[i] + points[j]
+                    middle[key] = len(points)
+                    points.append(p / np.linalg.norm(p))
+                ids.append(middle[key])
+            ab, bc, ca = ids
+            finer += [[a, ab, ca], [b, bc, ab], [c, ca, bc], [ab, bc, ca]]
+        f = finer
+    return np.array(points), np.array(f, np.int32)
+
+
+SPHERE = icosphere(2)
+
+
+def add_crown(parts: MeshParts, tree: F64, height_m: float, owner: int) -> None:
+    """A lumpy crown: an ellipsoid, flatter below, pushed in and out by noise."""
+    unit, triangles = SPHERE
+    seed = int(tree[TREE_SEED])
+    lumps = np.array([value3(3 * x + 9, 3 * y + 9, 3 * z + 9, seed) for x, y, z in unit])
+    radius = tree[TREE_R] * (0.72 + 0.5 * lumps)[:, None]
+    half = 0.4 * height_m
+    flat = np.where(unit[:, 2:] < 0, 0.7, 1.0)
+    centre = tree[[TREE_X, TREE_Y, TREE_Z]] + [0.0, 0.0, 0.6 * height_m]
+    vertices = centre + unit * radius * np.array([1.0, 1.0, half / tree[TREE_R]]) * np.hstack(
+        [np.ones((len(unit), 2)), flat]
+    )
+    parts.add(vertices, triangles, CROWN, owner)

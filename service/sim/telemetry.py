@@ -1,0 +1,196 @@
+"""The flight's MAVLink messages: as a tlog, or packet by packet in real time."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.frames import rotation_from_rpy
+from recon.se3 import quaternion_from_rotation
+from recon.types import F64
+from service.georeference import LocalFrame
+from service.sim.flight import LEAD_S, Sensors
+
+BOOT_BEFORE_VIDEO_S = 100.0
+GIMBAL_COMPONENT = 154
+ROLL_LOCK, PITCH_LOCK, YAW_IN_VEHICLE_FRAME, YAW_IN_EARTH_FRAME = 4, 8, 32, 64
+HEIGHT_OF_GROUND = Callable[[F64, F64], F64]
+
+
+@dataclass(frozen=True, slots=True)
+class TelemetryOptions:
+    """What is sent and how."""
+
+    gimbal_frame: str = "earth"  # or "vehicle": the frame of the gimbal's yaw
+    rangefinder: bool = True
+    gap_s: tuple[float, float] | None = None  # nothing is sent between these times
+
+    def __post_init__(self) -> None:
+        if self.gimbal_frame not in ("earth", "vehicle"):
+            raise ValueError(f"gimbal frame {self.gimbal_frame!r} is not 'earth' or 'vehicle'")
+
+
+def packets(
+    sensors: Sensors,
+    origin: LocalFrame,
+    epoch_unix_s: float,
+    ground_height: HEIGHT_OF_GROUND,
+    options: TelemetryOptions,
+) -> Iterator[tuple[float, bytes]]:
+    """(seconds since the first frame, MAVLink 2 packet) in the order of time."""
+    from pymavlink.dialects.v20 import common as dialect  # type: ignore[import-untyped]
+
+    timed: list[tuple[float, int, Any, int]] = []
+    for message, component, t in _messages(
+        sensors, origin, epoch_unix_s, ground_height, options, dialect
+    ):
+        timed.append((t, len(timed), message, component))
+    timed.sort(key=lambda item: item[:2])
+    senders = {
+        1: dialect.MAVLink(None, srcSystem=1, srcComponent=1),
+        GIMBAL_COMPONENT: dialect.MAVLink(None, srcSystem=1, srcComponent=GIMBAL_COMPONENT),
+    }
+    for t, _, message, component in timed:
+        if options.gap_s and options.gap_s[0] <= t < options.gap_s[1]:
+            continue
+        sender = senders[component]
+        data = bytes(message.pack(sender))
+        sender.seq = (sender.seq + 1) % 256
+        yield t, data
+
+
+def write_tlog(path: Path, epoch_unix_s: float, stream: Iterator[tuple[float, bytes]]) -> int:
+    """Write packets as a tlog and return their number: big-endian unix microseconds before each."""
+    count = 0
+    with path.open("wb") as out:
+        for t, data in stream:
+            out.write(struct.pack(">Q", round((epoch_unix_s + t) * 1e6)))
+            out.write(data)
+            count += 1
+    return count
+
+
+def _times(hz: float, duration_s: float) -> F64:
+    return np.asarray(np.arange(-LEAD_S, duration_s + LEAD_S, 1.0 / hz), np.float64)
+
+
+def _boot_ms(t: F64) -> npt.NDArray[np.int64]:
+    return np.asarray(np.round((t + BOOT_BEFORE_VIDEO_S) * 1e3), np.int64)
+
+
+def _messages(
+    sensors: Sensors,
+    origin: LocalFrame,
+    epoch_unix_s: float,
+    ground_height: HEIGHT_OF_GROUND,
+    options: TelemetryOptions,
+    dialect: Any,
+) -> Iterator[tuple[Any, int, float]]:
+    """(message, component, time) of every kind, each kind in its own order."""
+    duration = sensors.flight.plan.duration_s
+    yield from _housekeeping(origin, epoch_unix_s, duration, dialect)
+    yield from _attitude(sensors, duration, dialect)
+    yield from _gimbal(sensors, duration, options, dialect)
+    yield from _position(sensors, origin, duration, dialect)
+    if options.rangefinder:
+        yield from _range(sensors, ground_height, duration, dialect)
+
+
+def _housekeeping(
+    origin: LocalFrame, epoch_unix_s: float, duration_s: float, dialect: Any
+) -> Iterator[tuple[Any, int, float]]:
+    """HEARTBEAT (armed, in a mission), SYSTEM_TIME and HOME_POSITION, once a second."""
+    lat, lon = round(origin.lat_deg * 1e7), round(origin.lon_deg * 1e7)
+    level = [1.0, 0.0, 0.0, 0.0]
+    for t in _times(1.0, duration_s):
+        heartbeat = dialect.MAVLink_heartbeat_message(2, 3, 128 | 16 | 8 | 1, 3, 4, 3)
+        yield heartbeat, 1, float(t)
+        yield dialect.MAVLink_heartbeat_message(26, 8, 0, 0, 4, 3), GIMBAL_COMPONENT, float(t)
+        unix_us, boot_ms = round((epoch_unix_s + t) * 1e6), int(_boot_ms(np.array([t]))[0])
+        yield dialect.MAVLink_system_time_message(unix_us, boot_ms), 1, float(t) + 0.001
+        alt = round(origin.alt_amsl_m * 1e3)
+        home = dialect.MAVLink_home_position_message(lat, lon, alt, 0, 0, 0, level, 0, 0, 0)
+        yield home, 1, float(t) + 0.002
+
+
+def _attitude(
+    sensors: Sensors, duration_s: float, dialect: Any
+) -> Iterator[tuple[Any, int, float]]:
+    """ATTITUDE at 50 Hz."""
+    t = _times(50.0, duration_s)
+    rpy = sensors.vehicle_rpy(t)
+    rate = np.gradient(sensors.flight.vehicle_rpy(t), t, axis=0)
+    for k, boot in enumerate(_boot_ms(t)):
+        yaw = float((rpy[k, 2] + np.pi) % (2 * np.pi) - np.pi)
+        message = dialect.MAVLink_attitude_message(int(boot), rpy[k, 0], rpy[k, 1], yaw, *rate[k])
+        yield message, 1, float(t[k])
+
+
+def _gimbal(
+    sensors: Sensors, duration_s: float, options: TelemetryOptions, dialect: Any
+) -> Iterator[tuple[Any, int, float]]:
+    """GIMBAL_DEVICE_ATTITUDE_STATUS at 20 Hz, from the gimbal's own component."""
+    t = _times(20.0, duration_s) + 0.003
+    R = sensors.R_ned_gimbal(t)
+    flags = ROLL_LOCK | PITCH_LOCK | YAW_IN_EARTH_FRAME
+    if options.gimbal_frame == "vehicle":
+        flags = ROLL_LOCK | PITCH_LOCK | YAW_IN_VEHICLE_FRAME
+        for k, yaw in enumerate(sensors.vehicle_rpy(t)[:, 2]):
+            R[k] = rotation_from_rpy(0.0, 0.0, float(-yaw)) @ R[k]
+    for k, boot in enumerate(_boot_ms(t)):
+        q = [float(v) for v in quaternion_from_rotation(R[k])]
+        nan = float("nan")
+        message = dialect.MAVLink_gimbal_device_attitude_status_message(
+            0, 0, int(boot), flags, q, nan, nan, nan, 0, nan, nan, 0
+        )
+        yield message, GIMBAL_COMPONENT, float(t[k])
+
+
+def _position(
+    sensors: Sensors, origin: LocalFrame, duration_s: float, dialect: Any
+) -> Iterator[tuple[Any, int, float]]:
+    """GLOBAL_POSITION_INT at 10 Hz and GPS_RAW_INT at 5 Hz."""
+    t = _times(10.0, duration_s) + 0.001
+    at = sensors.estimate(t)
+    geodetic = origin.to_geodetic(at)
+    v = sensors.flight.velocity(t) + 0.05 * sensors.rng.normal(size=(len(t), 3))
+    yaw = np.degrees(sensors.vehicle_rpy(t)[:, 2]) % 360.0
+    for k, boot in enumerate(_boot_ms(t)):
+        lat, lon = round(geodetic[k, 0] * 1e7), round(geodetic[k, 1] * 1e7)
+        ned = round(v[k, 1] * 100), round(v[k, 0] * 100), round(-v[k, 2] * 100)
+        yield dialect.MAVLink_global_position_int_message(
+            int(boot), lat, lon, round(geodetic[k, 2] * 1e3), round(at[k, 2] * 1e3), *ned,
+            round(float(yaw[k]) * 100) % 36000,
+        ), 1, float(t[k])  # fmt: skip
+    t = _times(5.0, duration_s) + 0.004
+    geodetic = origin.to_geodetic(sensors.gps(t))
+    v = sensors.flight.velocity(t)
+    h_acc = round(1e3 * max(0.02, np.hypot(sensors.noise.gps_m, sensors.noise.gps_white_m)))
+    for k, boot in enumerate(_boot_ms(t)):
+        course = round(float(np.degrees(np.arctan2(v[k, 0], v[k, 1]))) * 100) % 36000
+        yield dialect.MAVLink_gps_raw_int_message(
+            int(boot) * 1000, 3, round(geodetic[k, 0] * 1e7), round(geodetic[k, 1] * 1e7),
+            round(geodetic[k, 2] * 1e3), 80, 120, round(float(np.hypot(v[k, 0], v[k, 1])) * 100),
+            course, 14, 0, h_acc, round(1.5 * h_acc), 300, 0,
+        ), 1, float(t[k])  # fmt: skip
+
+
+def _range(
+    sensors: Sensors, ground_height: HEIGHT_OF_GROUND, duration_s: float, dialect: Any
+) -> Iterator[tuple[Any, int, float]]:
+    """DISTANCE_SENSOR straight down at 10 Hz, up to 120 m."""
+    t = _times(10.0, duration_s) + 0.002
+    at = sensors.flight.position(t)
+    agl = at[:, 2] - ground_height(at[:, 0], at[:, 1])
+    agl = agl + sensors.noise.range_m * sensors.rng.normal(size=len(t))
+    for k, boot in enumerate(_boot_ms(t)):
+        if 0.1 < agl[k] < 120.0:
+            cm = round(float(agl[k]) * 100)
+            message = dialect.MAVLink_distance_sensor_message(int(boot), 10, 12000, cm, 0, 1, 25, 0)
+            yield message, 1, float(t[k])
