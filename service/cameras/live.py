@@ -50,25 +50,29 @@ class StampFilter:
 
     Queues and decoders only ever delay a picture, so the lower envelope of arrival minus
     presentation time is the best estimate of the clocks' offset. It may rise by 200 ppm, which
-    is more than two crystals drift apart.
+    is more than two crystals drift apart. A new connection first hands over what it had
+    gathered, faster than it was taken: those pictures are older than their arrival tells.
     """
 
     RISE = 200e-6
+    BACKLOG = 0.25  # of the step in presentation time: offset falls faster while catching up
 
     def __init__(self) -> None:
         """Start with no estimate."""
         self._offset_ns: float | None = None
         self._last_pts_ns = 0
 
-    def time_ns(self, pts_ns: int, arrival_ns: int) -> int:
-        """The picture's time on the clock of ``arrival_ns``; never later than its arrival."""
+    def time_ns(self, pts_ns: int, arrival_ns: int) -> int | None:
+        """The picture's time, on the clock of its arrival; None while catching up."""
         step_ns = pts_ns - self._last_pts_ns
-        if self._offset_ns is None or not 0 <= step_ns < 10_000_000_000:
-            self._offset_ns = float(arrival_ns - pts_ns)  # first picture, or a new time line
-        else:
-            self._offset_ns = min(self._offset_ns + self.RISE * step_ns, arrival_ns - pts_ns)
         self._last_pts_ns = pts_ns
-        return pts_ns + round(self._offset_ns)
+        delay_ns = float(arrival_ns - pts_ns)
+        if self._offset_ns is None or not 0 <= step_ns < 10_000_000_000:
+            self._offset_ns = delay_ns  # first picture, or a new time line
+            return None
+        fall_ns = self._offset_ns - delay_ns
+        self._offset_ns = min(self._offset_ns + self.RISE * step_ns, delay_ns)
+        return None if fall_ns > self.BACKLOG * step_ns else pts_ns + round(self._offset_ns)
 
 
 class LiveSource:
@@ -173,11 +177,12 @@ class LiveSource:
             elif arrival_ns - changed_ns > self.config.frozen_s * 1e9:
                 self._tell(f"the picture is frozen since {self.config.frozen_s:g} s")
                 return
-            time_ns = arrival_ns
+            time_ns: int | None = arrival_ns
             if picture.pts is not None and picture.time_base is not None:
                 pts_ns = round(picture.pts * picture.time_base * 1_000_000_000)
                 time_ns = stamps.time_ns(pts_ns, arrival_ns)
-            yield image, time_ns - self._start_ns
+            if time_ns is not None:
+                yield image, time_ns - self._start_ns
 
     def _damage(self, error: Exception) -> None:
         log.debug("%s: packet dropped: %s", self.description, error)
