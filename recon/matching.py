@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from recon import patch_search
+from recon import harris, patch_search
 from recon.phase_correlation import GlobalShift, global_shift
 from recon.types import F32, F64, U8, Bool
 
@@ -117,7 +117,7 @@ def harris_grid(gray: U8, config: MatchingConfig, mask: U8 | None = None) -> Cor
             side = 2 * margin + 1
             allowed = np.asarray(cv2.erode(mask, np.ones((side, side), np.uint8)), np.uint8)
     cells = np.zeros((config.grid, config.grid, 3), np.float32)
-    patch_search.harris_cells(
+    harris.harris_cells(
         np.ascontiguousarray(gray),
         allowed,
         config.grid,

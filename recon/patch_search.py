@@ -1,4 +1,4 @@
-"""Compiled kernels of corner detection and patch matching; :mod:`recon.matching` is the edge.
+"""Compiled kernels of patch matching; :mod:`recon.matching` is the edge.
 
 A template is a patch of image a resampled onto image b's pixel grid, made zero-mean and of
 unit length, so that the zero-mean SSD of two patches, each divided by its own contrast, is
@@ -19,91 +19,6 @@ NO_SCORE = -2.0
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _window_products(image: Any, row0: int, row1: int, sums: Any) -> None:
-    """Fill ``sums`` (3, rows, W) with Ix^2, Iy^2, Ix Iy under the binomial window w of Eq. 4."""
-    H, W = image.shape
-    rows = row1 - row0
-    products = np.zeros((3, rows + 4, W), np.float32)
-    for r in range(rows + 4):
-        y = row0 - 2 + r
-        if y < 1 or y >= H - 1:
-            continue
-        up, mid, down = image[y - 1], image[y], image[y + 1]
-        for x in range(1, W - 1):
-            a, c = np.float32(up[x - 1]), np.float32(up[x + 1])
-            g, i = np.float32(down[x - 1]), np.float32(down[x + 1])
-            d, f = np.float32(mid[x - 1]), np.float32(mid[x + 1])
-            gx = np.float32(0.125) * (c - a + np.float32(2) * (f - d) + i - g)
-            gy = np.float32(0.125) * (
-                g - a + np.float32(2) * (np.float32(down[x]) - np.float32(up[x])) + i - c
-            )
-            products[0, r, x] = gx * gx
-            products[1, r, x] = gy * gy
-            products[2, r, x] = gx * gy
-    line = np.zeros(W, np.float32)
-    for k in range(3):
-        for r in range(rows):
-            p0, p1, p2, p3, p4 = (
-                products[k, r],
-                products[k, r + 1],
-                products[k, r + 2],
-                products[k, r + 3],
-                products[k, r + 4],
-            )
-            for x in range(W):
-                line[x] = p0[x] + p4[x] + np.float32(4) * (p1[x] + p3[x]) + np.float32(6) * p2[x]
-            out = sums[k, r]
-            for x in range(2, W - 2):
-                out[x] = np.float32(1.0 / 256) * (
-                    line[x - 2]
-                    + line[x + 2]
-                    + np.float32(4) * (line[x - 1] + line[x + 1])
-                    + np.float32(6) * line[x]
-                )
-
-
-@njit(cache=True, nogil=True, fastmath=True, parallel=True)
-def harris_cells(
-    image: Any, mask: Any, columns: int, rows: int, margin: int, k: float, found: Any
-) -> None:
-    """Fill ``found`` (rows, columns, 3) with u, v and R of each cell's best local maximum.
-
-    R is zero where the cell has none. ``mask`` is (H, W) uint8 or (0, 0) for none.
-    """
-    H, W = image.shape
-    masked = mask.shape[0] == H
-    kk = np.float32(k)
-    for j in prange(rows):
-        y0, y1 = max(H * j // rows, margin), min(H * (j + 1) // rows, H - margin)
-        if y1 <= y0:
-            continue
-        sums = np.zeros((3, y1 - y0 + 2, W), np.float32)
-        _window_products(image, y0 - 1, y1 + 1, sums)
-        response = sums[0]
-        for r in range(y1 - y0 + 2):
-            for x in range(W):
-                a, b, c = sums[0, r, x], sums[1, r, x], sums[2, r, x]
-                # Eq. (5)
-                response[r, x] = a * b - c * c - kk * (a + b) * (a + b)
-        for i in range(columns):
-            x0, x1 = max(W * i // columns, margin), min(W * (i + 1) // columns, W - margin)
-            best, bx, by = np.float32(0), 0, 0
-            for r in range(1, y1 - y0 + 1):
-                for x in range(x0, x1):
-                    if response[r, x] > best and (not masked or mask[y0 + r - 1, x] != 0):
-                        best, bx, by = response[r, x], x, r
-            # The maximum of the cell may be the flank of a corner in the next cell.
-            peak = best > 0 and bx > 0 and bx < W - 1
-            if peak:
-                for dy in range(-1, 2):
-                    for dx in range(-1, 2):
-                        if response[by + dy, bx + dx] > best:
-                            peak = False
-            if peak:
-                found[j, i, 0], found[j, i, 1], found[j, i, 2] = bx, y0 + by - 1, best
-
-
-@njit(cache=True, nogil=True, fastmath=True)
 def _sample(image: Any, u: float, v: float, w: Any, radius: int, patch: Any) -> bool:
     """Fill ``patch`` (2 radius + 1 squared) with ``image`` about (u, v); False when outside."""
     H, W = image.shape
@@ -115,7 +30,7 @@ def _sample(image: Any, u: float, v: float, w: Any, radius: int, patch: Any) -> 
         for x in range(2 * radius + 1):
             pu = u + w[0] * (x - radius) + w[1] * (y - radius)
             pv = v + w[2] * (x - radius) + w[3] * (y - radius)
-            iu, iv = int(pu), int(pv)
+            iu, iv = np.uint32(pu), np.uint32(pv)
             fu, fv = np.float32(pu - iu), np.float32(pv - iv)
             a, b = np.float32(image[iv, iu]), np.float32(image[iv, iu + 1])
             c, d = np.float32(image[iv + 1, iu]), np.float32(image[iv + 1, iu + 1])
@@ -309,64 +224,107 @@ def _cubic(f: float, weights: Any) -> None:
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _sample_cubic(image: Any, u: float, v: float, radius: int, rows: Any, patch: Any) -> bool:
-    """Fill ``patch`` with ``image`` about (u, v), axes aligned; False when outside.
-
-    Every pixel has the same fraction, so the interpolation is one separable filter.
-    """
+def _window(image: Any, u0: int, v0: int, pitch: int, window: Any) -> bool:
+    """Fill flat ``window`` with the ``pitch`` squared pixels from (u0, v0); False when outside."""
     H, W = image.shape
-    n = 2 * radius + 1
-    u0, v0 = int(np.floor(u)) - radius - 1, int(np.floor(v)) - radius - 1
-    if not (u0 >= 0 and v0 >= 0 and u0 + n + 3 <= W and v0 + n + 3 <= H):
+    if not (u0 >= 0 and v0 >= 0 and u0 + pitch <= W and v0 + pitch <= H):
         return False
-    wx, wy = np.empty(4, np.float32), np.empty(4, np.float32)
-    _cubic(u - np.floor(u), wx)
-    _cubic(v - np.floor(v), wy)
-    for y in range(n + 3):
+    for y in range(pitch):
         line = image[v0 + y]
-        for x in range(n):
-            rows[y, x] = (
-                wx[0] * np.float32(line[u0 + x])
-                + wx[1] * np.float32(line[u0 + x + 1])
-                + wx[2] * np.float32(line[u0 + x + 2])
-                + wx[3] * np.float32(line[u0 + x + 3])
-            )
-    for y in range(n):
-        for x in range(n):
-            patch[y, x] = (
-                wy[0] * rows[y, x]
-                + wy[1] * rows[y + 1, x]
-                + wy[2] * rows[y + 2, x]
-                + wy[3] * rows[y + 3, x]
-            )
+        for x in range(pitch):
+            window[y * pitch + x] = np.float32(line[u0 + x]) - np.float32(128)
     return True
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _gradients(large: Any, n: int, patch: Any, gx: Any, gy: Any) -> None:
-    """Fill the template and its slopes from ``large`` (n + 2 squared), free of gain and offset.
+def _interpolate(window: Any, fu: float, fv: float, pitch: int, rows: Any, out: Any) -> None:
+    """Fill flat ``out`` with ``window`` moved by the fraction (fu, fv), Catmull-Rom.
 
-    ``patch`` becomes zero-mean and unit; both slopes are scaled with it and made orthogonal
-    to it and to a constant, so a step along them changes neither brightness nor contrast.
+    All pixels have one fraction, so it is one separable filter over the flat window. The last
+    three columns of each row run into the next row and mean nothing.
     """
-    for y in range(n):
-        for x in range(n):
-            patch[y, x] = large[y + 1, x + 1]
-    contrast = max(_normalise(patch, n), 1e-3)
-    scale = np.float32(0.5 / (contrast * n))
+    w = np.empty(4, np.float32)
+    _cubic(fu, w)
+    w0, w1, w2, w3 = w[0], w[1], w[2], w[3]
+    for i in range(pitch * pitch - 3):
+        rows[i] = w0 * window[i] + w1 * window[i + 1] + w2 * window[i + 2] + w3 * window[i + 3]
+    _cubic(fv, w)
+    w0, w1, w2, w3 = w[0], w[1], w[2], w[3]
+    below, second, third = rows[pitch:], rows[2 * pitch :], rows[3 * pitch :]
+    for i in range(pitch * (pitch - 3)):
+        out[i] = w0 * rows[i] + w1 * below[i] + w2 * second[i] + w3 * third[i]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _template(large: Any, n: int, pitch: int, kernels: Any) -> float:
+    """Fill ``kernels`` (4, n * pitch) from ``large`` (n + 2 squared); return det of the slopes.
+
+    Kernel 0 is the template, zero-mean and unit; 1 and 2 combine its slopes so that their
+    products with a patch are the Gauss-Newton step along u and v; they are free of constants
+    and of the template itself, so brightness and contrast do not move the step. Kernel 3 is
+    one inside the patch. Zero means that the template has no two-dimensional texture.
+    """
+    kernels[:] = np.float32(0)
+    patch, gx, gy, inside = kernels[0], kernels[1], kernels[2], kernels[3]
+    mean, power = 0.0, 0.0
+    for y in range(1, n + 1):
+        for x in range(1, n + 1):
+            mean += large[y, x]
+            power += large[y, x] * large[y, x]
+    mean /= n * n
+    power -= n * n * mean * mean
+    if power < 1e-3:
+        return 0.0
+    scale = 1.0 / np.sqrt(power)
     mx, my, dx, dy = 0.0, 0.0, 0.0, 0.0
     for y in range(n):
         for x in range(n):
-            gx[y, x] = scale * (large[y + 1, x + 2] - large[y + 1, x])
-            gy[y, x] = scale * (large[y + 2, x + 1] - large[y, x + 1])
-            mx += gx[y, x]
-            my += gy[y, x]
-            dx += gx[y, x] * patch[y, x]
-            dy += gy[y, x] * patch[y, x]
+            i = y * pitch + x
+            patch[i] = scale * (large[y + 1, x + 1] - mean)
+            gx[i] = 0.5 * scale * (large[y + 1, x + 2] - large[y + 1, x])
+            gy[i] = 0.5 * scale * (large[y + 2, x + 1] - large[y, x + 1])
+            inside[i] = 1.0
+            mx += gx[i]
+            my += gy[i]
+            dx += gx[i] * patch[i]
+            dy += gy[i] * patch[i]
+    a, b, c = 0.0, 0.0, 0.0
     for y in range(n):
         for x in range(n):
-            gx[y, x] -= np.float32(mx / (n * n) + dx * patch[y, x])
-            gy[y, x] -= np.float32(my / (n * n) + dy * patch[y, x])
+            i = y * pitch + x
+            gx[i] -= mx / (n * n) + dx * patch[i]
+            gy[i] -= my / (n * n) + dy * patch[i]
+            a += gx[i] * gx[i]
+            b += gy[i] * gy[i]
+            c += gx[i] * gy[i]
+    det = a * b - c * c
+    if det <= 1e-4 * (a + b) * (a + b):
+        return 0.0
+    for i in range(n * pitch):
+        along = (b * gx[i] - c * gy[i]) / det
+        gy[i] = (a * gy[i] - c * gx[i]) / det
+        gx[i] = along
+    return float(det)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _compare(kernels: Any, other: Any, n: int, sums: Any) -> None:
+    """Fill ``sums`` (4,): score, step along u, step along v, contrast of ``other``."""
+    patch, gx, gy, inside = kernels[0], kernels[1], kernels[2], kernels[3]
+    score, su, sv = np.float32(0), np.float32(0), np.float32(0)
+    total, squares = np.float32(0), np.float32(0)
+    for i in range(len(patch)):
+        value = other[i]
+        score += patch[i] * value
+        su += gx[i] * value
+        sv += gy[i] * value
+        total += inside[i] * value
+        squares += inside[i] * value * value
+    power = max(squares - total * total / (n * n), np.float32(1e-3))
+    length = np.sqrt(power)
+    # The template itself has no part along its slopes, so the residual is minus the patch.
+    sums[0], sums[1], sums[2] = score / length, -su / length, -sv / length
+    sums[3] = length / n
 
 
 @njit(cache=True, nogil=True, fastmath=True, parallel=True)
@@ -378,51 +336,43 @@ def refine(
 
     Gauss-Newton with the template's slopes (constant normal matrix, Baker and Matthews 2004,
     doi:10.1023/B:VISI.0000011205.11775.fd). Fills ``score`` (NO_SCORE when it left the image,
-    diverged by more than 1.5 px or has no two-dimensional texture) and ``contrast`` of b.
+    went further than 1.5 px or has no two-dimensional texture) and ``contrast`` of b.
     """
     N = uv_a.shape[0]
     n = 2 * radius + 1
+    pitch = n + 3
     for chunk in prange((N + CHUNK - 1) // CHUNK):
         large = np.empty((n + 2, n + 2), np.float32)
-        patch, other = np.empty((n, n), np.float32), np.empty((n, n), np.float32)
-        gx, gy = np.empty((n, n), np.float32), np.empty((n, n), np.float32)
-        rows = np.empty((n + 3, n), np.float32)
+        kernels = np.empty((4, n * pitch), np.float32)
+        window = np.empty(pitch * pitch, np.float32)
+        rows, other = np.zeros(pitch * pitch, np.float32), np.empty(n * pitch, np.float32)
+        sums = np.empty(4)
         for p in range(chunk * CHUNK, min((chunk + 1) * CHUNK, N)):
             score[p], contrast[p] = NO_SCORE, 0.0
             if not active[p]:
                 continue
             if not _sample(image_a, uv_a[p, 0], uv_a[p, 1], inverse_warp[p], radius + 1, large):
                 continue
-            _gradients(large, n, patch, gx, gy)
-            a, b, c = 0.0, 0.0, 0.0
-            for y in range(n):
-                for x in range(n):
-                    a += gx[y, x] * gx[y, x]
-                    b += gy[y, x] * gy[y, x]
-                    c += gx[y, x] * gy[y, x]
-            det = a * b - c * c
-            if det <= 1e-4 * (a + b) * (a + b):
+            if _template(large, n, pitch, kernels) == 0.0:
                 continue
             u, v = uv_b[p, 0], uv_b[p, 1]
+            held_u, held_v = -1, -1
             for _ in range(iterations):
-                if not _sample_cubic(image_b, u, v, radius, rows, other):
-                    score[p] = NO_SCORE
-                    break
-                contrast[p] = _normalise(other, n)
-                s, rx, ry = 0.0, 0.0, 0.0
-                for y in range(n):
-                    for x in range(n):
-                        residual = patch[y, x] - other[y, x]
-                        s += patch[y, x] * other[y, x]
-                        rx += gx[y, x] * residual
-                        ry += gy[y, x] * residual
-                score[p] = s
-                du, dv = (b * rx - c * ry) / det, (a * ry - c * rx) / det
-                u += du
-                v += dv
+                u0, v0 = int(np.floor(u)), int(np.floor(v))
+                if u0 != held_u or v0 != held_v:
+                    corner_u, corner_v = u0 - radius - 1, v0 - radius - 1
+                    if not _window(image_b, corner_u, corner_v, pitch, window):
+                        score[p] = NO_SCORE
+                        break
+                    held_u, held_v = u0, v0
+                _interpolate(window, u - u0, v - v0, pitch, rows, other)
+                _compare(kernels, other, n, sums)
+                score[p], contrast[p] = sums[0], sums[3]
+                u += sums[1]
+                v += sums[2]
                 if abs(u - uv_b[p, 0]) > 1.5 or abs(v - uv_b[p, 1]) > 1.5:
                     score[p] = NO_SCORE
                     break
-                if abs(du) < 0.02 and abs(dv) < 0.02:
+                if abs(sums[1]) < 0.02 and abs(sums[2]) < 0.02:
                     break
             uv_b[p, 0], uv_b[p, 1] = u, v

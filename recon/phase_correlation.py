@@ -96,12 +96,13 @@ def _vertex(left: float, middle: float, right: float) -> float:
     return 0.0 if bend >= 0 else float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5))
 
 
-def global_shift(gray_a: U8, gray_b: U8) -> GlobalShift | None:
-    """The turn, scale and shift between two overlapping nadir pictures, or None without texture.
+def global_shift(gray_a: U8, gray_b: U8) -> GlobalShift:
+    """The turn, scale and shift between two overlapping nadir pictures.
 
     Both (H, W) uint8 of one size. Any turn; scales 0.8 to 1.25; shifts up to about half of
     the picture. Accuracy is about 1 % of the width: a start for :func:`recon.matching.match`.
-    Raises ValueError when the pictures differ in size.
+    Pictures without texture give no motion with confidence 0. Raises ValueError when the
+    pictures differ in size.
     """
     if gray_a.shape != gray_b.shape or gray_a.ndim != 2:
         raise ValueError(f"pictures must be (H, W) of one size, got {gray_a.shape}, {gray_b.shape}")
@@ -112,7 +113,7 @@ def global_shift(gray_a: U8, gray_b: U8) -> GlobalShift | None:
         for g in (gray_a, gray_b)
     )
     if min(float(small_a.std()), float(small_b.std())) < 1.0:
-        return None
+        return GlobalShift(np.eye(2), np.zeros(2), 0.0, 1.0, 0.0)
     correlator = _Correlator(small_a, small_b)
     turns = np.linspace(0.0, 2 * np.pi, _TURNS, endpoint=False)
     heights, _ = correlator.peaks(turns, np.ones(_TURNS))
