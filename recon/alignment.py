@@ -19,7 +19,7 @@ from recon.types import F64, PosePrior
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity:
-    """``x_world = scale * R @ x_odom + t`` with a covariance of (rotation, translation, log scale)."""
+    """``x_world = scale * R @ x_odom + t``; covariance of (rotation, translation, log scale)."""
 
     scale: float
     R: F64  # (3, 3)
@@ -120,7 +120,7 @@ def fit(anchors: Sequence[Anchor], iterations: int = 30) -> Similarity | None:
         log_scale += float(step[6])
         if np.abs(step).max() < 1e-7:
             break
-    covariance = np.linalg.inv(H) * max(1.0, 0.2 * len(usable))
+    covariance = np.asarray(np.linalg.inv(H) * max(1.0, 0.2 * len(usable)), np.float64)
     return Similarity(float(np.exp(log_scale)), R, t, covariance, _sources(usable))
 
 

@@ -291,7 +291,7 @@ class Odometry:
             H = self.K @ (R_b_a - np.outer(t, n)) @ np.linalg.inv(self.K)
             out.append(self._by_homography(H, key.uv, self.config.wide_search_share * W))
         shift = matching.global_shift(key.pyramid.levels[0], grey)
-        if shift.confidence > self.config.least_shift_confidence:
+        if shift is not None and shift.confidence > self.config.least_shift_confidence:
             H = np.eye(3)
             H[:2, :2], H[:2, 2] = shift.A, shift.shift_px
             out.append(self._by_homography(H, key.uv, self.config.wide_search_share * W))
@@ -357,7 +357,7 @@ class Odometry:
     ) -> list[tuple[F64, float]]:
         """A start pose from the global shift between the keyframe's picture and this one."""
         shift = matching.global_shift(key.pyramid.levels[0], grey)
-        if shift.confidence < self.config.least_shift_confidence:
+        if shift is None or shift.confidence < self.config.least_shift_confidence:
             return []
         known = np.flatnonzero(key.landmark >= 0)
         points = self.points[key.landmark[known]]
@@ -371,8 +371,8 @@ class Odometry:
         )
         if not ok:
             return []
-        R, _ = cv2.Rodrigues(rvec)
-        return [(se3.compose(np.asarray(R), np.asarray(tvec).ravel()), 0.07)]
+        R = se3.so3_exp(np.asarray(rvec, np.float64).ravel())
+        return [(se3.compose(R, np.asarray(tvec, np.float64).ravel()), 0.07)]
 
     def _pose_from(
         self,

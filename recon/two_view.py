@@ -58,14 +58,14 @@ def _candidates(
     if E is not None and E.shape == (3, 3):
         count, R, t, _ = cv2.recoverPose(E, uv_a, uv_b, K, mask=mask)
         if count > 8:
-            out.append((np.asarray(R), np.asarray(t).ravel()))
+            out.append((np.asarray(R, np.float64), np.asarray(t, np.float64).ravel()))
     H, _ = cv2.findHomography(uv_a, uv_b, cv2.USAC_MAGSAC, 3.0)
     if H is not None:
         _, Rs, ts, _ = cv2.decomposeHomographyMat(H, K)
         for R, t in zip(Rs, ts, strict=True):
             length = float(np.linalg.norm(t))
             if length > 1e-3:
-                out.append((np.asarray(R), np.asarray(t).ravel() / length))
+                out.append((np.asarray(R, np.float64), np.asarray(t, np.float64).ravel() / length))
     return out
 
 

@@ -203,10 +203,15 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
     return config
 
 
+def change(config: Config, name: str, value: object) -> Config:
+    """``config`` with ``section.key`` set to a plain value; InputError when it is not allowed."""
+    return _override(config, f"{name}={value}")
+
+
 def parse_baseline(value: float | str) -> tuple[Literal["auto", "metres", "frames"], float, int]:
     """("auto", 0, 0), ("metres", m, 0) or ("frames", n, m) of ``scan.baseline``.
 
-    "n/m" is the paper's notation: a pair is n frames apart, one pair every m frames.
+    "n/m" is the paper's notation: n of every m frames take part, evenly spread.
     Raises ValueError for anything else.
     """
     if isinstance(value, str) and value.strip() == "auto":

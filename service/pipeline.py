@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -45,7 +45,7 @@ from recon.virtual_stereo import (
 )
 from recon.voxel_map import VoxelMap, VoxelMapConfig
 from service.cameras.source import GeoTag
-from service.config import Config
+from service.config import Config, ScanConfig
 from service.rig import Rig
 from service.stopwatch import Stopwatch
 from service.viewpoints import Viewpoint, Viewpoints
@@ -130,6 +130,16 @@ class Pipeline:
         anchor = Anchorage(frame.seq, key, se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera)
         is_view = viewpoint is not None
         return Step(tracked, prior, self.place(anchor), is_view, anchor, keyframes, self._moved())
+
+    def set_baseline(self, config: ScanConfig) -> None:
+        """Follow another ``scan.baseline`` from the next frame on."""
+        self.viewpoints.set_baseline(config)
+        least = self.viewpoints.least_base_to_height
+        self._stereo = replace(self._stereo, least_base_to_height=least)
+
+    def forget_map(self) -> None:
+        """Count every surface as new again."""
+        self._map = None
 
     def finish(self) -> Step:
         """The viewpoints still waiting for partners, and the last corrections."""

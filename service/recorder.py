@@ -40,7 +40,8 @@ class Recorder:
         self.store, self.pipeline = store, pipeline
         self.points = self.clouds = self.frames = self.chunk_bytes = 0
         self.states: Counter[str] = Counter()
-        self.distance_m = 0.0
+        self.distance_m = self.speed_m_s = self.turn_rate_rad_s = 0.0
+        self.last: PoseRecord | None = None
         self._offset_ns = clock_offset_ns
         self._codec = CodecConfig()
         self._told: list[_Told] = []
@@ -64,7 +65,8 @@ class Recorder:
                 step.is_view,
             )
             self._told.append(told)
-            self.store.add_pose(self._record(told, step.placed))
+            self.last = self._record(told, step.placed)
+            self.store.add_pose(self.last)
 
     def close(self, extra: dict[str, Any]) -> dict[str, Any]:
         """Write what is left, correct the trajectory, close the scan; return its summary."""
@@ -164,6 +166,7 @@ class Recorder:
             self.distance_m += step
             speed, turn = step / dt, _heading_change(self._last[1], T) / dt
         self._last = (told.time_ns, T)
+        self.speed_m_s, self.turn_rate_rad_s = speed, turn
         lat = lon = alt = None
         frame = self.pipeline.rig.frame
         if frame is not None:

@@ -84,7 +84,8 @@ class Scan:
     """Runs frames through the pipeline into the store until the source ends or a stop."""
 
     def __init__(self, inputs: ScanInputs, store: ScanStore) -> None:
-        self.inputs, self.store = inputs, store
+        self.inputs, self.store, self.source = inputs, store, inputs.source
+        self.epoch_ns = inputs.epoch_ns
         self.pipeline = Pipeline(inputs.camera, inputs.config, inputs.backend)
         self.recorder = Recorder(store, self.pipeline, inputs.unix_offset_ns)
         self.tagged = self.odd_sized = self.heights = 0
@@ -94,10 +95,10 @@ class Scan:
         """One frame through the pipeline; None when its size is not the camera's."""
         inputs = self.inputs
         H, W = frame.image.shape[:2]
-        if (W, H) != inputs.camera.size_px:
+        if inputs.camera.size_px != (W, H):
             self.odd_sized += 1
             return None
-        time_ns = inputs.epoch_ns + frame.time_ns
+        time_ns = self.epoch_ns + frame.time_ns
         exposed_ns = time_ns - round(inputs.config.camera.latency_ms * 1e6)
         state = inputs.history.state_at(exposed_ns) if inputs.history is not None else None
         self.tagged += state is not None
@@ -108,15 +109,29 @@ class Scan:
         self.recorder.write(step, exposed_ns, state.alt_agl_m if state is not None else None)
         return step
 
-    def run(self, stop: Event, progress: Callable[[Scan], None] | None = None) -> None:
-        """Feed every frame of the source until it ends or ``stop`` is set."""
-        for frame in self.inputs.source:
+    def run(
+        self,
+        stop: Event,
+        progress: Callable[[Scan], None] | None = None,
+        paused: Event | None = None,
+    ) -> None:
+        """Feed every frame of the source until it ends or ``stop`` is set.
+
+        Frames that come while ``paused`` is set are passed over.
+        """
+        for frame in self.source:
             if stop.is_set():
                 log.info("stopped; closing the scan")
                 break
+            if paused is not None and paused.is_set():
+                continue
             self.feed(frame)
             if progress is not None:
                 progress(self)
+
+    def replace_source(self, source: CameraSource, epoch_ns: int) -> None:
+        """Go on with another source, whose time 0 is ``epoch_ns`` on the history's clock."""
+        self.source, self.epoch_ns = source, epoch_ns
 
     def close(self) -> dict[str, Any]:
         """Write what is left and close the scan in the store; return its figures."""

@@ -40,11 +40,20 @@ class Viewpoints:
 
     def __init__(self, config: ScanConfig, kept: int = 6, partners: int = 4) -> None:
         """``kept`` views are remembered; at most ``partners`` pair up with one of them."""
+        self._kept: deque[Viewpoint] = deque(maxlen=kept)
+        self._most_partners = partners
+        self._take_next = False
+        self.set_baseline(config)
+
+    def set_baseline(self, config: ScanConfig) -> None:
+        """Follow another ``scan.baseline`` from the next frame on."""
         self._mode, self._amount, every = parse_baseline(config.baseline)
         self._stride = frames_apart(int(self._amount), every) if self._mode == "frames" else 0
-        self._kept: deque[Viewpoint] = deque(maxlen=kept)
-        self._partners = partners if self._mode == "auto" else 1
-        self._wanted = config.base_to_height
+        self._partners = self._most_partners if self._mode == "auto" else 1
+
+    def take_next(self) -> None:
+        """Make the next frame with a pose a view, whatever the baseline asks for."""
+        self._take_next = True
 
     @property
     def least_base_to_height(self) -> float:
@@ -61,8 +70,9 @@ class Viewpoints:
     ) -> Viewpoint | None:
         """The frame as a view, when it is to be one."""
         assert tracked.T_odom_camera is not None
-        if not self._wants(frame.seq, tracked):
+        if not (self._take_next or self._wants(frame.seq, tracked)):
             return None
+        self._take_next = False
         T_key_camera = se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera
         view = Viewpoint(frame.seq, frame.time_ns, picture, key, T_key_camera, prior)
         self._kept.append(view)
