@@ -34,9 +34,12 @@ OUTSIDE = -100.0
 """log2 of the weight of a tap outside the coarse image: nothing beside any other."""
 
 TILE = 64
-GROUP = 10
+GROUP = 5
+BAND = 16
 CHANNELS = 6
-"""Fine pixels and taps of one run of the compiled loop; values that a tap brings."""
+TAP_RUN = GROUP * CHANNELS * TILE
+"""Fine pixels and taps of one run of the compiled loop, rows at most that share their taps
+while these lie in the nearest cache; values that a tap brings; floats of a run of taps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,14 +97,14 @@ def _joint_bilateral(coarse: DisparityMap, guide: U8, config: UpsamplingConfig) 
     base_x, spatial_x = _window(w, shape[1], config)
     pad = -shape[1] % TILE
     padded = -config.diameter_px % GROUP
-    out, sure = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    out, sure = np.empty((2, *shape), np.float32)
     _bilateral(
         _taps(coarse, guide, scale),
         guide,
         np.pad(base_x, (0, pad), mode="edge"),
         base_y,
         np.pad(spatial_x, ((0, pad), (0, padded)), constant_values=OUTSIDE),
-        spatial_y,
+        np.ascontiguousarray(spatial_y.T),
         scale,
         config.min_support,
         out,
@@ -191,36 +194,40 @@ def _exp2(e: Any) -> Any:  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
 def _add_taps(
-    tap: Any, near: Any, y: Any, colour: Any, sums: Any
+    tap: Any, near: Any, spatial: Any, colours: Any, totals: Any
 ) -> None:  # pragma: no cover - compiled
-    """Add GROUP neighbouring taps of one coarse row to the sums of a run of fine pixels.
+    """Add GROUP neighbouring taps of one coarse row to the sums of some runs of fine pixels.
 
     Flat arrays and constant offsets, so that the compiler sees that nothing overlaps.
     """
-    for x in range(TILE):
-        b, g, r = colour[x], colour[TILE + x], colour[2 * TILE + x]
-        everything, known = sums[x], sums[TILE + x]
-        weight, value = sums[2 * TILE + x], sums[3 * TILE + x]
-        for n in range(GROUP):
-            db = b - tap[(CHANNELS * n) * TILE + x]
-            dg = g - tap[(CHANNELS * n + 1) * TILE + x]
-            dr = r - tap[(CHANNELS * n + 2) * TILE + x]
-            tonal = max(-(db * db + dg * dg + dr * dr), np.float32(RANGE_FLOOR))
-            w = _exp2(tonal + (near[n * TILE + x] + y))
-            value += w * tap[(CHANNELS * n + 3) * TILE + x]
-            weight += w * tap[(CHANNELS * n + 4) * TILE + x]
-            known += w * tap[(CHANNELS * n + 5) * TILE + x]
-            everything += w
-        sums[x] = everything
-        sums[TILE + x] = known
-        sums[2 * TILE + x] = weight
-        sums[3 * TILE + x] = value
+    for row in range(spatial.shape[0]):
+        s = spatial[row]
+        colour = colours[row]
+        sums = totals[row]
+        for x in range(TILE):
+            b, g, r = colour[x], colour[TILE + x], colour[2 * TILE + x]
+            everything, known = sums[x], sums[TILE + x]
+            weight, value = sums[2 * TILE + x], sums[3 * TILE + x]
+            for n in range(GROUP):
+                db = b - tap[(CHANNELS * n) * TILE + x]
+                dg = g - tap[(CHANNELS * n + 1) * TILE + x]
+                dr = r - tap[(CHANNELS * n + 2) * TILE + x]
+                tonal = max(-(db * db + dg * dg + dr * dr), np.float32(RANGE_FLOOR))
+                w = _exp2(tonal + (near[n * TILE + x] + s))
+                value += w * tap[(CHANNELS * n + 3) * TILE + x]
+                weight += w * tap[(CHANNELS * n + 4) * TILE + x]
+                known += w * tap[(CHANNELS * n + 5) * TILE + x]
+                everything += w
+            sums[x] = everything
+            sums[TILE + x] = known
+            sums[2 * TILE + x] = weight
+            sums[3 * TILE + x] = value
 
 
 @njit(cache=True, nogil=True)
 def _aligned(size: int) -> Any:  # pragma: no cover - compiled
     """``size`` float32 that start on a cache line: a load across two lines takes twice as long."""
-    memory = np.zeros(size + 16, np.float32)
+    memory = np.empty(size + 16, np.float32)
     start = (-memory.ctypes.data % 64) // 4
     return memory[start : start + size]
 
@@ -247,22 +254,27 @@ def _columns(
         for x in range(TILE):
             i = base[first + x] + k
             index[k, x] = min(max(i, 0), width - 1)
-            near[k // GROUP, k % GROUP * TILE + x] = spatial[first + x, k] if i == index[k, x] else OUTSIDE
+            near[k // GROUP, k % GROUP * TILE + x] = (
+                spatial[first + x, k] if i == index[k, x] else OUTSIDE
+            )
 
 
 @njit(cache=True, nogil=True)
-def _finish(
-    sums: Any, support: Any, out: Any, sure: Any
-) -> None:  # pragma: no cover - compiled
+def _load_colour(guide: Any, scale: Any, colour: Any) -> None:  # pragma: no cover - compiled
+    """The scaled colours of a run of fine pixels: (channel, pixel), flat."""
+    for x in range(guide.shape[0]):
+        for channel in range(3):
+            colour[channel * TILE + x] = scale * np.float32(guide[x, channel])
+
+
+@njit(cache=True, nogil=True)
+def _finish(sums: Any, support: Any, out: Any, sure: Any) -> None:  # pragma: no cover - compiled
     """Eq. 2's division by K_p for one run of fine pixels."""
     for x in range(out.shape[0]):
-        everything, known = sums[x], sums[TILE + x]
-        if known > support * everything and known > 0:
-            out[x] = sums[3 * TILE + x] / sums[2 * TILE + x]
-            sure[x] = sums[2 * TILE + x] / everything
-        else:
-            out[x] = np.nan
-            sure[x] = 0
+        everything, weight = sums[x], sums[2 * TILE + x]
+        good = sums[TILE + x] > support * everything
+        out[x] = sums[3 * TILE + x] / weight if good else np.float32(np.nan)
+        sure[x] = weight / everything if good else np.float32(0)
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -281,44 +293,41 @@ def _bilateral(
     """Tiles of fine columns in parallel; each goes down the rows with its spread taps at hand."""
     h = taps.shape[0]
     height, width = out.shape
-    reach = spatial_y.shape[1]
-    span = spatial_x.shape[1]
+    reach = spatial_y.shape[0]
+    groups = spatial_x.shape[1] // GROUP
     tiles = (width + TILE - 1) // TILE
-    chunks = 4
-    for job in prange(tiles * chunks):
-        first = (job // chunks) * TILE
-        count = min(TILE, width - first)
-        groups = span // GROUP
-        ring = _aligned(reach * CHANNELS * span * TILE).reshape((reach, groups, CHANNELS * GROUP * TILE))
-        near = _aligned(span * TILE).reshape((groups, GROUP * TILE))
-        index = np.empty((span, TILE), np.uint32)
-        _columns(base_x, spatial_x, first, taps.shape[2], index, near)
-        colour = _aligned(3 * TILE)
-        sums = _aligned(4 * TILE)
+    for tile in prange(tiles):
+        ring = _aligned(reach * groups * TAP_RUN).reshape((reach, groups, TAP_RUN))
         ready = np.full(reach, -1, np.int64)
-        for y in range(height * (job % chunks) // chunks, height * (job % chunks + 1) // chunks):
-            sums[:] = np.float32(0)
-            for x in range(count):
-                for channel in range(3):
-                    colour[channel * TILE + x] = np.float32(colour_scale) * np.float32(
-                        guide[y, first + x, channel]
-                    )
+        first = tile * TILE
+        last = min(first + TILE, width)
+        near = _aligned(groups * GROUP * TILE).reshape((groups, GROUP * TILE))
+        index = np.empty((groups * GROUP, TILE), np.uint32)
+        _columns(base_x, spatial_x, first, taps.shape[2], index, near)
+        colour = _aligned(BAND * 3 * TILE).reshape((BAND, 3 * TILE))
+        colour[:] = np.float32(0)
+        sums = _aligned(BAND * 4 * TILE).reshape((BAND, 4 * TILE))
+        top = 0
+        while top < height:
+            rows = 1
+            while rows < BAND and top + rows < height and base_y[top + rows] == base_y[top]:
+                rows += 1
+            for y in range(rows):
+                sums[y, :] = np.float32(0)
+                _load_colour(guide[top + y, first:last], np.float32(colour_scale), colour[y])
             for k in range(reach):
-                j = base_y[y] + k
+                j = base_y[top] + k
                 if 0 <= j < h:
                     if ready[j % reach] != j:
                         _spread(taps[j], index, ring[j % reach])
                         ready[j % reach] = j
                     for group in range(groups):
-                        _add_taps(
-                            ring[j % reach, group], near[group], spatial_y[y, k], colour, sums
-                        )
-            _finish(
-                sums,
-                np.float32(min_support),
-                out[y, first : first + count],
-                sure[y, first : first + count],
-            )
+                        tap = ring[j % reach, group]
+                        _add_taps(tap, near[group], spatial_y[k, top : top + rows], colour, sums)
+            for y in range(rows):
+                v = top + y
+                _finish(sums[y], np.float32(min_support), out[v, first:last], sure[v, first:last])
+            top += rows
 
 
 def _guided(coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
