@@ -20,6 +20,7 @@ class TrajectoryConfig:
     """When corrected poses are worth telling."""
 
     repose_m: float = 0.05  # a keyframe that moved or would move its ground by more
+    repose_sigmas: float = 0.1  # and by more than this share of the sigma, in flight
     least_anchors: int = 3  # keyframes before the alignment replaces the first guess
 
 
@@ -108,8 +109,12 @@ class Trajectory:
         moved[:3, 3] *= key.scale
         return Placed(seq, key.T_world_camera @ moved, key.scale, key.covariance, key.sources)
 
-    def moved(self) -> list[Placed]:
-        """Keyframes whose world pose changed more than ``repose_m`` since it was told."""
+    def moved(self, final: bool = False) -> list[Placed]:
+        """Keyframes whose world pose changed since it was told by more than is worth it.
+
+        In flight a change must exceed ``repose_m`` and a tenth of the pose's own sigma, or
+        each fix of a poor receiver would move the whole scan; ``final`` ones only the first.
+        """
         out = []
         for node in self._nodes.values():
             if node.told is None:
@@ -121,7 +126,9 @@ class Trajectory:
             shift = float(np.linalg.norm(now.T_world_camera[:3, 3] - T_old[:3, 3]))
             turn = float(np.linalg.norm(change[:3])) * reach
             growth = abs(now.scale / scale_old - 1.0) * reach
-            if shift + turn + growth > self.config.repose_m:
+            sigma = float(np.sqrt(np.trace(now.covariance[3:, 3:])))
+            least = max(self.config.repose_m, 0.0 if final else self.config.repose_sigmas * sigma)
+            if shift + turn + growth > least:
                 out.append(now)
         return out
 

@@ -145,7 +145,7 @@ class Pipeline:
         """The viewpoints still waiting for partners, and the last corrections."""
         tracked = Tracked("lost", self.odometry.segment, reason="end of the recording")
         keyframes = self._reconstruct_ready(everything=True)
-        return Step(tracked, PosePrior(), keyframes=keyframes, moved=self._moved())
+        return Step(tracked, PosePrior(), keyframes=keyframes, moved=self._moved(final=True))
 
     def _pictures(self, image: U8) -> tuple[U8, U8, U8 | None]:
         """Undistorted picture, its grey version at the odometry's size, and the mask of that."""
@@ -304,8 +304,8 @@ class Pipeline:
         T_carrier = carrier.key.T_odom_camera @ carrier.T_key_camera
         return self.trajectory.ride(carrier.seq, se3.inverse(T_carrier) @ T_odom_camera)
 
-    def _moved(self) -> tuple[Placed, ...]:
-        moved = self.trajectory.moved()
+    def _moved(self, final: bool = False) -> tuple[Placed, ...]:
+        moved = self.trajectory.moved(final)
         for placed in moved:
             self.trajectory.tell(placed)
         return tuple(moved)

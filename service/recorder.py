@@ -138,21 +138,18 @@ class Recorder:
             self.points += int((keyframe.fresh & np.isfinite(keyframe.depth.depth_m)).sum())
             self.chunk_bytes += sum(map(len, layers))
             self._encoded_scale[keyframe.seq] = self.pipeline.trajectory.place(keyframe.seq).scale
-        for placed in step.moved:
-            self._write_repose(placed)
+        moved = [self._repose(p) for p in step.moved if p.seq in self._encoded_scale]
+        if moved:
+            self.store.add_reposes(moved)
 
-    def _write_repose(self, placed: Placed) -> None:
-        if placed.seq not in self._encoded_scale:
-            return
+    def _repose(self, placed: Placed) -> Repose:
         self._revision[placed.seq] += 1
-        self.store.add_repose(
-            Repose(
-                placed.seq,
-                self._revision[placed.seq],
-                placed.T_world_camera,
-                placed.scale / self._encoded_scale[placed.seq],
-                placed.covariance,
-            )
+        return Repose(
+            placed.seq,
+            self._revision[placed.seq],
+            placed.T_world_camera,
+            placed.scale / self._encoded_scale[placed.seq],
+            placed.covariance,
         )
 
     def _record(self, told: _Told, placed: Placed) -> PoseRecord:

@@ -273,6 +273,14 @@ class ScanStore:
             self.put_repose(number, pack_repose(repose))
             return number
 
+    def add_reposes(self, reposes: Sequence[Repose]) -> None:
+        """Store several re-poses in one transaction, under the next numbers."""
+        sql = "INSERT INTO reposes VALUES (?, ?, ?, ?)"
+        with self._lock:
+            first = self._next_id("reposes")
+            rows = [(first + i, r.seq, r.revision, pack_repose(r)) for i, r in enumerate(reposes)]
+            self._write([(sql, row) for row in rows])
+
     def put_repose(self, number: int, data: bytes) -> bool:
         """Store a packed re-pose under the drone's number; False if it is no news."""
         repose = unpack_repose(data)
