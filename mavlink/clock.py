@@ -109,9 +109,9 @@ def _rate(stamps: F64, boots: F64) -> float:
     """Boot seconds per stamp second, exactly 1.0 when they agree within 3 percent."""
     if stamps[-1] - stamps[0] < WINDOW_NS:
         return 1.0
-    # The median slope over a third of the log: a clock that is set once does not matter.
-    third = max(1, len(stamps) // 3)
-    ds, db = stamps[third:] - stamps[:-third], boots[third:] - boots[:-third]
+    # The median slope over a twentieth of the log: a clock that is set once does not matter.
+    lag = max(1, len(stamps) // 20)
+    ds, db = stamps[lag:] - stamps[:-lag], boots[lag:] - boots[:-lag]
     use = ds > 0
     if not use.any():
         return 1.0

@@ -76,6 +76,11 @@ class VehicleHistory:
         times = [t.last_ns for t in (self._attitude, self._position) if t.last_ns is not None]
         return max(times, default=None)
 
+    def attitudes(self) -> list[tuple[AttitudeSample, int]]:
+        """Every attitude with its time in ns, oldest first."""
+        with self._lock:
+            return [(AttitudeSample(None, _quaternion(r)), t) for t, r in self._attitude.items()]
+
     def __len__(self) -> int:
         return len(self._attitude) + len(self._position)
 

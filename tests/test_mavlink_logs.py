@@ -1,0 +1,484 @@
+"""Telemetry logs of every kind, whole and damaged; truth from the logs' own making."""
+
+from __future__ import annotations
+
+import math
+import random
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mavlink import quaternion
+from mavlink.history import HistoryConfig, VehicleHistory
+from mavlink.logs import TelemetryLog, load_telemetry
+from mavlink.state import F64
+from mavlink.wire import dialect
+
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+TURN = Path(__file__).parent / "data" / "mavlink" / "arducopter_turn.tlog"
+US = 1_000_000
+T0_US = 1_700_000_000 * US
+
+
+def shared(name: str) -> Path:
+    path = SHARED / name
+    if not path.is_file():
+        pytest.skip(f"{name} is not here")
+    return path
+
+
+def angle(a: F64 | quaternion.Quaternion, b: F64 | quaternion.Quaternion) -> float:
+    ra, rb = (Rotation.from_quat([q[1], q[2], q[3], q[0]]) for q in (a, b))
+    return float((ra.inv() * rb).magnitude())
+
+
+class TlogWriter:
+    """Writes packets of any sender with pymavlink's own encoder."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self._encoders: dict[tuple[int, int], Any] = {}
+
+    def add(self, usec: int, message: Any, system: int = 1, component: int = 1) -> None:
+        key = (system, component)
+        encoder = self._encoders.setdefault(key, dialect.MAVLink(None, *key))
+        packet = bytes(message.pack(encoder))
+        encoder.seq = (encoder.seq + 1) % 256
+        self.data += usec.to_bytes(8, "big") + packet
+
+    def save(self, path: Path) -> Path:
+        path.write_bytes(self.data)
+        return path
+
+
+def heartbeat() -> Any:
+    return dialect.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3)
+
+
+def attitude(boot_ms: int, yaw: float) -> Any:
+    return dialect.MAVLink_attitude_message(boot_ms & 0xFFFFFFFF, 0.05, -0.1, yaw, 0, 0, 0)
+
+
+def fly(
+    writer: TlogWriter,
+    seconds: float,
+    stamp_us: Callable[[float], int],
+    boot_ms: Callable[[float], float],
+    system: int = 1,
+) -> None:
+    """20 Hz of attitude whose yaw is 0.3 rad/s, with a heartbeat every second."""
+    for k in range(round(seconds * 20)):
+        t = k / 20
+        if k % 20 == 0:
+            writer.add(stamp_us(t), heartbeat(), system)
+        writer.add(stamp_us(t), attitude(round(boot_ms(t)), 0.3 * t), system)
+
+
+def yaw_at(history: VehicleHistory, usec: int) -> float | None:
+    state = history.state_at(usec * 1000)
+    if state is None or state.q_ned_body_wxyz is None:
+        return None
+    w, x, y, z = state.q_ned_body_wxyz
+    return quaternion.to_rpy((float(w), float(x), float(y), float(z)))[2]
+
+
+# tlog: clocks
+
+
+def test_jitter_of_arrival_does_not_reach_the_samples(tmp_path: Path) -> None:
+    rng = random.Random(1)
+    writer = TlogWriter()
+    # Arrival is 3 ms late at best and 150 ms at worst; the clock drifts by 60 ppm.
+    fly(
+        writer,
+        120,
+        lambda t: T0_US + round((t + 0.003 + rng.expovariate(1 / 0.03)) * US),
+        lambda t: 5000 + t * 1000 * (1 + 60e-6),
+    )
+    log = load_telemetry(writer.save(tmp_path / "a.tlog"))
+    errors = []
+    for t in np.linspace(1.0, 119.0, 300):
+        yaw = yaw_at(log.history, T0_US + round(float(t) * US))
+        assert yaw is not None
+        errors.append((yaw - 0.3 * float(t) + math.pi) % (2 * math.pi) - math.pi)
+    lateness_ms = -np.array(errors) / 0.3 * 1000
+    assert np.abs(lateness_ms - 3.0).max() < 3.0
+    assert log.clock == "unix" and log.warnings == ()
+
+
+def test_a_faster_simulation_is_read_by_its_own_clock(tmp_path: Path) -> None:
+    writer = TlogWriter()
+    fly(writer, 100, lambda t: T0_US + round(t / 5 * US), lambda t: 60_000 + t * 1000)
+    log = load_telemetry(writer.save(tmp_path / "a.tlog"))
+    assert (log.last_ns - log.first_ns) * 1e-9 == pytest.approx(99.95)
+    assert yaw_at(log.history, T0_US + 10 * US) == pytest.approx(3.0, abs=1e-3)
+    assert any("clock" in warning for warning in log.warnings)
+
+
+def test_the_boot_counter_may_wrap_in_flight(tmp_path: Path) -> None:
+    writer = TlogWriter()
+    fly(writer, 20, lambda t: T0_US + round(t * US), lambda t: 2**32 - 10_000 + t * 1000)
+    log = load_telemetry(writer.save(tmp_path / "a.tlog"))
+    assert log.warnings == ()
+    for t in (5.0, 9.99, 10.01, 15.0):
+        yaw = yaw_at(log.history, T0_US + round(t * US))
+        assert yaw is not None
+        assert math.remainder(yaw - 0.3 * t, 2 * math.pi) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_reboot_starts_a_session_of_its_own(tmp_path: Path) -> None:
+    writer = TlogWriter()
+    fly(writer, 20, lambda t: T0_US + round(t * US), lambda t: 300_000 + t * 1000)
+    fly(writer, 20, lambda t: T0_US + round((t + 40) * US), lambda t: 2_000 + t * 1000)
+    log = load_telemetry(writer.save(tmp_path / "a.tlog"))
+    assert any("started again" in warning for warning in log.warnings)
+    assert yaw_at(log.history, T0_US + 5 * US) == pytest.approx(1.5, abs=1e-3)
+    assert yaw_at(log.history, T0_US + 45 * US) == pytest.approx(1.5, abs=1e-3)
+    assert yaw_at(log.history, T0_US + 30 * US) is None
+
+
+def test_a_clock_that_is_set_in_mid_log_is_followed(tmp_path: Path) -> None:
+    writer = TlogWriter()
+    step = 400 * 86_400 * US  # the computer learnt the date
+    fly(
+        writer,
+        60,
+        lambda t: T0_US + round(t * US) + (step if t >= 30 else 0),
+        lambda t: 5_000 + t * 1000,
+    )
+    log = load_telemetry(writer.save(tmp_path / "a.tlog"))
+    assert yaw_at(log.history, T0_US + 10 * US) == pytest.approx(3.0, abs=0.01)
+    late = yaw_at(log.history, T0_US + step + 50 * US)
+    assert late is not None and math.remainder(late - 15.0, 2 * math.pi) == pytest.approx(
+        0.0, abs=0.01
+    )
+
+
+def test_the_vehicle_with_an_attitude_is_taken_not_the_ground_station(tmp_path: Path) -> None:
+    writer = TlogWriter()
+    fly(writer, 10, lambda t: T0_US + round(t * US), lambda t: 9_000 + t * 1000, system=7)
+    for k in range(10):
+        station = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+        writer.add(T0_US + k * US, station, 255, 190)
+    log = load_telemetry(writer.save(tmp_path / "a.tlog"))
+    assert log.warnings == () and yaw_at(log.history, T0_US + 5 * US) is not None
+    fly(writer, 3, lambda t: T0_US + round(t * US), lambda t: 1_000 + t * 1000, system=8)
+    log = load_telemetry(writer.save(tmp_path / "b.tlog"))
+    assert any("several vehicles" in w and "7" in w for w in log.warnings)
+
+
+# tlog: damage
+
+
+def test_damage_is_skipped_and_counted(tmp_path: Path) -> None:
+    raw = bytearray(TURN.read_bytes())
+    rng = random.Random(2)
+    for _ in range(60):
+        at = rng.randrange(len(raw))
+        raw[at : at + rng.randrange(30)] = rng.randbytes(rng.randrange(50))
+    path = tmp_path / "damaged.tlog"
+    path.write_bytes(raw)
+    log, whole = load_telemetry(path), load_telemetry(TURN)
+    assert 0 < log.counts["skipped_bytes"] < 20_000
+    assert log.counts["packets"] > 0.95 * whole.counts["packets"]
+    assert any("damaged bytes" in warning for warning in log.warnings)
+    worst = 0.0
+    for t in np.linspace(whole.first_ns + 10**9, whole.last_ns - 10**9, 200).astype(int):
+        a, b = log.history.state_at(int(t)), whole.history.state_at(int(t))
+        assert b is not None and b.q_ned_body_wxyz is not None
+        if a is not None and a.q_ned_body_wxyz is not None:
+            worst = max(worst, angle(a.q_ned_body_wxyz, b.q_ned_body_wxyz))
+    assert worst < 0.05
+
+
+def test_a_damaged_first_stamp_does_not_cost_the_log(tmp_path: Path) -> None:
+    raw = bytearray(TURN.read_bytes())
+    raw[:8] = (T0_US + 40 * 365 * 86_400 * US).to_bytes(8, "big")
+    path = tmp_path / "first.tlog"
+    path.write_bytes(raw)
+    log, whole = load_telemetry(path), load_telemetry(TURN)
+    assert log.counts["packets"] == whole.counts["packets"] - 1
+    assert abs(log.first_ns - whole.first_ns) < 10**9
+
+
+@pytest.mark.parametrize("cut", [1, 7, 8, 9, 15, 40])
+def test_a_torn_end_is_no_failure(tmp_path: Path, cut: int) -> None:
+    path = tmp_path / "torn.tlog"
+    path.write_bytes(TURN.read_bytes()[:-cut])
+    assert load_telemetry(path).counts["packets"] >= 3300
+
+
+@pytest.mark.parametrize("name", ["x.tlog", "x.BIN", "x.ulg", "x.SRT"])
+@pytest.mark.parametrize("content", ["empty", "random", "zeros", "text"])
+def test_what_is_no_log_is_refused_in_one_line(tmp_path: Path, name: str, content: str) -> None:
+    path = tmp_path / name
+    made = {
+        "empty": b"",
+        "random": random.Random(4).randbytes(50_000),
+        "zeros": bytes(50_000),
+        "text": b"no telemetry here\n" * 1000,
+    }
+    path.write_bytes(made[content])
+    with pytest.raises(ValueError) as caught:
+        load_telemetry(path)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("header", [b"\xa3\x95", b"ULog\x01\x12\x35"], ids=["dataflash", "ulog"])
+def test_garbage_behind_a_right_header_is_refused(tmp_path: Path, header: bytes) -> None:
+    if header.startswith(b"ULog"):
+        pytest.importorskip("pyulog")
+    path = tmp_path / ("x.bin" if header[0] == 0xA3 else "x.ulg")
+    for seed in range(5):
+        path.write_bytes(header + random.Random(seed).randbytes(5_000))
+        with pytest.raises(ValueError) as caught:
+            load_telemetry(path)
+        assert "\n" not in str(caught.value)
+
+
+def test_no_file_and_an_unknown_kind_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no such"):
+        load_telemetry(tmp_path / "none.tlog")
+    (tmp_path / "x.txt").write_bytes(b"x")
+    with pytest.raises(ValueError, match=r"\.tlog, \.bin, \.ulg, \.srt"):
+        load_telemetry(tmp_path / "x.txt")
+
+
+# A real ArduCopter's log
+
+
+def left_out_errors(log: TelemetryLog, keep_every: int) -> tuple[F64, F64]:
+    """Errors and sigmas of attitudes left out of a thinned copy of a log's history."""
+    thin = VehicleHistory()
+    samples = log.history.attitudes()
+    for sample, time_ns in samples[::keep_every]:
+        thin.add(sample, time_ns)
+    errors, sigmas = [], []
+    for sample, time_ns in samples:
+        state = thin.state_at(time_ns)
+        if state is not None and state.q_ned_body_wxyz is not None and state.sigma_attitude_rad:
+            errors.append(angle(state.q_ned_body_wxyz, sample.q_ned_body))
+            sigmas.append(state.sigma_attitude_rad)
+    return np.array(errors), np.array(sigmas)
+
+
+def check_interpolation(log: TelemetryLog) -> None:
+    errors, sigmas = left_out_errors(log, 2)
+    assert np.percentile(errors, 99) < math.radians(0.6)
+    thin_errors, thin_sigmas = left_out_errors(log, 7)  # about the 3.5 Hz of a slow radio
+    assert (thin_errors < 2.0 * thin_sigmas).mean() > 0.99
+    assert thin_sigmas.max() > 1.5 * sigmas.max()
+
+
+def test_attitude_left_out_of_a_real_log_is_interpolated_within_its_sigma() -> None:
+    check_interpolation(load_telemetry(TURN))
+
+
+def test_the_whole_survey_is_read_quickly_and_agrees_with_itself() -> None:
+    log = load_telemetry(shared("ardupilot_survey/survey_companion.tlog"))
+    assert log.warnings == () and log.counts["ATTITUDE"] == 5954
+    assert (log.last_ns - log.first_ns) * 1e-9 == pytest.approx(297.7, abs=0.2)
+    check_interpolation(log)
+    other = load_telemetry(shared("ardupilot_survey/survey_gcs.tlog"))
+    for t in np.linspace(log.first_ns + 60e9, log.last_ns - 60e9, 50).astype(int):
+        a, b = log.history.state_at(int(t)), other.history.state_at(int(t))
+        assert a is not None and b is not None
+        assert a.q_ned_body_wxyz is not None and b.q_ned_body_wxyz is not None
+        assert angle(a.q_ned_body_wxyz, b.q_ned_body_wxyz) < math.radians(0.5)
+        assert a.alt_agl_m is not None and b.alt_agl_m is not None
+        assert a.alt_agl_m == pytest.approx(b.alt_agl_m, abs=0.3)
+
+
+def nadir_angle_deg(q: F64) -> float:
+    r = Rotation.from_quat([q[1], q[2], q[3], q[0]])
+    return float(np.degrees(np.arccos(np.clip(r.as_matrix()[2, 0], -1, 1))))
+
+
+def test_the_servo_mount_of_a_real_log_looks_straight_down() -> None:
+    log = load_telemetry(TURN)
+    off = []
+    for t in np.linspace(log.first_ns + 1e9, log.last_ns - 1e9, 300).astype(int):
+        state = log.history.state_at(int(t))
+        assert state is not None and state.q_ned_gimbal_wxyz is not None
+        off.append(nadir_angle_deg(state.q_ned_gimbal_wxyz))
+    assert np.median(off) < 0.1
+    assert np.percentile(off, 90) < 5.0  # in the turns the servo runs into its stop
+
+
+def test_a_gimbal_device_that_keeps_the_horizon_is_believed() -> None:
+    log = load_telemetry(shared("ardupilot_survey/gimbal_device_companion.tlog"))
+    state = log.history.state_at(log.first_ns + 50 * 10**9)
+    assert state is not None and state.q_ned_gimbal_wxyz is not None
+    assert nadir_angle_deg(state.q_ned_gimbal_wxyz) < 0.1
+    assert any("clock" in warning for warning in log.warnings)
+
+
+def test_the_slow_cmac_log_tags_with_terrain_height() -> None:
+    log = load_telemetry(shared("cuav_cmac_20180805/flight.tlog"))
+    start = 1_533_430_844_800_000_000  # the first frame, 01:00:44.80 UTC
+    seen = 0
+    for k in range(18):
+        state = log.history.state_at(start + k * 820_000_000)
+        if state is None or state.q_ned_body_wxyz is None or state.lat_deg is None:
+            continue
+        seen += 1
+        assert state.alt_agl_m is not None and 60.0 < state.alt_agl_m < 100.0
+        assert "terrain" in state.sources
+        assert state.sigma_h_m is not None and 0.2 < state.sigma_h_m < 1.0
+    assert seen >= 16
+
+
+# DJI subtitles
+
+
+SRT = {
+    "phantom": (
+        "1\n00:00:00,000 --> 00:00:01,000\nF/5.6, SS 400, GPS (-58.85, -34.23, 15), HOME (-58.8,"
+        " -34.2, -57.98m), D 698.70m, H 85.80m, F.PRY (2.7°, -7.0°, 110.1°), G.PRY (-24.4°, 0.0°,"
+        " 110.4°)\n\n"
+    ),
+    "mavic": (
+        '1\n00:00:00,000 --> 00:00:00,033\n<font size="36">SrtCnt : 1, DiffTime : 33ms\n'
+        "2022-05-01 15:01:58,531,716\n[iso : 100] [latitude: -34.23] [longitude: -58.85]"
+        " [rel_alt: 85.800 abs_alt: 210.500] [gb_yaw: 110.4 gb_pitch: -24.4 gb_roll: 0.0] </font>"
+        "\n\n"
+    ),
+    "matrice": (
+        "1\n00:00:00,000 --> 00:00:01,000\n2022.06.21 16:06:17\n"
+        "GPS(-34.2300,-58.8500,0.0M) BAROMETER:85.8M\n\n"
+    ),
+}
+
+
+@pytest.mark.parametrize("layout", list(SRT))
+def test_subtitles_of_several_drones(tmp_path: Path, layout: str) -> None:
+    path = tmp_path / "flight.SRT"
+    path.write_text(SRT[layout], encoding="utf-8")
+    log = load_telemetry(path)
+    assert log.clock == "video" and log.first_ns == 0
+    state = log.history.state_at(0)
+    assert state is not None
+    assert state.lat_deg == pytest.approx(-34.23) and state.lon_deg == pytest.approx(-58.85)
+    assert state.alt_agl_m == pytest.approx(85.8)
+    assert state.alt_amsl_m == (pytest.approx(210.5) if layout == "mavic" else None)
+    if layout != "matrice":
+        assert state.q_ned_gimbal_wxyz is not None
+        q = quaternion.from_rpy(0.0, math.radians(-24.4), math.radians(110.4))
+        assert angle(state.q_ned_gimbal_wxyz, q) < 1e-6
+    if layout == "phantom":
+        assert state.q_ned_body_wxyz is not None
+        q = quaternion.from_rpy(*map(math.radians, (-7.0, 2.7, 110.1)))
+        assert angle(state.q_ned_body_wxyz, q) < 1e-6
+
+
+@pytest.mark.parametrize("name", ["p4_rtk.SRT", "mavic_air2.srt", "matrice_300.srt"])
+def test_real_subtitles_are_read_whole(name: str) -> None:
+    log = load_telemetry(shared(f"flight_logs/dji_srt/{name}"))
+    assert log.counts["positions"] == log.counts["cues"] > 20
+    assert log.warnings == ()
+
+
+# PX4 and ArduPilot onboard logs
+
+
+def test_a_real_px4_log_gives_its_attitude() -> None:
+    pytest.importorskip("pyulog")
+    log = load_telemetry(shared("flight_logs/px4_auav_x21_68s.ulg"))
+    assert log.clock == "boot" and any("no GPS time" in w for w in log.warnings)
+    assert log.counts["vehicle_attitude"] == 6461
+    errors, _ = left_out_errors(log, 2)
+    assert np.percentile(errors, 99) < math.radians(0.1)
+
+
+DATAFLASH = {
+    "ATT": ("QhhHH", "TimeUS,Roll,Pitch,Yaw,AEKF", "Qcccc"),
+    "POS": ("QiifffB", "TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt,X", "QLLfffB"),
+    "XKF1": ("QBfff", "TimeUS,C,VN,VE,VD", "QBfff"),
+    "GPS": ("QBBIHBfi", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat", "QBBIHBfL"),
+    "GPA": ("QBff", "TimeUS,I,HAcc,VAcc", "QBff"),
+    "RFND": ("QBfBB", "TimeUS,Instance,Dist,Stat,Orient", "QBfBB"),
+    "TERR": ("QBf", "TimeUS,Status,CHeight", "QBf"),
+    "MNT": ("QBffff", "TimeUS,I,Roll,Pitch,YawB,YawE", "QBffff"),
+}
+
+
+class DataflashWriter:
+    """Writes an ArduPilot .BIN log by its documented layout."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self._numbers = {name: 129 + k for k, name in enumerate(DATAFLASH)}
+        self._format(128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")
+        for name, (fields, columns, kinds) in DATAFLASH.items():
+            size = 3 + struct.calcsize("<" + fields)
+            number = self._numbers[name]
+            self._format(number, size, name.encode(), kinds.encode(), columns.encode())
+
+    def _format(self, number: int, size: int, name: bytes, kinds: bytes, columns: bytes) -> None:
+        self.data += b"\xa3\x95\x80" + struct.pack(
+            "<BB4s16s64s", number, size, name, kinds, columns
+        )
+
+    def add(self, name: str, *values: float) -> None:
+        self.data += bytes((0xA3, 0x95, self._numbers[name]))
+        self.data += struct.pack("<" + DATAFLASH[name][0], *values)
+
+
+def dataflash_flight(dated: bool) -> DataflashWriter:
+    writer = DataflashWriter()
+    for k in range(200):
+        us = 30_000_000 + k * 50_000
+        if k % 4 == 0:
+            gms = 100_000_000 + k * 50 if dated else 0
+            writer.add("GPS", us, 0, 3, gms, 2200 if dated else 0, 12, 0.8, 473000000)
+            writer.add("GPA", us, 0, 0.7, 1.1)
+        writer.add("XKF1", us, 0, 3.0, 1.0, -0.5)
+        writer.add("ATT", us, 500, -1000, 9000, 3)
+        writer.add("POS", us, 473000000, 85000000, 512.5, 62.5, 60.0, 0)
+        writer.add("MNT", us, 0, 0.0, -60.0, 10.0, 100.0)
+        if k >= 100:
+            writer.add("RFND", us, 0, 50.0, 4, 25)
+        writer.add("TERR", us, 2, 58.0)
+    return writer
+
+
+@pytest.mark.parametrize("dated", [True, False])
+def test_an_ardupilot_onboard_log(tmp_path: Path, dated: bool) -> None:
+    path = tmp_path / "log.BIN"
+    path.write_bytes(dataflash_flight(dated).data)
+    log = load_telemetry(path)
+    assert log.clock == ("unix" if dated else "boot")
+    # GPS week 2200, 100000 s into it, leap seconds off: 2022-03-07 03:46:40 UTC less 18 s.
+    if dated:
+        assert log.first_ns * 1e-9 == pytest.approx(315964800 + 2200 * 604800 + 100_000 - 18, abs=1)
+    early, late = (
+        log.history.state_at(log.first_ns + 10**9),
+        log.history.state_at(log.last_ns - 10**9),
+    )
+    for state in (early, late):
+        assert state is not None and state.q_ned_body_wxyz is not None
+        q = quaternion.from_rpy(*map(math.radians, (5.0, -10.0, 90.0)))
+        assert angle(state.q_ned_body_wxyz, q) < 1e-4
+        assert state.lat_deg == pytest.approx(47.3) and state.lon_deg == pytest.approx(8.5)
+        assert state.alt_amsl_m == pytest.approx(512.5)
+        assert state.v_ned_m_s is not None and list(state.v_ned_m_s) == pytest.approx([3, 1, -0.5])
+        assert state.sigma_h_m == pytest.approx(0.7, rel=0.01)
+        assert state.q_ned_gimbal_wxyz is not None
+        head = quaternion.from_rpy(0.0, math.radians(-60.0), math.radians(100.0))
+        assert angle(state.q_ned_gimbal_wxyz, head) < 1e-4
+    assert early is not None and early.sources[-1] == "terrain"
+    assert late is not None and late.sources[-1] == "rangefinder"
+    path.write_bytes(dataflash_flight(dated).data[:-700])
+    assert load_telemetry(path).counts["ATT"] > 190
+
+
+def test_settings_of_the_history_reach_it() -> None:
+    config = HistoryConfig(sigma_tilt_rad=0.2)
+    log = load_telemetry(TURN, config)
+    state = log.history.state_at(log.first_ns + 10**9)
+    assert state is not None and state.sigma_attitude_rad == pytest.approx(0.2, rel=0.01)
