@@ -1,0 +1,118 @@
+"""The similarity from the odometry's frame to the world."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.alignment import Anchor, fit
+from recon.types import F64, PosePrior
+
+
+def track(n: int = 30) -> list[F64]:
+    """Camera poses of a bent flight, looking down."""
+    out = []
+    for i in range(n):
+        R = se3.so3_exp(np.array([0.02 * math.sin(i), 0.02 * math.cos(2 * i), 0.05 * i]))
+        out.append(
+            se3.compose(R @ np.diag([1.0, -1, -1]), np.array([4.0 * i, 0.02 * i * i, 60.0]))
+        )
+    return out
+
+
+def anchors(
+    R: F64, scale: float, t: F64, seed: int, gnss_m: float = 1.0, yaw_bias: float = 0.0
+) -> list[Anchor]:
+    """Noisy priors of a track that the odometry sees turned, shrunk and moved."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for T in track():
+        odom = se3.compose(R.T @ T[:3, :3], R.T @ (T[:3, 3] - t) / scale)
+        noise = np.r_[rng.normal(0, 0.01, 2), rng.normal(yaw_bias, 0.05)]
+        prior = PosePrior(
+            se3.so3_exp(noise) @ T[:3, :3],
+            0.01,
+            0.05,
+            T[:3, 3] + rng.normal(0, gnss_m, 3),
+            np.full(3, gnss_m),
+            60.0 + rng.normal(0, 2.0),
+            3.0,
+        )
+        out.append(Anchor(odom, prior, 60.0 / scale))
+    return out
+
+
+@pytest.mark.parametrize("scale", [0.2, 1.0, 7.0])
+@pytest.mark.parametrize("yaw", [0.0, 1.2, 3.0, -2.0])
+def test_any_turn_and_scale_is_found(scale: float, yaw: float) -> None:
+    R = se3.so3_exp(np.array([0.05, -0.03, yaw]))
+    t = np.array([10.0, -20.0, 5.0])
+    found = fit(anchors(R, scale, t, seed=1))
+    assert found is not None
+    assert found.scale == pytest.approx(scale, rel=0.03)
+    assert np.linalg.norm(se3.so3_log(found.R @ R.T)) < 0.03
+    assert found.sources == ("attitude", "altitude", "gnss")
+
+
+def test_one_wild_fix_does_not_move_the_map() -> None:
+    good = anchors(np.eye(3), 1.0, np.zeros(3), seed=2)
+    wild = list(good)
+    prior = wild[10].prior
+    assert prior.position_m is not None
+    moved = PosePrior(
+        prior.R_world_camera,
+        prior.sigma_tilt_rad,
+        prior.sigma_yaw_rad,
+        prior.position_m + np.array([30.0, 0, 0]),
+        prior.sigma_position_m,
+    )
+    wild[10] = Anchor(wild[10].T_odom_camera, moved, None)
+    a, b = fit(good), fit(wild)
+    assert a is not None and b is not None
+    shift = a.pose(good[15].T_odom_camera)[:3, 3] - b.pose(good[15].T_odom_camera)[:3, 3]
+    assert np.linalg.norm(shift) < 0.4
+
+
+def test_heading_comes_from_the_track_when_no_compass_tells_it() -> None:
+    R = se3.so3_exp(np.array([0.0, 0.0, 2.5]))
+    blind = []
+    for a in anchors(R, 2.0, np.array([1.0, 2.0, 3.0]), seed=3, gnss_m=2.0):
+        p = a.prior
+        nominal = np.diag([1.0, -1, -1])
+        prior = PosePrior(nominal, 0.1, 3.0, p.position_m, p.sigma_position_m)
+        blind.append(Anchor(a.T_odom_camera, prior, None))
+    found = fit(blind)
+    assert found is not None
+    assert found.scale == pytest.approx(2.0, rel=0.05)
+    turn = se3.so3_log(found.R @ R.T)
+    assert abs(turn[2]) < 0.05
+    assert "attitude" not in found.sources
+
+
+def test_scale_rests_on_the_height_without_gnss() -> None:
+    some = []
+    for a in anchors(np.eye(3), 3.0, np.zeros(3), seed=4):
+        p = a.prior
+        prior = PosePrior(p.R_world_camera, 0.01, 0.05, None, None, p.agl_m, 3.0)
+        some.append(Anchor(a.T_odom_camera, prior, a.height))
+    found = fit(some)
+    assert found is not None
+    assert found.scale == pytest.approx(3.0, rel=0.03)
+    assert found.sources == ("attitude", "altitude")
+
+
+def test_without_any_prior_there_is_no_alignment() -> None:
+    assert fit([Anchor(T, PosePrior(), None) for T in track()]) is None
+
+
+def test_covariance_of_the_scale_covers_its_error() -> None:
+    ratios = []
+    for seed in range(40):
+        found = fit(anchors(np.eye(3), 1.0, np.zeros(3), seed=10 + seed))
+        assert found is not None
+        ratios.append(abs(math.log(found.scale)) / found.sigma_scale)
+    assert np.mean(np.array(ratios) < 1.0) > 0.6
+    assert max(ratios) < 4.0
