@@ -1,0 +1,71 @@
+"""``skyrelief score``: a scan folder against the truth of a simulated flight."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+
+def score(
+    scan_dir: Annotated[Path, typer.Argument(help="Scan folder of replay or run.")],
+    truth_dir: Annotated[Path, typer.Argument(help="truth/ of simulate.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Report as one JSON object.")] = False,
+) -> None:
+    """Accuracy, completeness and trajectory error of a scan of a simulated flight."""
+    from service import scoring
+
+    report = scoring.score(scan_dir, truth_dir)
+    print(json.dumps(report) if as_json else _text(report))
+
+
+def _text(report: dict[str, Any]) -> str:
+    """The report as lines for people."""
+    lines = [
+        f"{report['points']} points, {report['poses_compared']} of {report['poses']} poses "
+        f"compared, flown {report['altitude_m']:.1f} m above the ground"
+        + ("" if report["georeferenced"] else "; the scan has no georeference"),
+        "",
+        "surface              median      rms      p90     bias   <0.25 m   <0.5 m   of altitude",
+    ]
+    for name, s in report["surface"].items():
+        lines.append(
+            f"  {_label(name):<16} {s['median_m']:7.3f} m {s['rms_m']:6.3f} m {s['p90_m']:6.3f} m "
+            f"{s['bias_m']:+6.3f} m  {s['share_25cm']:7.1%}  {s['share_50cm']:7.1%} "
+            f"  {s['median_percent_of_altitude']:8.2f} %"
+        )
+    for name, s in report["surface"].items():
+        if s.get("honesty") and name == report["judged_after"]:
+            h = s["honesty"]
+            lines.append(
+                f"  sigma: {h['within_1_sigma']:.0%} within 1, {h['within_2_sigma']:.0%} within 2 "
+                f"(a Gaussian has 68 % and 95 %), median {h['median_sigma_m']:.3f} m"
+            )
+    c = report["completeness"]
+    lines += [
+        "",
+        f"completeness: {c['share']:.1%} of {c['seen_m2']:.0f} m2 seen lies within "
+        f"{c['within_m']:g} m of a point ({c['share_flat']:.1%} of ground and roofs, "
+        f"{c['share_steep']:.1%} of walls)",
+        "",
+        "trajectory              rms   median      max     turn    drift",
+    ]
+    for name, t in report["trajectory"].items():
+        lines.append(
+            f"  {_label(name):<16} {t['rms_m']:6.2f} m {t['median_m']:6.2f} m {t['max_m']:6.2f} m "
+            f"{t['median_deg']:6.2f} deg {t['drift_percent']:5.2f} % of path"
+        )
+    for name, s in report["surface"].items():
+        f = s["fit"]
+        if name != "raw":
+            lines.append(
+                f"  the {_label(name)} fit moved the cloud by {f['shift_m']:.2f} m "
+                f"({f['shift_up_m']:+.2f} m up), {f['turn_deg']:.2f} deg, scale {f['scale']:.4f}"
+            )
+    return "\n".join(lines)
+
+
+def _label(name: str) -> str:
+    return {"raw": "as delivered", "rigid": "rigid fit", "similarity": "similarity fit"}[name]

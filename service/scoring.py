@@ -1,0 +1,273 @@
+"""A scan folder against the truth of a simulated flight."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recon import metrics, se3, triangle_grid
+from recon.metrics import Fit
+from recon.triangle_grid import TriangleGrid
+from recon.types import F32, F64
+from service.errors import InputError
+from service.georeference import LocalFrame
+from service.sim.surface_file import read_surface
+
+log = logging.getLogger(__name__)
+
+REACH_M = 5.0
+COMPLETE_WITHIN_M = 0.5
+SAMPLE_SPACING_M = 0.4
+FRAMES_FOR_VISIBILITY = 60
+VIEWS_TO_COUNT = 3
+MOST_POINTS = 300_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """What ``simulate`` wrote into ``truth/``."""
+
+    frame: LocalFrame
+    surface: TriangleGrid
+    times_s: F64  # (F,)
+    poses: F64  # (F, 4, 4)
+    K: F64
+    size_px: tuple[int, int]
+    agl_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanResult:
+    """What a scan folder claims, in the truth's frame when the scan has a place on the globe."""
+
+    points: F64  # (N, 3)
+    sigma_m: F32 | None  # (N,)
+    times_s: F64  # (P,)
+    poses: F64  # (P, 4, 4)
+    placed: bool  # False: coordinates are the scan's own
+
+
+def score(scan_folder: Path, truth_folder: Path) -> dict[str, Any]:
+    """All figures of a scan against the truth, ready for JSON; InputError for missing parts."""
+    truth = read_truth(truth_folder)
+    scan = read_scan(scan_folder, truth.frame)
+    at_truth, known = metrics.poses_at(truth.times_s, truth.poses, scan.times_s)
+    pairs = int(known.sum())
+    report: dict[str, Any] = {
+        "points": len(scan.points),
+        "poses": len(scan.times_s),
+        "poses_compared": pairs,
+        "altitude_m": truth.agl_m,
+        "georeferenced": scan.placed,
+    }
+    if pairs < 2 and not scan.placed:
+        raise InputError(
+            f"{scan_folder}: no pose lies within the flight's time and there is no georeference; "
+            "was the scan made from this flight's video?"
+        )
+    fits = _fits(scan, truth, at_truth, known)
+    report["trajectory"] = {
+        name: asdict(metrics.trajectory_errors(fit.poses(scan.poses[known]), at_truth[known]))
+        for name, fit in fits["trajectory"].items()
+        if pairs >= 2
+    }
+    report["surface"] = {
+        name: _surface_part(scan, truth, fit) for name, fit in fits["surface"].items()
+    }
+    best = "rigid" if scan.placed else "similarity"
+    report["judged_after"] = best
+    report["completeness"] = _completeness(scan, truth, fits["surface"][best])
+    for name, fit in fits["surface"].items():
+        report["surface"][name]["fit"] = _fit_size(fit, scan.points)
+    return report
+
+
+def _fits(scan: ScanResult, truth: Truth, at_truth: F64, known: Any) -> dict[str, dict[str, Fit]]:
+    """Alignments by name: from the trajectory, and refined on the surface."""
+    by_track: dict[str, Fit] = {}
+    if scan.placed:
+        by_track["raw"] = Fit.identity()
+    for name, with_scale in (("rigid", False), ("similarity", True)):
+        if known.sum() >= 2:
+            fit = metrics.fit_trajectory(scan.poses[known], at_truth[known], with_scale)
+        else:
+            fit = Fit.identity()
+        by_track[name] = fit
+    on_surface = dict(by_track)
+    for name in ("rigid", "similarity"):
+        refined = metrics.fit_surface(
+            scan.points, truth.surface, by_track[name], name == "similarity", REACH_M
+        )
+        on_surface[name] = refined
+    return {"trajectory": by_track, "surface": on_surface}
+
+
+def _surface_part(scan: ScanResult, truth: Truth, fit: Fit) -> dict[str, Any]:
+    """Errors of the cloud after one fit, and how honest its sigmas are."""
+    step = max(1, -(-len(scan.points) // MOST_POINTS))
+    points = fit.points(scan.points[::step])
+    distance, signed = metrics.distances(points, truth.surface, REACH_M)
+    out: dict[str, Any] = asdict(metrics.surface_errors(distance, signed, REACH_M))
+    out["median_percent_of_altitude"] = 100.0 * out["median_m"] / truth.agl_m
+    out["rms_percent_of_altitude"] = 100.0 * out["rms_m"] / truth.agl_m
+    if scan.sigma_m is not None:
+        claim = metrics.honesty(distance, scan.sigma_m[::step] * np.float32(fit.scale))
+        out["honesty"] = None if claim is None else asdict(claim)
+    return out
+
+
+def _fit_size(fit: Fit, points: F64) -> dict[str, float]:
+    """How much a fit moves the cloud: shift of its middle, turn and scale."""
+    middle = points.mean(axis=0)
+    shift = fit.points(middle[None])[0] - middle
+    return {
+        "shift_m": float(np.linalg.norm(shift)),
+        "shift_up_m": float(shift[2]),
+        "turn_deg": float(np.degrees(np.linalg.norm(se3.so3_log(fit.R)))),
+        "scale": fit.scale,
+    }
+
+
+def _completeness(scan: ScanResult, truth: Truth, fit: Fit) -> dict[str, float]:
+    """Share of the surface that the flight saw and the cloud has, in all and by steepness."""
+    samples, normals = metrics.sample_surface(truth.surface, SAMPLE_SPACING_M)
+    frames = np.unique(np.linspace(0, len(truth.poses) - 1, FRAMES_FOR_VISIBILITY).astype(int))
+    views = np.zeros(len(samples), np.int64)
+    for k in frames:
+        views += metrics.seen_from(
+            samples, normals, truth.surface, truth.poses[k], truth.K, np.array(truth.size_px)
+        )
+    seen = views >= min(VIEWS_TO_COUNT, len(frames))
+    if not seen.any():
+        raise InputError("the truth's cameras see none of the truth's surface; wrong folder?")
+    covered = metrics.share_covered(samples[seen], fit.points(scan.points), COMPLETE_WITHIN_M)
+    flat = np.abs(normals[seen, 2]) > 0.5
+    area = float(truth.surface.areas().sum()) * float(seen.mean())
+    return {
+        "share": float(covered.mean()),
+        "share_flat": float(covered[flat].mean()) if flat.any() else float("nan"),
+        "share_steep": float(covered[~flat].mean()) if (~flat).any() else float("nan"),
+        "steep_part": float((~flat).mean()),
+        "seen_m2": area,
+        "within_m": COMPLETE_WITHIN_M,
+    }
+
+
+def read_truth(folder: Path) -> Truth:
+    """The truth in ``folder``, or in its ``truth`` subfolder."""
+    if not (folder / "surface.ply").exists() and (folder / "truth").is_dir():
+        folder = folder / "truth"
+    if not folder.is_dir():
+        raise InputError(f"truth {folder}: no such folder; `skyrelief simulate` makes one")
+    origin = _json(folder / "origin.json")
+    params = _json(folder / "params.json")
+    vertices, triangles = read_surface(folder / "surface.ply")
+    times, poses = read_tum(folder / "trajectory.tum")
+    try:
+        frame = LocalFrame(origin["lat_deg"], origin["lon_deg"], origin["alt_amsl_m"])
+        K = np.array(params["K"], np.float64).reshape(3, 3)
+        width, height = (int(v) for v in params["size_px"])
+        agl = float(params["median_agl_m"])
+        surface = triangle_grid.build(vertices, triangles)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"truth {folder}: unusable ({_short(error)})") from error
+    if len(times) < 2:
+        raise InputError(f"truth {folder}: trajectory.tum has fewer than two poses")
+    return Truth(frame, surface, times, poses, K, (width, height), agl)
+
+
+def read_scan(folder: Path, frame: LocalFrame) -> ScanResult:
+    """The scan in ``folder``, brought into ``frame`` when it has a place on the globe."""
+    if not folder.is_dir():
+        raise InputError(f"scan {folder}: no such folder")
+    summary = _json(folder / "scan.json")
+    points, sigma = _read_cloud(folder / "cloud.laz")
+    if len(points) == 0:
+        raise InputError(f"scan {folder}: cloud.laz holds no points; nothing to score")
+    times, poses = read_tum(folder / "trajectory.tum")
+    origin, epsg = summary.get("origin"), summary.get("epsg")
+    if not origin or not epsg:
+        return ScanResult(points, sigma, times, poses, False)
+    try:
+        own = LocalFrame(origin["lat_deg"], origin["lon_deg"], origin["alt_amsl_m"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"scan {folder}: origin in scan.json ({_short(error)})") from error
+    if own.epsg != epsg:
+        raise InputError(f"scan {folder}: EPSG {epsg} in scan.json is not that of its origin")
+    enu = frame.to_enu(own.to_geodetic(own.from_utm(points)))
+    return ScanResult(enu, sigma, times, _moved_poses(poses, own, frame), True)
+
+
+def _moved_poses(poses: F64, own: LocalFrame, frame: LocalFrame) -> F64:
+    """Poses about one origin as poses about another; exact, the axes turn with the globe."""
+    out = np.array(poses, dtype=np.float64)
+    if len(poses) == 0:
+        return out
+    axes = np.vstack([np.zeros(3), np.eye(3)])
+    tips = frame.to_enu(own.to_geodetic(axes))
+    U, _, Vt = np.linalg.svd((tips[1:] - tips[0]).T)
+    out[:, :3, :3] = (U @ Vt) @ poses[:, :3, :3]
+    out[:, :3, 3] = frame.to_enu(own.to_geodetic(poses[:, :3, 3]))
+    return out
+
+
+def read_tum(path: Path) -> tuple[F64, F64]:
+    """(times (N,) unix s, poses (N, 4, 4)) of a TUM trajectory, in order of time."""
+    text = _text(path)
+    rows = [r.split() for r in text.splitlines() if r.strip() and not r.startswith("#")]
+    try:
+        table = np.array([[float(v) for v in row] for row in rows]).reshape(len(rows), 8)
+        if not np.isfinite(table).all():
+            raise ValueError("numbers that are not finite")
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        poses = np.tile(np.eye(4), (len(table), 1, 1))
+        for k, row in enumerate(table):
+            poses[k, :3, :3] = se3.rotation_from_quaternion(row[[7, 4, 5, 6]])
+        poses[:, :3, 3] = table[:, 1:4]
+    except ValueError as error:
+        raise InputError(f"trajectory {path}: not a TUM file ({_short(error)})") from error
+    return table[:, 0], poses
+
+
+def _read_cloud(path: Path) -> tuple[F64, F32 | None]:
+    """(points (N, 3), sigma_m (N,) or None) of a LAZ file."""
+    import laspy
+
+    try:
+        las = laspy.read(str(path))
+        points = np.asarray(las.xyz, np.float64)
+    except FileNotFoundError:
+        raise InputError(f"cloud {path}: no such file; was the scan finished?") from None
+    except (laspy.errors.LaspyException, RuntimeError, ValueError, OSError) as error:
+        raise InputError(f"cloud {path}: cannot be read ({_short(error)})") from error
+    names = set(las.point_format.extra_dimension_names)
+    sigma = np.asarray(las["sigma_m"], np.float32) if "sigma_m" in names else None
+    return points, sigma
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(_text(path))
+    except ValueError as error:
+        raise InputError(f"{path}: not JSON ({_short(error)})") from error
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: not a JSON object")
+    return value
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({_short(error)})") from error
+
+
+def _short(error: Exception) -> str:
+    return " ".join(str(error).split())[:120]
