@@ -1,0 +1,73 @@
+"""Fusion of several stereo readings of one keyframe."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.depth_fusion import FusionConfig, PairDepth, fuse, seen_from
+from recon.types import F32, DepthMap
+
+K = np.array([[100.0, 0, 39.5], [0, 100.0, 29.5], [0, 0, 1]])
+SHAPE = (60, 80)
+
+
+def reading(rng: np.random.Generator, truth: F32, sigma: float) -> PairDepth:
+    depth = truth + rng.normal(0, sigma, SHAPE)
+    return PairDepth(depth.astype(np.float32), np.full(SHAPE, sigma, np.float32))
+
+
+def test_sigma_is_honest_for_gaussian_readings() -> None:
+    rng = np.random.default_rng(0)
+    truth = np.full(SHAPE, 60.0, np.float32)
+    pairs = [reading(rng, truth, s) for s in (0.2, 0.3, 0.4)]
+    fused = fuse(pairs, K, np.eye(4), FusionConfig())
+    within = np.abs(fused.depth_m - truth) <= fused.sigma_m
+    assert 0.6 < within.mean() < 0.85
+    assert np.median(fused.sigma_m) < 0.2
+    assert np.median(fused.views) == 3
+
+
+def test_the_majority_wins_over_one_wrong_reading() -> None:
+    rng = np.random.default_rng(1)
+    truth = np.full(SHAPE, 60.0, np.float32)
+    wrong = reading(rng, truth - 12.0, 0.1)
+    pairs = [reading(rng, truth, 0.3), wrong, reading(rng, truth, 0.3)]
+    fused = fuse(pairs, K, np.eye(4), FusionConfig())
+    # Where the two right ones miss each other by over 2.5 sigma (1 in 80) there is none.
+    assert np.mean(np.abs(fused.depth_m - truth) < 2.0) > 0.97
+    assert (fused.views <= 2).all()
+
+
+def test_what_no_pair_knows_stays_unknown_and_single_views_are_marked() -> None:
+    rng = np.random.default_rng(2)
+    truth = np.full(SHAPE, 60.0, np.float32)
+    a, b = reading(rng, truth, 0.3), reading(rng, truth, 0.3)
+    a.depth_m[:, :40] = np.nan
+    b.depth_m[:20] = np.nan
+    fused = fuse([a, b], K, np.eye(4), FusionConfig())
+    assert np.isnan(fused.depth_m[:20, :40]).all() and (fused.views[:20, :40] == 0).all()
+    assert (fused.views[:20, 40:] == 1).all()
+    single, double = fused.sigma_m[:20, 40:], fused.sigma_m[20:, 40:]
+    assert np.median(single) > 1.6 * np.median(double)
+
+
+def test_useless_readings_are_left_out() -> None:
+    far = PairDepth(np.full(SHAPE, 60.0, np.float32), np.full(SHAPE, 30.0, np.float32))
+    fused = fuse([far], K, np.eye(4), FusionConfig())
+    assert np.isnan(fused.depth_m).all()
+    with pytest.raises(ValueError, match="no stereo pair"):
+        fuse([], K, np.eye(4), FusionConfig())
+
+
+def test_another_view_confirms_or_looks_through() -> None:
+    flat = np.full(SHAPE, 60.0, np.float32)
+    ghost = flat.copy()
+    ghost[20:30, 30:40] = 40.0
+    sigma, views = np.full(SHAPE, 0.2, np.float32), np.full(SHAPE, 2, np.uint8)
+    other = DepthMap(flat, sigma, views, K, np.eye(4))
+    moved = se3.compose(np.eye(3), np.array([0.6, 0.0, 0.0]))
+    confirmed, contradicted = seen_from(DepthMap(ghost, sigma, views, K, moved), other)
+    assert contradicted[22:28, 32:38].all()
+    assert confirmed[:15, 10:60].all() and not contradicted[:15, 10:60].any()
