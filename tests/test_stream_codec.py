@@ -58,6 +58,14 @@ def test_depth_error_is_the_promised_rounding() -> None:
     assert float(np.abs(at_60).max()) < 0.004 * 12**0.5 / 2 * 1.01
 
 
+def test_both_depth_methods_carry_the_same() -> None:
+    frame = keyframe(stripe(0.3))
+    a = decode(encode(frame, 0, CodecConfig(depth_method=planes.METHOD_JPEG_LS)))
+    b = decode(encode(frame, 0, CodecConfig(depth_method=planes.METHOD_PREDICTION)))
+    assert a is not None and b is not None
+    np.testing.assert_array_equal(a.depth.depth_m, b.depth.depth_m)
+
+
 def test_pose_and_camera_survive() -> None:
     frame = keyframe()
     back = decode(encode(frame, 99))

@@ -28,10 +28,11 @@ class CodecConfig:
 
     depth_rms_m: float = 0.004
     reference_depth_m: float = 60.0
-    colour_quality: int = 75  # JPEG, 1 to 100
+    colour_quality: int = 80  # JPEG, 1 to 100
     coarse_width_px: int = 80
     coarse_depth_rms_m: float = 0.016
     coarse_colour_quality: int = 35
+    depth_method: int = planes.METHOD_PREDICTION  # or planes.METHOD_JPEG_LS
 
     def __post_init__(self) -> None:
         for name in ("depth_rms_m", "reference_depth_m", "coarse_depth_rms_m"):
@@ -40,12 +41,20 @@ class CodecConfig:
         for name in ("colour_quality", "coarse_colour_quality"):
             if not 1 <= getattr(self, name) <= 100:
                 raise ValueError(f"{name} must be 1 to 100, got {getattr(self, name)}")
+        if self.depth_method not in (planes.METHOD_JPEG_LS, planes.METHOD_PREDICTION):
+            raise ValueError(f"depth_method must be 1 or 2, got {self.depth_method}")
         if not 8 <= self.coarse_width_px <= MAX_SIDE_PX:
             raise ValueError(f"coarse_width_px must be 8 to 4096, got {self.coarse_width_px}")
 
-    def inverse_step(self, depth_rms_m: float) -> float:
-        """Step of inverse depth in 1/m whose rounding error is ``depth_rms_m`` rms."""
-        return depth_rms_m * math.sqrt(12.0) / self.reference_depth_m**2
+    @property
+    def fine_step(self) -> float:
+        """Step of inverse depth, 1/m, whose rounding error is ``depth_rms_m`` rms."""
+        return self.depth_rms_m * math.sqrt(12.0) / self.reference_depth_m**2
+
+    @property
+    def coarse_step(self) -> float:
+        """The same for ``coarse_depth_rms_m``."""
+        return self.coarse_depth_rms_m * math.sqrt(12.0) / self.reference_depth_m**2
 
 
 def encode(
@@ -63,22 +72,19 @@ def encode(
     with np.errstate(invalid="ignore"):
         known = keyframe.fresh & (depth.depth_m > 1e-3) & (depth.depth_m < 1e5)
     fine = planes.Planes(depth.depth_m, depth.sigma_m, depth.views, keyframe.bgr, known)
-    fine_step = config.inverse_step(config.depth_rms_m)
     factor = -(-w // config.coarse_width_px)
+    fine_place = (0, 1, 1) if factor == 1 else (1, 2, 1)
+    fine_layer = _layer(
+        keyframe, time_unix_ns, fine_place, fine, config.fine_step, config.colour_quality, config
+    )
     if factor == 1:
-        return (_layer(keyframe, time_unix_ns, (0, 1, 1), fine, fine_step, config.colour_quality),)
-    coarse_step = config.inverse_step(config.coarse_depth_rms_m)
+        return (fine_layer,)
     coarse = planes.reduce(fine, factor)
+    quality = config.coarse_colour_quality
+    place = (0, 2, factor)
     return (
-        _layer(
-            keyframe,
-            time_unix_ns,
-            (0, 2, factor),
-            coarse,
-            coarse_step,
-            config.coarse_colour_quality,
-        ),
-        _layer(keyframe, time_unix_ns, (1, 2, 1), fine, fine_step, config.colour_quality),
+        _layer(keyframe, time_unix_ns, place, coarse, config.coarse_step, quality, config),
+        fine_layer,
     )
 
 
@@ -103,6 +109,7 @@ def _layer(
     full: planes.Planes,
     step: float,
     quality: int,
+    config: CodecConfig,
 ) -> bytes:
     """One coded layer; ``place`` is its number, how many there are, and its factor."""
     layer, layers, factor = place
@@ -114,7 +121,7 @@ def _layer(
         codes, low, step = planes.quantise(cut, step)
         sections = (
             planes.encode_mask(cut.known),
-            planes.encode_depth(codes),
+            planes.encode_depth(codes, cut.known, config.depth_method),
             planes.encode_sigma(cut),
             planes.encode_views(cut),
             planes.encode_colour(cut, quality),
@@ -127,7 +134,7 @@ def _layer(
         time_unix_ns=time_unix_ns,
         full_px=(w, h),
         factor=factor,
-        method=planes.METHOD_JPEG_LS,
+        method=config.depth_method,
         box=box,
         inverse_min=low,
         inverse_step=step,
@@ -159,15 +166,15 @@ def _open_planes(head: LayerHead, sections: Sequence[bytes]) -> planes.Planes | 
         blank = np.zeros((0, 0), np.float32)
         none = np.zeros((0, 0), np.uint8)
         return planes.Planes(blank, blank, none, np.zeros((0, 0, 3), np.uint8), none > 0)
-    if head.method != planes.METHOD_JPEG_LS:
-        return None
     mask, depth, sigma, views, colour = sections
     known = planes.decode_mask(mask, w, h)
-    depth_m = planes.decode_depth(depth, w, h, head.inverse_min, head.inverse_step)
+    if known is None:
+        return None
+    depth_m = planes.decode_depth(depth, known, head.method, head.inverse_min, head.inverse_step)
     sigma_m = planes.decode_sigma(sigma, w, h)
     count = planes.decode_views(views, w, h)
     bgr = planes.decode_colour(colour, w, h)
-    if known is None or depth_m is None or sigma_m is None or count is None or bgr is None:
+    if depth_m is None or sigma_m is None or count is None or bgr is None:
         return None
     return planes.Planes(depth_m, sigma_m, count, bgr, known)
 

@@ -15,10 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.types import F32, U8, Array, Bool
+from service.stream import prediction
 
 U16 = npt.NDArray[np.uint16]
 
 METHOD_JPEG_LS = 1
+METHOD_PREDICTION = 2
 SIGMA_BLOCK_PX = 4
 SIGMA_UNIT_M = 0.001
 SIGMA_STEPS_PER_OCTAVE = 4
@@ -63,10 +65,14 @@ def block_mean(plane: F32, factor: int) -> F32:
     """Mean of each factor x factor block, zeros beyond the edge counted in."""
     h, w = plane.shape[:2]
     rows, columns = -(-h // factor), -(-w // factor)
-    padded = cv2.copyMakeBorder(
-        plane, 0, rows * factor - h, 0, columns * factor - w, cv2.BORDER_CONSTANT, value=0
-    )
-    return np.asarray(cv2.resize(padded, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
+    if rows * factor != h or columns * factor != w:
+        plane = np.asarray(
+            cv2.copyMakeBorder(
+                plane, 0, rows * factor - h, 0, columns * factor - w, cv2.BORDER_CONSTANT, value=0
+            ),
+            np.float32,
+        )
+    return np.asarray(cv2.resize(plane, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _mean_known(plane: F32, weight: F32, share: F32, factor: int) -> F32:
@@ -86,23 +92,26 @@ def reduce(full: Planes, factor: int) -> Planes:
     """``full`` at 1/factor of its size; a block is known when a quarter of it is."""
     weight = full.known.astype(np.float32)
     share = block_mean(weight, factor)
-    inverse = np.where(full.known, 1.0 / np.where(full.known, full.depth_m, 1.0), 0.0)
-    inverse = inverse.astype(np.float32)
-    mean = _mean_known(inverse, weight, share, factor)
-    spread = _mean_known(inverse**2, weight, share, factor) - mean**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(full.known, np.float32(1.0) / full.depth_m, np.float32(0.0))
+    scale = 1.0 / np.maximum(share, 1e-6)
+    mean = block_mean(inverse, factor) * scale
+    spread = block_mean(inverse * inverse, factor) * scale - mean * mean
     torn = (spread > (SPREAD * mean) ** 2) & np.asarray(_middle(full.known, factor), np.bool_)
     mean = np.where(torn, _middle(inverse, factor), mean)
     known = (share >= 0.25) & (mean > 0)
-    sigma = _mean_known(_finite_sigma(full), weight, share, factor)
-    views = np.asarray(np.rint(_mean_known(full.views.astype(np.float32), weight, share, factor)))
-    bgr = block_mean(full.bgr * weight[..., None], factor) / np.maximum(share, 1e-6)[..., None]
+    bgr = full.bgr if full.known.all() else full.bgr * full.known[..., None]
     return Planes(
         np.asarray(1.0 / np.where(known, mean, 1.0), np.float32),
-        sigma,
-        np.clip(views, 1, MAX_VIEWS).astype(np.uint8),
-        np.clip(np.rint(bgr), 0, 255).astype(np.uint8),
+        np.asarray(block_mean(_finite_sigma(full), factor) * scale, np.float32),
+        _near(block_mean(full.views * weight, factor) * scale, 1, MAX_VIEWS),
+        _near(block_mean(bgr.astype(np.float32), factor) * scale[..., None], 0, 255),
         known,
     )
+
+
+def _near(values: Array, low: int, high: int) -> U8:
+    return np.clip(np.rint(values), low, high).astype(np.uint8)
 
 
 def _finite_sigma(planes: Planes) -> F32:
@@ -112,6 +121,8 @@ def _finite_sigma(planes: Planes) -> F32:
 
 def _fill_back(values: Array, known: Bool) -> Array:
     """``values`` with each unknown pixel replaced by the last known one in scan order."""
+    if known.all():
+        return values
     index = np.where(known.ravel(), np.arange(known.size), 0)
     index = np.maximum.accumulate(index)
     index[index == 0] = int(np.argmax(known))
@@ -149,23 +160,31 @@ def quantise(planes: Planes, step: float) -> tuple[U16, float, float]:
 
     Unknown pixels repeat the last known one. The step grows when 65536 codes are too few.
     """
-    inverse = 1.0 / _fill_back(planes.depth_m, planes.known).astype(np.float64)
-    low, high = float(inverse.min()), float(inverse.max())
-    low32 = np.float32(low)
-    step32 = np.float32(max(step, (high - low) / (MAX_CODE - 1)))
-    codes = np.rint((inverse - float(low32)) / float(step32))
-    return np.clip(codes, 0, MAX_CODE).astype(np.uint16), float(low32), float(step32)
+    depth = _fill_back(planes.depth_m, planes.known)
+    low = np.float32(1.0 / float(depth.max()))
+    high = 1.0 / float(depth.min())
+    step32 = np.float32(max(step, (high - float(low)) / (MAX_CODE - 1)))
+    codes = (1.0 / float(step32)) / depth.astype(np.float64)
+    codes -= float(low) / float(step32) - 0.5
+    return np.clip(codes, 0, MAX_CODE).astype(np.uint16), float(low), float(step32)
 
 
-def encode_depth(codes: U16) -> bytes:
-    """The codes as one JPEG-LS picture: 8 bits deep when they fit, else 16."""
+def encode_depth(codes: U16, known: Bool, method: int) -> bytes:
+    """The codes by prediction, or as one JPEG-LS picture (8 bits deep when they fit)."""
+    if method == METHOD_PREDICTION:
+        return prediction.encode(codes, known)
     picture = codes.astype(np.uint8) if codes.max() < 256 else codes
     return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(picture)))
 
 
-def decode_depth(data: bytes, w: int, h: int, low: float, step: float) -> F32 | None:
-    """(h, w) depth in metres."""
-    codes = _open_jpeg_ls(data, w, h)
+def decode_depth(data: bytes, known: Bool, method: int, low: float, step: float) -> F32 | None:
+    """(h, w) depth in metres; arbitrary where not known."""
+    h, w = known.shape
+    codes: Array | None = None
+    if method == METHOD_PREDICTION:
+        codes = prediction.decode(data, known)
+    elif method == METHOD_JPEG_LS:
+        codes = _open_jpeg_ls(data, w, h)
     if codes is None:
         return None
     return np.asarray(1.0 / (low + step * codes.astype(np.float64)), np.float32)
@@ -207,7 +226,9 @@ def encode_views(planes: Planes) -> bytes:
     """The section of views: one count per block of VIEWS_BLOCK_PX, at most MAX_VIEWS."""
     h, w = planes.known.shape
     views = np.where(planes.known, np.clip(planes.views, 1, MAX_VIEWS), 255).astype(np.uint8)
-    padded = cv2.copyMakeBorder(views, 0, h % 2, 0, w % 2, cv2.BORDER_CONSTANT, value=255)
+    padded = views
+    if h % 2 or w % 2:
+        padded = np.pad(views, ((0, h % 2), (0, w % 2)), constant_values=255)
     least = np.minimum(padded[::2], padded[1::2])
     least = np.minimum(least[:, ::2], least[:, 1::2])
     return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(_fill_back(least, least != 255))))

@@ -1,0 +1,237 @@
+"""A radio link between two sockets of this machine: delay, rate, loss, cuts, byte counts.
+
+TCP is relayed as a stream; a lost segment holds the stream back for one retransmission, as
+TCP shows it to an application. UDP (QUIC) is relayed datagram by datagram and lost ones are
+gone, so the transport's own recovery is at work.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import random
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass, field
+
+SEGMENT_BYTES = 1400
+SEGMENT_HEADER_BYTES = 52
+CHUNK_BYTES = 1400
+QUEUE_BYTES = 32_768
+"""The radio's own buffer; TCP is held back and UDP dropped beyond it."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkModel:
+    """What the link does to each direction."""
+
+    rate_kbit_s: float = 1000.0
+    delay_s: float = 0.05  # one way
+    loss: float = 0.0  # share of segments or datagrams
+    cuts: tuple[tuple[float, float], ...] = ()  # (from, to) seconds after the start
+    seed: int = 1
+
+
+@dataclass(slots=True, eq=False)
+class Traffic:
+    """What went one way: (time, bytes on the wire) as handed to the link."""
+
+    log: list[tuple[float, int]] = field(default_factory=list)
+
+    def total_bytes(self) -> int:
+        """Bytes in all."""
+        return sum(size for _, size in self.log)
+
+    def busiest_window_bytes(self, window_s: float = 1.0) -> int:
+        """The most bytes in any window of that length."""
+        most = held = 0
+        window: deque[tuple[float, int]] = deque()
+        for at, size in self.log:
+            window.append((at, size))
+            held += size
+            while window[0][0] <= at - window_s:
+                held -= window.popleft()[1]
+            most = max(most, held)
+        return most
+
+
+class _Pipe:
+    """One direction of the link: serialised at the rate, delayed, lost, cut."""
+
+    def __init__(self, model: LinkModel, started: float, seed: int) -> None:
+        self._model = model
+        self._started = started
+        self._random = random.Random(seed)
+        self._free_at = started
+        self.traffic = Traffic()
+
+    def backlog_bytes(self, now: float) -> float:
+        """Bytes that wait for the radio."""
+        return max(0.0, self._free_at - now) * self._model.rate_kbit_s * 125
+
+    def _after_cuts(self, at: float) -> float:
+        for first, last in self._model.cuts:
+            if self._started + first <= at < self._started + last:
+                at = self._started + last
+        return at
+
+    def send(self, size: int, now: float, stream: bool) -> float | None:
+        """When ``size`` bytes come out at the far end; None for a datagram that is lost."""
+        wire = size + SEGMENT_HEADER_BYTES * -(-size // SEGMENT_BYTES)
+        self.traffic.log.append((now, wire))
+        begin = self._after_cuts(max(now, self._free_at))
+        lost = self._random.random() < self._model.loss
+        if not stream and (
+            lost or begin > max(now, self._free_at) or self.backlog_bytes(now) > QUEUE_BYTES
+        ):
+            return None
+        self._free_at = begin + wire / (self._model.rate_kbit_s * 125)
+        if lost:  # the segment goes again a round trip later and holds back what follows
+            self._free_at += wire / (self._model.rate_kbit_s * 125)
+            return self._free_at + 3 * self._model.delay_s
+        return self._free_at + self._model.delay_s
+
+
+class LinkEmulator:
+    """Relays ``listen_port`` to ``target_port`` of this machine through a :class:`LinkModel`.
+
+    :attr:`up` is what the calling side (the drone) sent, :attr:`down` what came back.
+    """
+
+    def __init__(self, model: LinkModel, listen_port: int, target_port: int, udp: bool) -> None:
+        self._model = model
+        self._ports = listen_port, target_port
+        self._udp = udp
+        self._started = time.monotonic()
+        self._up = _Pipe(model, self._started, model.seed)
+        self._down = _Pipe(model, self._started, model.seed + 1)
+        self._loop = asyncio.new_event_loop()
+        self._ready = threading.Event()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._thread = threading.Thread(target=self._run, name="link-emulator", daemon=True)
+
+    @property
+    def up(self) -> Traffic:
+        """From the side that calls."""
+        return self._up.traffic
+
+    @property
+    def down(self) -> Traffic:
+        """From the side that is called."""
+        return self._down.traffic
+
+    def start(self) -> None:
+        """Begin to relay."""
+        self._thread.start()
+        self._ready.wait(5.0)
+
+    def close(self) -> None:
+        """End all connections."""
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(5.0)
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        self._loop.run_until_complete(self._open())
+        self._ready.set()
+        self._loop.run_forever()
+        for task in asyncio.all_tasks(self._loop):
+            task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            self._loop.run_until_complete(asyncio.sleep(0))
+        self._loop.close()
+
+    async def _open(self) -> None:
+        if self._udp:
+            await self._loop.create_datagram_endpoint(
+                lambda: _UdpSide(self), local_addr=("127.0.0.1", self._ports[0])
+            )
+        else:
+            await asyncio.start_server(self._accept, "127.0.0.1", self._ports[0], limit=CHUNK_BYTES)
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            far_reader, far_writer = await asyncio.open_connection("127.0.0.1", self._ports[1])
+        except OSError:
+            writer.close()
+            return
+        await asyncio.gather(
+            self._relay(reader, far_writer, self._up), self._relay(far_reader, writer, self._down)
+        )
+
+    async def _relay(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, pipe: _Pipe
+    ) -> None:
+        waiting: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue()
+        task = self._loop.create_task(self._deliver(waiting, writer))
+        self._tasks.add(task)
+        latest = 0.0
+        with contextlib.suppress(OSError):
+            while data := await reader.read(CHUNK_BYTES):
+                now = time.monotonic()
+                out = pipe.send(len(data), now, stream=True)
+                latest = max(latest, out or 0.0)  # a stream keeps its order
+                waiting.put_nowait((latest, data))
+                excess = pipe.backlog_bytes(now) - QUEUE_BYTES
+                if excess > 0:
+                    await asyncio.sleep(excess / (self._model.rate_kbit_s * 125))
+        waiting.put_nowait((latest, b""))
+
+    async def _deliver(
+        self, waiting: asyncio.Queue[tuple[float, bytes]], writer: asyncio.StreamWriter
+    ) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                at, data = await waiting.get()
+                await asyncio.sleep(max(0.0, at - time.monotonic()))
+                if not data:
+                    break
+                writer.write(data)
+                await writer.drain()
+        writer.close()
+
+
+class _UdpSide(asyncio.DatagramProtocol):
+    """The calling side's socket; opens a socket to the target for each caller."""
+
+    def __init__(self, emulator: LinkEmulator) -> None:
+        self._emulator = emulator
+        self._far: dict[tuple[str, int], asyncio.DatagramTransport] = {}
+        self.transport: asyncio.DatagramTransport | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.DatagramTransport)
+        self.transport = transport
+
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        emulator = self._emulator
+        at = emulator._up.send(len(data), time.monotonic(), stream=False)
+        if at is None:
+            return
+        task = emulator._loop.create_task(self._forward(at, data, addr))
+        emulator._tasks.add(task)
+        task.add_done_callback(emulator._tasks.discard)
+
+    async def _forward(self, at: float, data: bytes, addr: tuple[str, int]) -> None:
+        await asyncio.sleep(max(0.0, at - time.monotonic()))
+        if addr not in self._far:
+            transport, _ = await self._emulator._loop.create_datagram_endpoint(
+                lambda: _UdpBack(self._emulator, self, addr),
+                remote_addr=("127.0.0.1", self._emulator._ports[1]),
+            )
+            self._far[addr] = transport
+        self._far[addr].sendto(data)
+
+
+class _UdpBack(asyncio.DatagramProtocol):
+    """The way back to one caller."""
+
+    def __init__(self, emulator: LinkEmulator, near: _UdpSide, caller: tuple[str, int]) -> None:
+        self._emulator, self._near, self._caller = emulator, near, caller
+
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        at = self._emulator._down.send(len(data), time.monotonic(), stream=False)
+        if at is not None and self._near.transport is not None:
+            delay = max(0.0, at - time.monotonic())
+            self._emulator._loop.call_later(delay, self._near.transport.sendto, data, self._caller)
