@@ -1,0 +1,77 @@
+"""Which frames become views, and which views pair up."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.matching import Pyramid
+from recon.odometry import OdometryKeyframe, Tracked
+from recon.types import Camera, Frame, PosePrior
+from service.config import ScanConfig
+from service.viewpoints import Viewpoint, Viewpoints, frames_apart
+
+CAMERA = Camera(np.eye(3), np.zeros(5), (32, 32))
+
+
+def offer(views: Viewpoints, seq: int, x_m: float, state: str, segment: int = 0) -> Viewpoint | None:
+    T = se3.compose(np.eye(3), np.array([x_m, 0.0, 50.0]))
+    key = OdometryKeyframe(
+        seq, seq, segment, se3.inverse(T), np.eye(6), PosePrior(), Pyramid(()),
+        np.zeros((0, 2)), np.zeros(0, np.int64),
+    )  # fmt: skip
+    picture = np.zeros((32, 32, 3), np.uint8)
+    tracked = Tracked(state, segment, T, np.eye(6))
+    return views.offer(Frame(picture, seq, seq, CAMERA), picture, tracked, key, PosePrior())
+
+
+def test_automatic_takes_the_odometrys_keyframes() -> None:
+    views = Viewpoints(ScanConfig())
+    states = ["started", "tracked", "keyframe", "tracked", "keyframe"]
+    taken = [offer(views, i, float(i), s) is not None for i, s in enumerate(states)]
+    assert taken == [True, False, True, False, True]
+
+
+def test_partners_are_the_nearest_of_the_same_segment() -> None:
+    views = Viewpoints(ScanConfig(), partners=2)
+    offer(views, 0, 100.0, "started", segment=0)
+    kept = [offer(views, 1 + i, 5.0 * i, "keyframe", segment=1) for i in range(4)]
+    middle = kept[1]
+    assert middle is not None and views.ready(middle)
+    assert sorted(v.seq for v in views.partners(middle)) == [1, 3]
+    last = kept[3]
+    assert last is not None and not views.ready(last)
+
+
+@pytest.mark.parametrize(("baseline", "seqs"), [("2/10", [0, 10, 20, 30]), ("3/10", [0, 5, 10])])
+def test_the_papers_notation_takes_every_so_many_frames(baseline: str, seqs: list[int]) -> None:
+    views = Viewpoints(ScanConfig(baseline=baseline))
+    taken = [
+        i for i in range(31) if offer(views, i, 0.1 * i, "keyframe" if i == 0 else "tracked")
+    ]
+    assert taken[: len(seqs)] == seqs
+
+
+def test_a_baseline_in_metres_is_kept_and_may_change_in_flight() -> None:
+    views = Viewpoints(ScanConfig(baseline=2.0))
+    taken = [
+        i for i in range(20) if offer(views, i, 0.5 * i, "keyframe" if i == 0 else "tracked")
+    ]
+    assert taken == [0, 4, 8, 12, 16]
+    views.set_baseline(ScanConfig(baseline=1.0))
+    more = [i for i in range(20, 26) if offer(views, i, 0.5 * i, "tracked")]
+    assert more == [20, 22, 24]
+
+
+def test_the_operator_can_ask_for_the_next_frame() -> None:
+    views = Viewpoints(ScanConfig())
+    offer(views, 0, 0.0, "started")
+    assert offer(views, 1, 0.1, "tracked") is None
+    views.take_next()
+    assert offer(views, 2, 0.2, "tracked") is not None
+    assert offer(views, 3, 0.3, "tracked") is None
+
+
+def test_frames_apart() -> None:
+    assert frames_apart(2, 10) == 10 and frames_apart(1, 5) == 5 and frames_apart(6, 10) == 2
