@@ -63,7 +63,7 @@ class KeyframeReport:
 
 
 class CameraComponent:
-    """The camera's messages, shots and series. Time is the ``now_ns`` it was ticked with."""
+    """The camera's messages, shots and series. ``now`` is our time in ns."""
 
     def __init__(
         self,
@@ -72,13 +72,14 @@ class CameraComponent:
         outbox: Outbox,
         streams: Streams,
         boot_ms: Callable[[], int],
+        now: Callable[[], int],
     ) -> None:
         self.config = config
         self._control = control
         self._outbox = outbox
         self._streams = streams
         self._boot_ms = boot_ms
-        self._now_ns = 0
+        self._now = now
         self._count = 0
         self._kept: deque[tuple[int, object]] = deque(maxlen=KEPT)
         self._shots: deque[tuple[Address, float]] = deque(maxlen=64)
@@ -105,7 +106,7 @@ class CameraComponent:
         """Ask for one keyframe; the picture is reported when it is there."""
         handled = self._control.capture_keyframe()
         if isinstance(handled, Work) or handled.result is Result.ACCEPTED:
-            self._waiting.append(self._now_ns + SHOT_TIMEOUT_NS)
+            self._waiting.append(self._now() + SHOT_TIMEOUT_NS)
             self.send_capture_status()
         return handled
 
@@ -115,7 +116,7 @@ class CameraComponent:
         if isinstance(first, Answer) and first.result is not Result.ACCEPTED:
             return first
         self._series = (interval_s, count - 1 if count else 0) if count != 1 else None
-        self._next_shot_ns = self._now_ns + round(interval_s * S)
+        self._next_shot_ns = self._now() + round(interval_s * S)
         return ACCEPTED
 
     def stop_shooting(self) -> None:
@@ -144,7 +145,6 @@ class CameraComponent:
 
     def tick(self, now_ns: int) -> None:
         """Take the next shot of a series; give up shots that never came."""
-        self._now_ns = now_ns
         while self._waiting and now_ns >= self._waiting[0]:
             self._waiting.popleft()
             failed = self._image_captured(self._count, KeyframeReport(ok=False))

@@ -76,7 +76,12 @@ class Companion:
         self.texts = StatusTexts(self._outbox)
         self.parameters = Parameters(self._outbox, control.parameter_changed, kept_parameters)
         self.camera = CameraComponent(
-            config.camera, control, self._outbox, self.streams, self._boot_ms
+            config.camera,
+            control,
+            self._outbox,
+            self.streams,
+            self._boot_ms,
+            lambda: self._now_ns,
         )
         self.desk = CommandDesk(load_commands(), self._outbox, self, self._warn)
         self.streams.add(ONBOARD, LOAD_STATUS, round(config.load_every_s * 1e6), self._send_load)

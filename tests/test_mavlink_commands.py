@@ -1,0 +1,649 @@
+"""Every command and every result, two ends joined in memory: no socket, no clock."""
+
+from __future__ import annotations
+
+import math
+import random
+import struct
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from mavlink.camera import CameraConfig, KeyframeReport
+from mavlink.commands import COMMANDS, load_commands
+from mavlink.companion import Companion, CompanionConfig
+from mavlink.control import Answer, Phase, Result, Work
+from mavlink.framing import Framer
+from mavlink.history import VehicleHistory
+from mavlink.packer import Packer
+from mavlink.parameters import PARAMETERS
+from mavlink.presence import Health, Presence, PresenceConfig
+from mavlink.rehearsal import RehearsalControl
+from mavlink.wire import COMMAND_CANCEL, dialect, x25crc
+
+S = 1_000_000_000
+MS = 1_000_000
+STATION = (255, 190)
+NAN = math.nan
+ACCEPTED, BUSY, DENIED, UNSUPPORTED, FAILED, RUNNING, CANCELLED = range(7)
+
+
+class Ends:
+    """Our companion on one side, pymavlink as ground station and autopilot on the other."""
+
+    def __init__(self, camera: CameraConfig | None = None) -> None:
+        self.now_ns = 100 * S
+        self.control = RehearsalControl()
+        self.presence = Presence(PresenceConfig(), 77, self.now_ns)
+        self.history = VehicleHistory()
+        config = CompanionConfig(camera=camera or CameraConfig(), motion_every_s=1000.0)
+        self.companion = Companion(config, self.control, self.presence, self.history, self.now_ns)
+        self.packer = Packer(0)
+        self.ears = dialect.MAVLink(None)
+        self.ears.robust_parsing = True
+        self.mouths: dict[tuple[int, int], Any] = {}
+        self.heard: list[Any] = []
+        self.framer = Framer()
+        self.hear()
+
+    def pass_time(self, seconds: float, step: float = 0.05) -> list[Any]:
+        """Let time go by; what the companion sent meanwhile."""
+        start = len(self.heard)
+        for _ in range(max(1, round(seconds / step))):
+            self.now_ns += round(step * S)
+            self.companion.tick(self.now_ns)
+            self.hear()
+        return self.heard[start:]
+
+    def hear(self) -> None:
+        for outgoing in self.companion.take():
+            data = self.packer.pack(self.presence.system, outgoing, 0)
+            assert data is not None, outgoing.message
+            self.heard += self.ears.parse_buffer(data) or []
+
+    def say(self, message: Any, source: tuple[int, int] = STATION, link: int = 0) -> list[Any]:
+        """Send a message to the companion; its answers."""
+        mouth = self.mouths.setdefault(source, dialect.MAVLink(None, *source))
+        return self.say_bytes(bytes(message.pack(mouth)), link)
+
+    def say_bytes(self, data: bytes, link: int = 0) -> list[Any]:
+        start = len(self.heard)
+        for packet in self.framer.feed(data):
+            self.companion.receive(link, packet, self.now_ns)
+        self.companion.tick(self.now_ns)
+        self.hear()
+        return self.heard[start:]
+
+    def command(
+        self,
+        number: int,
+        component: int,
+        *params: float,
+        source: tuple[int, int] = STATION,
+        system: int = 1,
+        confirmation: int = 0,
+        as_int: bool = False,
+    ) -> list[int]:
+        """Send a command; the results acknowledged, in order."""
+        p = [*params, *[0.0] * (7 - len(params))]
+        if as_int:
+            x, y = (0x7FFFFFFF if math.isnan(v) else int(v) for v in p[4:6])
+            message = dialect.MAVLink_command_int_message(
+                system, component, 0, number, 0, 0, *p[:4], x, y, p[6]
+            )
+        else:
+            message = dialect.MAVLink_command_long_message(
+                system, component, number, confirmation, *p
+            )
+        answers = self.say(message, source)
+        acks = [m for m in answers if m.get_type() == "COMMAND_ACK" and m.command == number]
+        for ack in acks:
+            assert (ack.target_system, ack.target_component) == source
+            if component:
+                assert ack.get_srcComponent() == component
+            assert ack.get_srcSystem() == self.presence.system
+        return [ack.result for ack in acks]
+
+    def arm(self, armed: bool = True, system: int = 1) -> None:
+        beat = dialect.MAVLink_heartbeat_message(2, 3, 128 if armed else 0, 0, 4, 3)
+        self.say(beat, (system, 1))
+
+    def texts(self) -> list[str]:
+        return [m.text for m in self.heard if m.get_type() == "STATUSTEXT"]
+
+
+def kinds(messages: Iterable[Any]) -> list[str]:
+    return [m.get_type() for m in messages]
+
+
+@pytest.fixture
+def ends() -> Ends:
+    return Ends()
+
+
+# The table
+
+
+def test_every_line_of_the_table_keeps_the_contract() -> None:
+    table = load_commands()
+    assert len(set(table)) == len(table) >= len(COMMANDS)
+    for number, module in table.items():
+        assert number in module.NUMBERS
+        assert module.COMPONENTS and not module.COMPONENTS - {100, 191}
+        assert module.WINDOW_S >= 0.0
+        assert module.__doc__ and callable(module.handle)
+
+
+@pytest.mark.parametrize("number", sorted(load_commands()))
+def test_no_command_falls_over_any_parameters(number: int) -> None:
+    ends = Ends()
+    values = [NAN, math.inf, -math.inf, 0.0, -1.0, 1.0, 2.0, 7.5, 1e30, -1e30, 3.4e38]
+    rng = random.Random(number)
+    for _ in range(60):
+        params = [rng.choice(values) for _ in range(7)]
+        component = rng.choice([100, 191])
+        results = ends.command(number, component, *params)
+        assert len(results) >= 1 and results[-1] in (0, 1, 2, 3)
+        ends.pass_time(rng.choice([0.1, 4.0]), 1.0)
+
+
+# Scanning
+
+
+@pytest.mark.parametrize("as_int", [False, True])
+def test_start_and_stop(ends: Ends, as_int: bool) -> None:
+    assert ends.command(2500, 100, as_int=as_int) == [ACCEPTED]
+    assert ends.control.state.phase is Phase.SCANNING
+    status = [m for m in ends.heard if m.get_type() == "CAMERA_CAPTURE_STATUS"][-1]
+    assert status.video_status == 1
+    assert ends.command(2501, 100, as_int=as_int) == [ACCEPTED]
+    assert ends.control.asked == ["start_scan", "stop_scan"]
+    status = [m for m in ends.heard if m.get_type() == "CAMERA_CAPTURE_STATUS"][-1]
+    assert status.video_status == 0
+
+
+def test_starting_twice_is_one_start_and_stop_without_start_is_fine(ends: Ends) -> None:
+    assert ends.command(2501, 100) == [ACCEPTED]
+    assert ends.control.asked == []
+    assert ends.command(2500, 100) == [ACCEPTED]
+    ends.pass_time(5.0)
+    assert ends.command(2500, 100) == [ACCEPTED]
+    assert ends.control.asked == ["start_scan"]
+
+
+def test_start_stop_start_within_the_window_starts_again(ends: Ends) -> None:
+    for number in (2500, 2501, 2500):
+        assert ends.command(number, 100) == [ACCEPTED]
+    assert ends.control.asked == ["start_scan", "stop_scan", "start_scan"]
+
+
+def test_start_waits_for_the_last_scan_and_passes_on_refusals(ends: Ends) -> None:
+    ends.control.state = replace(ends.control.state, phase=Phase.FINALISING)
+    assert ends.command(2500, 100) == [BUSY]
+    assert any("still being written" in text for text in ends.texts())
+    ends.control.state = replace(ends.control.state, phase=Phase.IDLE)
+    for result in (Result.DENIED, Result.FAILED, Result.TEMPORARILY_REJECTED):
+        ends.pass_time(5.0)
+        ends.control.answers["start_scan"] = Answer(result, f"no camera {result}")
+        assert ends.command(2500, 100) == [int(result)]
+        assert ends.control.state.phase is Phase.IDLE
+    assert any("no camera" in text for text in ends.texts())
+
+
+def test_recording_status_is_streamed_at_the_rate_asked_for(ends: Ends) -> None:
+    ends.command(2500, 100, 0, 2.0)
+    heard = kinds(ends.pass_time(5.0)).count("CAMERA_CAPTURE_STATUS")
+    assert 9 <= heard <= 11
+    ends.command(2501, 100)
+    assert "CAMERA_CAPTURE_STATUS" not in kinds(ends.pass_time(3.0))
+
+
+def test_old_control_video_is_an_alias(ends: Ends) -> None:
+    assert ends.command(200, 100, 0, 0, 0, 1) == [ACCEPTED]
+    assert ends.command(200, 100, 0, 0, 0, 0) == [ACCEPTED]
+    assert ends.control.asked == ["start_scan", "stop_scan"]
+    assert ends.command(200, 100, 0, 0, 0, 9) == [DENIED]
+    assert ends.command(200, 100, 0, 0, 0, NAN) == [DENIED]
+
+
+# Keyframes
+
+
+def shot(ends: Ends) -> list[Any]:
+    ends.companion.report(KeyframeReport(1_700_000_000_000_000, 47.3, 8.5, 512.25, 80.5))
+    start = len(ends.heard)
+    ends.hear()
+    return ends.heard[start:]
+
+
+def test_one_photo_from_button_to_report(ends: Ends) -> None:
+    assert ends.command(2000, 100, 0, 0, 1) == [ACCEPTED]
+    before = [m for m in ends.heard if m.get_type() == "CAMERA_CAPTURE_STATUS"][-1]
+    assert before.image_status == 1
+    captured, after = shot(ends)
+    assert captured.get_type() == "CAMERA_IMAGE_CAPTURED" and captured.capture_result == 1
+    assert (captured.lat, captured.lon) == (473000000, 85000000)
+    assert (captured.alt, captured.relative_alt, captured.image_index) == (512250, 80500, 0)
+    assert captured.time_utc == 1_700_000_000_000_000
+    assert after.image_status == 0 and after.image_count == 1
+
+
+def test_a_numbered_shot_is_taken_once_however_often_it_comes(ends: Ends) -> None:
+    for k in range(4):  # MAVSDK repeats with confirmation 0 every half second
+        assert ends.command(2000, 100, 0, 0, 1, 17, confirmation=k) == [ACCEPTED]
+        ends.pass_time(0.5)
+    assert ends.control.asked == ["capture_keyframe"]
+    assert ends.command(2000, 100, 0, 0, 1, 18) == [ACCEPTED]
+    assert ends.control.asked == ["capture_keyframe"] * 2
+
+
+def test_an_unnumbered_shot_heard_on_two_links_is_one(ends: Ends) -> None:
+    message = dialect.MAVLink_command_long_message(0, 0, 203, 0, 0, 0, 0, 0, 1, 0, 0)
+    for link in (0, 1):
+        answers = ends.say(message, (1, 1), link)
+        assert "COMMAND_ACK" in kinds(answers)
+    assert ends.control.asked == ["capture_keyframe"]
+    ends.pass_time(1.0)
+    ends.say(message, (1, 1))
+    assert ends.control.asked == ["capture_keyframe"] * 2
+
+
+def test_digicam_without_a_shot_is_not_ours(ends: Ends) -> None:
+    assert ends.command(203, 100, 0, 0, 0, 0, 0) == [UNSUPPORTED]
+    assert ends.command(203, 100, 0, 0, 0, 0, 1) == [ACCEPTED]
+
+
+def test_a_series_counts_down_and_can_be_stopped(ends: Ends) -> None:
+    assert ends.command(2000, 100, 0, 1.0, 3) == [ACCEPTED]
+    ends.pass_time(5.0)
+    assert ends.control.asked == ["capture_keyframe"] * 3
+    assert ends.command(2000, 100, 0, 0.5, 0) == [ACCEPTED]
+    status = [m for m in ends.heard if m.get_type() == "CAMERA_CAPTURE_STATUS"][-1]
+    assert ends.companion.camera.message(262, 0) is not None
+    ends.pass_time(2.0)
+    assert ends.command(2001, 100) == [ACCEPTED]
+    assert ends.control.asked.count("capture_keyframe") in (7, 8)
+    ends.pass_time(3.0)
+    assert ends.control.asked.count("capture_keyframe") in (7, 8)
+    status = [m for m in ends.heard if m.get_type() == "CAMERA_CAPTURE_STATUS"][-1]
+    assert status.image_interval == 0.0
+
+
+@pytest.mark.parametrize("params", [(0, -1, 5), (0, 1e9, 5), (0, 1, -2), (0, 1, 1e9), (0, 0.01, 5)])
+def test_a_senseless_series_is_denied(ends: Ends, params: tuple[float, ...]) -> None:
+    assert ends.command(2000, 100, *params) == [DENIED]
+    assert ends.control.asked == []
+
+
+def test_a_shot_that_never_comes_is_reported_as_failed(ends: Ends) -> None:
+    ends.command(2000, 100, 0, 0, 1)
+    heard = ends.pass_time(11.0)
+    failed = [m for m in heard if m.get_type() == "CAMERA_IMAGE_CAPTURED"]
+    assert [m.capture_result for m in failed] == [0]
+    status = [m for m in heard if m.get_type() == "CAMERA_CAPTURE_STATUS"][-1]
+    assert status.image_status == 0
+
+
+def test_photos_are_passed_on_refusals_too(ends: Ends) -> None:
+    ends.control.answers["capture_keyframe"] = Answer(Result.TEMPORARILY_REJECTED, "no frames")
+    assert ends.command(2000, 100, 0, 0, 1) == [BUSY]
+    assert ends.command(2000, 100, 0, 2.0, 5) == [BUSY]
+    ends.pass_time(5.0)
+    assert ends.control.asked == ["capture_keyframe"] * 2
+
+
+def test_captured_keyframes_can_be_asked_for_again(ends: Ends) -> None:
+    for _ in range(3):
+        shot(ends)
+    answers = ends.say(dialect.MAVLink_command_long_message(1, 100, 512, 0, 263, 1, 0, 0, 0, 0, 0))
+    assert [m.image_index for m in answers if m.get_type() == "CAMERA_IMAGE_CAPTURED"] == [1]
+    assert ends.command(512, 100, 263, 99) == [UNSUPPORTED]
+
+
+# Baseline and the onboard computer
+
+
+@pytest.mark.parametrize("component", [100, 191])
+def test_baseline(ends: Ends, component: int) -> None:
+    assert ends.command(206, component, 2.5) == [ACCEPTED]
+    assert ends.companion.parameters["SR_BASELINE_M"] == 2.5
+    assert ends.command(206, component, 0) == [ACCEPTED]
+    assert ends.companion.parameters["SR_BASELINE_M"] == 0.0
+    for bad in (-1.0, 1e6):
+        assert ends.command(206, component, bad) == [DENIED]
+    assert ends.companion.parameters["SR_BASELINE_M"] == 0.0
+    assert ends.command(206, component, 3.0, 0, 1) == [ACCEPTED]
+    assert ends.control.asked[-1] == "capture_keyframe"
+
+
+def test_user_actions(ends: Ends) -> None:
+    assert ends.command(31010, 191, 1) == [BUSY]  # pause without a scan
+    assert ends.command(31010, 191, 2) == [BUSY]
+    assert ends.command(31010, 191, 7) == [ACCEPTED]
+    assert ends.command(31010, 191, 1) == [ACCEPTED]
+    assert ends.command(31010, 191, 2) == [ACCEPTED]
+    assert ends.control.asked == ["start_scan", "pause", "resume"]
+    assert ends.command(31010, 191, 6) == [BUSY]  # no self-test while scanning
+    assert ends.command(31010, 191, 3) == [ACCEPTED]
+    assert ends.command(31010, 191, 4, 1.5) == [ACCEPTED]
+    assert ends.companion.parameters["SR_BASELINE_M"] == 1.5
+    assert ends.command(31010, 191, 8) == [ACCEPTED]
+    assert ends.command(31010, 191, 6) == [ACCEPTED]
+    assert ends.command(31010, 191, 5) == [ACCEPTED]
+    for bad in (0, 9, 1.5, -3, NAN):
+        assert ends.command(31010, 191, bad) == [DENIED]
+    assert ends.command(31010, 100, 1) == [UNSUPPORTED]
+
+
+@pytest.mark.parametrize(
+    ("params", "asked"),
+    [((0, 1), "reboot"), ((0, 2), "shut down"), ((0, 0, 1, 191), "restart service")],
+)
+def test_power_is_refused_while_armed(ends: Ends, params: tuple[float, ...], asked: str) -> None:
+    ends.arm()
+    assert ends.command(246, 191, *params) == [BUSY]
+    assert ends.control.asked == []
+    assert any("while armed" in text for text in ends.texts())
+    ends.arm(False)
+    ends.pass_time(4.0)
+    assert ends.command(246, 191, *params) == [ACCEPTED]
+    assert ends.control.asked == [f"power: {asked}"]
+
+
+def test_a_reboot_of_the_autopilot_is_not_ours(ends: Ends) -> None:
+    assert ends.command(246, 191, 1) == [DENIED]
+    assert ends.command(246, 0, 1) == []
+    assert ends.control.asked == []
+
+
+def test_erase(ends: Ends) -> None:
+    shot(ends)
+    assert ends.command(526, 100, 1, 0) == [DENIED]
+    assert ends.command(526, 100, 5, 1) == [DENIED]
+    ends.command(2500, 100)
+    assert ends.command(526, 100, 1, 1) == [BUSY]
+    assert any("refused while scanning" in text for text in ends.texts())
+    ends.command(2501, 100)
+    assert ends.command(526, 100, 1, 1, 1) == [ACCEPTED]
+    assert ends.control.asked == ["start_scan", "stop_scan", "erase_scans"]
+    status = ends.companion.camera.message(262, 0)
+    assert isinstance(status, dialect.MAVLink_message) and status.image_count == 0
+
+
+def test_reset_of_the_settings(ends: Ends) -> None:
+    ends.companion.parameters.change("SR_BASELINE_M", 4.0)
+    assert ends.command(529, 100, 0) == [DENIED]
+    ends.command(2500, 100)
+    assert ends.command(529, 100, 1) == [BUSY]
+    ends.command(2501, 100)
+    assert ends.command(529, 100, 1) == [ACCEPTED]
+    assert ends.companion.parameters["SR_BASELINE_M"] == 0.0
+
+
+# Work that takes a while
+
+
+def test_work_reports_progress_and_ends(ends: Ends) -> None:
+    work = ends.control.works["finalise"] = Work()
+    assert ends.command(31010, 191, 5) == [RUNNING]
+    work.report(0.4)
+    heard = [m for m in ends.pass_time(1.1) if m.get_type() == "COMMAND_ACK"]
+    assert [(m.result, m.progress) for m in heard] == [(RUNNING, 40)] * 2
+    assert ends.command(31010, 191, 5) == [RUNNING]  # the same again: how it goes
+    assert ends.command(31010, 191, 6, source=(255, 191)) == [BUSY]  # another one
+    work.report(7.0)
+    work.finish()
+    work.finish(Answer(Result.FAILED))  # the first word stands
+    acks = [m for m in ends.pass_time(0.1) if m.get_type() == "COMMAND_ACK"]
+    assert [m.result for m in acks] == [ACCEPTED]
+    assert ends.control.asked == ["finalise"]
+    assert "COMMAND_ACK" not in kinds(ends.pass_time(5.0))
+
+
+def test_work_that_is_done_at_once_needs_no_progress(ends: Ends) -> None:
+    work = ends.control.works["self_test"] = Work()
+    work.finish(Answer(Result.FAILED, "Self-test: no camera"))
+    assert ends.command(31010, 191, 6) == [FAILED]
+    assert "Self-test: no camera" in ends.texts()
+
+
+def cancel_message(number: int, source: tuple[int, int] = STATION) -> bytes:
+    payload = struct.pack("<HBB", number, 1, 191)
+    head = bytes((0xFD, len(payload), 0, 0, 0, *source, COMMAND_CANCEL, 0, 0))
+    crc = x25crc(head[1:] + payload + bytes((14,))).crc
+    return head + payload + struct.pack("<H", crc)
+
+
+def test_work_can_be_cancelled(ends: Ends) -> None:
+    work = ends.control.works["finalise"] = Work()
+    ends.command(31010, 191, 5)
+    ends.say_bytes(cancel_message(2500))  # some other command
+    assert not work.cancelled
+    ends.say_bytes(cancel_message(31010))
+    assert work.cancelled
+    work.finish()
+    acks = [m for m in ends.pass_time(0.1) if m.get_type() == "COMMAND_ACK"]
+    assert [m.result for m in acks] == [CANCELLED]
+
+
+def test_work_without_end_fails(ends: Ends) -> None:
+    work = ends.control.works["finalise"] = Work()
+    ends.command(31010, 191, 5)
+    acks = [m for m in ends.pass_time(185.0, 1.0) if m.get_type() == "COMMAND_ACK"]
+    assert acks[-1].result == FAILED and work.cancelled
+
+
+# Questions
+
+
+@pytest.mark.parametrize(
+    ("number", "name"),
+    [
+        (259, "CAMERA_INFORMATION"),
+        (260, "CAMERA_SETTINGS"),
+        (261, "STORAGE_INFORMATION"),
+        (262, "CAMERA_CAPTURE_STATUS"),
+    ],
+)
+def test_camera_messages_on_request_old_and_new(ends: Ends, number: int, name: str) -> None:
+    legacy = {259: (521, 1), 260: (522, 1), 261: (525, 0, 1), 262: (527, 1)}[number]
+    for command, *params in ((512, number), legacy):
+        start = len(ends.heard)
+        assert ends.command(command, 100, *params) == [ACCEPTED]
+        assert name in kinds(ends.heard[start:])
+    start = len(ends.heard)
+    assert ends.command(512, 0, number) == [ACCEPTED]  # to all: the camera answers alone
+    assert name in kinds(ends.heard[start:])
+    assert ends.command(512, 191, number) == [UNSUPPORTED]
+
+
+def test_what_the_camera_says_of_itself(ends: Ends) -> None:
+    ends.command(512, 100, 259)
+    ends.command(512, 100, 261)
+    ends.command(512, 100, 260)
+    info = next(m for m in ends.heard if m.get_type() == "CAMERA_INFORMATION")
+    assert bytes(info.vendor_name).rstrip(b"\0") == b"skyrelief"
+    assert info.flags == 1 | 2 | 8 | 16
+    storage = next(m for m in ends.heard if m.get_type() == "STORAGE_INFORMATION")
+    assert (storage.total_capacity, storage.used_capacity) == (1000.0, 250.0)
+    assert storage.status == 2
+    settings = next(m for m in ends.heard if m.get_type() == "CAMERA_SETTINGS")
+    assert settings.mode_id == 1
+
+
+def test_a_video_stream_is_told_only_when_there_is_one(ends: Ends) -> None:
+    assert ends.command(512, 100, 269) == [UNSUPPORTED]
+    assert ends.command(2504, 100, 0) == [UNSUPPORTED]
+    with_stream = Ends(CameraConfig(stream_uri="rtsp://10.0.0.2/scan"))
+    for command, *params in ((512, 269), (2504, 0)):
+        assert with_stream.command(command, 100, *params) == [ACCEPTED]
+    stream = [m for m in with_stream.heard if m.get_type() == "VIDEO_STREAM_INFORMATION"]
+    assert [m.uri for m in stream] == ["rtsp://10.0.0.2/scan"] * 2
+    assert with_stream.command(512, 100, 270) == [ACCEPTED]
+    assert with_stream.command(2505, 100, 0) == [ACCEPTED]
+
+
+def test_a_legacy_question_for_nothing_sends_nothing(ends: Ends) -> None:
+    start = len(ends.heard)
+    assert ends.command(521, 100, 0) == [ACCEPTED]
+    assert kinds(ends.heard[start:]) == ["COMMAND_ACK"]
+
+
+def test_message_intervals(ends: Ends) -> None:
+    assert ends.command(511, 100, 262, 100_000) == [ACCEPTED]
+    assert 9 <= kinds(ends.pass_time(1.0)).count("CAMERA_CAPTURE_STATUS") <= 11
+    assert ends.command(510, 100, 262) == [ACCEPTED]
+    interval = [m for m in ends.heard if m.get_type() == "MESSAGE_INTERVAL"][-1]
+    assert (interval.message_id, interval.interval_us) == (262, 100_000)
+    assert ends.command(511, 100, 262, -1) == [ACCEPTED]
+    assert "CAMERA_CAPTURE_STATUS" not in kinds(ends.pass_time(1.0))
+    for params in ((262, 10), (262, 1e12)):
+        assert ends.command(511, 100, *params) == [DENIED]
+    assert ends.command(511, 100, 30, 1e5) == [UNSUPPORTED]
+    assert ends.command(511, 0, 262, 1e5) == []  # to all: not ours alone to take
+
+
+# Who is meant
+
+
+def test_unknown_commands_are_refused_at_once_and_only_by_the_one_asked(ends: Ends) -> None:
+    for component in (100, 191):
+        assert ends.command(400, component, 1) == [UNSUPPORTED]
+        assert ends.command(65535, component) == [UNSUPPORTED]
+    assert ends.command(400, 0, 1) == []
+    assert ends.command(530, 0, 0, 1) == []
+
+
+def test_commands_to_others_are_left_alone(ends: Ends) -> None:
+    assert ends.command(2500, 1) == []
+    assert ends.command(2500, 101) == []
+    assert ends.command(2500, 100, system=2) == []
+    assert ends.control.asked == []
+
+
+def test_broadcasts_of_the_autopilot_reach_the_camera(ends: Ends) -> None:
+    for system, component in ((0, 0), (1, 0), (0, 100)):
+        answers = ends.command(2500, component, system=system, source=(1, 1))
+        assert answers == [ACCEPTED]
+        ends.command(2501, component, system=system, source=(1, 1))
+    assert ends.control.asked == ["start_scan", "stop_scan"] * 3
+
+
+def test_retransmissions_are_answered_again_but_not_carried_out_again(ends: Ends) -> None:
+    ends.control.answers["clear_map"] = Answer(Result.FAILED, "no")
+    for _ in range(3):
+        assert ends.command(31010, 191, 3, NAN, NAN) == [FAILED]
+        ends.pass_time(0.5)
+    assert ends.control.asked == ["clear_map"]
+    assert ends.command(31010, 191, 3, NAN, NAN, source=(254, 1)) == [FAILED]
+    assert ends.control.asked == ["clear_map"] * 2  # another asker
+    ends.pass_time(4.0)
+    ends.command(31010, 191, 3, NAN, NAN)
+    assert ends.control.asked == ["clear_map"] * 3  # later: meant again
+
+
+def test_not_a_number_means_default(ends: Ends) -> None:
+    assert ends.command(2500, 100, *[NAN] * 7) == [ACCEPTED]
+    assert ends.command(2000, 100, *[NAN] * 7) == [ACCEPTED]
+    assert ends.control.asked == ["start_scan", "capture_keyframe"]
+    assert ends.command(206, 100, NAN, as_int=True) == [ACCEPTED]
+    assert ends.companion.parameters["SR_BASELINE_M"] == 0.0
+
+
+# Parameters
+
+
+def test_parameters_are_listed_read_set_and_refused(ends: Ends) -> None:
+    listed = ends.say(dialect.MAVLink_param_request_list_message(1, 0))
+    assert [m.param_id for m in listed] == [p.name for p in PARAMETERS]
+    assert {m.param_count for m in listed} == {len(PARAMETERS)}
+    assert {m.param_type for m in listed} == {9}
+    for by_name, by_index in ((b"SR_LINK_KBIT_S", -1), (b"", 2)):
+        message = dialect.MAVLink_param_request_read_message(1, 191, by_name, by_index)
+        (value,) = ends.say(message)
+        assert (value.param_id, value.param_value) == ("SR_LINK_KBIT_S", 1000.0)
+    for name, index in ((b"NONE", -1), (b"", 99), (b"", -2)):
+        assert ends.say(dialect.MAVLink_param_request_read_message(1, 191, name, index)) == []
+
+    def put(name: bytes, value: float) -> list[Any]:
+        return ends.say(dialect.MAVLink_param_set_message(1, 191, name, value, 9))
+
+    (value,) = put(b"SR_BASELINE_M", 2.5)
+    assert value.param_value == 2.5 and ends.control.asked == ["SR_BASELINE_M=2.5"]
+    for bad in (-1.0, 1e9, NAN, math.inf):
+        answers = put(b"SR_BASELINE_M", bad)
+        assert [m.param_value for m in answers if m.get_type() == "PARAM_VALUE"] == [2.5]
+    assert any("SR_BASELINE_M refused" in text for text in ends.texts())
+    assert [m.param_value for m in put(b"SR_YAW_FRAME", 1.5) if hasattr(m, "param_value")] == [0]
+    ends.control.answers["SR_LINK_KBIT_S"] = Answer(Result.DENIED, "not now")
+    answers = put(b"SR_LINK_KBIT_S", 500.0)
+    assert [m.param_value for m in answers if hasattr(m, "param_value")] == [1000.0]
+    assert put(b"UNKNOWN", 1.0) == [] or "no parameter UNKNOWN" in ends.texts()
+    assert ends.say(dialect.MAVLink_param_set_message(2, 191, b"SR_BASELINE_M", 9.0, 9)) == []
+    assert ends.say(dialect.MAVLink_param_set_message(1, 1, b"SR_BASELINE_M", 9.0, 9)) == []
+    assert ends.companion.parameters["SR_BASELINE_M"] == 2.5
+
+
+# What the operator is told
+
+
+def test_texts_are_spaced_and_not_repeated(ends: Ends) -> None:
+    for k in range(10):
+        ends.companion.say(4, f"text {k % 5}")
+    heard = ends.pass_time(1.0)
+    assert len(ends.texts()) in (3, 4)
+    ends.pass_time(10.0)
+    assert sorted(ends.texts()) == [f"text {k}" for k in range(5)]
+    ends.companion.say(4, "text 1")
+    ends.pass_time(1.0)
+    assert len(ends.texts()) == 5
+    ends.pass_time(40.0, 1.0)
+    ends.companion.say(4, "text 1")
+    ends.pass_time(1.0)
+    assert len(ends.texts()) == 6 and heard is not None
+
+
+def test_a_long_text_comes_in_chunks(ends: Ends) -> None:
+    text = "".join(chr(65 + k % 26) for k in range(120))
+    ends.companion.say(4, text)
+    ends.pass_time(0.1)
+    chunks = [m for m in ends.heard if m.get_type() == "STATUSTEXT"]
+    assert "".join(m.text for m in chunks) == text
+    assert [m.chunk_seq for m in chunks] == [0, 1, 2] and chunks[0].id > 0
+    assert len({m.id for m in chunks}) == 1
+
+
+def test_speed_and_distance_without_gps_are_told() -> None:
+    ends = Ends()
+    ends.companion.streams.set_interval(191, 251, 1_000_000)
+    ends.control.state = replace(
+        ends.control.state, speed_m_s=5.5, distance_m=120.0, turn_rate_rad_s=math.nan
+    )
+    named = [m for m in ends.pass_time(1.5) if m.get_type() == "NAMED_VALUE_FLOAT"]
+    assert {m.name: m.value for m in named} == {"SR_SPEED": 5.5, "SR_DIST": 120.0}
+
+
+def test_health_is_confirmed_or_it_is_not_told() -> None:
+    presence = Presence(PresenceConfig(stale_s=5, dead_s=20, boot_s=60), 1, 0)
+    first = presence.due(0)
+    assert [o.component for o in first] == [191, 100]
+    assert [o.message.type for o in first] == [18, 30]
+    assert all(o.message.system_status == 1 and o.message.autopilot == 8 for o in first)
+    assert presence.due(int(0.5 * S)) == [] and len(presence.due(S)) == 2
+    presence.confirm(Health.ACTIVE, 2 * S)
+    assert presence.due(2 * S)[0].message.system_status == 4
+    assert presence.due(8 * S)[0].message.system_status == 5  # nobody confirmed it
+    assert presence.due(23 * S) == []  # dead: silent
+    presence.confirm(Health.STANDBY, 24 * S)
+    assert presence.due(24 * S)[0].message.system_status == 3
+    assert Presence(PresenceConfig(boot_s=60), 1, 0).due(61 * S) == []
+
+
+def test_the_heartbeat_keeps_its_beat_when_called_a_little_late() -> None:
+    presence = Presence(PresenceConfig(boot_s=1000), 1, 0)
+    sent = [t for t in range(0, 20 * S, 7 * MS) if presence.due(t)]
+    assert len(sent) == 20
+    assert all(0.98 * S < b - a < 1.02 * S for a, b in pairwise(sent))
