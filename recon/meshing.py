@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -59,22 +58,6 @@ def height_mesh(raster: Raster, largest_faces: int = 400_000) -> Mesh:
     if len(faces) > largest_faces:
         vertices, faces = _simplified(vertices, faces, largest_faces)
     return Mesh(vertices, faces, _planar_uv(vertices, raster))
-
-
-def smoothed(raster: Raster, sigma_cells: float = 1.0) -> Raster:
-    """``raster`` with noise taken out of its heights and steps kept (bilateral filter).
-
-    The filter's tolerance in height is three times the median sigma of the cells.
-    """
-    known = raster.known
-    if not known.any():
-        return raster
-    tolerance = 3.0 * float(np.median(raster.sigma_m[known]))
-    middle = float(np.median(raster.height_m[known]))
-    filled = np.where(known, raster.height_m - middle, 1e6).astype(np.float32)
-    smooth = cv2.bilateralFilter(filled, -1, max(tolerance, 1e-3), sigma_cells)
-    height = np.where(known, smooth + middle, np.nan).astype(np.float32)
-    return Raster(raster.grid, height, raster.sigma_m, raster.rgb)
 
 
 def poisson_mesh(

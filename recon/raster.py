@@ -191,6 +191,26 @@ def _normalised_blur(layers: F32, known: Bool, largest_cells: int) -> tuple[F32,
     return out, reached
 
 
+def smoothed(raster: Raster, sigma_cells: float = 1.5) -> Raster:
+    """``raster`` with noise taken out of its heights and steps kept.
+
+    A median over 5x5 cells, which also joins surfaces of two keyframes that interleave, then
+    a bilateral filter whose tolerance in height is 1.5 times the median sigma of the cells.
+    """
+    known = raster.known
+    if not known.any():
+        return raster
+    far = np.float32(1e6)
+    tolerance = max(1.5 * float(np.median(raster.sigma_m[known])), 1e-3)
+    middle = np.float32(np.median(raster.height_m[known]))
+    height = np.where(known, raster.height_m - middle, far).astype(np.float32)
+    median = cv2.medianBlur(height, 5)
+    height = np.where(known & (median < 0.5 * far), median, height).astype(np.float32)
+    smooth = cv2.bilateralFilter(height, -1, tolerance, sigma_cells)
+    out = np.where(known, smooth + middle, np.float32(np.nan)).astype(np.float32)
+    return Raster(raster.grid, out, raster.sigma_m, raster.rgb)
+
+
 def hillshade(
     height_m: F32, cell_m: float, azimuth_deg: float = 315.0, elevation_deg: float = 45.0
 ) -> F32:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from recon.raster import Grid, Raster, fill_holes, hillshade
+from recon.raster import Grid, Raster, fill_holes, hillshade, smoothed
 from recon.types import F32, F64, U8, Bool
 
 BACKGROUND = (250, 248, 246)  # BGR
@@ -27,6 +27,7 @@ def draw_preview(raster: Raster, track_m: F64, lines: Sequence[str], largest_px:
     """(h, w, 3) BGR picture of ``raster`` with the (N, 2 or 3) track in the raster's frame.
 
     Each panel's longer side is at most ``largest_px``; ``lines`` are the key figures.
+    ``height_of_zero_m`` is added to the heights written.
     """
     shown = fill_holes(raster)
     shade = _relief(shown)
@@ -37,7 +38,7 @@ def draw_preview(raster: Raster, track_m: F64, lines: Sequence[str], largest_px:
         _draw_track(panel, raster.grid, track_m, scale)
         _draw_scale_bar(panel, raster.grid.cell_m / scale)
         _draw_north(panel)
-    _draw_height_legend(height, shown)
+    _draw_height_legend(height, shown, height_of_zero_m)
     h, w = colour.shape[:2]
     stacked = w > 1.3 * h
     gap = np.full((MARGIN, w, 3) if stacked else (h, MARGIN, 3), BACKGROUND, np.uint8)
@@ -52,22 +53,17 @@ def blank_preview(lines: Sequence[str]) -> U8:
 
 def _relief(raster: Raster) -> F32:
     """Shading of the smoothed surface, about 1 on level ground; NaN where unknown."""
-    height = _smooth(raster.height_m, raster.known)
     level = math.sin(math.radians(45.0))
-    return np.asarray(hillshade(height, raster.grid.cell_m) / level, np.float32)
-
-
-def _smooth(height_m: F32, known: Bool) -> F32:
-    """Median of 3x3 cells: takes out single noisy cells and keeps steps."""
-    filled = np.where(known, height_m, np.float32(np.nanmedian(height_m)))
-    smooth = cv2.medianBlur(filled.astype(np.float32), 3)
-    return np.asarray(np.where(known, smooth, np.float32(np.nan)), np.float32)
+    shade = hillshade(smoothed(raster).height_m, raster.grid.cell_m)
+    return np.asarray(shade / level, np.float32)
 
 
 def _colour_panel(raster: Raster, shade: F32) -> U8:
     """Colour times shading, softened so that the picture stays readable."""
-    light = np.clip(0.45 + 0.55 * np.nan_to_num(shade, nan=1.0), 0.0, 1.35)
-    bgr = raster.rgb[..., ::-1] * light[..., None]
+    light = np.clip(0.6 + 0.4 * np.nan_to_num(shade, nan=1.0), 0.0, 1.25)
+    bright = float(np.percentile(raster.rgb[raster.known], 98)) if raster.known.any() else 255.0
+    gain = float(np.clip(230.0 / max(bright, 1.0), 1.0, 2.0))
+    bgr = gain * raster.rgb[..., ::-1] * light[..., None]
     return _on_background(np.clip(bgr, 0, 255).astype(np.float32), raster.known)
 
 
@@ -152,15 +148,15 @@ def _draw_north(panel: U8) -> None:
     _text(panel, "N", (x - 5, y + 42), 0.45)
 
 
-def _draw_height_legend(panel: U8, raster: Raster) -> None:
+def _draw_height_legend(panel: U8, raster: Raster, height_of_zero_m: float) -> None:
     """The colour scale with its two heights."""
     low, high = _height_range(raster)
     length = min(120, panel.shape[0] // 3)
     tones = np.linspace(255, 0, length).astype(np.uint8)[:, None].repeat(10, axis=1)
     bar = 0.25 * 255 + 0.75 * cv2.applyColorMap(tones, cv2.COLORMAP_VIRIDIS).astype(np.float32)
     panel[12 : 12 + length, 12:22] = bar.astype(np.uint8)
-    _text(panel, f"{high:.1f} m", (28, 22), 0.4)
-    _text(panel, f"{low:.1f} m", (28, 12 + length), 0.4)
+    _text(panel, f"{high + height_of_zero_m:.1f} m", (28, 22), 0.4)
+    _text(panel, f"{low + height_of_zero_m:.1f} m", (28, 12 + length), 0.4)
 
 
 def _text(image: U8, text: str, at: tuple[int, int], size: float) -> None:

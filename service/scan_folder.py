@@ -257,7 +257,8 @@ def _preview(raster: Raster | None, poses: Sequence[PoseRecord], summary: dict[s
         picture = blank_preview(lines)
     else:
         track = np.array([p.T_world_camera[:3, 3] for p in poses]).reshape(-1, 3)
-        picture = draw_preview(raster, track, lines)
+        zero = summary["origin"]["alt_amsl_m"] if summary["origin"] else 0.0
+        picture = draw_preview(raster, track, lines, height_of_zero_m=zero)
     ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])
     if not ok:
         raise OutsideError("preview.jpg: OpenCV cannot write JPEG on this machine")

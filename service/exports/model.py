@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from recon.cloud_fusion import cloud_of
-from recon.meshing import Mesh, height_mesh, poisson_mesh, smoothed
-from recon.raster import Raster, fill_holes
+from recon.meshing import Mesh, height_mesh, poisson_mesh
+from recon.raster import Raster, fill_holes, smoothed
 from recon.types import F64, U8
 from service.errors import InputError
 from service.exports.glb import glb
