@@ -41,7 +41,7 @@ def demo(
     try:
         _wait_until_listening(ground, endpoint, out)
         _replay(source, out, endpoint, set_ or [])
-        received = _wait_for_ground(out / "ground")
+        received = _wait_for_ground(ground, out)
     finally:
         _stop(ground)
     report = _figures(out, received, time.monotonic() - began)
@@ -89,13 +89,18 @@ def _skyrelief(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "service.cli", *arguments]
 
 
-def _start_ground(out: Path, endpoint: str) -> subprocess.Popen[bytes]:
-    command = _skyrelief("ground", "--store", str(out / "ground"), "--listen", endpoint)
+def _start_ground(out: Path, endpoint: str) -> subprocess.Popen[str]:
+    """A receiver that ends by itself when it holds a whole scan, with its report as JSON."""
+    command = _skyrelief(
+        "ground", "--store", str(out / "ground"), "--listen", endpoint, "--once", "--json"
+    )
     with (out / "ground.log").open("wb") as log:
-        return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        return subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True
+        )
 
 
-def _wait_until_listening(ground: subprocess.Popen[bytes], endpoint: str, out: Path) -> None:
+def _wait_until_listening(ground: subprocess.Popen[str], endpoint: str, out: Path) -> None:
     host, _, port = endpoint.partition("/")[2].partition(":")
     deadline = time.monotonic() + READY_S
     while time.monotonic() < deadline and ground.poll() is None:
@@ -126,20 +131,21 @@ def _replay(flight: Path, out: Path, endpoint: str, overrides: list[str]) -> Non
         raise OutsideError(f"the replay ended with exit code {code}; its message stands above")
 
 
-def _wait_for_ground(folder: Path) -> Path:
-    """The scan folder at the ground, once it is finished."""
-    deadline = time.monotonic() + DRAIN_S
-    while time.monotonic() < deadline:
-        for path in folder.rglob("scan.json"):
-            if _read(path).get("finished"):
-                return path.parent
-        time.sleep(0.2)
-    raise OutsideError(
-        f"the ground did not finish its scan within {DRAIN_S:.0f} s; see {folder.parent}/ground.log"
-    )
+def _wait_for_ground(ground: subprocess.Popen[str], out: Path) -> Path:
+    """The scan folder at the ground, once the receiver says that it is complete."""
+    try:
+        report, _ = ground.communicate(timeout=DRAIN_S)
+        (scan,) = json.loads(report.splitlines()[-1])["scans"]
+    except subprocess.TimeoutExpired as error:
+        raise OutsideError(
+            f"the ground was not complete {DRAIN_S:.0f} s after the replay; see {out}/ground.log"
+        ) from error
+    except (ValueError, IndexError, KeyError) as error:
+        raise OutsideError(f"the ground receiver failed; see {out}/ground.log") from error
+    return Path(scan["folder"])
 
 
-def _stop(process: subprocess.Popen[bytes]) -> None:
+def _stop(process: subprocess.Popen[str]) -> None:
     if process.poll() is not None:
         return
     process.send_signal(signal.SIGINT)

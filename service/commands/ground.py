@@ -68,9 +68,10 @@ def ground(
     print(f"ground station at {where}, scans in {store}", file=sys.stderr, flush=True)
     try:
         _watch(receiver, once, idle_exit_s)
+        entries = receiver.progress()
     finally:
         receiver.close()
-    _report(receiver, as_json)
+    _report(entries, receiver.dropped, as_json)
 
 
 def _watch(receiver: Receiver, once: bool, idle_exit_s: float | None) -> None:
@@ -92,10 +93,9 @@ def _watch(receiver: Receiver, once: bool, idle_exit_s: float | None) -> None:
                 print(_line(entry), file=sys.stderr)
 
 
-def _report(receiver: Receiver, as_json: bool) -> None:
-    entries = receiver.progress()
+def _report(entries: list[dict[str, Any]], dropped: int, as_json: bool) -> None:
     if as_json:
-        print(json.dumps({"scans": entries, "dropped": receiver.dropped}))
+        print(json.dumps({"scans": entries, "dropped": dropped}))
         return
     for entry in entries:
         print(f"{_line(entry)}; {entry['folder']}")

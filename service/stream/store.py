@@ -280,6 +280,8 @@ class ScanStore:
             first = self._next_id("reposes")
             rows = [(first + i, r.seq, r.revision, pack_repose(r)) for i, r in enumerate(reposes)]
             self._write([(sql, row) for row in rows])
+            for number, seq, revision, _ in rows:
+                self._enforce(number, seq, revision)
 
     def put_repose(self, number: int, data: bytes) -> bool:
         """Store a packed re-pose under the drone's number; False if it is no news."""
