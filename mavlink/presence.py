@@ -158,6 +158,8 @@ class Presence:
             return
         self._system = 1
         self._settled = True
+        self._autopilot = self._autopilot_seen_ns = None
+        self._armed = False
         names = ", ".join(map(str, sorted(self._candidates)))
         self._news.append(f"Several autopilots ({names}): using system 1, set mavlink.system")
 

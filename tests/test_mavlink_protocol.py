@@ -1,0 +1,604 @@
+"""Hostile bytes, clocks, identity and signing: nothing raises and the state stays right."""
+
+from __future__ import annotations
+
+import os
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mavlink.camera import KeyframeReport
+from mavlink.clock import BootClock, BootCounter, fit_boot
+from mavlink.companion import Companion, CompanionConfig
+from mavlink.decode import READERS, decode
+from mavlink.framing import Decoder, Framer, check_packet, packet_length
+from mavlink.history import VehicleHistory
+from mavlink.messages import Outgoing
+from mavlink.packer import Packer
+from mavlink.parameters import Parameter
+from mavlink.presence import Health, Presence, PresenceConfig
+from mavlink.rates import LOOK_NS, RateKeeper
+from mavlink.rehearsal import RehearsalControl
+from mavlink.samples import PositionSample, RangeSample, TerrainSample
+from mavlink.signing import Signing, read_key, timestamp_of
+from mavlink.timesync import TimesyncFilter
+from mavlink.wire import CRC_EXTRA, dialect, x25crc
+
+MS = 1_000_000
+S = 1_000_000_000
+KEY = bytes(range(32))
+AUTOPILOT = (1, 1)
+
+
+def packed(message: Any, source: tuple[int, int] = AUTOPILOT, seq: int = 0) -> bytes:
+    mouth = dialect.MAVLink(None, *source)
+    mouth.seq = seq
+    return bytes(message.pack(mouth))
+
+
+def beat(system: int = 1, token: int = 0, autopilot: int = 3, armed: bool = False) -> Any:
+    return dialect.MAVLink_heartbeat_message(2, autopilot, 128 if armed else 0, token, 4, 3)
+
+
+def attitude(boot_ms: int, roll: float = 0.0) -> Any:
+    return dialect.MAVLink_attitude_message(boot_ms, roll, 0.0, 0.0, 0, 0, 0)
+
+
+class Station:
+    """A companion with a clock of its own that the test moves."""
+
+    def __init__(self, system: int | None = None) -> None:
+        self.now_ns = 50 * S
+        self.control = RehearsalControl()
+        self.presence = Presence(PresenceConfig(system=system), 4711, self.now_ns)
+        self.history = VehicleHistory()
+        self.companion = Companion(
+            CompanionConfig(), self.control, self.presence, self.history, self.now_ns
+        )
+        self.framer = Framer()
+        self.sent: list[Outgoing] = []
+
+    def feed(self, data: bytes) -> None:
+        for packet in self.framer.feed(data):
+            self.companion.receive(0, packet, self.now_ns)
+
+    def wait(self, seconds: float) -> list[Outgoing]:
+        self.now_ns += round(seconds * S)
+        self.companion.tick(self.now_ns)
+        out = self.companion.take()
+        self.sent += out
+        return out
+
+    def texts(self) -> list[str]:
+        raw = [o.message.text for o in self.sent if o.message.get_type() == "STATUSTEXT"]
+        return [t.decode() if isinstance(t, bytes) else t for t in raw]
+
+
+# Framing
+
+
+def mixture(rng: random.Random, count: int) -> tuple[bytes, int]:
+    """Good packets of both versions with noise between them, and how many are good."""
+    data, good = bytearray(), 0
+    v1 = dialect.MAVLink(None, 9, 9)
+    for k in range(count):
+        message = attitude(k)
+        if rng.random() < 0.3:
+            data += bytes(message.pack(v1, force_mavlink1=True))
+        else:
+            data += packed(message, seq=k % 256)
+        good += 1
+        if rng.random() < 0.3:  # noise that cannot hide a packet start
+            data += bytes(rng.choice(range(0xFD)) for _ in range(rng.randrange(40)))
+    return bytes(data), good
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_packets_are_found_however_the_bytes_come(seed: int) -> None:
+    rng = random.Random(seed)
+    data, good = mixture(rng, 200)
+    whole = Framer()
+    assert len(whole.feed(data)) == good
+    pieces = Framer()
+    found, at = 0, 0
+    while at < len(data):
+        step = rng.randrange(1, 50)
+        found += len(pieces.feed(data[at : at + step]))
+        at += step
+    assert found == good and pieces.skipped_bytes == whole.skipped_bytes
+
+
+def test_a_damaged_packet_does_not_take_the_next_one_along() -> None:
+    first, second = bytearray(packed(attitude(1))), packed(attitude(2))
+    first[1] = 200  # claims to be longer than it is
+    framer = Framer()
+    found = framer.feed(bytes(first) + second * 30)
+    assert len(found) == 30 and framer.bad_checksums >= 1
+
+
+def test_every_single_bit_error_is_noticed() -> None:
+    packet = packed(attitude(12345, 0.5))
+    for i in range(len(packet)):
+        for bit in range(8):
+            damaged = bytearray(packet)
+            damaged[i] ^= 1 << bit
+            for got in Framer().feed(bytes(damaged)):
+                assert not got.known, (i, bit)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.binary(max_size=300), max_size=8))
+def test_any_bytes_are_survived(chunks: list[bytes]) -> None:
+    station = Station()
+    for chunk in chunks:
+        station.feed(chunk)
+        station.wait(0.1)
+    assert station.control.asked == []
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=300), st.integers(0, 300))
+def test_length_and_check_take_any_bytes(data: bytes, at: int) -> None:
+    length = packet_length(data, at)
+    assert length is None or 0 <= length <= 280
+    if length and at + length <= len(data):
+        check_packet(data[at : at + length])
+
+
+def with_any_payload(message_id: int, payload: bytes, source: tuple[int, int]) -> bytes:
+    head = bytes((0xFD, len(payload), 0, 0, 0, *source)) + message_id.to_bytes(3, "little")
+    body = head + payload
+    crc: int = x25crc(body[1:] + bytes((CRC_EXTRA[message_id],))).crc
+    return body + crc.to_bytes(2, "little")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_right_checksums_around_any_payload_of_any_message(seed: int) -> None:
+    """What a hostile or confused sender can do: every message, random content."""
+    rng = random.Random(seed)
+    station = Station()
+    station.feed(packed(beat()))
+    numbers = [n for n in dialect.mavlink_map if n not in (0, 76, 75)]
+    for _ in range(2):
+        for number in numbers:
+            payload = rng.randbytes(rng.choice([0, 1, 8, 40, 255]))
+            station.feed(with_any_payload(number, payload, rng.choice([(1, 1), (255, 190)])))
+        station.wait(1.0)
+        state = station.history.state_at(station.now_ns)
+        assert state is None or state.sources
+    assert station.framer.skipped_bytes == 0
+
+
+def test_unknown_messages_are_counted_and_left() -> None:
+    station = Station()
+    head = bytes((0xFD, 4, 0, 0, 0, 1, 1)) + (60_000).to_bytes(3, "little")
+    station.feed(head + b"abcd" + b"\0\0")
+    assert station.companion.counts["not understood"] == 1
+
+
+# Decoding
+
+
+def test_samples_make_sense_or_there_are_none() -> None:
+    def sample(message: Any) -> Any:
+        framer, decoder = Framer(), Decoder()
+        (packet,) = framer.feed(packed(message))
+        return decode(decoder.message(packet))
+
+    d = dialect
+    assert sample(attitude(1, float("nan"))) is None
+    assert sample(d.MAVLink_attitude_quaternion_message(1, 0, 0, 0, 0, 0, 0, 0)) is None
+    nowhere = d.MAVLink_global_position_int_message(1, 0, 0, 5, 5, 0, 0, 0, 0)
+    assert sample(nowhere) is None
+    off = d.MAVLink_global_position_int_message(1, 2**31 - 1, 0, 5, 5, 0, 0, 0, 0)
+    assert sample(off) is None
+    place = sample(
+        d.MAVLink_global_position_int_message(
+            9, 473000000, 85000000, 512250, 62250, 100, -200, 50, 0
+        )
+    )
+    assert isinstance(place, PositionSample)
+    assert place.alt_amsl_m == pytest.approx(512.25)
+    assert place.v_ned_m_s == pytest.approx((1.0, -2.0, 0.5))
+
+    def distance(cm: int, orientation: int = 25, quality: int = 0) -> Any:
+        return d.MAVLink_distance_sensor_message(
+            1, 20, 4000, cm, 0, 0, orientation, 0, 0, 0, [0, 0, 0, 0], quality
+        )
+
+    assert isinstance(sample(distance(1234)), RangeSample)
+    assert sample(distance(10)) is None and sample(distance(4000)) is None
+    assert sample(distance(1234, orientation=0)) is None
+    assert sample(distance(1234, quality=1)) is None
+    terrain = d.MAVLink_terrain_report_message(473000000, 85000000, 100, 450.0, 62.0, 0, 50)
+    assert isinstance(sample(terrain), TerrainSample)
+    unloaded = d.MAVLink_terrain_report_message(473000000, 85000000, 0, 0.0, 0.0, 0, 0)
+    assert sample(unloaded) is None
+    clear = d.MAVLink_altitude_message(5_000_000, 1, 2, 3, 4, 5, 30.0)
+    got = sample(clear)
+    assert isinstance(got, TerrainSample) and got.boot_ms == 5000.0
+    unknown = d.MAVLink_altitude_message(5_000_000, 1, 2, 3, 4, 5, float("nan"))
+    assert sample(unknown) is None
+    assert set(READERS) >= {"GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS"}
+
+
+# Who we are
+
+
+@pytest.mark.parametrize("system", [1, 7, 42])
+def test_we_take_the_id_of_the_one_autopilot(system: int) -> None:
+    station = Station()
+    assert station.presence.system == 1
+    station.feed(packed(beat(), (system, 1)))
+    assert station.presence.system == system
+    station.wait(4.0)
+    station.feed(packed(beat(), (99, 1)))  # another vehicle comes by later
+    station.feed(packed(beat(), (99, 1)))
+    assert station.presence.system == system and station.presence.autopilot == (system, 1)
+
+
+def test_two_autopilots_at_once_are_told_once_and_none_is_taken() -> None:
+    station = Station()
+    for _ in range(5):
+        for system in (5, 6):
+            station.feed(packed(beat(), (system, 1)))
+        station.wait(1.0)
+    assert station.presence.system == 1 and station.presence.autopilot is None
+    assert len([t for t in station.texts() if "Several autopilots" in t]) == 1
+
+
+def test_a_system_that_was_given_stands() -> None:
+    station = Station(system=12)
+    station.feed(packed(beat(), (5, 1)))
+    assert station.presence.system == 12 and station.presence.autopilot is None
+    station.feed(packed(beat(armed=True), (12, 1)))
+    assert station.presence.autopilot == (12, 1) and station.presence.is_armed
+
+
+def test_ground_stations_and_gimbals_are_no_autopilots() -> None:
+    station = Station()
+    gcs = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+    station.feed(packed(gcs, (255, 190)))
+    gimbal = dialect.MAVLink_heartbeat_message(26, 8, 0, 0, 4, 3)
+    station.feed(packed(gimbal, (3, 154)))
+    assert station.presence.system == 1 and station.presence.autopilot is None
+
+
+def test_a_second_companion_is_told_once_and_our_own_echo_is_not_one() -> None:
+    station = Station()
+    station.feed(packed(beat(), (1, 1)))
+    own = dialect.MAVLink_heartbeat_message(18, 8, 0, 4711, 4, 3)
+    station.feed(packed(own, (1, 191)))
+    station.wait(1.0)
+    assert station.texts() == []
+    other = dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
+    for _ in range(10):
+        station.feed(packed(other, (1, 191)))
+        station.wait(35.0)
+        station.presence.confirm(Health.ACTIVE, station.now_ns)
+    assert len([t for t in station.texts() if "Another companion" in t]) == 1
+
+
+def test_a_wrong_configuration_is_refused() -> None:
+    with pytest.raises(ValueError, match="1 to 255"):
+        PresenceConfig(system=0)
+    with pytest.raises(ValueError, match="stale_s"):
+        PresenceConfig(stale_s=30.0)
+    with pytest.raises(ValueError, match="16 ASCII"):
+        Parameter("MUCH_TOO_LONG_A_NAME", 0, 0, 1, "")
+    with pytest.raises(ValueError, match="out of range"):
+        Parameter("A", 2, 0, 1, "")
+    with pytest.raises(ValueError, match="no MAVLink message"):
+        RateKeeper({"NOT_A_MESSAGE": 1.0})
+
+
+# Time
+
+
+def test_the_boot_counter_knows_wraps_reboots_and_stragglers() -> None:
+    counter = BootCounter()
+    assert counter.unwrap(2**32 - 100) == 2**32 - 100
+    assert counter.unwrap(50) == 2**32 + 50
+    assert counter.unwrap(2**32 - 60) == 2**32 - 60  # came late
+    assert counter.unwrap(90) == 2**32 + 90 and counter.session == 0
+    assert counter.unwrap(10) == 2**32 + 10
+    rebooting = BootCounter()
+    rebooting.unwrap(500_000)
+    assert rebooting.unwrap(1_200) == 1_200 and rebooting.session == 1
+    assert rebooting.unwrap(1_100) == 1_100 and rebooting.session == 1
+
+
+def test_the_offset_of_a_log_follows_drift_and_ignores_delays() -> None:
+    rng = np.random.default_rng(0)
+    boot_ms = np.arange(0, 600_000, 50.0)
+    truth = boot_ms * (1 + 80e-6) * 1e6 + 7e12
+    stamps = truth + rng.exponential(40e6, len(boot_ms))
+    fit = fit_boot([round(s) for s in stamps], list(boot_ms))
+    errors = [fit.from_boot(b * 1e6) - t for b, t in zip(boot_ms, truth, strict=True)]
+    assert np.abs(errors).max() < 5e6  # 5 ms of jitter of 40 ms, over 48 ms of drift
+    assert fit.is_real_time and fit.from_stamp(12345) == 12345
+    with pytest.raises(ValueError, match="pairs"):
+        fit_boot([], [])
+
+
+def test_the_live_clock_never_dates_a_sample_after_its_arrival() -> None:
+    rng = random.Random(3)
+    clock = BootClock()
+    late = []
+    for k in range(4000):
+        truth = 10 * S + k * 20 * MS
+        arrival = truth + round(rng.expovariate(1 / (30 * MS)))
+        got = clock.time_of(1000 + k * 20 * (1 - 50e-6), arrival)
+        assert got <= arrival
+        late.append(got - truth)
+    assert abs(np.median(late[500:])) < 2 * MS and max(late[500:]) < 8 * MS
+
+
+def test_an_autopilot_that_restarts_starts_the_history_over() -> None:
+    station = Station()
+    station.feed(packed(beat()))
+    for k in range(50):
+        station.feed(packed(attitude(100_000 + 20 * k)))
+        station.wait(0.02)
+    before = station.now_ns
+    assert station.history.state_at(before - 100 * MS) is not None
+    station.wait(2.0)
+    for k in range(20):
+        station.feed(packed(attitude(800 + 20 * k)))
+        station.wait(0.02)
+    assert station.history.state_at(before - 100 * MS) is None
+    assert station.history.state_at(station.now_ns - 100 * MS) is not None
+    assert [t for t in station.texts() if "restarted" in t] == [
+        "Autopilot restarted; telemetry starts over"
+    ]
+
+
+def test_a_scan_goes_on_through_a_restart_and_a_loss_of_the_autopilot() -> None:
+    station = Station()
+    station.feed(packed(beat()))
+    start = dialect.MAVLink_command_long_message(1, 100, 2500, 0, 0, 0, 0, 0, 0, 0, 0)
+    station.feed(packed(start, (255, 190)))
+    station.wait(10.0)
+    assert "Telemetry of the autopilot is lost" in station.texts()
+    station.feed(packed(beat()))
+    station.wait(1.0)
+    assert "Telemetry of the autopilot is back" in station.texts()
+    assert station.control.state.is_recording
+    station.wait(20.0)
+    assert station.texts().count("Telemetry of the autopilot is lost") == 1  # held back
+
+
+class Remote:
+    """An autopilot's clock behind a link with delays."""
+
+    def __init__(self, rng: random.Random, skew: float, delay_ms: float, jitter_ms: float) -> None:
+        self.rng, self.skew = rng, skew
+        self.delay_ns, self.jitter_ns = delay_ms * MS, jitter_ms * MS
+        self.boot_ns = 30 * S
+
+    def at(self, ours: float) -> int:
+        return self.boot_ns + round(ours * (1 + self.skew))
+
+    def leg(self) -> float:
+        return self.delay_ns + self.rng.expovariate(1.0) * self.jitter_ns
+
+
+@pytest.mark.parametrize(("delay_ms", "jitter_ms"), [(0.3, 0.2), (3.0, 2.0), (60.0, 20.0)])
+def test_timesync_converges_on_fast_and_slow_links(delay_ms: float, jitter_ms: float) -> None:
+    remote = Remote(random.Random(1), 20e-6, delay_ms, jitter_ms)
+    sync = TimesyncFilter()
+    now = 5 * S
+    errors = []
+    for _ in range(400):
+        now = max(now, sync.next_timer())
+        request: Any = sync.request(now)
+        assert request is not None
+        there = now + remote.leg()
+        back = round(there + remote.leg())
+        sync.answer(remote.at(there), request.ts1, back)
+        if sync.offset_ns is not None:
+            errors.append(abs(sync.offset_ns - (back - remote.at(back))))
+        now = back
+    assert sync.resets == 0
+    assert np.percentile(errors[100:], 95) < (0.3 + 0.4 * jitter_ms) * MS
+
+
+def test_timesync_takes_only_answers_to_its_own_questions() -> None:
+    sync = TimesyncFilter()
+    request: Any = sync.request(5 * S)
+    assert sync.request(5 * S) is None  # not yet again
+    assert not sync.answer(1_000, request.ts1 + 1, 5 * S)
+    assert not sync.answer(0, request.ts1, 5 * S)
+    assert not sync.answer(1_000, request.ts1, 5 * S + 10 * S)  # far too late
+    assert not sync.answer(1_000, request.ts1, 5 * S)  # answered before
+
+
+def test_timesync_starts_over_after_five_contradictions() -> None:
+    sync = TimesyncFilter()
+    now = 5 * S
+
+    def round_trip(boot_minus_ours_ns: int) -> bool:
+        nonlocal now
+        now = max(now + MS, sync.next_timer())
+        request: Any = sync.request(now)
+        return sync.answer(now + MS // 2 + boot_minus_ours_ns, request.ts1, now + MS)
+
+    for _ in range(30):
+        assert round_trip(2 * S)
+    assert sync.offset_ns == -2 * S
+    for _ in range(5):
+        assert not round_trip(900 * S)
+    assert sync.resets == 1 and sync.offset_ns is None
+    for _ in range(20):
+        round_trip(900 * S)
+    assert sync.offset_ns == -900 * S
+
+
+def test_timesync_reaches_the_samples_and_questions_are_answered() -> None:
+    station = Station()
+    station.feed(packed(beat()))
+    boot_offset = station.now_ns - 40 * S  # the autopilot booted 40 s ago
+    for _ in range(80):
+        for out in station.wait(0.1):
+            if out.message.get_type() == "TIMESYNC" and out.message.tc1 == 0:
+                reply = dialect.MAVLink_timesync_message(
+                    station.now_ns - boot_offset + MS, out.message.ts1
+                )
+                station.now_ns += 2 * MS
+                station.feed(packed(reply))
+        boot = (station.now_ns - boot_offset) // MS
+        station.now_ns += 35 * MS  # telemetry comes late, and evenly so
+        station.feed(packed(attitude(boot)))
+        station.feed(packed(beat()))
+    clock = station.companion.boot_clock()
+    assert clock is not None and clock.offset_ns is not None
+    assert abs(clock.offset_ns - boot_offset) < 2 * MS
+    station.companion.take()
+    station.feed(packed(dialect.MAVLink_timesync_message(0, 123456)))
+    (answer,) = [o.message for o in station.companion.take()]
+    assert answer.ts1 == 123456 and answer.tc1 == station.now_ns
+
+
+# Rates
+
+
+def test_rates_are_asked_for_and_asked_again_when_they_fade() -> None:
+    keeper = RateKeeper({"ATTITUDE_QUATERNION": 50.0, "GPS_RAW_INT": 2.0})
+    now = 100 * S
+    asked = keeper.tick(1, 1, now)
+    assert [(m.command, m.param1, m.param2) for m in asked] == [
+        (511, 31, 20000),
+        (511, 24, 500000),
+    ]
+    assert keeper.tick(1, 1, now + S) == []
+    for _ in range(480):
+        keeper.heard("ATTITUDE_QUATERNION")
+    now += LOOK_NS
+    assert [m.param1 for m in keeper.tick(1, 1, now)] == [24]
+    for _ in range(40):  # a ground station slowed it down
+        keeper.heard("ATTITUDE_QUATERNION")
+    now += LOOK_NS
+    assert [m.param1 for m in keeper.tick(1, 1, now)] == [31, 24]
+    count = 0
+    for _ in range(24):  # what never comes is asked for only now and then
+        now += LOOK_NS
+        for _ in range(600):
+            keeper.heard("ATTITUDE_QUATERNION")
+        count += len(keeper.tick(1, 1, now))
+    assert count <= 5
+    keeper.restart()
+    assert len(keeper.tick(1, 1, now + 1)) == 2
+
+
+# Signing
+
+
+def signed(message: Any, timestamp: int, key: bytes = KEY, link: int = 3) -> bytes:
+    mouth = dialect.MAVLink(None, 255, 190)
+    mouth.signing.secret_key = key
+    mouth.signing.link_id = link
+    mouth.signing.timestamp = timestamp
+    mouth.signing.sign_outgoing = True
+    return bytes(message.pack(mouth))
+
+
+NOW = timestamp_of(1_760_000_000 * S)
+
+
+def accepts(signing: Signing, data: bytes) -> bool:
+    (packet,) = Framer().feed(data)
+    return signing.accepts(packet)
+
+
+def test_signatures_of_pymavlink_are_verified_and_replays_refused() -> None:
+    signing = Signing(KEY, NOW)
+    first = signed(beat(), NOW + 10)
+    assert accepts(signing, first)
+    assert not accepts(signing, first)  # replayed
+    assert not accepts(signing, signed(beat(), NOW + 5))  # older
+    assert accepts(signing, signed(beat(), NOW + 11))
+    assert not accepts(signing, signed(beat(), NOW + 20, bytes(32)))  # another key
+    assert accepts(signing, signed(beat(), NOW + 12))  # the forgery moved nothing
+    assert not accepts(signing, signed(beat(), NOW - 61 * 100_000, link=4))  # a stale stream
+    assert not accepts(signing, packed(beat()))  # unsigned
+    radio = dialect.MAVLink_radio_status_message(1, 1, 90, 1, 1, 0, 0)
+    assert accepts(signing, packed(radio, (51, 68)))  # radios cannot sign
+    assert signing.refused == 5
+
+
+def test_a_flipped_bit_breaks_the_signature() -> None:
+    data = signed(beat(), NOW + 10)
+    for i in range(len(data) - 13, len(data)):
+        signing = Signing(KEY, NOW)
+        damaged = bytearray(data)
+        damaged[i] ^= 1
+        assert not accepts(signing, bytes(damaged))
+
+
+def test_our_signatures_satisfy_pymavlink_and_times_only_grow() -> None:
+    signing = Signing(KEY)
+    packer = Packer(2, signing)
+    ear = dialect.MAVLink(None)
+    ear.signing.secret_key = KEY
+    stamps = []
+    for unix_ns in (1_760_000_000 * S, 1_760_000_000 * S, 1_500_000_000 * S):  # steps back
+        data = packer.pack(1, Outgoing(191, beat()), unix_ns)
+        assert data is not None
+        (message,) = ear.parse_buffer(data)
+        assert message.get_signed() and message.get_srcComponent() == 191
+        stamps.append(signing.timestamp)
+    assert stamps == sorted(set(stamps))
+
+
+def test_keys_must_be_private_and_whole(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    with pytest.raises(ValueError, match="no such"):
+        read_key(path)
+    path.write_bytes(KEY)
+    os.chmod(path, 0o644)
+    with pytest.raises(ValueError, match="chmod 600"):
+        read_key(path)
+    os.chmod(path, 0o600)
+    assert read_key(path) == KEY
+    path.write_text(KEY.hex() + "\n")
+    assert read_key(path) == KEY
+    path.write_bytes(b"short")
+    with pytest.raises(ValueError, match="32 bytes"):
+        read_key(path)
+    with pytest.raises(ValueError, match="32 bytes"):
+        Signing(b"short")
+
+
+# Sending
+
+
+def test_values_that_do_not_fit_are_dropped_not_raised() -> None:
+    packer = Packer(0)
+    bad = dialect.MAVLink_named_value_float_message(-5, b"x", 1e300)
+    assert packer.pack(1, Outgoing(191, bad), 0) is None and packer.refused == 1
+    station = Station()
+    for report in (
+        KeyframeReport(10**20, 1e30, -1e30, float("nan"), float("inf"), None, False, "x" * 999),
+        KeyframeReport(-5, None, None, None, None, (1.0, 0.0, 0.0, 0.0)),
+    ):
+        station.companion.report(report)
+    for out in station.companion.take():
+        packer.pack(1, out, 0)
+    assert packer.pack(1, Outgoing(191, beat()), 0) is not None
+
+
+def test_sequence_numbers_count_per_component() -> None:
+    packer = Packer(0)
+    sequences: dict[int, list[int]] = {191: [], 100: []}
+    for k in range(300):
+        component = 191 if k % 3 else 100
+        data = packer.pack(1, Outgoing(component, beat()), 0)
+        assert data is not None
+        sequences[component].append(data[4])
+    for numbers in sequences.values():
+        assert numbers == [k % 256 for k in range(len(numbers))]
