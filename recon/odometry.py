@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from recon import bundle, matching, pnp, se3, two_view
 from recon.camera_model import rays
+from recon.landmarks import Landmarks
 from recon.types import F64, U8, Bool, Camera, PosePrior
 
 I64 = npt.NDArray[np.int64]
@@ -61,7 +62,8 @@ class OdometryKeyframe:
     prior: PosePrior
     pyramid: matching.Pyramid
     uv: F64  # (N, 2) corners
-    landmark: I64  # (N,) row in the landmark table, -1 none yet
+    landmark: I64  # (N,) number in ``map``, -1 none yet
+    map: Landmarks  # of its segment, in the odometry's frame
 
     @property
     def T_odom_camera(self) -> F64:
@@ -107,7 +109,6 @@ class Odometry:
         self.config = config or OdometryConfig()
         self.keyframes: list[OdometryKeyframe] = []  # of the current segment
         self.segment = -1
-        self.points = np.zeros((0, 3))  # landmarks in the odometry's frame, NaN = dropped
         self._metric = False  # the current segment has landmarks
         self._lost = 0
         self._last: tuple[int, F64, PosePrior] | None = None  # time, T_odom_camera, prior
@@ -172,7 +173,6 @@ class Odometry:
         R = prior.R_world_camera if prior.R_world_camera is not None else np.diag([1.0, -1, -1])
         t = prior.position_m if prior.position_m is not None else np.zeros(3)
         T_odom_camera = se3.compose(R, t)
-        self.points = np.zeros((0, 3))
         uv = corners.uv_px.astype(np.float64)
         self.keyframes = [
             OdometryKeyframe(
@@ -185,6 +185,7 @@ class Odometry:
                 pyramid,
                 uv,
                 np.full(len(uv), -1, np.int64),
+                Landmarks(),
             )
         ]
         self._last = (time_ns, T_odom_camera, prior)
@@ -243,8 +244,8 @@ class Odometry:
         first = self.keyframes[0]
         T_odom_a = first.T_odom_camera
         scale = _metric_scale(view, first.prior, prior, T_odom_a)
-        first.landmark[rows] = np.arange(len(rows))
-        self.points = se3.transform(T_odom_a, view.points[view.inliers] * scale)
+        points = se3.transform(T_odom_a, view.points[view.inliers] * scale)
+        first.landmark[rows] = first.map.add(points)
         return scale
 
     def _match_without_map(
@@ -359,11 +360,11 @@ class Odometry:
         shift = matching.global_shift(key.pyramid.levels[0], grey)
         if shift is None or shift.confidence < self.config.least_shift_confidence:
             return []
-        known = np.flatnonzero(key.landmark >= 0)
-        points = self.points[key.landmark[known]]
+        known = np.flatnonzero(key.map.known(key.landmark))
+        points = key.map[key.landmark[known]]
         there = shift.apply(key.uv[known])
         W, H = self.camera.size_px
-        inside = np.isfinite(points[:, 0]) & np.all((there > 0) & (there < [W, H]), axis=1)
+        inside = np.all((there > 0) & (there < [W, H]), axis=1)
         if inside.sum() < 12:
             return []
         ok, rvec, tvec = cv2.solvePnP(
@@ -385,7 +386,7 @@ class Odometry:
         """EPnP pose of the frame from one keyframe's landmarks, or why there is none."""
         prediction, visible = self._predict_3d(key, T_camera_odom, share)
         if stride > 1:
-            visible &= (key.landmark >= 0) & (np.arange(len(visible)) % stride == 0)
+            visible &= key.map.known(key.landmark) & (np.arange(len(visible)) % stride == 0)
         index = np.flatnonzero(visible)
         need = self.config.min_tracks // stride
         if index.size < need:
@@ -403,11 +404,12 @@ class Odometry:
         ok[index] = found.ok
         uv = prediction.uv.copy()
         uv[index] = found.uv_px
-        known = np.flatnonzero(ok & (key.landmark >= 0))
-        expected = int((visible & (key.landmark >= 0)).sum())
+        mapped = key.map.known(key.landmark)
+        known = np.flatnonzero(ok & mapped)
+        expected = int((visible & mapped).sum())
         if known.size < max(need, self.config.min_track_share * expected):
             return "too few matches"
-        points = self.points[key.landmark[known]]
+        points = key.map[key.landmark[known]]
         solved = pnp.solve(points, uv[known], self.K, self.config.pnp, T_camera_odom)
         if solved is None or solved.inliers.sum() < max(need, 0.5 * known.size):
             return "no pose fits the matches"
@@ -420,10 +422,8 @@ class Odometry:
         """Where the keyframe's corners fall for a start pose; corners without a landmark
         are taken to lie on the plane through the landmarks."""
         T_new_key = T_camera_odom @ key.T_odom_camera
-        known = key.landmark >= 0
-        P_key = se3.transform(key.T_camera_odom, self.points[key.landmark[known]])
-        known[np.flatnonzero(known)[~np.isfinite(P_key[:, 0])]] = False
-        P_key = P_key[np.isfinite(P_key[:, 0])]
+        known = key.map.known(key.landmark)
+        P_key = se3.transform(key.T_camera_odom, key.map[key.landmark[known]])
         plane = _inverse_depth_plane(self.K, P_key)
         H = self.K @ (T_new_key[:3, :3] + np.outer(T_new_key[:3, 3], plane)) @ np.linalg.inv(self.K)
         uv = cv2.perspectiveTransform(key.uv[:, None], H)[:, 0].astype(np.float64)
@@ -509,11 +509,22 @@ class Odometry:
             pyramid,
             np.vstack([uv[kept], fresh]),
             np.concatenate([key.landmark[kept], np.full(len(fresh), -1, np.int64)]),
+            key.map,
         )
         self.keyframes.append(new)
         self._adjust_window()
-        for old in self.keyframes[: -self.config.window - 2]:
+        self._forget()
+
+    def _forget(self) -> None:
+        """Let go of what left the window: pictures, corners, and landmarks nobody sees."""
+        window = self.keyframes[-self.config.window - 2 :]
+        for old in self.keyframes[: -len(window)]:
             old.pyramid = matching.Pyramid(())
+            old.uv, old.landmark = np.zeros((0, 2)), np.zeros(0, np.int64)
+        self.keyframes = window
+        seen = np.concatenate([k.landmark for k in window])
+        if (seen >= 0).any():
+            window[0].map.forget_before(int(seen[seen >= 0].min()))
 
     def _triangulate(self, key: OdometryKeyframe, T_camera_odom: F64, uv: F64, ok: Bool) -> None:
         """Landmarks for the keyframe's matched corners that have none yet."""
@@ -528,8 +539,7 @@ class Odometry:
             two_view.reprojection_error(T_camera_odom, points, self.K, uv[rows]),
         )
         good = (error < 1.5) & (angle > 0.5 * self.config.least_base_to_height)
-        key.landmark[rows[good]] = len(self.points) + np.arange(int(good.sum()))
-        self.points = np.vstack([self.points, points[good]])
+        key.landmark[rows[good]] = key.map.add(points[good])
         ok[rows[~good & (error >= 1.5)]] = False
 
     def _adjust_window(self) -> None:
@@ -538,8 +548,7 @@ class Odometry:
         fixed = 1 if len(window) == 2 else 2
         cam, pt, uv = [], [], []
         for c, key in enumerate(window):
-            rows = np.flatnonzero(key.landmark >= 0)
-            rows = rows[np.isfinite(self.points[key.landmark[rows], 0])]
+            rows = np.flatnonzero(key.map.known(key.landmark))
             cam.append(np.full(rows.size, c, np.int64))
             pt.append(key.landmark[rows])
             uv.append(key.uv[rows])
@@ -547,11 +556,11 @@ class Odometry:
         ids, index, counts = np.unique(point, return_inverse=True, return_counts=True)
         use = counts[index] >= 2
         ids, index = np.unique(point[use], return_inverse=True)
-        base = self._baseline(window)
+        base, table = self._baseline(window), window[0].map
         free = np.arange(len(window)) >= fixed
         result = bundle.adjust(
             np.stack([k.T_camera_odom for k in window]),
-            self.points[ids],
+            table[ids],
             np.concatenate(cam)[use],
             index.astype(np.int64),
             np.concatenate(uv)[use],
@@ -561,7 +570,7 @@ class Odometry:
         for c in np.flatnonzero(free):
             window[c].T_camera_odom = result.T_camera_world[c]
             window[c].covariance = result.covariance[c]
-        self.points[ids] = result.points_m
+        table[ids] = result.points_m
         self._drop_outliers(window, ids, index, np.concatenate(cam)[use], result.residual_px)
         if len(window) == 2:
             self._restore_baseline(window, base)
@@ -575,7 +584,7 @@ class Odometry:
         """Two views leave the scale open; put it back to where it was."""
         factor = base / max(self._baseline(window), 1e-9)
         origin = window[0].T_odom_camera[:3, 3]
-        self.points = origin + (self.points - origin) * factor
+        window[0].map.scale_about(origin, factor)
         T = window[1].T_odom_camera
         T[:3, 3] = origin + (T[:3, 3] - origin) * factor
         window[1].T_camera_odom = se3.inverse(T)
@@ -595,7 +604,7 @@ class Odometry:
             key = window[c]
             key.landmark[np.isin(key.landmark, gone)] = -1
         good = np.bincount(index[~bad], minlength=len(ids))
-        self.points[ids[good < 2]] = np.nan
+        window[0].map[ids[good < 2]] = np.nan
 
     # ---- what the dense stages ask -----------------------------------------------------
 
@@ -606,9 +615,7 @@ class Odometry:
 
     def landmarks(self, key: OdometryKeyframe) -> tuple[F64, F64]:
         """(N, 3) points in the keyframe's camera and (N,) their depths, in odometry units."""
-        ids = key.landmark[key.landmark >= 0]
-        points = self.points[ids]
-        points = points[np.isfinite(points[:, 0])]
+        points = key.map[key.landmark[key.map.known(key.landmark)]]
         P = se3.transform(key.T_camera_odom, points)
         P = P[P[:, 2] > 0]
         return P, P[:, 2]

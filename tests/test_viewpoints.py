@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from recon import se3
+from recon.landmarks import Landmarks
 from recon.matching import Pyramid
 from recon.odometry import OdometryKeyframe, Tracked
 from recon.types import Camera, Frame, PosePrior
@@ -19,7 +20,7 @@ def offer(views: Viewpoints, seq: int, x_m: float, state: str, segment: int = 0)
     T = se3.compose(np.eye(3), np.array([x_m, 0.0, 50.0]))
     key = OdometryKeyframe(
         seq, seq, segment, se3.inverse(T), np.eye(6), PosePrior(), Pyramid(()),
-        np.zeros((0, 2)), np.zeros(0, np.int64),
+        np.zeros((0, 2)), np.zeros(0, np.int64), Landmarks(),
     )  # fmt: skip
     picture = np.zeros((32, 32, 3), np.uint8)
     tracked = Tracked(state, segment, T, np.eye(6))
