@@ -23,7 +23,13 @@ MARGIN = 16
 LINE_PX = 24
 
 
-def draw_preview(raster: Raster, track_m: F64, lines: Sequence[str], largest_px: int = 1400) -> U8:
+def draw_preview(
+    raster: Raster,
+    track_m: F64,
+    lines: Sequence[str],
+    largest_px: int = 1400,
+    height_of_zero_m: float = 0.0,
+) -> U8:
     """(h, w, 3) BGR picture of ``raster`` with the (N, 2 or 3) track in the raster's frame.
 
     Each panel's longer side is at most ``largest_px``; ``lines`` are the key figures.
