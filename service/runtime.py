@@ -267,7 +267,7 @@ class Daemon:
             self._backend,
             folder,
             scan_id,
-            time.monotonic_ns(),
+            _zero_ns(source),
             unix_offset_ns=offset,
             history=self.vehicle.history,
             extra={"backend": self._backend.name, "source": source.description},
@@ -323,7 +323,7 @@ class Daemon:
                 if again is None:
                     return
                 source = again
-                scan.replace_source(source, time.monotonic_ns())
+                scan.replace_source(source, _zero_ns(source))
         source.close()
 
     def _on_frame(self, scan: Scan) -> None:
@@ -384,6 +384,12 @@ def _keyframe_report(pose: PoseRecord) -> KeyframeReport:
         alt_agl_m=pose.agl_m,
         q_ned_camera_wxyz=(float(q[0]), float(q[1]), float(q[2]), float(q[3])),
     )
+
+
+def _zero_ns(source: CameraSource) -> int:
+    """Monotonic clock at the source's time 0: its own word if it is live, else now."""
+    start_ns = source.start_monotonic_ns
+    return time.monotonic_ns() if start_ns is None else start_ns
 
 
 def _existing(folder: Path) -> Path:
