@@ -16,7 +16,7 @@ def bumpy(h: int, w: int, noise: float) -> U16:
     v, u = np.mgrid[:h, :w]
     rng = np.random.default_rng(1)
     plane = 2000 + 300 * np.sin(u / 25) + 200 * np.cos(v / 17) + noise * rng.normal(size=(h, w))
-    return np.rint(plane).astype(np.uint16)
+    return np.asarray(np.rint(plane), np.uint16)
 
 
 @settings(max_examples=60, deadline=None)

@@ -9,9 +9,6 @@ that the drone gave them, so that both ends can name what is missing.
 from __future__ import annotations
 
 import json
-import logging
-import sqlite3
-import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -22,8 +19,12 @@ from typing import Any
 import numpy as np
 
 from recon.types import DepthMap, Keyframe, Pose
-from service.errors import InputError, OutsideError
+from service.errors import InputError
 from service.stream import codec, layer
+from service.stream.database import SCHEMA_VERSION, Database
+from service.stream.radio_messages import unpack_pose as unpack_radio_pose
+from service.stream.radio_messages import unpack_tile
+from service.stream.radio_tiles import keyframe_of
 from service.stream.ranges import RangeSet
 from service.stream.records import (
     PoseRecord,
@@ -36,25 +37,7 @@ from service.stream.records import (
     unpack_repose,
 )
 
-log = logging.getLogger(__name__)
-
 Listener = Callable[[str, int], None]
-SCHEMA_VERSION = 1
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS chunks (
-    seq INTEGER NOT NULL, layer INTEGER NOT NULL, layers INTEGER NOT NULL,
-    time_unix_ns INTEGER NOT NULL, crc INTEGER NOT NULL, stored_unix_ns INTEGER NOT NULL,
-    data BLOB NOT NULL, PRIMARY KEY (seq, layer));
-CREATE TABLE IF NOT EXISTS poses (
-    id INTEGER PRIMARY KEY, time_unix_ns INTEGER NOT NULL, data BLOB NOT NULL);
-CREATE TABLE IF NOT EXISTS reposes (
-    id INTEGER PRIMARY KEY, seq INTEGER NOT NULL, revision INTEGER NOT NULL,
-    data BLOB NOT NULL);
-CREATE INDEX IF NOT EXISTS reposes_by_seq ON reposes (seq, revision);
-CREATE TABLE IF NOT EXISTS held (
-    peer TEXT NOT NULL, kind TEXT NOT NULL, ranges TEXT NOT NULL, PRIMARY KEY (peer, kind));
-"""
 
 
 class ScanStore:
@@ -68,21 +51,15 @@ class ScanStore:
         self.path = path
         self.quota_bytes = quota_bytes
         self.refused = 0
-        self._lock = threading.RLock()
         self._listeners: list[Listener] = []
-        try:
-            self._db = sqlite3.connect(path, check_same_thread=False, timeout=10.0)
-            self._db.execute("PRAGMA journal_mode=WAL")
-            self._db.execute("PRAGMA synchronous=FULL")
-            self._db.executescript(_SCHEMA)
-            if header is not None:
-                self._set("schema", str(SCHEMA_VERSION))
-                self._set("header", header.to_json().decode())
-            self._header = self._read_header()
-        except sqlite3.Error as error:
-            raise InputError(f"{path} is not a scan database ({error})") from error
-        row = self._db.execute("SELECT TOTAL(LENGTH(data)) FROM chunks").fetchone()
-        self.chunk_bytes = int(row[0])
+        self._db = Database(path)
+        self._lock = self._db.lock
+        if header is not None:
+            self._db.set("schema", str(SCHEMA_VERSION))
+            self._db.set("header", header.to_json().decode())
+        self._header = self._read_header()
+        total = self._db.one("SELECT TOTAL(LENGTH(data)) FROM chunks")
+        self.chunk_bytes = int(total[0]) if total else 0
         self._load_numbers()
 
     @classmethod
@@ -112,12 +89,7 @@ class ScanStore:
 
     def close(self) -> None:
         """Fold the write-ahead log into the file and close it."""
-        with self._lock:
-            try:
-                self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-            except sqlite3.Error as error:
-                log.debug("no checkpoint of %s: %s", self.path, error)
-            self._db.close()
+        self._db.close()
 
     def __enter__(self) -> ScanStore:
         return self
@@ -145,13 +117,13 @@ class ScanStore:
     @property
     def summary(self) -> dict[str, Any] | None:
         """What :meth:`finish` was given; None while the scan goes on."""
-        text = self._get("summary")
+        text = self._db.get("summary")
         return None if text is None else dict(json.loads(text))
 
     @property
     def finished(self) -> bool:
         """True once the drone closed the scan."""
-        return self._get("summary") is not None
+        return self._db.get("summary") is not None
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Close the scan with its ``summary`` (must be JSON)."""
@@ -194,7 +166,7 @@ class ScanStore:
                 for head, data in zip(heads, layers, strict=True)
                 if head.seq not in self._numbers.setdefault(f"k{head.layer}", RangeSet())
             ]
-            self._write([(sql, _chunk_row(head, data)) for head, data in fresh])
+            self._db.write([(sql, _chunk_row(head, data)) for head, data in fresh])
             for head, data in fresh:
                 self.chunk_bytes += len(data)
                 self._note(f"k{head.layer}", head.seq)
@@ -203,19 +175,23 @@ class ScanStore:
     def chunk(self, seq: int, number: int) -> bytes | None:
         """The coded layer ``number`` of keyframe ``seq``."""
         sql = "SELECT data FROM chunks WHERE seq = ? AND layer = ?"
-        row = self._one(sql, (seq, number))
+        row = self._db.one(sql, (seq, number))
         return None if row is None else bytes(row[0])
 
     def keyframe(self, seq: int) -> Keyframe | None:
-        """Keyframe ``seq`` at its finest stored layer, with the newest re-pose applied."""
+        """Keyframe ``seq`` at its finest stored layer, with the newest re-pose applied.
+
+        What came only by the narrow radio stands in until a layer is stored.
+        """
         sql = "SELECT data FROM chunks WHERE seq = ? ORDER BY layer DESC"
-        with self._lock:
-            rows = self._db.execute(sql, (seq,)).fetchall()
-        for (data,) in rows:
+        for (data,) in self._db.all(sql, (seq,)):
             decoded = codec.decode([bytes(data)])
             if decoded is not None:
                 return _reposed(decoded, self.repose(seq))
-        return None
+        sql = "SELECT data FROM radio WHERE kind = 'tile' AND number = ? ORDER BY part"
+        tiles = [unpack_tile(bytes(row[0])) for row in self._db.all(sql, (seq,))]
+        decoded = keyframe_of([tile[1] for tile in tiles if tile is not None])
+        return None if decoded is None else _reposed(decoded, self.repose(seq))
 
     def keyframes(self) -> Iterator[Keyframe]:
         """All keyframes in order of their number, as :meth:`keyframe` gives them."""
@@ -226,12 +202,13 @@ class ScanStore:
 
     def seqs(self) -> list[int]:
         """Numbers of the keyframes of which any layer is stored."""
-        return [row[0] for row in self._all("SELECT DISTINCT seq FROM chunks ORDER BY seq")]
+        sql = "SELECT seq FROM chunks UNION SELECT number FROM radio WHERE kind = 'tile' ORDER BY 1"
+        return [row[0] for row in self._db.all(sql)]
 
     @property
     def next_seq(self) -> int:
         """The number for the next keyframe, also after a restart."""
-        row = self._one("SELECT MAX(seq) FROM chunks", ())
+        row = self._db.one("SELECT MAX(seq) FROM chunks", ())
         return 0 if row is None or row[0] is None else int(row[0]) + 1
 
     # Poses and re-poses
@@ -252,19 +229,25 @@ class ScanStore:
             if number in self._numbers["pose"]:
                 return False
             row = (number, pose.time_unix_ns, data)
-            self._write([("INSERT INTO poses VALUES (?, ?, ?)", row)])
+            self._db.write([("INSERT INTO poses VALUES (?, ?, ?)", row)])
             self._note("pose", number)
             return True
 
     def poses(self) -> Iterator[PoseRecord]:
         """All poses in order of time; of several for one time the newest, which corrects it."""
         newest = "SELECT MAX(id) FROM poses GROUP BY time_unix_ns"
-        for (data,) in self._all(
+        for (data,) in self._db.all(
             f"SELECT data FROM poses WHERE id IN ({newest}) ORDER BY time_unix_ns"
         ):
             pose = unpack_pose(bytes(data))
             if pose is not None:
                 yield pose
+        if not self._numbers["pose"]:
+            sql = "SELECT data FROM radio WHERE kind = 'pose' ORDER BY number"
+            for (data,) in self._db.all(sql):
+                found = unpack_radio_pose(bytes(data))
+                if found is not None:
+                    yield found[2]
 
     def add_repose(self, repose: Repose) -> int:
         """Store a re-pose under the next number, which is returned."""
@@ -279,7 +262,7 @@ class ScanStore:
         with self._lock:
             first = self._next_id("reposes")
             rows = [(first + i, r.seq, r.revision, pack_repose(r)) for i, r in enumerate(reposes)]
-            self._write([(sql, row) for row in rows])
+            self._db.write([(sql, row) for row in rows])
             for number, seq, revision, _ in rows:
                 self._enforce(number, seq, revision)
 
@@ -292,7 +275,7 @@ class ScanStore:
             if number in self._known_reposes:
                 return False
             row = (number, repose.seq, repose.revision, data)
-            self._write([("INSERT INTO reposes VALUES (?, ?, ?, ?)", row)])
+            self._db.write([("INSERT INTO reposes VALUES (?, ?, ?, ?)", row)])
             self._enforce(number, repose.seq, repose.revision)
             return True
 
@@ -310,8 +293,13 @@ class ScanStore:
     def repose(self, seq: int) -> Repose | None:
         """The newest re-pose of keyframe ``seq``."""
         sql = "SELECT data FROM reposes WHERE seq = ? ORDER BY revision DESC, id DESC LIMIT 1"
-        row = self._one(sql, (seq,))
+        row = self._db.one(sql, (seq,))
         return None if row is None else unpack_repose(bytes(row[0]))
+
+    def add_radio(self, kind: str, number: int, part: int, data: bytes) -> bool:
+        """Store a message of the narrow radio ("tile" or "pose"); False if it is no news."""
+        row = (kind, number, part, data)
+        return self._db.write([("INSERT OR IGNORE INTO radio VALUES (?, ?, ?, ?)", row)]) > 0
 
     # What the link asks
 
@@ -321,13 +309,13 @@ class ScanStore:
         Header and summary are numbered by the CRC-32 of their JSON, so that a change shows.
         """
         if kind in ("header", "summary"):
-            text = self._get(kind)
+            text = self._db.get(kind)
             data = b"" if text is None else text.encode()
             return data if zlib.crc32(data) == number else None
         if kind.startswith("k"):
             return self.chunk(number, int(kind[1:]))
         table = {"pose": "poses", "repose": "reposes"}[kind]
-        row = self._one(f"SELECT data FROM {table} WHERE id = ?", (number,))
+        row = self._db.one(f"SELECT data FROM {table} WHERE id = ?", (number,))
         return None if row is None else bytes(row[0])
 
     def put_record(self, kind: str, number: int, data: bytes) -> bool:
@@ -377,7 +365,7 @@ class ScanStore:
 
     def _set_whole(self, kind: str, data: bytes) -> None:
         with self._lock:
-            self._set(kind, data.decode())
+            self._db.set(kind, data.decode())
             self._note_whole(kind, data)
 
     def _note_whole(self, kind: str, data: bytes) -> None:
@@ -386,29 +374,31 @@ class ScanStore:
 
     def _load_numbers(self) -> None:
         self._numbers: dict[str, RangeSet] = {"header": RangeSet(), "summary": RangeSet()}
-        self._numbers["pose"] = RangeSet.of(r[0] for r in self._all("SELECT id FROM poses"))
+        self._numbers["pose"] = RangeSet.of(r[0] for r in self._db.all("SELECT id FROM poses"))
         self._numbers["repose"] = RangeSet()
         self._known_reposes = RangeSet()
         self._in_force: dict[int, tuple[int, int]] = {}
-        for number, seq, revision in self._all("SELECT id, seq, revision FROM reposes ORDER BY id"):
+        for number, seq, revision in self._db.all(
+            "SELECT id, seq, revision FROM reposes ORDER BY id"
+        ):
             self._enforce(number, seq, revision)
         for kind in ("header", "summary"):
-            text = self._get(kind)
+            text = self._db.get(kind)
             if text is not None:
                 self._note_whole(kind, text.encode())
-        for seq, number in self._all("SELECT seq, layer FROM chunks ORDER BY layer, seq"):
+        for seq, number in self._db.all("SELECT seq, layer FROM chunks ORDER BY layer, seq"):
             self._numbers.setdefault(f"k{number}", RangeSet()).add(seq)
 
     def set_held(self, peer: str, numbers: dict[str, RangeSet]) -> None:
         """Note what ``peer`` says it holds."""
         sql = "INSERT OR REPLACE INTO held VALUES (?, ?, ?)"
         rows = [(peer, kind, json.dumps(ranges.pairs())) for kind, ranges in numbers.items()]
-        self._write([(sql, row) for row in rows])
+        self._db.write([(sql, row) for row in rows])
 
     def held(self) -> dict[str, dict[str, RangeSet]]:
         """Peer to what it said it holds."""
         out: dict[str, dict[str, RangeSet]] = {}
-        for peer, kind, text in self._all("SELECT peer, kind, ranges FROM held"):
+        for peer, kind, text in self._db.all("SELECT peer, kind, ranges FROM held"):
             out.setdefault(peer, {})[kind] = RangeSet((a, b) for a, b in json.loads(text))
         return out
 
@@ -418,8 +408,8 @@ class ScanStore:
         return self.quota_bytes is None or self.chunk_bytes + size <= self.quota_bytes
 
     def _read_header(self) -> ScanHeader:
-        text = self._get("header")
-        schema = self._get("schema")
+        text = self._db.get("header")
+        schema = self._db.get("schema")
         header = None if text is None else header_from_json(text.encode())
         if header is None or schema is None:
             raise InputError(f"{self.path} holds no scan header; it is not a scan database")
@@ -427,37 +417,9 @@ class ScanStore:
             raise InputError(f"{self.path} was written by a newer version; update skyrelief")
         return header
 
-    def _get(self, key: str) -> str | None:
-        row = self._one("SELECT value FROM meta WHERE key = ?", (key,))
-        return None if row is None else str(row[0])
-
-    def _set(self, key: str, value: str) -> None:
-        self._write([("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, value))])
-
     def _next_id(self, table: str) -> int:
-        row = self._one(f"SELECT MAX(id) FROM {table}", ())
+        row = self._db.one(f"SELECT MAX(id) FROM {table}", ())
         return 1 if row is None or row[0] is None else int(row[0]) + 1
-
-    def _one(self, sql: str, values: tuple[Any, ...]) -> tuple[Any, ...] | None:
-        with self._lock:
-            row: tuple[Any, ...] | None = self._db.execute(sql, values).fetchone()
-            return row
-
-    def _all(self, sql: str) -> list[tuple[Any, ...]]:
-        with self._lock:
-            return self._db.execute(sql).fetchall()
-
-    def _write(self, statements: list[tuple[str, tuple[Any, ...]]]) -> None:
-        """Run the statements in one transaction."""
-        with self._lock:
-            try:
-                with self._db:
-                    for sql, values in statements:
-                        self._db.execute(sql, values)
-            except sqlite3.Error as error:
-                raise OutsideError(
-                    f"cannot write {self.path} ({error}); free some space or check the disk"
-                ) from error
 
 
 def _chunk_row(head: layer.LayerHead, data: bytes) -> tuple[Any, ...]:

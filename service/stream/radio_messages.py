@@ -1,0 +1,284 @@
+"""The messages of the narrow radio: each fits a MAVLink TUNNEL and decodes alone.
+
+An announcement says which scan is flown, a pose where the camera is, a tile is 8 x 8 cells of
+a keyframe's coarse depth and colour with its own pose and camera. Bytes: ``docs/wire.md``.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from recon import se3
+from recon.types import F32, F64, U8, Bool
+from service.stream.records import PoseRecord, ScanHeader, source_bits, sources_of
+from service.stream.session import NAME
+
+U16 = npt.NDArray[np.uint16]
+
+PAYLOAD_TYPE = 42_432
+"""TUNNEL.payload_type of these messages; 32768 and above is for private use."""
+MAX_BYTES = 128
+ANNOUNCE, POSE, TILE = 0x11, 0x12, 0x13
+CELLS = 8
+"""A tile is CELLS x CELLS."""
+_DEPTH_UNIT_M = 0.02
+_LEVELS = 62  # depth codes 1 to 63; 0 is unknown
+_METRE_CM = 100.0
+
+_ANNOUNCE = struct.Struct("<BIq2dfHB")  # type, tag, started, lat, lon, alt, epsg, drone length
+_POSE = struct.Struct("<BIIq3i4h2ifHBH")
+_TILE = struct.Struct("<BIHIBBB3i4h3HHHBbb")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tile:
+    """A part of a keyframe, as the narrow radio carries it."""
+
+    seq: int
+    time_unix_ns: int  # to a second
+    grid_px: tuple[int, int]  # (w, h) of the whole coarse keyframe
+    index: int  # tiles row by row
+    K: F64  # (3, 3) px of the grid
+    T_world_camera: F64
+    sigma_m: float
+    depth_m: F32  # (8, 8), NaN where unknown or beyond the grid
+    bgr: U8  # (8, 8, 3)
+
+
+def tag_of(drone: str, scan_id: str) -> int:
+    """The number that stands for a scan of a drone on the radio."""
+    return zlib.crc32(f"{drone}/{scan_id}".encode())
+
+
+def pack_announce(header: ScanHeader) -> bytes:
+    """The announcement of a scan. Raises ValueError when the names are too long together."""
+    drone, scan = header.drone.encode(), header.scan_id.encode()
+    if _ANNOUNCE.size + len(drone) + len(scan) > MAX_BYTES:
+        raise ValueError(f"{header.drone}/{header.scan_id} is too long for the radio")
+    nan = math.nan
+    return (
+        _ANNOUNCE.pack(
+            ANNOUNCE,
+            tag_of(header.drone, header.scan_id),
+            header.started_unix_ns,
+            nan if header.origin_lat_deg is None else header.origin_lat_deg,
+            nan if header.origin_lon_deg is None else header.origin_lon_deg,
+            nan if header.origin_alt_amsl_m is None else header.origin_alt_amsl_m,
+            header.epsg or 0,
+            len(drone),
+        )
+        + drone
+        + scan
+    )
+
+
+def unpack_announce(data: bytes) -> ScanHeader | None:
+    """The header that an announcement gives; None for anything else."""
+    if not _ANNOUNCE.size < len(data) <= MAX_BYTES or data[0] != ANNOUNCE:
+        return None
+    _, tag, started, lat, lon, alt, epsg, length = _ANNOUNCE.unpack_from(data)
+    try:
+        names = data[_ANNOUNCE.size :].decode("ascii")
+    except UnicodeDecodeError:
+        return None
+    drone, scan = names[:length], names[length:]
+    if not (NAME.fullmatch(drone) and NAME.fullmatch(scan)) or tag_of(drone, scan) != tag:
+        return None
+    return ScanHeader(
+        scan,
+        drone,
+        started,
+        origin_lat_deg=_finite(lat),
+        origin_lon_deg=_finite(lon),
+        origin_alt_amsl_m=_finite(alt),
+        epsg=epsg or None,
+        georeference="none" if math.isnan(lat) else "gnss",
+        notes=("from the narrow radio",),
+    )
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def pack_pose(tag: int, number: int, pose: PoseRecord) -> bytes:
+    """A pose, to a centimetre and 3e-5."""
+    lat = math.nan if pose.lat_deg is None else pose.lat_deg
+    lon = math.nan if pose.lon_deg is None else pose.lon_deg
+    no_fix = math.isnan(lat) or math.isnan(lon)
+    return _POSE.pack(
+        POSE,
+        tag,
+        number,
+        pose.time_unix_ns,
+        *_position(pose.T_world_camera),
+        *_rotation(pose.T_world_camera),
+        -(1 << 31) if no_fix else round(lat * 1e7),
+        -(1 << 31) if no_fix else round(lon * 1e7),
+        math.nan if pose.alt_amsl_m is None else pose.alt_amsl_m,
+        min(65535, round(pose.sigma_m * _METRE_CM)),
+        source_bits(pose.sources),
+        min(65535, round(pose.speed_m_s * _METRE_CM)),
+    )
+
+
+def unpack_pose(data: bytes) -> tuple[int, int, PoseRecord] | None:
+    """Tag, number and pose; None for anything else."""
+    data = _extended(data, _POSE.size)
+    if len(data) != _POSE.size or data[0] != POSE:
+        return None
+    f = _POSE.unpack(data)
+    T = _motion(f[4:7], f[7:11])
+    if T is None:
+        return None
+    no_fix = f[11] == -(1 << 31)
+    sigma = f[14] / _METRE_CM
+    pose = PoseRecord(
+        f[3],
+        T,
+        np.diag([1e-4] * 3 + [sigma**2] * 3),
+        lat_deg=None if no_fix else f[11] * 1e-7,
+        lon_deg=None if no_fix else f[12] * 1e-7,
+        alt_amsl_m=_finite(f[13]),
+        sources=sources_of(f[15]),
+        sigma_m=sigma,
+        speed_m_s=f[16] / _METRE_CM,
+    )
+    return f[1], f[2], pose
+
+
+def pack_tile(tag: int, tile: Tile) -> bytes:
+    """A tile. Raises ValueError when it has no known cell or the grid is beyond 255 px."""
+    known = np.isfinite(tile.depth_m)
+    w, h = tile.grid_px
+    if not known.any() or max(w, h) > 255:
+        raise ValueError(f"no tile of a {w}x{h} grid with {known.sum()} known cells")
+    near = max(1, math.floor(float(np.nanmin(tile.depth_m)) / _DEPTH_UNIT_M))
+    far = min(65535, max(near + 1, math.ceil(float(np.nanmax(tile.depth_m)) / _DEPTH_UNIT_M)))
+    low, high = 1.0 / (far * _DEPTH_UNIT_M), 1.0 / (near * _DEPTH_UNIT_M)
+    inverse = 1.0 / np.where(known, tile.depth_m, 1.0).astype(np.float64)
+    codes = np.rint((inverse - low) / (high - low) * _LEVELS) + 1
+    codes = np.where(known, np.clip(codes, 1, _LEVELS + 1), 0).astype(np.uint16)
+    luma, cb, cr = _to_luma(tile.bgr, known)
+    K = tile.K
+    head = _TILE.pack(
+        TILE,
+        tag,
+        tile.seq & 0xFFFF,
+        tile.time_unix_ns // 1_000_000_000,
+        w,
+        h,
+        tile.index,
+        *_position(tile.T_world_camera),
+        *_rotation(tile.T_world_camera),
+        min(65535, round((K[0, 0] + K[1, 1]) / 2 / w * 8192)),
+        round(min(max((K[0, 2] + 0.5) / w, 0.0), 1.0) * 65535),
+        round(min(max((K[1, 2] + 0.5) / h, 0.0), 1.0) * 65535),
+        near,
+        far,
+        _sigma_code(tile.sigma_m),
+        cb,
+        cr,
+    )
+    return head + _ten_bits(codes.ravel() | luma.ravel() << 6)
+
+
+def unpack_tile(data: bytes) -> tuple[int, Tile] | None:
+    """Tag and tile; None for anything else."""
+    size = _TILE.size + CELLS * CELLS * 10 // 8
+    data = _extended(data, size)
+    if len(data) != size or data[0] != TILE:
+        return None
+    f = _TILE.unpack_from(data)
+    w, h, index, near, far = f[4], f[5], f[6], f[17], f[18]
+    T = _motion(f[7:10], f[10:14])
+    if T is None or min(w, h, near, f[14]) == 0 or far <= near:
+        return None
+    if index >= -(-w // CELLS) * -(-h // CELLS):
+        return None
+    packed = _from_ten_bits(data[_TILE.size :])
+    codes = (packed & np.uint16(63)).reshape(CELLS, CELLS)
+    low, high = 1.0 / (far * _DEPTH_UNIT_M), 1.0 / (near * _DEPTH_UNIT_M)
+    depth = 1.0 / (low + (codes - 1.0) * (high - low) / _LEVELS)
+    K = np.array(
+        [
+            [f[14] / 8192 * w, 0.0, f[15] / 65535 * w - 0.5],
+            [0.0, f[14] / 8192 * w, f[16] / 65535 * h - 0.5],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    tile = Tile(
+        seq=f[2],
+        time_unix_ns=f[3] * 1_000_000_000,
+        grid_px=(w, h),
+        index=index,
+        K=K,
+        T_world_camera=T,
+        sigma_m=0.001 * 2.0 ** ((f[19] - 1) / 4) if f[19] else math.nan,
+        depth_m=np.where(codes > 0, depth, np.nan).astype(np.float32),
+        bgr=_from_luma((packed >> np.uint16(6)).reshape(CELLS, CELLS), f[20], f[21]),
+    )
+    return f[1], tile
+
+
+def _extended(data: bytes, size: int) -> bytes:
+    """``data`` with the zeros at its end that MAVLink cuts off."""
+    return data + bytes(size - len(data)) if 0 < len(data) < size else data
+
+
+def _position(T: F64) -> list[int]:
+    return [round(float(np.clip(v * _METRE_CM, -2e9, 2e9))) for v in T[:3, 3]]
+
+
+def _rotation(T: F64) -> list[int]:
+    return [round(float(v) * 32767) for v in se3.quaternion_from_rotation(T[:3, :3])]
+
+
+def _motion(position_cm: tuple[int, ...], quaternion: tuple[int, ...]) -> F64 | None:
+    q = np.array(quaternion, np.float64) / 32767
+    if not 0.5 < float(np.linalg.norm(q)) < 1.5:
+        return None
+    return se3.compose(se3.rotation_from_quaternion(q), np.array(position_cm) / _METRE_CM)
+
+
+def _sigma_code(sigma_m: float) -> int:
+    if not math.isfinite(sigma_m) or sigma_m <= 0:
+        return 0
+    return min(255, max(1, round(4 * math.log2(sigma_m / 0.001)) + 1))
+
+
+def _to_luma(bgr: U8, known: Bool) -> tuple[U16, int, int]:
+    """4-bit luma per cell and the tile's mean chroma (BT.601)."""
+    b, g, r = (bgr[..., k].astype(np.float64) for k in range(3))
+    y = 0.299 * r + 0.587 * g + 0.114 * b
+    cb = float(np.mean((0.564 * (b - y))[known]))
+    cr = float(np.mean((0.713 * (r - y))[known]))
+    return (
+        np.rint(y / 17).astype(np.uint16),
+        round(min(max(cb, -127.0), 127.0)),
+        round(min(max(cr, -127.0), 127.0)),
+    )
+
+
+def _from_luma(luma: U16, cb: int, cr: int) -> U8:
+    y = luma.astype(np.float64) * 17.0
+    b, r = y + cb / 0.564, y + cr / 0.713
+    g = (y - 0.299 * r - 0.114 * b) / 0.587
+    return np.asarray(np.clip(np.rint(np.stack([b, g, r], axis=-1)), 0, 255), np.uint8)
+
+
+def _ten_bits(values: U16) -> bytes:
+    """64 values of ten bits, most significant bit first."""
+    bits = (values[:, None] >> np.arange(9, -1, -1)) & 1
+    return np.packbits(bits.astype(np.uint8)).tobytes()
+
+
+def _from_ten_bits(data: bytes) -> U16:
+    bits = np.unpackbits(np.frombuffer(data, np.uint8)).reshape(-1, 10).astype(np.uint16)
+    return np.asarray(bits @ (1 << np.arange(9, -1, -1)).astype(np.uint16), np.uint16)

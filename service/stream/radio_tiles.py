@@ -1,0 +1,82 @@
+"""A keyframe's coarse layer as the tiles of the narrow radio, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from recon.types import DepthMap, Keyframe, Pose
+from service.stream import planes
+from service.stream.radio_messages import CELLS, Tile
+
+GRID_WIDTH_PX = 40
+
+
+def tiles_of(coarse: Keyframe) -> list[Tile]:
+    """The tiles of a keyframe's coarse layer that hold anything, at most 40 px across."""
+    depth = coarse.depth
+    full = planes.Planes(depth.depth_m, depth.sigma_m, depth.views, coarse.bgr, coarse.fresh)
+    factor = -(-full.known.shape[1] // GRID_WIDTH_PX)
+    small = planes.reduce(full, factor)
+    K = np.array(depth.K)
+    K[:2] /= factor
+    K[:2, 2] += 0.5 / factor - 0.5
+    h, w = small.known.shape
+    out = []
+    for index in range(-(-h // CELLS) * -(-w // CELLS)):
+        v, u = divmod(index, -(-w // CELLS))
+        cut = np.s_[v * CELLS : (v + 1) * CELLS, u * CELLS : (u + 1) * CELLS]
+        known = small.known[cut]
+        if not known.any():
+            continue
+        cells = np.full((CELLS, CELLS), np.nan, np.float32)
+        cells[: known.shape[0], : known.shape[1]] = np.where(known, small.depth_m[cut], np.nan)
+        bgr = np.zeros((CELLS, CELLS, 3), np.uint8)
+        bgr[: known.shape[0], : known.shape[1]] = small.bgr[cut]
+        sigma = small.sigma_m[cut][known & (small.sigma_m[cut] > 0)]
+        out.append(
+            Tile(
+                coarse.seq,
+                coarse.time_ns,
+                (w, h),
+                index,
+                K,
+                depth.T_world_camera,
+                float(np.median(sigma)) if sigma.size else float("nan"),
+                cells,
+                bgr,
+            )
+        )
+    return out
+
+
+def keyframe_of(tiles: Sequence[Tile]) -> Keyframe | None:
+    """The keyframe that tiles of one grid show; None when there are none."""
+    if not tiles:
+        return None
+    first = tiles[0]
+    w, h = first.grid_px
+    rows, columns = -(-h // CELLS), -(-w // CELLS)
+    depth = np.full((rows * CELLS, columns * CELLS), np.nan, np.float32)
+    sigma = np.full_like(depth, np.nan)
+    bgr = np.zeros((*depth.shape, 3), np.uint8)
+    for tile in tiles:
+        if tile.grid_px != first.grid_px:
+            continue
+        v, u = divmod(tile.index, columns)
+        cut = np.s_[v * CELLS : (v + 1) * CELLS, u * CELLS : (u + 1) * CELLS]
+        depth[cut] = tile.depth_m
+        sigma[cut] = np.where(np.isfinite(tile.depth_m), np.float32(tile.sigma_m), np.nan)
+        bgr[cut] = tile.bgr
+    depth, sigma, bgr = depth[:h, :w], sigma[:h, :w], bgr[:h, :w]
+    fresh = np.isfinite(depth)
+    T = first.T_world_camera
+    return Keyframe(
+        first.seq,
+        first.time_unix_ns,
+        DepthMap(depth, sigma, fresh.astype(np.uint8), first.K, T),
+        bgr,
+        Pose(T, np.diag([1e-4] * 3 + [0.25] * 3)),
+        fresh,
+    )

@@ -1,0 +1,172 @@
+"""The narrow radio, both ends, without sockets or clocks: coarse tiles and poses by TUNNEL.
+
+When there is no IP link, the drone sends small messages over the telemetry radio, each
+decodable alone, within a share of the radio's rate and slower when RADIO_STATUS says that
+the radio's buffer fills. What was sent is repeated while there is nothing new.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+from service.stream import codec
+from service.stream.budget import TokenBucket
+from service.stream.radio_messages import (
+    pack_announce,
+    pack_pose,
+    pack_tile,
+    tag_of,
+    unpack_announce,
+    unpack_pose,
+    unpack_tile,
+)
+from service.stream.radio_tiles import tiles_of
+from service.stream.records import PoseRecord, ScanHeader
+from service.stream.records import unpack_pose as unpack_record
+from service.stream.store import ScanStore
+
+ANNOUNCE_EVERY_S = 10.0
+POSE_EVERY_S = 1.0
+REPEATS = 2
+MAX_WAITING = 2000
+MAVLINK_OVERHEAD_BYTES = 17
+"""Header, checksum and TUNNEL's own fields around each payload."""
+
+
+@dataclass(frozen=True, slots=True)
+class TunnelConfig:
+    """What of the telemetry radio may be used."""
+
+    radio_bytes_s: float = 5760.0  # 57,600 baud
+    share: float = 0.3
+    low_buffer_percent: int = 50  # RADIO_STATUS.txbuf below this: slow down
+
+
+@dataclass(slots=True, eq=False)
+class _Waiting:
+    payload: bytes
+    repeats: int = REPEATS
+
+
+class TunnelSender:
+    """What the drone sends over the radio. Times are the caller's: seconds, monotonic."""
+
+    def __init__(self, store: ScanStore, config: TunnelConfig, now: float) -> None:
+        """Raises ValueError when drone and scan have names too long for the radio."""
+        self._store = store
+        self._config = config
+        self._announcement = pack_announce(store.header)
+        self._tag = tag_of(store.header.drone, store.header.scan_id)
+        self._factor = 1.0
+        self._bucket = TokenBucket(config.radio_bytes_s * config.share, now)
+        self._announce_at = now
+        self._pose_at = now
+        self._pose: tuple[int, PoseRecord] | None = None
+        self._fresh: deque[_Waiting] = deque(maxlen=MAX_WAITING)
+        self._again: deque[_Waiting] = deque(maxlen=MAX_WAITING)
+        self.sent_bytes = 0
+
+    def news(self, kind: str, number: int) -> None:
+        """The store has a new item."""
+        data = self._store.record(kind, number) if kind in ("k0", "pose") else None
+        if data is None:
+            return
+        if kind == "pose":
+            pose = unpack_record(data)
+            self._pose = None if pose is None else (number, pose)
+            return
+        coarse = codec.decode([data])
+        if coarse is not None:
+            for tile in tiles_of(coarse):
+                self._fresh.append(_Waiting(pack_tile(self._tag, tile)))
+
+    def radio_status(self, free_percent: int, now: float) -> None:
+        """The radio says how much of its buffer is free (RADIO_STATUS.txbuf)."""
+        if free_percent < self._config.low_buffer_percent // 2:
+            self._factor = max(0.05, self._factor * 0.5)
+        elif free_percent < self._config.low_buffer_percent:
+            self._factor = max(0.05, self._factor * 0.85)
+        elif free_percent > 90:
+            self._factor = min(1.0, self._factor * 1.1)
+        rate = self._config.radio_bytes_s * self._config.share * self._factor
+        self._bucket.set_rate(rate, now)
+
+    def next(self, now: float) -> bytes | float:
+        """The TUNNEL payload to send now, or the seconds to wait."""
+        chosen = self._choose(now)
+        if chosen is None:
+            return 0.2
+        size = len(chosen) + MAVLINK_OVERHEAD_BYTES
+        wait = self._bucket.ready_in(size, now)
+        if wait > 0:
+            return wait
+        self._bucket.take(size, now)
+        self.sent_bytes += size
+        self._sent(chosen, now)
+        return chosen
+
+    def _choose(self, now: float) -> bytes | None:
+        if now >= self._announce_at:
+            return self._announcement
+        if self._pose is not None and now >= self._pose_at:
+            return pack_pose(self._tag, *self._pose)
+        queue = self._fresh or self._again
+        return queue[-1].payload if queue else None
+
+    def _sent(self, payload: bytes, now: float) -> None:
+        if payload is self._announcement:
+            self._announce_at = now + ANNOUNCE_EVERY_S
+        elif self._pose is not None and now >= self._pose_at:
+            self._pose, self._pose_at = None, now + POSE_EVERY_S
+        elif self._fresh:
+            self._again.appendleft(self._fresh.pop())
+        else:
+            waiting = self._again.pop()
+            waiting.repeats -= 1
+            if waiting.repeats > 0:
+                self._again.appendleft(waiting)
+
+
+@dataclass(slots=True, eq=False)
+class TunnelIntake:
+    """What the ground makes of the radio's messages: (header, kind, number, part, bytes).
+
+    Messages that come before their scan's announcement are kept, up to MAX_WAITING.
+    """
+
+    headers: dict[int, ScanHeader] = field(default_factory=dict)
+    waiting: deque[tuple[int, str, int, int, bytes]] = field(
+        default_factory=lambda: deque(maxlen=MAX_WAITING)
+    )
+    dropped: int = 0
+
+    def receive(self, payload: bytes) -> list[tuple[ScanHeader, str, int, int, bytes]]:
+        """What ``payload`` gives to store; nothing for foreign bytes."""
+        header = unpack_announce(payload)
+        if header is not None:
+            tag = tag_of(header.drone, header.scan_id)
+            self.headers[tag] = header
+            ready = [item[1:] for item in self.waiting if item[0] == tag]
+            for item in [item for item in self.waiting if item[0] == tag]:
+                self.waiting.remove(item)
+            return [(header, *item) for item in ready]
+        found = _item(payload)
+        if found is None:
+            self.dropped += 1
+            return []
+        known = self.headers.get(found[0])
+        if known is None:
+            self.waiting.append(found)
+            return []
+        return [(known, *found[1:])]
+
+
+def _item(payload: bytes) -> tuple[int, str, int, int, bytes] | None:
+    tile = unpack_tile(payload)
+    if tile is not None:
+        return tile[0], "tile", tile[1].seq, tile[1].index, payload
+    pose = unpack_pose(payload)
+    if pose is not None:
+        return pose[0], "pose", pose[1], 0, payload
+    return None
