@@ -42,7 +42,7 @@ class MatchingConfig:
     search_levels: int = 5  # pyramid levels that a search may use, at most
     coarse_reach_px: int = 8  # search radius that decides on the level to start at
     min_contrast: float = 2.0  # standard deviation of a patch, grey levels
-    max_zssd: float = 0.5  # of patches made unit: 2 (1 - correlation)
+    max_zssd: float = 0.4  # of patches made unit: 2 (1 - correlation)
     ambiguity: float = 0.8  # best zssd over that of the next separate peak, at most
     max_return_px: float = 0.5  # forward and backward match may differ by this
     refine_iterations: int = 6
@@ -153,6 +153,20 @@ def _warps(warp: npt.ArrayLike | None, count: int) -> tuple[F64, F64]:
     return matrices.reshape(count, 4), np.ascontiguousarray(inverse)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    """The answer of one search on one level."""
+
+    uv: F64  # (N, 2) full-size px
+    score: F64  # (N,) correlation, NO_SCORE where nothing could be compared
+    second: F64  # (N,) correlation of the next separate peak
+    contrast: F64  # (N,) of the patch of a, grey levels
+
+    def distinct(self, config: MatchingConfig) -> Bool:
+        """(N,) True where no other place comes near the best one."""
+        return np.asarray(1.0 - self.score <= config.ambiguity * (1.0 - self.second))
+
+
 @dataclass(slots=True, eq=False)
 class _Search:
     """One direction of matching: the state of every point on its way down the pyramid."""
@@ -163,16 +177,16 @@ class _Search:
     inverse_warp: F64
     config: MatchingConfig
 
-    def at(self, level: int, uv_b: F64, active: Bool, reach: int) -> tuple[F64, F64, F64]:
-        """Best place in b (N, 2, full-size px), its score and the next peak's, at ``level``."""
+    def at(self, level: int, uv_b: F64, active: Bool, reach: int) -> _Found:
+        """Best places in b within ``reach`` px of ``level`` about ``uv_b`` (full-size px)."""
         N = len(uv_b)
-        found, score, second = uv_b / 2.0**level, np.empty(N), np.empty(N)
+        uv, score, second, contrast = uv_b / 2.0**level, np.empty(N), np.empty(N), np.empty(N)
         patch_search.search(
-            self.a[level], self.b[level], self.uv_a / 2.0**level, found.copy(),
+            self.a[level], self.b[level], self.uv_a / 2.0**level, uv.copy(),
             self.inverse_warp, active, reach, self.config.patch_radius_px,
-            self.config.min_contrast, found, score, second,
+            self.config.min_contrast, uv, score, second, contrast,
         )  # fmt: skip
-        return found * 2.0**level, score, second
+        return _Found(uv * 2.0**level, score, second, contrast)
 
     def refined(self, uv_b: F64, active: Bool) -> tuple[F64, F64, F64]:
         """Sub-pixel places in b, their scores and the contrast found there."""
@@ -243,22 +257,18 @@ def match(
     level, reach = _start(radius_px, min(len(pyramid_a.levels), len(pyramid_b.levels)), config)
 
     everyone: Bool = np.abs(np.hstack([a, predicted])).max(axis=1, initial=0.0) < _FAR
-    uv, score, second = forward.at(level, predicted, everyone, reach)
-    active = _trusted(score, second, config) & everyone
+    coarse = forward.at(level, predicted, everyone, reach)
+    uv = coarse.uv
+    # A coarse pixel blurs; the fine patches have the last word on likeness.
+    active = coarse.distinct(config) & (1.0 - coarse.score <= config.max_zssd)
     back_a = _Search(pyramid_b.levels, pyramid_a.levels, uv, forward_warp, config)
-    returned, _, _ = back_a.at(level, a, active, min(reach, 4))
+    returned = back_a.at(level, a, active, min(reach, 4)).uv
     active &= np.abs(returned - a).max(axis=1, initial=0.0) <= 1.6 * 2**level
     if level > 0:
-        trend = _consensus(a, uv - predicted, active, 2.0 * 2**level)
-        if trend is not None:
-            lost = everyone & ~active
-            uv[lost] = predicted[lost] + trend[lost]
-            active = everyone.copy()
-    while level > 0:
-        finer = max(level - 2, 0)
-        uv, score, _ = forward.at(finer, uv, active, 1 + level - finer)
-        level = finer
-    uv, score, contrast = forward.refined(uv, active & (score > 0))
+        stray_px = max(0.5 * radius_px, 4.0 * 2**level)
+        uv, active = _follow_others(a, uv, predicted, active, everyone, 2.0 * 2**level, stray_px)
+        uv, active = _descend(forward, level, uv, active, coarse.contrast)
+    uv, score, contrast = forward.refined(uv, active)
     ok = active & (2.0 * (1.0 - score) <= config.max_zssd) & (contrast >= config.min_contrast)
 
     back = _Search(pyramid_b.levels, pyramid_a.levels, uv, forward_warp, config)
@@ -269,9 +279,38 @@ def match(
     return Matches(uv.astype(np.float32), zssd.astype(np.float32), ok)
 
 
-def _trusted(score: F64, second: F64, config: MatchingConfig) -> Bool:
-    """(N,) True where the best place is alike enough and no other place comes near it."""
-    best = 1.0 - score
-    return np.asarray(
-        (2.0 * best <= 2 * config.max_zssd) & (best <= config.ambiguity * (1 - second))
-    )
+def _follow_others(
+    a: F64, uv: F64, predicted: F64, active: Bool, everyone: Bool, tolerance_px: float,
+    stray_px: float,
+) -> tuple[F64, Bool]:  # fmt: skip
+    """Places and who takes part, after points without an answer got one from the trend.
+
+    So did those further than ``stray_px`` from it: relief moves points, but not that far.
+    """
+    trend = _consensus(a, uv - predicted, active, tolerance_px)
+    if trend is None:
+        return uv, active
+    expected = predicted + trend
+    own = active & (np.linalg.norm(uv - expected, axis=1) <= stray_px)
+    return np.where(own[:, None], uv, expected), everyone.copy()
+
+
+def _descend(
+    search: _Search, level: int, uv: F64, active: Bool, coarse_contrast: F64
+) -> tuple[F64, Bool]:
+    """Places to about a pixel, from ``level`` down to the full size, two levels at a time.
+
+    A texture that repeats may vanish on the coarse level, and what little is left there
+    decides by chance; such points must be distinct on a level that shows the repetition.
+    """
+    found = None
+    while level > 0:
+        finer = max(level - 2, 0)
+        found = search.at(finer, uv, active, 1 + level - finer)
+        uv, level = found.uv, finer
+        active = active & (found.score > 0)
+    assert found is not None
+    vague = active & (coarse_contrast < 0.3 * found.contrast)
+    if vague.any():
+        active = active & ~(vague & ~search.at(1, uv, vague, 8).distinct(search.config))
+    return uv, active

@@ -183,11 +183,13 @@ def _vertex(line: Any, i: int, count: int) -> float:
 def search(
     image_a: Any, image_b: Any, uv_a: Any, uv_b: Any, inverse_warp: Any, active: Any,
     reach: int, radius: int, min_contrast: float, uv_found: Any, score: Any, second: Any,
+    contrast: Any,
 ) -> None:  # fmt: skip
     """Find each active point of a near ``uv_b`` in image b, to about a quarter of a pixel.
 
     Fills ``uv_found`` (N, 2), ``score`` (N,) (NO_SCORE when nothing could be compared) and
-    ``second`` (N,), the score of the next separate peak in the window.
+    ``second`` (N,), the score of the next separate peak in the window, and ``contrast`` (N,)
+    of the patch of a.
     """
     N = uv_a.shape[0]
     H, W = image_b.shape
@@ -199,14 +201,15 @@ def search(
         window = np.zeros((S + n) * pitch + 4, np.float32)
         scores = np.zeros((S, pitch), np.float32)
         for p in range(chunk * CHUNK, min((chunk + 1) * CHUNK, N)):
-            score[p], second[p] = NO_SCORE, NO_SCORE
+            score[p], second[p], contrast[p] = NO_SCORE, NO_SCORE, 0.0
             cu, cv = int(np.floor(uv_b[p, 0] + 0.5)), int(np.floor(uv_b[p, 1] + 0.5))
             outside = cu < -reach or cv < -reach or cu >= W + reach or cv >= H + reach
             if not active[p] or outside:
                 continue
             if not _sample(image_a, uv_a[p, 0], uv_a[p, 1], inverse_warp[p], radius, patch):
                 continue
-            if _normalise(patch, n) < min_contrast:
+            contrast[p] = _normalise(patch, n)
+            if contrast[p] < min_contrast:
                 continue
             _scores(image_b, cu, cv, reach, radius, patch, min_contrast, window, scores)
             bx, by, score[p], second[p] = _peaks(scores, S)

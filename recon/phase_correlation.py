@@ -99,10 +99,10 @@ def _vertex(left: float, middle: float, right: float) -> float:
 def global_shift(gray_a: U8, gray_b: U8) -> GlobalShift:
     """The turn, scale and shift between two overlapping nadir pictures.
 
-    Both (H, W) uint8 of one size. Any turn; scales 0.8 to 1.25; shifts up to about half of
-    the picture. Accuracy is about 1 % of the width: a start for :func:`recon.matching.match`.
-    Pictures without texture give no motion with confidence 0. Raises ValueError when the
-    pictures differ in size.
+    Both (H, W) uint8 of one size. Any turn; shifts up to about a third of the picture; scales
+    0.95 to 1.05, and 0.85 to 1.2 where the ground has coarse structure. Accuracy is about 1 %
+    of the width: a start for :func:`recon.matching.match`. Pictures without texture give no
+    motion with confidence 0. Raises ValueError when the pictures differ in size.
     """
     if gray_a.shape != gray_b.shape or gray_a.ndim != 2:
         raise ValueError(f"pictures must be (H, W) of one size, got {gray_a.shape}, {gray_b.shape}")
