@@ -1,0 +1,108 @@
+"""``skyrelief calibrate``: a camera model from pictures of a chessboard."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.errors import InputError
+
+if TYPE_CHECKING:
+    from recon.calibration import Board, Calibration
+    from service.board_pictures import BoardSet
+
+
+def calibrate(
+    sources: Annotated[list[Path], typer.Argument(help="Pictures, folders of them, or a video.")],
+    pattern: Annotated[str, typer.Option(help="Inner corners of the board: 9x6.")],
+    square_m: Annotated[float, typer.Option(help="Side of a square in metres.")],
+    out: Annotated[Path, typer.Option(help="Camera model to write (YAML).")],
+    tangential: Annotated[bool, typer.Option(help="Fit p1 and p2 too.")] = False,
+    name: Annotated[str, typer.Option(help="Name of the camera in the file.")] = "camera",
+    as_json: Annotated[bool, typer.Option("--json", help="Report as one JSON object.")] = False,
+) -> None:
+    """Intrinsics and radial distortion from a chessboard, as ROS camera_info YAML.
+
+    Writes a picture of where the corners were beside the model.
+    """
+    from recon.calibration import FEWEST_VIEWS, CalibrationConfig
+    from recon.calibration import calibrate as fit
+    from service.board_pictures import draw_coverage, find_boards, write_picture
+    from service.camera_file import save_camera
+
+    board = _board(pattern, square_m)
+    boards = find_boards(sources, board)
+    if len(boards.views) < FEWEST_VIEWS:
+        raise InputError(
+            f"the board was found in {len(boards.views)} of "
+            f"{len(boards.views) + len(boards.missed)} pictures, {FEWEST_VIEWS} are needed; "
+            f"is --pattern {pattern} the number of inner corners?"
+        )
+    result = fit(boards.views, board, boards.size_px, CalibrationConfig(tangential))
+    if result is None:
+        raise InputError("no camera fits these views; take the board from different angles")
+    try:
+        save_camera(out, result.camera, name, {"calibration": _record(result, boards, board)})
+    except ValueError as error:
+        raise InputError(f"the views give no usable camera ({error}); take more views") from error
+    picture = out.with_name(f"{out.stem}_coverage.png")
+    write_picture(picture, draw_coverage(result, boards.views))
+    report = _record(result, boards, board) | {
+        "out": str(out),
+        "coverage_picture": str(picture),
+        "K": result.camera.K.tolist(),
+        "distortion": result.camera.distortion.tolist(),
+    }
+    print(json.dumps(report) if as_json else _text(report))
+
+
+def _board(pattern: str, square_m: float) -> Board:
+    from recon.calibration import Board
+
+    found = re.match(r"^(\d{1,3})x(\d{1,3})$", pattern.strip())
+    if found is None:
+        raise InputError(f"--pattern {pattern!r}: expected inner corners such as 9x6")
+    try:
+        return Board(int(found[1]), int(found[2]), square_m)
+    except ValueError as error:
+        raise InputError(f"--pattern {pattern} --square-m {square_m:g}: {error}") from error
+
+
+def _record(result: Calibration, boards: BoardSet, board: Board) -> dict[str, Any]:
+    """What is worth keeping of a calibration, in plain values."""
+    return {
+        "rms_px": round(result.rms_px, 4),
+        "pattern": f"{board.columns}x{board.rows}",
+        "square_m": board.square_m,
+        "sigma_focal_px": round(result.sigma_focal_px, 4),
+        "coverage": round(result.coverage, 3),
+        "views": {
+            view: round(float(rms), 4)
+            for view, rms in zip(result.used, result.view_rms_px, strict=True)
+        },
+        "not_used": dict(boards.missed + result.rejected),
+        "warnings": list(result.warnings),
+    }
+
+
+def _text(report: dict[str, Any]) -> str:
+    """The report as lines for people."""
+    K, d = report["K"], report["distortion"]
+    lines = [
+        f"rms {report['rms_px']:.3f} px over {len(report['views'])} views, "
+        f"corners in {report['coverage']:.0%} of the image",
+        f"fx {K[0][0]:.2f}  fy {K[1][1]:.2f} (sigma {report['sigma_focal_px']:.2f})  "
+        f"cx {K[0][2]:.2f}  cy {K[1][2]:.2f} px",
+        f"k1 {d[0]:+.5f}  k2 {d[1]:+.5f}  k3 {d[4]:+.5f}  p1 {d[2]:+.6f}  p2 {d[3]:+.6f}",
+        "",
+        *(f"  {rms:6.3f} px  {view}" for view, rms in report["views"].items()),
+        *(f"  not used   {view}: {reason}" for view, reason in report["not_used"].items()),
+        *(f"warning: {warning}" for warning in report["warnings"]),
+        "",
+        f"wrote {report['out']} and {report['coverage_picture']}",
+    ]
+    return "\n".join(lines)
