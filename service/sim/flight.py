@@ -14,7 +14,7 @@ from recon.types import F64
 
 PATTERNS = ("nadir", "oblique", "legs", "orbit", "hover")
 LEAD_S = 5.0
-"""Seconds of flight and telemetry before the first and after the last frame."""
+"""Seconds of flight before the first and after the last frame, and of telemetry after it."""
 STEP_S = 0.02
 G_M_S2 = 9.81
 

@@ -77,7 +77,9 @@ def write_tlog(path: Path, epoch_unix_s: float, stream: Iterator[tuple[float, by
 
 
 def _times(hz: float, duration_s: float) -> F64:
-    return np.asarray(np.arange(-LEAD_S, duration_s + LEAD_S, 1.0 / hz), np.float64)
+    """From the first frame on: a video piped without its start time is taken to begin with
+    the log."""
+    return np.asarray(np.arange(0.0, duration_s + LEAD_S, 1.0 / hz), np.float64)
 
 
 def _boot_ms(t: F64) -> npt.NDArray[np.int64]:
