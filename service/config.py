@@ -137,6 +137,9 @@ class DatalinkConfig:
     tls_ca: str = key("", "fleet's certificate authority (PEM), from 'skyrelief keys'")
     tls_certificate: str = key("", "this aircraft's certificate (PEM)")
     tls_key: str = key("", "this aircraft's private key (PEM)")
+    radio: str = key("", "MAVLink endpoint for the narrow fallback: udpout:127.0.0.1:14551")
+    radio_baud: int = key(57600, "speed of that telemetry radio")
+    radio_share: float = key(0.3, "how much of it we may use")
     drain_s: float = key(20.0, "after a replay, wait so long for the ground to fetch the rest")
 
     def __post_init__(self) -> None:
@@ -144,6 +147,8 @@ class DatalinkConfig:
         _within("datalink.budget_kbit_s", self.budget_kbit_s, 1, 10_000_000)
         _within("datalink.drain_s", self.drain_s, 0, 86_400)
         _within("datalink.share", self.share, 0.01, 1.0)
+        _within("datalink.radio_baud", self.radio_baud, 1200, 10_000_000)
+        _within("datalink.radio_share", self.radio_share, 0.01, 1.0)
         for endpoint in (*self.connect, *self.listen):
             if not re.fullmatch(r"[a-z]+/.+", endpoint):
                 raise ValueError(f"datalink endpoint {endpoint!r} is not like tcp/HOST:7447")

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 def open_datalink(store: ScanStore, config: Config) -> Datalink | None:
     """A sender of what the store gets, or None when no ground station is configured."""
-    if not (config.datalink.connect or config.datalink.listen):
+    if not (config.datalink.connect or config.datalink.listen or config.datalink.radio):
         return None
     from service.stream.link import DatalinkSender
 

@@ -14,8 +14,11 @@ import typer
 
 if TYPE_CHECKING:
     from service.ground.receiver import Receiver
+    from service.stream.radio_link import RadioLink
 
 DEFAULT_PORT = 7447
+RADIO_REFRESH_S = 15.0
+MAV_TYPE_GCS = 6
 
 
 def ground(
@@ -36,6 +39,13 @@ def ground(
     quota_mb: Annotated[
         float | None, typer.Option(help="of one scan; beyond it only coarse layers are kept")
     ] = None,
+    mavlink: Annotated[
+        list[str] | None,
+        typer.Option(help="telemetry radio for the narrow fallback: udpin:0.0.0.0:14551"),
+    ] = None,
+    refresh_s: Annotated[
+        float | None, typer.Option(help="write clouds of growing scans so often")
+    ] = None,
     once: Annotated[bool, typer.Option("--once", help="end when a scan is complete")] = False,
     idle_exit_s: Annotated[
         float | None, typer.Option(help="end when nothing new came for so many seconds")
@@ -45,6 +55,7 @@ def ground(
     """Receive scans from drones; end with Ctrl-C. Scans lie in STORE/DRONE/SCAN."""
     from service.ground.receiver import Receiver, ReceiverConfig
     from service.stream.keys import tls_files
+    from service.stream.radio_link import GROUND, RadioLink
     from service.stream.session import SessionConfig
 
     ca, certificate, key = tls_files(keys) if keys is not None else ("", "", "")
@@ -62,26 +73,38 @@ def ground(
         fleet_rights=keys is not None and bool(listen),
     )
     quota = None if quota_mb is None else int(quota_mb * 1e6)
-    receiver = Receiver(ReceiverConfig(store, session, quota))
+    refresh = refresh_s if refresh_s is not None else RADIO_REFRESH_S if mavlink else 0.0
+    receiver = Receiver(ReceiverConfig(store, session, quota, refresh_s=refresh))
+    radios = [RadioLink(endpoint, GROUND, receiver.add_radio) for endpoint in mavlink or ()]
     receiver.start()
     where = ", ".join((*session.listen, *session.connect))
     print(f"ground station at {where}, scans in {store}", file=sys.stderr, flush=True)
+    for radio in radios:
+        radio.start()
     try:
-        _watch(receiver, once, idle_exit_s)
+        _watch(receiver, radios, once, idle_exit_s)
         entries = receiver.progress()
     finally:
+        for radio in radios:
+            radio.close()
         receiver.close()
     _report(entries, receiver.dropped, as_json)
 
 
-def _watch(receiver: Receiver, once: bool, idle_exit_s: float | None) -> None:
+def _watch(
+    receiver: Receiver, radios: list[RadioLink], once: bool, idle_exit_s: float | None
+) -> None:
     """Return on a signal, or when what the options name has come about."""
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    shown = 0.0
+    shown = beat_at = 0.0
     while not stop.wait(0.2):
         entries = receiver.progress()
+        if time.monotonic() >= beat_at:
+            beat_at = time.monotonic() + 1.0
+            for radio in radios:
+                radio.beat(MAV_TYPE_GCS)
         if once and any(entry["complete"] for entry in entries):
             stop.wait(1.5)  # let the report reach the drone
             return

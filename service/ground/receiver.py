@@ -27,6 +27,7 @@ from service.stream.messages import count, pack_ask, pack_held, unpack_head
 from service.stream.records import ScanHeader
 from service.stream.session import NAME, ROOT, SessionConfig, check_endpoints, open_session
 from service.stream.store import ScanStore
+from service.stream.tunnel import TunnelIntake
 
 if TYPE_CHECKING:
     import zenoh
@@ -53,6 +54,7 @@ class ReceiverConfig:
     session: SessionConfig = field(default_factory=lambda: SessionConfig(mode="router"))
     quota_bytes: int | None = None  # of one scan's chunks; beyond it only coarse layers
     name: str = ""  # of this station; empty: made once and kept in the store
+    refresh_s: float = 0.0  # write deliverables of growing scans so often; 0: when complete
 
 
 @dataclass(slots=True, eq=False)
@@ -65,6 +67,7 @@ class _Scan:
     unwritten: bool = False  # since the last deliverables
     rest_until: float = 0.0
     writing: Future[None] | None = None
+    radio_messages: int = 0
 
     @property
     def key(self) -> str:
@@ -93,6 +96,8 @@ class Receiver:
         self._session: zenoh.Session | None = None
         self._opened = threading.Event()
         self._failure: SkyreliefError | None = None
+        self._tunnel = TunnelIntake()
+        self._refresh_at = 0.0
         self.dropped = 0  # messages that were malformed, foreign or too many
         self.last_news_at = time.monotonic()
 
@@ -119,6 +124,10 @@ class Receiver:
         """Where a scan is kept."""
         return self._config.store / drone / scan_id
 
+    def add_radio(self, payload: bytes) -> None:
+        """Take in a message of the narrow radio; from any thread."""
+        self._post(lambda now: self._radio(payload, now))
+
     def progress(self) -> list[dict[str, Any]]:
         """One entry per scan: drone, scan, items held and missing, bytes, lags, folder."""
         return [self._scan_progress(scan) for scan in list(self._scans.values())]
@@ -142,6 +151,7 @@ class Receiver:
             "received_bytes": intake.progress.received_bytes,
             "duplicates": intake.progress.duplicates,
             "refused": intake.store.refused,
+            "radio_messages": scan.radio_messages,
             "lag_s": lags,
         }
 
@@ -184,6 +194,7 @@ class Receiver:
                 pass
             for scan in self._scans.values():
                 self._tend(session, scan, time.monotonic())
+            self._refresh(time.monotonic())
 
     def _look_around(self, session: zenoh.Session) -> None:
         """Have the drones that are there say at once what they have."""
@@ -302,6 +313,31 @@ class Receiver:
         except OutsideError as error:
             log.error("%s; trying again in %.0f s", error, FULL_DISK_REST_S)
             scan.rest_until = now + FULL_DISK_REST_S
+
+    def _radio(self, payload: bytes, now: float) -> None:
+        for header, kind, number, part, data in self._tunnel.receive(payload):
+            scan = self._scan(header.drone, header.scan_id)
+            if scan is None:
+                continue
+            store = scan.intake.store
+            try:
+                if store.header.started_unix_ns == 0:
+                    store.put_header(header)
+                if store.add_radio(kind, number, part, data):
+                    scan.radio_messages += 1
+                    scan.unwritten = True
+                    self.last_news_at = now
+            except OutsideError as error:
+                log.error("%s", error)
+
+    def _refresh(self, now: float) -> None:
+        """Write the deliverables of scans that grow, every ``refresh_s``."""
+        if not self._config.refresh_s or now < self._refresh_at:
+            return
+        self._refresh_at = now + self._config.refresh_s
+        for scan in self._scans.values():
+            if scan.unwritten and _idle(scan.writing):
+                self._write(scan)
 
     def _scan(self, drone: str, scan_id: str) -> _Scan | None:
         found = self._scans.get((drone, scan_id))

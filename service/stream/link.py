@@ -15,9 +15,11 @@ from service.errors import OutsideError, SkyreliefError
 from service.stream.lanes import Outgoing
 from service.stream.messages import unpack_ask, unpack_held
 from service.stream.outbox import Outbox
+from service.stream.radio_link import RadioSender
 from service.stream.ranges import ranges_from_text
 from service.stream.session import ROOT, SessionConfig, check_endpoints, check_name, open_session
 from service.stream.store import ScanStore
+from service.stream.tunnel import TunnelConfig
 
 if TYPE_CHECKING:
     import zenoh
@@ -82,6 +84,14 @@ class DatalinkSender:
         if config.connect or config.listen:
             self._thread = threading.Thread(target=self._run, name="datalink", daemon=True)
             self._thread.start()
+        self._radio = None
+        if config.radio:
+            tunnel = TunnelConfig(config.radio_baud / 10, config.radio_share)
+            self._radio = RadioSender(store, tunnel, config.radio, lambda: not self._listened())
+
+    def _listened(self) -> bool:
+        with self._lock:
+            return self._outbox.listened(time.monotonic())
 
     # The scan's side
 
@@ -138,6 +148,9 @@ class DatalinkSender:
         if self._thread is not None:
             self._thread.join(timeout=5.0)
             self._thread = None
+        if self._radio is not None:
+            self._radio.close()
+            self._radio = None
         for store, news in self._stores:
             store.unlisten(news)
         self._stores.clear()

@@ -1,0 +1,253 @@
+"""The narrow radio: messages decodable alone, pace, and a map in flight at 57,600 baud."""
+
+from __future__ import annotations
+
+import socket
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from recon import se3
+from recon.types import DepthMap, Keyframe, Pose
+from service.ground import receiver as receiver_module
+from service.ground.receiver import Receiver, ReceiverConfig
+from service.stream import codec
+from service.stream.radio_link import GROUND, RadioLink, RadioSender
+from service.stream.radio_messages import (
+    MAX_BYTES,
+    Tile,
+    pack_announce,
+    pack_pose,
+    pack_tile,
+    tag_of,
+    unpack_announce,
+    unpack_pose,
+    unpack_tile,
+)
+from service.stream.radio_tiles import keyframe_of, tiles_of
+from service.stream.records import PoseRecord, ScanHeader
+from service.stream.records import unpack_pose as unpack_record
+from service.stream.session import SessionConfig
+from service.stream.store import ScanStore
+from service.stream.tunnel import TunnelConfig, TunnelIntake, TunnelSender
+
+HEADER = ScanHeader("20260101T120000Z", "drone-a", 1_767_268_800_000_000_000, 47.5, 8.25, 431.5)
+F = 260.0
+R_DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+
+
+def keyframe(seq: int, x_m: float, fresh_from_px: int = 0) -> Keyframe:
+    """A nadir view from 60 m above ``ground_m``."""
+    w, h = 320, 180
+    T = se3.compose(R_DOWN, np.array([x_m, 20.0, 60.0]))
+    K = np.array([[F, 0, 159.5], [0, F, 89.5], [0, 0, 1]])
+    v, u = np.mgrid[:h, :w]
+    z = np.full((h, w), 60.0)
+    for _ in range(12):
+        x = x_m + (u - 159.5) / F * z
+        y = 20.0 - (v - 89.5) / F * z
+        z = 60.0 - ground_m(x, y)
+    grey = (128 + 60 * np.sin(x / 3)).astype(np.uint8)
+    depth = DepthMap(
+        z.astype(np.float32), np.full((h, w), 0.2, np.float32), np.full((h, w), 3, np.uint8), K, T
+    )
+    fresh = np.broadcast_to(u >= fresh_from_px, (h, w)).copy()
+    bgr = np.stack([grey, grey, grey // 2], axis=-1)
+    return Keyframe(seq, 5, depth, bgr, Pose(T, np.eye(6) * 1e-4), fresh)
+
+
+def ground_m(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.asarray(4 * np.sin(x / 15) + 3 * np.cos(y / 12))
+
+
+def world_points(frame: Keyframe) -> np.ndarray:
+    depth = frame.depth
+    v, u = np.nonzero(np.isfinite(depth.depth_m))
+    z = depth.depth_m[v, u].astype(np.float64)
+    K = depth.K
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(len(u))], axis=1)
+    return se3.transform(depth.T_world_camera, rays * z[:, None])
+
+
+def coarse(frame: Keyframe) -> Keyframe:
+    decoded = codec.decode(codec.encode(frame, 2_000_000_000)[:1])
+    assert decoded is not None
+    return decoded
+
+
+def test_a_tile_fits_and_decodes_alone() -> None:
+    tiles = tiles_of(coarse(keyframe(9, 3.0)))
+    packed = [pack_tile(77, tile) for tile in tiles]
+    assert len(packed) == 15 and max(map(len, packed)) <= MAX_BYTES
+    for data, tile in zip(packed, tiles, strict=True):
+        back = unpack_tile(data)
+        assert back is not None and back[0] == 77
+        got = back[1]
+        assert (got.seq, got.index, got.grid_px) == (9, tile.index, (40, 23))
+        error = got.depth_m - tile.depth_m
+        assert float(np.nanmax(np.abs(error))) < 0.15
+        np.testing.assert_array_equal(np.isfinite(got.depth_m), np.isfinite(tile.depth_m))
+        assert float(np.abs(got.bgr.astype(float) - tile.bgr).mean()) < 12
+        np.testing.assert_allclose(got.T_world_camera, tile.T_world_camera, atol=0.01)
+        assert 0.8 < got.sigma_m / tile.sigma_m < 1.25
+
+
+def test_tiles_make_the_surface_again() -> None:
+    frame = keyframe(0, 3.0, fresh_from_px=200)
+    tiles = [unpack_tile(pack_tile(1, tile)) for tile in tiles_of(coarse(frame))]
+    again = keyframe_of([tile[1] for tile in tiles if tile is not None])
+    assert again is not None
+    points = world_points(again)
+    assert points[:, 0].min() > 3.0 + (190 - 160) / F * 70
+    error = points[:, 2] - ground_m(points[:, 0], points[:, 1])
+    assert float(np.sqrt(np.mean(error**2))) < 0.4
+
+
+def test_announcement_and_pose_round_trip() -> None:
+    back = unpack_announce(pack_announce(HEADER))
+    assert back is not None
+    assert (back.scan_id, back.drone, back.started_unix_ns) == (
+        HEADER.scan_id, HEADER.drone, HEADER.started_unix_ns,
+    )  # fmt: skip
+    assert (back.origin_lat_deg, back.origin_alt_amsl_m) == (47.5, 431.5)
+    T = se3.exp(np.array([0.1, 0.2, -3.0, 4.0, 5.0, -6.0]))
+    pose = PoseRecord(17, T, np.eye(6), lat_deg=47.1234567, lon_deg=-8.5, sigma_m=0.31)
+    found = unpack_pose(pack_pose(5, 3, pose))
+    assert found is not None and found[:2] == (5, 3)
+    np.testing.assert_allclose(found[2].T_world_camera, T, atol=0.006)
+    assert found[2].lat_deg == pytest.approx(47.1234567, abs=1e-7)
+    assert found[2].alt_amsl_m is None
+    with pytest.raises(ValueError, match="too long"):
+        pack_announce(ScanHeader("s" * 60, "d" * 60, 0))
+
+
+@settings(max_examples=300)
+@given(st.binary(max_size=128), st.sampled_from([0x11, 0x12, 0x13]))
+def test_any_bytes_never_raise(data: bytes, kind: int) -> None:
+    for payload in (data, bytes([kind]) + data[1:]):
+        TunnelIntake().receive(payload)
+        found = unpack_tile(payload)
+        if found is not None:
+            keyframe_of([found[1]])
+
+
+def fly(sender: TunnelSender, store: ScanStore, seconds: float) -> list[tuple[float, bytes]]:
+    """What the radio gets while 100 m are flown in that time, a keyframe every 8 m."""
+    sent: list[tuple[float, bytes]] = []
+    next_frame, seq, now = 0.0, 0, 0.0
+    while now < seconds:
+        if now >= next_frame:
+            frame = keyframe(seq, 8.0 * seq, fresh_from_px=0 if seq == 0 else 290)
+            store.add_keyframe(seq, codec.encode(frame, round(now * 1e9)))
+            store.add_pose(PoseRecord(round(now * 1e9), frame.pose.T_world_camera, np.eye(6)))
+            sender.news("k0", seq)
+            sender.news("pose", seq + 1)
+            seq, next_frame = seq + 1, next_frame + seconds / 13
+        todo = sender.next(now)
+        if isinstance(todo, bytes):
+            sent.append((now, todo))
+        else:
+            now += min(todo, 0.05)
+    return sent
+
+
+def test_a_map_of_100_m_arrives_in_flight_within_the_share(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    with (
+        ScanStore.create(tmp_path / "a.db", HEADER) as onboard,
+        ScanStore.create(tmp_path / "g.db", HEADER) as ground,
+    ):
+        sender = TunnelSender(onboard, TunnelConfig(), 0.0)
+        sent = fly(sender, onboard, 20.0)
+        size = sum(len(payload) + 17 for _, payload in sent)
+        assert size <= 0.3 * 5760 * 20 * 1.05
+        intake = TunnelIntake()
+        for _, payload in sent:
+            if rng.random() < 0.1:
+                continue
+            for _, kind, number, part, data in intake.receive(payload):
+                ground.add_radio(kind, number, part, data)
+        points = np.concatenate([world_points(frame) for frame in ground.keyframes()])
+        error = points[:, 2] - ground_m(points[:, 0], points[:, 1])
+        assert float(np.sqrt(np.mean(error**2))) < 0.5
+        cells = {(int(x // 4), int(y // 4)) for x, y in points[:, :2]}
+        whole = [world_points(frame) for frame in onboard.keyframes()]
+        seen = {(int(x // 4), int(y // 4)) for part in whole for x, y in part[:, :2]}
+        assert len(cells & seen) > 0.85 * len(seen)
+        assert len(list(ground.poses())) >= 10
+        # What comes later over IP takes the place of what the radio brought.
+        for seq in onboard.seqs():
+            record = onboard.record("k1", seq)
+            assert record is not None and ground.put_record("k1", seq, record)
+        for a, b in zip(onboard.keyframes(), ground.keyframes(), strict=True):
+            np.testing.assert_array_equal(a.depth.depth_m, b.depth.depth_m)
+
+
+def test_a_full_radio_buffer_slows_it_down_and_an_empty_one_speeds_it_up(tmp_path: Path) -> None:
+    with ScanStore.create(tmp_path / "a.db", HEADER) as store:
+        sender = TunnelSender(store, TunnelConfig(), 0.0)
+        store.add_keyframe(0, codec.encode(keyframe(0, 0.0), 0))
+
+        def bytes_in_ten_seconds(start: float, free_percent: int) -> int:
+            before, now = sender.sent_bytes, start
+            sender.news("k0", 0)
+            while now < start + 10:
+                todo = sender.next(now)
+                if isinstance(todo, float):
+                    now += min(todo, 0.05)
+                if int(now * 20) % 20 == 0:
+                    sender.radio_status(free_percent, now)
+            return sender.sent_bytes - before
+
+        full_speed = bytes_in_ten_seconds(0.0, 95)
+        slowed = bytes_in_ten_seconds(10.0, 10)
+        assert slowed < 0.4 * full_speed
+
+
+def test_over_a_real_link_into_the_ground_station(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("zenoh")
+    monkeypatch.setattr(receiver_module, "_deliver", lambda *_: None)
+    with socket.socket(type=socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        udp = probe.getsockname()[1]
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        tcp = probe.getsockname()[1]
+    session = SessionConfig(mode="router", listen=(f"tcp/127.0.0.1:{tcp}",))
+    ground = Receiver(ReceiverConfig(tmp_path / "ground", session))
+    ground.start()
+    radio = RadioLink(f"udpin:127.0.0.1:{udp}", GROUND, ground.add_radio)
+    radio.start()
+    store = ScanStore.create(tmp_path / "a.db", HEADER)
+    sender = RadioSender(store, TunnelConfig(radio_bytes_s=50_000), f"udpout:127.0.0.1:{udp}")
+    try:
+        store.add_keyframe(0, codec.encode(keyframe(0, 0.0), 0))
+        deadline = time.monotonic() + 15
+        while time.monotonic() < deadline:
+            entries = ground.progress()
+            if entries and entries[0]["radio_messages"] >= 15:
+                break
+            time.sleep(0.05)
+    finally:
+        sender.close()
+        radio.close()
+        ground.close()
+        store.close()
+    path = tmp_path / "ground" / HEADER.drone / HEADER.scan_id / "scan.db"
+    with ScanStore.open(path) as kept:
+        (frame,) = kept.keyframes()
+        assert np.isfinite(frame.depth.depth_m).mean() > 0.95
+        assert kept.header.origin_lat_deg == 47.5
+
+
+def test_tags_tell_scans_apart() -> None:
+    assert tag_of("a", "b") != tag_of("b", "a")
+    assert isinstance(tiles_of(coarse(keyframe(0, 0.0)))[0], Tile)
+    pose = unpack_record(b"")
+    assert pose is None
