@@ -85,6 +85,7 @@ def _key(call: Call) -> tuple[object, ...]:
 class _Running:
     call: Call
     key: tuple[object, ...]
+    window_ns: int
     work: Work
     until_ns: int
     next_report_ns: int
@@ -147,17 +148,23 @@ class CommandDesk:
             if not call.is_broadcast:
                 self._answer(component, call, Answer(Result.DENIED))
         elif isinstance(handled, Work):
-            self._start(component, call, handled, now_ns)
+            window_ns = int(command.WINDOW_S * S)
+            limit_ns, report_ns = now_ns + WORK_LIMIT_NS, now_ns + PROGRESS_EVERY_NS
+            running = _Running(call, key, window_ns, handled, limit_ns, report_ns)
+            self._start(component, running, now_ns)
         else:
             self._answer(component, call, handled)
-            if command.WINDOW_S:
-                until = now_ns + int(command.WINDOW_S * S)
-                self._last[component] = _Done(key, handled, until)
+            self._remember(component, key, handled, now_ns, int(command.WINDOW_S * S))
 
-    def _start(self, component: int, call: Call, work: Work, now_ns: int) -> None:
-        running = _Running(
-            call, _key(call), work, now_ns + WORK_LIMIT_NS, now_ns + PROGRESS_EVERY_NS
-        )
+    def _remember(
+        self, component: int, key: tuple[object, ...], answer: Answer, now_ns: int, window_ns: int
+    ) -> None:
+        """A question leaves no trace, so that it does not hide what was done before it."""
+        if window_ns:
+            self._last[component] = _Done(key, answer, now_ns + window_ns)
+
+    def _start(self, component: int, running: _Running, now_ns: int) -> None:
+        call, work = running.call, running.work
         self._last.pop(component, None)
         self._running[(component, call.number)] = running
         if work.answer is None:
@@ -184,6 +191,7 @@ class CommandDesk:
                 if running.work.cancelled and answer.result is Result.ACCEPTED:
                     answer = Answer(Result.CANCELLED)
                 self._answer(component, running.call, answer)
+                self._remember(component, running.key, answer, now_ns, running.window_ns)
             elif now_ns >= running.next_report_ns:
                 running.next_report_ns = now_ns + PROGRESS_EVERY_NS
                 self._progress(component, running.call, running.work)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from mavlink import status as texts
@@ -16,12 +16,13 @@ from mavlink.camera import CAPTURE_STATUS, CameraComponent, CameraConfig, Keyfra
 from mavlink.clock import BootClock
 from mavlink.command_desk import CommandDesk, decode_call
 from mavlink.commands import load_commands
-from mavlink.control import Answer, ScanControl
+from mavlink.control import Answer, Result, ScanControl
 from mavlink.decode import READERS, decode
 from mavlink.framing import Decoder, Packet
+from mavlink.gimbal import YAW_FRAMES
 from mavlink.history import VehicleHistory
 from mavlink.messages import CAMERA, ONBOARD, Address, Outbox, Outgoing
-from mavlink.parameters import Parameters
+from mavlink.parameters import YAW_FRAME, Parameters
 from mavlink.presence import Presence
 from mavlink.rates import WANTED_HZ, RateKeeper
 from mavlink.status import ComputerLoad, StatusTexts, computer_status, motion_values
@@ -74,7 +75,9 @@ class Companion:
         self.rates = RateKeeper(config.wanted_hz)
         self.streams = Streams(self._outbox)
         self.texts = StatusTexts(self._outbox)
-        self.parameters = Parameters(self._outbox, control.parameter_changed, kept_parameters)
+        self.parameters = Parameters(self._outbox, self._parameter_changed, kept_parameters)
+        if self.parameters[YAW_FRAME]:
+            self._set_yaw_frame(self.parameters[YAW_FRAME])
         self.camera = CameraComponent(
             config.camera,
             control,
@@ -170,6 +173,16 @@ class Companion:
         answer = self.parameters.receive(message)
         if isinstance(answer, Answer) and answer.text:
             self._warn(answer.text)
+
+    def _parameter_changed(self, name: str, value: float) -> Answer:
+        answer = self.control.parameter_changed(name, value)
+        if name == YAW_FRAME and answer.result is Result.ACCEPTED:
+            self._set_yaw_frame(value)
+        return answer
+
+    def _set_yaw_frame(self, value: float) -> None:
+        gimbal = replace(self.history.config.gimbal, yaw_frame=YAW_FRAMES[round(value)])
+        self.history.set_gimbal(gimbal)
 
     def _hear_timesync(self, message: Any, packet: Packet, link: int, now_ns: int) -> None:
         if message.tc1 == 0:  # a question; we answer with our own time since boot

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -91,6 +91,11 @@ class VehicleHistory:
             track.add(time_ns, row)
             if math.isfinite(self.config.keep_s):
                 track.forget_before(time_ns - int(self.config.keep_s * 1e9))
+
+    def set_gimbal(self, gimbal: GimbalConfig) -> None:
+        """Read gimbal messages in another way from now on, those already kept as well."""
+        with self._lock:
+            self.config = replace(self.config, gimbal=gimbal)
 
     def clear(self) -> None:
         """Forget everything, as after a reboot of the autopilot."""

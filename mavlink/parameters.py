@@ -17,6 +17,7 @@ from mavlink.messages import ONBOARD, Outbox
 from mavlink.wire import dialect
 
 REAL32 = 9  # MAV_PARAM_TYPE
+YAW_FRAME = "SR_YAW_FRAME"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +49,7 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter("SR_BASELINE_M", 0.0, 0.0, 200.0, "Stereo baseline, 0 follows altitude", unit="m"),
     Parameter("SR_RESOLUTION_M", 0.1, 0.01, 5.0, "Map resolution", unit="m"),
     Parameter("SR_LINK_KBIT_S", 1000.0, 0.0, 100_000.0, "Datalink budget", unit="kbit/s"),
-    Parameter(
-        "SR_YAW_FRAME", 0.0, 0.0, len(YAW_FRAMES) - 1.0, "Gimbal yaw frame", options=YAW_FRAMES
-    ),
+    Parameter(YAW_FRAME, 0.0, 0.0, len(YAW_FRAMES) - 1.0, "Gimbal yaw frame", options=YAW_FRAMES),
     Parameter("SR_CAM_LATENCY", 0.0, -500.0, 2000.0, "Camera latency", unit="ms"),
 )
 """The next parameter is one line here and one case in the service."""

@@ -399,6 +399,7 @@ def test_work_reports_progress_and_ends(ends: Ends) -> None:
     work.finish(Answer(Result.FAILED))  # the first word stands
     acks = [m for m in ends.pass_time(0.1) if m.get_type() == "COMMAND_ACK"]
     assert [m.result for m in acks] == [ACCEPTED]
+    assert ends.command(31010, 191, 5) == [ACCEPTED]  # the end was not heard: said again
     assert ends.control.asked == ["finalise"]
     assert "COMMAND_ACK" not in kinds(ends.pass_time(5.0))
 

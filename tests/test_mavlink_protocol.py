@@ -602,3 +602,19 @@ def test_sequence_numbers_count_per_component() -> None:
         sequences[component].append(data[4])
     for numbers in sequences.values():
         assert numbers == [k % 256 for k in range(len(numbers))]
+
+
+def test_the_gimbals_frame_is_tuned_in_flight() -> None:
+    station = Station()
+    assert station.history.config.gimbal.yaw_frame == "auto"
+    message = dialect.MAVLink_param_set_message(1, 191, b"SR_YAW_FRAME", 3.0, 9)
+    station.feed(packed(message, (255, 190)))
+    assert station.history.config.gimbal.yaw_frame == "body"
+    refused = dialect.MAVLink_param_set_message(1, 191, b"SR_YAW_FRAME", 17.0, 9)
+    station.feed(packed(refused, (255, 190)))
+    assert station.history.config.gimbal.yaw_frame == "body"
+    history = VehicleHistory()
+    presence = Presence(PresenceConfig(), 1, 0)
+    control = RehearsalControl()
+    Companion(CompanionConfig(), control, presence, history, 0, {"SR_YAW_FRAME": 2.0, "X": 1.0})
+    assert history.config.gimbal.yaw_frame == "earth"

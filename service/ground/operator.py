@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import threading
 import time
@@ -11,6 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from service.errors import InputError, OutsideError
+
+log = logging.getLogger(__name__)
 
 ONBOARD, CAMERA = 191, 100
 START_SCAN, STOP_SCAN, CAPTURE, BASELINE, USER_1, REQUEST = 2500, 2501, 2000, 206, 31010, 512
@@ -52,6 +55,17 @@ RESULTS = (
 )
 
 
+def _quieten() -> None:
+    """mavsdk's own log goes to our log, as debugging, instead of standard error."""
+    from mavsdk.logging import log_subscribe  # type: ignore[import-untyped, unused-ignore]
+
+    def pass_on(level: Any, text: str, *_: object) -> bool:
+        log.debug("mavsdk: %s", text)
+        return True
+
+    log_subscribe(pass_on)
+
+
 @dataclass(frozen=True, slots=True)
 class Ack:
     """Who answered a command, and what."""
@@ -81,6 +95,7 @@ class Operator:
             )
         except ImportError as error:
             raise OutsideError("ctl needs mavsdk; pip install 'skyrelief[ground]'") from error
+        _quieten()
         self._direct_module = mavlink_direct
         kind = ComponentType.GROUND_STATION
         self._mavsdk = Mavsdk(Configuration.create_with_component_type(kind))
@@ -134,7 +149,11 @@ class Operator:
         return number
 
     def command(self, number: int, component: int, params: tuple[float, ...] = ()) -> Ack:
-        """Send a command and wait for its final answer, whoever gives it."""
+        """Send a command and wait for the final answer of the component asked.
+
+        OutsideError when nobody answers, or somebody else: an autopilot that has not heard the
+        companion carries its commands out itself.
+        """
         padded = [*params, *[0.0] * (7 - len(params))]
         fields = {
             "target_system": self.system,
@@ -143,24 +162,36 @@ class Operator:
             "confirmation": 0,
             **{f"param{k}": value for k, value in enumerate(padded, 1)},
         }
+        others: list[Ack] = []
+
+        def overhear(message: Any, _: Any = None) -> None:
+            told = parse_fields(message.fields_json)
+            if message.component_id != component and told.get("command") == number:
+                result = told.get("result", 4)
+                others.append(Ack(message.system_id, message.component_id, int(result)))
+
         module = self._direct_module
+        handle = self._direct.subscribe_message("COMMAND_ACK", overhear)
         message = module.MavlinkMessage(
             "COMMAND_LONG", *GROUND_STATION, self.system, component, json.dumps(fields)
         )
         try:
             answer = self._direct.send_command(message)
         except module.MavlinkDirectError as error:
+            if others:
+                raise OutsideError(
+                    f"component {others[0].component} of system {others[0].system} answered "
+                    f"({others[0].text}) instead of component {component}: the autopilot does not "
+                    "know the companion's link"
+                ) from error
             raise OutsideError(
                 f"no answer from component {component} of system {self.system}; "
                 "the link to the vehicle may be down"
             ) from error
-        ack = Ack(answer.system_id, answer.component_id, json.loads(answer.fields_json)["result"])
-        if (ack.system, ack.component) != (self.system, component):
-            raise OutsideError(
-                f"component {ack.component} of system {ack.system} answered ({ack.text}) instead "
-                f"of component {component}: the autopilot does not know the companion's link"
-            )
-        return ack
+        finally:
+            self._direct.unsubscribe_message(handle)
+        result = int(json.loads(answer.fields_json)["result"])
+        return Ack(answer.system_id, answer.component_id, result)
 
     def subscribe(self, name: str, callback: Callable[[int, dict[str, Any]], None]) -> None:
         """Call back with (component, fields) for every message of a name; "" is all."""
