@@ -19,8 +19,10 @@ from recon.types import F32, F64, Bool, DepthMap, Registration
 __all__ = ["IcpConfig", "Surface", "register_clouds", "register_projective", "register_surfaces"]
 
 
+# Variance that the residuals do not show: edges half seen, errors of the normals; measured.
+_UNSEEN_VARIANCE = 1.5
 # Neighbours of a loose cloud share the points that their normals are made from; measured.
-_CLOUD_CORRELATION = 2.0
+_CLOUD_CORRELATION = 1.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +61,6 @@ class IcpConfig:
 class Surface:
     """A depth map with its surface elements, ready to be aligned many times."""
 
-    depth_m: F32  # (h, w)
     elements: F32  # (h, w, 6), see recon.icp_kernels
     intrinsics: F64  # (4,) fx fy cx cy
     centre: F64  # (3,) m, mean of the surface in the camera frame
@@ -82,7 +83,7 @@ class Surface:
         points = some[:, None] * rays(K, np.column_stack([4.0 * u, 4.0 * v]))
         centre = points.mean(axis=0) if len(points) else np.zeros(3)
         lever = np.sqrt(np.mean(np.sum((points - centre) ** 2, axis=1))) if len(points) else 1.0
-        return Surface(z, elements, intrinsics, centre, max(float(lever), 1e-6))
+        return Surface(elements, intrinsics, centre, max(float(lever), 1e-6))
 
 
 @dataclass(slots=True, eq=False)
@@ -134,7 +135,7 @@ def _problem(
     shape = (h - stride // 2 - 1) // stride + 1, (w - stride // 2 - 1) // stride + 1
     size, rows = np.empty(shape, np.float32), np.empty((*shape, 10), np.float32)
     icp_kernels.residuals(
-        source.elements, source.depth_m, source.intrinsics, target.elements, target.intrinsics,
+        source.elements, source.intrinsics, target.elements, target.intrinsics,
         T, stride, config.gate_share, size, rows,
     )  # fmt: skip
     return _weighed(size, rows, T[:3, :3] @ source.centre + T[:3, 3], source.lever_m, tukey, config)
@@ -242,7 +243,7 @@ def _covariance(problem: _Problem, config: IcpConfig) -> tuple[F64, F64]:
     weights, squares = float(problem.sums[0]), float(problem.sums[1])
     # Residuals of neighbours err together, so they count as fewer than they are.
     area = float(icp_kernels.correlated_area(problem.size, 4.685 * problem.scale, 12))
-    variance = max(squares / max(weights - 6.0, 1.0), 1e-6) * area
+    variance = max(squares / max(weights - 6.0, 1.0), 1e-6) * area * _UNSEEN_VARIANCE
     # Information from noise in the normals is none: only the shared part moves the estimate.
     information = np.maximum(problem.shared, 1e-30) ** 2 / np.maximum(problem.values, 1e-30)
     spread = np.where(problem.strong, variance / information, config.unknown_sigma_m**2)
