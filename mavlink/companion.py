@@ -16,7 +16,7 @@ from mavlink.camera import CAPTURE_STATUS, CameraComponent, CameraConfig, Keyfra
 from mavlink.clock import BootClock
 from mavlink.command_desk import CommandDesk, decode_call
 from mavlink.commands import load_commands
-from mavlink.control import Answer, Result, ScanControl
+from mavlink.control import ACCEPTED, Answer, Result, ScanControl
 from mavlink.decode import READERS, decode
 from mavlink.framing import Decoder, Packet
 from mavlink.gimbal import YAW_FRAMES
@@ -76,8 +76,6 @@ class Companion:
         self.streams = Streams(self._outbox)
         self.texts = StatusTexts(self._outbox)
         self.parameters = Parameters(self._outbox, self._parameter_changed, kept_parameters)
-        if self.parameters[YAW_FRAME]:
-            self._set_yaw_frame(self.parameters[YAW_FRAME])
         self.camera = CameraComponent(
             config.camera,
             control,
@@ -175,10 +173,17 @@ class Companion:
             self._warn(answer.text)
 
     def _parameter_changed(self, name: str, value: float) -> Answer:
-        answer = self.control.parameter_changed(name, value)
-        if name == YAW_FRAME and answer.result is Result.ACCEPTED:
-            self._set_yaw_frame(value)
-        return answer
+        if name != YAW_FRAME:
+            return self.control.parameter_changed(name, value)
+        self._set_yaw_frame(value)
+        return ACCEPTED
+
+    def announce_kept(self) -> None:
+        """Tell the service the parameters that were kept from an earlier run."""
+        for name, value in self.parameters.kept().items():
+            answer = self._parameter_changed(name, value)
+            if answer.result is not Result.ACCEPTED:
+                self.parameters.forget(name)
 
     def _set_yaw_frame(self, value: float) -> None:
         gimbal = replace(self.history.config.gimbal, yaw_frame=YAW_FRAMES[round(value)])

@@ -69,7 +69,7 @@ class Parameters:
         self._on_change = on_change
         self.table = tuple(table)
         self._index = {p.name: i for i, p in enumerate(self.table)}
-        self._values = [p.default for p in self.table]
+        self._values = [_real32(p.default) for p in self.table]
         self.revision = 0  # grows with every change, so that a keeper knows when to save
         for name, value in (kept or {}).items():
             i = self._index.get(name)
@@ -82,6 +82,16 @@ class Parameters:
     def values(self) -> dict[str, float]:
         """Every value by name."""
         return {p.name: v for p, v in zip(self.table, self._values, strict=True)}
+
+    def kept(self) -> dict[str, float]:
+        """The values that differ from their defaults, by name."""
+        pairs = zip(self.table, self._values, strict=True)
+        return {p.name: v for p, v in pairs if v != _real32(p.default)}
+
+    def forget(self, name: str) -> None:
+        """Put a value that the service no longer takes back to its default."""
+        i = self._index[name]
+        self._values[i] = _real32(self.table[i].default)
 
     def change(self, name: str, value: float) -> Answer:
         """Set a value, unless it is out of range or the service refuses it."""

@@ -123,6 +123,7 @@ class VehicleLink:
 
     def start(self) -> None:
         """Open the links; the first heartbeat goes out before anything else."""
+        self._do(self._companion.announce_kept)
         for target in (self._beat, self._run):
             thread = threading.Thread(target=target, name=f"mavlink {target.__name__}", daemon=True)
             self._threads.append(thread)

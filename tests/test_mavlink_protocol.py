@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from mavlink.camera import KeyframeReport
 from mavlink.clock import BootClock, BootCounter, fit_boot
 from mavlink.companion import Companion, CompanionConfig
+from mavlink.control import Answer, Result
 from mavlink.decode import READERS, decode
 from mavlink.framing import Decoder, Framer, check_packet, packet_length
 from mavlink.history import VehicleHistory
@@ -613,8 +614,18 @@ def test_the_gimbals_frame_is_tuned_in_flight() -> None:
     refused = dialect.MAVLink_param_set_message(1, 191, b"SR_YAW_FRAME", 17.0, 9)
     station.feed(packed(refused, (255, 190)))
     assert station.history.config.gimbal.yaw_frame == "body"
-    history = VehicleHistory()
+
+
+def test_kept_parameters_are_told_to_the_service_and_dropped_when_it_refuses() -> None:
+    history, control = VehicleHistory(), RehearsalControl()
+    control.answers["SR_LINK_KBIT_S"] = Answer(Result.UNSUPPORTED)
+    kept = {"SR_YAW_FRAME": 2.0, "SR_BASELINE_M": 2.5, "SR_LINK_KBIT_S": 5.0, "X": 1.0}
+    kept["SR_RESOLUTION_M"] = 1e9  # out of range by now
     presence = Presence(PresenceConfig(), 1, 0)
-    control = RehearsalControl()
-    Companion(CompanionConfig(), control, presence, history, 0, {"SR_YAW_FRAME": 2.0, "X": 1.0})
+    companion = Companion(CompanionConfig(), control, presence, history, 0, kept)
+    companion.announce_kept()
     assert history.config.gimbal.yaw_frame == "earth"
+    assert "SR_BASELINE_M=2.5" in control.asked
+    values = companion.parameters.values()
+    assert values["SR_BASELINE_M"] == 2.5 and values["SR_LINK_KBIT_S"] == 1000.0
+    assert values["SR_RESOLUTION_M"] == pytest.approx(0.1)

@@ -1,0 +1,52 @@
+"""What operators are given agrees with what the service takes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from mavlink.commands import load_commands
+from mavlink.commands.user import (
+    BASELINE,
+    CLEAR_MAP,
+    FINALISE,
+    PAUSE,
+    RESUME,
+    SELF_TEST,
+    START,
+    STOP,
+)
+from mavlink.gimbal import YAW_FRAMES
+from mavlink.parameters import PARAMETERS
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def test_every_button_of_qgroundcontrol_has_its_command() -> None:
+    actions = json.loads((ROOT / "deploy" / "qgc-custom-actions.json").read_text())
+    assert actions["fileType"] == "MavlinkActions" and actions["version"] == 1
+    table = load_commands()
+    for action in actions["actions"]:
+        assert action["compId"] in table[action["mavCmd"]].COMPONENTS
+        assert action["label"] and action["description"]
+    used = {action["param1"] for action in actions["actions"]}
+    assert used == {BASELINE, CLEAR_MAP, FINALISE, PAUSE, RESUME, SELF_TEST, START, STOP}
+
+
+def test_the_operators_page_names_every_parameter_and_command() -> None:
+    page = (ROOT / "docs" / "operators.md").read_text()
+    for parameter in PARAMETERS:
+        assert f"`{parameter.name}`" in page
+    for number in load_commands():
+        assert str(number) in page
+    for k, frame in enumerate(YAW_FRAMES):
+        assert f"{k} {frame}" in page
+
+
+def test_the_operators_page_names_every_action_of_ctl() -> None:
+    from service.commands.ctl import ACTIONS
+    from service.ground.operator import ORDERS
+
+    page = (ROOT / "docs" / "operators.md").read_text()
+    assert all(action in page for action in ACTIONS)
+    assert set(ORDERS) | {"status", "watch"} == set(ACTIONS)
