@@ -211,8 +211,26 @@ def test_an_embedded_picture_that_lies_about_its_size_is_not_opened() -> None:
     assert planes.picture_size(colour) == (8, 8)
     assert planes.picture_size(lying) == (65535, 65535)
     assert planes.decode_colour(lying, 8, 8) is None
-    bomb = zlib.compress(bytes(10_000_000))
-    assert planes.decode_mask(bomb, 16, 16) is None
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 30), st.integers(1, 30), st.integers(0, 2**32 - 1), st.floats(0, 1))
+def test_any_mask_comes_back(h: int, w: int, seed: int, share: float) -> None:
+    known = np.random.default_rng(seed).random((h, w)) < share
+    known[0, 0] = True
+    np.testing.assert_array_equal(planes.decode_mask(planes.encode_mask(known), w, h), known)
+
+
+@given(st.binary(max_size=100))
+def test_any_bytes_are_some_mask(data: bytes) -> None:
+    assert planes.decode_mask(data, 13, 9).shape == (9, 13)
+
+
+def test_a_ragged_mask_costs_less_than_zlib() -> None:
+    noise = cv2.GaussianBlur(np.random.default_rng(1).normal(size=(180, 320)), (0, 0), 4)
+    known = noise > 0
+    packed = zlib.compress(np.packbits(known, axis=1).tobytes(), 9)
+    assert len(planes.encode_mask(known)) < 0.7 * len(packed)
 
 
 def test_records_round_trip() -> None:

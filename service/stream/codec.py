@@ -168,8 +168,6 @@ def _open_planes(head: LayerHead, sections: Sequence[bytes]) -> planes.Planes | 
         return planes.Planes(blank, blank, none, np.zeros((0, 0, 3), np.uint8), none > 0)
     mask, depth, sigma, views, colour = sections
     known = planes.decode_mask(mask, w, h)
-    if known is None:
-        return None
     depth_m = planes.decode_depth(depth, known, head.method, head.inverse_min, head.inverse_step)
     sigma_m = planes.decode_sigma(sigma, w, h)
     count = planes.decode_views(views, w, h)

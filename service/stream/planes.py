@@ -6,7 +6,6 @@ claims before opening it, so no more is allocated than the caller's own grid nee
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
 
 import cv2
@@ -15,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.types import F32, U8, Array, Bool
-from service.stream import prediction
+from service.stream import mask_coder, prediction
 
 U16 = npt.NDArray[np.uint16]
 
@@ -129,27 +128,17 @@ def _fill_back(values: Array, known: Bool) -> Array:
     return np.asarray(values.reshape(known.size)[index].reshape(known.shape))
 
 
-# Mask: rows packed to bits (most significant first), then zlib.
+# Mask: which pixels of the box are known.
 
 
 def encode_mask(known: Bool) -> bytes:
     """The section that says which pixels of the box are known; empty when all are."""
-    return b"" if known.all() else zlib.compress(np.packbits(known, axis=1).tobytes(), 6)
+    return b"" if known.all() else mask_coder.encode(known)
 
 
-def decode_mask(data: bytes, w: int, h: int) -> Bool | None:
-    """(h, w) known pixels."""
-    if not data:
-        return np.ones((h, w), np.bool_)
-    size = h * (-(-w // 8))
-    try:
-        raw = zlib.decompressobj().decompress(data, size + 1)
-    except zlib.error:
-        return None
-    if len(raw) != size:
-        return None
-    rows = np.frombuffer(raw, np.uint8).reshape(h, -1)
-    return np.unpackbits(rows, axis=1, count=w).astype(np.bool_)
+def decode_mask(data: bytes, w: int, h: int) -> Bool:
+    """(h, w) known pixels; any bytes give some."""
+    return mask_coder.decode(data, w, h) if data else np.ones((h, w), np.bool_)
 
 
 # Depth: codes of inverse depth.
