@@ -1,4 +1,4 @@
-# make demo | test | lint | types | bench | trials | clean. The first call makes .venv.
+# make demo | test | lint | types | bench | trials | bundle | clean. The first call makes .venv.
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -11,7 +11,7 @@ ARGS ?=
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: demo test lint types check bench trials format clean
+.PHONY: demo test lint types check bench trials format bundle clean
 
 demo: $(STAMP)
 	$(BIN)/skyrelief demo --out demo-output $(ARGS)
@@ -38,6 +38,10 @@ trials: $(STAMP)
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# Everything that deploy/install.sh needs on a machine without a network.
+bundle: $(STAMP)
+	PYTHON=$(abspath $(BIN))/python deploy/bundle.sh $(ARGS)
 
 clean:
 	rm -rf demo-output build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

@@ -1,0 +1,227 @@
+#!/usr/bin/env bash
+# Installs, upgrades or removes skyrelief on a drone's computer or a ground station: Jetson
+# (JetPack 6) or any Debian or Ubuntu machine with Python 3.10 to 3.13. May be run again at any
+# time. Each version has its own folder; the switch is one rename, and is undone when the new
+# version does not come up healthy.
+#
+#   sudo deploy/install.sh                      from this clone, with pip's package index
+#   sudo deploy/install.sh --bundle DIR         offline, from what 'make bundle' prepared
+#   sudo deploy/install.sh --ground             the ground receiver instead of the onboard service
+#   sudo deploy/install.sh --rollback           back to the version before
+#   sudo deploy/install.sh --uninstall          remove it; scans and configuration stay
+set -euo pipefail
+
+here=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
+root=${SKYRELIEF_ROOT:-}          # for trials: everything goes below this folder
+python=${PYTHON:-python3}
+bundle=""
+extras="logs"
+unit=skyrelief
+start=1
+action=install
+keep=3
+health_s=${SKYRELIEF_HEALTH_S:-45}
+
+say() { printf '%s\n' "$*"; }
+die() { printf 'install.sh: %s\n' "$*" >&2; exit 1; }
+
+while (($#)); do
+  case $1 in
+    --bundle) bundle=${2:?--bundle needs a folder}; shift ;;
+    --python) python=${2:?--python needs a command}; shift ;;
+    --extras) extras=${2:?--extras needs a list such as gpu,logs}; shift ;;
+    --ground) unit=skyrelief-ground; extras="ground,logs" ;;
+    --no-start) start=0 ;;
+    --rollback) action=rollback ;;
+    --uninstall) action=uninstall ;;
+    -h | --help) sed -n '2,11s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"; exit 0 ;;
+    *) die "no option $1; see --help" ;;
+  esac
+  shift
+done
+
+home=$root/opt/skyrelief
+versions=$home/versions
+current=$home/current
+etc=$root/etc/skyrelief
+
+[[ -n $root || $(id -u) -eq 0 ]] || die "run it as root: sudo $0"
+
+# True when this machine is run by systemd and we install for real.
+live() { [[ -z $root && -d /run/systemd/system ]]; }
+
+check_python() {
+  command -v "$python" >/dev/null || die "no $python; apt install python3 python3-venv"
+  "$python" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' ||
+    die "$python is $("$python" -V 2>&1); Python 3.10 to 3.13 is needed (--python python3.12)"
+  "$python" -c 'import ensurepip' 2>/dev/null || die "no venv module; apt install python3-venv"
+}
+
+# NVIDIA's own builds of torch and onnxruntime live in the system's Python on a Jetson; a
+# virtual environment that sees them keeps them, PyPI's would lack the GPU.
+site_packages() {
+  if "$python" - <<'PY' 2>/dev/null
+import importlib.util, sys
+found = [n for n in ("torch", "onnxruntime", "tensorrt") if importlib.util.find_spec(n)]
+sys.exit(not found)
+PY
+  then printf '%s' --system-site-packages; fi
+}
+
+# Makes $versions/$1 from this clone or the bundle; an unfinished one is thrown away.
+build_version() {
+  local target=$versions/$1 part=$versions/$1.part site
+  rm -rf "$part"
+  mkdir -p "$versions"
+  site=$(site_packages)
+  say "making $target${site:+ (with the packages of the system)}"
+  # shellcheck disable=SC2086  # empty or one word
+  "$python" -m venv $site "$part"
+  if [[ -n $bundle ]]; then
+    "$part/bin/python" -m pip install -q --disable-pip-version-check --no-index \
+      --find-links "$bundle/wheels" "skyrelief[$extras]"
+  else
+    "$part/bin/python" -m pip install -q --disable-pip-version-check \
+      -c "$here/constraints.txt" "${here}[$extras]"
+  fi
+  # A virtual environment holds its own path in the scripts it writes.
+  grep -rlIZ --fixed-strings "$part" "$part/bin" "$part/pyvenv.cfg" |
+    xargs -0 -r sed -i "s|$part|${target#"$root"}|g"
+  "$part/bin/python" -c 'import service.cli, recon, mavlink' || die "the new version does not start"
+  mv "$part" "$target"
+}
+
+# Points 'current' at $1 by one rename.
+switch_to() {
+  ln -sfn "versions/$1" "$home/current.new"
+  mv -T "$home/current.new" "$current"
+}
+
+version_now() { [[ -L $current ]] && basename "$(readlink "$current")" || true; }
+
+install_files() {
+  local from=$here
+  [[ -n $bundle ]] && from=$bundle
+  install -D -m 0644 -t "$root/etc/systemd/system" "$from/systemd/$unit.service"
+  install -D -m 0644 "$from/systemd/skyrelief.sysusers" "$root/usr/lib/sysusers.d/skyrelief.conf"
+  install -D -m 0644 "$from/systemd/skyrelief.tmpfiles" "$root/usr/lib/tmpfiles.d/skyrelief.conf"
+  install -D -m 0644 "$from/deploy/60-skyrelief.rules" "$root/etc/udev/rules.d/60-skyrelief.rules"
+  install -D -m 0644 "$from/deploy/50-skyrelief.polkit.rules" \
+    "$root/etc/polkit-1/rules.d/50-skyrelief.rules"
+  install -d -m 0755 "$etc"
+  if [[ $unit == skyrelief && ! -e $etc/skyrelief.toml ]]; then
+    "$current/bin/python" -m service.cli config default >"$etc/skyrelief.toml.new"
+    mv "$etc/skyrelief.toml.new" "$etc/skyrelief.toml"
+    say "wrote $etc/skyrelief.toml: set camera.source, camera.model, mavlink.links, datalink.connect"
+  fi
+}
+
+prepare_machine() {
+  live || return 0
+  systemd-sysusers skyrelief.conf
+  systemd-tmpfiles --create skyrelief.conf
+  # The Jetson's console on its header UART would talk into the autopilot.
+  if systemctl list-unit-files nvgetty.service >/dev/null 2>&1; then
+    systemctl disable --now nvgetty.service >/dev/null 2>&1 || true
+  fi
+  udevadm control --reload 2>/dev/null || true
+  systemctl daemon-reload
+  systemctl enable "$unit.service" >/dev/null
+}
+
+# True when the service is up and stays up without a restart.
+healthy() {
+  local before after
+  systemctl restart "$unit.service" || return 1
+  before=$(systemctl show -p NRestarts --value "$unit.service")
+  for ((i = 0; i < health_s; i++)); do
+    sleep 1
+    after=$(systemctl show -p NRestarts --value "$unit.service")
+    [[ $after == "$before" ]] || return 1
+  done
+  systemctl is-active --quiet "$unit.service"
+}
+
+start_or_roll_back() {
+  local old=$1 new=$2
+  if ! live || ((!start)); then
+    say "not started: run 'systemctl enable --now $unit' when the configuration is right"
+    return 0
+  fi
+  say "starting $unit; watching it for $health_s s"
+  if healthy; then
+    say "$unit $new is up"
+  elif [[ -n $old && $old != "$new" ]]; then
+    switch_to "$old"
+    systemctl restart "$unit.service" || true
+    die "$new did not come up; $old is back in place (journalctl -u $unit)"
+  else
+    die "$new did not come up; see journalctl -u $unit and 'skyrelief config check'"
+  fi
+}
+
+# Keeps the version in use, the one before, and the newest others: $keep in all.
+prune() {
+  find "$versions" -mindepth 1 -maxdepth 1 -type d -printf '%T@ %f\n' | sort -rn |
+    awk -v now="$(version_now)" -v kept="$((keep - 1))" '$2 != now && n++ >= kept { print $2 }' |
+    while read -r old; do
+      [[ $(readlink "$home/previous") == "versions/$old" ]] || rm -rf "${versions:?}/$old"
+    done
+}
+
+version_to_install() {
+  local from=$here
+  [[ -n $bundle ]] && from=$bundle
+  local release stamp
+  release=$(sed -n 's/^version = "\(.*\)"/\1/p' "$from/pyproject.toml" | head -n 1)
+  stamp=$(cd "$from" && find pyproject.toml service recon mavlink systemd wheels -type f \
+    ! -name '*.pyc' ! -name '*.nb[ic]' -print0 2>/dev/null |
+    sort -z | xargs -0 -r cat | sha256sum | cut -c1-8)
+  printf '%s-%s' "${release:?no version in $from/pyproject.toml}" "$stamp"
+}
+
+do_install() {
+  [[ -z $bundle || -d $bundle/wheels ]] || die "$bundle holds no wheels/; make one with 'make bundle'"
+  [[ -z $bundle ]] || bundle=$(cd "$bundle" && pwd)
+  check_python
+  local new old
+  new=$(version_to_install)
+  old=$(version_now)
+  if [[ -x $versions/$new/bin/skyrelief ]]; then
+    say "version $new is already there"
+  else
+    build_version "$new"
+  fi
+  [[ $old == "$new" ]] || { [[ -z $old ]] || ln -sfn "versions/$old" "$home/previous"; }
+  switch_to "$new"
+  install_files
+  prepare_machine
+  start_or_roll_back "$old" "$new"
+  prune
+}
+
+do_rollback() {
+  [[ -L $home/previous ]] || die "there is no version before"
+  local now previous
+  now=$(version_now)
+  previous=$(basename "$(readlink "$home/previous")")
+  [[ -x $versions/$previous/bin/skyrelief ]] || die "version $previous is gone"
+  switch_to "$previous"
+  ln -sfn "versions/$now" "$home/previous"
+  if live; then systemctl restart "$unit.service"; fi
+  say "version $previous is in place, $now is the one before"
+}
+
+do_uninstall() {
+  if live; then
+    systemctl disable --now skyrelief.service skyrelief-ground.service 2>/dev/null || true
+  fi
+  rm -rf "$home"
+  rm -f "$root"/etc/systemd/system/skyrelief{,-ground}.service \
+    "$root"/usr/lib/{sysusers.d,tmpfiles.d}/skyrelief.conf \
+    "$root/etc/udev/rules.d/60-skyrelief.rules" "$root/etc/polkit-1/rules.d/50-skyrelief.rules"
+  if live; then systemctl daemon-reload; fi
+  say "removed; $etc and $root/var/lib/skyrelief stay"
+}
+
+"do_$action"
