@@ -61,7 +61,7 @@ def _text(report: dict[str, Any]) -> str:
         f = s["fit"]
         if name != "raw":
             lines.append(
-                f"  the {_label(name)} fit moved the cloud by {f['shift_m']:.2f} m "
+                f"  the {_label(name)} moved the cloud by {f['shift_m']:.2f} m "
                 f"({f['shift_up_m']:+.2f} m up), {f['turn_deg']:.2f} deg, scale {f['scale']:.4f}"
             )
     return "\n".join(lines)
