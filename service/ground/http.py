@@ -1,0 +1,388 @@
+"""The portal: page, scan library, downloads and live view over HTTP and WebSocket.
+
+Reading is free on this machine; every change needs the token. On other addresses the token
+is needed for everything and must be given by the operator. Nothing is fetched from outside.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import secrets
+import socket
+import sqlite3
+import threading
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import (
+    FileResponse,
+    HTMLResponse,
+    JSONResponse,
+    PlainTextResponse,
+    Response,
+)
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from service.errors import InputError, OutsideError, SkyreliefError
+from service.ground.guard import LARGEST_BODY_BYTES, Guard, is_loopback
+from service.ground.jobs import Jobs
+from service.ground.library import Library
+from service.ground.live import LiveFeed, StoreIndex
+from service.ground.openapi import DOCUMENT
+from service.stream.store import ScanStore
+
+log = logging.getLogger(__name__)
+
+PAGE = Path(__file__).parent / "web" / "dist"
+MOST_LIVE_VIEWS = 16
+POLL_S = 0.25
+NO_PAGE = (
+    "<!doctype html><meta charset=utf-8><title>skyrelief</title><h1>skyrelief</h1>"
+    "<p>The page was not built when skyrelief was installed. Build it with <code>npm ci</code>"
+    " and <code>npm run build</code> in <code>service/ground/web</code>, or install again with"
+    " the npm registry in reach. The interface works: <a href=/api/scans>scans</a>,"
+    " <a href=/api/openapi.json>description</a>.</p>"
+)
+SANDBOX = {
+    "content-security-policy": "sandbox; default-src 'none'; style-src 'unsafe-inline';"
+    " img-src data:"
+}
+
+
+@dataclass(frozen=True, slots=True)
+class PortalConfig:
+    """Where the portal listens, which scans it shows, and its secrets."""
+
+    store: Path
+    host: str = "127.0.0.1"
+    port: int = 8080
+    token: str = ""  # empty: made at the start; only on this machine
+    tls_certificate: str = ""
+    tls_key: str = ""
+
+    def __post_init__(self) -> None:
+        """Raise InputError for an address open to others without a token."""
+        if not 0 <= self.port < 65536:
+            raise InputError(f"portal: port {self.port} is not 0 to 65535")
+        if not is_loopback(self.host) and len(self.token) < 16:
+            raise InputError(
+                f"portal on {self.host}: others can reach it; give a token of 16 letters or more"
+            )
+
+    @property
+    def tls(self) -> bool:
+        """True when the portal speaks HTTPS."""
+        return bool(self.tls_certificate)
+
+
+def parse_address(text: str) -> tuple[str, int]:
+    """(host, port) of ``HOST:PORT``; InputError for anything else."""
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit():
+        raise InputError(f"portal {text!r}: give HOST:PORT, such as 127.0.0.1:8080")
+    return host.strip("[]"), int(port)
+
+
+class Portal:
+    """The web server, on a thread of its own between :meth:`start` and :meth:`close`."""
+
+    def __init__(
+        self, config: PortalConfig, progress: Callable[[], list[dict[str, Any]]] | None = None
+    ) -> None:
+        """``progress`` gives one entry per scan being received (``Receiver.progress``)."""
+        self.config = config
+        self.token = config.token or secrets.token_urlsafe(24)
+        self._app = portal_app(config.store, self.token, is_loopback(config.host), progress)
+        self._socket: socket.socket | None = None
+        self._server: Any = None
+        self._thread: threading.Thread | None = None
+
+    @property
+    def url(self) -> str:
+        """The address to open, with the token in it."""
+        port = self.config.port if self._socket is None else self._socket.getsockname()[1]
+        scheme = "https" if self.config.tls else "http"
+        host = f"[{self.config.host}]" if ":" in self.config.host else self.config.host
+        return f"{scheme}://{host}:{port}/?token={self.token}"
+
+    def start(self) -> None:
+        """Begin to serve; raises OutsideError when the address cannot be used."""
+        import uvicorn
+
+        config = self.config
+        family = socket.AF_INET6 if ":" in config.host else socket.AF_INET
+        try:
+            self._socket = socket.create_server((config.host, config.port), family=family)
+        except OSError as error:
+            raise OutsideError(
+                f"portal: cannot listen on {config.host}:{config.port} ({error.strerror}); "
+                "choose another address"
+            ) from error
+        if not is_loopback(config.host) and not config.tls:
+            log.warning("portal on %s without TLS: the token can be read on the way", config.host)
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                self._app,
+                log_level="warning",
+                access_log=False,
+                lifespan="off",
+                ws_max_size=LARGEST_BODY_BYTES,
+                ssl_certfile=config.tls_certificate or None,
+                ssl_keyfile=config.tls_key or None,
+            )
+        )
+        sockets = [self._socket]
+        self._thread = threading.Thread(
+            target=lambda: self._server.run(sockets=sockets), name="portal", daemon=True
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        """End; open connections are closed."""
+        if self._server is not None and self._thread is not None:
+            self._server.should_exit = True
+            self._server.force_exit = True
+            self._thread.join(timeout=5.0)
+        if self._socket is not None:
+            self._socket.close()
+
+
+@dataclass(slots=True, eq=False)
+class _State:
+    """What the endpoints share."""
+
+    library: Library
+    jobs: Jobs
+    progress: Callable[[], list[dict[str, Any]]]
+    live_views: int = 0
+    started: float = field(default_factory=time.monotonic)
+
+
+def portal_app(
+    store: Path,
+    token: str,
+    local: bool,
+    progress: Callable[[], list[dict[str, Any]]] | None = None,
+) -> ASGIApp:
+    """The portal as an ASGI application; ``local`` when only this machine can reach it."""
+    state = _State(Library(store), Jobs(), progress or (list))
+    one = "/api/scans/{drone}/{scan}"
+    routes: list[Any] = [
+        Route("/", _page),
+        Route("/api/scans", _scans),
+        Route(one, _scan, methods=["GET"]),
+        Route(one, _label, methods=["PATCH"]),
+        Route(one, _delete, methods=["DELETE"]),
+        Route(one + "/files/{name}", _file),
+        Route(one + "/exports", _export, methods=["POST"]),
+        WebSocketRoute(one + "/live", _live),
+        Route("/api/bin", _bin),
+        Route("/api/bin/{name}/restore", _restore, methods=["POST"]),
+        Route("/api/import", _import, methods=["POST"]),
+        Route("/api/status", _status),
+        Route("/api/openapi.json", lambda _: JSONResponse(DOCUMENT)),
+        Route("/metrics", _metrics),
+    ]
+    if PAGE.is_dir():
+        routes.append(Mount("/assets", StaticFiles(directory=PAGE / "assets", check_dir=False)))
+    app = Starlette(
+        routes=routes,
+        exception_handlers={InputError: _said, OutsideError: _said, HTTPException: _refused},
+    )
+    app.state.portal = state
+    return Guard(app, token, local)
+
+
+def _portal(connection: HTTPConnection) -> _State:
+    state: _State = connection.app.state.portal
+    return state
+
+
+def _names(connection: HTTPConnection) -> tuple[str, str]:
+    return connection.path_params["drone"], connection.path_params["scan"]
+
+
+def _said(request: HTTPConnection, error: Exception) -> Response:
+    """An error of ours as JSON: 404 for what is not there, 400 otherwise, 503 for the world."""
+    if isinstance(error, OutsideError):
+        return JSONResponse({"error": str(error)}, 503)
+    return JSONResponse({"error": str(error)}, 404 if str(error).startswith("no ") else 400)
+
+
+def _refused(request: HTTPConnection, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    return JSONResponse({"error": error.detail}, error.status_code)
+
+
+async def _body(request: Request) -> dict[str, Any]:
+    """The JSON object sent; InputError for anything else."""
+    data = await request.body()
+    try:
+        document = json.loads(data[: LARGEST_BODY_BYTES + 1])
+    except (ValueError, RecursionError) as error:
+        raise InputError("the request is not JSON") from error
+    if not isinstance(document, dict):
+        raise InputError("the request is not a JSON object")
+    return document
+
+
+def _page(request: Request) -> Response:
+    index = PAGE / "index.html"
+    return FileResponse(index) if index.is_file() else HTMLResponse(NO_PAGE)
+
+
+def _scans(request: Request) -> Response:
+    return JSONResponse(_portal(request).library.scans())
+
+
+def _scan(request: Request) -> Response:
+    state, names = _portal(request), _names(request)
+    entry = state.library.entry(*names)
+    entry["jobs"] = state.jobs.of(state.library.folder(*names))
+    return JSONResponse(entry)
+
+
+def _file(request: Request) -> Response:
+    """A deliverable; byte ranges are honoured."""
+    path = _portal(request).library.file(*_names(request), request.path_params["name"])
+    if path.name in ("preview.jpg", "mesh.glb"):
+        return FileResponse(path)
+    if path.name == "report.html":
+        return FileResponse(path, headers=SANDBOX)
+    return FileResponse(path, filename=f"{request.path_params['scan']}-{path.name}")
+
+
+async def _label(request: Request) -> Response:
+    body = await _body(request)
+    unknown = set(body) - {"title", "tags"}
+    if unknown:
+        raise InputError(f"unknown: {', '.join(sorted(unknown))[:100]}")
+    library = _portal(request).library
+    labels = await run_in_threadpool(
+        library.label, *_names(request), body.get("title"), body.get("tags")
+    )
+    return JSONResponse({"title": labels.title, "tags": list(labels.tags)})
+
+
+def _delete(request: Request) -> Response:
+    state, (drone, scan) = _portal(request), _names(request)
+    for entry in state.progress():
+        if (entry["drone"], entry["scan"]) == (drone, scan):
+            raise HTTPException(409, "this scan is open at the receiver; delete it after a restart")
+    if state.jobs.busy(state.library.folder(drone, scan)):
+        raise HTTPException(409, "a deliverable of this scan is being made; wait for it")
+    return JSONResponse({"bin": state.library.delete(drone, scan)})
+
+
+async def _export(request: Request) -> Response:
+    body = await _body(request)
+    state = _portal(request)
+    folder = state.library.folder(*_names(request))
+    job = state.jobs.start(folder, str(body.get("kind", "")))
+    return JSONResponse(job, 202)
+
+
+def _bin(request: Request) -> Response:
+    return JSONResponse(_portal(request).library.bin())
+
+
+def _restore(request: Request) -> Response:
+    drone, scan = _portal(request).library.restore(request.path_params["name"])
+    return JSONResponse({"drone": drone, "scan": scan})
+
+
+async def _import(request: Request) -> Response:
+    body = await _body(request)
+    folder = body.get("folder")
+    if not isinstance(folder, str) or not folder or "\0" in folder:
+        raise InputError("give the folder to import")
+    drone, scan = await run_in_threadpool(_portal(request).library.import_folder, Path(folder))
+    return JSONResponse({"drone": drone, "scan": scan}, 201)
+
+
+def _status(request: Request) -> Response:
+    state = _portal(request)
+    return JSONResponse(
+        {
+            "up_s": round(time.monotonic() - state.started, 1),
+            "live_views": state.live_views,
+            "receiving": state.progress(),
+        }
+    )
+
+
+def _metrics(request: Request) -> Response:
+    """The receiver's figures in the text form of Prometheus."""
+    lines = ["# TYPE skyrelief_received_bytes counter", "# TYPE skyrelief_keyframes gauge"]
+    for entry in _portal(request).progress():
+        labels = f'{{drone="{_quoted(entry["drone"])}",scan="{_quoted(entry["scan"])}"}}'
+        lines.append(f"skyrelief_received_bytes{labels} {entry['received_bytes']}")
+        lines.append(f"skyrelief_keyframes{labels} {entry['held'].get('k0', 0)}")
+    return PlainTextResponse("\n".join(lines) + "\n")
+
+
+def _quoted(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")
+
+
+async def _live(socket: WebSocket) -> None:
+    """Messages of :mod:`service.ground.live` until the browser goes away."""
+    state = _portal(socket)
+    try:
+        folder = state.library.folder(*_names(socket))
+    except InputError as error:
+        await socket.close(1008, str(error)[:100])
+        return
+    if state.live_views >= MOST_LIVE_VIEWS:
+        await socket.close(1013, "too many live views")
+        return
+    await socket.accept()
+    state.live_views += 1
+    store = index = None
+    try:
+        store = await run_in_threadpool(ScanStore.open, folder / "scan.db")
+        index = StoreIndex(store.path)
+        feed = LiveFeed(store, index, _most_points(socket))
+        gone = asyncio.create_task(_until_gone(socket))
+        while not gone.done():
+            for message in await run_in_threadpool(lambda: list(feed.news())):
+                await _send(socket, message)
+            await asyncio.wait({gone}, timeout=POLL_S)
+    except (SkyreliefError, sqlite3.Error, WebSocketDisconnect, RuntimeError) as error:
+        log.debug("live view of %s ended: %s", folder, error)
+    finally:
+        state.live_views -= 1
+        for opened in (index, store):
+            if opened is not None:
+                await run_in_threadpool(opened.close)
+        with contextlib.suppress(RuntimeError):
+            await socket.close()
+
+
+def _most_points(socket: WebSocket) -> int | None:
+    text = socket.query_params.get("points", "")
+    return min(max(int(text), 100), 1_000_000) if text.isdigit() and len(text) < 9 else None
+
+
+def _send(socket: WebSocket, message: str | bytes) -> Awaitable[None]:
+    return socket.send_text(message) if isinstance(message, str) else socket.send_bytes(message)
+
+
+async def _until_gone(socket: WebSocket) -> None:
+    """Return when the browser closed the connection; what it sends is not read."""
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+        while (await socket.receive())["type"] != "websocket.disconnect":
+            pass

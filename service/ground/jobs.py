@@ -1,0 +1,63 @@
+"""Deliverables made on request, one after the other, in the background."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from service.errors import InputError, SkyreliefError
+from service.exports import EXPORTERS
+from service.exports.view import ExportOptions, ScanView, export
+
+log = logging.getLogger(__name__)
+
+MOST_WAITING = 20
+KEPT = 100
+
+
+class Jobs:
+    """A queue of exports; each job is a dict of id, kind, state, file and error."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(1, "exports")
+        self._lock = threading.Lock()
+        self._jobs: list[tuple[Path, dict[str, Any]]] = []
+
+    def start(self, folder: Path, kind: str) -> dict[str, Any]:
+        """Queue an export. InputError for an unknown kind or a full queue."""
+        if kind not in EXPORTERS:
+            raise InputError(f"kind is one of {', '.join(EXPORTERS)}")
+        with self._lock:
+            waiting = [j for _, j in self._jobs if j["state"] in ("waiting", "running")]
+            if len(waiting) >= MOST_WAITING:
+                raise InputError("too many deliverables are waiting; try again later")
+            job = {"kind": kind, "state": "waiting", "queued_unix_s": time.time(), "error": None}
+            self._jobs = [*self._jobs[-KEPT:], (folder, job)]
+        self._pool.submit(self._run, folder, job)
+        return dict(job)
+
+    def of(self, folder: Path) -> list[dict[str, Any]]:
+        """The jobs of a scan, the oldest first."""
+        with self._lock:
+            return [dict(job) for place, job in self._jobs if place == folder]
+
+    def busy(self, folder: Path) -> bool:
+        """True while a deliverable of this scan is waiting or being made."""
+        return any(job["state"] in ("waiting", "running") for job in self.of(folder))
+
+    def _run(self, folder: Path, job: dict[str, Any]) -> None:
+        job["state"] = "running"
+        try:
+            with ScanView(folder) as scan:
+                job["file"] = export(scan, job["kind"], None, ExportOptions()).name
+            job["state"] = "done"
+        except SkyreliefError as error:
+            job |= {"state": "failed", "error": str(error)}
+        finally:
+            if job["state"] == "running":  # our own fault; the pool keeps the traceback
+                job |= {"state": "failed", "error": "failed; see the log"}
+                log.exception("export of %s to %s", folder, job["kind"])

@@ -1,0 +1,267 @@
+"""The scans kept at a ground station: list, rename, tag, delete to a bin, bring back, import.
+
+A scan is a folder with a ``scan.db``, two levels below the store (drone, then scan). Names
+given by people live in ``library.json`` beside it and are never used as paths.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import sqlite3
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from service.errors import InputError, OutsideError, SkyreliefError
+from service.scan_folder import SUMMARY, writing
+from service.stream.store import ScanStore
+
+BIN = ".bin"
+LABELS = "library.json"
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+"""What a drone's and a scan's folder may be called."""
+
+LONGEST_TITLE = 200
+MOST_TAGS = 20
+LARGEST_JSON_BYTES = 4_000_000
+FILES: dict[str, str] = {
+    "cloud.laz": "fused cloud",
+    "cloud.copc.laz": "cloud-optimised LAZ",
+    "cloud.ply": "fused cloud, PLY",
+    "dsm.tif": "surface model",
+    "ortho.tif": "orthophoto",
+    "contours.geojson": "contours",
+    "mesh.glb": "textured mesh",
+    "trajectory.tum": "trajectory, TUM",
+    "trajectory.csv": "trajectory, table",
+    "flight.geojson": "flight, GeoJSON",
+    "flight.kml": "flight, KML",
+    "flight.mcap": "recording, MCAP",
+    "report.html": "report",
+    "scan.json": "summary",
+    "scan.db": "store",
+    "preview.jpg": "preview",
+}
+"""Files of a scan folder that may be downloaded, and what they are."""
+
+
+@dataclass(frozen=True, slots=True)
+class Labels:
+    """What people wrote about a scan."""
+
+    title: str = ""
+    tags: tuple[str, ...] = ()
+
+
+class Library:
+    """The scans below one folder. Safe for several threads; the last of two renames holds."""
+
+    def __init__(self, store: Path) -> None:
+        self.store = store
+        self._lock = threading.Lock()
+
+    def scans(self) -> list[dict[str, Any]]:
+        """One entry per scan, the newest first; a broken scan is listed with what is wrong."""
+        entries = [self.entry(drone, scan) for drone, scan in self._names()]
+        return sorted(entries, key=lambda e: e["started_unix_s"] or 0.0, reverse=True)
+
+    def folder(self, drone: str, scan: str) -> Path:
+        """The folder of a scan. Raises InputError when there is none, whatever the names."""
+        if not (NAME.fullmatch(drone) and NAME.fullmatch(scan)):
+            raise InputError("no such scan: a name may hold letters, digits, dots and dashes")
+        folder = self.store / drone / scan
+        if not (folder / "scan.db").is_file():
+            raise InputError(f"no scan {drone}/{scan}")
+        return folder
+
+    def entry(self, drone: str, scan: str) -> dict[str, Any]:
+        """What the list shows of a scan."""
+        folder = self.folder(drone, scan)
+        labels = read_labels(folder)
+        entry: dict[str, Any] = {
+            "drone": drone,
+            "scan": scan,
+            "title": labels.title or scan,
+            "tags": list(labels.tags),
+            "files": _files(folder),
+            "preview": (folder / "preview.jpg").is_file(),
+            "started_unix_s": None,
+            "origin": None,
+            "finished": False,
+            "trouble": None,
+        }
+        try:
+            entry |= _facts(folder)
+        except (SkyreliefError, sqlite3.Error, ValueError, KeyError, TypeError) as error:
+            entry["trouble"] = str(error)
+        return entry
+
+    def file(self, drone: str, scan: str, name: str) -> Path:
+        """The path of a deliverable. Raises InputError for any other file."""
+        path = self.folder(drone, scan) / name
+        if name not in FILES or not path.is_file():
+            raise InputError(f"no file {name} in {drone}/{scan}"[:200])
+        return path
+
+    def label(self, drone: str, scan: str, title: str | None, tags: list[str] | None) -> Labels:
+        """Rename or tag a scan; what is None stays. Raises InputError for unfit values."""
+        folder = self.folder(drone, scan)
+        with self._lock:
+            old = read_labels(folder)
+            new = Labels(
+                old.title if title is None else _title(title),
+                old.tags if tags is None else _tags(tags),
+            )
+            with writing(folder / LABELS) as part:
+                part.write_text(json.dumps({"title": new.title, "tags": list(new.tags)}))
+        return new
+
+    def delete(self, drone: str, scan: str) -> str:
+        """Move a scan to the bin; the name it has there."""
+        folder = self.folder(drone, scan)
+        with self._lock:
+            name = f"{drone}~{scan}~{time.time_ns()}"
+            _move(folder, self.store / BIN / name)
+        with contextlib.suppress(OSError):
+            folder.parent.rmdir()  # only when it was the drone's last
+        return name
+
+    def bin(self) -> list[str]:
+        """Names of the deleted scans."""
+        place = self.store / BIN
+        return sorted(p.name for p in place.iterdir()) if place.is_dir() else []
+
+    def restore(self, name: str) -> tuple[str, str]:
+        """Bring a scan back from the bin; its drone and scan."""
+        parts = name.split("~")
+        if name not in self.bin() or len(parts) != 3:
+            raise InputError("no such scan in the bin")
+        target = self.store / parts[0] / parts[1]
+        with self._lock:
+            if target.exists():
+                raise InputError(f"there is a scan {parts[0]}/{parts[1]}; rename its folder first")
+            _move(self.store / BIN / name, target)
+        return parts[0], parts[1]
+
+    def import_folder(self, source: Path) -> tuple[str, str]:
+        """Copy a scan folder, as it lay on the aircraft's disk, into the library.
+
+        Raises InputError when it is none or the library has that scan already.
+        """
+        if not (source / "scan.db").is_file():
+            raise InputError(f"{source} holds no scan.db; give a scan folder")
+        with ScanStore.open(source / "scan.db") as store:
+            drone, scan = _safe(store.header.drone, "drone"), _safe(store.header.scan_id, "scan")
+        target = self.store / drone / scan
+        part = target.with_name(f".{scan}.part")
+        try:
+            with self._lock:
+                if target.exists():
+                    raise InputError(f"the library holds {drone}/{scan} already")
+                shutil.rmtree(part, ignore_errors=True)
+                shutil.copytree(source, part, symlinks=False)
+                os.replace(part, target)
+        except OSError as error:
+            raise OutsideError(f"cannot copy {source} to {target} ({error})") from error
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+        return drone, scan
+
+    def _names(self) -> list[tuple[str, str]]:
+        """(drone, scan) of every folder that holds a scan."""
+        return sorted(
+            (path.parent.parent.name, path.parent.name)
+            for path in self.store.glob("*/*/scan.db")
+            if NAME.fullmatch(path.parent.parent.name) and NAME.fullmatch(path.parent.name)
+        )
+
+
+def read_labels(folder: Path) -> Labels:
+    """The labels of a scan folder; none when the file is missing or unfit."""
+    try:
+        document = json.loads(_small_text(folder / LABELS))
+        return Labels(_title(document["title"]), _tags(document["tags"]))
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, InputError):
+        return Labels()
+
+
+def _facts(folder: Path) -> dict[str, Any]:
+    """From scan.json when it is there, else from the store's header."""
+    path = folder / SUMMARY
+    if path.is_file():
+        document = json.loads(_small_text(path))
+        if document.get("schema") != 1:
+            raise InputError("scan.json was written by another version; update skyrelief")
+        return {
+            "started_unix_s": float(document["times"]["started_unix_s"]),
+            "origin": document["origin"],
+            "finished": bool(document["finished"]),
+            "counts": document["counts"],
+            "quality": document["quality"],
+            "notes": document["notes"],
+        }
+    with ScanStore.open(folder / "scan.db") as store:
+        header = store.header
+        origin = None
+        if header.origin_lat_deg is not None:
+            origin = {
+                "lat_deg": header.origin_lat_deg,
+                "lon_deg": header.origin_lon_deg,
+                "alt_amsl_m": header.origin_alt_amsl_m,
+            }
+        return {
+            "started_unix_s": header.started_unix_ns / 1e9,
+            "origin": origin,
+            "finished": store.finished,
+            "counts": {"keyframes": len(store.seqs())},
+            "quality": {},
+            "notes": list(header.notes),
+        }
+
+
+def _files(folder: Path) -> list[dict[str, Any]]:
+    out = []
+    for name, what in FILES.items():
+        path = folder / name
+        if path.is_file():
+            out.append({"name": name, "what": what, "bytes": path.stat().st_size})
+    return out
+
+
+def _small_text(path: Path) -> str:
+    """The text of a small file. Raises ValueError when it is not small, OSError when not there."""
+    if path.stat().st_size > LARGEST_JSON_BYTES:
+        raise ValueError(f"{path.name} is too large")
+    return path.read_text(encoding="utf-8")
+
+
+def _title(title: Any) -> str:
+    if not isinstance(title, str) or len(title) > LONGEST_TITLE:
+        raise InputError(f"a title is a text of at most {LONGEST_TITLE} letters")
+    return " ".join(title.split())
+
+
+def _tags(tags: Any) -> tuple[str, ...]:
+    if not isinstance(tags, list) or len(tags) > MOST_TAGS:
+        raise InputError(f"tags are a list of at most {MOST_TAGS} texts")
+    return tuple(dict.fromkeys(_title(tag) for tag in tags if tag))
+
+
+def _safe(name: str, what: str) -> str:
+    """A folder name made of ``name``."""
+    out = re.sub(r"[^A-Za-z0-9._-]+", "-", name).lstrip(".-")[:100]
+    return out or what
+
+
+def _move(source: Path, target: Path) -> None:
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(source, target)
+    except OSError as error:
+        raise OutsideError(f"cannot move {source.name} ({error.strerror})") from error

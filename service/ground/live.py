@@ -1,0 +1,208 @@
+"""What a browser is sent of a scan, as it grows: chunks of points, corrections, the track.
+
+A message is either JSON text or a binary chunk (little-endian):
+
+======  =======================================================================
+bytes   content
+======  =======================================================================
+4       length J of the JSON
+J       JSON: ``seq``, ``layer``, ``points`` N, ``unit_m``, ``T`` (16, column by column)
+pad     zeros up to a multiple of 4
+6 N     int16 x, y, z of the camera frame, in ``unit_m``
+3 N     uint8 red, green, blue (sRGB)
+N       uint8 sigma, in steps of 2 cm
+N       uint8 views
+======  =======================================================================
+
+Points stay in the camera's frame, so a correction is a new matrix and scale.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sqlite3
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recon.cloud_fusion import cloud_of
+from recon.types import F64, DepthMap, Keyframe
+from service.scan_folder import latest
+from service.stream.records import PoseRecord
+from service.stream.store import ScanStore
+
+SIGMA_STEP_M = 0.02
+TRACK_POINTS = 2000
+
+
+def chunk_message(keyframe: Keyframe, layer: int, most_points: int | None = None) -> bytes:
+    """The points of ``keyframe`` as a binary message, thinned to ``most_points``.
+
+    They come in random order, so that a viewer may draw any first part of them.
+    """
+    depth = keyframe.depth
+    local = DepthMap(depth.depth_m, depth.sigma_m, depth.views, depth.K, np.eye(4))
+    cloud = cloud_of(local, keyframe.bgr, keyframe.fresh)
+    rows = np.random.default_rng(keyframe.seq).permutation(len(cloud))[:most_points]
+    xyz = cloud.xyz_m[rows]
+    reach = float(np.abs(xyz).max()) if len(xyz) else 1.0
+    unit = max(reach, 1e-3) / 32767.0
+    head = json.dumps(
+        {
+            "type": "chunk",
+            "seq": keyframe.seq,
+            "layer": layer,
+            "points": len(rows),
+            "unit_m": unit,
+            "time_unix_s": keyframe.time_ns / 1e9,
+            "T": columns(depth.T_world_camera),
+        }
+    ).encode()
+    sigma = np.clip(np.rint(cloud.sigma_m[rows] / SIGMA_STEP_M), 0, 255).astype(np.uint8)
+    body = (
+        np.rint(xyz / unit).astype("<i2").tobytes(),
+        cloud.rgb[rows].tobytes(),
+        sigma.tobytes(),
+        cloud.views[rows].tobytes(),
+    )
+    padding = b"\0" * (-(4 + len(head)) % 4)
+    return b"".join([struct.pack("<I", len(head)), head, padding, *body])
+
+
+def columns(T: F64) -> list[float]:
+    """The 16 numbers of a (4, 4) matrix, column by column."""
+    return [round(float(v), 9) for v in np.asarray(T).T.ravel()]
+
+
+class StoreIndex:
+    """What is in a store's file, also when another process writes it. Use from one thread."""
+
+    RADIO = -1
+    """The layer that stands for what came by the narrow radio only."""
+
+    def __init__(self, path: Path) -> None:
+        uri = f"{path.resolve().as_uri()}?mode=ro"
+        self._db = sqlite3.connect(uri, uri=True, check_same_thread=False, timeout=10.0)
+        self._version = -1
+
+    def close(self) -> None:
+        """Close the file."""
+        self._db.close()
+
+    def changed(self) -> bool:
+        """True at the first call, and when the file changed since the last one."""
+        version = int(self._db.execute("PRAGMA data_version").fetchone()[0])
+        news = version != self._version
+        self._version = version
+        return news
+
+    def layers(self) -> dict[int, int]:
+        """Keyframe number to its finest stored layer."""
+        radio = "SELECT number, -1 FROM radio WHERE kind = 'tile'"
+        sql = f"SELECT seq, MAX(layer) FROM (SELECT seq, layer FROM chunks UNION {radio})"
+        return dict(self._db.execute(f"{sql} GROUP BY seq ORDER BY seq").fetchall())
+
+    def counts(self) -> tuple[int, int]:
+        """How many poses and how many re-poses there are."""
+        poses, radio, reposes = (
+            int(self._db.execute(f"SELECT COUNT(*) FROM {source}").fetchone()[0])
+            for source in ("poses", "radio WHERE kind = 'pose'", "reposes")
+        )
+        return poses + radio, reposes
+
+
+@dataclass(slots=True, eq=False)
+class LiveFeed:
+    """Says what is new in a store since it was asked before.
+
+    One feed serves one browser. Keyframes come with the finest layer there is; when a finer
+    one arrives later, it comes again and replaces the coarse one.
+    """
+
+    store: ScanStore
+    index: StoreIndex
+    most_points: int | None = None  # of one chunk
+    _sent: dict[int, int] = field(default_factory=dict)  # keyframe to the layer sent
+    _scale: dict[int, float] = field(default_factory=dict)
+    _revision: dict[int, int] = field(default_factory=dict)
+    _counts: tuple[int, int] = (-1, -1)
+    _finished: bool | None = None
+    _more: bool = True  # the last call left something for the next
+
+    def news(self, most_chunks: int = 20) -> Iterator[str | bytes]:
+        """Messages for what has changed; at most ``most_chunks`` keyframes at a time."""
+        if not (self.index.changed() or self._more):
+            return
+        finest = self.index.layers()
+        due = [seq for seq, layer in finest.items() if layer > self._sent.get(seq, -2)]
+        self._more = len(due) > most_chunks
+        for seq in due[:most_chunks]:
+            self._sent[seq] = finest[seq]
+            keyframe = self.store.keyframe(seq)
+            if keyframe is not None:
+                self._note_repose(seq)
+                yield chunk_message(keyframe, finest[seq], self.most_points)
+        poses, reposes = self.index.counts()
+        before, self._counts = self._counts, (poses, reposes)
+        if reposes != before[1]:
+            yield from self._corrections()
+        if poses != before[0]:
+            yield track_message(latest(self.store.poses()))
+        state = self.store.finished
+        if state != self._finished and not self._more:
+            self._finished = state
+            yield json.dumps({"type": "state", "finished": state, "keyframes": len(finest)})
+
+    def _note_repose(self, seq: int) -> None:
+        repose = self.store.repose(seq)
+        self._revision[seq] = -1 if repose is None else repose.revision
+        self._scale[seq] = 1.0 if repose is None else repose.scale
+
+    def _corrections(self) -> Iterator[str]:
+        """Re-poses newer than what a sent chunk was placed with."""
+        for seq, had in self._revision.items():
+            repose = self.store.repose(seq)
+            if repose is None or repose.revision <= had:
+                continue
+            self._revision[seq] = repose.revision
+            yield json.dumps(
+                {
+                    "type": "repose",
+                    "seq": seq,
+                    "scale": repose.scale / self._scale[seq],
+                    "T": columns(repose.T_world_camera),
+                }
+            )
+
+
+def track_message(poses: list[PoseRecord]) -> str:
+    """The way flown, thinned, and the state of the last pose."""
+    step = max(1, math.ceil(len(poses) / TRACK_POINTS))
+    thinned = poses[::step] + (poses[-1:] if poses and (len(poses) - 1) % step else [])
+    message: dict[str, Any] = {
+        "type": "track",
+        "track": [[round(float(v), 3) for v in p.T_world_camera[:3, 3]] for p in thinned],
+    }
+    if poses:
+        last = poses[-1]
+        message["last"] = {
+            "time_unix_s": last.time_unix_ns / 1e9,
+            "T": columns(last.T_world_camera),
+            "lat_deg": last.lat_deg,
+            "lon_deg": last.lon_deg,
+            "alt_amsl_m": last.alt_amsl_m,
+            "agl_m": last.agl_m,
+            "speed_m_s": round(last.speed_m_s, 2),
+            "distance_m": round(last.distance_m, 1),
+            "roll_deg": round(math.degrees(last.roll_rad), 1),
+            "pitch_deg": round(math.degrees(last.pitch_rad), 1),
+            "yaw_deg": round(math.degrees(last.yaw_rad), 1),
+            "sigma_m": round(last.sigma_m, 2),
+            "sources": list(last.sources),
+        }
+    return json.dumps(message)

@@ -1,0 +1,85 @@
+"""The description of the portal's HTTP interface, served at ``/api/openapi.json``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from service.exports import EXPORTERS
+
+
+def _operation(
+    summary: str, answer: str, change: bool = False, body: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """One operation; a change needs the token."""
+    out: dict[str, Any] = {"summary": summary, "responses": {"200": {"description": answer}}}
+    if change:
+        out["security"] = [{"token": []}]
+        out["responses"]["401"] = {"description": "the token is missing"}
+    if body is not None:
+        schema = {"type": "object", "properties": body, "additionalProperties": False}
+        out["requestBody"] = {"required": True, "content": {"application/json": {"schema": schema}}}
+    return out
+
+
+def _path(*names: str, **operations: dict[str, Any]) -> dict[str, Any]:
+    """A path with text parameters."""
+    parameters = [
+        {"name": n, "in": "path", "required": True, "schema": {"type": "string"}} for n in names
+    ]
+    return {**({"parameters": parameters} if parameters else {}), **operations}
+
+
+_TEXT = {"type": "string"}
+
+DOCUMENT: dict[str, Any] = {
+    "openapi": "3.1.0",
+    "info": {"title": "skyrelief portal", "version": "1"},
+    "components": {"securitySchemes": {"token": {"type": "http", "scheme": "bearer"}}},
+    "paths": {
+        "/api/scans": _path(get=_operation("All scans, the newest first.", "a list of scans")),
+        "/api/scans/{drone}/{scan}": _path(
+            "drone",
+            "scan",
+            get=_operation("One scan with its files and jobs.", "a scan"),
+            patch=_operation(
+                "Rename or tag.",
+                "the labels",
+                True,
+                {"title": _TEXT, "tags": {"type": "array", "items": _TEXT}},
+            ),
+            delete=_operation("Move to the bin.", "the name in the bin", True),
+        ),
+        "/api/scans/{drone}/{scan}/files/{name}": _path(
+            "drone", "scan", "name", get=_operation("A deliverable; ranges work.", "the file")
+        ),
+        "/api/scans/{drone}/{scan}/exports": _path(
+            "drone",
+            "scan",
+            post=_operation(
+                "Make a deliverable in the background.",
+                "the job",
+                True,
+                {"kind": {"type": "string", "enum": list(EXPORTERS)}},
+            ),
+        ),
+        "/api/scans/{drone}/{scan}/live": _path(
+            "drone",
+            "scan",
+            get=_operation("WebSocket: chunks, corrections and track as they come.", "messages"),
+        ),
+        "/api/bin": _path(get=_operation("Names of deleted scans.", "a list of names")),
+        "/api/bin/{name}/restore": _path(
+            "name", post=_operation("Bring a scan back.", "its drone and scan", True)
+        ),
+        "/api/import": _path(
+            post=_operation(
+                "Copy a scan folder of this machine into the library.",
+                "its drone and scan",
+                True,
+                {"folder": _TEXT},
+            )
+        ),
+        "/api/status": _path(get=_operation("What is being received.", "the status")),
+        "/metrics": _path(get=_operation("Figures for Prometheus.", "text")),
+    },
+}

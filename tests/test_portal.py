@@ -1,0 +1,408 @@
+"""The portal over real HTTP and WebSocket connections on this machine."""
+
+from __future__ import annotations
+
+import json
+import struct
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("starlette")
+pytest.importorskip("uvicorn")
+pytest.importorskip("websockets")
+
+from recon import se3
+from service.errors import InputError, OutsideError
+from service.ground.http import Portal, PortalConfig, parse_address
+from service.ground.library import Library
+from service.ground.live import SIGMA_STEP_M, LiveFeed, StoreIndex
+from service.scan_folder import write_deliverables
+from service.stream.codec import encode
+from service.stream.records import Repose, ScanHeader
+from service.stream.store import ScanStore
+
+if TYPE_CHECKING:
+    from conftest import HouseFlight
+
+TOKEN = "a-token-of-enough-letters"
+
+
+class Client:
+    """Requests to a portal on this machine."""
+
+    def __init__(self, portal: Portal) -> None:
+        self.base = portal.url.split("/?")[0]
+
+    def ask(
+        self,
+        path: str,
+        method: str = "GET",
+        body: Any = None,
+        token: str | None = TOKEN,
+        headers: dict[str, str] | None = None,
+    ) -> tuple[int, Any, dict[str, str]]:
+        """Status, JSON (or bytes) and headers."""
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(self.base + path, data, method=method)
+        for name, value in (headers or {}).items():
+            request.add_header(name, value)
+        if token is not None:
+            request.add_header("Authorization", f"Bearer {token}")
+        try:
+            with urllib.request.urlopen(request, timeout=10) as answer:
+                content, status, found = answer.read(), answer.status, dict(answer.headers)
+        except urllib.error.HTTPError as error:
+            content, status, found = error.read(), error.code, dict(error.headers)
+        found = {name.lower(): value for name, value in found.items()}
+        if found.get("content-type", "").startswith("application/json"):
+            return status, json.loads(content), found
+        return status, content, found
+
+
+@pytest.fixture
+def store(tmp_path: Path, house: HouseFlight) -> Path:
+    root = tmp_path / "scans"
+    folder = root / "drone-1" / "test-1"
+    with house.flown(folder) as scan:
+        write_deliverables(folder, scan, {})
+    return root
+
+
+@pytest.fixture
+def client(store: Path) -> Iterator[Client]:
+    portal = Portal(PortalConfig(store, port=0, token=TOKEN))
+    portal.start()
+    yield Client(portal)
+    portal.close()
+
+
+def test_the_list_shows_the_scan(client: Client, store: Path) -> None:
+    status, scans, headers = client.ask("/api/scans", token=None)
+    assert status == 200
+    assert [(s["drone"], s["scan"], s["title"]) for s in scans] == [("drone-1", "test-1", "test-1")]
+    assert scans[0]["preview"] and scans[0]["counts"]["keyframes"] == 5
+    assert scans[0]["origin"]["lat_deg"] == pytest.approx(47.39)
+    assert {"cloud.laz", "scan.json"} <= {f["name"] for f in scans[0]["files"]}
+    assert "default-src 'self'" in headers["content-security-policy"]
+
+
+def test_downloads_and_their_ranges(client: Client, store: Path) -> None:
+    path = "/api/scans/drone-1/test-1/files/cloud.laz"
+    whole = (store / "drone-1/test-1/cloud.laz").read_bytes()
+    status, content, headers = client.ask(path)
+    assert status == 200 and content == whole
+    assert "test-1-cloud.laz" in headers["content-disposition"]
+    status, content, headers = client.ask(path, headers={"Range": "bytes=100-199"})
+    assert status == 206 and content == whole[100:200]
+    assert headers["content-range"] == f"bytes 100-199/{len(whole)}"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/api/scans/drone-1/test-1/files/..%2fscan.db",
+        "/api/scans/drone-1/test-1/files/library.json",
+        "/api/scans/drone-1/..%2f..%2fetc/files/scan.json",
+        "/api/scans/%2e%2e/test-1",
+        "/api/scans/.bin/test-1",
+        "/api/scans/drone-1/test-1%00",
+        "/api/scans/drone-1/none",
+        "/assets/../../http.py",
+        "/nothing",
+    ],
+)
+def test_nothing_but_deliverables_is_given(client: Client, path: str) -> None:
+    status, _, _ = client.ask(path)
+    assert 400 <= status < 500
+
+
+def test_changes_need_the_token(client: Client) -> None:
+    one = "/api/scans/drone-1/test-1"
+    for method, path, body in [
+        ("PATCH", one, {"title": "x"}),
+        ("DELETE", one, None),
+        ("POST", one + "/exports", {"kind": "kml"}),
+        ("POST", "/api/import", {"folder": "/"}),
+        ("POST", "/api/bin/x/restore", {}),
+    ]:
+        for token in (None, "wrong"):
+            status, answer, _ = client.ask(path, method, body, token=token)
+            assert status == 401 and "token" in answer["error"]
+    assert client.ask(one)[1]["title"] == "test-1"
+
+
+def test_other_sites_and_other_names_are_refused(client: Client) -> None:
+    assert client.ask("/api/scans", headers={"Host": "evil.example"})[0] == 421
+    assert client.ask("/api/scans", headers={"Origin": "http://evil.example"})[0] == 403
+    port = client.base.rsplit(":", 1)[1]
+    assert client.ask("/api/scans", headers={"Host": f"localhost:{port}"})[0] == 200
+
+
+def test_rename_and_tag_with_any_letters(client: Client, store: Path) -> None:
+    one = "/api/scans/drone-1/test-1"
+    title = "<script>alert(1)</script> Ölmühle\n Süd"
+    status, labels, _ = client.ask(one, "PATCH", {"title": title, "tags": ["a", "b", "a"]})
+    assert status == 200
+    assert labels == {"title": "<script>alert(1)</script> Ölmühle Süd", "tags": ["a", "b"]}
+    assert client.ask(one)[1]["tags"] == ["a", "b"]
+    client.ask(one, "PATCH", {"title": "only this"})
+    assert client.ask(one)[1]["tags"] == ["a", "b"]
+    for bad in ({"title": 3}, {"title": "x" * 999}, {"tags": "a"}, {"tags": [1]}, {"x": 1}, [1]):
+        assert client.ask(one, "PATCH", bad)[0] == 400
+    assert client.ask(one, "PATCH", {"title": "x" * 70_000})[0] == 413
+    (store / "drone-1/test-1/library.json").write_text("{broken")
+    assert client.ask(one)[1]["title"] == "test-1"
+
+
+def test_two_renames_at_once_leave_one_whole(store: Path) -> None:
+    library = Library(store)
+    titles = [f"title {n}" * 20 for n in range(8)]
+    threads = [
+        threading.Thread(target=library.label, args=("drone-1", "test-1", t[:200], [t[:9]]))
+        for t in titles
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    entry = library.entry("drone-1", "test-1")
+    assert entry["title"] in [t[:200] for t in titles]
+
+
+def test_delete_goes_to_the_bin_and_comes_back(client: Client, store: Path) -> None:
+    name = client.ask("/api/scans/drone-1/test-1", "DELETE")[1]["bin"]
+    assert client.ask("/api/scans")[1] == []
+    assert client.ask("/api/bin")[1] == [name]
+    status, answer, _ = client.ask(f"/api/bin/{name}/restore", "POST", {})
+    assert (status, answer) == (200, {"drone": "drone-1", "scan": "test-1"})
+    assert len(client.ask("/api/scans")[1]) == 1
+    assert client.ask("/api/bin/a~b~c/restore", "POST", {})[0] == 404
+
+
+def test_a_scan_being_received_is_not_deleted(store: Path) -> None:
+    entry = {"drone": "drone-1", "scan": "test-1", "held": {"k0": 5}, "received_bytes": 9}
+    portal = Portal(PortalConfig(store, port=0, token=TOKEN), lambda: [entry])
+    portal.start()
+    try:
+        client = Client(portal)
+        assert client.ask("/api/scans/drone-1/test-1", "DELETE")[0] == 409
+        assert client.ask("/api/status")[1]["receiving"] == [entry]
+        assert (
+            b'skyrelief_received_bytes{drone="drone-1",scan="test-1"} 9'
+            in (client.ask("/metrics")[1])
+        )
+    finally:
+        portal.close()
+
+
+def test_import_copies_a_scan_folder(client: Client, tmp_path: Path, house: HouseFlight) -> None:
+    house.flown(tmp_path / "card").close()
+    client.ask("/api/scans/drone-1/test-1", "DELETE")
+    status, answer, _ = client.ask("/api/import", "POST", {"folder": str(tmp_path / "card")})
+    assert (status, answer) == (201, {"drone": "drone-1", "scan": "test-1"})
+    assert client.ask("/api/scans")[1][0]["counts"]["keyframes"] == 5
+    again = client.ask("/api/import", "POST", {"folder": str(tmp_path / "card")})
+    assert again[0] == 400 and "already" in again[1]["error"]
+    for bad in ({}, {"folder": 3}, {"folder": str(tmp_path)}, {"folder": "a\0b"}):
+        assert client.ask("/api/import", "POST", bad)[0] == 400
+
+
+def test_deliverables_are_made_on_request(client: Client) -> None:
+    one = "/api/scans/drone-1/test-1"
+    assert client.ask(one + "/exports", "POST", {"kind": "kml"})[0] == 202
+    assert client.ask(one + "/exports", "POST", {"kind": "docx"})[0] == 400
+    deadline = time.monotonic() + 20
+    while (job := client.ask(one)[1]["jobs"][-1])["state"] in ("waiting", "running"):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert job["state"] == "done" and job["file"] == "flight.kml"
+    assert b"<kml" in client.ask(one + "/files/flight.kml")[1]
+
+
+def test_broken_folders_are_listed_with_their_trouble(store: Path, house: HouseFlight) -> None:
+    for name, content in [("junk", b"not a database"), ("empty", b"")]:
+        (store / "drone-1" / name).mkdir()
+        (store / "drone-1" / name / "scan.db").write_bytes(content)
+    house.flown(store / "drone-1" / "later").close()
+    (store / "drone-1/later/scan.json").write_text('{"schema": 99}')
+    house.flown(store / "drone-1" / "half").close()
+    (store / "drone-1/half/scan.json").write_text('{"schema": 1, "times"')
+    house.flown(store / "drone-1" / "fresh").close()
+    (store / "drone-1" / "bad name").mkdir()
+    troubles = {e["scan"]: e["trouble"] for e in Library(store).scans()}
+    assert set(troubles) == {"test-1", "junk", "empty", "later", "half", "fresh"}
+    assert troubles["test-1"] is None and troubles["fresh"] is None
+    assert all(troubles[n] for n in ("junk", "empty", "half"))
+    assert "another version" in str(troubles["later"])
+
+
+def unpack(message: bytes) -> tuple[dict[str, Any], np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Head, world points and colours of a binary chunk, as the page reads them."""
+    (size,) = struct.unpack_from("<I", message)
+    head = json.loads(message[4 : 4 + size])
+    at = 4 + size + (-(4 + size) % 4)
+    n = head["points"]
+    xyz = np.frombuffer(message, "<i2", 3 * n, at).reshape(n, 3) * head["unit_m"]
+    rgb = np.frombuffer(message, np.uint8, 3 * n, at + 6 * n).reshape(n, 3)
+    assert len(message) == at + 11 * n
+    T = np.array(head["T"]).reshape(4, 4).T
+    return head, xyz @ T[:3, :3].T + T[:3, 3], rgb
+
+
+def test_the_live_view_grows_with_the_scan(client: Client, store: Path, house: HouseFlight) -> None:
+    from websockets.sync.client import connect
+
+    url = client.base.replace("http", "ws") + "/api/scans/drone-1/test-1/live?points=5000"
+    with ScanStore.open(store / "drone-1/test-1/scan.db") as scan, connect(url) as socket:
+        chunks: dict[int, Any] = {}
+        while len(chunks) < 5:
+            message = socket.recv(timeout=5)
+            if isinstance(message, bytes):
+                head, xyz, rgb = unpack(message)
+                chunks[head["seq"]] = (xyz, rgb)
+        xyz, rgb = chunks[2]
+        assert len(xyz) == 5000
+        on_roof = xyz[:, 2] > 5.5
+        assert np.abs(xyz[on_roof][:, :2] - [10, 2]).max(axis=0)[0] < 6.2
+        assert np.median(rgb[on_roof, 0]) > 150
+        one = house.keyframe(5, 25.0)
+        scan.add_keyframe(5, encode(one, one.time_ns))
+        scan.add_repose(Repose(2, 1, house.pose(60.0), 1.5, np.eye(6)))
+        seen: dict[str, Any] = {}
+        while not {"chunk", "repose"} <= set(seen):
+            message = socket.recv(timeout=5)
+            if isinstance(message, bytes):
+                seen["chunk"] = unpack(message)[0]
+            else:
+                seen[json.loads(message)["type"]] = json.loads(message)
+        assert seen["chunk"]["seq"] == 5
+        assert seen["repose"]["seq"] == 2 and seen["repose"]["scale"] == pytest.approx(1.5)
+        np.testing.assert_allclose(seen["repose"]["T"][12:15], [60.0, 0.0, 40.0])
+
+
+def test_a_live_view_of_nothing_is_closed(client: Client) -> None:
+    from websockets.exceptions import ConnectionClosed, InvalidStatus
+    from websockets.sync.client import connect
+
+    url = client.base.replace("http", "ws") + "/api/scans/drone-1/none/live"
+    with pytest.raises((ConnectionClosed, InvalidStatus)), connect(url) as socket:
+        socket.recv(timeout=5)
+
+
+def test_the_feed_sends_each_thing_once(tmp_path: Path, house: HouseFlight) -> None:
+    with house.flown(tmp_path) as scan:
+        feed = LiveFeed(scan, StoreIndex(scan.path))
+        first = [m for m in feed.news() if isinstance(m, bytes)]
+        assert len(first) == 5
+        assert list(feed.news()) == []
+        scan.add_repose(Repose(1, 1, house.pose(9.0), 1.0, np.eye(6)))
+        scan.add_repose(Repose(1, 2, house.pose(8.0), 1.0, np.eye(6)))
+        moved = [json.loads(m) for m in feed.news()]
+        assert [(m["type"], m["seq"], m["T"][12]) for m in moved] == [("repose", 1, 8.0)]
+        scan.add_pose(house.record(9, 50.0))
+        track = [json.loads(m) for m in feed.news()]
+        assert track[0]["type"] == "track" and len(track[0]["track"]) == 6
+        scan.finish({})
+        assert [json.loads(m)["finished"] for m in feed.news()] == [True]
+    head, _, _ = unpack(first[0])
+    sigma = first[0][-2 * head["points"] : -head["points"]]
+    assert np.median(np.frombuffer(sigma, np.uint8)) * SIGMA_STEP_M == pytest.approx(0.05, abs=0.02)
+
+
+def test_a_finer_layer_replaces_the_coarse_one(tmp_path: Path, house: HouseFlight) -> None:
+    one = house.keyframe(0, 0.0)
+    coarse, fine = encode(one, one.time_ns)
+    with ScanStore.create(tmp_path / "scan.db", ScanHeader("x", "d", 0)) as scan:
+        feed = LiveFeed(scan, StoreIndex(scan.path))
+        scan.add_chunk(coarse)
+        heads = [unpack(m)[0] for m in feed.news() if isinstance(m, bytes)]
+        scan.add_chunk(fine)
+        heads += [unpack(m)[0] for m in feed.news() if isinstance(m, bytes)]
+    assert [(h["seq"], h["layer"]) for h in heads] == [(0, 0), (0, 1)]
+    assert heads[1]["points"] > heads[0]["points"]
+
+
+def test_the_page_takes_the_token_into_a_cookie(client: Client) -> None:
+    class Stay(urllib.request.HTTPRedirectHandler):
+        def redirect_request(self, *_: Any) -> None:
+            return None
+
+    opener = urllib.request.build_opener(Stay)
+    with pytest.raises(urllib.error.HTTPError) as answer:
+        opener.open(f"{client.base}/?token={TOKEN}")
+    assert answer.value.code == 303
+    cookie = answer.value.headers["set-cookie"]
+    assert "HttpOnly" in cookie and "samesite=strict" in cookie.lower()
+    value = cookie.split(";")[0]
+    status, _, _ = client.ask(
+        "/api/scans/drone-1/test-1", "PATCH", {"title": "by cookie"}, None, {"Cookie": value}
+    )
+    assert status == 200
+    with pytest.raises(urllib.error.HTTPError) as answer:
+        opener.open(f"{client.base}/?token=wrong")
+    assert "set-cookie" not in answer.value.headers
+    assert client.ask("/")[0] == 200
+
+
+def test_the_interface_is_described(client: Client) -> None:
+    status, document, _ = client.ask("/api/openapi.json")
+    assert status == 200 and document["openapi"].startswith("3.")
+    assert "/api/scans/{drone}/{scan}/live" in document["paths"]
+
+
+def test_open_addresses_need_a_token(tmp_path: Path) -> None:
+    for host in ("0.0.0.0", "192.168.1.5", "::", "ground.example"):
+        with pytest.raises(InputError, match="token"):
+            PortalConfig(tmp_path, host=host)
+        PortalConfig(tmp_path, host=host, token=TOKEN)
+    with pytest.raises(InputError, match="port"):
+        PortalConfig(tmp_path, port=99999)
+    assert parse_address("127.0.0.1:8080") == ("127.0.0.1", 8080)
+    assert parse_address("[::1]:80") == ("::1", 80)
+    for bad in ("8080", "host:", "host:x", ""):
+        with pytest.raises(InputError, match="HOST:PORT"):
+            parse_address(bad)
+
+
+def test_on_open_addresses_reading_needs_the_token(store: Path) -> None:
+    portal = Portal(PortalConfig(store, host="0.0.0.0", port=0, token=TOKEN))
+    portal.start()
+    try:
+        client = Client(portal)
+        client.base = client.base.replace("0.0.0.0", "127.0.0.1")
+        assert client.ask("/api/scans", token=None)[0] == 401
+        assert client.ask("/", token=None)[0] == 401
+        assert client.ask("/api/scans")[0] == 200
+    finally:
+        portal.close()
+
+
+def test_a_taken_port_is_said(store: Path) -> None:
+    first = Portal(PortalConfig(store, port=0))
+    first.start()
+    try:
+        port = int(first.url.split(":")[2].split("/")[0])
+        with pytest.raises(OutsideError, match="cannot listen"):
+            Portal(PortalConfig(store, port=port)).start()
+    finally:
+        first.close()
+
+
+def test_a_moved_keyframe_carries_its_points(house: HouseFlight) -> None:
+    """The matrix alone places the points, as a re-pose relies on."""
+    from service.ground.live import chunk_message
+
+    one = house.keyframe(0, 5.0)
+    _, xyz, _ = unpack(chunk_message(one, 1))
+    flat = np.abs(xyz[:, 2]) < 0.01
+    assert flat.sum() > 10_000
+    T = se3.inverse(house.pose(5.0))
+    assert np.abs(se3.transform(T, xyz)[flat, 2] - 40.0).max() < 0.01
