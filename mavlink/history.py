@@ -81,6 +81,19 @@ class VehicleHistory:
         with self._lock:
             return [(AttitudeSample(None, _quaternion(r)), t) for t, r in self._attitude.items()]
 
+    def heads(self) -> list[tuple[int, Quaternion]]:
+        """The camera head's attitude at every gimbal sample, or the body's without a gimbal."""
+        with self._lock:
+            times = {t for track in self._gimbals.values() for t, _ in track.items()}
+            bodies = [(t, _quaternion(r)) for t, r in self._attitude.items()]
+        states = [(t, self.state_at(t)) for t in sorted(times)]
+        found = [
+            (t, _quaternion(tuple(map(float, s.q_ned_gimbal_wxyz))))
+            for t, s in states
+            if s is not None and s.q_ned_gimbal_wxyz is not None
+        ]
+        return found or bodies
+
     def __len__(self) -> int:
         return len(self._attitude) + len(self._position)
 

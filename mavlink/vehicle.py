@@ -27,6 +27,7 @@ from mavlink.framing import Framer, Packet
 from mavlink.history import HistoryConfig, VehicleHistory
 from mavlink.link import Link, LinkSpec, parse_link
 from mavlink.messages import Outgoing
+from mavlink.odometry import Odometry, odometry_message
 from mavlink.packer import Packer
 from mavlink.presence import Health, Presence, PresenceConfig
 from mavlink.recorder import Recorder
@@ -51,6 +52,7 @@ class VehicleConfig:
     companion: CompanionConfig = field(default_factory=CompanionConfig)
     history: HistoryConfig = field(default_factory=lambda: HistoryConfig(keep_s=120.0))
     signing_key: Path | None = None  # 32 bytes, mode 600
+    odometry: bool = False  # send our motion estimate to the autopilot
     state_dir: Path | None = None  # where parameters and the signing time are kept
 
     def __post_init__(self) -> None:
@@ -159,9 +161,16 @@ class VehicleLink:
         """Tell ground stations of a keyframe."""
         self._do(lambda: self._companion.report(keyframe))
 
-    def send(self, message: object) -> None:
-        """Send a message of the onboard computer to everyone, such as an odometry."""
-        self._do(lambda: self._companion.send(message))
+    def report_odometry(self, odometry: Odometry, time_ns: int) -> bool:
+        """Send our estimate to the autopilot, stamped with its clock at our monotonic time.
+
+        False, and nothing sent, unless ``odometry`` is switched on and its clock is known.
+        """
+        boot_us = self.boot_time_us(time_ns)
+        if boot_us is None or not self.config.odometry:
+            return False
+        self._do(lambda: self._companion.send(odometry_message(odometry, boot_us)))
+        return True
 
     def parameter(self, name: str) -> float:
         """The value of a parameter."""
