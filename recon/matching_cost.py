@@ -36,10 +36,10 @@ class MatchingCostConfig:
     each part stops growing at its truncation.
     """
 
-    census_weight: float = 0.10
+    census_weight: float = 0.08
     census_truncation: int = 24  # bits
-    difference_weight: float = 0.03
-    difference_truncation: int = 20  # grey levels
+    difference_weight: float = 0.04
+    difference_truncation: int = 30  # grey levels
     unseen: float = 1.0  # of a label whose partner is outside the image, above the best one
 
     def __post_init__(self) -> None:
@@ -49,8 +49,8 @@ class MatchingCostConfig:
             raise ValueError(
                 f"difference_truncation is 0 to 255 levels, not {self.difference_truncation}"
             )
-        if not (self.census_weight >= 0 and self.difference_weight >= 0 and 0 < self.ceiling <= 64):
-            raise ValueError("the weights of the matching cost are out of range")
+        if not (self.census_weight >= 0 and self.difference_weight >= 0 and 0 < self.ceiling <= 10):
+            raise ValueError("weights must be at least 0, and the largest cost at most 10 labels")
 
     @property
     def ceiling(self) -> float:

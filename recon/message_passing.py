@@ -1,0 +1,318 @@
+"""Messages of belief propagation on a checkerboard, 32 pixels of one label at a time.
+
+Layout: the cells of one column parity of a row lie side by side, (row, parity, label, cell),
+so that a SIMD register holds one label of neighbouring pixels of one colour and any number of
+labels costs the same per label. A row of cells ends with at least one empty cell, and the
+messages have an empty row above and below: what lies beyond the border says nothing.
+
+Everything is a 16-bit integer. A cost further than four truncations above its pixel's best
+can never matter (a message is at most one truncation), so it is cut there and no sum
+overflows: the result is exactly that of unbounded integers.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from llvmlite import ir
+from numba import get_num_threads, njit, prange, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+I16 = npt.NDArray[np.int16]
+
+LANES = 32
+"""Cells that are updated together; LLVM spreads them over the registers that there are."""
+
+MAX_TRUNCATION = 2048
+"""The largest truncation for which no sum leaves 16 bits."""
+
+UP, DOWN, LEFT, RIGHT = 0, 1, 2, 3
+"""Where a message travels."""
+
+_FAR = 16383
+
+
+def propagate(
+    cost: I16, iterations: int, levels: int, slope: int, truncation: int
+) -> tuple[I16, I16]:
+    """Data (h, 2, L, cells) and messages (4, h + 2, 2, L, cells) of the finest level.
+
+    ``cost`` is (h, L, w) int16, at least 0. Coarse to fine, each level runs ``iterations``,
+    each of which updates one colour of the checkerboard. ``slope`` and ``truncation`` (at most
+    ``MAX_TRUNCATION``) shape the smoothness, in units of cost.
+    """
+    height, _, width = cost.shape
+    pyramid = [_split(cost, truncation)]
+    sizes = [(height, width)]
+    while len(pyramid) < levels and min(sizes[-1]) >= 8:
+        h, w = (sizes[-1][0] + 1) // 2, (sizes[-1][1] + 1) // 2
+        sizes.append((h, w))
+        pyramid.append(_coarser(pyramid[-1], w, cells_of(w), truncation))
+    messages = np.zeros((4, 1, 2, pyramid[0].shape[2], 1), np.int16)
+    for data, (_, w) in zip(reversed(pyramid), reversed(sizes), strict=True):
+        messages = _start(messages, data)
+        bands = max(1, min(get_num_threads(), data.shape[0] // (2 * iterations)))
+        _sweeps(data, messages, w, iterations, bands, slope, truncation)
+    return pyramid[0], messages
+
+
+def cells_of(width: int) -> int:
+    """Length of a row of cells of one parity: whole blocks, and at least one empty cell."""
+    return ((width + 1) // 2 // LANES + 1) * LANES
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _split(cost: Any, truncation: int) -> Any:  # pragma: no cover - compiled
+    """(h, L, w) to (h, 2, L, cells), each pixel less its least cost and cut."""
+    height, labels, width = cost.shape
+    cells = ((width + 1) // 2 // LANES + 1) * LANES
+    data = np.empty((height, 2, labels, cells), np.int16)
+    for v in prange(height):
+        low = cost[v, 0].copy()
+        for label in range(1, labels):
+            row = cost[v, label]
+            for u in range(width):
+                low[u] = min(low[u], row[u])
+        top = np.int16(4 * truncation)
+        for label in range(labels):
+            row = cost[v, label]
+            for parity in range(2):
+                out = data[v, parity, label]
+                count = (width + 1 - parity) // 2
+                for i in range(count):
+                    u = 2 * i + parity
+                    out[i] = min(np.int16(row[u] - low[u]), top)
+                out[count:] = 0
+    return data
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _coarser(
+    fine: Any, width: int, cells: int, truncation: int
+) -> Any:  # pragma: no cover - compiled
+    """Sum of the costs of 2x2 pixels, less its least, cut again to what can matter."""
+    fine_height, _, labels, _ = fine.shape
+    height = (fine_height + 1) // 2
+    data = np.empty((height, 2, labels, cells), np.int16)
+    for v in prange(height):
+        below = 2 * v + 1 < fine_height
+        top = np.int16(4 * truncation)
+        for parity in range(2):
+            count = (width + 1 - parity) // 2
+            low = np.full(count, np.int16(32767), np.int16)
+            for label in range(labels):
+                out = data[v, parity, label]
+                a, b = fine[2 * v, 0, label], fine[2 * v, 1, label]
+                for i in range(count):
+                    out[i] = np.int16(a[2 * i + parity] + b[2 * i + parity])
+                if below:
+                    a, b = fine[2 * v + 1, 0, label], fine[2 * v + 1, 1, label]
+                    for i in range(count):
+                        out[i] += np.int16(a[2 * i + parity] + b[2 * i + parity])
+                for i in range(count):
+                    low[i] = min(low[i], out[i])
+                out[count:] = 0
+            for label in range(labels):
+                out = data[v, parity, label]
+                for i in range(count):
+                    out[i] = min(np.int16(out[i] - low[i]), top)
+    return data
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _start(coarse: Any, data: Any) -> Any:  # pragma: no cover - compiled
+    """The messages that a level starts from: those of the coarser cells that it divides.
+
+    Only the colour that the first sweep reads is filled; the sweep writes the other.
+    """
+    height, _, labels, cells = data.shape
+    messages = np.empty((4, height + 2, 2, labels, cells), np.int16)
+    known = coarse.shape[4]
+    for r in prange(height + 2):
+        for direction in range(4):
+            if r in (0, height + 1):
+                messages[direction, r] = 0
+                continue
+            parity = r & 1  # row r - 1 + colour 1
+            for label in range(labels):
+                out = messages[direction, r, parity, label]
+                if known == 1:
+                    out[:] = 0
+                    continue
+                even = coarse[direction, (r + 1) // 2, 0, label]
+                odd = coarse[direction, (r + 1) // 2, 1, label]
+                for i in range(cells // 2):
+                    out[2 * i] = even[i]
+                    out[2 * i + 1] = odd[i]
+    return messages
+
+
+@intrinsic
+def _update_block(
+    typingctx: Any,
+    data: Any,
+    arriving: Any,
+    leaving: Any,
+    mask: Any,
+    scratch: Any,
+    stride: Any,
+    labels: Any,
+    slope: Any,
+    cut: Any,
+) -> Any:
+    """Write the four messages that leave LANES pixels of one colour of one row.
+
+    Addresses of: the data of label 0, the four messages that arrive (from below, above,
+    right, left), the four that leave (up, down, left, right), the lanes that exist (-1 or 0)
+    and ``labels * 4 * LANES`` int16 of scratch. ``stride`` is bytes from label to label.
+    """
+    addresses = types.UniTuple(types.intp, 4)
+    signature = types.void(
+        types.intp, addresses, addresses, types.intp, types.intp, types.intp, types.intp,
+        types.int16, types.int16,
+    )  # fmt: skip
+    return signature, _update_block_code
+
+
+def _update_block_code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    """LLVM of :func:`_update_block`: lower envelope up the labels, then down."""
+    data, arriving, leaving, mask, scratch, stride, labels, slope, cut = args
+    block = _Block(builder)
+    m_from = cgutils.unpack_tuple(builder, arriving, 4)
+    m_to = cgutils.unpack_tuple(builder, leaving, 4)
+    sources = (m_from[1], m_from[0], m_from[3], m_from[2])  # what each message must leave out
+    slope, cut, exists = block.splat(slope), block.splat(cut), block.load(mask)
+    row = ir.Constant(data.type, 2 * LANES)
+    envelope = [block.variable(_FAR) for _ in range(4)]
+    lowest = [block.variable(_FAR) for _ in range(4)]
+    with cgutils.for_range(builder, labels) as loop:
+        offset = builder.mul(loop.index, stride)
+        total = block.load(builder.add(data, offset))
+        arrived = {a: block.load(builder.add(a, offset)) for a in m_from}
+        for message in arrived.values():
+            total = builder.add(total, message)
+        for k in range(4):
+            rest = builder.sub(total, arrived[sources[k]])
+            builder.store(block.least(builder.load(lowest[k]), rest), lowest[k])
+            step = builder.add(builder.load(envelope[k]), slope)
+            best = block.least(rest, step)
+            builder.store(best, envelope[k])
+            place = builder.add(builder.mul(loop.index, ir.Constant(data.type, 4)),
+                                ir.Constant(data.type, k))  # fmt: skip
+            block.save(best, builder.add(scratch, builder.mul(place, row)))
+    after = [block.variable(_FAR) for _ in range(4)]
+    with cgutils.for_range(builder, labels) as loop:
+        label = builder.sub(builder.sub(labels, loop.index), ir.Constant(data.type, 1))
+        offset = builder.mul(label, stride)
+        for k in range(4):
+            place = builder.add(builder.mul(label, ir.Constant(data.type, 4)),
+                                ir.Constant(data.type, k))  # fmt: skip
+            best = block.load(builder.add(scratch, builder.mul(place, row)))
+            best = block.least(builder.sub(best, builder.load(lowest[k])), cut)
+            best = block.least(best, builder.add(builder.load(after[k]), slope))
+            builder.store(best, after[k])
+            block.save(builder.and_(best, exists), builder.add(m_to[k], offset))
+    return context.get_dummy_value()
+
+
+class _Block:
+    """Builds the instructions on LANES 16-bit integers at once."""
+
+    def __init__(self, builder: Any) -> None:
+        self.builder = builder
+        self.type = ir.VectorType(ir.IntType(16), LANES)
+
+    def load(self, address: Any) -> Any:
+        """The lanes at an address, aligned or not."""
+        return self.builder.load(self.builder.inttoptr(address, self.type.as_pointer()), align=2)
+
+    def save(self, value: Any, address: Any) -> None:
+        """Put the lanes at an address."""
+        pointer = self.builder.inttoptr(address, self.type.as_pointer())
+        self.builder.store(value, pointer, align=2)
+
+    def variable(self, value: int) -> Any:
+        """A local variable with this value in all lanes."""
+        variable = cgutils.alloca_once(self.builder, self.type)
+        self.builder.store(ir.Constant(self.type, [value] * LANES), variable)
+        return variable
+
+    def splat(self, value: Any) -> Any:
+        """One 16-bit integer in all lanes."""
+        undefined = ir.Constant(self.type, ir.Undefined)
+        one = self.builder.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
+        zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+        return self.builder.shuffle_vector(one, undefined, zeros)
+
+    def least(self, a: Any, b: Any) -> Any:
+        """The lesser of each lane."""
+        return self.builder.select(self.builder.icmp_signed("<", a, b), a, b)
+
+
+@njit(cache=True, nogil=True)
+def _update_row(
+    data: Any, messages: Any, v: int, colour: int, masks: Any, scratch: Any, slope: int, cut: int
+) -> None:  # pragma: no cover - compiled
+    """Messages that leave the pixels of one colour of row ``v``."""
+    _, _, labels, cells = data.shape
+    parity = (v + colour) & 1
+    row = labels * cells * 2  # bytes
+    base = messages.ctypes.data
+    step = (data.shape[0] + 2) * 2 * row  # from direction to direction
+    here = base + (2 * (v + 1) + parity) * row
+    beside = base + (2 * (v + 1) + 1 - parity) * row
+    d = data.ctypes.data + (2 * v + parity) * row
+    for block in range(cells // LANES):
+        at = 2 * LANES * block
+        arriving = (
+            here + 2 * row + UP * step + at,
+            here - 2 * row + DOWN * step + at,
+            beside + LEFT * step + at + 2 * parity,
+            beside + RIGHT * step + at + 2 * parity - 2,
+        )
+        leaving = (here + at, here + step + at, here + 2 * step + at, here + 3 * step + at)
+        _update_block(
+            d + at,
+            arriving,
+            leaving,
+            masks.ctypes.data + parity * 2 * cells + at,
+            scratch.ctypes.data,
+            2 * cells,
+            labels,
+            np.int16(slope),
+            np.int16(cut),
+        )
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _sweeps(
+    data: Any, messages: Any, width: int, iterations: int, bands: int, slope: int, truncation: int
+) -> None:  # pragma: no cover - compiled
+    """Run the iterations of one level, each band of rows in one go so that it stays in cache.
+
+    Iteration t of a row needs iteration t - 1 of the rows beside it. A band does what it can
+    alone (one row less at each inner edge per iteration), then the gaps are filled.
+    """
+    height, _, labels, cells = data.shape
+    masks = np.zeros((2, cells), np.int16)
+    masks[0, : (width + 1) // 2] = -1
+    masks[1, : width // 2] = -1
+    for band in prange(bands):
+        scratch = np.empty(labels * 4 * LANES, np.int16)
+        first, last = height * band // bands, height * (band + 1) // bands
+        for front in range(first, last + iterations):
+            for t in range(iterations):
+                v = front - t
+                begin = first + t if band > 0 else 0
+                end = last - t if band < bands - 1 else height
+                if begin <= v < end:
+                    _update_row(data, messages, v, t & 1, masks, scratch, slope, truncation)
+    for band in prange(1, bands):
+        scratch = np.empty(labels * 4 * LANES, np.int16)
+        edge = height * band // bands
+        for t in range(1, iterations):
+            for v in range(edge - t, edge + t):
+                _update_row(data, messages, v, t & 1, masks, scratch, slope, truncation)
