@@ -37,6 +37,7 @@ class OdometryConfig:
     min_tracks: int = 40  # fewer inliers: lost
     min_track_share: float = 0.25  # of the corners that should be visible
     max_tilt_error_rad: float = 0.35  # vision against attitude: more is a false solution
+    loose_px: float = 6.0  # gate of a second try: a rolling shutter bends pictures that much
     lost_after: int = 8  # frames in a row without a pose before a new segment starts
     least_shift_confidence: float = 1.4  # of the global shift between two pictures
     still_gap_s: float = 0.7  # frames further apart are stills: no motion model holds
@@ -410,11 +411,20 @@ class Odometry:
         if known.size < max(need, self.config.min_track_share * expected):
             return "too few matches"
         points = key.map[key.landmark[known]]
-        solved = pnp.solve(points, uv[known], self.K, self.config.pnp, T_camera_odom)
-        if solved is None or solved.inliers.sum() < max(need, 0.5 * known.size):
+        solved = self._solve(points, uv[known], T_camera_odom, max(need, int(0.5 * known.size)))
+        if solved is None:
             return "no pose fits the matches"
         ok[known[~solved.inliers]] = False
         return _Located(solved, uv, ok)
+
+    def _solve(self, points: F64, uv: F64, start: F64, least: int) -> pnp.PnpResult | None:
+        """EPnP with a tight gate, else with a loose one; None with fewer than ``least``."""
+        for gate_px in (self.config.pnp.threshold_px, self.config.loose_px):
+            config = replace(self.config.pnp, threshold_px=gate_px)
+            solved = pnp.solve(points, uv, self.K, config, start)
+            if solved is not None and solved.inliers.sum() >= least:
+                return solved
+        return None
 
     def _predict_3d(
         self, key: OdometryKeyframe, T_camera_odom: F64, share: float
@@ -538,9 +548,12 @@ class Odometry:
             two_view.reprojection_error(key.T_camera_odom, points, self.K, key.uv[rows]),
             two_view.reprojection_error(T_camera_odom, points, self.K, uv[rows]),
         )
-        good = (error < 1.5) & (angle > 0.5 * self.config.least_base_to_height)
+        gate_px = max(1.5, 2.0 * float(np.median(error)))
+        good = (error < min(gate_px, self.config.loose_px)) & (
+            angle > 0.5 * self.config.least_base_to_height
+        )
         key.landmark[rows[good]] = key.map.add(points[good])
-        ok[rows[~good & (error >= 1.5)]] = False
+        ok[rows[error >= gate_px]] = False
 
     def _adjust_window(self) -> None:
         """Bundle-adjust the last keyframes; the two oldest of them hold the frame and scale."""
@@ -597,8 +610,8 @@ class Odometry:
         cam: I64,
         residual_px: F64,
     ) -> None:
-        """Remove observations over 2.5 px; a landmark left with one view is dropped."""
-        bad = residual_px > 2.5
+        """Remove observations far off; a landmark left with one view is dropped."""
+        bad = residual_px > max(2.5, 4.0 * float(np.median(residual_px)))
         for c in np.unique(cam[bad]):
             gone = ids[index[bad & (cam == c)]]
             key = window[c]

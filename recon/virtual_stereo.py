@@ -15,6 +15,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import scaled_K
+from recon.exposure import stretch
 from recon.types import F32, F64, U8, Bool, DepthMap, DisparityMap, StereoPair
 
 
@@ -130,9 +131,11 @@ def rectify(
     plane, labels = window
     R_rect_right = R_rect_left @ T_left_right[:3, :3]
     scale = max(1.0, config.guide_width_px / config.width_px)
+    left_seen = _seen(left, R_rect_left, K, size)
+    right_seen = _seen(right, R_rect_right, K, size, plane)
     return StereoPair(
-        left=_grey(_warp(left, R_rect_left, K, size, 2)),
-        right=_grey(_warp(right, R_rect_right, K, size, 2, plane)),
+        left=stretch(_grey(_warp(left, R_rect_left, K, size, 2)), left_seen),
+        right=stretch(_grey(_warp(right, R_rect_right, K, size, 2, plane)), right_seen),
         baseline_m=base,
         K=K,
         labels=labels,
@@ -141,8 +144,8 @@ def rectify(
         T_world_left=left.T_odom_camera @ se3.compose(R_rect_left.T, np.zeros(3)),
         R_left_keyframe=R_rect_left,
         guide=_warp(left, R_rect_left, K, size, scale, area=False),
-        left_seen=_seen(left, R_rect_left, K, size),
-        right_seen=_seen(right, R_rect_right, K, size, plane),
+        left_seen=left_seen,
+        right_seen=right_seen,
     )
 
 

@@ -18,6 +18,7 @@ from recon.backends import Backend
 from recon.belief_propagation import BeliefPropagationConfig
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.depth_fusion import FusionConfig, PairDepth, fuse, onto_keyframe
+from recon.exposure import stretch
 from recon.odometry import Odometry, OdometryConfig, OdometryKeyframe, Tracked
 from recon.registration import IcpConfig
 from recon.reprojection import depth_from_disparity
@@ -66,7 +67,7 @@ class Step:
 
     tracked: Tracked
     prior: PosePrior
-    placed: Placed | None = None  # the frame in the world, when it has a pose
+    placed: Placed | None = None  # the frame in the world; by telemetry alone when vision fails
     is_view: bool = False  # the frame takes part in stereo and may become a keyframe
     anchor: Anchorage | None = None  # gives the frame's place again, as it is known later
     keyframes: tuple[Keyframe, ...] = ()  # finished depth images, oldest first
@@ -121,7 +122,7 @@ class Pipeline:
             tracked = self.odometry.track(grey, frame.seq, frame.time_ns, prior, mask)
         if tracked.T_odom_camera is None:
             self.refusals[tracked.reason] += 1
-            return Step(tracked, prior)
+            return Step(tracked, prior, _by_telemetry(frame.seq, prior))
         key = self.odometry.keyframes[-1]
         viewpoint = self.viewpoints.offer(frame, picture, tracked, key, prior)
         if viewpoint is not None:
@@ -158,7 +159,7 @@ class Pipeline:
         if size != (W, H):
             grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
             mask = np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST), np.uint8)
-        return picture, np.asarray(grey, np.uint8), None if mask.all() else mask
+        return picture, stretch(np.asarray(grey, np.uint8), mask > 0), None if mask.all() else mask
 
     # ---- a viewpoint whose partners are there ------------------------------------------
 
@@ -309,6 +310,16 @@ class Pipeline:
         for placed in moved:
             self.trajectory.tell(placed)
         return tuple(moved)
+
+
+def _by_telemetry(seq: int, prior: PosePrior) -> Placed | None:
+    """Where telemetry alone says the camera is; None without attitude, heading or position."""
+    R, position, sigma = prior.R_world_camera, prior.position_m, prior.sigma_position_m
+    if R is None or position is None or sigma is None or prior.sigma_yaw_rad > 1.0:
+        return None
+    tilt, yaw = prior.sigma_tilt_rad, prior.sigma_yaw_rad
+    covariance = np.diag(np.square([tilt, tilt, yaw, *sigma]))
+    return Placed(seq, se3.compose(R, position), 1.0, covariance, ("attitude", "gnss"))
 
 
 def _within_width(camera: Camera, width_px: int) -> Camera:

@@ -26,7 +26,7 @@ class _Told:
     """A frame's pose as it was written."""
 
     time_ns: int
-    anchor: Anchorage
+    anchor: Anchorage | None  # None: by telemetry alone, never corrected
     position_m: F64  # (3,)
     agl_m: float | None
     is_view: bool
@@ -56,17 +56,13 @@ class Recorder:
         self.states[step.tracked.state] += 1
         self._write_origin()
         self._write_keyframes(step)
-        if step.placed is not None and step.anchor is not None:
-            told = _Told(
-                time_ns + self._offset_ns,
-                step.anchor,
-                step.placed.T_world_camera[:3, 3],
-                agl_m,
-                step.is_view,
-            )
-            self._told.append(told)
-            self.last = self._record(told, step.placed)
-            self.store.add_pose(self.last)
+        if step.placed is None:
+            return
+        position = step.placed.T_world_camera[:3, 3]
+        told = _Told(time_ns + self._offset_ns, step.anchor, position, agl_m, step.is_view)
+        self._told.append(told)
+        self.last = self._record(told, step.placed)
+        self.store.add_pose(self.last)
 
     def close(self, extra: dict[str, Any]) -> dict[str, Any]:
         """Write what is left, correct the trajectory, close the scan; return its summary."""
@@ -80,6 +76,8 @@ class Recorder:
         """Write those poses again that corrections have moved; the newest of a time holds."""
         self._last, self.distance_m = None, 0.0
         for told in self._told:
+            if told.anchor is None:
+                continue
             record = self._record(told, self.pipeline.place(told.anchor))
             if np.linalg.norm(record.T_world_camera[:3, 3] - told.position_m) > TOLD_M:
                 self.store.add_pose(record)
@@ -184,7 +182,7 @@ class Recorder:
             turn_rate_rad_s=turn,
             sources=placed.sources,
             sigma_m=float(np.sqrt(np.trace(placed.covariance[3:, 3:]))),
-            keyframe_seq=told.anchor.seq if told.is_view else None,
+            keyframe_seq=told.anchor.seq if told.is_view and told.anchor else None,
         )
 
 

@@ -25,6 +25,9 @@ from service.version import software
 
 log = logging.getLogger(__name__)
 
+TIME_STEP_NS = 100_000
+"""Frame times are rounded to this; no camera's clock is finer."""
+
 
 class Datalink(Protocol):
     """The sending end, as a scan needs it."""
@@ -100,6 +103,8 @@ class Scan:
             return None
         time_ns = self.epoch_ns + frame.time_ns
         exposed_ns = time_ns - round(inputs.config.camera.latency_ms * 1e6)
+        # Containers round times by up to 11 us; rounded alike, a pipe and a file agree.
+        exposed_ns = round(exposed_ns / TIME_STEP_NS) * TIME_STEP_NS
         state = inputs.history.state_at(exposed_ns) if inputs.history is not None else None
         self.tagged += state is not None
         self.heights += self.pipeline.rig.height_known(state, frame.geotag)
