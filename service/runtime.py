@@ -83,8 +83,8 @@ class Daemon:
 
     def _load(self) -> None:
         """The heavy part of the start: camera model and backend."""
-        from recon.backends import load_backend
         from service.camera_file import load_camera
+        from service.compute import open_backend
 
         if not self.config.camera.source:
             raise InputError("camera.source is not set; give it in the configuration file")
@@ -93,7 +93,7 @@ class Daemon:
                 "camera.model is not set; make one with 'skyrelief calibrate' and name it"
             )
         self._camera = load_camera(Path(self.config.camera.model))
-        self._backend = load_backend(self.config.compute.backend)
+        self._backend = open_backend(self.config.compute)
         self._booted = True
         log.info("ready: backend %s", self._backend.name)
 

@@ -89,8 +89,8 @@ def _replay(
     realtime: bool,
     as_json: bool,
 ) -> dict[str, Any]:
-    from recon.backends import load_backend
     from service.cameras.pace import paced
+    from service.compute import open_backend
     from service.datalink import open_datalink
     from service.errors import InputError
     from service.scan import Scan, ScanInputs, create_store
@@ -108,7 +108,7 @@ def _replay(
     epoch_ns = _epoch(source, log, video_epoch, notes)
     scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(epoch_ns / 1e9))
     folder = out or Path(f"scan-{scan_id}")
-    chosen = load_backend(config.compute.backend)
+    chosen = open_backend(config.compute)
     notes += log.warnings if log is not None else ()
     inputs = ScanInputs(
         paced(source) if realtime else source,
