@@ -1,6 +1,7 @@
 """Stereo by hierarchical min-sum belief propagation on a grid (paper section 2.2, Eq. 1).
 
-The energy is the matching cost plus a truncated linear smoothness; messages pass through the
+The energy is the matching cost plus a truncated linear smoothness, weaker where the image has
+an edge; messages pass through the
 lower envelope of Felzenszwalb and Huttenlocher, https://doi.org/10.1007/s11263-006-7899-4,
 coarse to fine, on a checkerboard: an iteration updates the pixels of one colour from those of
 the other. :mod:`recon.message_passing` does that; here labels become a disparity map: between
@@ -16,7 +17,7 @@ import numpy as np
 
 from recon.disparity_selection import check_visibility, select
 from recon.matching_cost import COST_UNIT, MatchingCostConfig, check_pair, matching_cost
-from recon.message_passing import MAX_TRUNCATION, propagate
+from recon.message_passing import MAX_TRUNCATION, Smoothness, propagate
 from recon.types import F32, U8, DisparityMap
 
 SPECKLE_STEP = 16
@@ -30,6 +31,8 @@ class BeliefPropagationConfig:
     iterations: int = 5  # per level; one iteration updates one colour of the checkerboard
     levels: int = 5  # of the pyramid; fewer when the image is small
     smoothness_truncation: float = 2.5  # labels; a larger jump costs no more
+    edge_floor: float = 0.4  # share of the smoothness that is left across strong edges
+    edge_contrast: int = 32  # grey levels between neighbours that make a strong edge
     min_disparity: int = 0  # px, disparity of label 0
     cost: MatchingCostConfig = field(default_factory=MatchingCostConfig)
     min_evidence: float = 0.2  # how much better than the mean label, 0 to 1; 0: believe all
@@ -46,6 +49,8 @@ class BeliefPropagationConfig:
                 f"smoothness_truncation must be above 0 and at most {MAX_TRUNCATION // COST_UNIT}"
                 f" labels, not {self.smoothness_truncation}"
             )
+        if not 0 < self.edge_floor <= 1 or not 1 <= self.edge_contrast <= 255:
+            raise ValueError("edge_floor must be in (0, 1] and edge_contrast 1 to 255")
         if abs(self.min_disparity) > 32767 or self.speckle_px < 0:
             raise ValueError("min_disparity or speckle_px is out of range")
 
@@ -53,6 +58,11 @@ class BeliefPropagationConfig:
     def truncation(self) -> int:
         """The largest smoothness cost in integer units."""
         return round(self.smoothness_truncation * COST_UNIT)
+
+    @property
+    def smoothness(self) -> Smoothness:
+        """The smoothness term in integer units."""
+        return Smoothness(COST_UNIT, self.truncation, self.edge_floor, self.edge_contrast)
 
 
 def belief_propagation(
@@ -65,7 +75,7 @@ def belief_propagation(
     """
     check_pair(left, right, labels)
     cost = matching_cost(left, right, labels, config.cost, config.min_disparity)
-    data, messages = propagate(cost, config.iterations, config.levels, COST_UNIT, config.truncation)
+    data, messages = propagate(cost, left, config.iterations, config.levels, config.smoothness)
     px, confidence = select(
         data, messages, cost, config.min_disparity, config.truncation, config.min_evidence
     )

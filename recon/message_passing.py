@@ -12,6 +12,7 @@ overflows: the result is exactly that of unbounded integers.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ from numba import get_num_threads, njit, prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from recon.types import U8
+
 I16 = npt.NDArray[np.int16]
 
 LANES = 32
@@ -29,33 +32,102 @@ LANES = 32
 MAX_TRUNCATION = 2048
 """The largest truncation for which no sum leaves 16 bits."""
 
+FULL_WEIGHT = 256
+
 UP, DOWN, LEFT, RIGHT = 0, 1, 2, 3
 """Where a message travels."""
 
 _FAR = 16383
 
 
+@dataclass(frozen=True, slots=True)
+class Smoothness:
+    """What a step between neighbouring labels costs, in integer units.
+
+    ``slope`` per label, ``truncation`` at most; both fall, with the contrast of the two
+    pixels, to ``floor`` of that at ``full_contrast`` grey levels and above.
+    """
+
+    slope: int
+    truncation: int
+    floor: float
+    full_contrast: int
+
+    def weights(self, image: U8) -> I16:
+        """Weight of the edge to the pixel above and to the left, (2, h, w) in 1 / FULL_WEIGHT."""
+        contrast = np.arange(256, dtype=np.float64) / self.full_contrast
+        table = np.maximum(1 - contrast * (1 - self.floor), self.floor) * FULL_WEIGHT
+        return np.asarray(_weights(image, np.rint(table).astype(np.int16)))
+
+
+@njit(cache=True, nogil=True)
+def _weights(image: Any, table: Any) -> Any:  # pragma: no cover - compiled
+    height, width = image.shape
+    weights = np.full((2, height, width), np.int16(FULL_WEIGHT), np.int16)
+    for v in range(height):
+        for u in range(width):
+            here = np.int16(image[v, u])
+            if v > 0:
+                weights[0, v, u] = table[abs(here - np.int16(image[v - 1, u]))]
+            if u > 0:
+                weights[1, v, u] = table[abs(here - np.int16(image[v, u - 1]))]
+    return weights
+
+
+@njit(cache=True, nogil=True)
+def _coarser_weights(fine: Any) -> Any:  # pragma: no cover - compiled
+    """Mean of the two edges that lie between two coarse pixels."""
+    _, height, width = fine.shape
+    coarse = np.empty((2, (height + 1) // 2, (width + 1) // 2), np.int16)
+    for v in range(coarse.shape[1]):
+        for u in range(coarse.shape[2]):
+            right, below = min(2 * u + 1, width - 1), min(2 * v + 1, height - 1)
+            coarse[0, v, u] = (fine[0, 2 * v, 2 * u] + fine[0, 2 * v, right]) // 2
+            coarse[1, v, u] = (fine[1, 2 * v, 2 * u] + fine[1, below, 2 * u]) // 2
+    return coarse
+
+
+@njit(cache=True, nogil=True)
+def _edges(
+    weights: Any, cells: int, slope: int, truncation: int
+) -> Any:  # pragma: no cover - compiled
+    """Slope and truncation of each edge: (slope or cut, vertical or horizontal, row, parity, cell).
+
+    A row and a cell beyond the border are never read for a pixel that exists.
+    """
+    _, height, width = weights.shape
+    edges = np.zeros((2, 2, height + 2, 2, cells), np.int16)
+    for kind in range(2):
+        for v in range(height):
+            for u in range(width):
+                w = np.int32(weights[kind, v, u])
+                edges[0, kind, v + 1, u & 1, u // 2] = slope * w // FULL_WEIGHT
+                edges[1, kind, v + 1, u & 1, u // 2] = truncation * w // FULL_WEIGHT
+    return edges
+
+
 def propagate(
-    cost: I16, iterations: int, levels: int, slope: int, truncation: int
+    cost: I16, image: U8, iterations: int, levels: int, smoothness: Smoothness
 ) -> tuple[I16, I16]:
     """Data (h, 2, L, cells) and messages (4, h + 2, 2, L, cells) of the finest level.
 
-    ``cost`` is (h, L, w) int16, at least 0. Coarse to fine, each level runs ``iterations``,
-    each of which updates one colour of the checkerboard. ``slope`` and ``truncation`` (at most
-    ``MAX_TRUNCATION``) shape the smoothness, in units of cost.
+    ``cost`` is (h, L, w) int16, at least 0; ``image`` (h, w) uint8 says where surfaces may end.
+    Coarse to fine, each level runs ``iterations``, each of which updates one colour of the
+    checkerboard.
     """
-    height, _, width = cost.shape
+    truncation = smoothness.truncation
     pyramid = [_split(cost, truncation)]
-    sizes = [(height, width)]
-    while len(pyramid) < levels and min(sizes[-1]) >= 8:
-        h, w = (sizes[-1][0] + 1) // 2, (sizes[-1][1] + 1) // 2
-        sizes.append((h, w))
+    weights = [smoothness.weights(image)]
+    while len(pyramid) < levels and min(weights[-1].shape[1:]) >= 8:
+        weights.append(_coarser_weights(weights[-1]))
+        w = weights[-1].shape[2]
         pyramid.append(_coarser(pyramid[-1], w, cells_of(w), truncation))
     messages = np.zeros((4, 1, 2, pyramid[0].shape[2], 1), np.int16)
-    for data, (_, w) in zip(reversed(pyramid), reversed(sizes), strict=True):
+    for data, weight in zip(reversed(pyramid), reversed(weights), strict=True):
         messages = _start(messages, data)
+        edges = _edges(weight, data.shape[3], smoothness.slope, truncation)
         bands = max(1, min(get_num_threads(), data.shape[0] // (2 * iterations)))
-        _sweeps(data, messages, w, iterations, bands, slope, truncation)
+        _sweeps(data, messages, edges, weight.shape[2], iterations, bands)
     return pyramid[0], messages
 
 
@@ -160,31 +232,32 @@ def _update_block(
     scratch: Any,
     stride: Any,
     labels: Any,
-    slope: Any,
-    cut: Any,
+    slopes: Any,
+    cuts: Any,
 ) -> Any:
     """Write the four messages that leave LANES pixels of one colour of one row.
 
     Addresses of: the data of label 0, the four messages that arrive (from below, above,
     right, left), the four that leave (up, down, left, right), the lanes that exist (-1 or 0)
-    and ``labels * 4 * LANES`` int16 of scratch. ``stride`` is bytes from label to label.
+    and ``labels * 4 * LANES`` int16 of scratch. ``stride`` is bytes from label to label;
+    ``slopes`` and ``cuts`` are the addresses of the smoothness of the four edges.
     """
     addresses = types.UniTuple(types.intp, 4)
-    signature = types.void(
-        types.intp, addresses, addresses, types.intp, types.intp, types.intp, types.intp,
-        types.int16, types.int16,
-    )  # fmt: skip
+    one = types.intp
+    signature = types.void(one, addresses, addresses, one, one, one, one, addresses, addresses)
     return signature, _update_block_code
 
 
 def _update_block_code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
     """LLVM of :func:`_update_block`: lower envelope up the labels, then down."""
-    data, arriving, leaving, mask, scratch, stride, labels, slope, cut = args
+    data, arriving, leaving, mask, scratch, stride, labels, slopes, cuts = args
     block = _Block(builder)
     m_from = cgutils.unpack_tuple(builder, arriving, 4)
     m_to = cgutils.unpack_tuple(builder, leaving, 4)
     sources = (m_from[1], m_from[0], m_from[3], m_from[2])  # what each message must leave out
-    slope, cut, exists = block.splat(slope), block.splat(cut), block.load(mask)
+    exists = block.load(mask)
+    slope = [block.load(a) for a in cgutils.unpack_tuple(builder, slopes, 4)]
+    cut = [block.load(a) for a in cgutils.unpack_tuple(builder, cuts, 4)]
     row = ir.Constant(data.type, 2 * LANES)
     envelope = [block.variable(_FAR) for _ in range(4)]
     lowest = [block.variable(_FAR) for _ in range(4)]
@@ -197,7 +270,7 @@ def _update_block_code(context: Any, builder: Any, signature: Any, args: Any) ->
         for k in range(4):
             rest = builder.sub(total, arrived[sources[k]])
             builder.store(block.least(builder.load(lowest[k]), rest), lowest[k])
-            step = builder.add(builder.load(envelope[k]), slope)
+            step = builder.add(builder.load(envelope[k]), slope[k])
             best = block.least(rest, step)
             builder.store(best, envelope[k])
             place = builder.add(builder.mul(loop.index, ir.Constant(data.type, 4)),
@@ -211,8 +284,8 @@ def _update_block_code(context: Any, builder: Any, signature: Any, args: Any) ->
             place = builder.add(builder.mul(label, ir.Constant(data.type, 4)),
                                 ir.Constant(data.type, k))  # fmt: skip
             best = block.load(builder.add(scratch, builder.mul(place, row)))
-            best = block.least(builder.sub(best, builder.load(lowest[k])), cut)
-            best = block.least(best, builder.add(builder.load(after[k]), slope))
+            best = block.least(builder.sub(best, builder.load(lowest[k])), cut[k])
+            best = block.least(best, builder.add(builder.load(after[k]), slope[k]))
             builder.store(best, after[k])
             block.save(builder.and_(best, exists), builder.add(m_to[k], offset))
     return context.get_dummy_value()
@@ -240,13 +313,6 @@ class _Block:
         self.builder.store(ir.Constant(self.type, [value] * LANES), variable)
         return variable
 
-    def splat(self, value: Any) -> Any:
-        """One 16-bit integer in all lanes."""
-        undefined = ir.Constant(self.type, ir.Undefined)
-        one = self.builder.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
-        zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-        return self.builder.shuffle_vector(one, undefined, zeros)
-
     def least(self, a: Any, b: Any) -> Any:
         """The lesser of each lane."""
         return self.builder.select(self.builder.icmp_signed("<", a, b), a, b)
@@ -254,7 +320,7 @@ class _Block:
 
 @njit(cache=True, nogil=True)
 def _update_row(
-    data: Any, messages: Any, v: int, colour: int, masks: Any, scratch: Any, slope: int, cut: int
+    data: Any, messages: Any, v: int, colour: int, edges: Any, masks: Any, scratch: Any
 ) -> None:  # pragma: no cover - compiled
     """Messages that leave the pixels of one colour of row ``v``."""
     _, _, labels, cells = data.shape
@@ -265,6 +331,8 @@ def _update_row(
     here = base + (2 * (v + 1) + parity) * row
     beside = base + (2 * (v + 1) + 1 - parity) * row
     d = data.ctypes.data + (2 * v + parity) * row
+    line = 2 * cells  # bytes of the edges of one parity of a row
+    side = (data.shape[0] + 2) * 2 * line  # from vertical to horizontal edges
     for block in range(cells // LANES):
         at = 2 * LANES * block
         arriving = (
@@ -274,6 +342,15 @@ def _update_row(
             beside + RIGHT * step + at + 2 * parity - 2,
         )
         leaving = (here + at, here + step + at, here + 2 * step + at, here + 3 * step + at)
+        e = edges.ctypes.data + at
+        # smoothness towards above, below, left and right
+        places = (
+            e + (2 * (v + 1) + parity) * line,
+            e + (2 * (v + 2) + parity) * line,
+            e + (2 * (v + 1) + parity) * line + side,
+            e + (2 * (v + 1) + 1 - parity) * line + side + 2 * parity,
+        )
+        cut = 2 * side
         _update_block(
             d + at,
             arriving,
@@ -282,14 +359,14 @@ def _update_row(
             scratch.ctypes.data,
             2 * cells,
             labels,
-            np.int16(slope),
-            np.int16(cut),
+            places,
+            (places[0] + cut, places[1] + cut, places[2] + cut, places[3] + cut),
         )
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def _sweeps(
-    data: Any, messages: Any, width: int, iterations: int, bands: int, slope: int, truncation: int
+    data: Any, messages: Any, edges: Any, width: int, iterations: int, bands: int
 ) -> None:  # pragma: no cover - compiled
     """Run the iterations of one level, each band of rows in one go so that it stays in cache.
 
@@ -309,10 +386,10 @@ def _sweeps(
                 begin = first + t if band > 0 else 0
                 end = last - t if band < bands - 1 else height
                 if begin <= v < end:
-                    _update_row(data, messages, v, t & 1, masks, scratch, slope, truncation)
+                    _update_row(data, messages, v, t & 1, edges, masks, scratch)
     for band in prange(1, bands):
         scratch = np.empty(labels * 4 * LANES, np.int16)
         edge = height * band // bands
         for t in range(1, iterations):
             for v in range(edge - t, edge + t):
-                _update_row(data, messages, v, t & 1, masks, scratch, slope, truncation)
+                _update_row(data, messages, v, t & 1, edges, masks, scratch)
