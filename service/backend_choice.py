@@ -1,0 +1,103 @@
+"""Which backend does the heavy operations: the operator's, or the fastest that works."""
+
+from __future__ import annotations
+
+import ctypes.util
+import logging
+import time
+from importlib.util import find_spec
+
+import numpy as np
+
+from recon.backends import BACKENDS, Backend, load_backend
+from recon.belief_propagation import BeliefPropagationConfig
+from recon.upsampling import UpsamplingConfig
+from service.errors import OutsideError
+
+log = logging.getLogger(__name__)
+
+TRIAL_SIZE = (180, 320)
+TRIAL_LABELS = 16
+TRIAL_ROUNDS = 5
+
+
+def choose_backend(name: str = "auto") -> Backend:
+    """The backend called ``name``, or for ``"auto"`` the fastest in a short measured trial.
+
+    Raises OutsideError, with the reason, when a named backend cannot run here.
+    """
+    if name != "auto":
+        return named_backend(name)
+    working: list[Backend] = []
+    for candidate in BACKENDS:
+        reason = pointless(candidate)
+        if reason:
+            log.info("backend %s: not tried, %s", candidate, reason)
+            continue
+        try:
+            working.append(load_backend(candidate))
+        except (ImportError, RuntimeError, ValueError) as error:
+            log.info("backend %s: cannot run here, %s", candidate, error)
+    if len(working) == 1:
+        log.info("backend %s on %s, the only one", working[0].name, working[0].device)
+        return working[0]
+    timed: list[tuple[float, Backend]] = []
+    for backend in working:
+        try:
+            timed.append((trial(backend), backend))
+        except RuntimeError as error:
+            log.info("backend %s: failed its trial, %s", backend.name, error)
+    if not timed:
+        raise OutsideError("no backend runs here; 'skyrelief doctor' says what is missing")
+    seconds, chosen = min(timed, key=lambda entry: entry[0])
+    figures = ", ".join(f"{b.name} {1e3 * s:.1f} ms" for s, b in timed)
+    log.info(
+        "backend %s on %s: %.1f ms a trial, the least of %s",
+        chosen.name, chosen.device, 1e3 * seconds, figures,
+    )  # fmt: skip
+    return chosen
+
+
+def named_backend(name: str) -> Backend:
+    """The backend called ``name``; OutsideError with the reason when it cannot run."""
+    try:
+        backend = load_backend(name)
+    except (ImportError, RuntimeError, ValueError) as error:
+        raise OutsideError(f"backend {name}: {error}") from error
+    log.info("backend %s on %s, as named", backend.name, backend.device)
+    return backend
+
+
+def pointless(name: str) -> str | None:
+    """Why ``auto`` need not try this backend, or None; costs no heavy import."""
+    if name == "torch":
+        if find_spec("torch") is None:
+            return "torch is not installed"
+        if ctypes.util.find_library("cuda") is None:
+            return "there is no CUDA driver, and on a processor the cpu backend is faster"
+    if name == "onnx":
+        if find_spec("onnxruntime") is None or find_spec("onnx") is None:
+            return "onnx and onnxruntime are not installed"
+        import onnxruntime  # type: ignore[import-untyped]
+
+        providers = set(onnxruntime.get_available_providers())
+        if not providers & {"TensorrtExecutionProvider", "CUDAExecutionProvider"}:
+            return "ONNX Runtime has no GPU provider, and on a processor cpu is faster"
+    return None
+
+
+def trial(backend: Backend) -> float:
+    """Least seconds of a pair from images to upsampled disparity, after a warm-up round."""
+    rng = np.random.default_rng(0)
+    height, width = TRIAL_SIZE
+    guide = rng.integers(0, 256, (2 * height, 2 * width, 3), np.uint8)
+    left = np.ascontiguousarray(guide[:height, :width, 0])
+    right = np.roll(left, -5, axis=1)
+    matching, upsampling = BeliefPropagationConfig(), UpsamplingConfig()
+    least = float("inf")
+    for _ in range(TRIAL_ROUNDS + 1):
+        start = time.perf_counter()
+        coarse = backend.belief_propagation(left, right, TRIAL_LABELS, matching)
+        backend.upsample(coarse, guide, upsampling)
+        least = min(least, time.perf_counter() - start)
+    return least

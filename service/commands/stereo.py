@@ -1,0 +1,126 @@
+"""``skyrelief stereo LEFT RIGHT``: the stereo stage alone on a rectified pair."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from service.errors import InputError, OutsideError
+
+if TYPE_CHECKING:
+    from recon.belief_propagation import BeliefPropagationConfig
+    from recon.types import F32, U8
+
+
+def stereo(
+    left: Annotated[Path, typer.Argument(help="left image, rectified")],
+    right: Annotated[Path, typer.Argument(help="right image, of the same size")],
+    labels: Annotated[int, typer.Option(help="number of disparities that are tried")],
+    out: Annotated[Path, typer.Option(help="float32 (h, w) pixels, NaN = unknown (.npy)")],
+    min_disparity: Annotated[int, typer.Option(help="the smallest disparity, px")] = 0,
+    iterations: Annotated[int, typer.Option(help="of belief propagation, per level")] = 5,
+    backend: Annotated[str, typer.Option(help="auto, cpu, torch or onnx")] = "auto",
+    checked: Annotated[
+        bool, typer.Option("--checked", help="unknown where the pair does not prove it")
+    ] = False,
+    picture: Annotated[Path | None, typer.Option(help="also write it in colour (.png)")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
+) -> None:
+    """Disparity of a rectified pair: left pixel (u, v) matches right pixel (u - d, v).
+
+    As complete as the pair allows: what the right image cannot see takes the disparity of the
+    surface behind; unknown stay blank areas and what lies outside the right image. With
+    --checked, as in flight, only what the pair proves is kept.
+    """
+    grey_left, grey_right = read_grey(left), read_grey(right)
+    if grey_left.shape != grey_right.shape:
+        raise InputError(
+            f"{left} is {_size(grey_left)} but {right} is {_size(grey_right)}: "
+            "a rectified pair has one size"
+        )
+    if not 2 <= labels <= 1024:
+        raise InputError(f"--labels {labels}: give 2 to 1024")
+    config = matching_config(iterations, min_disparity, checked)
+    check_output(out, ".npy")
+    if picture is not None:
+        check_output(picture, ".png")
+    from service.backend_choice import choose_backend
+
+    chosen = choose_backend(backend)
+    start = time.perf_counter()
+    found = chosen.belief_propagation(grey_left, grey_right, labels, config)
+    seconds = time.perf_counter() - start
+    write(out, picture, found.px + config.min_disparity, labels, min_disparity)
+    known = float((found.px == found.px).mean())
+    if as_json:
+        report = {"out": str(out), "known_share": known, "backend": chosen.name}
+        print(json.dumps(report | {"seconds": seconds, "size_px": grey_left.shape[::-1]}))
+    else:
+        print(f"{out}: {_size(grey_left)}, {100 * known:.1f} % known, {chosen.name}")
+
+
+def matching_config(iterations: int, min_disparity: int, checked: bool) -> BeliefPropagationConfig:
+    """How the pair is matched; InputError for numbers out of range."""
+    from recon.belief_propagation import BeliefPropagationConfig
+
+    try:
+        if checked:
+            return BeliefPropagationConfig(iterations=iterations, min_disparity=min_disparity)
+        return BeliefPropagationConfig(
+            iterations=iterations,
+            min_disparity=min_disparity,
+            min_evidence=0.1,
+            min_contrast=0.3,
+            fill_occluded=True,
+            speckle_px=0,
+        )
+    except ValueError as error:
+        raise InputError(f"stereo: {error}") from error
+
+
+def read_grey(path: Path) -> U8:
+    """A grey 8-bit image (h, w); InputError when there is none."""
+    import cv2
+    import numpy as np
+
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE) if (
+        path.stat().st_size
+    ) else None  # fmt: skip
+    if image is None:
+        raise InputError(f"{path}: not an image that can be read; give PNG, JPEG or TIFF")
+    return np.asarray(image, np.uint8)
+
+
+def check_output(path: Path, suffix: str) -> None:
+    """InputError unless a file of this kind can go there."""
+    if path.suffix.lower() != suffix:
+        raise InputError(f"{path}: the name must end in {suffix}")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: there is no folder {path.parent}")
+
+
+def write(out: Path, picture: Path | None, px: F32, labels: int, min_disparity: int) -> None:
+    """The disparity as an array and, when asked, as a picture (black = unknown)."""
+    import cv2
+    import numpy as np
+
+    try:
+        np.save(out, px.astype(np.float32))
+        if picture is not None:
+            known = np.isfinite(px)
+            level = np.where(known, (px - min_disparity) * (255 / (labels - 1)), 0)
+            colour = cv2.applyColorMap(level.astype(np.uint8), cv2.COLORMAP_TURBO)
+            colour[~known] = 0
+            picture.write_bytes(cv2.imencode(".png", colour)[1].tobytes())
+    except OSError as error:
+        raise OutsideError(f"{out}: cannot be written: {error.strerror}") from error
+
+
+def _size(image: U8) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
