@@ -13,12 +13,15 @@ from typing import Any
 
 from mavlink import status as texts
 from mavlink.camera import CAPTURE_STATUS, CameraComponent, CameraConfig, KeyframeReport
+from mavlink.camera_definition import FILE, URI, camera_definition, definition_version
 from mavlink.clock import BootClock
 from mavlink.command_desk import CommandDesk, decode_call
 from mavlink.commands import load_commands
 from mavlink.control import ACCEPTED, Answer, Result, ScanControl
 from mavlink.decode import READERS, decode
+from mavlink.extended_parameters import ExtendedParameters
 from mavlink.framing import Decoder, Packet
+from mavlink.ftp import FileServer
 from mavlink.gimbal import YAW_FRAMES
 from mavlink.history import VehicleHistory
 from mavlink.messages import CAMERA, ONBOARD, Address, Outbox, Outgoing
@@ -33,7 +36,7 @@ from mavlink.wire import COMMAND_CANCEL, dialect
 S = 1_000_000_000
 MS = 1_000_000
 COMPONENTS = (ONBOARD, CAMERA)
-HEARTBEAT, TIMESYNC = 0, 111
+HEARTBEAT, FILE_TRANSFER, TIMESYNC = 0, 110, 111
 LOAD_STATUS, MOTION = 390, 251
 LOST_NS = 5 * S
 
@@ -76,8 +79,12 @@ class Companion:
         self.streams = Streams(self._outbox)
         self.texts = StatusTexts(self._outbox)
         self.parameters = Parameters(self._outbox, self._parameter_changed, kept_parameters)
+        self._extended = ExtendedParameters(self.parameters, self._outbox)
+        table = self.parameters.table
+        definition = camera_definition(config.camera.vendor, config.camera.model, table)
+        self._files = FileServer({FILE: definition})
         self.camera = CameraComponent(
-            config.camera,
+            _with_definition(config.camera, definition_version(table)),
             control,
             self._outbox,
             self.streams,
@@ -110,7 +117,9 @@ class Companion:
         elif name.startswith("COMMAND_"):
             self._hear_command(message, link, now_ns)
         elif name.startswith("PARAM_"):
-            self._hear_parameter(message)
+            self._hear_parameter(message, name)
+        elif packet.message_id == FILE_TRANSFER:
+            self._hear_file_request(message, link)
         elif packet.message_id == TIMESYNC:
             self._hear_timesync(message, packet, link, now_ns)
 
@@ -162,15 +171,27 @@ class Companion:
         if self._is_for_us(Address(payload[2], payload[3])):
             self.desk.cancel(number, Address(packet.system, packet.component), now_ns)
 
-    def _hear_parameter(self, message: Any) -> None:
+    def _hear_parameter(self, message: Any, name: str) -> None:
         target = getattr(message, "target_system", None)
         if target is None or target not in (0, self.presence.system):
             return
-        if message.target_component not in (0, ONBOARD):
+        extended = name.startswith("PARAM_EXT_")
+        if message.target_component not in (0, CAMERA if extended else ONBOARD):
             return
-        answer = self.parameters.receive(message)
+        answer = (self._extended if extended else self.parameters).receive(message)
         if isinstance(answer, Answer) and answer.text:
             self._warn(answer.text)
+
+    def _hear_file_request(self, message: Any, link: int) -> None:
+        target = Address(message.target_system, message.target_component)
+        if target.component == 0 or not self._is_for_us(target):
+            return
+        source = Address(message.get_srcSystem(), message.get_srcComponent())
+        for payload in self._files.answer(bytes(message.payload), source):
+            reply = dialect.MAVLink_file_transfer_protocol_message(
+                0, source.system, source.component, list(payload)
+            )
+            self._outbox.put(target.component, reply, link)
 
     def _parameter_changed(self, name: str, value: float) -> Answer:
         if name != YAW_FRAME:
@@ -294,3 +315,10 @@ class Companion:
         """The autopilot's clock; None before it was heard."""
         autopilot = self.presence.autopilot
         return None if autopilot is None else self._clocks.get(autopilot[1])
+
+
+def _with_definition(camera: CameraConfig, version: int) -> CameraConfig:
+    """The camera with our own definition, unless it names another."""
+    if camera.definition_uri:
+        return camera
+    return replace(camera, definition_uri=URI, definition_version=version)

@@ -31,6 +31,7 @@ class Parameter:
     text: str
     options: tuple[str, ...] = ()  # names of the values 0, 1, 2 ...
     unit: str = ""
+    step: float = 1.0  # of a ground station's slider
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.name) <= 16 or not self.name.isascii():
@@ -46,11 +47,11 @@ class Parameter:
 
 
 PARAMETERS: tuple[Parameter, ...] = (
-    Parameter("SR_BASELINE_M", 0.0, 0.0, 200.0, "Stereo baseline, 0 follows altitude", unit="m"),
-    Parameter("SR_RESOLUTION_M", 0.1, 0.01, 5.0, "Map resolution", unit="m"),
-    Parameter("SR_LINK_KBIT_S", 1000.0, 0.0, 100_000.0, "Datalink budget", unit="kbit/s"),
+    Parameter("SR_BASELINE_M", 0.0, 0.0, 200.0, "Stereo baseline, 0 automatic", (), "m", 0.5),
+    Parameter("SR_RESOLUTION_M", 0.1, 0.01, 5.0, "Map resolution", (), "m", 0.01),
+    Parameter("SR_LINK_KBIT_S", 1000.0, 0.0, 100_000.0, "Datalink budget", (), "kbit/s", 10.0),
     Parameter(YAW_FRAME, 0.0, 0.0, len(YAW_FRAMES) - 1.0, "Gimbal yaw frame", options=YAW_FRAMES),
-    Parameter("SR_CAM_LATENCY", 0.0, -500.0, 2000.0, "Camera latency", unit="ms"),
+    Parameter("SR_CAM_LATENCY", 0.0, -500.0, 2000.0, "Camera latency", (), "ms", 5.0),
 )
 """The next parameter is one line here and one case in the service."""
 
@@ -125,11 +126,11 @@ class Parameters:
                 self._send(i)
         elif kind == "PARAM_REQUEST_READ":
             i = int(message.param_index)
-            i = self._index.get(_text(message.param_id), -1) if i < 0 else i
+            i = self._index.get(text_of(message.param_id), -1) if i < 0 else i
             if 0 <= i < len(self.table):
                 self._send(i)
         elif kind == "PARAM_SET":
-            name = _text(message.param_id)
+            name = text_of(message.param_id)
             before = self.revision
             answer = self.change(name, message.param_value)
             if self.revision == before and name in self._index:
@@ -149,6 +150,7 @@ def _real32(value: float) -> float:
     return rounded
 
 
-def _text(raw: str | bytes) -> str:
+def text_of(raw: str | bytes) -> str:
+    """A parameter's name as it came, without what follows a zero."""
     text = raw.decode("ascii", "replace") if isinstance(raw, bytes) else raw
     return text.partition("\0")[0]

@@ -176,6 +176,10 @@ class VehicleLink:
         """The value of a parameter."""
         return self._companion.parameters[name]
 
+    def parameters(self) -> dict[str, float]:
+        """Every parameter's value by name."""
+        return self._companion.parameters.values()
+
     def record(self, path: Path | None) -> None:
         """Keep a .tlog of all links in a file from now on; None ends it."""
         if path is None:

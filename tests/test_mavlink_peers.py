@@ -188,6 +188,35 @@ def test_mavsdk_sets_parameters_and_reads_texts(joined: tuple[Daemon, Ground, An
     assert any("SR_BASELINE_M refused" in text for text in texts)
 
 
+def test_mavsdk_downloads_the_definition_and_sets_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("mavsdk")
+    monkeypatch.setenv("HOME", str(tmp_path))  # its cache would hide the download
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    from mavsdk.plugins.camera.camera import Camera, Option, Setting
+
+    port = free_port()
+    ground = Ground(port)
+    with contextlib.closing(ground), Daemon(f"udpout:127.0.0.1:{port}") as daemon:
+        camera = ground.use(Camera(ground.find()))
+        until(lambda: camera.camera_list().cameras)
+
+        def options() -> Any:
+            with contextlib.suppress(Exception):
+                return camera.get_possible_setting_options(100)
+            return None
+
+        known = {o.setting_id: o for o in until(options)}
+        assert set(known) == set(daemon.link.parameters())
+        frames = [option.option_description for option in known["SR_YAW_FRAME"].options]
+        assert frames == ["auto", "vehicle", "earth", "body", "servo"]
+        camera.set_setting(100, Setting("SR_YAW_FRAME", "", Option("3", ""), False))
+        assert daemon.link.history.config.gimbal.yaw_frame == "body"
+        camera.set_setting(100, Setting("SR_BASELINE_M", "", Option("2.5", ""), True))
+        assert daemon.link.parameter("SR_BASELINE_M") == 2.5
+
+
 def test_mavsdk_waits_for_work_and_survives_lost_answers() -> None:
     pytest.importorskip("mavsdk")
     from service.ground.operator import Operator

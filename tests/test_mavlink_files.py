@@ -1,0 +1,254 @@
+"""The camera definition, the files that serve it, and its parameters."""
+
+from __future__ import annotations
+
+import random
+import struct
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from mavlink.camera_definition import FILE, URI, camera_definition, definition_version
+from mavlink.companion import Companion, CompanionConfig
+from mavlink.framing import Framer
+from mavlink.ftp import (
+    ACK,
+    BURST,
+    CRC32,
+    END,
+    HEAD,
+    LIST,
+    NAK,
+    NOT_FOUND,
+    OPEN,
+    PROTECTED,
+    READ,
+    RESET,
+    TERMINATE,
+    FileServer,
+)
+from mavlink.history import VehicleHistory
+from mavlink.messages import Address
+from mavlink.parameters import PARAMETERS
+from mavlink.presence import Presence, PresenceConfig
+from mavlink.rehearsal import RehearsalControl
+from mavlink.wire import dialect
+
+STATION = Address(255, 190)
+CONTENT = random.Random(1).randbytes(20_000)
+
+
+class Client:
+    """A reading client, written after the protocol's description."""
+
+    def __init__(self, server: FileServer, source: Address = STATION) -> None:
+        self.server, self.source, self.sequence = server, source, 0
+
+    def ask(
+        self, opcode: int, data: bytes = b"", session: int = 0, offset: int = 0, size: int = -1
+    ) -> list[tuple[int, int, int, bytes, int]]:
+        """(opcode, session, burst complete, data, offset) of each answer."""
+        self.sequence += 1
+        count = len(data) if size < 0 else size
+        head = HEAD.pack(self.sequence, session, opcode, count, 0, 0, 0, offset)
+        answers: list[tuple[int, int, int, bytes, int]] = []
+        for raw in self.server.answer((head + data).ljust(251, b"\0"), self.source):
+            assert len(raw) == 251
+            sequence, number, code, length, asked, complete, _, at = HEAD.unpack_from(raw)
+            assert asked == opcode
+            assert sequence == self.sequence + 1 + len(answers)
+            answers.append((code, number, complete, raw[HEAD.size :][:length], at))
+        if opcode == BURST and answers:
+            self.sequence += len(answers)
+        return answers
+
+    def open(self, name: bytes) -> tuple[int, int]:
+        ((code, session, _, data, _),) = self.ask(OPEN, name)
+        assert code == ACK
+        return session, int.from_bytes(data, "little")
+
+
+def test_a_file_is_read_piece_by_piece() -> None:
+    client = Client(FileServer({"a.bin": CONTENT}))
+    session, size = client.open(b"/a.bin")
+    assert size == len(CONTENT)
+    got = b""
+    while True:
+        ((code, _, _, data, _),) = client.ask(READ, session=session, offset=len(got), size=200)
+        if code == NAK:
+            assert data[0] == END
+            break
+        got += data
+    assert got == CONTENT
+    ((code, *_),) = client.ask(TERMINATE, session=session)
+    assert code == ACK
+    ((code, *_),) = client.ask(READ, session=session, size=10)
+    assert code == NAK
+
+
+def test_a_file_is_read_in_bursts_with_losses() -> None:
+    rng = random.Random(2)
+    client = Client(FileServer({"a.bin": CONTENT}))
+    session, size = client.open(b"a.bin")
+    got = bytearray(size)
+    have = set[int]()
+    at = 0
+    while at < size:
+        answers = client.ask(BURST, session=session, offset=at, size=239)
+        assert [a[2] for a in answers] == [0] * (len(answers) - 1) + [1]
+        for code, _, _, data, offset in answers:
+            assert code == ACK
+            if rng.random() < 0.8:
+                got[offset : offset + len(data)] = data
+                have.add(offset)
+            at = offset + len(data)
+    for offset in range(0, size, 239):  # the gaps are filled by single reads
+        if offset not in have:
+            ((_, _, _, data, _),) = client.ask(READ, session=session, offset=offset, size=239)
+            got[offset : offset + len(data)] = data
+    assert bytes(got) == CONTENT
+
+
+def test_listing_checksum_and_refusals() -> None:
+    client = Client(FileServer({"b.xml": b"abc", "a.bin": CONTENT}))
+    ((code, _, _, data, _),) = client.ask(LIST, b"/")
+    assert code == ACK and data == b"Fa.bin\t20000\0Fb.xml\t3\0"
+    ((code, _, _, data, _),) = client.ask(LIST, b"/", offset=2)
+    assert (code, data[0]) == (NAK, END)
+    ((code, _, _, data, _),) = client.ask(LIST, b"/etc")
+    assert (code, data[0]) == (NAK, NOT_FOUND)
+    ((code, _, _, data, _),) = client.ask(CRC32, b"b.xml")
+    # The reference: bit by bit, start 0, polynomial 0xEDB88320, no inversion.
+    crc = 0
+    for byte in b"abc":
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xEDB88320 if crc & 1 else 0)
+    assert int.from_bytes(data, "little") == crc
+    for opcode in (6, 7, 8, 9, 13):
+        ((code, _, _, data, _),) = client.ask(opcode, b"b.xml")
+        assert (code, data[0]) == (NAK, PROTECTED)
+    ((code, _, _, data, _),) = client.ask(OPEN, b"../../etc/passwd")
+    assert (code, data[0]) == (NAK, NOT_FOUND)
+    assert client.ask(200)[0][0] == NAK
+
+
+def test_lost_answers_are_given_again_and_sessions_belong_to_their_owner() -> None:
+    server = FileServer({"a.bin": CONTENT})
+    client, other = Client(server), Client(server, Address(254, 1))
+    session, _ = client.open(b"a.bin")
+    client.sequence -= 1
+    again, _ = client.open(b"a.bin")
+    assert again == session
+    ((code, *_),) = other.ask(READ, session=session, size=10)
+    assert code == NAK
+    for _ in range(20):
+        other.ask(OPEN, b"a.bin")
+    assert other.ask(OPEN, b"a.bin")[0][0] == NAK  # no session left
+    assert other.ask(RESET)[0][0] == ACK
+    assert other.ask(OPEN, b"a.bin")[0][0] == ACK
+    ((code, *_),) = client.ask(READ, session=session, size=10)
+    assert code == ACK
+
+
+def test_any_request_is_survived() -> None:
+    rng = random.Random(3)
+    server = FileServer({"a.bin": CONTENT})
+    for _ in range(3000):
+        raw = bytearray(rng.randbytes(rng.choice([0, 5, 12, 251])))
+        if len(raw) > 3:
+            raw[3] = rng.randrange(20)
+        answers = server.answer(bytes(raw), Address(rng.randrange(256), 1))
+        assert all(len(answer) == 251 for answer in answers) and len(answers) <= 20
+
+
+def test_the_definition_describes_every_parameter() -> None:
+    root = ET.fromstring(camera_definition("skyrelief", "3D <scan>", PARAMETERS))
+    assert root.tag == "mavlinkcamera"
+    definition = root.find("definition")
+    assert definition is not None
+    assert definition.findtext("model") == "3D <scan>"
+    assert int(definition.get("version", "0")) == definition_version(PARAMETERS)
+    described = root.findall("parameters/parameter")
+    assert [p.get("name") for p in described] == [p.name for p in PARAMETERS]
+    for element, parameter in zip(described, PARAMETERS, strict=True):
+        assert float(element.get("default", "nan")) == parameter.default
+        options = [o.get("name") for o in element.findall("options/option")]
+        assert tuple(options) == parameter.options
+        if not options:
+            assert float(element.get("max", "nan")) == parameter.high
+    changed = (replace(PARAMETERS[0], high=99.0), *PARAMETERS[1:])
+    assert definition_version(changed) != definition_version(PARAMETERS)
+
+
+class Ends:
+    """A companion and pymavlink's encoder, joined in memory."""
+
+    def __init__(self) -> None:
+        self.control = RehearsalControl()
+        presence = Presence(PresenceConfig(), 1, 0)
+        config = CompanionConfig()
+        self.companion = Companion(config, self.control, presence, VehicleHistory(), 0)
+
+    def say(self, message: Any, component: int = 190) -> list[Any]:
+        for packet in Framer().feed(bytes(message.pack(dialect.MAVLink(None, 255, component)))):
+            self.companion.receive(0, packet, 10**9)
+        return [o.message for o in self.companion.take()]
+
+
+def test_the_camera_names_its_definition_and_serves_it() -> None:
+    ends = Ends()
+    info: Any = ends.companion.camera.message(259, 0)
+    assert info.cam_definition_uri == URI
+    assert info.cam_definition_version == definition_version(PARAMETERS)
+    head = HEAD.pack(7, 0, OPEN, len(FILE), 0, 0, 0, 0)
+    payload = list((head + FILE.encode()).ljust(251, b"\0"))
+    message = dialect.MAVLink_file_transfer_protocol_message(0, 1, 100, payload)
+    (reply,) = ends.say(message)
+    assert (reply.target_system, reply.target_component) == (255, 190)
+    size = int.from_bytes(bytes(reply.payload[HEAD.size : HEAD.size + 4]), "little")
+    assert size == len(camera_definition("skyrelief", "3D scan", PARAMETERS))
+    for target in ((1, 0), (1, 1), (2, 100)):
+        elsewhere = dialect.MAVLink_file_transfer_protocol_message(0, *target, payload)
+        assert ends.say(elsewhere) == []
+
+
+def value_of(message: Any) -> float:
+    raw: bytes = message._param_value_raw  # as text the zeros would be lost
+    return float(struct.unpack("<f", raw[:4])[0])
+
+
+def test_settings_of_the_camera_are_the_same_parameters() -> None:
+    ends = Ends()
+    listed = ends.say(dialect.MAVLink_param_ext_request_list_message(1, 100))
+    assert [m.param_id for m in listed] == [p.name for p in PARAMETERS]
+    (read,) = ends.say(
+        dialect.MAVLink_param_ext_request_read_message(1, 100, b"SR_LINK_KBIT_S", -1)
+    )
+    assert value_of(read) == 1000.0
+    (read,) = ends.say(dialect.MAVLink_param_ext_request_read_message(1, 100, b"", 0))
+    assert read.param_id == "SR_BASELINE_M"
+
+    def put(name: bytes, value: float, kind: int = 9) -> Any:
+        raw = struct.pack("<f", value).ljust(128, b"\0")
+        answers = ends.say(dialect.MAVLink_param_ext_set_message(1, 100, name, raw, kind))
+        return next(m for m in answers if m.get_type() == "PARAM_EXT_ACK")
+
+    ack = put(b"SR_BASELINE_M", 2.5)
+    assert (ack.param_result, value_of(ack)) == (0, 2.5)
+    assert ends.companion.parameters["SR_BASELINE_M"] == 2.5
+    assert ends.control.asked == ["SR_BASELINE_M=2.5"]
+    ack = put(b"SR_BASELINE_M", 1e9)
+    assert (ack.param_result, value_of(ack)) == (2, 2.5)
+    assert put(b"NOT_THERE", 1.0).param_result == 1
+    assert put(b"SR_BASELINE_M", 1.0, kind=6).param_result == 1
+    assert ends.say(dialect.MAVLink_param_ext_request_list_message(1, 1)) == []
+    assert ends.say(dialect.MAVLink_param_ext_request_list_message(2, 100)) == []
+
+
+@pytest.mark.parametrize("name", [b"", b"NOT_THERE"])
+def test_questions_for_unknown_settings_stay_without_answer(name: bytes) -> None:
+    message = dialect.MAVLink_param_ext_request_read_message(1, 100, name, -1)
+    assert Ends().say(message) == []
