@@ -114,7 +114,12 @@ def _wait_until_listening(ground: subprocess.Popen[str], endpoint: str, out: Pat
 
 
 def _replay(flight: Path, out: Path, endpoint: str, overrides: list[str]) -> None:
-    settings = [f'datalink.connect=["{endpoint}"]', "datalink.budget_kbit_s=20000", *overrides]
+    settings = [
+        f'datalink.connect=["{endpoint}"]',
+        "datalink.budget_kbit_s=20000",
+        "compute.stereo_width=640",
+        *overrides,
+    ]
     command = _skyrelief(
         "replay",
         str(flight / "frames"),
