@@ -45,6 +45,7 @@ def simulate(
     gimbal_frame: Annotated[str, typer.Option(help="Yaw of the gimbal: earth, vehicle.")] = "earth",
     rangefinder: Annotated[bool, typer.Option(help="Send DISTANCE_SENSOR.")] = True,
     telemetry_gap: Annotated[str, typer.Option(help="FROM:TO seconds without packets.")] = "",
+    log_lead_s: Annotated[float, typer.Option(help="How long the log begins earlier.")] = 0.0,
     blank: Annotated[list[str] | None, typer.Option(help="FRAME:COUNT black frames.")] = None,
     exposure: Annotated[list[str] | None, typer.Option(help="SECOND:GAIN brightness step.")] = None,
     depth_frames: Annotated[int, typer.Option(help="How many depth maps to keep.")] = 12,
@@ -70,7 +71,7 @@ def simulate(
             ),
             TelemetryOptions(
                 gimbal_frame, rangefinder,
-                _pair(telemetry_gap, "--telemetry-gap") if telemetry_gap else None,
+                _pair(telemetry_gap, "--telemetry-gap") if telemetry_gap else None, log_lead_s,
             ),
             Look(noise=image_noise),
             recording.Faults(

@@ -34,6 +34,8 @@ EPOCH_UNIX_S = 1_777_629_600  # 2026-05-01 10:00:00 UTC: containers keep whole s
 ORIGIN = LocalFrame(47.3977, 8.5456, 488.0)
 DISTORTION = (-0.12, 0.03, 0.0, 0.0, 0.0)
 LARGEST_TEXELS = 120_000_000
+REPEATABLE = "bframes=0:mbtree=0:scenecut=0"
+"""x264's look-ahead differs from run to run; without it equal frames give equal files."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,12 +252,11 @@ def _write_video(
         stream = container.add_stream("libx264", rate=rate)
         stream.width, stream.height = options.size_px
         stream.pix_fmt = "yuv420p"
-        stream.options = {"crf": str(options.crf), "preset": "veryfast"}
+        stream.options = {"crf": str(options.crf), "preset": "veryfast", "x264-params": REPEATABLE}
         for index in range(len(simulation.times_s)):
-            picture_ = av.VideoFrame.from_ndarray(simulation.frame(index), format="bgr24")
-            for packet in stream.encode(picture_):
-                container.mux(packet)
+            shot = av.VideoFrame.from_ndarray(simulation.frame(index), format="bgr24")
+            shot.pts, shot.time_base = index, 1 / rate
+            container.mux(stream.encode(shot))
             if progress is not None:
                 progress(index + 1, len(simulation.times_s))
-        for packet in stream.encode():
-            container.mux(packet)
+        container.mux(stream.encode())

@@ -30,8 +30,11 @@ class TelemetryOptions:
     gimbal_frame: str = "earth"  # or "vehicle": the frame of the gimbal's yaw
     rangefinder: bool = True
     gap_s: tuple[float, float] | None = None  # nothing is sent between these times
+    lead_s: float = 0.0  # how long before the first frame the log begins
 
     def __post_init__(self) -> None:
+        if not 0.0 <= self.lead_s <= LEAD_S:
+            raise ValueError(f"log lead of {self.lead_s:g} s is not within 0 to {LEAD_S:g} s")
         if self.gimbal_frame not in ("earth", "vehicle"):
             raise ValueError(f"gimbal frame {self.gimbal_frame!r} is not 'earth' or 'vehicle'")
 
@@ -52,6 +55,8 @@ def packets(
     ):
         timed.append((t, len(timed), message, component))
     timed.sort(key=lambda item: item[:2])
+    # A video piped without its start time is taken to begin with the log.
+    timed = [item for item in timed if item[0] >= -options.lead_s]
     senders = {
         1: dialect.MAVLink(None, srcSystem=1, srcComponent=1),
         GIMBAL_COMPONENT: dialect.MAVLink(None, srcSystem=1, srcComponent=GIMBAL_COMPONENT),
@@ -77,9 +82,8 @@ def write_tlog(path: Path, epoch_unix_s: float, stream: Iterator[tuple[float, by
 
 
 def _times(hz: float, duration_s: float) -> F64:
-    """From the first frame on: a video piped without its start time is taken to begin with
-    the log."""
-    return np.asarray(np.arange(0.0, duration_s + LEAD_S, 1.0 / hz), np.float64)
+    """From before the first frame until after the last."""
+    return np.asarray(np.arange(-LEAD_S, duration_s + LEAD_S, 1.0 / hz), np.float64)
 
 
 def _boot_ms(t: F64) -> npt.NDArray[np.int64]:
