@@ -12,7 +12,7 @@ import numpy as np
 from recon.backends import BACKENDS, Backend, load_backend
 from recon.belief_propagation import BeliefPropagationConfig
 from recon.upsampling import UpsamplingConfig
-from service.errors import OutsideError
+from service.errors import InputError, OutsideError
 
 log = logging.getLogger(__name__)
 
@@ -24,7 +24,8 @@ TRIAL_ROUNDS = 5
 def choose_backend(name: str = "auto") -> Backend:
     """The backend called ``name``, or for ``"auto"`` the fastest in a short measured trial.
 
-    Raises OutsideError, with the reason, when a named backend cannot run here.
+    Raises InputError for an unknown name and OutsideError, with the reason, when a named
+    backend cannot run here.
     """
     if name != "auto":
         return named_backend(name)
@@ -59,11 +60,16 @@ def choose_backend(name: str = "auto") -> Backend:
 
 
 def named_backend(name: str) -> Backend:
-    """The backend called ``name``; OutsideError with the reason when it cannot run."""
+    """The backend called ``name``.
+
+    Raises InputError when there is none of that name, OutsideError when it cannot run here.
+    """
+    if name not in BACKENDS:
+        raise InputError(f"backend {name}: there are auto, {', '.join(BACKENDS)}")
     try:
         backend = load_backend(name)
     except (ImportError, RuntimeError, ValueError) as error:
-        raise OutsideError(f"backend {name}: {error}") from error
+        raise OutsideError(f"backend {name} cannot run here: {error}") from error
     log.info("backend %s on %s, as named", backend.name, backend.device)
     return backend
 

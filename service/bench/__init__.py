@@ -1,0 +1,156 @@
+"""Benchmarks that run on the board: each figure beside a peer's from the same run.
+
+A benchmark is a module with ``run(options) -> list[BenchResult]`` and one line in the table.
+Ours and the peer's rounds alternate, after a warm-up, so that a busy machine slows both.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import statistics
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+BENCHMARKS: dict[str, str] = {
+    "stereo": "service.bench.stereo:run",
+    "upsample": "service.bench.upsample:run",
+}
+"""Name to ``module:function``; imported when it runs."""
+
+
+@dataclass(frozen=True, slots=True)
+class BenchOptions:
+    """What a run of benchmarks is given."""
+
+    rounds: int = 30
+    warm_up: int = 3
+    backend: str = "cpu"
+    data: Path | None = None  # folder with ground truth, for the benchmarks that score
+
+
+@dataclass(frozen=True, slots=True)
+class BenchResult:
+    """One figure, and the peer's in the same run; less is better unless the unit is per second."""
+
+    name: str
+    what: str
+    value: float
+    unit: str
+    spread: float = 0.0  # 10th to 90th percentile of the rounds
+    peer: str = ""
+    peer_value: float | None = None
+    peer_spread: float = 0.0
+    note: str = ""
+
+    @property
+    def ratio(self) -> float | None:
+        """Ours over the peer's; None without a peer."""
+        return self.value / self.peer_value if self.peer_value else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, with the ratio."""
+        fields = {name: getattr(self, name) for name in self.__slots__}
+        return fields | {"ratio": self.ratio}
+
+
+def compare(
+    name: str,
+    what: str,
+    ours: Callable[[], object],
+    options: BenchOptions,
+    peer: str = "",
+    theirs: Callable[[], object] | None = None,
+    note: str = "",
+) -> BenchResult:
+    """Median milliseconds of ``ours`` and ``theirs``, rounds alternating."""
+    runs: list[Callable[[], object]] = [ours] if theirs is None else [ours, theirs]
+    taken: list[list[float]] = [[] for _ in runs]
+    for number in range(options.warm_up + options.rounds):
+        for run, times in zip(runs, taken, strict=True):
+            start = time.perf_counter()
+            run()
+            seconds = time.perf_counter() - start
+            if number >= options.warm_up:
+                times.append(1e3 * seconds)
+    value, spread = statistics.median(taken[0]), _spread(taken[0])
+    if theirs is None:
+        return BenchResult(name, what, value, "ms", spread, note=note)
+    return BenchResult(
+        name, what, value, "ms", spread,
+        peer, statistics.median(taken[1]), _spread(taken[1]), note,
+    )  # fmt: skip
+
+
+def run_benchmarks(names: list[str], options: BenchOptions) -> list[BenchResult]:
+    """Every figure of the named benchmarks, in order."""
+    results: list[BenchResult] = []
+    for name in names:
+        module, _, function = BENCHMARKS[name].partition(":")
+        results += getattr(import_module(module), function)(options)
+    return results
+
+
+def table(results: list[BenchResult]) -> str:
+    """The results as aligned text, one line a figure."""
+    rows = [("benchmark", "figure", "ours", "spread", "peer", "theirs", "ratio", "note")]
+    for r in results:
+        theirs = "" if r.peer_value is None else f"{r.peer_value:.3g} {r.unit}"
+        ratio = "" if r.ratio is None else f"{r.ratio:.2f}"
+        spread = f"{r.spread:.2g}" if r.spread else ""
+        rows.append(
+            (r.name, r.what, f"{r.value:.3g} {r.unit}", spread, r.peer, theirs, ratio, r.note)
+        )
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def record(results: list[BenchResult], options: BenchOptions) -> dict[str, Any]:
+    """What a kept result file holds: figures, commit, date and the machine in general words."""
+    return {
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "commit": commit(),
+        "machine": machine(),
+        "rounds": options.rounds,
+        "results": [result.to_dict() for result in results],
+    }
+
+
+def commit() -> str:
+    """The commit of the source that runs, with ``+`` when it was changed since; or ``unknown``."""
+    folder = Path(__file__).parent
+
+    def git(*words: str) -> str:
+        done = subprocess.run(["git", *words], cwd=folder, capture_output=True, text=True)
+        return done.stdout.strip() if done.returncode == 0 else ""
+
+    try:
+        head = git("rev-parse", "--short=10", "HEAD")
+        changed = "+" if head and git("status", "--porcelain", "--untracked-files=no") else ""
+    except OSError:
+        return "unknown"
+    return head + changed or "unknown"
+
+
+def machine() -> str:
+    """Architecture, cores and memory; nothing that names the machine."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    words = [platform.machine() or "unknown processor", f"{cores} cores"]
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+        words.append(f"{memory:.0f} GiB")
+    return ", ".join([*words, f"Python {platform.python_version()}"])
+
+
+def _spread(values: list[float]) -> float:
+    """10th to 90th percentile."""
+    ordered = sorted(values)
+    last = len(ordered) - 1
+    return ordered[round(0.9 * last)] - ordered[round(0.1 * last)]

@@ -1,0 +1,175 @@
+"""Stereo against OpenCV's semi-global matcher: time at the flight's size, errors on truth.
+
+The matcher is at its best: images padded on the left by the number of disparities, dense (no
+uniqueness or left-right check), block size 3, and the better of its two-pass modes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from recon.belief_propagation import BeliefPropagationConfig
+from recon.types import F32, U8, Bool
+from service.backend_choice import choose_backend
+from service.bench import BenchOptions, BenchResult, compare
+from service.commands.stereo import matching_config, read_grey
+from service.errors import InputError
+
+SIZES = ((320, 180, 16), (640, 360, 32))
+ITERATIONS = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruePair:
+    """A rectified pair whose disparity is known."""
+
+    name: str
+    left: U8  # (h, w)
+    right: U8  # (h, w)
+    truth_px: F32  # (h, w), NaN = unknown
+    visible: Bool  # (h, w) truth known and seen by both views
+    labels: int
+
+
+def run(options: BenchOptions) -> list[BenchResult]:
+    """Milliseconds for the sizes of flight, then bad pixels on the pairs in ``options.data``."""
+    backend = choose_backend(options.backend)
+    results = []
+    for width, height, labels in SIZES:
+        left, right = scene(width, height, labels)
+        matcher = semi_global(labels)
+        config = BeliefPropagationConfig(iterations=ITERATIONS)
+        results.append(
+            compare(
+                "stereo",
+                f"{width}x{height}, {labels} labels, {ITERATIONS} iterations",
+                partial(backend.belief_propagation, left, right, labels, config),
+                options,
+                "OpenCV SGBM",
+                partial(matcher.compute, left, right),
+                note=f"{backend.name}, images to checked sub-pixel disparity",
+            )
+        )
+    for pair in true_pairs(options.data) if options.data else []:
+        config = matching_config(ITERATIONS, 0, checked=False)
+        ours = backend.belief_propagation(pair.left, pair.right, pair.labels, config).px
+        theirs = min(
+            (semi_global_disparity(pair, mode) for mode in (0, 2)),
+            key=lambda px: bad_share(px, pair, 1.0),
+        )
+        for limit in (1.0, 0.5):
+            results.append(
+                BenchResult(
+                    "stereo",
+                    f"{pair.name}, bad-{limit}, not occluded",
+                    100 * bad_share(ours, pair, limit),
+                    "%",
+                    peer="OpenCV SGBM, padded",
+                    peer_value=100 * bad_share(theirs, pair, limit),
+                    note=f"{pair.labels} labels",
+                )
+            )
+    return results
+
+
+def scene(width: int, height: int, labels: int) -> tuple[U8, U8]:
+    """A textured pair with steps and slopes of disparity, the same at every call."""
+    rng = np.random.default_rng(7)
+    noise = cv2.GaussianBlur(rng.normal(0, 1, (height, width + labels)), (0, 0), 1.2)
+    texture = np.clip(128 + 45 * noise / noise.std(), 0, 255).astype(np.float32)
+    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    disparity = labels * (0.2 + 0.3 * v / height)
+    disparity[(abs(u - width / 2) < width / 6) & (abs(v - height / 2) < height / 5)] = labels * 0.75
+    left = cv2.remap(texture, u - disparity + labels, v, cv2.INTER_CUBIC)
+    right = texture[:, labels : labels + width]
+    return np.clip(left, 0, 255).astype(np.uint8), np.ascontiguousarray(right.astype(np.uint8))
+
+
+def semi_global(labels: int, mode: int = 0) -> Any:
+    """OpenCV's matcher, dense, for grey images; its number of disparities is a multiple of 16."""
+    return cv2.StereoSGBM.create(
+        minDisparity=0,
+        numDisparities=-(-labels // 16) * 16,
+        blockSize=3,
+        P1=8 * 9,
+        P2=32 * 9,
+        disp12MaxDiff=-1,
+        preFilterCap=63,
+        uniquenessRatio=0,
+        mode=mode,
+    )
+
+
+def semi_global_disparity(pair: TruePair, mode: int) -> F32:
+    """Disparity of the matcher on the padded pair, NaN where it found none."""
+    pad = -(-pair.labels // 16) * 16
+    left, right = (
+        cv2.copyMakeBorder(image, 0, 0, pad, 0, cv2.BORDER_REPLICATE)
+        for image in (pair.left, pair.right)
+    )
+    found = semi_global(pair.labels, mode).compute(left, right)[:, pad:].astype(np.float32) / 16
+    found[found < 0] = np.nan
+    return np.asarray(found, np.float32)
+
+
+def bad_share(px: F32, pair: TruePair, limit: float) -> float:
+    """Share of the visible pixels that are unknown or wrong by more than ``limit`` px."""
+    good = np.abs(px - pair.truth_px) <= limit
+    return float(1 - good[pair.visible].mean())
+
+
+def true_pairs(folder: Path) -> list[TruePair]:
+    """The Middlebury pairs in a folder laid out as ``cones``, ``cloth3`` and ``motorcycle``."""
+    found = []
+    for name, left, right, truth, other, scale, labels in (
+        ("cones", "im2", "im6", "disp2", "disp6", 4, 64),
+        ("teddy", "im2", "im6", "disp2", "disp6", 4, 64),
+        ("cloth3", "view1", "view5", "disp1", "disp5", 2, 96),
+    ):
+        place = folder / name
+        if place.is_dir():
+            truths = [
+                read_grey(place / f"{f}.png").astype(np.float32) / np.float32(scale)
+                for f in (truth, other)
+            ]
+            for px in truths:
+                px[px == 0] = np.nan
+            images = [read_grey(place / f"{f}.png") for f in (left, right)]
+            visible = seen_by_both(truths[0], truths[1])
+            found.append(TruePair(name, images[0], images[1], truths[0], visible, labels))
+    place = folder / "motorcycle"
+    if place.is_dir():
+        with np.load(place / "motorcycle_disp.npz") as archive:
+            px = archive["arr_0"].astype(np.float32)
+        px[~np.isfinite(px)] = np.nan
+        images = [read_grey(place / f"motorcycle_{side}.png") for side in ("left", "right")]
+        found.append(TruePair("motorcycle", images[0], images[1], px, not_hidden(px), 64))
+    if not found:
+        raise InputError(f"{folder}: holds none of cones, teddy, cloth3, motorcycle")
+    return found
+
+
+def seen_by_both(left: F32, right: F32) -> Bool:
+    """Pixels of the left truth whose partner in the right truth agrees within one pixel."""
+    partner = np.arange(left.shape[1])[None, :] - np.rint(left)
+    inside = np.isfinite(left) & (partner >= 0)
+    back = np.take_along_axis(right, np.where(inside, partner, 0).astype(np.int64), axis=1)
+    return np.asarray(inside & (np.abs(back - left) <= 1))
+
+
+def not_hidden(left: F32) -> Bool:
+    """Pixels of the left truth that no nearer surface covers in the right view."""
+    partner = np.arange(left.shape[1])[None, :] - np.rint(left)
+    v, u = np.nonzero(np.isfinite(left) & (partner >= 0))
+    column = partner[v, u].astype(np.int64)
+    nearest = np.full(left.shape, -np.inf, np.float32)
+    np.maximum.at(nearest, (v, column), left[v, u])
+    visible = np.zeros(left.shape, np.bool_)
+    visible[v, u] = nearest[v, column] <= left[v, u] + 1
+    return visible

@@ -1,0 +1,50 @@
+"""``skyrelief bench [NAME ...]``: benchmarks, each against a peer in the same run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.errors import InputError, OutsideError
+
+
+def bench(
+    names: Annotated[list[str] | None, typer.Argument(help="which; all when none is named")] = None,
+    rounds: Annotated[int, typer.Option(help="timed rounds of each figure", min=1)] = 30,
+    backend: Annotated[str, typer.Option(help="auto, cpu, torch or onnx")] = "cpu",
+    data: Annotated[Path | None, typer.Option(help="folder with ground truth to score on")] = None,
+    keep: Annotated[Path | None, typer.Option(help="folder for a result file (JSON)")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
+) -> None:
+    """Print our figure, the peer's in the same run, and the ratio."""
+    from service.bench import BENCHMARKS, BenchOptions, record, run_benchmarks, table
+
+    for name in names or []:
+        if name not in BENCHMARKS:
+            raise InputError(f"bench {name}: there are {', '.join(BENCHMARKS)}")
+    if data is not None and not data.is_dir():
+        raise InputError(f"{data}: no such folder")
+    options = BenchOptions(rounds=rounds, backend=backend, data=data)
+    chosen = names or list(BENCHMARKS)
+    results = run_benchmarks(chosen, options)
+    print(table(results))
+    report = record(results, options)
+    if keep is not None:
+        print(f"kept in {_keep(keep, chosen, report)}")
+    if as_json:
+        print(json.dumps(report))
+
+
+def _keep(folder: Path, names: list[str], report: dict[str, object]) -> Path:
+    """Write the result file; its name says what ran, when, and on which commit."""
+    day = str(report["date"])[:10]
+    path = folder / f"{day}-{str(report['commit']).rstrip('+')}-{'-'.join(names)}.json"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OutsideError(f"{path}: cannot be written: {error.strerror}") from error
+    return path
