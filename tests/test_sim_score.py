@@ -1,0 +1,209 @@
+"""``score`` on scan folders with known errors, made from the truth itself."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from recon.se3 import so3_exp
+from recon.types import F64, PointCloud
+from service.cli import app
+from service.errors import InputError
+from service.georeference import LocalFrame
+from service.las import write_laz
+
+TRUTH_AT = LocalFrame(47.3977, 8.5456, 488.0)
+SCAN_AT = LocalFrame(47.3980, 8.5450, 540.0)  # another origin, 33 m north and 45 m west
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("score") / "flight"
+    arguments = [
+        "simulate", "--out", str(folder), "--size", "320x180", "--fps", "2", "--duration-s", "10",
+        "--height-m", "40", "--depth-frames", "20", "--no-telemetry",
+    ]  # fmt: skip
+    result = CliRunner().invoke(app, arguments)
+    if result.exception is not None:
+        raise result.exception
+    return folder
+
+
+def true_cloud(flight: Path) -> F64:
+    """(N, 3) every fourth pixel, each way, of the true depth maps, in the truth's ENU."""
+    parts = []
+    for path in sorted((flight / "truth").glob("depth_*.npz")):
+        with np.load(path) as data:
+            depth, K, T = data["depth_m"][::4, ::4], data["K"], data["T_world_camera"]
+        v, u = np.mgrid[0:180:4, 0:320:4]
+        rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.shape)], -1)
+        parts.append((rays * depth[..., None]).reshape(-1, 3) @ T[:3, :3].T + T[:3, 3])
+    return np.concatenate(parts)
+
+
+def write_scan(
+    folder: Path, flight: Path, points: F64, place: bool, R: F64, t: F64, sigma_m: float
+) -> Path:
+    """A scan folder: ``points`` and the true trajectory, both moved by ``R``, ``t``."""
+    folder.mkdir()
+    rows = np.loadtxt(flight / "truth" / "trajectory.tum")
+    centres, turns = (
+        rows[:, 1:4] @ R.T + t,
+        Rotation.from_matrix(R) * Rotation.from_quat(rows[:, 4:]),
+    )
+    points = points @ R.T + t
+    if place:  # tangent planes 56 m apart differ by 0.0005 degrees: positions through the globe
+        points = SCAN_AT.to_enu(TRUTH_AT.to_geodetic(points))
+        centres = SCAN_AT.to_enu(TRUTH_AT.to_geodetic(centres))
+    count = len(points)
+    cloud = PointCloud(
+        points.astype(np.float32),
+        np.zeros((count, 3), np.uint8),
+        np.full(count, sigma_m, np.float32),
+        np.full(count, 2, np.uint8),
+    )
+    write_laz(folder / "cloud.laz", cloud, SCAN_AT if place else None, 1_777_629_600 * 10**9)
+    table = np.column_stack([rows[:, 0], centres, turns.as_quat()])
+    np.savetxt(folder / "trajectory.tum", table, "%.9f")
+    origin = {"lat_deg": SCAN_AT.lat_deg, "lon_deg": SCAN_AT.lon_deg, "alt_amsl_m": 540.0}
+    summary = {"origin": origin if place else None, "epsg": 32632 if place else None}
+    (folder / "scan.json").write_text(json.dumps(summary))
+    return folder
+
+
+def score(scan: Path, truth: Path) -> dict[str, Any]:
+    result = CliRunner().invoke(app, ["score", str(scan), str(truth), "--json"])
+    if result.exception is not None:
+        raise result.exception
+    report = json.loads(result.stdout.strip().splitlines()[-1])
+    assert isinstance(report, dict)
+    return report
+
+
+def test_perfect_scan_scores_perfectly(flight: Path, tmp_path: Path) -> None:
+    scan = write_scan(
+        tmp_path / "scan", flight, true_cloud(flight), True, np.eye(3), np.zeros(3), 0.01
+    )
+    report = score(scan, flight)  # the flight's own folder is as good as its truth/
+    assert report["georeferenced"] and report["poses_compared"] == 20
+    assert report["surface"]["raw"]["rms_m"] < 0.003
+    assert report["surface"]["rigid"]["rms_m"] < 0.003
+    assert report["completeness"]["share"] > 0.97
+    assert report["trajectory"]["raw"]["max_m"] < 0.001
+    assert report["trajectory"]["raw"]["median_deg"] < 0.01
+    assert report["altitude_m"] == pytest.approx(40.0, abs=3.0)
+
+
+def test_known_displacement_and_noise_are_told_apart(flight: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    points = true_cloud(flight)
+    points += 0.1 * rng.normal(size=points.shape)
+    turn = so3_exp(np.radians([0.4, -0.3, 0.8]))
+    scan = write_scan(
+        tmp_path / "scan", flight, points, True, turn, np.array([0.8, -0.5, 1.1]), 0.1
+    )
+    report = score(scan, flight / "truth")
+    raw, rigid = report["surface"]["raw"], report["surface"]["rigid"]
+    assert raw["median_m"] > 0.5 and raw["bias_m"] > 0.5
+    assert rigid["median_m"] == pytest.approx(0.0674, rel=0.12)  # of |N(0, 0.1)|
+    assert abs(rigid["bias_m"]) < 0.01
+    assert rigid["honesty"]["within_1_sigma"] == pytest.approx(0.68, abs=0.06)
+    assert rigid["fit"]["turn_deg"] == pytest.approx(np.sqrt(0.16 + 0.09 + 0.64), abs=0.05)
+    assert rigid["median_percent_of_altitude"] == pytest.approx(
+        100 * rigid["median_m"] / report["altitude_m"]
+    )
+    assert report["trajectory"]["raw"]["rms_m"] > 0.5
+    assert report["trajectory"]["rigid"]["rms_m"] < 0.01
+    assert report["trajectory"]["raw"]["drift_percent"] == pytest.approx(1.4, abs=0.4)
+
+
+def test_scan_without_a_place_is_judged_after_a_similarity_fit(
+    flight: Path, tmp_path: Path
+) -> None:
+    turn = so3_exp(np.array([0.4, -0.2, 1.9]))
+    cloud = true_cloud(flight)
+    shift = np.array([90.0, -40.0, 7.0])
+    scan = write_scan(tmp_path / "scan", flight, cloud, False, turn, shift, 0.01)
+    shrink(scan, 0.93)
+    report = score(scan, flight / "truth")
+    assert not report["georeferenced"] and report["judged_after"] == "similarity"
+    assert "raw" not in report["surface"] and "raw" not in report["trajectory"]
+    assert report["surface"]["similarity"]["fit"]["scale"] == pytest.approx(1 / 0.93, rel=1e-3)
+    assert report["surface"]["similarity"]["median_m"] < 0.01
+    assert (
+        report["trajectory"]["rigid"]["rms_m"] > 0.5 > report["trajectory"]["similarity"]["rms_m"]
+    )
+    assert report["completeness"]["share"] > 0.97
+
+
+def shrink(scan: Path, scale: float) -> None:
+    """Scale a scan about its origin."""
+    import laspy
+
+    las = laspy.read(scan / "cloud.laz")
+    las.xyz = np.asarray(las.xyz) * scale
+    las.write(scan / "cloud.laz")
+    rows = np.loadtxt(scan / "trajectory.tum")
+    rows[:, 1:4] *= scale
+    np.savetxt(scan / "trajectory.tum", rows, "%.9f")
+
+
+def test_missing_half_of_the_surface_is_missed(flight: Path, tmp_path: Path) -> None:
+    points = true_cloud(flight)
+    along = points[:, :2] @ [np.sin(np.radians(35)), np.cos(np.radians(35))]
+    points = points[along < np.median(along)]
+    scan = write_scan(tmp_path / "scan", flight, points, True, np.eye(3), np.zeros(3), 0.01)
+    report = score(scan, flight)
+    assert 0.35 < report["completeness"]["share"] < 0.65
+    assert report["surface"]["raw"]["median_m"] < 0.003
+    text = CliRunner().invoke(app, ["score", str(scan), str(flight)]).stdout
+    assert "completeness: " in text and "% of path" in text and "of altitude" in text
+
+
+@pytest.mark.parametrize(
+    ("damage", "word"),
+    [
+        ("cloud.laz", "no such file"),
+        ("scan.json", "no such file"),
+        ("trajectory.tum", "no such file"),
+        ("cloud.laz:broken", "cannot be read"),
+        ("scan.json:broken", "not JSON"),
+        ("trajectory.tum:broken", "not a TUM file"),
+        ("whole", "no such folder"),
+        ("truth", "no such folder"),
+        ("points", "no points"),
+        ("times", "no pose lies within"),
+    ],
+)
+def test_missing_or_damaged_parts_are_named(
+    damage: str, word: str, flight: Path, tmp_path: Path
+) -> None:
+    points = true_cloud(flight)[::50]
+    if damage == "points":
+        points = points[:0]
+    scan = write_scan(
+        tmp_path / "scan", flight, points, damage != "times", np.eye(3), np.zeros(3), 0.01
+    )
+    truth = flight
+    name, _, how = damage.partition(":")
+    if how == "broken":
+        (scan / name).write_text("neither this nor that")
+    elif damage == "whole":
+        scan = tmp_path / "elsewhere"
+    elif damage == "truth":
+        truth = tmp_path / "nowhere"
+    elif damage == "times":
+        rows = np.loadtxt(scan / "trajectory.tum")
+        rows[:, 0] += 1e6
+        np.savetxt(scan / "trajectory.tum", rows, "%.9f")
+    elif damage != "points":
+        (scan / name).unlink()
+    with pytest.raises(InputError, match=word) as caught:
+        score(scan, truth)
+    assert "\n" not in str(caught.value)
