@@ -368,7 +368,7 @@ async def _live(socket: WebSocket) -> None:
         for opened in (index, store):
             if opened is not None:
                 await run_in_threadpool(opened.close)
-        with contextlib.suppress(RuntimeError):
+        with contextlib.suppress(RuntimeError, WebSocketDisconnect):
             await socket.close()
 
 

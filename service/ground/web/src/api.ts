@@ -1,0 +1,68 @@
+// The portal's HTTP interface, typed; see /api/openapi.json.
+
+export interface Origin {
+  lat_deg: number;
+  lon_deg: number;
+  alt_amsl_m: number;
+}
+
+export interface Job {
+  kind: string;
+  state: "waiting" | "running" | "done" | "failed";
+  file?: string;
+  error: string | null;
+}
+
+export interface Scan {
+  drone: string;
+  scan: string;
+  title: string;
+  tags: string[];
+  files: { name: string; what: string; bytes: number }[];
+  preview: boolean;
+  started_unix_s: number | null;
+  origin: Origin | null;
+  finished: boolean;
+  trouble: string | null;
+  counts?: { keyframes?: number; points?: number };
+  quality?: Record<string, number | null>;
+  notes?: string[];
+  jobs?: Job[];
+}
+
+/** The JSON answer; throws an Error with the portal's own words when it refuses. */
+async function ask<T>(path: string, method = "GET", body?: unknown): Promise<T> {
+  const init: RequestInit = { method };
+  if (body !== undefined) {
+    init.body = JSON.stringify(body);
+    init.headers = { "content-type": "application/json" };
+  }
+  const answer = await fetch(path, init);
+  const content = (await answer.json().catch(() => ({}))) as { error?: string };
+  if (!answer.ok) throw new Error(content.error ?? `the portal answered ${answer.status}`);
+  return content as T;
+}
+
+const place = (s: { drone: string; scan: string }): string =>
+  `/api/scans/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`;
+
+export const scans = (): Promise<Scan[]> => ask("/api/scans");
+export const scan = (drone: string, name: string): Promise<Scan> =>
+  ask(place({ drone, scan: name }));
+export const label = (s: Scan, body: { title?: string; tags?: string[] }): Promise<unknown> =>
+  ask(place(s), "PATCH", body);
+export const remove = (s: Scan): Promise<unknown> => ask(place(s), "DELETE");
+export const make = (s: Scan, kind: string): Promise<Job> =>
+  ask(`${place(s)}/exports`, "POST", { kind });
+export const bin = (): Promise<string[]> => ask("/api/bin");
+export const restore = (name: string): Promise<unknown> =>
+  ask(`/api/bin/${encodeURIComponent(name)}/restore`, "POST", {});
+export const importFolder = (folder: string): Promise<unknown> =>
+  ask("/api/import", "POST", { folder });
+export const file = (s: { drone: string; scan: string }, name: string): string =>
+  `${place(s)}/files/${encodeURIComponent(name)}`;
+
+export function liveAddress(s: { drone: string; scan: string }): string {
+  const scheme = location.protocol === "https:" ? "wss:" : "ws:";
+  return `${scheme}//${location.host}${place(s)}/live`;
+}

@@ -1,0 +1,34 @@
+// Elements without HTML strings: names given by people are only ever text.
+
+type Child = Node | string | null | false;
+
+export function el<K extends keyof HTMLElementTagNameMap>(
+  tag: K,
+  props: Partial<HTMLElementTagNameMap[K]> & { onclick?: (event: MouseEvent) => void } = {},
+  ...children: Child[]
+): HTMLElementTagNameMap[K] {
+  const node = document.createElement(tag);
+  Object.assign(node, props);
+  for (const child of children) if (child) node.append(child);
+  return node;
+}
+
+/** Says what went wrong, for a few seconds. */
+export function tell(error: unknown): void {
+  const text = error instanceof Error ? error.message : String(error);
+  const note = el("div", { className: "note", textContent: text });
+  note.setAttribute("role", "alert");
+  document.body.append(note);
+  setTimeout(() => note.remove(), 6000);
+}
+
+export const count = (n: number | null | undefined): string =>
+  n === null || n === undefined ? "?" : Math.round(n).toLocaleString("en");
+
+export function size(bytes: number): string {
+  if (bytes < 1e6) return `${(bytes / 1e3).toFixed(0)} kB`;
+  return bytes < 1e9 ? `${(bytes / 1e6).toFixed(1)} MB` : `${(bytes / 1e9).toFixed(2)} GB`;
+}
+
+export const date = (unix_s: number | null): string =>
+  unix_s === null ? "no date" : new Date(unix_s * 1000).toLocaleString();

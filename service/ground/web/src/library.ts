@@ -1,0 +1,164 @@
+// The list of scans: look, open, rename, tag, download, make files, delete, bring back.
+
+import * as api from "./api";
+import { count, date, el, size, tell } from "./dom";
+
+const KINDS = [
+  "laz", "copc", "ply", "dsm", "ortho", "contours", "glb", "geojson", "kml", "mcap",
+];
+
+export async function showLibrary(root: HTMLElement): Promise<void> {
+  const list = el("main", { className: "cards" });
+  const search = el("input", { type: "search", placeholder: "find by name, tag or drone" });
+  search.setAttribute("aria-label", "find");
+  const bin = el("section", { className: "bin" });
+  const again = (): void => void load().catch(tell);
+  root.replaceChildren(
+    el("header", {}, el("h1", { textContent: "skyrelief" }), search, importForm(again)),
+    list,
+    bin,
+  );
+  let scans: api.Scan[] = [];
+  const draw = (): void => {
+    const wanted = search.value.toLowerCase();
+    const shown = scans.filter((s) =>
+      [s.title, s.scan, s.drone, ...s.tags].join(" ").toLowerCase().includes(wanted),
+    );
+    list.replaceChildren(...shown.map((s) => card(s, again)));
+    if (!shown.length) list.append(el("p", { textContent: "No scans here yet." }));
+  };
+  search.oninput = draw;
+  async function load(): Promise<void> {
+    const [found, deleted] = await Promise.all([api.scans(), api.bin()]);
+    scans = found;
+    draw();
+    bin.replaceChildren(...binRows(deleted, again));
+  }
+  await load();
+}
+
+function importForm(again: () => void): HTMLElement {
+  const folder = el("input", { placeholder: "scan folder on this machine" });
+  folder.setAttribute("aria-label", "folder to import");
+  const act = el("button", {
+    textContent: "Import",
+    onclick: () => void api.importFolder(folder.value).then(again, tell),
+  });
+  return el("span", { className: "import" }, folder, act);
+}
+
+function card(s: api.Scan, again: () => void): HTMLElement {
+  const open = `#/view/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`;
+  const picture = s.preview
+    ? el("img", { src: api.file(s, "preview.jpg"), alt: "", loading: "lazy" })
+    : el("div", { className: "blank", textContent: "no preview yet" });
+  return el(
+    "article",
+    {},
+    el("a", { href: open, className: "picture" }, picture),
+    el("h2", {}, el("a", { href: open, textContent: s.title })),
+    el("p", { className: "facts", textContent: facts(s) }),
+    s.trouble ? el("p", { className: "trouble", textContent: s.trouble }) : null,
+    el("p", { className: "tags" }, ...s.tags.map((t) => el("span", { textContent: t }))),
+    downloads(s),
+    el(
+      "p",
+      { className: "acts" },
+      el("button", { textContent: "Rename", onclick: () => rename(s, again) }),
+      el("button", { textContent: "Tags", onclick: () => retag(s, again) }),
+      makeMenu(s, again),
+      el("button", { textContent: "Delete", onclick: () => remove(s, again) }),
+    ),
+  );
+}
+
+function facts(s: api.Scan): string {
+  const parts = [s.drone, date(s.started_unix_s)];
+  if (s.origin) parts.push(`${s.origin.lat_deg.toFixed(5)}, ${s.origin.lon_deg.toFixed(5)}`);
+  if (s.counts?.points !== undefined) parts.push(`${count(s.counts.points)} points`);
+  else if (s.counts?.keyframes !== undefined) parts.push(`${s.counts.keyframes} keyframes`);
+  const { area_m2, sigma_median_m } = s.quality ?? {};
+  if (area_m2) parts.push(`${count(area_m2)} m²`);
+  if (sigma_median_m) parts.push(`σ ${sigma_median_m.toFixed(2)} m`);
+  if (!s.finished) parts.push("not finished");
+  return parts.join(" · ");
+}
+
+function downloads(s: api.Scan): HTMLElement {
+  const rows = s.files.map((f) =>
+    el(
+      "li",
+      {},
+      el("a", { href: api.file(s, f.name), textContent: f.name, download: "" }),
+      ` ${f.what}, ${size(f.bytes)}`,
+    ),
+  );
+  return el(
+    "details",
+    {},
+    el("summary", { textContent: `${s.files.length} files` }),
+    el("ul", {}, ...rows),
+  );
+}
+
+function makeMenu(s: api.Scan, again: () => void): HTMLElement {
+  const menu = el("select", {}, el("option", { value: "", textContent: "Make …" }));
+  menu.setAttribute("aria-label", "make a file");
+  for (const kind of KINDS) menu.append(el("option", { value: kind, textContent: kind }));
+  menu.onchange = async () => {
+    const kind = menu.value;
+    menu.value = "";
+    try {
+      await api.make(s, kind);
+      await done(s, kind);
+      again();
+    } catch (error) {
+      tell(error);
+    }
+  };
+  return menu;
+}
+
+/** Waits until the newest job of a kind has ended; throws its error. */
+async function done(s: api.Scan, kind: string): Promise<void> {
+  for (;;) {
+    const jobs = (await api.scan(s.drone, s.scan)).jobs ?? [];
+    const job = jobs.filter((j) => j.kind === kind).at(-1);
+    if (job?.state === "failed") throw new Error(job.error ?? "failed");
+    if (!job || job.state === "done") return;
+    await new Promise((resolve) => setTimeout(resolve, 500));
+  }
+}
+
+function rename(s: api.Scan, again: () => void): void {
+  const title = prompt("Name of this scan", s.title);
+  if (title !== null) void api.label(s, { title }).then(again, tell);
+}
+
+function retag(s: api.Scan, again: () => void): void {
+  const text = prompt("Tags, separated by commas", s.tags.join(", "));
+  if (text === null) return;
+  const tags = text.split(",").map((t) => t.trim()).filter(Boolean);
+  void api.label(s, { tags }).then(again, tell);
+}
+
+function remove(s: api.Scan, again: () => void): void {
+  if (confirm(`Move “${s.title}” to the bin?`)) void api.remove(s).then(again, tell);
+}
+
+function binRows(names: string[], again: () => void): HTMLElement[] {
+  if (!names.length) return [];
+  const rows = names.map((name) =>
+    el(
+      "li",
+      {},
+      name.split("~").slice(0, 2).join(" / "),
+      " ",
+      el("button", {
+        textContent: "Bring back",
+        onclick: () => void api.restore(name).then(again, tell),
+      }),
+    ),
+  );
+  return [el("h3", { textContent: "Bin" }), el("ul", {}, ...rows)];
+}

@@ -1,0 +1,86 @@
+// The live WebSocket: binary chunks and JSON news, as service/ground/live.py describes them.
+
+export interface Chunk {
+  seq: number;
+  layer: number;
+  points: number;
+  unit_m: number;
+  time_unix_s: number;
+  T: number[];
+  xyz: Int16Array;
+  rgb: Uint8Array;
+  sigma: Uint8Array;
+  views: Uint8Array;
+}
+
+export interface LastPose {
+  T: number[];
+  lat_deg: number | null;
+  lon_deg: number | null;
+  alt_amsl_m: number | null;
+  agl_m: number | null;
+  speed_m_s: number;
+  distance_m: number;
+  roll_deg: number;
+  pitch_deg: number;
+  yaw_deg: number;
+  sigma_m: number;
+  sources: string[];
+}
+
+export type News =
+  | { type: "repose"; seq: number; scale: number; T: number[] }
+  | { type: "track"; track: [number, number, number][]; last?: LastPose }
+  | { type: "state"; finished: boolean; keyframes: number };
+
+/** The chunk in a binary message; throws when it is cut short. */
+export function decode(data: ArrayBuffer): Chunk {
+  const length = new DataView(data).getUint32(0, true);
+  const head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length))) as Chunk;
+  let at = 4 * Math.ceil((4 + length) / 4);
+  const n = head.points;
+  head.xyz = new Int16Array(data, at, 3 * n);
+  at += 6 * n;
+  head.rgb = new Uint8Array(data, at, 3 * n);
+  at += 3 * n;
+  head.sigma = new Uint8Array(data, at, n);
+  head.views = new Uint8Array(data, at + n, n);
+  return head;
+}
+
+/** Keeps a live view open until closed; connects again after a break. */
+export class LiveView {
+  private socket: WebSocket | null = null;
+  private closed = false;
+
+  constructor(
+    private readonly address: string,
+    private readonly onChunk: (chunk: Chunk) => void,
+    private readonly onNews: (news: News) => void,
+    private readonly onState: (state: string) => void,
+  ) {
+    this.open();
+  }
+
+  close(): void {
+    this.closed = true;
+    this.socket?.close();
+  }
+
+  private open(): void {
+    this.onState("connecting");
+    const socket = new WebSocket(this.address);
+    this.socket = socket;
+    socket.binaryType = "arraybuffer";
+    socket.onopen = () => this.onState("connected");
+    socket.onmessage = ({ data }: MessageEvent<ArrayBuffer | string>) => {
+      if (typeof data === "string") this.onNews(JSON.parse(data) as News);
+      else this.onChunk(decode(data));
+    };
+    socket.onclose = ({ code, reason }) => {
+      if (this.closed) return;
+      this.onState(code === 1008 ? reason || "refused" : "cut off, trying again");
+      if (code !== 1008) setTimeout(() => this.closed || this.open(), 1500);
+    };
+  }
+}

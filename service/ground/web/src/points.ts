@@ -1,0 +1,162 @@
+// The cloud in the scene: one Points object per chunk, so that a correction is a matrix.
+
+import * as THREE from "three";
+import type { Chunk } from "./live";
+
+export const COLOURS = ["colour", "height", "sigma", "views", "age"] as const;
+export type Colour = (typeof COLOURS)[number];
+
+const VERTEX = /* glsl */ `
+  attribute vec3 rgb;
+  attribute float sigma;
+  attribute float views;
+  uniform float size;
+  uniform float mode;
+  uniform vec2 range;
+  uniform float age;
+  varying vec3 shown;
+
+  vec3 linear(vec3 s) {
+    return mix(s / 12.92, pow((s + 0.055) / 1.055, vec3(2.4)), step(0.04045, s));
+  }
+  vec3 ramp(float t) {
+    t = clamp(t, 0.0, 1.0);
+    vec3 low = mix(vec3(0.27, 0.0, 0.33), vec3(0.13, 0.57, 0.55), min(2.0 * t, 1.0));
+    return mix(low, vec3(0.99, 0.91, 0.14), max(2.0 * t - 1.0, 0.0));
+  }
+  void main() {
+    vec4 world = modelMatrix * vec4(position, 1.0);
+    vec4 seen = viewMatrix * world;
+    gl_Position = projectionMatrix * seen;
+    gl_PointSize = clamp(size / max(-seen.z, 0.01), 1.0, 24.0);
+    vec3 s = rgb;
+    if (mode > 0.5) s = ramp((world.z - range.x) / max(range.y - range.x, 0.01));
+    if (mode > 1.5) s = ramp(sigma * 5.1 / 1.0);
+    if (mode > 2.5) s = ramp(views * 255.0 / 8.0);
+    if (mode > 3.5) s = ramp(age);
+    shown = linear(s);
+  }
+`;
+
+const FRAGMENT = /* glsl */ `
+  varying vec3 shown;
+  void main() {
+    vec2 c = gl_PointCoord - 0.5;
+    if (dot(c, c) > 0.25) discard;
+    gl_FragColor = vec4(shown, 1.0);
+    #include <colorspace_fragment>
+  }
+`;
+
+interface Held {
+  object: THREE.Points<THREE.BufferGeometry, THREE.ShaderMaterial>;
+  unit_m: number;
+  points: number;
+  time: number;
+}
+
+export class Cloud {
+  readonly group = new THREE.Group();
+  budget = 3_000_000;
+  private readonly chunks = new Map<number, Held>();
+  private readonly shared = {
+    size: { value: 300 },
+    mode: { value: 0 },
+    range: { value: new THREE.Vector2(0, 1) },
+  };
+
+  get total(): number {
+    let sum = 0;
+    for (const held of this.chunks.values()) sum += held.points;
+    return sum;
+  }
+
+  get keyframes(): number {
+    return this.chunks.size;
+  }
+
+  /** Adds a chunk, in place of the one with the same number. */
+  add(chunk: Chunk): void {
+    this.remove(chunk.seq);
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(chunk.xyz, 3, false));
+    geometry.setAttribute("rgb", new THREE.BufferAttribute(chunk.rgb, 3, true));
+    geometry.setAttribute("sigma", new THREE.BufferAttribute(chunk.sigma, 1, true));
+    geometry.setAttribute("views", new THREE.BufferAttribute(chunk.views, 1, true));
+    const material = new THREE.ShaderMaterial({
+      vertexShader: VERTEX,
+      fragmentShader: FRAGMENT,
+      uniforms: { ...this.shared, age: { value: 0 } },
+    });
+    const object = new THREE.Points(geometry, material);
+    object.matrixAutoUpdate = false;
+    const held = { object, unit_m: chunk.unit_m, points: chunk.points, time: chunk.time_unix_s };
+    this.chunks.set(chunk.seq, held);
+    this.place(held, chunk.T, 1);
+    this.group.add(object);
+    this.thin();
+  }
+
+  /** Moves a chunk to its corrected pose; its points stay as they are. */
+  repose(seq: number, T: number[], scale: number): void {
+    const held = this.chunks.get(seq);
+    if (held) this.place(held, T, scale);
+  }
+
+  colour(mode: Colour): void {
+    this.shared.mode.value = COLOURS.indexOf(mode);
+    if (mode === "height") this.range();
+    if (mode === "age") this.ages();
+  }
+
+  pointSize(pixelsAtOneMetre: number): void {
+    this.shared.size.value = pixelsAtOneMetre;
+  }
+
+  /** Draws at most the budget: of each chunk, whose points are shuffled, the first part. */
+  thin(): void {
+    const share = Math.min(1, this.budget / Math.max(1, this.total));
+    for (const { object, points } of this.chunks.values()) {
+      object.geometry.setDrawRange(0, Math.ceil(points * share));
+    }
+  }
+
+  /** Heights of the middle 96 % of a sample of the points, for the colour scale. */
+  private range(): void {
+    const heights: number[] = [];
+    const p = new THREE.Vector3();
+    for (const { object } of this.chunks.values()) {
+      const xyz = object.geometry.getAttribute("position");
+      for (let i = 0; i < Math.min(xyz.count, 200); i++) {
+        heights.push(p.fromBufferAttribute(xyz, i).applyMatrix4(object.matrixWorld).z);
+      }
+    }
+    heights.sort((a, b) => a - b);
+    const at = (share: number): number => heights[Math.floor(share * (heights.length - 1))] ?? 0;
+    this.shared.range.value.set(at(0.02), at(0.98));
+  }
+
+  private ages(): void {
+    const times = [...this.chunks.values()].map((held) => held.time);
+    const first = Math.min(...times);
+    const span = Math.max(Math.max(...times) - first, 1e-3);
+    for (const held of this.chunks.values()) {
+      held.object.material.uniforms["age"]!.value = (held.time - first) / span;
+    }
+  }
+
+  private place(held: Held, T: number[], scale: number): void {
+    const unit = held.unit_m * scale;
+    held.object.matrix.fromArray(T).scale(new THREE.Vector3(unit, unit, unit));
+    held.object.updateMatrixWorld(true);
+  }
+
+  private remove(seq: number): void {
+    const held = this.chunks.get(seq);
+    if (!held) return;
+    this.group.remove(held.object);
+    held.object.geometry.dispose();
+    held.object.material.dispose();
+    this.chunks.delete(seq);
+  }
+}
