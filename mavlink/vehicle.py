@@ -7,24 +7,24 @@ protocol's thread.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 import os
-import queue
 import secrets
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from mavlink import status as texts
 from mavlink.camera import KeyframeReport
 from mavlink.companion import Companion, CompanionConfig
 from mavlink.control import ScanControl
+from mavlink.decode import READERS
 from mavlink.framing import Framer, Packet
 from mavlink.history import HistoryConfig, VehicleHistory
+from mavlink.inbox import Inbox, Job
 from mavlink.link import Link, LinkSpec, parse_link
 from mavlink.messages import Outgoing
 from mavlink.odometry import Odometry, odometry_message
@@ -33,13 +33,14 @@ from mavlink.presence import Health, Presence, PresenceConfig
 from mavlink.recorder import Recorder
 from mavlink.signing import Signing, read_key
 from mavlink.status import ComputerLoad
+from mavlink.wire import numbers_of
 
 log = logging.getLogger(__name__)
 
 S = 1_000_000_000
 SAVE_EVERY_NS = 30 * S
+TELEMETRY = numbers_of(READERS)
 BACKLOG = 10_000  # packets waiting for the protocol's thread
-BATCH = 200  # of them served before the next look at the timers
 STUCK_NS = 10 * S
 
 
@@ -103,11 +104,11 @@ class VehicleLink:
             config.companion, control, self.presence, self.history, now_ns, self._memory.parameters
         )
         self._companion.unix_us = lambda: time.time_ns() // 1000
-        self._jobs: queue.Queue[Callable[[], object]] = queue.Queue(BACKLOG)
+        self._inbox = Inbox(BACKLOG)
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
-        self._dropped = 0
         self._alive_ns = now_ns
+        self._is_served = True  # something was done that may have set a timer
         specs = [parse_link(text) for text in config.links]
         self._framers = [Framer() for _ in specs]
         self._packers = [Packer(i, self._signing) for i in range(len(specs))]
@@ -136,8 +137,7 @@ class VehicleLink:
     def stop(self) -> None:
         """Say what is left to say, then close everything."""
         self._stop.set()
-        with contextlib.suppress(queue.Full):
-            self._jobs.put_nowait(lambda: None)
+        self._do(lambda: None)
         for thread in self._threads:
             thread.join(timeout=5.0)
         for link in self._links:
@@ -155,11 +155,11 @@ class VehicleLink:
 
     def statustext(self, text: str, severity: int = texts.INFO) -> None:
         """Tell the operator; repetitions and floods are held back."""
-        self._do(lambda: self._companion.say(severity, text))
+        self._served(lambda: self._companion.say(severity, text))
 
     def report_keyframe(self, keyframe: KeyframeReport) -> None:
         """Tell ground stations of a keyframe."""
-        self._do(lambda: self._companion.report(keyframe))
+        self._served(lambda: self._companion.report(keyframe))
 
     def report_odometry(self, odometry: Odometry, time_ns: int) -> bool:
         """Send our estimate to the autopilot, stamped with its clock at our monotonic time.
@@ -217,7 +217,7 @@ class VehicleLink:
             self.presence.is_armed,
             None if round_trip is None else round_trip * 1e-6,
             0 if self._signing is None else self._signing.refused,
-            self._dropped,
+            self._inbox.dropped,
         )
 
     # Threads.
@@ -225,39 +225,52 @@ class VehicleLink:
     def _on_data(self, index: int, data: bytes, now_ns: int) -> None:
         for packet in self._framers[index].feed(data):
             self.recorder.write(packet.data, now_ns)
-            self._do(lambda packet=packet: self._hear(index, packet, now_ns))  # type: ignore[misc]
+            urgent = packet.message_id not in TELEMETRY
+            self._inbox.put(partial(self._hear, index, packet, now_ns), urgent)
 
     def _hear(self, index: int, packet: Packet, now_ns: int) -> None:
         if self._signing is not None and not self._signing.accepts(packet):
             return
         self._companion.receive(index, packet, now_ns)
+        self._is_served = self._is_served or packet.message_id not in TELEMETRY
 
-    def _do(self, job: Callable[[], object]) -> None:
-        try:
-            self._jobs.put_nowait(job)
-        except queue.Full:
-            self._dropped += 1
+    def _do(self, job: Job) -> None:
+        self._inbox.put(job)
+
+    def _served(self, job: Job) -> None:
+        """Do a job after which a timer may be nearer."""
+        self._do(job)
+        self._do(self._look_at_timers)
+
+    def _look_at_timers(self) -> None:
+        self._is_served = True
 
     def _run(self) -> None:
         """The protocol's thread, the only one that touches the companion."""
         save_ns = time.monotonic_ns() + SAVE_EVERY_NS
+        timer_ns = 0
         while not self._stop.is_set():
-            wait_s = max(0.0, (self._companion.next_timer() - time.monotonic_ns()) / S)
-            try:
-                with contextlib.suppress(queue.Empty):
-                    self._jobs.get(timeout=min(1.0, wait_s) or 1e-4)()
-                    for _ in range(BATCH):
-                        self._jobs.get_nowait()()
-                self._companion.tick(time.monotonic_ns())
-            except Exception:
-                # A fault in what the service does on a command must not cost the link.
-                log.exception("a fault while serving MAVLink")
+            wait_s = (timer_ns - time.monotonic_ns()) / S
+            jobs = self._inbox.take(max(1e-4, min(1.0, wait_s)))
+            for job in jobs:
+                self._guard(job)
             now_ns = self._alive_ns = time.monotonic_ns()
+            if now_ns >= timer_ns or self._is_served:
+                self._is_served = False
+                self._guard(lambda now_ns=now_ns: self._companion.tick(now_ns))  # type: ignore[misc]
+                timer_ns = self._companion.next_timer()
             self._send(self._companion.take())
             if now_ns >= save_ns or self._memory.is_stale(self._companion.parameters.revision):
                 save_ns = now_ns + SAVE_EVERY_NS
                 self._save()
         self._send(self._companion.take())
+
+    def _guard(self, job: Job) -> None:
+        """Do a job; a fault in what the service does on a command must not cost the link."""
+        try:
+            job()
+        except Exception:
+            log.exception("a fault while serving MAVLink")
 
     def _beat(self) -> None:
         """The heartbeats' thread."""

@@ -5,6 +5,7 @@ pymavlink carries no types, so this is the one place that says so.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega  # type: ignore[import-untyped]
@@ -21,3 +22,9 @@ COMMAND_CANCEL = 80
 CRC_EXTRA: dict[int, int] = {n: kind.crc_extra for n, kind in dialect.mavlink_map.items()}
 """Message number to the byte that its checksum ends with."""
 CRC_EXTRA.setdefault(COMMAND_CANCEL, 14)  # of common.xml; pymavlink's dialect lacks it
+
+
+def numbers_of(names: Iterable[str]) -> frozenset[int]:
+    """The numbers of messages by their names; names of other dialects are left out."""
+    wanted = set(names)
+    return frozenset(n for n, kind in dialect.mavlink_map.items() if kind.msgname in wanted)

@@ -14,7 +14,7 @@ from mavlink.framing import Decoder, Packet, check_packet, packet_length
 from mavlink.history import HistoryConfig, VehicleHistory
 from mavlink.logs import TelemetryLog, finish
 from mavlink.samples import AttitudeSample, Sample
-from mavlink.wire import dialect
+from mavlink.wire import numbers_of
 
 STAMP = 8
 BLOCK = 1 << 16
@@ -23,9 +23,7 @@ STEP_USEC = 3_600 * 10**6  # a longer way between two packets wants confirmation
 HEARTBEAT = 0
 NO_AUTOPILOT = 8
 
-WANTED = frozenset(
-    number for number, kind in dialect.mavlink_map.items() if kind.msgname in READERS
-)
+WANTED = numbers_of(READERS)
 
 
 @dataclass(slots=True)
