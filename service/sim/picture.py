@@ -313,19 +313,16 @@ def _colour(  # type: ignore[no-untyped-def]
             if k > 0:
                 u, v = _local(blocks[k - 1], x, y)
                 b, g, r = _top(blocks[k - 1], x, y, u, v)
-                facing = _roof_facing(blocks[k - 1], v, sun)
+                bright = AMBIENT + SUN_STRENGTH * lit * _roof_facing(blocks[k - 1], v, sun)
+            elif photo:  # the photograph has its own sun
+                b, g, r = 1.0 * base[row, col, 0], 1.0 * base[row, col, 1], 1.0 * base[row, col, 2]
+                bright = 0.55 + 0.45 * lit
             else:
-                facing = _facing(z, (x - x0) / step_m, (y - y0) / step_m, step_m, sun)
-                if cover[row, col] > 0 and not photo:
+                if cover[row, col] > 0:
                     b, g, r = _road(x, y, cover[row, col], seed)
-                elif not photo:
+                else:
                     b, g, r = _land(x, y, seed)
-            if photo:
-                b, g, r = (
-                    float(base[row, col, 0]), float(base[row, col, 1]), float(base[row, col, 2])
-                )  # fmt: skip
-                bright = 0.55 + 0.45 * lit  # the photograph has its own sun
-            else:
+                facing = _facing(z, (x - x0) / step_m, (y - y0) / step_m, step_m, sun)
                 bright = AMBIENT + SUN_STRENGTH * facing * lit
             out[row, col, 0] = min(255.0, b * bright)
             out[row, col, 1] = min(255.0, g * bright)
