@@ -30,8 +30,8 @@ class CodecConfig:
     reference_depth_m: float = 60.0
     colour_quality: int = 80  # JPEG, 1 to 100
     coarse_width_px: int = 80
-    coarse_depth_rms_m: float = 0.016
-    coarse_colour_quality: int = 35
+    coarse_depth_rms_m: float = 0.05
+    coarse_colour_quality: int = 25
     depth_method: int = planes.METHOD_PREDICTION  # or planes.METHOD_JPEG_LS
 
     def __post_init__(self) -> None:

@@ -74,11 +74,6 @@ def block_mean(plane: F32, factor: int) -> F32:
     return np.asarray(cv2.resize(plane, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
 
 
-def _mean_known(plane: F32, weight: F32, share: F32, factor: int) -> F32:
-    """Block mean of ``plane`` over the pixels of ``weight`` 1; zero where there are none."""
-    return np.asarray(block_mean(plane * weight, factor) / np.maximum(share, 1e-6), np.float32)
-
-
 def _middle(plane: Array, factor: int) -> Array:
     """The pixel in the middle of each block (the last one where the block is cut off)."""
     h, w = plane.shape[:2]
@@ -99,12 +94,20 @@ def reduce(full: Planes, factor: int) -> Planes:
     torn = (spread > (SPREAD * mean) ** 2) & np.asarray(_middle(full.known, factor), np.bool_)
     mean = np.where(torn, _middle(inverse, factor), mean)
     known = (share >= 0.25) & (mean > 0)
-    bgr = full.bgr if full.known.all() else full.bgr * full.known[..., None]
+    h, w = known.shape
+    box = (0, 0, w * factor, h * factor)
+    if full.known.all() and full.known.shape == (box[3], box[2]):
+        bgr = np.asarray(cv2.resize(full.bgr, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
+        views = np.asarray(cv2.resize(full.views, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
+    else:
+        masked = (full.bgr * full.known[..., None]).astype(np.float32)
+        bgr = _near(block_mean(masked, factor) * scale[..., None], 0, 255)
+        views = _near(block_mean(full.views * weight, factor) * scale, 0, 255)
     return Planes(
         np.asarray(1.0 / np.where(known, mean, 1.0), np.float32),
         np.asarray(block_mean(_finite_sigma(full), factor) * scale, np.float32),
-        _near(block_mean(full.views * weight, factor) * scale, 1, MAX_VIEWS),
-        _near(block_mean(bgr.astype(np.float32), factor) * scale[..., None], 0, 255),
+        np.clip(views, 1, MAX_VIEWS),
+        bgr,
         known,
     )
 
@@ -179,20 +182,19 @@ def decode_depth(data: bytes, known: Bool, method: int, low: float, step: float)
     return np.asarray(1.0 / (low + step * codes.astype(np.float64)), np.float32)
 
 
-# Sigma: geometric mean of 4x4 blocks on a logarithmic scale; 0 is unknown.
+# Sigma: mean of 4x4 blocks on a logarithmic scale; 0 is unknown.
 
 
 def encode_sigma(planes: Planes) -> bytes:
     """The section of sigma: one code per block of SIGMA_BLOCK_PX."""
     sigma = _finite_sigma(planes)
-    weight = (sigma > 0).astype(np.float32)
-    share = block_mean(weight, SIGMA_BLOCK_PX)
-    octaves = np.log2(np.maximum(sigma, SIGMA_UNIT_M) / SIGMA_UNIT_M)
-    mean = _mean_known(octaves, weight, share, SIGMA_BLOCK_PX)
-    codes = np.clip(np.rint(mean * SIGMA_STEPS_PER_OCTAVE) + 1, 1, 255).astype(np.uint8)
+    share = block_mean((sigma > 0).astype(np.float32), SIGMA_BLOCK_PX)
     has = share > 0
     if not has.any():
         return b""
+    mean = block_mean(sigma, SIGMA_BLOCK_PX) / np.maximum(share, 1e-6)
+    octaves = np.log2(np.maximum(mean, SIGMA_UNIT_M) / SIGMA_UNIT_M)
+    codes = np.clip(np.rint(octaves * SIGMA_STEPS_PER_OCTAVE) + 1, 1, 255).astype(np.uint8)
     return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(_fill_back(codes, has))))
 
 

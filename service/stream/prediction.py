@@ -109,22 +109,46 @@ def _normal_equations(c: I64, k: I64, size: tuple[int, int], step: int) -> tuple
 
 @numba.njit(cache=True, nogil=True)
 def _residuals(c: I64, k: I64, size: tuple[int, int], weights: I64) -> U16:
-    """Zigzag residuals of the known pixels in scan order."""
+    """Zigzag residuals of the known pixels in scan order.
+
+    A row's predictions are made at once in float64, where these integers are exact.
+    """
     h, w = size
     row = w + 2 * MARGIN
+    real, there, f = c.astype(np.float64), k.astype(np.float64), weights.astype(np.float64)
+    base = np.zeros(w)
+    guess = np.zeros(w)
     out = np.empty(h * w, np.uint16)
     last = 0
     at = 0
     for v in range(h):
         start = (v + MARGIN) * row + MARGIN
-        for i in range(start, start + w):
-            if k[i]:
-                guess = _guess(c, k, i, row, _base(c, k, i, row, last), weights)
-                r = (c[i] - guess + 32768) % 65536 - 32768
-                out[at] = 2 * r if r >= 0 else -2 * r - 1
+        for u in range(w):
+            base[u] = _base(c, k, start + u, row, last)
+            if k[start + u]:
+                last = c[start + u]
+        _guess_row(real, there, start, row, base, f, guess)
+        for u in range(w):
+            if k[start + u]:
+                r = ((c[start + u] - np.int64(guess[u]) + 32768) & 0xFFFF) - 32768
+                out[at] = (r << 1) ^ (r >> 63)
                 at += 1
-                last = c[i]
     return out[:at]
+
+
+@numba.njit(cache=True, nogil=True)
+def _guess_row(c: F64, k: F64, start: int, row: int, base: F64, f: F64, guess: F64) -> None:
+    """Fill ``guess`` for the row of pixels that begins at ``start``."""
+    w = base.size
+    total = np.full(w, 2048.0)
+    for j in range(9):
+        at = start + NEIGHBOURS[j + 1, 0] * row + NEIGHBOURS[j + 1, 1]
+        near, there = c[at : at + w], k[at : at + w]
+        weight = f[j]
+        for u in range(w):
+            total[u] += weight * (near[u] - base[u]) * there[u]
+    for u in range(w):
+        guess[u] = min(max(base[u] + np.floor(total[u] / 4096.0), 0.0), 65535.0)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -141,7 +165,7 @@ def _restore(residuals: U16, c: I64, k: I64, size: tuple[int, int], weights: I64
                 guess = _guess(c, k, i, row, _base(c, k, i, row, last), weights)
                 z = np.int64(residuals[at])
                 r = -((z + 1) >> 1) if z & 1 else z >> 1
-                last = (guess + r) % 65536
+                last = (guess + r) & 0xFFFF
                 c[i] = last
                 at += 1
 

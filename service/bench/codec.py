@@ -1,0 +1,239 @@
+"""``skyrelief bench codec``: bits per point, time and error of the chunk codec and its peers.
+
+All code the same synthetic keyframes (depth 50 to 95 m, noise 2 cm white and 8 cm
+correlated). Ours carries mask, sigma, views and a coarse layer besides; the peers do not.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from recon.types import F32, U8, Bool, Keyframe
+from service.bench import BenchOptions, BenchResult
+from service.bench.keyframes import make_keyframe, strip
+from service.stream import codec
+
+SIZE_PX = (320, 180)
+REPEATS = 30
+FRAMES = 3
+
+
+@dataclass(frozen=True, slots=True)
+class CodecFigures:
+    """What a codec makes of a keyframe; NaN where it does not apply."""
+
+    name: str
+    bits_per_point: float
+    encode_ms: float
+    rms_at_60_m_m: float
+    psnr_db: float
+
+
+def measure() -> list[CodecFigures]:
+    """Our codec first, then every peer that is installed."""
+    frames = [make_keyframe(k, SIZE_PX, seed=1 + k) for k in range(FRAMES)]
+    rows = [_average([_ours(frame) for frame in frames])]
+    for peer in (_jpeg_ls, _draco, _laz, _raw):
+        try:
+            rows.append(_average([peer(frame) for frame in frames]))
+        except ImportError:
+            continue
+    return rows
+
+
+def run(options: BenchOptions) -> list[BenchResult]:
+    """Bits per point against every peer, encoding time, error, masking and coarse share."""
+    ours, *peers = measure()
+    results = [
+        BenchResult(
+            "codec",
+            "size with colour",
+            ours.bits_per_point,
+            "bits per point",
+            peer=peer.name,
+            peer_value=peer.bits_per_point,
+            note=f"error at 60 m {ours.rms_at_60_m_m * 100:.2f} cm against "
+            f"{peer.rms_at_60_m_m * 100:.2f} cm",
+        )
+        for peer in peers
+    ]
+    results += [
+        BenchResult(
+            "codec",
+            "encode 320x180, both layers, one thread",
+            ours.encode_ms,
+            "ms",
+            peer=peer.name,
+            peer_value=peer.encode_ms,
+        )
+        for peer in peers
+    ]
+    saved, bits = masking()
+    results += [
+        BenchResult("codec", "depth error at 60 m", ours.rms_at_60_m_m * 100, "cm rms"),
+        BenchResult("codec", "colour", ours.psnr_db, "dB PSNR"),
+        BenchResult("codec", "sent of a keyframe at 80 % overlap", 100 * (1 - saved), "%"),
+        BenchResult("codec", "size of such keyframes", bits, "bits per point"),
+        BenchResult("codec", "coarse layer of their bytes", 100 * coarse_share(), "%"),
+        BenchResult("codec", "coarse layer of a whole keyframe", 100 * coarse_share(False), "%"),
+    ]
+    return results
+
+
+def masking() -> tuple[float, float]:
+    """Share of the bytes that sending only what is new saves at 80 % overlap, and the bits
+    per point of such keyframes."""
+    frames = range(FRAMES)
+    whole = sum(_size(make_keyframe(k, SIZE_PX, seed=1 + k)) for k in frames)
+    fresh = [strip(SIZE_PX, 20 + k) for k in frames]
+    part = sum(_size(make_keyframe(k, SIZE_PX, fresh[k], seed=1 + k)) for k in frames)
+    return 1 - part / whole, part * 8 / sum(int(f.sum()) for f in fresh)
+
+
+def coarse_share(masked: bool = True) -> float:
+    """Share of the bytes that the coarse layer takes, at 80 % overlap or of whole keyframes."""
+    fresh = [strip(SIZE_PX, 20 + k) if masked else None for k in range(FRAMES)]
+    layers = [
+        codec.encode(make_keyframe(k, SIZE_PX, fresh[k], seed=1 + k), 0) for k in range(FRAMES)
+    ]
+    return sum(len(x[0]) for x in layers) / sum(len(x[0]) + len(x[1]) for x in layers)
+
+
+def _size(frame: Keyframe) -> int:
+    return sum(map(len, codec.encode(frame, 0)))
+
+
+def _average(rows: list[CodecFigures]) -> CodecFigures:
+    return CodecFigures(
+        rows[0].name,
+        float(np.mean([r.bits_per_point for r in rows])),
+        float(np.median([r.encode_ms for r in rows])),
+        float(np.sqrt(np.mean([r.rms_at_60_m_m**2 for r in rows]))),
+        float(np.mean([r.psnr_db for r in rows])),
+    )
+
+
+def _median_ms(work: Callable[[], object]) -> float:
+    work()
+    times = []
+    for _ in range(REPEATS):
+        began = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - began)
+    return float(np.median(times)) * 1e3
+
+
+def _rms_at_60(frame: Keyframe, depth_m: F32) -> float:
+    truth = frame.depth.depth_m.astype(np.float64)
+    error = (depth_m - truth) * (60.0 / truth) ** 2
+    return float(np.sqrt(np.nanmean(error**2)))
+
+
+def _psnr(a: U8, frame: Keyframe) -> float:
+    return float(10 * np.log10(255**2 / np.mean((a.astype(float) - frame.bgr) ** 2)))
+
+
+def _ours(frame: Keyframe) -> CodecFigures:
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        encode_ms = _median_ms(lambda: codec.encode(frame, 0))
+    finally:
+        cv2.setNumThreads(threads)
+    layers = codec.encode(frame, 0)
+    back = codec.decode(layers)
+    assert back is not None
+    bits = sum(map(len, layers)) * 8 / frame.fresh.sum()
+    rms = _rms_at_60(frame, back.depth.depth_m)
+    return CodecFigures("skyrelief", float(bits), encode_ms, rms, _psnr(back.bgr, frame))
+
+
+def _jpeg_ls(frame: Keyframe) -> CodecFigures:
+    """12-bit inverse depth between nearest and farthest in JPEG-LS, and JPEG quality 80."""
+    import imagecodecs
+
+    inverse = 1.0 / frame.depth.depth_m.astype(np.float64)
+    low, step = inverse.min(), (inverse.max() - inverse.min()) / 4095
+
+    def encode() -> tuple[bytes, bytes]:
+        codes = np.rint((1.0 / frame.depth.depth_m - low) / step).astype(np.uint16)
+        colour = cv2.imencode(".jpg", frame.bgr, [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
+        return bytes(imagecodecs.jpegls_encode(codes)), colour.tobytes()
+
+    depth, colour = encode()
+    codes = imagecodecs.jpegls_decode(depth)
+    picture = cv2.imdecode(np.frombuffer(colour, np.uint8), cv2.IMREAD_COLOR)
+    bits = (len(depth) + len(colour)) * 8 / codes.size
+    rms = _rms_at_60(frame, (1.0 / (low + step * codes)).astype(np.float32))
+    return CodecFigures(
+        "JPEG-LS 12 bit + JPEG 80",
+        bits,
+        _median_ms(encode),
+        rms,
+        _psnr(np.asarray(picture, np.uint8), frame),
+    )
+
+
+def _points(frame: Keyframe) -> tuple[F32, U8]:
+    known: Bool = frame.fresh
+    v, u = np.nonzero(known)
+    z = frame.depth.depth_m[v, u]
+    K = frame.depth.K
+    xyz = np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], axis=1)
+    return xyz.astype(np.float32), np.ascontiguousarray(frame.bgr[v, u, ::-1])
+
+
+def _draco(frame: Keyframe) -> CodecFigures:
+    """Draco at 14 bits, where its error of position is about ours."""
+    import DracoPy  # type: ignore[import-not-found, unused-ignore]
+
+    xyz, rgb = _points(frame)
+
+    def encode() -> bytes:
+        return bytes(DracoPy.encode(xyz, colors=rgb, quantization_bits=14, compression_level=7))
+
+    began = time.perf_counter()
+    data = encode()
+    encode_ms = (time.perf_counter() - began) * 1e3
+    extent = float((xyz.max(axis=0) - xyz.min(axis=0)).max())
+    rms = extent / (1 << 14) / 12**0.5
+    return CodecFigures("Draco 14 bit", len(data) * 8 / len(xyz), encode_ms, rms, float("inf"))
+
+
+def _laz(frame: Keyframe) -> CodecFigures:
+    """LAZ, point format 7, 1 cm."""
+    import io
+
+    import laspy
+
+    xyz, rgb = _points(frame)
+
+    def encode() -> bytes:
+        las = laspy.create(point_format=7, file_version="1.4")
+        las.header.scales = np.full(3, 0.01)
+        las.x, las.y, las.z = xyz[:, 0], xyz[:, 1], xyz[:, 2]
+        las.red, las.green, las.blue = (rgb[:, k].astype(np.uint16) * 257 for k in range(3))
+        out = io.BytesIO()
+        las.write(out, do_compress=True, laz_backend=laspy.LazBackend.Lazrs)
+        return out.getvalue()
+
+    data = encode()
+    return CodecFigures(
+        "LAZ 1 cm", len(data) * 8 / len(xyz), _median_ms(encode), 0.01 / 12**0.5, float("inf")
+    )
+
+
+def _raw(frame: Keyframe) -> CodecFigures:
+    """Three floats and three bytes."""
+    xyz, rgb = _points(frame)
+
+    def encode() -> bytes:
+        return xyz.tobytes() + rgb.tobytes()
+
+    bits = len(encode()) * 8 / len(xyz)
+    return CodecFigures("raw float32", bits, _median_ms(encode), 0.0, float("inf"))
