@@ -6,8 +6,8 @@ labels costs the same per label. A row of cells ends with at least one empty cel
 messages have an empty row above and below: what lies beyond the border says nothing.
 
 Everything is a 16-bit integer. A cost further than four truncations above its pixel's best
-can never matter (a message is at most one truncation), so it is cut there and no sum
-overflows: the result is exactly that of unbounded integers.
+cannot win its pixel (a message is at most one truncation), so it is cut there, at every level
+before the next coarser one sums it, and no sum overflows.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ def _start(coarse: Any, data: Any) -> Any:  # pragma: no cover - compiled
     Only the colour that the first sweep reads is filled; the sweep writes the other.
     """
     height, _, labels, cells = data.shape
-    messages = np.empty((4, height + 2, 2, labels, cells), np.int16)
+    messages = np.zeros((4, height + 2, 2, labels, cells), np.int16)  # lanes beyond rows are read
     known = coarse.shape[4]
     for r in prange(height + 2):
         for direction in range(4):
