@@ -13,6 +13,7 @@ import typer
 
 from service.errors import InputError
 
+VIDEO_TO = "udp://127.0.0.1:5600?pkt_size=1316"
 PAIR = re.compile(r"^(-?[0-9.]+):(-?[0-9.]+)$")
 
 
@@ -50,9 +51,20 @@ def simulate(
     exposure: Annotated[list[str] | None, typer.Option(help="SECOND:GAIN brightness step.")] = None,
     depth_frames: Annotated[int, typer.Option(help="How many depth maps to keep.")] = 12,
     crf: Annotated[int, typer.Option(help="H.264 quality; lower is better.")] = 18,
+    live: Annotated[bool, typer.Option("--live", help="Then play it in real time.")] = False,
+    video_to: Annotated[str, typer.Option(help="Live: where H.264 in MPEG-TS goes.")] = VIDEO_TO,
+    mavlink_to: Annotated[str, typer.Option(help="Live: UDP host:port.")] = "127.0.0.1:14550",
+    loop: Annotated[bool, typer.Option("--loop", help="Live: again and again.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Report as one JSON object.")] = False,
 ) -> None:
-    """A rendered flight: flight.mp4, flight.tlog, camera.yaml, and truth/ to score against."""
+    """A rendered flight: flight.mp4, flight.tlog, camera.yaml, and truth/ to score against.
+
+    With --live the flight is then played in real time, as a camera's stream and an autopilot's
+    MAVLink; a folder that already holds a flight is played as it is.
+    """
+    if live and (out / "flight.mp4").exists():
+        _play(out, video_to, mavlink_to, loop, as_json)
+        return
     from service.sim import recording
     from service.sim.flight import FlightPlan, SensorNoise
     from service.sim.render import Look
@@ -87,7 +99,26 @@ def simulate(
         raise InputError(f"simulate: {error}") from error
     show = _progress if sys.stderr.isatty() else None
     result = recording.write(simulation, out, show)
+    if live:
+        print(f"{out}: {result['frames']} frames rendered", file=sys.stderr)
+        _play(out, video_to, mavlink_to, loop, as_json)
+        return
     _report(out, result, time.monotonic() - started, as_json)
+
+
+def _play(folder: Path, video_to: str, mavlink_to: str, loop: bool, as_json: bool) -> None:
+    """Play a flight until its end or Ctrl-C."""
+    from service.sim.live import LiveOptions, play
+
+    print(f"playing {folder}: video to {video_to}, MAVLink to {mavlink_to}", file=sys.stderr)
+    try:
+        counts = play(folder, LiveOptions(video_to, mavlink_to, loop))
+    except ValueError as error:
+        raise InputError(f"simulate --live: {error}") from error
+    except KeyboardInterrupt:
+        return
+    if as_json:
+        print(json.dumps(counts), file=sys.stderr if video_to.startswith("pipe:") else sys.stdout)
 
 
 def _pair(text: str, option: str) -> tuple[float, float]:

@@ -252,6 +252,7 @@ def _write_video(
         stream = container.add_stream("libx264", rate=rate)
         stream.width, stream.height = options.size_px
         stream.pix_fmt = "yuv420p"
+        stream.codec_context.gop_size = max(1, round(2 * options.fps))
         stream.options = {"crf": str(options.crf), "preset": "veryfast", "x264-params": REPEATABLE}
         for index in range(len(simulation.times_s)):
             shot = av.VideoFrame.from_ndarray(simulation.frame(index), format="bgr24")

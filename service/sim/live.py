@@ -1,0 +1,180 @@
+"""Plays a simulated flight in real time: H.264 in MPEG-TS for the camera, MAVLink over UDP.
+
+The flight's own packets are sent when they are due. SYSTEM_TIME is renewed, so that it tells
+the present, and TIMESYNC requests are answered with the boot time, as an autopilot does.
+"""
+
+from __future__ import annotations
+
+import heapq
+import logging
+import select
+import socket
+import struct
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import av
+
+from service.errors import InputError, OutsideError
+from service.sim.recording import EPOCH_UNIX_S
+from service.sim.telemetry import BOOT_BEFORE_VIDEO_S
+
+log = logging.getLogger(__name__)
+
+CAMERA, TELEMETRY = 0, 1
+START_DELAY_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class LiveOptions:
+    """Where the flight is played to."""
+
+    video: str = "udp://127.0.0.1:5600?pkt_size=1316"  # any URL of FFmpeg; pipe:1 is stdout
+    mavlink: str = "127.0.0.1:14550"  # host:port of UDP
+    loop: bool = False
+
+    @property
+    def mavlink_address(self) -> tuple[str, int]:
+        """(host, port); raises ValueError when it is not that."""
+        host, _, port = self.mavlink.rpartition(":")
+        if not host or not port.isdigit() or not 0 < int(port) < 65536:
+            raise ValueError(f"MAVLink address {self.mavlink!r} is not host:port")
+        return host, int(port)
+
+
+class MavlinkPlayer:
+    """Sends the flight's messages from their components, and answers TIMESYNC."""
+
+    def __init__(self, address: tuple[str, int]) -> None:
+        """Open the socket; OutsideError when the address cannot be used."""
+        from pymavlink.dialects.v20 import common  # type: ignore[import-untyped]
+
+        self.dialect: Any = common
+        self.sent = self.answered = 0
+        self._senders: dict[int, Any] = {}
+        self._reader = common.MAVLink(None)
+        self._requests = common.MAVLink(None)
+        self._requests.robust_parsing = True
+        try:
+            self._to = socket.getaddrinfo(*address, socket.AF_INET, socket.SOCK_DGRAM)[0][4]
+            self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self.socket.setblocking(False)
+        except OSError as error:
+            raise OutsideError(f"MAVLink to {address[0]}:{address[1]}: {error}") from error
+
+    def play(self, packet: bytes, boot_s: float) -> None:
+        """Send one packet of the log as if it happened ``boot_s`` after the boot."""
+        for message in self._reader.parse_buffer(packet) or []:
+            if message.get_type() == "SYSTEM_TIME":
+                message = self.dialect.MAVLink_system_time_message(
+                    time.time_ns() // 1000, round(boot_s * 1e3)
+                )
+                self._send(message, 1)
+            else:
+                self._send(message, message.get_srcComponent())
+            self.sent += 1
+
+    def answer(self, boot_s: float) -> None:
+        """Answer what has come in: TIMESYNC requests get the time since the boot."""
+        while True:
+            try:
+                data, _ = self.socket.recvfrom(2048)
+            except OSError:  # nothing there, or nobody listens yet
+                return
+            for message in self._requests.parse_buffer(data) or []:
+                if message.get_type() == "TIMESYNC" and message.tc1 == 0:
+                    reply = self.dialect.MAVLink_timesync_message(round(boot_s * 1e9), message.ts1)
+                    self._send(reply, 1)
+                    self.answered += 1
+
+    def _send(self, message: Any, component: int) -> None:
+        if component not in self._senders:
+            self._senders[component] = self.dialect.MAVLink(
+                None, srcSystem=1, srcComponent=component
+            )
+        sender = self._senders[component]
+        data = bytes(message.pack(sender))
+        sender.seq = (sender.seq + 1) % 256
+        try:
+            self.socket.sendto(data, self._to)
+        except OSError as error:  # a full buffer or a refused datagram loses one packet
+            log.debug("MAVLink packet not sent: %s", error)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self.socket.close()
+
+
+def play(folder: Path, options: LiveOptions) -> dict[str, int]:
+    """Play the flight in ``folder`` to its end, or for ever; counts of what was sent.
+
+    InputError when the folder holds no flight; OutsideError when the outputs cannot be opened.
+    """
+    video, tlog = folder / "flight.mp4", folder / "flight.tlog"
+    if not video.exists():
+        raise InputError(f"{folder} holds no flight.mp4 to play")
+    player = MavlinkPlayer(options.mavlink_address)
+    frames = 0
+    try:
+        while True:
+            frames += _play_once(video, tlog, options.video, player)
+            if not options.loop:
+                break
+    finally:
+        player.close()
+    return {"frames": frames, "packets": player.sent, "timesync_answers": player.answered}
+
+
+def _play_once(video: Path, tlog: Path, url: str, player: MavlinkPlayer) -> int:
+    """Play once from the start; returns the number of frames."""
+    frames = 0
+    try:
+        with av.open(str(video)) as source, av.open(url, "w", format="mpegts") as sink:
+            stream = sink.add_stream_from_template(source.streams.video[0])
+            events = heapq.merge(_packets(source), _telemetry(tlog), key=lambda e: e[:2])
+            start = None
+            for due_s, kind, payload in events:
+                if start is None:
+                    start = time.monotonic() + START_DELAY_S - due_s
+                _wait(start, due_s, player)
+                if kind == TELEMETRY:
+                    player.play(payload, due_s + BOOT_BEFORE_VIDEO_S)
+                else:
+                    payload.stream = stream
+                    sink.mux(payload)
+                    frames += 1
+    except (av.error.FFmpegError, OSError) as error:
+        raise OutsideError(f"video to {url}: {error}") from error
+    return frames
+
+
+def _wait(start: float, due_s: float, player: MavlinkPlayer) -> None:
+    """Wait until ``due_s`` of the flight, answering requests meanwhile."""
+    while True:
+        left = start + due_s - time.monotonic()
+        select.select([player.socket], [], [], max(left, 0.0))
+        player.answer(time.monotonic() - start + BOOT_BEFORE_VIDEO_S)
+        if start + due_s - time.monotonic() <= 0:
+            return
+
+
+def _packets(source: Any) -> Iterator[tuple[float, int, Any]]:
+    """(seconds, CAMERA, coded frame) of the video."""
+    for packet in source.demux(video=0):
+        if packet.dts is not None:
+            yield float(packet.dts * packet.time_base), CAMERA, packet
+
+
+def _telemetry(tlog: Path) -> Iterator[tuple[float, int, bytes]]:
+    """(seconds, TELEMETRY, packet) of the log; nothing when there is none."""
+    data = tlog.read_bytes() if tlog.exists() else b""
+    at = 0
+    while at + 20 <= len(data):
+        (unix_us,) = struct.unpack_from(">Q", data, at)
+        size = data[at + 9] + 12  # MAVLink 2 without a signature
+        yield unix_us / 1e6 - EPOCH_UNIX_S, TELEMETRY, data[at + 8 : at + 8 + size]
+        at += 8 + size
