@@ -1,0 +1,79 @@
+"""Factors of the pose graph that GTSAM does not bring, and conversions to its conventions.
+
+GTSAM perturbs poses on the right; this package on the left. Both put the rotation first.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from recon import se3
+from recon.types import F64
+
+
+def reversed_motion(T: F64, covariance: F64) -> tuple[F64, F64]:
+    """T_b_a and its (6, 6) covariance in b's frame, from T_a_b and that in a's frame."""
+    return se3.inverse(T), right_covariance(T, covariance)
+
+
+def right_covariance(T: F64, covariance: F64) -> F64:
+    """(6, 6) covariance of the right perturbation of ``T`` from that of the left."""
+    A = se3.adjoint(se3.inverse(T))
+    return np.asarray(A @ covariance @ A.T)
+
+
+def left_covariance(T: F64, covariance: F64) -> F64:
+    """(6, 6) covariance of the left perturbation of ``T`` from that of the right."""
+    A = se3.adjoint(T)
+    return np.asarray(A @ covariance @ A.T)
+
+
+def pose3(T: F64) -> Any:
+    """The gtsam.Pose3 of ``T`` (4, 4), its rotation made exact."""
+    import gtsam
+
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    return gtsam.Pose3(gtsam.Rot3(U @ Vt), T[:3, 3])
+
+
+def matrix(pose: Any) -> F64:
+    """(4, 4) of a gtsam.Pose3."""
+    return np.asarray(pose.matrix(), np.float64)
+
+
+def altitude_error(measured_m: float) -> Any:
+    """Error function of (pose, bias): camera height plus bias less the reading."""
+
+    def error(factor: Any, values: Any, jacobians: Any) -> F64:
+        pose_key, bias_key = factor.keys()
+        pose = values.atPose3(pose_key)
+        if jacobians is not None:
+            jacobians[0] = np.concatenate([np.zeros(3), pose.rotation().matrix()[2]])[None]
+            jacobians[1] = np.eye(1)
+        height = pose.translation()[2] + values.atVector(bias_key)[0]
+        return np.array([height - measured_m])
+
+    return error
+
+
+def scaled_motion_error(T_a_b: F64) -> Any:
+    """Error function of (pose a, pose b, log scale): their motion against the scaled ``T_a_b``."""
+    R, t = T_a_b[:3, :3].copy(), T_a_b[:3, 3].copy()
+
+    def error(factor: Any, values: Any, jacobians: Any) -> F64:
+        import gtsam
+
+        a_key, b_key, scale_key = factor.keys()
+        stretched = t * float(np.exp(values.atVector(scale_key)[0]))
+        motion = values.atPose3(a_key).between(values.atPose3(b_key))
+        expected = gtsam.Pose3(gtsam.Rot3(R), stretched)
+        if jacobians is not None:
+            # To first order in the error, which is small where the graph is any good.
+            jacobians[0] = -motion.inverse().AdjointMap()
+            jacobians[1] = np.eye(6)
+            jacobians[2] = -np.concatenate([np.zeros(3), R.T @ stretched])[:, None]
+        return np.asarray(gtsam.Pose3.Logmap(expected.between(motion)), np.float64)
+
+    return error

@@ -1,0 +1,401 @@
+"""The pose graph on exact flights: consistency, gauge, wrong readings, loops, lost vision."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from recon import se3
+from recon.pose_graph import PoseGraph, PoseGraphConfig
+from recon.track_alignment import align_track, mean_rotation, umeyama
+from recon.types import F64, Pose, PosePrior
+
+STEP_M = 6.0
+# The noise of these flights is white, unlike real sensors', and their scale does not drift.
+WHITE = PoseGraphConfig(correlation_s=0.0, sigma_step=1e-4, sigma_scale_walk=1e-4)
+
+
+@dataclass
+class Flight:
+    truth: list[F64]  # T_world_camera
+    odom: list[F64]  # T_odom_camera: another heading, origin and scale, and drift
+    covariance: F64  # of one motion
+    priors: list[PosePrior]
+
+
+def flight(
+    count: int,
+    seed: int = 0,
+    scale: float = 1.3,
+    sigma_gnss_m: float = 1.0,
+    sigma_yaw_rad: float = 0.05,
+    drift: float = 0.002,
+    turn_every: int = 30,
+) -> Flight:
+    """A lawnmower at 60 m, looking down."""
+    rng = np.random.default_rng(seed)
+    truth, place, yaw = [], np.array([0.0, 0.0, 60.0]), 0.0
+    for i in range(count):
+        if i and i % turn_every == 0:
+            yaw += np.pi / 2
+        heading = se3.so3_exp(np.array([0.0, 0.0, yaw]))
+        wobble = se3.so3_exp(rng.normal(size=3) * 0.02)
+        truth.append(se3.compose(heading @ np.diag([1.0, -1.0, -1.0]) @ wobble, place.copy()))
+        place = place + heading @ np.array([STEP_M, 0.0, 0.0]) + rng.normal(size=3) * 0.3
+    covariance = np.diag([2e-4**2] * 3 + [(drift * STEP_M) ** 2] * 3)
+    odom = [se3.compose(se3.so3_exp(np.array([0.1, -0.1, 0.7])) @ truth[0][:3, :3], np.ones(3))]
+    for a, b in pairwise(truth):
+        motion = se3.exp(rng.multivariate_normal(np.zeros(6), covariance)) @ se3.inverse(a) @ b
+        motion[:3, 3] /= scale
+        odom.append(odom[-1] @ motion)
+    units = np.array([1.0] * 3 + [1 / scale] * 3)
+    noise = np.array([0.01, 0.01, sigma_yaw_rad])
+    priors = [
+        PosePrior(
+            se3.so3_exp(rng.normal(size=3) * noise) @ T[:3, :3], 0.01, sigma_yaw_rad,
+            T[:3, 3] + rng.normal(size=3) * sigma_gnss_m, np.full(3, sigma_gnss_m),
+        )
+        for T in truth
+    ]  # fmt: skip
+    return Flight(truth, odom, covariance * np.outer(units, units), priors)
+
+
+def fly(
+    f: Flight, config: PoseGraphConfig = WHITE, altitude_bias_m: float | None = None
+) -> tuple[PoseGraph, Pose]:
+    """The graph after the whole flight and its last pose."""
+    graph = PoseGraph(config)
+    rng = np.random.default_rng(99)
+    pose = None
+    for i, (T, prior) in enumerate(zip(f.odom, f.priors, strict=True)):
+        altitude = None
+        if altitude_bias_m is not None:
+            altitude = f.truth[i][2, 3] + altitude_bias_m + rng.normal() * 0.2
+        pose = graph.add_keyframe(i, i * 10**9, 0, T, f.covariance, prior, altitude, 0.2)
+    assert pose is not None
+    return graph, pose
+
+
+def rms_m(graph: PoseGraph, f: Flight) -> float:
+    poses = graph.poses()
+    errors = [poses[i][:3, 3] - T[:3, 3] for i, T in enumerate(f.truth)]
+    return float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1))))
+
+
+def blind(prior: PosePrior, attitude: bool) -> PosePrior:
+    """The prior without its position, and without its attitude unless that is kept."""
+    R = prior.R_world_camera if attitude else None
+    return replace(prior, position_m=None, sigma_position_m=None, R_world_camera=R)
+
+
+# ---- the similarity of a track ---------------------------------------------------------------
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.floats(0.05, 20), st.floats(-3.1, 3.1), st.floats(-1, 1), st.integers(0, 999), st.booleans()
+)
+def test_umeyama_recovers_any_similarity(
+    scale: float, yaw: float, tilt: float, seed: int, level: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    source = rng.normal(size=(12, 3)) * [30, 20, 5]
+    R = Rotation.from_euler("zyx", [yaw, 0.0 if level else tilt, 0.0]).as_matrix()
+    t = rng.normal(size=3) * 100
+    found = umeyama(source, scale * source @ R.T + t, rng.uniform(0.5, 2, 12), level)
+    assert found[0] == pytest.approx(scale)
+    np.testing.assert_allclose(found[1], R, atol=1e-9)
+    np.testing.assert_allclose(found[2], t, atol=1e-6 * max(scale, 1) * 100)
+
+
+def test_umeyama_rotates_as_scipy_does() -> None:
+    rng = np.random.default_rng(1)
+    source = rng.normal(size=(30, 3)) * 10
+    R = Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix()
+    target = source @ R.T + rng.normal(size=(30, 3))
+    weight = rng.uniform(0.2, 1, 30)
+    a = source - weight @ source / weight.sum()
+    b = target - weight @ target / weight.sum()
+    oracle = Rotation.align_vectors(b, a, weights=weight)[0].as_matrix()
+    np.testing.assert_allclose(umeyama(source, target, weight, False)[1], oracle, atol=1e-9)
+
+
+def test_a_track_is_aligned_when_it_is_long_enough_and_not_before() -> None:
+    rng = np.random.default_rng(0)
+    for length_m, expected in ((4.0, False), (300.0, True)):
+        x = np.linspace(0, length_m, 40)
+        odom = np.column_stack([x, 0.1 * x, np.zeros(40)]) / 1.7
+        fixes = 1.7 * odom @ se3.so3_exp(np.array([0, 0, 0.9])).T + rng.normal(size=(40, 3))
+        found = align_track(odom, fixes, np.ones((40, 3)), True, 0.04)
+        assert (found is not None) == expected
+        # A straight track leaves the roll about itself open.
+        assert align_track(odom, fixes, np.ones((40, 3)), False, 0.04) is None
+    assert found is not None
+    assert found.scale == pytest.approx(1.7, rel=0.01)
+    assert np.arctan2(found.R[1, 0], found.R[0, 0]) == pytest.approx(0.9, abs=0.01)
+
+
+def test_wild_fixes_do_not_turn_the_track() -> None:
+    rng = np.random.default_rng(2)
+    odom = np.column_stack([np.linspace(0, 200, 50), 20 * np.sin(np.arange(50) / 8), np.zeros(50)])
+    fixes = odom + rng.normal(size=(50, 3)) * 0.5
+    fixes[10:18] += [0.0, 30.0, 5.0]
+    found = align_track(odom, fixes, np.full((50, 3), 0.5), True, 0.04)
+    assert found is not None
+    assert abs(np.arctan2(found.R[1, 0], found.R[0, 0])) < 0.01
+    assert found.scale == pytest.approx(1.0, abs=0.01)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000))
+def test_the_mean_rotation_is_scipys(seed: int) -> None:
+    middle = Rotation.random(random_state=seed)
+    near = Rotation.from_rotvec(np.random.default_rng(seed).normal(size=(9, 3)) * 0.2)
+    rotations = (middle * near).as_matrix()
+    oracle = Rotation.from_matrix(rotations).mean().as_matrix()
+    np.testing.assert_allclose(mean_rotation(rotations), oracle, atol=1e-7)
+
+
+# ---- whole flights ---------------------------------------------------------------------------
+
+
+def test_all_sensors_give_decimetres() -> None:
+    f = flight(150)
+    graph, pose = fly(f, altitude_bias_m=4.0)
+    assert graph.aligned
+    assert graph.scale == pytest.approx(1.3, rel=0.01)
+    assert rms_m(graph, f) < 0.4
+    assert pose.sources == ("altitude", "attitude", "gnss", "vision")
+    assert not graph.counts
+
+
+def test_reported_covariance_holds() -> None:
+    """Normalised squared errors average to six degrees of freedom, at the end and before."""
+    last: list[float] = []
+    middle: list[float] = []
+    for seed in range(24):
+        f = flight(50, seed=seed)
+        graph, pose = fly(f)
+        for i, values in ((49, last), (25, middle)):
+            p = graph.pose(i)
+            error = se3.log(p.T_world_camera @ se3.inverse(f.truth[i]))
+            values.append(float(error @ np.linalg.solve(p.covariance, error)))
+        np.testing.assert_allclose(pose.T_world_camera, graph.pose(49).T_world_camera)
+    # The mean of 24 chi-squares of six degrees has a standard deviation of 0.7.
+    assert 4.0 < np.mean(last) < 8.5
+    assert 4.0 < np.mean(middle) < 8.5
+
+
+@pytest.mark.parametrize("use", ["vision", "vision attitude"])
+def test_without_fixes_the_frame_stays_local_and_drift_is_small(use: str) -> None:
+    f = flight(120, scale=1.0)
+    f.priors = [blind(p, "attitude" in use) for p in f.priors]
+    graph, pose = fly(f)
+    assert not graph.aligned
+    assert "gnss" not in pose.sources and "vision" in pose.sources
+    moved = se3.inverse(graph.pose(0).T_world_camera) @ pose.T_world_camera
+    true = se3.inverse(f.truth[0]) @ f.truth[-1]
+    share = np.linalg.norm(moved[:3, 3] - true[:3, 3]) / (119 * STEP_M)
+    assert share < 0.003
+    if "attitude" in use:
+        tilt = (pose.T_world_camera[:3, :3] @ f.truth[-1][:3, :3].T)[2]
+        np.testing.assert_allclose(tilt, [0, 0, 1], atol=0.02)
+
+
+def test_the_gauge_is_free() -> None:
+    """Moving the world and turning the odometry's frame moves the answer and nothing else."""
+    f = flight(60)
+    move = se3.compose(se3.so3_exp(np.array([0.0, 0.0, 2.0])), np.array([300.0, -80.0, 40.0]))
+    other = se3.exp(np.array([0.4, -0.2, 1.0, 5.0, 6.0, 7.0]))
+    g = Flight(
+        [move @ T for T in f.truth],
+        [other @ T for T in f.odom],
+        f.covariance,
+        [
+            replace(
+                p,
+                R_world_camera=None
+                if p.R_world_camera is None
+                else move[:3, :3] @ p.R_world_camera,
+                position_m=None
+                if p.position_m is None
+                else se3.transform(move, p.position_m[None])[0],
+            )
+            for p in f.priors
+        ],
+    )
+    first, second = fly(f)[0].poses(), fly(g)[0].poses()
+    for i in range(0, 60, 7):
+        np.testing.assert_allclose(second[i], move @ first[i], atol=0.02)
+
+
+def test_more_accurate_fixes_make_a_more_accurate_track() -> None:
+    errors = [rms_m(fly(f)[0], f) for f in (flight(80, sigma_gnss_m=s) for s in (2.0, 0.5, 0.02))]
+    assert errors[0] > errors[1] > errors[2]
+    assert errors[2] < 0.03
+
+
+# ---- wrong readings --------------------------------------------------------------------------
+
+
+def test_a_jump_of_the_receiver_is_left_out() -> None:
+    f = flight(120)
+    for i in range(70, 90):
+        p = f.priors[i]
+        assert p.position_m is not None
+        f.priors[i] = replace(p, position_m=p.position_m + np.array([25.0, -18.0, 6.0]))
+    graph, _ = fly(f)
+    assert graph.counts["position off"] >= 18
+    assert rms_m(graph, f) < 0.6
+
+
+def test_a_frozen_receiver_is_not_believed() -> None:
+    f = flight(120)
+    for i in range(60, 100):
+        f.priors[i] = replace(f.priors[i], position_m=f.priors[59].position_m)
+    graph, _ = fly(f)
+    assert graph.counts["position frozen"] == 40
+    assert rms_m(graph, f) < 0.9
+
+
+def test_a_compass_that_turns_round_is_left_out() -> None:
+    f = flight(120)
+    half = se3.so3_exp(np.array([0.0, 0.0, np.pi]))
+    for i in range(60, 120):
+        R = f.priors[i].R_world_camera
+        assert R is not None
+        f.priors[i] = replace(f.priors[i], R_world_camera=half @ R)
+    graph, pose = fly(f)
+    assert graph.counts["heading off"] == 60
+    assert rms_m(graph, f) < 0.6
+    turn = se3.so3_log(pose.T_world_camera[:3, :3] @ f.truth[-1][:3, :3].T)
+    assert np.linalg.norm(turn) < 0.03
+
+
+def test_a_compass_wrong_from_the_start_yields_to_the_track() -> None:
+    f = flight(120)
+    half = se3.so3_exp(np.array([0.0, 0.0, np.pi]))
+    for i, p in enumerate(f.priors):
+        assert p.R_world_camera is not None
+        f.priors[i] = replace(p, R_world_camera=half @ p.R_world_camera)
+    graph, pose = fly(f)
+    assert graph.counts["heading off"] > 60
+    turn = se3.so3_log(pose.T_world_camera[:3, :3] @ f.truth[-1][:3, :3].T)
+    assert np.linalg.norm(turn) < 0.05
+    assert rms_m(graph, f) < 0.8
+
+
+def test_the_attitude_of_a_wrong_frame_is_left_out() -> None:
+    f = flight(90)
+    for i in range(50, 90):  # of the body instead of the gimbal: level instead of straight down
+        R = f.priors[i].R_world_camera
+        assert R is not None
+        f.priors[i] = replace(
+            f.priors[i], R_world_camera=R @ se3.so3_exp(np.array([np.pi / 2, 0.0, 0.0]))
+        )
+    graph, _ = fly(f)
+    assert graph.counts["tilt off"] + graph.counts["heading off"] >= 40
+    assert rms_m(graph, f) < 0.6
+
+
+def test_a_hover_of_an_hour_bends_nothing() -> None:
+    f = flight(40)
+    rng = np.random.default_rng(5)
+    for _ in range(120):
+        f.truth.append(f.truth[39])
+        jitter = se3.exp(rng.multivariate_normal(np.zeros(6), f.covariance * 0.01))
+        f.odom.append(f.odom[-1] @ jitter)
+        p = f.priors[39]
+        place = f.truth[39][:3, 3] + rng.normal(size=3)
+        f.priors.append(replace(p, position_m=place, R_world_camera=f.truth[39][:3, :3]))
+    graph, _ = fly(f)
+    assert rms_m(graph, f) < 0.6
+
+
+# ---- lost vision, loops ----------------------------------------------------------------------
+
+
+def test_a_stretch_without_vision_is_bridged_and_said() -> None:
+    f, later = flight(120), flight(120, scale=0.6)
+    graph = PoseGraph(WHITE)
+    for i in range(50):
+        graph.add_keyframe(i, i * 10**9, 0, f.odom[i], f.covariance, f.priors[i])
+    for i in range(56, 120):
+        odom = later.odom[i]  # the same flight, found again in a frame of another scale
+        pose = graph.add_keyframe(i, i * 10**9, 1, odom, later.covariance, f.priors[i])
+        if i == 56:
+            assert "dead reckoning" in pose.sources and "vision" not in pose.sources
+            assert not graph.aligned
+            assert np.sqrt(pose.covariance[3, 3]) > 1.0
+    assert graph.aligned
+    assert graph.scale == pytest.approx(0.6, rel=0.02)
+    poses = graph.poses()
+    for i in (20, 49, 60, 80, 119):
+        assert np.linalg.norm(poses[i][:3, 3] - f.truth[i][:3, 3]) < 1.2
+
+
+def circle(drift_sigma: float = 0.01) -> Flight:
+    """A closed square flown one and a half times, without fixes."""
+    f = flight(61, scale=1.0, drift=drift_sigma, turn_every=10, seed=3)
+    f.priors = [blind(p, True) for p in f.priors]
+    return f
+
+
+LOOP_COVARIANCE = np.diag([5e-4**2] * 3 + [0.02**2] * 3)
+
+
+def true_loop(f: Flight, a: int, b: int) -> F64:
+    return np.asarray(se3.inverse(f.truth[a]) @ f.truth[b])
+
+
+def test_two_loops_that_agree_close_the_circle() -> None:
+    f = circle()
+    graph, _ = fly(f)
+
+    def apart() -> float:
+        poses = graph.poses()
+        moved = se3.inverse(poses[4]) @ poses[44]
+        return float(np.linalg.norm((moved - true_loop(f, 4, 44))[:3, 3]))
+
+    before = apart()
+    assert before > 0.2
+    assert not graph.add_loop(3, 43, true_loop(f, 3, 43), LOOP_COVARIANCE)
+    assert apart() == pytest.approx(before)
+    # Told the other way round, and found a little further on.
+    assert graph.add_loop(46, 6, true_loop(f, 46, 6), LOOP_COVARIANCE)
+    assert apart() < 0.15
+    assert "loop" in graph.pose(43).sources
+    assert graph.counts["loop waits"] == 1
+
+
+def test_false_loops_never_bend_the_map() -> None:
+    f = circle()
+    graph, _ = fly(f)
+    before = graph.poses()
+    rng = np.random.default_rng(1)
+    for a, b in ((2, 41), (5, 44), (12, 52), (20, 58), (3, 45)):
+        wrong = se3.exp(np.concatenate([rng.normal(size=3) * 0.1, rng.normal(size=3) * 8]))
+        assert not graph.add_loop(a, b, wrong @ true_loop(f, a, b), LOOP_COVARIANCE)
+    after = graph.poses()
+    for i in before:
+        np.testing.assert_array_equal(after[i], before[i])
+
+
+def test_wrong_calls_are_named() -> None:
+    graph = PoseGraph()
+    f = flight(3)
+    graph.add_keyframe(5, 0, 0, f.odom[0], f.covariance, f.priors[0])
+    with pytest.raises(ValueError, match="after 5"):
+        graph.add_keyframe(5, 1, 0, f.odom[1], f.covariance, f.priors[1])
+    with pytest.raises(ValueError, match=r"\(6, 6\)"):
+        graph.add_keyframe(6, 1, 0, f.odom[1], np.eye(3), f.priors[1])
+    with pytest.raises(ValueError, match="not two"):
+        graph.add_loop(5, 5, np.eye(4), np.eye(6))
+    with pytest.raises(ValueError, match="sigma_step"):
+        PoseGraphConfig(sigma_step=0.0)
