@@ -84,11 +84,15 @@ class ScanConfig:
         None, "height above ground when telemetry has none; gives the scan its scale"
     )
     keyframe_overlap: float = key(0.8, "a new keyframe when less of the last one is still seen")
+    keep_free_mib: float = key(
+        2048.0, "the oldest finished scans are deleted to keep so much of the disk; 0: never", True
+    )
     keep_debug: bool = key(False, "keep what 'skyrelief inspect' shows of every stage")
 
     def __post_init__(self) -> None:
         """Check ranges and the notation of the baseline."""
         _within("scan.base_to_height", self.base_to_height, 0.005, 1.0)
+        _within("scan.keep_free_mib", self.keep_free_mib, 0, 1e9)
         _within("scan.keyframe_overlap", self.keyframe_overlap, 0.1, 0.99)
         if self.assumed_agl_m is not None:
             _within("scan.assumed_agl_m", self.assumed_agl_m, 0.5, 10_000)
@@ -206,6 +210,27 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
     for override in overrides:
         config = _override(config, override)
     return config
+
+
+def reload(running: Config, wanted: Config) -> tuple[Config, list[str], list[str]]:
+    """``running`` with what of ``wanted`` may change live; names of the taken and the waiting.
+
+    The waiting ones differ too, but need a restart.
+    """
+    taken, waiting = [], []
+    for section, field in keys():
+        old, new = getattr(running, section), getattr(wanted, section)
+        value = getattr(new, field.name)
+        if value == getattr(old, field.name):
+            continue
+        name = f"{section}.{field.name}"
+        if not field.metadata.get("live"):
+            waiting.append(name)
+            continue
+        taken.append(name)
+        changed = dataclasses.replace(old, **{field.name: value})
+        running = dataclasses.replace(running, **{section: changed})
+    return running, taken, waiting
 
 
 def change(config: Config, name: str, value: object) -> Config:

@@ -13,15 +13,19 @@ import shutil
 import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mavlink.camera import KeyframeReport
 from mavlink.control import ACCEPTED, Answer, Handled, Phase, Power, Result, ScanStatus, Work
 from mavlink.presence import Health
 from mavlink.status import CRITICAL, INFO, WARNING
 from mavlink.vehicle import VehicleConfig, VehicleLink
-from service.config import Config, change
+from service.config import Config, change, reload
 from service.errors import InputError, OutsideError, SkyreliefError
+from service.health import HealthServer, Notifier
+from service.machine import read_machine
+from service.retention import close_open_scans, make_room
+from service.version import software
 
 if TYPE_CHECKING:
     from recon.backends import Backend
@@ -35,6 +39,10 @@ log = logging.getLogger(__name__)
 STUCK_S = 10.0
 """A scan without a processed frame for so long is reported as critical."""
 
+HUNG_S = 180.0
+"""A scan without a processed frame for so long is restarted by the watchdog; the compilers
+of the first frames may take minutes on a small board."""
+
 FIRST_RETRY_S, LAST_RETRY_S = 0.5, 10.0
 """Back-off between attempts to open a camera again."""
 
@@ -47,6 +55,7 @@ class Daemon:
         self.phase = Phase.IDLE
         self.fault = ""
         self._booted = False
+        self._started_s = time.time()
         self._scan: Scan | None = None
         self._backend: Backend | None = None
         self._camera: Camera | None = None
@@ -63,19 +72,69 @@ class Daemon:
 
     def run(self) -> None:
         """Serve until :meth:`quit`; raises InputError when the configuration cannot work."""
+        notifier = Notifier()
         self.vehicle.set_health(Health.BOOT)
         self.vehicle.start()
+        http = self._serve_health()
         try:
             self._load()
+            notifier.ready()
+            threading.Thread(target=self._tidy, name="tidy", daemon=True).start()
             if self.config.scan.start == "on-boot":
                 self.start_scan()
             was_armed = False
             while not self._quit.wait(0.25):
                 self.vehicle.set_health(self._health())
                 was_armed = self._follow_arming(was_armed)
+                if time.monotonic() - self._progress_s < HUNG_S or self.phase is not Phase.SCANNING:
+                    notifier.alive(self.phase.value)
         finally:
+            notifier.stopping()
             self._end_scan()
             self.vehicle.stop()
+            if http is not None:
+                http.close()
+
+    def _serve_health(self) -> HealthServer | None:
+        """The server of health.http; a flight goes on without it."""
+        if not self.config.health.http:
+            return None
+        try:
+            return HealthServer(self.config.health.http, self.snapshot)
+        except OutsideError as error:
+            log.error("%s", error)
+            return None
+
+    def snapshot(self) -> dict[str, Any]:
+        """How it goes, for /status and /metrics."""
+        health, status = self._health(), self.status()
+        figures = {"speed_m_s": status.speed_m_s, "distance_m": status.distance_m}
+        return {
+            "ok": health is not Health.CRITICAL,
+            "state": self.phase.value if self._booted else "starting",
+            "fault": self.fault,
+            "software": software(),
+            "scan": status.scan_id,
+            "recording_s": status.recording_ms / 1e3,
+            "machine": read_machine(Path(self.config.scan.folder)).to_dict(),
+        } | {key: value for key, value in figures.items() if math.isfinite(value)}
+
+    def reload(self, wanted: Config) -> None:
+        """Take over what of ``wanted`` may change while running; the rest waits for a restart."""
+        self.config, taken, waiting = reload(self.config, wanted)
+        if "scan.baseline" in taken and self._scan is not None:
+            self._scan.pipeline.set_baseline(self.config.scan)
+        log.info("configuration: now in force: %s", ", ".join(taken) or "nothing new")
+        if waiting:
+            log.warning("configuration: after a restart: %s", ", ".join(waiting))
+
+    def _tidy(self) -> None:
+        """Close what a crash left open, then keep the disk from filling up."""
+        folder = Path(self.config.scan.folder)
+        close_open_scans(folder, self._started_s)
+        while not self._quit.wait(10.0):
+            scan = self._scan.inputs.scan_id if self._scan is not None else ""
+            make_room(folder, self.config.scan.keep_free_mib, scan)
 
     def quit(self) -> None:
         """Close a running scan, then let :meth:`run` return."""

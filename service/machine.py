@@ -1,0 +1,119 @@
+"""The machine under us: heat, throttling, power, memory, disk, as far as it tells.
+
+Everything comes from the kernel's files, so nothing has to be installed; ``root`` stands in
+for ``/`` in tests.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+THROTTLED_NOW = 0b1111  # Raspberry Pi: under-voltage, frequency capped, throttled, soft limit
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """Readings at one moment; None where this machine does not tell."""
+
+    model: str
+    temperature_c: float | None = None  # the hottest sensor
+    throttled: bool | None = None  # right now, for heat or lack of power
+    power_w: float | None = None  # drawn in all
+    memory_free_mib: float | None = None  # available without swapping
+    resident_mib: float | None = None  # of this process
+    load: float | None = None  # runnable threads per core, 1 minute
+    disk_free_mib: float | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The readings that there are."""
+        return {key: value for key, value in asdict(self).items() if value is not None}
+
+
+def read_machine(disk: Path, root: Path = Path("/")) -> Machine:
+    """The readings now; ``disk`` is any path on the disk of the scans."""
+    return Machine(
+        model=_text(root / "proc/device-tree/model") or os.uname().machine,
+        temperature_c=_hottest(root),
+        throttled=_throttled(root),
+        power_w=_power_w(root),
+        memory_free_mib=_field_mib(root / "proc/meminfo", "MemAvailable:"),
+        resident_mib=_field_mib(root / "proc/self/status", "VmRSS:"),
+        load=_load(root),
+        disk_free_mib=_disk_free_mib(disk),
+    )
+
+
+def _hottest(root: Path) -> float | None:
+    zones = (root / "sys/class/thermal").glob("thermal_zone*/temp")
+    found = [t / 1000.0 for zone in zones if (t := _number(zone)) is not None]
+    return max((t for t in found if -40.0 < t < 150.0), default=None)
+
+
+def _throttled(root: Path) -> bool | None:
+    """Raspberry Pi's firmware word, else any cooling device of a Jetson that is at work."""
+    word = _text(root / "sys/devices/platform/soc/soc:firmware/get_throttled")
+    if word:
+        return bool(int(word, 16) & THROTTLED_NOW)
+    active = []
+    for device in (root / "sys/class/thermal").glob("cooling_device*"):
+        kind, state = _text(device / "type"), _number(device / "cur_state")
+        if state is not None and "fan" not in kind.lower():
+            active.append(state > 0)
+    return any(active) if active else None
+
+
+def _power_w(root: Path) -> float | None:
+    """Of the input rail: an INA3221 of a Jetson gives volts and amperes per channel."""
+    for sensor in (root / "sys/class/hwmon").glob("hwmon*"):
+        if "ina" not in _text(sensor / "name"):
+            continue
+        for channel in (1, 2, 3):
+            label = _text(sensor / f"in{channel}_label")
+            volts, amperes = (
+                _number(sensor / f"in{channel}_input"),
+                _number(sensor / f"curr{channel}_input"),
+            )
+            if "VDD_IN" in label and volts is not None and amperes is not None:
+                return volts * amperes / 1e6
+    return None
+
+
+def _load(root: Path) -> float | None:
+    text = _text(root / "proc/loadavg")
+    return float(text.split()[0]) / (os.cpu_count() or 1) if text else None
+
+
+def _disk_free_mib(disk: Path) -> float | None:
+    while not disk.exists() and disk != disk.parent:
+        disk = disk.parent
+    try:
+        return shutil.disk_usage(disk).free / 2**20
+    except OSError:
+        return None
+
+
+def _field_mib(path: Path, name: str) -> float | None:
+    for line in _text(path).splitlines():
+        if line.startswith(name):
+            return float(line.split()[1]) / 1024.0
+    return None
+
+
+def _number(path: Path) -> float | None:
+    text = _text(path)
+    try:
+        return float(text) if text else None
+    except ValueError:
+        return None
+
+
+def _text(path: Path) -> str:
+    """Contents without trailing zeros and blanks; empty when it cannot be read."""
+    try:
+        return path.read_text(encoding="utf-8", errors="replace").strip("\0\n ")
+    except OSError:
+        return ""

@@ -1,0 +1,220 @@
+"""What the service says of itself and of the machine, and what it keeps on the disk."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from service.config import Config, load_config, reload
+from service.errors import OutsideError
+from service.health import HealthServer, Notifier, metrics_text
+from service.machine import read_machine
+from service.retention import close_open_scans, make_room
+from service.stream.records import ScanHeader
+from service.stream.store import ScanStore
+
+FAR_FUTURE_S = 4e9
+
+
+def fetch(port: int, path: str) -> tuple[int, str]:
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=10) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+def test_http_tells_health_status_and_metrics() -> None:
+    snapshot: dict[str, Any] = {
+        "ok": True,
+        "state": "scanning",
+        "fault": "",
+        "machine": {"temperature_c": 61.5, "throttled": False},
+        "distance_m": 12,
+    }
+    server = HealthServer("127.0.0.1:0", lambda: snapshot)
+    try:
+        assert fetch(server.port, "/healthz")[0] == 200
+        assert json.loads(fetch(server.port, "/status")[1]) == snapshot
+        code, text = fetch(server.port, "/metrics?x=1")
+        assert code == 200
+        values = dict(line.split() for line in text.splitlines() if not line.startswith("#"))
+        assert values == {
+            "skyrelief_ok": "1",
+            "skyrelief_machine_temperature_c": "61.5",
+            "skyrelief_machine_throttled": "0",
+            "skyrelief_distance_m": "12",
+        }
+        snapshot |= {"ok": False, "fault": "camera lost"}
+        code, text = fetch(server.port, "/healthz")
+        assert code == 503
+        assert json.loads(text)["fault"] == "camera lost"
+        assert fetch(server.port, "/etc/passwd")[0] == 404
+        with pytest.raises(OutsideError, match="another port"):
+            HealthServer(f"127.0.0.1:{server.port}", lambda: snapshot)
+    finally:
+        server.close()
+
+
+@pytest.mark.parametrize(
+    "hostile", [b"\0" * 2000, b"GET\r\n\r\n", b"POST /status HTTP/1.1\r\n\r\n", b"GET / HTTP/9\r\n"]
+)
+def test_http_survives_hostile_bytes(hostile: bytes) -> None:
+    server = HealthServer("127.0.0.1:0", lambda: {"ok": True})
+    try:
+        with socket.create_connection(("127.0.0.1", server.port), timeout=10) as client:
+            client.sendall(hostile)
+            client.shutdown(socket.SHUT_WR)
+            while client.recv(4096):
+                pass
+        assert fetch(server.port, "/healthz")[0] == 200
+    finally:
+        server.close()
+
+
+def test_metric_names_are_plain() -> None:
+    assert metrics_text({"a b-ü": 1.5, "text": "no", "deep": {"er": {"x": 2}}}) == (
+        "# TYPE skyrelief_a_b__ gauge\nskyrelief_a_b__ 1.5\n"
+        "# TYPE skyrelief_deep_er_x gauge\nskyrelief_deep_er_x 2\n"
+    )
+
+
+def test_systemd_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(path)
+        monkeypatch.setenv("NOTIFY_SOCKET", path)
+        notifier = Notifier()
+        notifier.ready()
+        notifier.alive("scanning")
+        notifier.stopping()
+        told = [listener.recv(200).decode() for _ in range(3)]
+    assert told == ["READY=1", "WATCHDOG=1\nSTATUS=scanning", "STOPPING=1"]
+    notifier.alive()  # nobody listens any more
+    monkeypatch.delenv("NOTIFY_SOCKET")
+    Notifier().ready()
+
+
+def test_machine_of_a_raspberry_pi_and_a_jetson(tmp_path: Path) -> None:
+    def put(name: str, text: str) -> None:
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+    put("proc/device-tree/model", "Raspberry Pi 5 Model B\0")
+    put("proc/meminfo", "MemTotal: 8000000 kB\nMemAvailable:    2097152 kB\n")
+    put("proc/self/status", "Name:\tpython\nVmRSS:\t  524288 kB\n")
+    put("proc/loadavg", "3.00 2.00 1.00 1/200 999\n")
+    put("sys/class/thermal/thermal_zone0/temp", "48500\n")
+    put("sys/class/thermal/thermal_zone1/temp", "71250\n")
+    put("sys/class/thermal/thermal_zone2/temp", "-273000\n")  # a sensor that is not there
+    put("sys/devices/platform/soc/soc:firmware/get_throttled", "50000\n")  # once, not now
+    found = read_machine(tmp_path, tmp_path)
+    assert found.model == "Raspberry Pi 5 Model B"
+    assert found.temperature_c == 71.25
+    assert found.throttled is False
+    assert found.memory_free_mib == 2048.0
+    assert found.resident_mib == 512.0
+    assert found.power_w is None
+    assert "power_w" not in found.to_dict()
+    put("sys/devices/platform/soc/soc:firmware/get_throttled", "50005\n")
+    assert read_machine(tmp_path, tmp_path).throttled is True
+    shutil.rmtree(tmp_path / "sys/devices")
+    put("sys/class/thermal/cooling_device0/type", "pwm-fan\n")
+    put("sys/class/thermal/cooling_device0/cur_state", "3\n")
+    put("sys/class/thermal/cooling_device1/type", "gpu-throttle-alert\n")
+    put("sys/class/thermal/cooling_device1/cur_state", "0\n")
+    put("sys/class/hwmon/hwmon3/name", "ina3221\n")
+    put("sys/class/hwmon/hwmon3/in1_label", "VDD_IN\n")
+    put("sys/class/hwmon/hwmon3/in1_input", "5040\n")
+    put("sys/class/hwmon/hwmon3/curr1_input", "1500\n")
+    found = read_machine(tmp_path, tmp_path)
+    assert found.throttled is False
+    assert found.power_w == pytest.approx(7.56)
+
+
+def test_this_machine_can_be_read(tmp_path: Path) -> None:
+    found = read_machine(tmp_path / "not" / "yet" / "there")
+    assert found.disk_free_mib is not None
+    assert found.disk_free_mib > 0
+    assert found.resident_mib is not None
+    assert 1 < found.resident_mib < 100_000
+
+
+def scan(folder: Path, name: str, finished: bool) -> Path:
+    header = ScanHeader(
+        scan_id=name,
+        drone="d",
+        started_unix_ns=1_700_000_000_000_000_000,
+        origin_lat_deg=None,
+        origin_lon_deg=None,
+        origin_alt_amsl_m=None,
+        epsg=None,
+        camera={},
+        configuration={},
+        software="test",
+        georeference="none",
+        notes=(),
+    )
+    with ScanStore.create(folder / name / "scan.db", header) as store:
+        if finished:
+            store.finish({"frames": 1})
+    return folder / name
+
+
+def test_open_scans_are_closed_after_a_crash(tmp_path: Path) -> None:
+    left = scan(tmp_path, "20260101T000000Z", finished=False)
+    done = scan(tmp_path, "20260102T000000Z", finished=True)
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "scan.db").write_bytes(b"no database")
+    assert close_open_scans(tmp_path, before_unix_s=0.0) == []  # written since: in use
+    assert close_open_scans(tmp_path, FAR_FUTURE_S) == [left.name]
+    with ScanStore.open(left / "scan.db") as store:
+        assert store.finished
+        assert store.summary == {"interrupted": True}
+    assert json.loads((left / "scan.json").read_text())["finished"] is True
+    assert not (done / "scan.json").exists()
+    assert close_open_scans(tmp_path, FAR_FUTURE_S) == []
+
+
+class Usage(NamedTuple):
+    total: int
+    used: int
+    free: int
+
+
+def test_oldest_finished_scans_make_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [f"2026010{i}T000000Z" for i in range(1, 7)]
+    for i, name in enumerate(names):
+        scan(tmp_path, name, finished=i != 1)
+
+    def usage(_: object) -> Usage:
+        """A disk of 1000 MiB on which every scan takes 150."""
+        taken = 150 * len(list(tmp_path.iterdir()))
+        return Usage(1000 << 20, taken << 20, (1000 - taken) << 20)
+
+    monkeypatch.setattr("service.retention.shutil.disk_usage", usage)
+    assert make_room(tmp_path, 0.0) == []
+    assert make_room(tmp_path, 50.0) == []
+    assert make_room(tmp_path, 300.0, keep=names[2]) == [names[0], names[3]]
+    assert (tmp_path / names[1]).is_dir()  # still open
+    assert make_room(tmp_path, 1e6, keep=names[5]) == [names[2], names[4]]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [names[1], names[5]]
+    assert make_room(tmp_path / "none", 100.0) == []
+
+
+def test_reload_takes_what_may_change_live() -> None:
+    wanted = load_config(None, ["scan.baseline=4", "compute.labels=32"])
+    now, taken, waiting = reload(Config(), wanted)
+    assert now.scan.baseline == 4.0
+    assert now.compute.labels == Config().compute.labels
+    assert (taken, waiting) == (["scan.baseline"], ["compute.labels"])
+    assert reload(now, now) == (now, [], [])
