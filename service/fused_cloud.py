@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon.cloud_fusion import cloud_of, fuse
+from recon.free_space import seen_through
 from recon.types import PointCloud
 from recon.voxel_map import ground_sample_m
 from service.stream.store import ScanStore
@@ -33,7 +34,8 @@ class FusedCloud:
 def fused_cloud(store: ScanStore, voxel_m: float | None = None) -> FusedCloud:
     """All keyframes of ``store`` fused; voxels of the ground sample distance by default.
 
-    The store is read twice, so that memory holds one keyframe and the fused points only.
+    Points that other keyframes see through are left out. The store is read three times, so
+    that memory holds one keyframe and the fused points only.
     """
     samples, points = [], 0
     for keyframe in store.keyframes():
@@ -48,6 +50,11 @@ def fused_cloud(store: ScanStore, voxel_m: float | None = None) -> FusedCloud:
         size *= float(np.sqrt(points / LARGEST_POINTS))
         notes = (f"{points} points before fusion: voxels enlarged to {size:.3f} m",)
     cloud = fuse(_clouds(store), size)
+    if len(cloud):
+        keep = ~seen_through(cloud, (k.depth for k in store.keyframes()))
+        cloud = PointCloud(
+            cloud.xyz_m[keep], cloud.rgb[keep], cloud.sigma_m[keep], cloud.views[keep]
+        )
     return FusedCloud(cloud, size, sample, len(samples), points, notes)
 
 
