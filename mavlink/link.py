@@ -66,6 +66,8 @@ def parse_link(text: str) -> LinkSpec:
 class Port(Protocol):
     """An open link. Failures are OSErrors."""
 
+    is_quick: bool  # writing never waits, so whoever has something to send may do it
+
     def read(self) -> bytes:
         """What came; empty when nothing did within ``READ_S``."""
 
@@ -78,6 +80,8 @@ class Port(Protocol):
 
 class SerialPort:
     """A serial line."""
+
+    is_quick = False
 
     def __init__(self, spec: LinkSpec) -> None:
         import serial
@@ -108,6 +112,8 @@ class SerialPort:
 
 class UdpPort:
     """Datagrams: to a fixed place (out), or to those who were heard (in)."""
+
+    is_quick = True
 
     def __init__(self, spec: LinkSpec) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -151,6 +157,8 @@ class UdpPort:
 class TcpPort:
     """A connection to a server."""
 
+    is_quick = False
+
     def __init__(self, spec: LinkSpec) -> None:
         self._socket = socket.create_connection((spec.place, spec.number), timeout=3.0)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -175,6 +183,8 @@ class TcpPort:
 
 class TcpServerPort:
     """A server for a few clients at once."""
+
+    is_quick = False
 
     def __init__(self, spec: LinkSpec) -> None:
         self._server = socket.create_server((spec.place, spec.number))
@@ -277,7 +287,12 @@ class Link:
             thread.join(timeout=5.0)
 
     def write(self, data: bytes) -> None:
-        """Queue data; never blocks. The oldest give way on a link that does not take them."""
+        """Send or queue data; never waits. The oldest give way on a link that takes nothing."""
+        port = self._port
+        if port is not None and port.is_quick:
+            port.write(data)
+            self.sent_bytes += len(data)
+            return
         with self._wake:
             self._waiting.append(data)
             while self._port is None and len(self._waiting) > KEPT_WHILE_DOWN:

@@ -47,6 +47,8 @@ class Recorder:
 
     def write(self, packet: bytes, monotonic_ns: int) -> None:
         """Keep one packet."""
+        if self._file is None:
+            return
         with self._lock:
             if self._file is None:
                 return

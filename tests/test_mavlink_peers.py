@@ -66,7 +66,12 @@ class Daemon:
     def __enter__(self) -> Daemon:
         self.link.start()
         self._thread.start()
+        listening = [r for r in self.link.report().links if r.name.startswith(("udpin", "tcpin"))]
+        until(lambda: all(self._is_up(r.name) for r in listening))
         return self
+
+    def _is_up(self, name: str) -> bool:
+        return any(r.is_up for r in self.link.report().links if r.name == name)
 
     def __exit__(self, *_: object) -> None:
         self._stop.set()

@@ -21,6 +21,7 @@ from typing import Any
 BENCHMARKS: dict[str, str] = {
     "stereo": "service.bench.stereo:run",
     "upsample": "service.bench.upsample:run",
+    "mavlink": "service.bench.mavlink:run",
 }
 """Name to ``module:function``; imported when it runs."""
 
