@@ -165,7 +165,7 @@ def _epoch(
     elif source.epoch_unix_ns is not None:
         epoch_ns = source.epoch_unix_ns
     elif log is not None:
-        epoch_ns = log.first_ns
+        epoch_ns = round(log.first_ns / 1e6) * 10**6  # autopilots count whole milliseconds
         notes.append("the video does not say when it began: taken as the start of the log")
     else:
         epoch_ns = time.time_ns()

@@ -1,0 +1,227 @@
+"""The main job end to end on a small simulated flight, and what it says to bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pytest
+
+pytest.importorskip("open3d", reason="the simulator needs Open3D (extra 'ground')")
+
+EPOCH = 1777629600  # of the simulated video; a transport stream does not carry it
+
+Run = subprocess.CompletedProcess[str]
+
+
+def skyrelief(*arguments: str | Path, stdin: Any = subprocess.DEVNULL) -> Run:
+    command = [sys.executable, "-m", "service.cli", *map(str, arguments)]
+    return subprocess.run(command, stdin=stdin, capture_output=True, text=True, timeout=240)
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated nadir flight of 8 s."""
+    folder = tmp_path_factory.mktemp("sim") / "flight"
+    made = skyrelief(
+        "simulate", "--out", folder, "--size", "480x270", "--fps", "5", "--duration-s", "8",
+        "--height-m", "40", "--speed-m-s", "6", "--seed", "3",
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr
+    return folder
+
+
+def replay_of(flight: Path, out: Path, *more: str | Path) -> Run:
+    return skyrelief(
+        "replay", flight / "flight.mp4", "--telemetry", flight / "flight.tlog",
+        "--camera-model", flight / "camera.yaml", "--out", out, "--json", *more,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scan(flight: Path) -> tuple[Path, dict[str, Any]]:
+    """The flight replayed with telemetry."""
+    out = flight.parent / "scan"
+    done = replay_of(flight, out)
+    assert done.returncode == 0, done.stderr
+    return out, json.loads(done.stdout.splitlines()[-1])
+
+
+def score(scan: Path, flight: Path) -> dict[str, Any]:
+    done = skyrelief("score", scan, flight, "--json")
+    assert done.returncode == 0, done.stderr
+    report: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return report
+
+
+def points(folder: Path) -> Any:
+    return np.asarray(laspy.read(folder / "cloud.laz").xyz)
+
+
+def test_a_flight_becomes_a_georeferenced_cloud(scan: tuple[Path, dict[str, Any]]) -> None:
+    folder, summary = scan
+    assert summary["frames"] == 40 and summary["frames_tagged"] == 40
+    assert summary["clouds"] >= 8 and summary["georeference"] == "gnss"
+    for name in ("scan.json", "scan.db", "cloud.laz", "trajectory.tum", "trajectory.csv"):
+        assert (folder / name).stat().st_size > 0
+    with laspy.open(folder / "cloud.laz") as cloud:
+        names = set(cloud.header.point_format.dimension_names)
+        crs = cloud.header.parse_crs()
+    assert {"red", "green", "blue", "sigma_m", "views"} <= names
+    assert crs is not None and crs.to_epsg() == summary["epsg"] == 32632
+
+
+def test_the_cloud_is_close_to_the_truth(scan: tuple[Path, dict[str, Any]], flight: Path) -> None:
+    report = score(scan[0], flight)
+    text = json.dumps(report)
+    assert report["surface"]["rigid"]["median_m"] < 0.006 * 40.0, text
+    assert report["completeness"]["share"] > 0.8, text
+    assert report["trajectory"]["raw"]["rms_m"] < 4.0, text
+
+
+def test_without_telemetry_it_still_reconstructs(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "scan"
+    done = skyrelief(
+        "replay", flight / "flight.mp4", "--camera-model", flight / "camera.yaml",
+        "--out", out, "--json",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout.splitlines()[-1])
+    assert summary["georeference"] == "none" and summary["epsg"] is None
+    assert any("scale" in warning for warning in summary["warnings"])
+    report = score(out, flight)
+    assert report["surface"]["similarity"]["median_m"] < 0.006 * 40.0
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
+def test_a_pipe_gives_the_same_cloud_as_the_file(
+    flight: Path, scan: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    muxed = subprocess.Popen(
+        ["ffmpeg", "-loglevel", "error", "-i", str(flight / "flight.mp4"),
+         "-c", "copy", "-f", "mpegts", "-"],
+        stdout=subprocess.PIPE, stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+    done = skyrelief(
+        "replay", "-", "--telemetry", flight / "flight.tlog", "--camera-model",
+        flight / "camera.yaml", "--out", tmp_path / "scan", "--json",
+        "--video-epoch", str(EPOCH), stdin=muxed.stdout,
+    )  # fmt: skip
+    muxed.wait(timeout=20)
+    assert done.returncode == 0, done.stderr
+    np.testing.assert_array_equal(points(tmp_path / "scan"), points(scan[0]))
+
+
+def test_a_second_run_into_the_same_folder_is_refused(
+    flight: Path, scan: tuple[Path, dict[str, Any]]
+) -> None:
+    before = points(scan[0])
+    again = replay_of(flight, scan[0])
+    assert again.returncode == 2 and "already holds a scan" in again.stderr
+    np.testing.assert_array_equal(points(scan[0]), before)
+
+
+def test_an_interrupt_closes_the_scan(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "scan"
+    command = [
+        sys.executable, "-m", "service.cli", "replay", str(flight / "flight.mp4"),
+        "--camera-model", str(flight / "camera.yaml"), "--out", str(out), "--realtime", "--json",
+    ]  # fmt: skip
+    running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    while not (out / "scan.db").exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    time.sleep(2.0)
+    running.send_signal(signal.SIGINT)
+    stdout, stderr = running.communicate(timeout=60)
+    assert running.returncode == 0, stderr
+    summary = json.loads(stdout.splitlines()[-1])
+    assert summary["finished"] is True
+    assert (out / "cloud.laz").exists() and (out / "preview.jpg").exists()
+
+
+def bad_inputs(flight: Path, tmp: Path) -> dict[str, tuple[list[str | Path], str]]:
+    """Name to (arguments, what the message must say)."""
+    (tmp / "empty.mp4").touch()
+    (tmp / "text.mp4").write_text("this is not a video\n" * 50)
+    model = (flight / "camera.yaml").read_text()
+    (tmp / "small.yaml").write_text(model.replace("image_width: 480", "image_width: 640"))
+    (tmp / "negative.yaml").write_text(model.replace("360.0", "-360.0"))
+    (tmp / "nan.yaml").write_text(model.replace("360.0", ".nan"))
+    (tmp / "file").write_text("in the way")
+    video, camera = flight / "flight.mp4", flight / "camera.yaml"
+    log = flight / "flight.tlog"
+    return {
+        "no such file": (["no-such.mp4"], "no such file"),
+        "empty file": ([tmp / "empty.mp4"], "empty"),
+        "not a video": ([tmp / "text.mp4"], "text.mp4"),
+        "model of another size": ([video, "--camera-model", tmp / "small.yaml"], "640x270"),
+        "negative focal length": ([video, "--camera-model", tmp / "negative.yaml"], "positive"),
+        "NaN in the model": ([video, "--camera-model", tmp / "nan.yaml"], "finite"),
+        "no such log": ([video, "--telemetry", tmp / "none.tlog"], "none.tlog"),
+        "log of another day": (
+            [video, "--camera-model", camera, "--telemetry", log, "--video-epoch", "1000000000"],
+            "do not overlap",
+        ),
+        "unwritable folder": (
+            [video, "--camera-model", camera, "--out", tmp / "file" / "scan"],
+            "file",
+        ),
+        "unknown key": ([video, "--set", "scan.basline=2"], "baseline"),
+        "unknown backend": ([video, "--backend", "abacus"], "abacus"),
+    }
+
+
+CASES = (
+    "no such file", "empty file", "not a video", "model of another size",
+    "negative focal length", "NaN in the model", "no such log", "log of another day",
+    "unwritable folder", "unknown key", "unknown backend",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bad_input_gets_one_line_and_exit_code_two(
+    case: str, flight: Path, tmp_path: Path
+) -> None:
+    arguments, words = bad_inputs(flight, tmp_path)[case]
+    more = [] if "--out" in arguments else ["--out", tmp_path / "scan"]
+    done = skyrelief("replay", *arguments, *more)
+    last = done.stderr.strip().splitlines()[-1]
+    assert done.returncode == 2, done.stderr
+    assert last.startswith("skyrelief: ") and words in last, last
+    assert "Traceback" not in done.stderr
+
+
+def test_damaged_input_gives_a_smaller_scan_with_a_warning(flight: Path, tmp_path: Path) -> None:
+    """Telemetry with bytes knocked out of it, and a transport stream cut in the middle."""
+    log = bytearray((flight / "flight.tlog").read_bytes())
+    rng = np.random.default_rng(0)
+    for at in rng.integers(0, len(log), 40):
+        log[at] ^= 0xFF
+    (tmp_path / "damaged.tlog").write_bytes(log)
+    done = skyrelief(
+        "replay", flight / "flight.mp4", "--telemetry", tmp_path / "damaged.tlog",
+        "--camera-model", flight / "camera.yaml", "--out", tmp_path / "scan", "--json",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout.splitlines()[-1])
+    assert summary["frames_tagged"] >= 38
+    assert any("checksum" in w or "skipped" in w for w in summary["warnings"]), summary["warnings"]
+
+
+def test_an_unreadable_folder_loses_nothing(flight: Path, tmp_path: Path) -> None:
+    if os.geteuid() == 0:
+        pytest.skip("root may write everywhere")
+    closed = tmp_path / "closed"
+    closed.mkdir(mode=0o500)
+    done = replay_of(flight, closed / "scan")
+    assert done.returncode == 2 and "closed" in done.stderr
