@@ -28,6 +28,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "calibrate": ("service.commands.calibrate:calibrate", "Camera model from a chessboard."),
     "stereo": ("service.commands.stereo:stereo", "The stereo stage alone."),
     "config": ("service.commands.config:config", "Check, show or print the configuration."),
+    "doctor": ("service.commands.doctor:doctor", "What works here, what does not."),
     "bench": ("service.commands.bench:bench", "Benchmarks, each against a peer."),
 }
 """Name to (``module:function``, one line of help). The next command is one file, one line."""

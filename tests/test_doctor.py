@@ -1,0 +1,121 @@
+"""The doctor tells what works and what does not, and never fails itself."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from service.config import load_config
+from service.diagnosis import BAD, GOOD, NOTE, examine
+
+DEMO = Path(__file__).resolve().parents[1] / "demo" / "caliterra"
+
+
+def free_udp_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def findings(*overrides: str, listen_s: float = 0.1) -> dict[str, tuple[str, str]]:
+    found = examine(load_config(None, ["compute.backend=cpu", *overrides]), listen_s)
+    return {f.what: (f.verdict, f.text) for f in found}
+
+
+def test_everything_in_order(tmp_path: Path) -> None:
+    port = free_udp_port()
+    ended = threading.Event()
+
+    def autopilot() -> None:
+        sender = dialect.MAVLink(None, srcSystem=7, srcComponent=1)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            while not ended.wait(0.05):
+                message: Any = sender.heartbeat_encode(2, 3, 0, 0, 4)
+                out.sendto(message.pack(sender), ("127.0.0.1", port))
+
+    thread = threading.Thread(target=autopilot, daemon=True)
+    thread.start()
+    with socket.create_server(("127.0.0.1", 0)) as ground:
+        found = findings(
+            f"scan.folder={tmp_path / 'scans'}",
+            f"camera.source={DEMO / 'frames'}",
+            f"camera.model={DEMO / 'camera.yaml'}",
+            f"mavlink.links=udpin:127.0.0.1:{port}",
+            f"datalink.connect=tcp/127.0.0.1:{ground.getsockname()[1]}",
+            listen_s=1.0,
+        )
+    ended.set()
+    thread.join()
+    assert "system 7" in found["mavlink"][1]
+    assert "1600x1200" in found["camera"][1]
+    assert {what for what, (verdict, _) in found.items() if verdict == BAD} == set()
+    for what in ("python", "packages", "scans", "compute", "camera", "mavlink", "datalink"):
+        assert found[what][0] == GOOD, found[what]
+
+
+def test_what_is_missing_is_told(tmp_path: Path) -> None:
+    found = findings(
+        f"scan.folder={tmp_path}",
+        f"camera.source={tmp_path / 'none.mp4'}",
+        f"camera.model={tmp_path / 'none.yaml'}",
+        f"mavlink.links=udpin:127.0.0.1:{free_udp_port()}",
+        f"datalink.connect=tcp/127.0.0.1:{free_udp_port()}",
+    )
+    assert found["camera"] == (BAD, f"no such file or folder: {tmp_path / 'none.mp4'}")
+    assert found["camera model"][0] == BAD
+    assert found["mavlink"][0] == BAD
+    assert "silent" in found["mavlink"][1]
+    assert found["datalink"][0] == NOTE
+    bare = findings(f"scan.folder={tmp_path}")
+    for what in ("camera", "camera model", "mavlink", "datalink"):
+        assert bare[what][0] == NOTE
+    assert findings("mavlink.links=modem:1")["mavlink"][0] == BAD
+
+
+def test_camera_model_of_another_size_is_told(tmp_path: Path) -> None:
+    model = tmp_path / "camera.yaml"
+    model.write_text((DEMO / "camera.yaml").read_text().replace("1600", "800", 1))
+    found = findings(
+        f"scan.folder={tmp_path}", f"camera.source={DEMO / 'frames'}", f"camera.model={model}"
+    )
+    assert found["camera"][0] == BAD
+    assert "calibrate at 1600x1200" in found["camera"][1]
+
+
+def test_foreign_package_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.diagnosis._parent", lambda name: f"/somewhere/{name}")
+    assert "hides one of ours" in findings()["packages"][1]
+
+
+def test_command_line(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "service.cli",
+            "doctor",
+            "--json",
+            "--set",
+            f"scan.folder={tmp_path}",
+            "--set",
+            "compute.backend=cpu",
+            "--set",
+            f"camera.source={tmp_path / 'no'}",
+        ],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    assert done.returncode == 3
+    report = json.loads(done.stdout.splitlines()[-1])
+    assert report["ok"] is False
+    assert "not ready to fly: camera" in done.stderr.splitlines()[-1]
