@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as dialect
+from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 
 from service.config import load_config
 from service.diagnosis import BAD, GOOD, NOTE, examine
@@ -82,7 +82,9 @@ def test_what_is_missing_is_told(tmp_path: Path) -> None:
 
 def test_camera_model_of_another_size_is_told(tmp_path: Path) -> None:
     model = tmp_path / "camera.yaml"
-    model.write_text((DEMO / "camera.yaml").read_text().replace("1600", "800", 1))
+    model.write_text(
+        (DEMO / "camera.yaml").read_text().replace("image_width: 1600", "image_width: 800")
+    )
     found = findings(
         f"scan.folder={tmp_path}", f"camera.source={DEMO / 'frames'}", f"camera.model={model}"
     )
