@@ -21,7 +21,7 @@ pytest.importorskip("websockets")
 
 from recon import se3
 from service.errors import InputError, OutsideError
-from service.ground.http import Portal, PortalConfig, parse_address
+from service.ground.http import Portal, PortalConfig, open_portal, parse_address
 from service.ground.library import Library
 from service.ground.live import SIGMA_STEP_M, LiveFeed, StoreIndex
 from service.scan_folder import write_deliverables
@@ -406,3 +406,36 @@ def test_a_moved_keyframe_carries_its_points(house: HouseFlight) -> None:
     assert flat.sum() > 10_000
     T = se3.inverse(house.pose(5.0))
     assert np.abs(se3.transform(T, xyz)[flat, 2] - 40.0).max() < 0.01
+
+
+def test_the_ground_command_serves_the_portal(store: Path, tmp_path: Path) -> None:
+    import subprocess
+    import sys
+
+    (tmp_path / "token").write_text(TOKEN + "\n")
+    command = f"ground --listen tcp/127.0.0.1:0 --store {store} --portal 127.0.0.1:0"
+    command += f" --portal-token {tmp_path / 'token'}"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "service.cli", *command.split()], stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stderr is not None
+        line = next(line for line in process.stderr if line.startswith("portal: "))
+        base = line.split()[1].split("/?")[0]
+        with urllib.request.urlopen(f"{base}/api/scans", timeout=10) as answer:
+            assert [s["scan"] for s in json.load(answer)] == ["test-1"]
+    finally:
+        process.terminate()
+        process.communicate(timeout=30)
+    assert process.returncode == 0
+
+
+def test_unfit_tokens_and_certificates_are_said(store: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty").write_text("\n")
+    for options in (
+        {"token_file": tmp_path / "none"},
+        {"token_file": tmp_path / "empty"},
+        {"tls": (tmp_path / "a.crt", tmp_path / "a.key")},
+    ):
+        with pytest.raises(InputError):
+            open_portal("127.0.0.1:0", store, **options)  # type: ignore[arg-type]

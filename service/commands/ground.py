@@ -12,7 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from service.errors import OutsideError
+
 if TYPE_CHECKING:
+    from service.ground.http import Portal
     from service.ground.receiver import Receiver
     from service.stream.radio_link import RadioLink
 
@@ -45,6 +48,15 @@ def ground(
     ] = None,
     refresh_s: Annotated[
         float | None, typer.Option(help="write clouds of growing scans so often")
+    ] = None,
+    portal: Annotated[
+        str | None, typer.Option(help="serve the web portal at HOST:PORT, such as 127.0.0.1:8080")
+    ] = None,
+    portal_token: Annotated[
+        Path | None, typer.Option(help="file with the portal's token; default: one is made")
+    ] = None,
+    portal_tls: Annotated[
+        tuple[Path, Path] | None, typer.Option(help="the portal's certificate and key")
     ] = None,
     once: Annotated[bool, typer.Option("--once", help="end when a scan is complete")] = False,
     idle_exit_s: Annotated[
@@ -81,14 +93,38 @@ def ground(
     print(f"ground station at {where}, scans in {store}", file=sys.stderr, flush=True)
     for radio in radios:
         radio.start()
+    page = None
     try:
+        if portal is not None:
+            page = _open_portal(portal, receiver, store, portal_token, portal_tls)
         _watch(receiver, radios, once, idle_exit_s)
         entries = receiver.progress()
     finally:
+        if page is not None:
+            page.close()
         for radio in radios:
             radio.close()
         receiver.close()
     _report(entries, receiver.dropped, as_json)
+
+
+def _open_portal(
+    address: str,
+    receiver: Receiver,
+    store: Path,
+    token: Path | None,
+    tls: tuple[Path, Path] | None,
+) -> Portal:
+    """The portal, started; its address is printed."""
+    try:
+        from service.ground.http import open_portal
+    except ModuleNotFoundError as error:
+        raise OutsideError(
+            f"the portal needs the package {error.name}; pip install 'skyrelief[ground]'"
+        ) from error
+    page = open_portal(address, store, receiver.progress, token, tls)
+    print(f"portal: {page.url}", file=sys.stderr, flush=True)
+    return page
 
 
 def _watch(

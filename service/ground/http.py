@@ -386,3 +386,33 @@ async def _until_gone(socket: WebSocket) -> None:
     with contextlib.suppress(WebSocketDisconnect, RuntimeError):
         while (await socket.receive())["type"] != "websocket.disconnect":
             pass
+
+
+def open_portal(
+    address: str,
+    store: Path,
+    progress: Callable[[], list[dict[str, Any]]] | None = None,
+    token_file: Path | None = None,
+    tls: tuple[Path, Path] | None = None,
+) -> Portal:
+    """A started portal at ``HOST:PORT`` on the scans below ``store``.
+
+    ``token_file`` holds the token; without it one is made, on this machine only. ``tls`` are
+    certificate and key. Raises InputError or OutsideError, in one line.
+    """
+    host, port = parse_address(address)
+    token = ""
+    if token_file is not None:
+        try:
+            token = token_file.read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"portal token {token_file} cannot be read ({error})") from error
+        if not token:
+            raise InputError(f"portal token {token_file} is empty")
+    for path in tls or ():
+        if not path.is_file():
+            raise InputError(f"portal certificate {path}: no such file")
+    certificate, key = (str(path) for path in tls) if tls else ("", "")
+    portal = Portal(PortalConfig(store, host, port, token, certificate, key), progress)
+    portal.start()
+    return portal
