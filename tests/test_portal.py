@@ -438,4 +438,4 @@ def test_unfit_tokens_and_certificates_are_said(store: Path, tmp_path: Path) -> 
         {"tls": (tmp_path / "a.crt", tmp_path / "a.key")},
     ):
         with pytest.raises(InputError):
-            open_portal("127.0.0.1:0", store, **options)  # type: ignore[arg-type]
+            open_portal("127.0.0.1:0", store, **options)
