@@ -88,11 +88,13 @@ def believe(left: U8, px: F32, confidence: F32, config: BeliefPropagationConfig)
     ``px`` and ``confidence`` are changed in place. Every backend ends with this.
     """
     if config.min_contrast > 0:
-        px[_contrast(left) < config.min_contrast] = np.nan
+        confidence[_contrast(left) < config.min_contrast] = 0
     if config.occlusion_tolerance >= 0:
         check_visibility(
             px, confidence, config.min_disparity, config.occlusion_tolerance, config.fill_occluded
         )
+    else:
+        px[confidence <= 0] = np.nan
     if config.speckle_px > 0:
         _drop_speckles(px, config.speckle_px)
     confidence[np.isnan(px)] = 0

@@ -34,13 +34,13 @@ _NOISE = 0.2 * COST_UNIT
 def select(
     data: I16, messages: I16, cost: I16, min_disparity: int, truncation: int, min_evidence: float
 ) -> tuple[F32, F32]:
-    """Real-valued labels (h, w), NaN where not believed, and their confidence, 0 to 1.
+    """Real-valued labels (h, w) and their confidence, 0 to 1; 0 where not believed.
 
     ``data`` and ``messages`` come from :func:`recon.message_passing.propagate` for ``cost``
     (h, L, w). Evidence is how far the winner's cost lies below the mean over the labels that
-    are seen, relative to that mean: about 0.1 for unrelated images, 0.6 for texture. Unknown
-    are winners with less than ``min_evidence``, those that tie with another label, and those
-    whose partner lies outside the right image.
+    are seen, relative to that mean: about 0.1 for unrelated images, 0.6 for texture. Not
+    believed are winners with less than ``min_evidence`` and those that tie with another
+    label. NaN are those whose partner lies outside the right image.
     """
     height, _, width = cost.shape
     px = np.empty((height, width), np.float32)
@@ -54,8 +54,11 @@ def check_visibility(
 ) -> None:
     """NaN, in place, where the right view would see a nearer surface (by ``tolerance`` labels).
 
-    With ``fill`` such a pixel takes the farther of the nearest known labels of its row, at
-    ``FILLED_CONFIDENCE``, unless its partner would lie outside the right image.
+    Only believed labels (confidence above 0) hide others. With ``fill`` a hidden pixel takes
+    the farther of the nearest believed labels of its row, at ``FILLED_CONFIDENCE``, unless its
+    partner would lie outside the right image; so does an unknown strip to the left of a nearer
+    surface that is no wider than the step in disparity. What is neither believed nor filled
+    becomes NaN.
     """
     _check_visibility(px, confidence, min_disparity, tolerance, fill)
 
@@ -179,11 +182,12 @@ def _select(
                     partner = u - label - min_disparity
                     evidence = (mean[u] - box[label, u]) / (mean[u] + window * np.float32(_NOISE))
                     margin = np.float32(second[i] - low[i]) / np.float32(2 * truncation)
-                    if partner < 0 or partner >= width or margin <= 0 or evidence < min_evidence:
+                    confidence[v, u] = 0
+                    if partner < 0 or partner >= width:
                         px[v, u] = np.nan
-                        confidence[v, u] = 0
-                    else:
-                        px[v, u] = np.float32(label) + _offset(box, label, u)
+                        continue
+                    px[v, u] = np.float32(label) + _offset(box, label, u)
+                    if margin > 0 and (evidence >= min_evidence or min_evidence <= 0):
                         sure = max(evidence, np.float32(0.01)) / np.float32(SURE_EVIDENCE)
                         confidence[v, u] = min(np.float32(1), margin) * min(np.float32(1), sure)
 
@@ -198,7 +202,7 @@ def _check_visibility(
         nearest = np.full(width, np.float32(-np.inf), np.float32)
         hidden = np.zeros(width, np.bool_)
         for u in range(width):
-            if not np.isnan(row[u]):
+            if confidence[v, u] > 0:
                 partner = u - int(row[u] + np.float32(0.5)) - min_disparity
                 if 0 <= partner < width:
                     nearest[partner] = max(nearest[partner], row[u])
@@ -207,11 +211,25 @@ def _check_visibility(
                 partner = u - int(row[u] + np.float32(0.5)) - min_disparity
                 hidden[u] = 0 <= partner < width and nearest[partner] > row[u] + tolerance
         for u in range(width):
-            if hidden[u]:
+            if hidden[u] or confidence[v, u] <= 0:
                 row[u] = np.nan
                 confidence[v, u] = 0
         if fill:
+            _mark_strips(row, hidden, tolerance)
             _fill_row(row, confidence[v], hidden, min_disparity)
+
+
+@njit(cache=True, nogil=True)
+def _mark_strips(row: Any, hidden: Any, tolerance: float) -> None:  # pragma: no cover - compiled
+    """Also hidden: an unknown strip left of a nearer surface, no wider than the step hides."""
+    last = -1
+    for u in range(row.shape[0]):
+        if not np.isnan(row[u]):
+            if 0 <= last < u - 1:
+                step = row[u] - row[last]
+                if step > tolerance and u - last - 1 <= step + 2:
+                    hidden[last + 1 : u] = True
+            last = u
 
 
 @njit(cache=True, nogil=True)

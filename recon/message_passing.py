@@ -124,7 +124,7 @@ def propagate(
         pyramid.append(_coarser(pyramid[-1], w, cells_of(w), truncation))
     messages = np.zeros((4, 1, 2, pyramid[0].shape[2], 1), np.int16)
     for data, weight in zip(reversed(pyramid), reversed(weights), strict=True):
-        messages = _start(messages, data)
+        messages = _start(messages, data, weight.shape[2])
         edges = _edges(weight, data.shape[3], smoothness.slope, truncation)
         bands = max(1, min(get_num_threads(), data.shape[0] // (2 * iterations)))
         _sweeps(data, messages, edges, weight.shape[2], iterations, bands)
@@ -195,7 +195,7 @@ def _coarser(
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _start(coarse: Any, data: Any) -> Any:  # pragma: no cover - compiled
+def _start(coarse: Any, data: Any, width: int) -> Any:  # pragma: no cover - compiled
     """The messages that a level starts from: those of the coarser cells that it divides.
 
     Only the colour that the first sweep reads is filled; the sweep writes the other.
@@ -219,6 +219,7 @@ def _start(coarse: Any, data: Any) -> Any:  # pragma: no cover - compiled
                 for i in range(cells // 2):
                     out[2 * i] = even[i]
                     out[2 * i + 1] = odd[i]
+                out[(width + 1 - parity) // 2 :] = 0
     return messages
 
 

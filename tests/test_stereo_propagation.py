@@ -1,0 +1,295 @@
+"""Belief propagation: exact against plain NumPy, and right on surfaces that are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.backends import reference
+from recon.belief_propagation import BeliefPropagationConfig, belief_propagation
+from recon.matching_cost import COST_UNIT, MatchingCostConfig, census, matching_cost
+from recon.message_passing import propagate
+from recon.types import F64, U8, Array
+
+BELIEVE_ALL = BeliefPropagationConfig(
+    min_evidence=0, min_contrast=0, occlusion_tolerance=-1, speckle_px=0
+)
+
+
+def texture(height: int, width: int, seed: int = 0, blur: float = 1.2) -> F64:
+    """Band-limited noise of mean 128 and deviation 40."""
+    noise = cv2.GaussianBlur(
+        np.random.default_rng(seed).normal(0, 1, (height, width)), (0, 0), blur
+    )
+    return np.asarray(128 + 40 * noise / noise.std())
+
+
+def grey(image: Array) -> U8:
+    """Rounded to 8 bits."""
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def shifted_pair(disparity: F64, seed: int = 0, blur: float = 1.2) -> tuple[U8, U8]:
+    """Left and right view of a texture on a surface of this disparity (h, w)."""
+    height, width = disparity.shape
+    margin = 80
+    canvas = texture(height, width + 2 * margin, seed, blur).astype(np.float32)
+    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    x = (u - disparity + margin).astype(np.float32)
+    left = cv2.remap(canvas, x, v, cv2.INTER_LANCZOS4)
+    return grey(left), grey(canvas[:, margin : margin + width])
+
+
+def beliefs_of(data: Array, messages: Array, width: int) -> Array:
+    """(h, w, L) beliefs from the compiled layout, assembled cell by cell."""
+    height, _, labels, _ = data.shape
+    out = np.zeros((height, width, labels), np.int64)
+    for v in range(height):
+        for u in range(width):
+            out[v, u] = data[v, u & 1, :, u // 2]
+            out[v, u] += messages[0, v + 2, u & 1, :, u // 2]
+            out[v, u] += messages[1, v, u & 1, :, u // 2]
+            if u + 1 < width:
+                out[v, u] += messages[2, v + 1, (u + 1) & 1, :, (u + 1) // 2]
+            if u > 0:
+                out[v, u] += messages[3, v + 1, (u - 1) & 1, :, (u - 1) // 2]
+    return out
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "labels", "iterations", "levels"),
+    [
+        (1, 1, 2, 5, 5), (1, 9, 3, 2, 3), (9, 1, 3, 2, 3), (23, 37, 5, 5, 5),
+        (24, 64, 16, 5, 4), (33, 65, 7, 1, 2), (45, 130, 4, 3, 5), (40, 66, 33, 4, 1),
+    ],
+)  # fmt: skip
+def test_beliefs_equal_the_reference(
+    height: int, width: int, labels: int, iterations: int, levels: int
+) -> None:
+    rng = np.random.default_rng(height * width)
+    cost = rng.integers(0, 1200, (height, labels, width)).astype(np.int16)
+    image = rng.integers(0, 256, (height, width), np.uint8)
+    smoothness = BeliefPropagationConfig(edge_floor=0.3).smoothness
+    got = beliefs_of(*propagate(cost, image, iterations, levels, smoothness), width)
+    want = reference.beliefs(cost, image, iterations, levels, smoothness)
+    np.testing.assert_array_equal(got, want)
+
+
+def test_one_row_finds_the_exact_minimum_of_the_energy() -> None:
+    """On a chain, min-sum is exact once messages crossed it: compare with dynamic programming."""
+    rng = np.random.default_rng(5)
+    width, labels = 24, 6
+    cost = rng.integers(0, 700, (1, labels, width)).astype(np.int16)
+    image = np.full((1, width), 90, np.uint8)
+    config = BeliefPropagationConfig()
+    belief = reference.beliefs(cost, image, 60, 1, config.smoothness)
+    data, messages = propagate(cost, image, 60, 1, config.smoothness)
+    step = abs(np.arange(labels)[:, None] - np.arange(labels)[None, :])
+    price = np.minimum(step * COST_UNIT, config.truncation)
+    best = cost[0, :, 0].astype(np.int64)
+    trace = []
+    for u in range(1, width):
+        options = best[None, :] + price
+        trace.append(options.argmin(axis=1))
+        best = options.min(axis=1) + cost[0, :, u]
+    path = [int(best.argmin())]
+    for back in reversed(trace):
+        path.append(int(back[path[-1]]))
+    np.testing.assert_array_equal(belief[0].argmin(axis=1), path[::-1])
+    np.testing.assert_array_equal(beliefs_of(data, messages, width)[0].argmin(axis=1), path[::-1])
+
+
+def test_census_against_its_definition() -> None:
+    image = np.random.default_rng(1).integers(0, 256, (12, 15), np.uint8)
+    words = census(image)
+    padded = np.pad(image, 3, mode="edge").astype(int)
+    for v, u in ((0, 0), (5, 7), (11, 14), (3, 0)):
+        window = padded[v : v + 7, u : u + 7].ravel()
+        bits = np.delete(window < int(image[v, u]), 24)
+        assert int(words[v, u]) == int("".join("1" if b else "0" for b in bits), 2)
+
+
+@pytest.mark.parametrize("min_disparity", [0, 3, -4, 40, -40])
+def test_matching_cost_against_its_definition(min_disparity: int) -> None:
+    rng = np.random.default_rng(2)
+    left, right = rng.integers(0, 256, (2, 9, 22), np.uint8)
+    config = MatchingCostConfig()
+    cost = matching_cost(left, right, 6, config, min_disparity)
+    words_left, words_right = census(left), census(right)
+    weights = [round(w * COST_UNIT) for w in (config.census_weight, config.difference_weight)]
+    for v in range(9):
+        for u in range(22):
+            seen = {}
+            for label in range(6):
+                x = u - label - min_disparity
+                if 0 <= x < 22:
+                    bits = bin(int(words_left[v, u]) ^ int(words_right[v, x])).count("1")
+                    grey_step = abs(int(left[v, u]) - int(right[v, x]))
+                    seen[label] = (
+                        min(bits, config.census_truncation) * weights[0]
+                        + min(grey_step, config.difference_truncation) * weights[1]
+                    )
+            unseen = min(seen.values()) + round(config.unseen * COST_UNIT) if seen else 0
+            want = [seen.get(label, unseen) for label in range(6)]
+            assert cost[v, :, u].tolist() == want
+
+
+@pytest.mark.parametrize(("labels", "top"), [(16, 12.0), (32, 27.0), (64, 57.0), (5, 3.4)])
+def test_slanted_plane_to_a_tenth_of_a_pixel(labels: int, top: float) -> None:
+    height, width = 90, 200
+    truth = np.tile(np.linspace(1.0, top, width), (height, 1))
+    found = belief_propagation(*shifted_pair(truth), labels, BeliefPropagationConfig())
+    inner = np.zeros(truth.shape, np.bool_)
+    inner[:, 8:-8] = np.arange(8, width - 8) - truth[0, 8:-8] > 4
+    error = (found.px - truth)[inner]
+    assert np.isfinite(error).mean() > 0.93
+    error = error[np.isfinite(error)]
+    assert np.sqrt((error**2).mean()) < 0.15
+    assert abs(error.mean()) < 0.03
+    assert found.px.dtype == found.confidence.dtype == np.float32
+    assert ((found.confidence > 0) == np.isfinite(found.px)).all()
+
+
+def test_offset_between_labels_has_little_bias() -> None:
+    for fraction in (0.0, 0.2, 0.4, 0.5, 0.6, 0.8):
+        truth = np.full((60, 120), 6 + fraction)
+        px = belief_propagation(*shifted_pair(truth, blur=1.5), 16, BELIEVE_ALL).px
+        assert abs(np.median(px[:, 30:]) - 6 - fraction) < 0.07
+
+
+def test_min_disparity_moves_the_window_only() -> None:
+    truth = np.full((60, 140), 23.3)
+    left, right = shifted_pair(truth)
+    for first in (0, 10, 20):
+        config = replace(BELIEVE_ALL, min_disparity=first)
+        px = belief_propagation(left, right, 26 - first, config).px[:, 40:]
+        assert abs(np.nanmedian(px) + first - 23.3) < 0.1
+    px = belief_propagation(right, left, 8, replace(BELIEVE_ALL, min_disparity=-27)).px[:, :90]
+    assert abs(np.nanmedian(px) - 27 + 23.3) < 0.1  # the views exchanged
+
+
+def box_scene() -> tuple[F64, U8, U8]:
+    """A near box before a far wall, with the truth of the left view."""
+    truth = np.full((100, 180), 4.0)
+    truth[30:70, 70:120] = 14.0
+    far, near = texture(100, 340, 3), texture(100, 340, 4)
+    u, v = np.meshgrid(np.arange(180), np.arange(100))
+    on_box = truth == 14
+    left = np.where(on_box, near[v, u - 14 + 80], far[v, u - 4 + 80])
+    box_right = np.roll(on_box, -14, axis=1)
+    right = np.where(box_right, near[v, u + 80], far[v, u + 80])
+    return truth, grey(left), grey(right)
+
+
+def test_occluded_strip_is_unknown_and_edges_stay_sharp() -> None:
+    truth, left, right = box_scene()
+    px = belief_propagation(left, right, 20, BeliefPropagationConfig()).px
+    hidden = np.zeros(truth.shape, np.bool_)
+    hidden[32:68, 60:69] = True  # wall that the box covers in the right view
+    assert np.isnan(px[hidden]).mean() > 0.7
+    known = np.isfinite(px)
+    assert (np.abs(px - truth) < 1)[known & ~hidden].mean() > 0.97
+    filled = belief_propagation(left, right, 20, BeliefPropagationConfig(fill_occluded=True))
+    assert (np.abs(filled.px - truth) < 1)[hidden].mean() > 0.5
+    assert np.isfinite(filled.px).sum() > known.sum()
+    new = np.isfinite(filled.px) & ~known
+    assert np.median(filled.confidence[new]) <= 0.051
+
+
+def test_no_label_whose_partner_lies_outside_the_right_image() -> None:
+    truth = np.full((60, 100), 12.0)
+    left, right = shifted_pair(truth)
+    for fill in (False, True):
+        config = BeliefPropagationConfig(fill_occluded=fill)
+        px = belief_propagation(left, right, 16, config).px
+        u = np.arange(100)[None, :]
+        assert not (u - px < -0.5).any()  # half a pixel of sub-pixel offset
+        assert np.isnan(px[:, :8]).mean() > 0.8
+
+
+def rng_image(seed: int, level: float) -> U8:
+    """Independent noise about grey 128."""
+    return grey(np.random.default_rng(seed).normal(128, level, (120, 200)))
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        (np.full((120, 200), 130, np.uint8), np.full((120, 200), 130, np.uint8)),
+        (np.full((120, 200), 255, np.uint8), np.full((120, 200), 255, np.uint8)),
+        (np.zeros((120, 200), np.uint8), rng_image(1, 40)),
+        (rng_image(2, 40), rng_image(3, 40)),
+        (rng_image(4, 2), rng_image(5, 2)),
+        (grey(texture(120, 200, 6)), grey(texture(120, 200, 7))),
+    ],
+    ids=["blank", "white", "half blank", "noise", "sensor noise", "unrelated"],
+)
+def test_nothing_is_invented_without_evidence(left: U8, right: U8) -> None:
+    px = belief_propagation(left, right, 16, BeliefPropagationConfig()).px
+    assert np.isfinite(px).mean() < 0.08
+
+
+def test_confidence_tells_right_from_wrong() -> None:
+    truth = np.tile(np.linspace(3, 12, 200), (120, 1))
+    left, right = shifted_pair(truth)
+    patch = grey(texture(120, 200, 9))
+    left = left.copy()
+    left[30:80, 80:150] = patch[30:80, 80:150]  # moved between the exposures
+    found = belief_propagation(left, right, 16, BELIEVE_ALL)
+    wrong = np.abs(found.px - truth) > 1
+    inside = np.zeros(truth.shape, np.bool_)
+    inside[34:76, 84:146] = True
+    sound = ~inside & (np.arange(200)[None, :] > 20) & ~wrong
+    assert found.confidence[inside & wrong].mean() < 0.5 * found.confidence[sound].mean()
+
+
+def test_exposure_change_is_survived() -> None:
+    truth = np.tile(np.linspace(3, 12, 200), (100, 1))
+    left, right = shifted_pair(truth)
+    brighter = grey(right * 0.8 + 45)
+    px = belief_propagation(left, brighter, 16, BeliefPropagationConfig()).px[:, 20:]
+    assert np.isfinite(px).mean() > 0.85
+    assert np.nanmean(np.abs(px - truth[:, 20:]) < 0.5) > 0.97
+
+
+def test_result_does_not_depend_on_the_number_of_threads() -> None:
+    import numba
+
+    _, left, right = box_scene()
+    many = belief_propagation(left, right, 20, BeliefPropagationConfig())
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        one = belief_propagation(left, right, 20, BeliefPropagationConfig())
+    finally:
+        numba.set_num_threads(threads)
+    np.testing.assert_array_equal(many.px, one.px)
+    np.testing.assert_array_equal(many.confidence, one.confidence)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (3, 5), (7, 64), (8, 63)])
+def test_small_images_do_not_fail(shape: tuple[int, int]) -> None:
+    image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+    found = belief_propagation(image, image, 4, BeliefPropagationConfig())
+    assert found.px.shape == found.confidence.shape == shape
+
+
+def test_bad_input_is_named() -> None:
+    image = np.zeros((20, 30), np.uint8)
+    with pytest.raises(ValueError, match="one size"):
+        belief_propagation(image, image[:, :-1], 16, BELIEVE_ALL)
+    with pytest.raises(ValueError, match="labels"):
+        belief_propagation(image, image, 1, BELIEVE_ALL)
+    with pytest.raises(ValueError, match="grey"):
+        belief_propagation(image.astype(np.float32), image, 16, BELIEVE_ALL)
+    for wrong in (
+        {"iterations": 0}, {"levels": 0}, {"smoothness_truncation": 0.0},
+        {"smoothness_truncation": 99.0}, {"edge_floor": 0.0}, {"edge_contrast": 0},
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match="must be"):
+            BeliefPropagationConfig(**wrong)
+    with pytest.raises(ValueError, match="census_truncation"):
+        MatchingCostConfig(census_truncation=60)
