@@ -22,6 +22,7 @@ from mavlink.packer import Packer
 from mavlink.parameters import PARAMETERS
 from mavlink.presence import Health, Presence, PresenceConfig
 from mavlink.rehearsal import RehearsalControl
+from mavlink.status import ComputerLoad
 from mavlink.wire import COMMAND_CANCEL, dialect, x25crc
 
 S = 1_000_000_000
@@ -625,6 +626,36 @@ def test_speed_and_distance_without_gps_are_told() -> None:
     )
     named = [m for m in ends.pass_time(1.5) if m.get_type() == "NAMED_VALUE_FLOAT"]
     assert {m.name: m.value for m in named} == {"SR_SPEED": 5.5, "SR_DIST": 120.0}
+
+
+def test_the_companions_load_is_told_once_it_is_known(ends: Ends) -> None:
+    assert ends.command(512, 191, 390) == [UNSUPPORTED]
+    ends.companion.load = ComputerLoad(
+        (50, 100), 30, 71, 900, 4000, 2000, 64_000, 12, 125, throttled=True, disk_full=True
+    )
+    assert ends.command(512, 191, 390) == [ACCEPTED]
+    told = [m for m in ends.pass_time(4.0) if m.get_type() == "ONBOARD_COMPUTER_STATUS"]
+    assert len(told) in (2, 3)
+    m = told[-1]
+    assert list(m.cpu_cores[:3]) == [50, 100, 255] and m.cpu_combined[0] == 75
+    assert (m.gpu_cores[0], m.temperature_board) == (30, 71)
+    assert (m.ram_usage, m.ram_total) == (900, 4000)
+    assert (m.storage_usage[0], m.storage_total[0]) == (2000, 64_000)
+    assert (m.link_tx_rate[0], m.link_tx_max[0], m.status_flags) == (12, 125, 4 | 8)
+    ends.companion.load = ComputerLoad((900,) * 20, temperature_c=5000, ram_used_mib=-5)
+    m = [m for m in ends.pass_time(3.0) if m.get_type() == "ONBOARD_COMPUTER_STATUS"][-1]
+    assert set(m.cpu_cores) == {100} and m.temperature_board == 126 and m.ram_usage == 0
+
+
+def test_a_text_of_whole_chunks_is_closed_by_an_empty_one(ends: Ends) -> None:
+    ends.companion.say(4, "x" * 100)
+    ends.pass_time(0.1)
+    chunks = [m for m in ends.heard if m.get_type() == "STATUSTEXT"]
+    assert [len(m.text) for m in chunks] == [50, 50, 0]
+    for k in range(300):  # a flood is cut off, not stored
+        ends.companion.say(4, f"flood {k}")
+    ends.pass_time(60.0, 1.0)
+    assert len(ends.texts()) < 30
 
 
 def test_health_is_confirmed_or_it_is_not_told() -> None:

@@ -477,6 +477,97 @@ def test_an_ardupilot_onboard_log(tmp_path: Path, dated: bool) -> None:
     assert load_telemetry(path).counts["ATT"] > 190
 
 
+class UlogWriter:
+    """Writes a PX4 .ulg log by its documented layout."""
+
+    def __init__(self, topics: dict[str, str]) -> None:
+        self.data = bytearray(b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 10_000_000))
+        self._codes: dict[str, tuple[int, str]] = {}
+        self._put(b"B", bytes(40))
+        for name, fields in topics.items():
+            self._put(b"F", f"{name}:{fields}".encode())
+        for number, (name, fields) in enumerate(topics.items()):
+            self._put(b"A", struct.pack("<BH", 0, number) + name.encode())
+            self._codes[name] = (number, "<" + "".join(self._code(f) for f in fields.split(";")))
+
+    @staticmethod
+    def _code(field: str) -> str:
+        if not field:
+            return ""
+        kind = field.split()[0]
+        codes = {"uint64_t": "Q", "float": "f", "double": "d", "bool": "?", "uint8_t": "B"}
+        codes |= {"uint16_t": "H", "float[4]": "4f"}
+        return codes[kind]
+
+    def _put(self, kind: bytes, content: bytes) -> None:
+        self.data += struct.pack("<H", len(content)) + kind + content
+
+    def add(self, name: str, *values: float) -> None:
+        number, code = self._codes[name]
+        self._put(b"D", struct.pack("<H", number) + struct.pack(code, *values))
+
+
+STAMP = "uint64_t timestamp;"
+GLOBAL = "double lat;double lon;float alt;float vel_n;float vel_e;float vel_d;float eph;float epv;"
+LOCAL = (
+    "double ref_lat;double ref_lon;float ref_alt;float x;float y;float z;float vx;float vy;"
+    "float vz;float eph;float epv;float dist_bottom;bool dist_bottom_valid;bool xy_global;"
+    "bool z_global;"
+)
+ULOG = {
+    "vehicle_attitude": STAMP + "float[4] q;",
+    "vehicle_global_position": STAMP + GLOBAL,
+    "vehicle_local_position": STAMP + LOCAL,
+    "distance_sensor": STAMP
+    + "float min_distance;float max_distance;float current_distance;uint8_t orientation;",
+    "gimbal_device_attitude_status": STAMP + "float[4] q;uint16_t device_flags;",
+    "sensor_gps": STAMP + "uint64_t time_utc_usec;",
+}
+
+
+@pytest.mark.parametrize("place", ["vehicle_global_position", "vehicle_local_position"])
+def test_a_px4_onboard_log(tmp_path: Path, place: str) -> None:
+    pytest.importorskip("pyulog")
+    writer = UlogWriter(ULOG)
+    body, head = quaternion.from_rpy(0.1, -0.1, 0.5), quaternion.from_rpy(0.0, -1.2, 0.0)
+    for k in range(100):
+        us = 10_000_000 + k * 50_000
+        writer.add("vehicle_attitude", us, *body)
+        writer.add("gimbal_device_attitude_status", us, *head, 64)
+        if place == "vehicle_global_position":
+            writer.add(place, us, 47.3, 8.5, 512.5, 3.0, 1.0, -0.5, 0.6, 0.9)
+        else:
+            # 111.31949 m north of the reference is a thousandth of a degree.
+            writer.add(
+                place, us, 47.299, 8.5, 450.0, 111.31949, 0.0, -62.5,
+                3.0, 1.0, -0.5, 0.6, 0.9, 55.0, True, True, True,
+            )  # fmt: skip
+        writer.add("sensor_gps", us, T0_US + k * 50_000)
+        if k >= 50:
+            writer.add("distance_sensor", us, 0.2, 100.0, 50.0, 25)
+        writer.add("distance_sensor", us + 1, 0.2, 100.0, 9.0, 0)  # looks ahead
+    path = tmp_path / "log.ulg"
+    path.write_bytes(writer.data)
+    log = load_telemetry(path)
+    assert log.clock == "unix" and log.first_ns == T0_US * 1000 and log.warnings == ()
+    early = log.history.state_at(log.first_ns + 10**9)
+    late = log.history.state_at(log.last_ns - 10**9)
+    for state in (early, late):
+        assert state is not None
+        assert state.lat_deg == pytest.approx(47.3, abs=1e-7)
+        assert state.lon_deg == pytest.approx(8.5)
+        assert state.alt_amsl_m == pytest.approx(512.5)
+        assert state.v_ned_m_s is not None and list(state.v_ned_m_s) == pytest.approx([3, 1, -0.5])
+        assert state.sigma_h_m == pytest.approx(0.6, rel=0.01)
+        assert state.q_ned_body_wxyz is not None and state.q_ned_gimbal_wxyz is not None
+        assert angle(state.q_ned_body_wxyz, body) < 1e-5
+        assert angle(state.q_ned_gimbal_wxyz, head) < 1e-5
+    assert late is not None and late.sources[-1] == "rangefinder"
+    assert early is not None and ("terrain" in early.sources) == (
+        place != "vehicle_global_position"
+    )
+
+
 def test_settings_of_the_history_reach_it() -> None:
     config = HistoryConfig(sigma_tilt_rad=0.2)
     log = load_telemetry(TURN, config)

@@ -28,6 +28,7 @@ from mavlink.framing import Framer
 from mavlink.link import LinkSpec, parse_link
 from mavlink.logs.tlog import packets
 from mavlink.presence import Health
+from mavlink.recorder import Recorder
 from mavlink.rehearsal import RehearsalControl
 from mavlink.signing import Signing
 from mavlink.vehicle import VehicleConfig, VehicleLink
@@ -681,6 +682,18 @@ def test_links_are_named_as_pymavlink_does(text: str, spec: LinkSpec) -> None:
 def test_senseless_links_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="link"):
         VehicleConfig(links=(text,))
+
+
+def test_a_full_disk_ends_the_log_and_nothing_else(caplog: pytest.LogCaptureFixture) -> None:
+    full = Path("/dev/full")
+    if not full.exists():
+        pytest.skip("no /dev/full here")
+    recorder = Recorder()
+    recorder.open(full)
+    for k in range(3000):
+        recorder.write(bytes(40), k)
+    recorder.close()
+    assert "telemetry log" in caplog.text
 
 
 def test_odometry_time_is_the_autopilots(tmp_path: Path) -> None:
