@@ -162,9 +162,19 @@ class _Found:
     second: F64  # (N,) correlation of the next separate peak
     contrast: F64  # (N,) of the patch of a, grey levels
 
-    def distinct(self, config: MatchingConfig) -> Bool:
-        """(N,) True where no other place comes near the best one."""
-        return np.asarray(1.0 - self.score <= config.ambiguity * (1.0 - self.second))
+    def distinct(self, ratio: float) -> Bool:
+        """(N,) True where the best place is that much better than any other."""
+        return np.asarray(1.0 - self.score <= ratio * (1.0 - self.second))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Refined:
+    """The answer at the full size, sub-pixel."""
+
+    uv: F64  # (N, 2) px
+    score: F64  # (N,) correlation, NO_SCORE where there is none
+    contrast_a: F64  # (N,) grey levels, of the patch in a
+    contrast_b: F64  # (N,) and where it was found
 
 
 @dataclass(slots=True, eq=False)
@@ -188,14 +198,16 @@ class _Search:
         )  # fmt: skip
         return _Found(uv * 2.0**level, score, second, contrast)
 
-    def refined(self, uv_b: F64, active: Bool) -> tuple[F64, F64, F64]:
-        """Sub-pixel places in b, their scores and the contrast found there."""
-        out, score, contrast = uv_b.copy(), np.empty(len(uv_b)), np.empty(len(uv_b))
+    def refined(self, uv_b: F64, active: Bool) -> _Refined:
+        """Sub-pixel places in b from starts within about a pixel."""
+        N = len(uv_b)
+        uv, score, contrast_a, contrast_b = uv_b.copy(), np.empty(N), np.empty(N), np.empty(N)
         patch_search.refine(
             self.a[0], self.b[0], self.uv_a, self.inverse_warp, active,
-            self.config.patch_radius_px, self.config.refine_iterations, out, score, contrast,
+            self.config.patch_radius_px, self.config.refine_iterations, uv, score, contrast_a,
+            contrast_b,
         )  # fmt: skip
-        return out, score, contrast
+        return _Refined(uv, score, contrast_a, contrast_b)
 
 
 def _consensus(uv: F64, residual: F64, good: Bool, tolerance_px: float) -> F64 | None:
@@ -207,13 +219,10 @@ def _consensus(uv: F64, residual: F64, good: Bool, tolerance_px: float) -> F64 |
     x, y = basis[some], residual[some]
     trend = np.zeros((3, 2))
     trend[0] = np.median(y, axis=0)
-    weight = np.zeros(len(y))
-    for i in range(8):
-        distance = np.linalg.norm(y - x @ trend, axis=1)
-        scale = max(tolerance_px, 2.0 * float(np.median(distance)) if i < 4 else tolerance_px)
-        weight = 1.0 / (1.0 + (distance / scale) ** 2) ** 2
-        normal = (x * weight[:, None]).T @ x + 1e-6 * np.eye(3)
-        trend = np.linalg.solve(normal, (x * weight[:, None]).T @ y)
+    for scale in (8.0, 4.0, 2.0, 1.0, 1.0):
+        distance = np.hypot(*(y - x @ trend).T)
+        weighted = x / (1.0 + (distance / (scale * tolerance_px))[:, None] ** 2) ** 2
+        trend = np.linalg.solve(weighted.T @ x + 1e-6 * np.eye(3), weighted.T @ y)
     agree = np.linalg.norm(y - x @ trend, axis=1) < 2 * tolerance_px
     if np.count_nonzero(agree) < max(12, 0.4 * len(y)):
         return None
@@ -260,20 +269,31 @@ def match(
     coarse = forward.at(level, predicted, everyone, reach)
     uv = coarse.uv
     # A coarse pixel blurs; the fine patches have the last word on likeness.
-    active = coarse.distinct(config) & (1.0 - coarse.score <= config.max_zssd)
+    active = coarse.distinct(config.ambiguity) & (1.0 - coarse.score <= config.max_zssd)
     back_a = _Search(pyramid_b.levels, pyramid_a.levels, uv, forward_warp, config)
-    returned = back_a.at(level, a, active, min(reach, 4)).uv
+    doubtful = active & ~coarse.distinct(0.4 * config.ambiguity)
+    returned = back_a.at(level, a, doubtful, min(reach, 4)).uv
     active &= np.abs(returned - a).max(axis=1, initial=0.0) <= 1.6 * 2**level
+    start = level
     if level > 0:
         stray_px = max(0.5 * radius_px, 4.0 * 2**level)
         uv, active = _follow_others(a, uv, predicted, active, everyone, 2.0 * 2**level, stray_px)
-        uv, active = _descend(forward, level, uv, active, coarse.contrast)
-    uv, score, contrast = forward.refined(uv, active)
-    ok = active & (2.0 * (1.0 - score) <= config.max_zssd) & (contrast >= config.min_contrast)
+    while level > 1:
+        finer = max(level - 2, 1)
+        found = forward.at(finer, uv, active, 1 + level - finer)
+        uv, level = found.uv, finer
+        active = active & (found.score > 0)
+    fine = forward.refined(uv, active)
+    uv = fine.uv
+    ok = active & (2.0 * (1.0 - fine.score) <= config.max_zssd)
+    ok &= fine.contrast_b >= config.min_contrast
+    if start > 0:
+        ok &= ~_repeats(forward, uv, ok, coarse.contrast, fine.contrast_a)
 
     back = _Search(pyramid_b.levels, pyramid_a.levels, uv, forward_warp, config)
-    home, home_score, _ = back.refined(a, ok)
-    ok &= (home_score > 0) & (np.linalg.norm(home - a, axis=1) <= config.max_return_px)
+    home = back.refined(a, ok)
+    ok &= (home.score > 0) & (np.linalg.norm(home.uv - a, axis=1) <= config.max_return_px)
+    score = fine.score
     uv = np.where(ok[:, None], uv, predicted)
     zssd = np.where(score > patch_search.NO_SCORE, 2.0 * (1.0 - score), 4.0)
     return Matches(uv.astype(np.float32), zssd.astype(np.float32), ok)
@@ -295,22 +315,13 @@ def _follow_others(
     return np.where(own[:, None], uv, expected), everyone.copy()
 
 
-def _descend(
-    search: _Search, level: int, uv: F64, active: Bool, coarse_contrast: F64
-) -> tuple[F64, Bool]:
-    """Places to about a pixel, from ``level`` down to the full size, two levels at a time.
+def _repeats(search: _Search, uv: F64, ok: Bool, coarse: F64, fine: F64) -> Bool:
+    """(N,) True for places in a texture that repeats.
 
-    A texture that repeats may vanish on the coarse level, and what little is left there
-    decides by chance; such points must be distinct on a level that shows the repetition.
+    It may vanish on the coarse level, whose little contrast then decides by chance; such
+    points must be distinct on a level that shows the repetition.
     """
-    found = None
-    while level > 0:
-        finer = max(level - 2, 0)
-        found = search.at(finer, uv, active, 1 + level - finer)
-        uv, level = found.uv, finer
-        active = active & (found.score > 0)
-    assert found is not None
-    vague = active & (coarse_contrast < 0.3 * found.contrast)
-    if vague.any():
-        active = active & ~(vague & ~search.at(1, uv, vague, 8).distinct(search.config))
-    return uv, active
+    vague = ok & (coarse < 0.3 * fine)
+    if not vague.any():
+        return vague
+    return np.asarray(vague & ~search.at(1, uv, vague, 8).distinct(search.config.ambiguity))

@@ -260,12 +260,12 @@ def _interpolate(window: Any, fu: float, fv: float, pitch: int, rows: Any, out: 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _template(large: Any, n: int, pitch: int, kernels: Any) -> float:
-    """Fill ``kernels`` (4, n * pitch) from ``large`` (n + 2 squared); return det of the slopes.
+    """Fill ``kernels`` (4, n * pitch) from ``large`` (n + 2 squared); return its contrast.
 
     Kernel 0 is the template, zero-mean and unit; 1 and 2 combine its slopes so that their
     products with a patch are the Gauss-Newton step along u and v; they are free of constants
     and of the template itself, so brightness and contrast do not move the step. Kernel 3 is
-    one inside the patch. Zero means that the template has no two-dimensional texture.
+    one inside the patch. Zero when the template has no two-dimensional texture.
     """
     kernels[:] = np.float32(0)
     patch, gx, gy, inside = kernels[0], kernels[1], kernels[2], kernels[3]
@@ -307,7 +307,7 @@ def _template(large: Any, n: int, pitch: int, kernels: Any) -> float:
         along = (b * gx[i] - c * gy[i]) / det
         gy[i] = (a * gy[i] - c * gx[i]) / det
         gx[i] = along
-    return float(det)
+    return float(np.sqrt(power) / n)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -333,13 +333,13 @@ def _compare(kernels: Any, other: Any, n: int, sums: Any) -> None:
 @njit(cache=True, nogil=True, fastmath=True, parallel=True)
 def refine(
     image_a: Any, image_b: Any, uv_a: Any, inverse_warp: Any, active: Any, radius: int,
-    iterations: int, uv_b: Any, score: Any, contrast: Any,
+    iterations: int, uv_b: Any, score: Any, contrast_a: Any, contrast_b: Any,
 ) -> None:  # fmt: skip
     """Move ``uv_b`` (N, 2) to the sub-pixel minimum of the normalised zero-mean SSD, in place.
 
     Gauss-Newton with the template's slopes (constant normal matrix, Baker and Matthews 2004,
     doi:10.1023/B:VISI.0000011205.11775.fd). Fills ``score`` (NO_SCORE when it left the image,
-    went further than 1.5 px or has no two-dimensional texture) and ``contrast`` of b.
+    went further than 2 px or has no two-dimensional texture) and the contrast of both patches.
     """
     N = uv_a.shape[0]
     n = 2 * radius + 1
@@ -351,12 +351,13 @@ def refine(
         rows, other = np.zeros(pitch * pitch, np.float32), np.empty(n * pitch, np.float32)
         sums = np.empty(4)
         for p in range(chunk * CHUNK, min((chunk + 1) * CHUNK, N)):
-            score[p], contrast[p] = NO_SCORE, 0.0
+            score[p], contrast_a[p], contrast_b[p] = NO_SCORE, 0.0, 0.0
             if not active[p]:
                 continue
             if not _sample(image_a, uv_a[p, 0], uv_a[p, 1], inverse_warp[p], radius + 1, large):
                 continue
-            if _template(large, n, pitch, kernels) == 0.0:
+            contrast_a[p] = _template(large, n, pitch, kernels)
+            if contrast_a[p] == 0.0:
                 continue
             u, v = uv_b[p, 0], uv_b[p, 1]
             held_u, held_v = -1, -1
@@ -370,10 +371,10 @@ def refine(
                     held_u, held_v = u0, v0
                 _interpolate(window, u - u0, v - v0, pitch, rows, other)
                 _compare(kernels, other, n, sums)
-                score[p], contrast[p] = sums[0], sums[3]
+                score[p], contrast_b[p] = sums[0], sums[3]
                 u += sums[1]
                 v += sums[2]
-                if abs(u - uv_b[p, 0]) > 1.5 or abs(v - uv_b[p, 1]) > 1.5:
+                if abs(u - uv_b[p, 0]) > 2.0 or abs(v - uv_b[p, 1]) > 2.0:
                     score[p] = NO_SCORE
                     break
                 if abs(sums[1]) < 0.02 and abs(sums[2]) < 0.02:

@@ -1,0 +1,164 @@
+"""Alignment of two 320x180 depth maps, 57,600 points each, against Open3D and small_gicp."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from recon import se3
+from recon.camera_model import rays
+from recon.registration import IcpConfig, register_projective
+from recon.types import F64, DepthMap
+from service.bench import BenchOptions, BenchResult, compare
+
+K: F64 = np.array([[190.7, 0, 159.5], [0, 190.7, 89.5], [0, 0, 1.0]])
+SCENES = 12
+NOISE_M = 0.05
+
+
+def run(options: BenchOptions) -> list[BenchResult]:
+    """Milliseconds and centimetres from the same depth maps and starts, preparation included.
+
+    The second figure of error has noise that neighbouring pixels share, as stereo has it.
+    """
+    source, target, T = pair(0, 0.0)
+    guess = start(0, T)
+    config = IcpConfig()
+    what = "align 57,600 points"
+    ours = partial(register_projective, source, target, guess, config)
+    results = []
+    for peer, other in peers().items():
+        theirs = partial(other, source, target, guess)
+        results.append(compare("icp", what, ours, options, peer, theirs))
+    for blur_px, words in ((0.0, "error, noise of each pixel"), (2.0, "error, noise of patches")):
+        results += errors(words, blur_px, config)
+    return results
+
+
+def peers() -> dict[str, Callable[[DepthMap, DepthMap, F64], F64]]:
+    """Those that can be imported, by name."""
+    found: dict[str, Callable[[DepthMap, DepthMap, F64], F64]] = {}
+    if find_spec("open3d") is not None:
+        found["Open3D rgbd_odometry_multi_scale"] = by_open3d
+    found["small_gicp VGICP 1 m"] = by_small_gicp
+    return found
+
+
+def height(x: F64, y: F64) -> F64:
+    """Hills with houses, in m."""
+    z = 0.6 * np.sin(x / 7 + 1) * np.cos(y / 9) + 0.3 * np.sin(x / 3.1 + y / 4.3)
+    fx, fy = np.mod(x, 18) - 9, np.mod(y, 22) - 11
+    roof = (np.abs(fx) < 4) & (np.abs(fy) < 5)
+    return np.asarray(z + np.where(roof, 5 - 0.8 * np.abs(fx), 0.0))
+
+
+def rendered(T_world_camera: F64) -> F64:
+    """(180, 320) depth along z of the terrain, by marching every ray and halving."""
+    v, u = np.mgrid[0:180, 0:320].astype(np.float64)
+    directions = rays(K, np.column_stack([u.ravel(), v.ravel()])) @ T_world_camera[:3, :3].T
+    origin = T_world_camera[:3, 3]
+
+    def below(t: F64) -> Any:
+        p = origin + directions * t[:, None]
+        return p[:, 2] <= height(p[:, 0], p[:, 1])
+
+    near = np.full(len(directions), 0.75 * origin[2])
+    far = near.copy()
+    still = np.ones(len(near), bool)
+    for t in np.linspace(0.75, 1.2, 200) * origin[2]:
+        far[still] = t
+        hit = below(far)
+        near[still & ~hit] = t
+        still &= ~hit
+    for _ in range(25):
+        middle = 0.5 * (near + far)
+        hit = below(middle)
+        far, near = np.where(hit, middle, far), np.where(hit, near, middle)
+    return np.asarray(far.reshape(180, 320))
+
+
+def pair(seed: int, blur_px: float) -> tuple[DepthMap, DepthMap, F64]:
+    """Source and target from two places 4 m apart, and the true T_target_source."""
+    import cv2
+
+    rng = np.random.default_rng(seed)
+    nadir = np.diag([1.0, -1.0, -1.0])
+    a = se3.compose(nadir, np.array([3.0 * seed, 1.0 * seed, 60.0]))
+    turned = nadir @ se3.so3_exp(np.array([0.01, -0.015, 0.03]))
+    b = se3.compose(turned, a[:3, 3] + np.array([4.0, 1.0, 0.5]))
+    maps = []
+    for T in (b, a):
+        noise = rng.normal(size=(180, 320))
+        if blur_px > 0:
+            noise = np.asarray(cv2.GaussianBlur(noise, (0, 0), blur_px))
+        depth = rendered(T) + NOISE_M * noise / noise.std()
+        maps.append(
+            DepthMap(
+                depth.astype(np.float32), np.full((180, 320), NOISE_M, np.float32),
+                np.full((180, 320), 2, np.uint8), K, np.eye(4),
+            )
+        )  # fmt: skip
+    return maps[0], maps[1], np.asarray(se3.inverse(a) @ b)
+
+
+def start(seed: int, T: F64) -> F64:
+    """The truth moved by about half a metre and half a degree."""
+    rng = np.random.default_rng(1000 + seed)
+    twist = np.concatenate([rng.normal(size=3) * 0.003, rng.normal(size=3) * 0.27])
+    return np.asarray(se3.exp(twist) @ T)
+
+
+def by_open3d(source: DepthMap, target: DepthMap, guess: F64) -> F64:
+    """(4, 4) by Open3D's tensor RGB-D odometry, point to plane on three scales."""
+    o3d: Any = import_module("open3d")
+    geometry, odometry = o3d.t.geometry, o3d.t.pipelines.odometry
+    blank = np.zeros((180, 320, 3), np.uint8)
+    images = [
+        geometry.RGBDImage(geometry.Image(blank), geometry.Image(d.depth_m[..., None]))
+        for d in (source, target)
+    ]
+    found = odometry.rgbd_odometry_multi_scale(
+        *images, o3d.core.Tensor(K), o3d.core.Tensor(guess), 1.0, 100.0,
+        [odometry.OdometryConvergenceCriteria(n) for n in (6, 4, 2)],
+        odometry.Method.PointToPlane, odometry.OdometryLossParams(1.5, 1.0, 0.3),
+    )  # fmt: skip
+    return np.asarray(found.transformation.numpy(), np.float64)
+
+
+def by_small_gicp(source: DepthMap, target: DepthMap, guess: F64) -> F64:
+    """(4, 4) by voxelised generalised ICP of small_gicp on two threads."""
+    import small_gicp
+
+    v, u = np.mgrid[0:180, 0:320].astype(np.float64)
+    directions = rays(K, np.column_stack([u.ravel(), v.ravel()]))
+    clouds = [directions * d.depth_m.reshape(-1, 1) for d in (target, source)]
+    found = small_gicp.align(
+        *clouds, guess, registration_type="VGICP", voxel_resolution=1.0,
+        downsampling_resolution=1.0, num_threads=2,
+    )  # fmt: skip
+    return np.asarray(found.T_target_source, np.float64)
+
+
+def errors(what: str, blur_px: float, config: IcpConfig) -> list[BenchResult]:
+    """Mean error of the ground below the camera over several scenes, ours and each peer's."""
+    off: dict[str, list[float]] = {}
+    below = np.array([[0.0, 0.0, 60.0]])
+    for seed in range(SCENES):
+        source, target, T = pair(seed, blur_px)
+        guess = start(seed, T)
+        result = register_projective(source, target, guess, config)
+        answers = {"": result.T_target_source}
+        answers |= {name: other(source, target, guess) for name, other in peers().items()}
+        for name, answer in answers.items():
+            miss = se3.transform(answer, below) - se3.transform(T, below)
+            off.setdefault(name, []).append(100 * float(np.linalg.norm(miss)))
+    ours = float(np.mean(off.pop("")))
+    return [
+        BenchResult("icp", what, ours, "cm", 0.0, name, float(np.mean(values)))
+        for name, values in off.items()
+    ]

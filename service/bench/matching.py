@@ -1,0 +1,114 @@
+"""Corners and matches on a 1280x720 pair with a known shift, against OpenCV's trackers."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import cv2
+import numpy as np
+
+from recon.matching import Corners, MatchingConfig, Pyramid, global_shift, harris_grid, match
+from recon.types import F32, F64, U8
+from service.bench import BenchOptions, BenchResult, compare
+
+SIZE = (720, 1280)
+SHIFT_PX = np.array([23.4, -17.7])
+RADIUS_PX = 38.0  # what the odometry searches around a fair prediction
+NOISE = 2.0  # grey levels
+
+
+def run(options: BenchOptions) -> list[BenchResult]:
+    """Milliseconds for 900 corners and their matches, and how far the matches are off.
+
+    The peers are OpenCV's corner detector and its pyramidal Lucas-Kanade tracker run forward
+    and backward, with windows and levels that reach as far.
+    """
+    a, b = pictures()
+    config = MatchingConfig()
+    corners = harris_grid(a, config)
+    points = corners.uv_px[:, None]
+    timed = [
+        compare(
+            "matching", "corners, 1280x720, 30x30 grid", partial(harris_grid, a, config), options,
+            "OpenCV goodFeaturesToTrack", partial(features_by_opencv, a),
+        ),
+        compare(
+            "matching", f"match {len(corners)} corners, radius {RADIUS_PX:.0f} px",
+            partial(matched, a, b, corners, config), options,
+            "OpenCV PyrLK both ways", partial(tracked, a, b, points),
+            note="pyramids included",
+        ),
+        compare(
+            "matching", "global shift without a prior", partial(global_shift, a, b), options
+        ),
+    ]  # fmt: skip
+    return timed + accuracy(a, b, corners, config)
+
+
+def pictures() -> tuple[U8, U8]:
+    """Two noisy views of one texture with detail at every scale, shifted by SHIFT_PX."""
+    rng = np.random.default_rng(0)
+    h, w = SIZE[0] + 128, SIZE[1] + 128
+    total = np.zeros((h, w), np.float64)
+    for k in range(7):
+        small = rng.normal(size=((h >> k) + 4, (w >> k) + 4))
+        blurred = cv2.GaussianBlur(small, (0, 0), 1.2)
+        layer = cv2.resize(blurred, None, fx=2.0**k, fy=2.0**k, interpolation=cv2.INTER_CUBIC)
+        total += 2 ** (0.3 * k) * layer[:h, :w]
+    total = 128 + 55 * (total - total.mean()) / total.std()
+    fy, fx = np.fft.fftfreq(h)[:, None], np.fft.fftfreq(w)[None]
+    phase = np.exp(2j * np.pi * (fx * SHIFT_PX[0] + fy * SHIFT_PX[1]))
+    moved = np.fft.ifft2(np.fft.fft2(total) * phase).real
+    return noisy(total, rng), noisy(moved, rng)
+
+
+def noisy(scene: F64, rng: np.random.Generator) -> U8:
+    """The middle of the scene as a camera with noise sees it."""
+    view = scene[64 : 64 + SIZE[0], 64 : 64 + SIZE[1]]
+    seen = view + rng.normal(size=SIZE) * NOISE
+    return np.asarray(np.clip(np.round(seen), 0, 255), np.uint8)
+
+
+def features_by_opencv(image: U8) -> object:
+    """900 Harris corners by OpenCV."""
+    return cv2.goodFeaturesToTrack(image, 900, 0.001, 15, useHarrisDetector=True, k=0.04)
+
+
+def matched(a: U8, b: U8, corners: Corners, config: MatchingConfig) -> tuple[F32, F32]:
+    """Pixels in a and b of the corners that ours found."""
+    found = match(
+        Pyramid.build(a), corners.uv_px, Pyramid.build(b), corners.uv_px, RADIUS_PX, None, config
+    )
+    return corners.uv_px[found.ok], found.uv_px[found.ok]
+
+
+def tracked(a: U8, b: U8, points: F32) -> tuple[F32, F32]:
+    """Pixels in a and b of the corners that OpenCV's tracker found both ways."""
+    window = {"winSize": (11, 11), "maxLevel": 3}
+    there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, points, None, **window)  # type: ignore[call-overload]
+    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, **window)  # type: ignore[call-overload]
+    near = np.linalg.norm(back - points, axis=2)[:, 0] < 0.5
+    good = near & (ok[:, 0] > 0) & (ok_back[:, 0] > 0)
+    return points[good, 0], there[good, 0]
+
+
+def accuracy(a: U8, b: U8, corners: Corners, config: MatchingConfig) -> list[BenchResult]:
+    """Root mean square error of the good matches, and the share found."""
+    ours = matched(a, b, corners, config)
+    theirs = tracked(a, b, corners.uv_px[:, None])
+    truth = corners.uv_px - SHIFT_PX
+    visible = np.all((truth > 12) & (truth < np.array(SIZE[::-1]) - 12), axis=1)
+    rms, shares = [], []
+    for here, there in (ours, theirs):
+        error = np.linalg.norm(there - (here - SHIFT_PX), axis=1)
+        good = error < 1.0
+        rms.append(float(np.sqrt(np.mean(error[good] ** 2) / 2)))
+        shares.append(100 * float(good.sum() / visible.sum()))
+    peer = "OpenCV PyrLK both ways"
+    return [
+        BenchResult("matching", "error of a coordinate", rms[0], "px", 0.0, peer, rms[1]),
+        BenchResult(
+            "matching", "found within 1 px, of the visible", shares[0], "%", 0.0, peer, shares[1],
+            note="more is better",
+        ),
+    ]  # fmt: skip
