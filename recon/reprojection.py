@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
+from numba import njit, prange
 
 from recon.types import F32, F64, DepthMap, DisparityMap, StereoPair
 
@@ -13,40 +17,104 @@ MIN_CONFIDENCE = 0.05
 """Below it a label is not trusted at all."""
 
 
-def depth_from_disparity(disparity: DisparityMap, pair: StereoPair) -> tuple[F32, F32]:
-    """Depth along the rectified left camera's z and its sigma, two (H, W) float32 in metres.
+@dataclass(frozen=True, slots=True, eq=False)
+class PairDepth:
+    """What one stereo pair says of the keyframe's depth, on the keyframe's own grid."""
 
-    ``disparity`` holds labels of ``pair``, on the pair's own grid (h, w) or upsampled to any
-    (H, W); labels are always in pixels of (h, w). With Eq. 3, ``z = f B / d`` where
-    ``d = plane . (u, v, 1) + slope * label``; sigma is ``z / d`` times the label's sigma,
-    which grows as confidence falls. NaN where the label is unknown, its confidence below
-    ``MIN_CONFIDENCE`` or the point at or beyond infinity. Raises ValueError for bad shapes.
+    depth_m: F32  # (h, w), NaN = unknown
+    sigma_m: F32  # (h, w)
+
+
+def reproject(
+    disparity: DisparityMap, pair: StereoPair, K: F64, size_px: tuple[int, int]
+) -> PairDepth:
+    """Depth along the keyframe's z on its own grid, and its sigma, in metres.
+
+    ``disparity`` holds labels of ``pair`` on the pair's grid (h, w) or upsampled to any size;
+    labels are always in pixels of (h, w). The rectified left camera sits where the keyframe's
+    does and is only turned, so a keyframe pixel's ray meets exactly one of its pixels. With
+    Eq. 3, ``z = f B / d`` where ``d = plane . (u, v, 1) + slope * label``; sigma is ``z / d``
+    times the label's sigma, which grows as confidence falls.
+
+    Args:
+        K: (3, 3) intrinsics of the keyframe's grid of ``size_px`` (w, h).
+
+    NaN where the label is unknown or not trusted, or the point at or beyond infinity. Between
+    labels that agree within one the value is interpolated; at an edge the nearest is taken.
+    Raises ValueError for bad shapes.
     """
     if disparity.px.ndim != 2 or disparity.px.shape != disparity.confidence.shape:
         raise ValueError(f"bad disparity {disparity.px.shape}, {disparity.confidence.shape}")
-    height, width = disparity.px.shape
-    h, w = pair.left.shape
-    u = ((np.arange(width) + 0.5) * (w / width) - 0.5)[None, :]
-    v = ((np.arange(height) + 0.5) * (h / height) - 0.5)[:, None]
-    plane = pair.plane
-    d = (plane[0] * u + plane[1] * v + plane[2]) + pair.slope * disparity.px
-    usable = (disparity.confidence >= MIN_CONFIDENCE) & (d > 1e-3)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = np.where(usable, pair.K[0, 0] * pair.baseline_m / d, np.nan)
-        label_sigma = LABEL_SIGMA_PX / np.sqrt(np.maximum(disparity.confidence, MIN_CONFIDENCE))
-        sigma = depth / d * abs(pair.slope) * label_sigma
-    return depth.astype(np.float32), sigma.astype(np.float32)
+    w, h = size_px
+    out = PairDepth(np.empty((h, w), np.float32), np.empty((h, w), np.float32))
+    to_left = pair.K @ pair.R_left_keyframe @ np.linalg.inv(K)
+    finer = np.array(disparity.px.shape, np.float64) / pair.left.shape
+    _reproject(
+        disparity.px,
+        disparity.confidence,
+        np.ascontiguousarray(to_left),
+        finer,
+        np.asarray(pair.plane, np.float64),
+        float(pair.slope),
+        float(pair.K[0, 0] * pair.baseline_m),
+        out.depth_m,
+        out.sigma_m,
+    )
+    return out
 
 
-def scale_intrinsics(K: F64, size: tuple[int, int], new_size: tuple[int, int]) -> F64:
-    """K of the same view at another (W, H); pixel centres are at integers."""
-    sx, sy = new_size[0] / size[0], new_size[1] / size[1]
-    scaled = np.array(K, np.float64)
-    scaled[0] *= sx
-    scaled[1] *= sy
-    scaled[0, 2] += 0.5 * sx - 0.5
-    scaled[1, 2] += 0.5 * sy - 0.5
-    return scaled
+@njit(cache=True, nogil=True, inline="always")
+def _label(px: Any, x: float, y: float) -> float:  # pragma: no cover - compiled
+    """Label at a place: bilinear where the four around it agree, else the nearest; or NaN."""
+    height, width = px.shape
+    i, j = int(np.rint(x)), int(np.rint(y))
+    if i < 0 or j < 0 or i >= width or j >= height:
+        return np.nan
+    nearest = px[j, i]
+    i0, j0 = int(np.floor(x)), int(np.floor(y))
+    if i0 < 0 or j0 < 0 or i0 + 1 >= width or j0 + 1 >= height:
+        return nearest
+    a, b, c, d = px[j0, i0], px[j0, i0 + 1], px[j0 + 1, i0], px[j0 + 1, i0 + 1]
+    if not max(max(a, b), max(c, d)) - min(min(a, b), min(c, d)) <= 1.0:  # also NaN
+        return nearest
+    fx, fy = x - i0, y - j0
+    mixed = (1 - fy) * ((1 - fx) * a + fx * b) + fy * ((1 - fx) * c + fx * d)
+    return nearest if np.isnan(mixed) else mixed
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _reproject(
+    px: Any,
+    confidence: Any,
+    to_left: Any,
+    finer: Any,
+    plane: Any,
+    slope: float,
+    focal_base: float,
+    depth_m: Any,
+    sigma_m: Any,
+) -> None:  # pragma: no cover - compiled
+    height, width = depth_m.shape
+    for v in prange(height):
+        for u in range(width):
+            depth_m[v, u] = np.nan
+            sigma_m[v, u] = np.nan
+            z = to_left[2, 0] * u + to_left[2, 1] * v + to_left[2, 2]
+            if z < 1e-3:
+                continue
+            x = (to_left[0, 0] * u + to_left[0, 1] * v + to_left[0, 2]) / z
+            y = (to_left[1, 0] * u + to_left[1, 1] * v + to_left[1, 2]) / z
+            X, Y = (x + 0.5) * finer[1] - 0.5, (y + 0.5) * finer[0] - 0.5
+            label = _label(px, X, Y)
+            if np.isnan(label):
+                continue
+            trust = confidence[int(np.rint(Y)), int(np.rint(X))]
+            d = plane[0] * x + plane[1] * y + plane[2] + slope * label
+            if trust < MIN_CONFIDENCE or d < 1e-3:
+                continue
+            depth = focal_base / d / z  # Eq. 3, along the keyframe's z
+            depth_m[v, u] = depth
+            sigma_m[v, u] = depth / d * abs(slope) * LABEL_SIGMA_PX / np.sqrt(trust)
 
 
 def points_from_depth(depth: DepthMap) -> F32:

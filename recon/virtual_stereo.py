@@ -16,7 +16,7 @@ import numpy as np
 from recon import se3
 from recon.camera_model import scaled_K
 from recon.exposure import stretch
-from recon.types import F32, F64, U8, Bool, DepthMap, DisparityMap, StereoPair
+from recon.types import F64, U8, Bool, DepthMap, DisparityMap, StereoPair
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +29,7 @@ class VirtualStereoConfig:
     least_overlap: float = 0.4  # share of the left view that the right one sees
     width_px: int = 320  # of the stereo views, along the picture's width
     guide_width_px: int = 1280  # of the picture that guides the upsampling
+    guided: bool = True  # make the picture that guides the upsampling
     labels: int = 16  # the fewest; relief may widen it
     most_labels: int = 96
     margin_labels: float = 3.0  # on either side of the relief that the landmarks show
@@ -49,7 +50,8 @@ class View:
 
     seq: int
     time_ns: int
-    bgr: U8  # (H, W, 3)
+    bgr: U8 | None  # (H, W, 3); only a left view that guides the upsampling needs it
+    grey: U8  # (H, W) the same
     K: F64  # (3, 3) px of that picture
     T_odom_camera: F64  # (4, 4)
     seen: U8 | None = None  # (H, W) zero where the picture has nothing; None: all of it
@@ -78,7 +80,7 @@ def check_pair(
         return Refusal("baseline too short")
     if base > config.most_base_to_height * depth_m:
         return Refusal("baseline too long")
-    H, W = left.bgr.shape[:2]
+    H, W = left.grey.shape
     reach = np.hypot(W, H) / 2 / left.K[0, 0]
     for axis in (t, T_left_right[:3, :3].T @ t):  # seen from the left and from the right view
         if np.hypot(axis[0], axis[1]) < config.epipole_margin * reach * abs(axis[2]):
@@ -131,11 +133,14 @@ def rectify(
     plane, labels = window
     R_rect_right = R_rect_left @ T_left_right[:3, :3]
     scale = max(1.0, config.guide_width_px / config.width_px)
-    left_seen = _seen(left, R_rect_left, K, size)
-    right_seen = _seen(right, R_rect_right, K, size, plane)
+    left_grey, left_seen = _stereo_view(left, R_rect_left, K, size, None)
+    right_grey, right_seen = _stereo_view(right, R_rect_right, K, size, plane)
+    guide = None
+    if config.guided and left.bgr is not None:
+        guide = _warp(left.bgr, left, R_rect_left, K, size, scale)
     return StereoPair(
-        left=stretch(_grey(_warp(left, R_rect_left, K, size, 2)), left_seen),
-        right=stretch(_grey(_warp(right, R_rect_right, K, size, 2, plane)), right_seen),
+        left=left_grey,
+        right=right_grey,
         baseline_m=base,
         K=K,
         labels=labels,
@@ -143,7 +148,7 @@ def rectify(
         slope=1.0 - float(plane[0]),
         T_world_left=left.T_odom_camera @ se3.compose(R_rect_left.T, np.zeros(3)),
         R_left_keyframe=R_rect_left,
-        guide=_warp(left, R_rect_left, K, size, scale, area=False),
+        guide=guide,
         left_seen=left_seen,
         right_seen=right_seen,
     )
@@ -178,7 +183,7 @@ def _rectified_intrinsics(
     left: View, R_rect_left: F64, width_px: int
 ) -> tuple[F64, tuple[int, int]]:
     """Intrinsics and (w, h) of a rectified picture that holds the whole left view."""
-    H, W = left.bgr.shape[:2]
+    H, W = left.grey.shape
     s = width_px / W
     corners = np.array([[0, 0, 1], [W - 1, 0, 1], [0, H - 1, 1], [W - 1, H - 1, 1.0]])
     ray = corners @ np.linalg.inv(left.K).T @ R_rect_left.T
@@ -234,82 +239,74 @@ def _fit_plane(u: F64, v: F64, d: F64) -> tuple[F64, F64]:
     return np.asarray(plane), np.asarray(d - A @ plane)
 
 
-def _maps(
-    view: View,
-    R_rect_view: F64,
-    K: F64,
-    size: tuple[int, int],
-    oversample: float,
-    plane: F64 | None,
-) -> tuple[F32, F32]:
-    """Where in the view each pixel of the rectified picture (``oversample`` finer) lies."""
-    w, h = int(size[0] * oversample), int(size[1] * oversample)
-    x = (np.arange(w, dtype=np.float32) + 0.5) / oversample - 0.5
-    y = (np.arange(h, dtype=np.float32) + 0.5) / oversample - 0.5
-    xx, yy = np.meshgrid(x, y)
+def _homography(view: View, R_rect_view: F64, K: F64, oversample: float, plane: F64 | None) -> F64:
+    """(3, 3) from a pixel of the rectified picture (``oversample`` finer) to one of the view.
+
+    The shift by the disparity plane is affine along the rows, so it is part of it.
+    """
+    fine = np.array(
+        [
+            [1 / oversample, 0.0, 0.5 / oversample - 0.5],
+            [0.0, 1 / oversample, 0.5 / oversample - 0.5],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    shift = np.eye(3)
     if plane is not None:
-        xx = xx - (np.float32(plane[0]) * xx + np.float32(plane[1]) * yy + np.float32(plane[2]))
-    M = (view.K @ R_rect_view.T @ np.linalg.inv(K)).astype(np.float32)
-    den = M[2, 0] * xx + M[2, 1] * yy + M[2, 2]
-    den = np.where(den > 1e-6, den, np.float32(np.nan))
-    map_x = (M[0, 0] * xx + M[0, 1] * yy + M[0, 2]) / den
-    map_y = (M[1, 0] * xx + M[1, 1] * yy + M[1, 2]) / den
-    return map_x.astype(np.float32), map_y.astype(np.float32)
+        shift[0] -= plane
+    return np.asarray(view.K @ R_rect_view.T @ np.linalg.inv(K) @ shift @ fine)
 
 
 def _seen(
     view: View, R_rect_view: F64, K: F64, size: tuple[int, int], plane: F64 | None = None
 ) -> Bool:
     """(h, w) True where the rectified picture shows something, a pixel inside the border."""
-    map_x, map_y = _maps(view, R_rect_view, K, size, 1.0, plane)
-    H, W = view.bgr.shape[:2]
-    rim = 1.0 + view.K[0, 0] / K[0, 0]
-    inside = (map_x >= rim) & (map_x <= W - 1 - rim) & (map_y >= rim) & (map_y <= H - 1 - rim)
-    if view.seen is not None:
-        inside &= cv2.remap(view.seen, map_x, map_y, cv2.INTER_NEAREST) > 0
-    return np.asarray(inside)
+    H, W = view.grey.shape
+    rim = int(np.ceil(1.0 + view.K[0, 0] / K[0, 0]))
+    inside = np.zeros((H, W), np.uint8)
+    inside[rim:-rim, rim:-rim] = 1 if view.seen is None else view.seen[rim:-rim, rim:-rim]
+    M = _homography(view, R_rect_view, K, 1.0, plane)
+    flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+    seen = cv2.warpPerspective(inside, M, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
+    return np.asarray(seen > 0)
 
 
 def _warp(
+    picture: U8,
     view: View,
     R_rect_view: F64,
     K: F64,
     size: tuple[int, int],
     oversample: float,
     plane: F64 | None = None,
-    *,
-    area: bool = True,
 ) -> U8:
-    """The view's picture as the rectified camera sees it, shifted by the disparity plane.
+    """The view's ``picture`` as the rectified camera sees it, shifted by the disparity plane.
 
-    With ``area`` the picture is made ``oversample`` times larger and averaged down to
-    ``size`` (no aliasing); without, it stays that much larger. Beyond the picture its edge
-    is repeated: a black rim would be matched with the other view's.
+    It is halved first until no pixel is skipped. Beyond the picture its edge is repeated: a
+    black rim would be matched with the other view's.
     """
-    maps = _maps(view, R_rect_view, K, size, oversample, plane)
-    source, map_x, map_y = _prefilter(view, K[0, 0] * oversample, *maps)
-    out = cv2.remap(source, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    if area and oversample > 1:
-        out = cv2.resize(out, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(out, dtype=np.uint8)
-
-
-def _prefilter(view: View, focal_px: float, map_x: F32, map_y: F32) -> tuple[U8, F32, F32]:
-    """The picture halved until sampling it at ``focal_px`` skips no pixels, and its maps."""
-    picture, ratio = view.bgr, float(view.K[0, 0]) / focal_px
+    M = _homography(view, R_rect_view, K, oversample, plane)
+    ratio = float(view.K[0, 0]) / (K[0, 0] * oversample)
     while ratio > 1.9:
         H, W = picture.shape[:2]
         half = (W // 2, H // 2)
-        S = scaled_K(np.eye(3), half[0] / W, half[1] / H)
-        map_x = (map_x * np.float32(S[0, 0]) + np.float32(S[0, 2])).astype(np.float32)
-        map_y = (map_y * np.float32(S[1, 1]) + np.float32(S[1, 2])).astype(np.float32)
+        M = scaled_K(M, half[0] / W, half[1] / H)
         picture = np.asarray(cv2.resize(picture, half, interpolation=cv2.INTER_AREA), np.uint8)
         ratio /= 2
-    return picture, map_x, map_y
+    fine = (int(size[0] * oversample), int(size[1] * oversample))
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    out = cv2.warpPerspective(picture, M, fine, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(out, dtype=np.uint8)
 
 
-def _grey(bgr: U8) -> U8:
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+def _stereo_view(
+    view: View, R_rect_view: F64, K: F64, size: tuple[int, int], plane: F64 | None
+) -> tuple[U8, Bool]:
+    """Grey rectified view (h, w), averaged down from twice its size, and where it is seen."""
+    seen = _seen(view, R_rect_view, K, size, plane)
+    double = _warp(view.grey, view, R_rect_view, K, size, 2.0, plane)
+    grey = np.asarray(cv2.resize(double, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return stretch(grey, seen), seen
 
 
 def plane_relief(depth: DepthMap, known: tuple[float, float]) -> tuple[float, float]:

@@ -114,6 +114,10 @@ class ComputeConfig:
     labels: int = key(16, "least number of disparity labels; the paper's is 16")
     iterations: int = key(5, "belief propagation's iterations per level; the paper's is 5")
     guide_width: int = key(1280, "width of the picture that guides the upsampling")
+    upsample: bool = key(
+        True, "joint bilateral upsampling; without it depth is coarser and quicker"
+    )
+    pairs: int = key(4, "stereo pairs fused into a keyframe, at most")
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -121,6 +125,7 @@ class ComputeConfig:
         _within("compute.stereo_width", self.stereo_width, 64, 4096)
         _within("compute.labels", self.labels, 2, 256)
         _within("compute.iterations", self.iterations, 1, 100)
+        _within("compute.pairs", self.pairs, 1, 64)
         _within("compute.guide_width", self.guide_width, 64, 8192)
         if self.guide_width < self.stereo_width:
             raise ValueError(

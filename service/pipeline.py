@@ -17,11 +17,11 @@ from recon import se3
 from recon.backends import Backend
 from recon.belief_propagation import BeliefPropagationConfig
 from recon.camera_model import Undistorter, scaled, scaled_K
-from recon.depth_fusion import FusionConfig, PairDepth, fuse, onto_keyframe
+from recon.depth_fusion import FusionConfig, fuse
 from recon.exposure import stretch
 from recon.odometry import Odometry, OdometryConfig, OdometryKeyframe, Tracked
 from recon.registration import IcpConfig
-from recon.reprojection import depth_from_disparity
+from recon.reprojection import PairDepth, reproject
 from recon.trajectory import Placed, Trajectory
 from recon.types import (
     F64,
@@ -86,7 +86,7 @@ class Pipeline:
             _within_width(self.undistorter.camera, 1280),
             OdometryConfig(base_to_height=config.scan.base_to_height),
         )
-        self.viewpoints = Viewpoints(config.scan)
+        self.viewpoints = Viewpoints(config.scan, config.compute.pairs)
         self.trajectory = Trajectory()
         self.stopwatch = Stopwatch()
         self.refusals: Counter[str] = Counter()
@@ -98,6 +98,7 @@ class Pipeline:
             least_base_to_height=self.viewpoints.least_base_to_height,
             width_px=config.compute.stereo_width,
             guide_width_px=config.compute.guide_width,
+            guided=config.compute.upsample,
             labels=config.compute.labels,
         )
         self._bp = BeliefPropagationConfig(iterations=config.compute.iterations)
@@ -199,20 +200,20 @@ class Pipeline:
         self, pair: StereoPair, K: F64, size: tuple[int, int], view: View, partner: Viewpoint
     ) -> PairDepth:
         """Belief propagation, upsampling and reprojection of one pair."""
-        assert pair.guide is not None
         self.pairs += 1
         with self.stopwatch("belief propagation"):  # Eq. 1
             coarse = self._backend.belief_propagation(pair.left, pair.right, pair.labels, self._bp)
             coarse = drop_unseen(coarse, pair)
-        with self.stopwatch("upsample"):  # Eq. 2
-            fine = self._backend.upsample(coarse, pair.guide, self._jbu)
+        fine = coarse
+        if pair.guide is not None:
+            with self.stopwatch("upsample"):  # Eq. 2
+                fine = self._backend.upsample(coarse, pair.guide, self._jbu)
         with self.stopwatch("reproject"):  # Eq. 3
-            depth_m, sigma_m = depth_from_disparity(fine, pair)
-            depth = onto_keyframe(depth_m, sigma_m, pair, K, size)
+            depth = reproject(fine, pair, K, size)
         if self.config.scan.keep_debug:
             self.debug = {
-                "raw_left": view.bgr,
-                "raw_right": partner.bgr,
+                "raw_left": view.grey if view.bgr is None else view.bgr,
+                "raw_right": partner.grey if partner.bgr is None else partner.bgr,
                 "rect_left": pair.left,
                 "rect_right": pair.right,
                 "disparity": coarse.px,
@@ -270,6 +271,7 @@ class Pipeline:
             depth.K,
             placed.T_world_camera,
         )
+        assert viewpoint.bgr is not None
         colour = cv2.resize(viewpoint.bgr, (w, h), interpolation=cv2.INTER_AREA)
         if self.config.scan.keep_debug:
             self.debug |= {"depth_m": metric.depth_m, "sigma_m": metric.sigma_m, "bgr": colour}
@@ -289,6 +291,7 @@ class Pipeline:
             viewpoint.seq,
             viewpoint.time_ns,
             viewpoint.bgr,
+            viewpoint.grey,
             self.undistorter.camera.K,
             viewpoint.T_odom_camera,
             self.undistorter.valid,

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from recon import se3
@@ -24,7 +25,8 @@ class Viewpoint:
 
     seq: int
     time_ns: int
-    bgr: U8  # (H, W, 3) undistorted
+    bgr: U8 | None  # (H, W, 3) undistorted; None for one that is only a partner
+    grey: U8  # (H, W) the same
     key: OdometryKeyframe
     T_key_camera: F64  # (4, 4)
     prior: PosePrior
@@ -38,9 +40,14 @@ class Viewpoint:
 class Viewpoints:
     """Selects views from tracked frames and remembers the last few as partners."""
 
-    def __init__(self, config: ScanConfig, kept: int = 6, partners: int = 4) -> None:
-        """``kept`` views are remembered; at most ``partners`` pair up with one of them."""
+    def __init__(self, config: ScanConfig, partners: int = 4, kept: int = 6) -> None:
+        """``kept`` views are remembered; at most ``partners`` pair up with one of them.
+
+        With more partners than the neighbouring views can be, tracked frames between them
+        become partners too.
+        """
         self._kept: deque[Viewpoint] = deque(maxlen=kept)
+        self._between: deque[Viewpoint] = deque(maxlen=8 * partners if partners > kept - 2 else 0)
         self._most_partners = partners
         self._take_next = False
         self.set_baseline(config)
@@ -70,11 +77,17 @@ class Viewpoints:
     ) -> Viewpoint | None:
         """The frame as a view, when it is to be one."""
         assert tracked.T_odom_camera is not None
-        if not (self._take_next or self._wants(frame.seq, tracked)):
+        wanted = self._take_next or self._wants(frame.seq, tracked)
+        if not wanted and not self._between.maxlen:
+            return None
+        grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
+        T_key_camera = se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera
+        bgr = picture if wanted else None
+        view = Viewpoint(frame.seq, frame.time_ns, bgr, grey, key, T_key_camera, prior)
+        if not wanted:
+            self._between.append(view)
             return None
         self._take_next = False
-        T_key_camera = se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera
-        view = Viewpoint(frame.seq, frame.time_ns, picture, key, T_key_camera, prior)
         self._kept.append(view)
         return view
 
@@ -100,13 +113,26 @@ class Viewpoints:
         Automatic: those nearest to the wanted base-to-height, from both sides; a fixed
         baseline: the neighbour after it, or before it at the end of a segment.
         """
-        others = [v for v in self._kept if v is not view and v.key.segment == view.key.segment]
+        candidates = [*self._kept, *self._between]
+        others = [v for v in candidates if v is not view and v.key.segment == view.key.segment]
         if self._mode != "auto":
             others.sort(key=lambda v: (v.seq < view.seq, abs(v.seq - view.seq)))
             return others[:1]
         centre = view.T_odom_camera[:3, 3]
         others.sort(key=lambda v: float(np.linalg.norm(v.T_odom_camera[:3, 3] - centre)))
-        return others[: self._partners]
+        if not self._between:
+            return others[: self._partners]
+        return self._spread(view, others)
+
+    def _spread(self, view: Viewpoint, others: list[Viewpoint]) -> list[Viewpoint]:
+        """Partners between half and twice the keyframes' spacing, evenly spread."""
+        centre = view.T_odom_camera[:3, 3]
+        base = [float(np.linalg.norm(v.T_odom_camera[:3, 3] - centre)) for v in others]
+        steps = [b for v, b in zip(others, base, strict=True) if v.bgr is not None]
+        spacing = steps[0] if steps else 0.0
+        good = [v for v, b in zip(others, base, strict=True) if 0.6 * spacing <= b <= 2.2 * spacing]
+        picked = np.unique(np.linspace(0, len(good) - 1, self._partners).round().astype(int))
+        return [good[i] for i in picked] if good else []
 
 
 def frames_apart(chosen: int, every: int) -> int:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon import se3
-from recon.depth_fusion import FusionConfig, PairDepth, fuse, seen_from
-from recon.types import F32, DepthMap
+from recon.depth_fusion import FusionConfig, fuse
+from recon.reprojection import PairDepth
+from recon.types import F32
 
 K = np.array([[100.0, 0, 39.5], [0, 100.0, 29.5], [0, 0, 1]])
 SHAPE = (60, 80)
@@ -59,15 +59,3 @@ def test_useless_readings_are_left_out() -> None:
     assert np.isnan(fused.depth_m).all()
     with pytest.raises(ValueError, match="no stereo pair"):
         fuse([], K, np.eye(4), FusionConfig())
-
-
-def test_another_view_confirms_or_looks_through() -> None:
-    flat = np.full(SHAPE, 60.0, np.float32)
-    ghost = flat.copy()
-    ghost[20:30, 30:40] = 40.0
-    sigma, views = np.full(SHAPE, 0.2, np.float32), np.full(SHAPE, 2, np.uint8)
-    other = DepthMap(flat, sigma, views, K, np.eye(4))
-    moved = se3.compose(np.eye(3), np.array([0.6, 0.0, 0.0]))
-    confirmed, contradicted = seen_from(DepthMap(ghost, sigma, views, K, moved), other)
-    assert contradicted[22:28, 32:38].all()
-    assert confirmed[:15, 10:60].all() and not contradicted[:15, 10:60].any()

@@ -2,100 +2,111 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
-from recon.reprojection import depth_from_disparity, points_from_depth, scale_intrinsics
+from recon.reprojection import points_from_depth, reproject
 from recon.types import F64, DepthMap, DisparityMap, StereoPair
 
 K = np.array([[190.0, 0, 159.5], [0, 190.0, 89.5], [0, 0, 1]])
 BASELINE_M = 4.0
+SIZE = (320, 180)
 
 
-def pair_for(plane: F64, slope: float = 1.0) -> StereoPair:
+def pair_for(plane: F64, slope: float = 1.0, turn: F64 | None = None) -> StereoPair:
     """A pair with this disparity plane; the images do not matter here."""
     blank = np.zeros((180, 320), np.uint8)
-    eye = np.eye(4)
-    return StereoPair(blank, blank, BASELINE_M, K, 16, plane, slope, eye, np.eye(3))
+    R = np.eye(3) if turn is None else turn
+    return StereoPair(blank, blank, BASELINE_M, K, 16, plane, slope, np.eye(4), R)
 
 
-def labels_of(depth: F64, pair: StereoPair, size: tuple[int, int]) -> DisparityMap:
-    """The labels that a surface of this depth gives, on a grid of (H, W)."""
-    height, width = size
+def labels_of(depth: F64, pair: StereoPair) -> DisparityMap:
+    """The labels that a surface of this depth gives the rectified left view, on any grid."""
+    height, width = depth.shape
     v, u = np.mgrid[0:height, 0:width]
-    u = (u + 0.5) * 320 / width - 0.5
-    v = (v + 0.5) * 180 / height - 0.5
+    x, y = (u + 0.5) * 320 / width - 0.5, (v + 0.5) * 180 / height - 0.5
     d = K[0, 0] * BASELINE_M / depth
-    label = (d - pair.plane[0] * u - pair.plane[1] * v - pair.plane[2]) / pair.slope
-    return DisparityMap(label.astype(np.float32), np.ones(size, np.float32))
+    label = (d - pair.plane[0] * x - pair.plane[1] * y - pair.plane[2]) / pair.slope
+    return DisparityMap(label.astype(np.float32), np.ones(depth.shape, np.float32))
 
 
-@pytest.mark.parametrize("size", [(180, 320), (720, 1280), (1520, 2704)])
+@pytest.mark.parametrize("finer", [1, 2, 4])
 @pytest.mark.parametrize("slope", [1.0, 0.5, -1.0])
-def test_depth_of_a_known_surface(size: tuple[int, int], slope: float) -> None:
+def test_depth_of_a_known_surface(finer: int, slope: float) -> None:
+    """z = f B / d (Eq. 3), from labels on the pair's grid or an upsampled one."""
     pair = pair_for(np.array([0.01, -0.02, 9.0]), slope)
-    depth = 55 + 6 * np.sin(np.linspace(0, 5, size[1]))[None, :] * np.ones(size)
-    found, sigma = depth_from_disparity(labels_of(depth, pair, size), pair)
-    assert found.shape == size
-    assert found.dtype == sigma.dtype == np.float32
-    np.testing.assert_allclose(found, depth, rtol=1e-4)
-    assert (sigma > 0).all()
+    width, height = 320 * finer, 180 * finer
+    x = (np.arange(width) + 0.5) / finer - 0.5
+    depth = np.tile(55 + 6 * np.sin(x / 60), (height, 1))
+    found = reproject(labels_of(depth, pair), pair, K, SIZE)
+    assert found.depth_m.shape == found.sigma_m.shape == (180, 320)
+    assert found.depth_m.dtype == found.sigma_m.dtype == np.float32
+    want = np.tile(55 + 6 * np.sin(np.arange(320) / 60), (180, 1))
+    np.testing.assert_allclose(found.depth_m, want, rtol=1e-3)
+    assert (found.sigma_m > 0).all()
+
+
+def test_keyframe_turned_against_the_rectified_view() -> None:
+    """A plane seen by the turned left camera comes back as the plane the keyframe sees."""
+    turn = cv2.Rodrigues(np.array([0.05, -0.03, 0.2]))[0].astype(np.float64)
+    pair = pair_for(np.array([0, 0, 5.0]), 1.0, turn)
+    normal, offset = np.array([0.1, 0.05, 1.0]), 60.0  # in the keyframe's frame
+    v, u = np.mgrid[0:180, 0:320]
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.shape)], axis=-1)
+    in_left = offset / (rays @ (turn @ normal))  # z of the plane along the left camera's rays
+    found = reproject(labels_of(in_left, pair), pair, K, SIZE)
+    want = offset / (rays @ normal)
+    known = np.isfinite(found.depth_m)
+    assert known.mean() > 0.6
+    np.testing.assert_allclose(found.depth_m[known], want[known], rtol=2e-3)
 
 
 def test_sigma_is_the_spread_of_depths_under_label_noise() -> None:
     """Propagation by sampling: a quarter of a label of noise gives the sigma that is claimed."""
     pair = pair_for(np.array([0, 0, 8.0]), 0.8)
-    depth = np.full((180, 320), 60.0)
-    labels = labels_of(depth, pair, (180, 320))
-    _, sigma = depth_from_disparity(labels, pair)
-    noise = np.random.default_rng(0).normal(0, 0.25, (180, 320)).astype(np.float32)
-    shaken, _ = depth_from_disparity(DisparityMap(labels.px + noise, labels.confidence), pair)
-    assert np.std(shaken) == pytest.approx(float(np.median(sigma)), rel=0.05)
+    labels = labels_of(np.full((180, 320), 60.0), pair)
+    sigma = reproject(labels, pair, K, SIZE).sigma_m
+    shaken = []
+    for seed in range(60):
+        shift = np.random.default_rng(seed).normal(0, 0.25)
+        moved = DisparityMap((labels.px + shift).astype(np.float32), labels.confidence)
+        shaken.append(float(np.median(reproject(moved, pair, K, SIZE).depth_m)))
+    assert np.std(shaken) == pytest.approx(float(np.median(sigma)), rel=0.25)
 
 
 def test_sigma_grows_as_confidence_falls() -> None:
     pair = pair_for(np.array([0, 0, 8.0]))
-    labels = labels_of(np.full((180, 320), 60.0), pair, (180, 320))
-    _, sure = depth_from_disparity(labels, pair)
-    _, unsure = depth_from_disparity(DisparityMap(labels.px, labels.confidence * 0.25), pair)
-    np.testing.assert_allclose(unsure, 2 * sure, rtol=1e-4)
+    labels = labels_of(np.full((180, 320), 60.0), pair)
+    sure = reproject(labels, pair, K, SIZE).sigma_m
+    unsure = reproject(DisparityMap(labels.px, labels.confidence * 0.25), pair, K, SIZE).sigma_m
+    assert (unsure > 1.5 * sure).all()
 
 
 def test_unknown_doubtful_and_infinite_are_nan() -> None:
     pair = pair_for(np.array([0, 0, 2.0]))
     px = np.full((180, 320), 5, np.float32)
     confidence = np.ones((180, 320), np.float32)
-    px[0, 0], px[0, 1], px[0, 2], confidence[0, 3] = np.nan, -2, -9, 0.0
-    depth, sigma = depth_from_disparity(DisparityMap(px, confidence), pair)
-    assert np.isnan(depth[0, :4]).all()
-    assert np.isnan(sigma[0, :4]).all()
-    assert np.isfinite(depth[0, 4:]).all()
+    px[0, 0], px[0, 4], px[0, 8], confidence[0, 12] = np.nan, -2, -9, 0.0
+    found = reproject(DisparityMap(px, confidence), pair, K, SIZE)
+    assert np.isnan(found.depth_m[0, [0, 4, 8, 12]]).all()
+    assert np.isnan(found.sigma_m[0, [0, 4, 8, 12]]).all()
+    assert np.isfinite(found.depth_m[2:]).all()
     with pytest.raises(ValueError, match="bad disparity"):
-        depth_from_disparity(DisparityMap(px, confidence[1:]), pair)
+        reproject(DisparityMap(px, confidence[1:]), pair, K, SIZE)
 
 
 def test_points_project_back_onto_their_pixels() -> None:
     depth = np.random.default_rng(0).uniform(30, 80, (36, 64)).astype(np.float32)
     depth[3, 4] = np.nan
-    small = scale_intrinsics(K, (320, 180), (64, 36))
+    small = np.array([[38.0, 0, 31.5], [0, 38.0, 17.5], [0, 0, 1]])
     ones = np.ones((36, 64), np.uint8)
     points = points_from_depth(DepthMap(depth, depth * 0.01, ones, small, np.eye(4)))
     assert points.shape == (36, 64, 3)
     assert points.dtype == np.float32
     assert np.isnan(points[3, 4]).all()
-    points[3, 4] = (0, 0, 1)
     uvw = points.reshape(-1, 3).astype(np.float64) @ small.T
     v, u = np.mgrid[0:36, 0:64]
     keep = np.arange(36 * 64) != 3 * 64 + 4
     np.testing.assert_allclose((uvw[:, 0] / uvw[:, 2])[keep], u.ravel()[keep], atol=1e-3)
     np.testing.assert_allclose((uvw[:, 1] / uvw[:, 2])[keep], v.ravel()[keep], atol=1e-3)
-
-
-def test_scaled_intrinsics_see_the_same_rays() -> None:
-    """The corner of the image stays the corner; pixel centres lie at integers."""
-    large = scale_intrinsics(K, (320, 180), (1280, 720))
-    for corner in ((-0.5, -0.5), (319.5, 179.5)):
-        ray = np.linalg.solve(K, np.array([*corner, 1.0]))
-        scaled = large @ ray
-        want = [(corner[0] + 0.5) * 4 - 0.5, (corner[1] + 0.5) * 4 - 0.5]
-        np.testing.assert_allclose(scaled[:2] / scaled[2], want, atol=1e-9)

@@ -16,7 +16,9 @@ from service.viewpoints import Viewpoint, Viewpoints, frames_apart
 CAMERA = Camera(np.eye(3), np.zeros(5), (32, 32))
 
 
-def offer(views: Viewpoints, seq: int, x_m: float, state: str, segment: int = 0) -> Viewpoint | None:
+def offer(
+    views: Viewpoints, seq: int, x_m: float, state: str, segment: int = 0
+) -> Viewpoint | None:
     T = se3.compose(np.eye(3), np.array([x_m, 0.0, 50.0]))
     key = OdometryKeyframe(
         seq, seq, segment, se3.inverse(T), np.eye(6), PosePrior(), Pyramid(()),
@@ -48,17 +50,13 @@ def test_partners_are_the_nearest_of_the_same_segment() -> None:
 @pytest.mark.parametrize(("baseline", "seqs"), [("2/10", [0, 10, 20, 30]), ("3/10", [0, 5, 10])])
 def test_the_papers_notation_takes_every_so_many_frames(baseline: str, seqs: list[int]) -> None:
     views = Viewpoints(ScanConfig(baseline=baseline))
-    taken = [
-        i for i in range(31) if offer(views, i, 0.1 * i, "keyframe" if i == 0 else "tracked")
-    ]
+    taken = [i for i in range(31) if offer(views, i, 0.1 * i, "keyframe" if i == 0 else "tracked")]
     assert taken[: len(seqs)] == seqs
 
 
 def test_a_baseline_in_metres_is_kept_and_may_change_in_flight() -> None:
     views = Viewpoints(ScanConfig(baseline=2.0))
-    taken = [
-        i for i in range(20) if offer(views, i, 0.5 * i, "keyframe" if i == 0 else "tracked")
-    ]
+    taken = [i for i in range(20) if offer(views, i, 0.5 * i, "keyframe" if i == 0 else "tracked")]
     assert taken == [0, 4, 8, 12, 16]
     views.set_baseline(ScanConfig(baseline=1.0))
     more = [i for i in range(20, 26) if offer(views, i, 0.5 * i, "tracked")]
