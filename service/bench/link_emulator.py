@@ -103,9 +103,9 @@ class LinkEmulator:
         self._model = model
         self._ports = listen_port, target_port
         self._udp = udp
-        self._started = time.monotonic()
-        self._up = _Pipe(model, self._started, model.seed)
-        self._down = _Pipe(model, self._started, model.seed + 1)
+        self.started = time.monotonic()
+        self._up = _Pipe(model, self.started, model.seed)
+        self._down = _Pipe(model, self.started, model.seed + 1)
         self._loop = asyncio.new_event_loop()
         self._ready = threading.Event()
         self._tasks: set[asyncio.Task[None]] = set()

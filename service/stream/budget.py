@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 
 WINDOW_SHARE = 0.05
 """The bucket holds this share of a second, so no 1 s window exceeds the rate by more."""
@@ -65,3 +66,68 @@ class TokenBucket:
         passed = max(0.0, now - self._at)
         self._tokens = min(self.depth_bytes, self._tokens + passed * self._rate)
         self._at = max(self._at, now)
+
+
+class RateEstimate:
+    """What the link really carries, from what the far end says it received.
+
+    Bytes sent and not yet received beyond the least of late are a queue. When two reports in
+    a row find more than half a second of it, the allowed rate falls below what came through
+    at best of late; then it climbs, fast to where the queue began and slowly from there on.
+    One stall of a lossy link is no queue.
+    """
+
+    QUEUE_S = 0.5
+    QUEUE_LEAST_BYTES = 8_000
+    FALL = 0.8  # of what came through
+    CLIMB, CREEP = 0.05, 0.005  # of the configured rate, per report
+    FLOOR = 0.03  # of the configured rate
+    LEAST_S = 0.8  # reports closer together are joined
+    SILENCE_S = 10.0  # after a gap, begin anew
+    REST = 2  # reports after a fall that are not judged
+    PATIENCE = 2  # bad reports in a row before the rate falls
+
+    def __init__(self, configured_bytes_s: float) -> None:
+        self.configured_bytes_s = configured_bytes_s
+        self.rate_bytes_s = configured_bytes_s
+        self._knee = configured_bytes_s
+        self._at = -math.inf
+        self._received = 0
+        self._under_way: deque[int] = deque(maxlen=20)
+        self._through: deque[float] = deque(maxlen=4)
+        self._rest = 0
+        self._bad = 0
+
+    def report(self, sent_bytes: int, received_bytes: int, now: float) -> float:
+        """The rate to use, given the totals sent and received so far."""
+        passed = now - self._at
+        if passed < self.LEAST_S:
+            return self.rate_bytes_s
+        self._through.append((received_bytes - self._received) / passed)
+        through = max(self._through)
+        anew = passed > self.SILENCE_S or received_bytes < self._received
+        self._at, self._received = now, received_bytes
+        if anew:
+            self._under_way.clear()
+            self._through.clear()
+        self._under_way.append(sent_bytes - received_bytes)
+        queue = self._under_way[-1] - min(self._under_way)
+        if self._rest > 0:
+            self._rest -= 1
+        elif not anew and queue > max(self.QUEUE_LEAST_BYTES, self.QUEUE_S * through):
+            self._bad += 1
+            if self._bad >= self.PATIENCE:
+                self._fall(through)
+        else:
+            self._bad = 0
+            step = self.CLIMB if self.rate_bytes_s < self._knee else self.CREEP
+            climbed = self.rate_bytes_s + step * self.configured_bytes_s
+            self.rate_bytes_s = min(self.configured_bytes_s, climbed)
+        return self.rate_bytes_s
+
+    def _fall(self, through: float) -> None:
+        least = self.FLOOR * self.configured_bytes_s
+        self._knee = max(least, 0.9 * through)
+        self.rate_bytes_s = max(least, min(self.rate_bytes_s, self.FALL * through))
+        self._under_way.clear()
+        self._rest, self._bad = self.REST, 0

@@ -42,6 +42,7 @@ class LinkProgress:
     items: int  # in the stores: poses, layers …
     lacking: dict[str, int] = field(default_factory=dict)  # by kind, at the best ground station
     sent_bytes: int = 0
+    rate_kbit_s: float = 0.0  # allowed now; below the budget when less comes through
     left_for_later: int = 0  # live items that made way; a ground station asks for them
 
     @property
@@ -111,7 +112,7 @@ class DatalinkSender:
     def set_budget(self, budget_kbit_s: float, share: float | None = None) -> None:
         """Change the link's rate, in flight."""
         rate = _rate(budget_kbit_s, self._config.share if share is None else share)
-        self._post(lambda now: self._outbox.bucket.set_rate(rate, now))
+        self._post(lambda now: self._outbox.set_rate(rate, now))
 
     @property
     def progress(self) -> LinkProgress:
@@ -129,6 +130,7 @@ class DatalinkSender:
                 items,
                 lacking,
                 self._outbox.sent_bytes,
+                self._outbox.bucket.rate_bytes_s / 125,
                 self._outbox.skipped,
             )
 

@@ -12,7 +12,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
 from itertools import islice
 
-from service.stream.budget import TokenBucket, wire_bytes
+from service.stream.budget import RateEstimate, TokenBucket, wire_bytes
 from service.stream.lanes import MAX_ASKED, AskedLane, LiveLane, Outgoing, Request
 from service.stream.messages import Ask, Head, Held, Numbers, missing, pack_head
 from service.stream.ranges import RangeSet
@@ -35,6 +35,7 @@ class _Feed:
     head_due: float
     head_sent: float = -1e9
     held: dict[str, Numbers] = field(default_factory=dict)
+    sent_bytes: int = 0  # parts of this scan's items
 
 
 class Outbox:
@@ -47,6 +48,8 @@ class Outbox:
         self._live = {POSE: LiveLane(64), COARSE: LiveLane(16), FINE: LiveLane(2)}
         self._asked = {ASKED: AskedLane(), BACKFILL: AskedLane()}
         self._heard: dict[str, float] = {}
+        self._estimates: dict[tuple[str, str], RateEstimate] = {}
+        self._configured = rate_bytes_s
         self._head: Outgoing | None = None
 
     def add(self, store: ScanStore, now: float) -> None:
@@ -79,8 +82,27 @@ class Outbox:
         """A ground station reports what it holds."""
         self._hear(peer, now)
         feed = self._feeds.get(scan_id)
-        if feed is not None:
-            feed.held[peer] = report.numbers
+        if feed is None:
+            return
+        feed.held[peer] = report.numbers
+        estimate = self._estimates.setdefault((scan_id, peer), RateEstimate(self._configured))
+        estimate.report(feed.sent_bytes, report.received_bytes, now)
+        self._adapt(now)
+
+    def set_rate(self, rate_bytes_s: float, now: float) -> None:
+        """Change what may be sent per second; the link's own pace may keep it lower."""
+        self._configured = rate_bytes_s
+        self._estimates.clear()
+        self._adapt(now)
+
+    def _adapt(self, now: float) -> None:
+        """Keep to what the best supplied ground station receives."""
+        rates = [
+            estimate.rate_bytes_s
+            for (_, peer), estimate in self._estimates.items()
+            if now - self._heard.get(peer, -1e9) < PEER_TIMEOUT_S
+        ]
+        self.bucket.set_rate(max(rates, default=self._configured), now)
 
     def ask(
         self, scan_id: str, kind: str, numbers: RangeSet, ask: Ask, token: Hashable, now: float
@@ -133,6 +155,8 @@ class Outbox:
                 return wait
             self.bucket.take(size, now)
             self.sent_bytes += size
+            if number != STATUS and message.scan_id in self._feeds:
+                self._feeds[message.scan_id].sent_bytes += len(message.payload)
             self._pop(number)
             return replace(message, lane=number)
         due = min((feed.head_due for feed in self._feeds.values()), default=now + 1.0)

@@ -1,0 +1,229 @@
+"""``skyrelief bench link``: the datalink over an emulated radio, and a fleet into one ground.
+
+The trial: 1 Mbit/s, 100 ms each way, 3 % loss, a cut of 20 s, more produced than the link
+carries. The fleet: ten drones with 1 Mbit/s each. Drone and ground run in this process, over
+real sockets and Zenoh, with the emulator between them.
+"""
+
+from __future__ import annotations
+
+import socket
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from service.bench import BenchOptions, BenchResult
+from service.bench.keyframes import make_keyframe, strip
+from service.bench.link_emulator import LinkEmulator, LinkModel
+from service.config import DatalinkConfig
+from service.ground.receiver import Receiver, ReceiverConfig
+from service.stream import codec
+from service.stream.link import DatalinkSender
+from service.stream.records import PoseRecord, ScanHeader
+from service.stream.session import SessionConfig
+from service.stream.store import ScanStore
+
+SIZE_PX = (320, 180)
+SHARE = 0.65
+SETTLE_S = 3.0
+"""Time after a cut in which the link is not counted as up: TCP and Zenoh find each other."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """What is flown over which link."""
+
+    link: LinkModel
+    flight_s: float = 45.0
+    keyframes_hz: float = 7.0
+    drones: int = 1
+    drain_s: float = 240.0
+
+
+RADIO = Trial(LinkModel(1000.0, 0.1, 0.03, ((12.0, 32.0),)))
+FLEET = Trial(LinkModel(1000.0, 0.05, 0.0), flight_s=15.0, keyframes_hz=2.0, drones=10)
+
+
+@dataclass(slots=True, eq=False)
+class _Drone:
+    store: ScanStore
+    sender: DatalinkSender
+    emulator: LinkEmulator
+    made: dict[tuple[str, int], float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of a trial; latencies in seconds, per kind, while the link was up."""
+
+    delivered: int
+    made: int
+    least_share: float  # of the drone that got through least, when the flight ended
+    latency_s: dict[str, list[float]]
+    busiest_share: float  # busiest second over the budget, on the wire
+    sent_over_stored: float
+    duplicates: int
+    drain_s: float
+    cpu_share: float  # of one core, drone and ground and emulator together
+
+
+def run(options: BenchOptions) -> list[BenchResult]:
+    """The trial and the fleet, each as a handful of figures."""
+    return [*_report("link", fly(RADIO)), *_report("link fleet of ten", fly(FLEET))]
+
+
+def _report(name: str, outcome: Outcome) -> list[BenchResult]:
+    rows = [
+        ("delivered of what was made", 100 * outcome.delivered / outcome.made, "%"),
+        ("least served drone at the flight's end, coarse layers", 100 * outcome.least_share, "%"),
+        ("busiest second on the wire, of the budget", 100 * outcome.busiest_share, "%"),
+        ("bytes on the wire per byte stored", outcome.sent_over_stored, ""),
+        ("records that came twice", float(outcome.duplicates), ""),
+        ("time to fetch the rest after the flight", outcome.drain_s, "s"),
+        ("processor, all parts together", 100 * outcome.cpu_share, "% of a core"),
+    ]
+    for kind, what in (("pose", "poses"), ("k0", "coarse layers"), ("k1", "fine layers")):
+        latencies = outcome.latency_s.get(kind, [])
+        if latencies:
+            rows.append((f"latency of {what}, median", float(np.median(latencies)), "s"))
+            rows.append((f"latency of {what}, 95 %", float(np.percentile(latencies, 95)), "s"))
+            rows.append((f"latency of {what}, worst", max(latencies), "s"))
+    return [BenchResult(name, what, value, unit) for what, value, unit in rows]
+
+
+def fly(trial: Trial) -> Outcome:
+    """Run a trial from take-off until the ground has everything or ``drain_s`` is over."""
+    with tempfile.TemporaryDirectory() as folder:
+        return _fly(trial, Path(folder))
+
+
+def _fly(trial: Trial, folder: Path) -> Outcome:
+    ground_port = _free_port()
+    session = SessionConfig(mode="router", listen=(f"tcp/127.0.0.1:{ground_port}",))
+    ground = _WatchedReceiver(ReceiverConfig(folder / "ground", session))
+    ground.start()
+    drones = [_take_off(trial, folder, k, ground_port) for k in range(trial.drones)]
+    began, cpu = time.monotonic(), time.process_time()
+    _produce(trial, drones, began)
+    least = min(_coarse_share(drone, ground) for drone in drones)
+    landed = time.monotonic()
+    for drone in drones:
+        drone.store.finish({})
+    for drone in drones:
+        drone.sender.drain(max(0.0, trial.drain_s - (time.monotonic() - landed)))
+    ended = time.monotonic()
+    outcome = _outcome(trial, drones, ground, least, began, landed, ended, cpu)
+    for drone in drones:
+        drone.sender.close()
+        drone.emulator.close()
+        drone.store.close()
+    ground.close()
+    return outcome
+
+
+def _take_off(trial: Trial, folder: Path, number: int, ground_port: int) -> _Drone:
+    port = _free_port()
+    emulator = LinkEmulator(replace(trial.link, seed=number), port, ground_port, udp=False)
+    emulator.start()
+    name = f"drone-{number}"
+    store = ScanStore.create(folder / name / "scan.db", ScanHeader("scan", name, 1))
+    config = DatalinkConfig(
+        connect=(f"tcp/127.0.0.1:{port}",),
+        budget_kbit_s=trial.link.rate_kbit_s,
+        share=SHARE,
+    )
+    return _Drone(store, DatalinkSender(store, config), emulator)
+
+
+def _produce(trial: Trial, drones: Sequence[_Drone], began: float) -> None:
+    """Keyframes with 80 % overlap and a pose each, at the trial's rate."""
+    patterns = [make_keyframe(k, SIZE_PX, strip(SIZE_PX, 20 + k), seed=1 + k) for k in range(4)]
+    for seq in range(round(trial.flight_s * trial.keyframes_hz)):
+        time.sleep(max(0.0, began + seq / trial.keyframes_hz - time.monotonic()))
+        layers = codec.encode(replace(patterns[seq % 4], seq=seq), time.time_ns())
+        for drone in drones:
+            now = time.monotonic()
+            drone.made["k0", seq] = drone.made["k1", seq] = now
+            drone.store.add_keyframe(seq, layers)
+            pose = PoseRecord(time.time_ns(), np.eye(4), np.eye(6), keyframe_seq=seq)
+            drone.made["pose", drone.store.add_pose(pose)] = now
+
+
+class _WatchedReceiver(Receiver):
+    """A receiver that notes when each item is stored, and writes no deliverables."""
+
+    def __init__(self, config: ReceiverConfig) -> None:
+        super().__init__(config)
+        self.came: dict[tuple[str, str, int], float] = {}
+
+    def _scan(self, drone: str, scan_id: str):  # type: ignore[no-untyped-def]
+        known = (drone, scan_id) in self._scans
+        scan = super()._scan(drone, scan_id)
+        if scan is not None and not known:
+
+            def came(kind: str, number: int) -> None:
+                self.came.setdefault((drone, kind, number), time.monotonic())
+
+            scan.intake.store.listen(came)
+        return scan
+
+    def _write(self, scan) -> None:  # type: ignore[no-untyped-def]
+        scan.unwritten = False
+
+
+def _coarse_share(drone: _Drone, ground: _WatchedReceiver) -> float:
+    name = drone.store.header.drone
+    coarse = [number for kind, number in drone.made if kind == "k0"]
+    return sum((name, "k0", number) in ground.came for number in coarse) / max(1, len(coarse))
+
+
+def _outcome(
+    trial: Trial,
+    drones: Sequence[_Drone],
+    ground: _WatchedReceiver,
+    least: float,
+    began: float,
+    landed: float,
+    ended: float,
+    cpu: float,
+) -> Outcome:
+    latency: dict[str, list[float]] = {}
+    delivered = 0
+    for drone in drones:
+        name = drone.store.header.drone
+        for (kind, number), at in drone.made.items():
+            came = ground.came.get((name, kind, number))
+            if came is None:
+                continue
+            delivered += 1
+            if _is_up(trial.link, at - drone.emulator.started):
+                latency.setdefault(kind, []).append(came - at)
+    budget = trial.link.rate_kbit_s * 125 * SHARE
+    wire = sum(drone.emulator.up.total_bytes() for drone in drones)
+    stored = sum(drone.store.chunk_bytes for drone in drones)
+    return Outcome(
+        delivered=delivered,
+        made=sum(len(drone.made) for drone in drones),
+        least_share=least,
+        latency_s=latency,
+        busiest_share=max(d.emulator.up.busiest_window_bytes() for d in drones) / budget,
+        sent_over_stored=wire / max(1, stored),
+        duplicates=sum(entry["duplicates"] for entry in ground.progress()),
+        drain_s=ended - landed,
+        cpu_share=(time.process_time() - cpu) / (ended - began),
+    )
+
+
+def _is_up(link: LinkModel, at_s: float) -> bool:
+    """Whether something captured then could travel: no cut just before or soon after."""
+    return not any(first - 1.0 <= at_s < last + SETTLE_S for first, last in link.cuts)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
