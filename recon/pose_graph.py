@@ -10,68 +10,20 @@ supports that fit, poses stay in the odometry's frame and say so.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from recon import graph_factors, se3
 from recon.graph_factors import matrix, pose3
-from recon.track_alignment import Similarity, align_track, mean_rotation
+from recon.graph_records import Loop, Node, PoseGraphConfig, leveller, loops_agree
+from recon.track_alignment import Similarity, align_track
 from recon.types import F64, Pose, PosePrior
 
 __all__ = ["PoseGraph", "PoseGraphConfig"]
 
+_CHI2_LIMIT = 22.5  # 99.9 % of chi-square with six degrees of freedom
 _BLOCK = 20  # keyframes that share one scale and one altitude bias
-
-
-@dataclass(frozen=True, slots=True)
-class PoseGraphConfig:
-    """Parameters of the pose graph."""
-
-    sigma_scale: float = 0.1  # of a segment's scale after its alignment, before the readings
-    sigma_step: float = 0.003  # of one vision motion's length: scale drifts step by step
-    max_align_sigma: float = 0.04  # rad and share; the track must fix heading and scale this well
-    correlation_s: float = 10.0  # readings of one sensor closer in time than this err together
-    gate_sigmas: float = 5.0  # readings further from the prediction are left out
-    huber_sigmas: float = 1.5
-    sigma_scale_walk: float = 0.005  # change of the scale per twenty keyframes
-    sigma_altitude_bias_m: float = 10.0
-    sigma_altitude_walk_m: float = 0.3  # change of the bias per twenty keyframes
-    sigma_link_m: float = 3.0  # per second without vision
-    sigma_link_rad: float = 0.3
-    loop_window: int = 15  # keyframes within which two loops support each other
-
-    def __post_init__(self) -> None:
-        """Raise ValueError when a parameter makes no sense."""
-        for name in ("sigma_scale", "sigma_step", "max_align_sigma", "gate_sigmas", "huber_sigmas",
-                     "sigma_altitude_bias_m", "sigma_link_m", "sigma_link_rad"):  # fmt: skip
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.correlation_s < 0 or self.loop_window < 1:
-            raise ValueError("correlation_s must not be negative, loop_window at least 1")
-
-
-@dataclass(slots=True, eq=False)
-class _Node:
-    """One keyframe and what is known of it."""
-
-    key: int  # in the graph
-    time_ns: int
-    segment: int
-    T_odom_camera: F64
-    covariance: F64  # (6, 6) of the motion since the node before, left, in that camera's frame
-    prior: PosePrior
-    altitude_m: float | None
-    sigma_altitude_m: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Loop:
-    a: int
-    b: int
-    T_a_b: F64
-    covariance: F64
 
 
 class PoseGraph:
@@ -84,11 +36,11 @@ class PoseGraph:
         """An empty graph."""
         self.config = config or PoseGraphConfig()
         self.counts: Counter[str] = Counter()  # readings left out, by reason
-        self._nodes: dict[int, _Node] = {}  # by keyframe number, in order of time
+        self._nodes: dict[int, Node] = {}  # by keyframe number, in order of time
         self._similarity: dict[int, Similarity] = {}  # by segment, once aligned
         self._local: dict[int, Similarity] = {}  # by segment, until then
-        self._loops: list[_Loop] = []
-        self._pending: list[_Loop] = []
+        self._loops: list[Loop] = []
+        self._pending: list[Loop] = []
         self._start()
 
     @property
@@ -132,7 +84,7 @@ class PoseGraph:
             raise ValueError(f"keyframe {seq} does not come after {next(reversed(self._nodes))}")
         if T_odom_camera.shape != (4, 4) or covariance.shape != (6, 6):
             raise ValueError("T_odom_camera must be (4, 4) and covariance (6, 6)")
-        node = _Node(
+        node = Node(
             len(self._nodes), time_ns, segment, np.array(T_odom_camera, np.float64),
             np.array(covariance, np.float64), self._fresh(prior), altitude_m, sigma_altitude_m,
         )  # fmt: skip
@@ -158,7 +110,7 @@ class PoseGraph:
         if a > b:
             a, b = b, a
             T_a_b, covariance = graph_factors.reversed_motion(T_a_b, covariance)
-        loop = _Loop(a, b, T_a_b, covariance)
+        loop = Loop(a, b, T_a_b, covariance)
         support = [other for other in self._pending + self._loops if self._agree(loop, other)]
         if not support:
             self._pending.append(loop)
@@ -207,7 +159,7 @@ class PoseGraph:
     def rebuild(self) -> None:
         """Make the whole graph anew from all readings and the segments' present similarities."""
         self._start()
-        last: _Node | None = None
+        last: Node | None = None
         for i, node in enumerate(self._nodes.values()):
             self._insert(node, last)
             if i % 50 == 49:
@@ -237,7 +189,7 @@ class PoseGraph:
             self._head = state
         return state[1], state[2]
 
-    def _insert(self, node: _Node, last: _Node | None) -> None:
+    def _insert(self, node: Node, last: Node | None) -> None:
         self._sources[node.key] = set()
         if last is None:
             T, spread = self._first(node)
@@ -252,7 +204,7 @@ class PoseGraph:
         self._head = (node.key, T, spread)
         self._add_readings(node, last, T, spread)
 
-    def _first(self, node: _Node) -> tuple[F64, F64]:
+    def _first(self, node: Node) -> tuple[F64, F64]:
         """Pose and covariance of the first keyframe: loose where readings will tell.
 
         The gauge that no reading ever fixes is held at the start.
@@ -265,7 +217,7 @@ class PoseGraph:
         self._graph.add(self._gtsam.PriorFactorPose3(node.key, pose3(T), noise))
         return T, graph_factors.left_covariance(T, np.diag(sigma**2))
 
-    def _connect(self, node: _Node, last: _Node, motion: F64, covariance: F64) -> None:
+    def _connect(self, node: Node, last: Node, motion: F64, covariance: F64) -> None:
         """The motion between two keyframes; of an aligned segment, with its scale left open."""
         gtsam = self._gtsam
         noise = gtsam.noiseModel.Gaussian.Covariance(
@@ -307,7 +259,7 @@ class PoseGraph:
             return float(self._values.atVector(key)[0])
         return float(self._isam.calculateEstimateVector(key)[0])
 
-    def _frame(self, node: _Node) -> Similarity:
+    def _frame(self, node: Node) -> Similarity:
         """The segment's similarity; until there is one, its own frame turned to the attitude."""
         if node.segment in self._similarity:
             return self._similarity[node.segment]
@@ -317,7 +269,7 @@ class PoseGraph:
             self._local[node.segment] = Similarity(1.0, turn, np.zeros(3), 1.0)
         return self._local[node.segment]
 
-    def _motion(self, node: _Node, last: _Node, T_last: F64) -> tuple[F64, F64]:
+    def _motion(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
         """T_last_node in metres and its (6, 6) covariance, left, in last's frame."""
         if node.segment != last.segment:
             return self._link(node, last, T_last)
@@ -329,7 +281,7 @@ class PoseGraph:
         self._sources[node.key].add("vision")
         return motion, covariance
 
-    def _link(self, node: _Node, last: _Node, T_last: F64) -> tuple[F64, F64]:
+    def _link(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
         """Dead reckoning where vision was lost: telemetry's motion, or none, with wide sigmas."""
         self.counts["stretch without vision"] += 1
         T = T_last.copy()
@@ -349,7 +301,7 @@ class PoseGraph:
 
     # ---- readings ----------------------------------------------------------------------------
 
-    def _add_readings(self, node: _Node, last: _Node | None, T: F64, spread: F64) -> None:
+    def _add_readings(self, node: Node, last: Node | None, T: F64, spread: F64) -> None:
         seconds = self.config.correlation_s
         gap = 1e9 if last is None else max((node.time_ns - last.time_ns) * 1e-9, 1e-3)
         # Readings that err together count as one per correlation time.
@@ -362,7 +314,7 @@ class PoseGraph:
         self._add_position(node, T, place, inflate)
         self._add_altitude(node, T, inflate)
 
-    def _add_attitude(self, node: _Node, T: F64, spread: F64, inflate: float) -> None:
+    def _add_attitude(self, node: Node, T: F64, spread: F64, inflate: float) -> None:
         prior = node.prior
         if prior.R_world_camera is None:
             return
@@ -381,7 +333,7 @@ class PoseGraph:
         self._graph.add(self._gtsam.PoseRotationPrior3D(node.key, self._gtsam.Rot3(R), noise))
         self._sources[node.key].add("attitude")
 
-    def _add_position(self, node: _Node, T: F64, place: F64, inflate: float) -> None:
+    def _add_position(self, node: Node, T: F64, place: F64, inflate: float) -> None:
         prior = node.prior
         if prior.position_m is None or prior.sigma_position_m is None:
             return
@@ -394,7 +346,7 @@ class PoseGraph:
         self._graph.add(self._gtsam.GPSFactor(node.key, prior.position_m, noise))
         self._sources[node.key].add("gnss")
 
-    def _add_altitude(self, node: _Node, T: F64, inflate: float) -> None:
+    def _add_altitude(self, node: Node, T: F64, inflate: float) -> None:
         if node.altitude_m is None:
             return
         gtsam = self._gtsam
@@ -437,7 +389,7 @@ class PoseGraph:
         if len(places) < 4 or len(places) != len(sigmas):
             return False
         level = any(n.prior.R_world_camera is not None for n in nodes)
-        tilt = _leveller(nodes) if level else np.eye(3)
+        tilt = leveller(nodes) if level else np.eye(3)
         track = np.array([tilt @ n.T_odom_camera[:3, 3] for n in fixed])
         found = align_track(
             track, np.array(places), np.array(sigmas), level, self.config.max_align_sigma
@@ -447,27 +399,19 @@ class PoseGraph:
         self._similarity[segment] = Similarity(found.scale, found.R @ tilt, found.t, found.sigma)
         return True
 
-    def _agree(self, one: _Loop, other: _Loop) -> bool:
+    def _agree(self, one: Loop, other: Loop) -> bool:
         """True when two loops, joined by the track between their ends, close on themselves."""
         window = self.config.loop_window
         near = abs(one.a - other.a) <= window and abs(one.b - other.b) <= window
         if not near or (one.a == other.a and one.b == other.b):
             return False
-        bridge_a = se3.inverse(self._estimate(self._nodes[one.a].key)) @ self._estimate(
-            self._nodes[other.a].key
+        ends = (one.a, other.a, other.b, one.b)
+        a, a_other, b_other, b = (self._estimate(self._nodes[i].key) for i in ends)
+        return loops_agree(
+            one, other, se3.inverse(a) @ a_other, se3.inverse(b_other) @ b, _CHI2_LIMIT
         )
-        bridge_b = se3.inverse(self._estimate(self._nodes[other.b].key)) @ self._estimate(
-            self._nodes[one.b].key
-        )
-        circle = bridge_a @ other.T_a_b @ bridge_b @ se3.inverse(one.T_a_b)
-        length = np.linalg.norm(bridge_a[:3, 3]) + np.linalg.norm(bridge_b[:3, 3])
-        A = se3.adjoint(bridge_a)
-        slack = np.diag([0.01**2] * 3 + [(0.03 * float(length) + 0.02) ** 2] * 3)
-        covariance = one.covariance + A @ other.covariance @ A.T + slack
-        error = se3.log(circle)
-        return bool(error @ np.linalg.solve(covariance, error) < 22.5)  # 99.9 % of chi-square(6)
 
-    def _loop_factor(self, loop: _Loop) -> Any:
+    def _loop_factor(self, loop: Loop) -> Any:
         a, b = self._nodes[loop.a].key, self._nodes[loop.b].key
         noise = self._gtsam.noiseModel.Gaussian.Covariance(
             graph_factors.right_covariance(loop.T_a_b, loop.covariance)
@@ -475,21 +419,8 @@ class PoseGraph:
         self._sources[b].add("loop")
         return self._gtsam.BetweenFactorPose3(a, b, pose3(loop.T_a_b), self._robust(noise))
 
-    def _newest(self) -> _Node:
+    def _newest(self) -> Node:
         return next(reversed(self._nodes.values()))
 
     def _estimate(self, key: int) -> F64:
         return matrix(self._isam.calculateEstimatePose3(key))
-
-
-def _leveller(nodes: list[_Node]) -> F64:
-    """(3, 3) rotation of the odometry's frame by the mean of all attitudes."""
-    return mean_rotation(
-        np.array(
-            [
-                n.prior.R_world_camera @ n.T_odom_camera[:3, :3].T
-                for n in nodes
-                if n.prior.R_world_camera is not None
-            ]
-        )
-    )
