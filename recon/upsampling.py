@@ -30,8 +30,10 @@ RANGE_FLOOR = -20.0
 MIN_CONFIDENCE = 1e-3
 """The least weight of a known tap."""
 
-OUTSIDE = -100.0
-"""log2 of the weight of a tap outside the coarse image: nothing beside any other."""
+FARTHEST = -40.0
+OUTSIDE = -60.0
+"""log2 of the least spatial weight along one axis, and of that of a tap outside the coarse
+image: nothing beside the nearest tap, and no sum leaves the range of :func:`_exp2`."""
 
 TILE = 64
 GROUP = 5
@@ -119,7 +121,7 @@ def _window(taps: int, fine: int, config: UpsamplingConfig) -> tuple[I32, F32]:
     first = np.ceil(q - config.diameter_px / 2).astype(np.int32)
     distance = first[:, None] + np.arange(config.diameter_px) - q[:, None]
     spatial = -0.5 * np.log2(np.e) * (distance / config.spatial_sigma) ** 2
-    return first, spatial.astype(np.float32)
+    return first, np.maximum(spatial, FARTHEST).astype(np.float32)
 
 
 def _taps(coarse: DisparityMap, guide: U8, scale: float) -> F32:
