@@ -154,7 +154,7 @@ class BootClock:
         self._window_end_ns = 0
         self._current_ns: float | None = None
         self._previous_ns: float | None = None
-        self.timesync_offset_ns: int | None = None  # ours - boot, by TIMESYNC
+        self._timesync_ns: int | None = None
 
     @property
     def reboots(self) -> int:
@@ -166,7 +166,7 @@ class BootClock:
         reboots = self.reboots
         boot_ns = self._counter.unwrap(boot_ms) * MS
         if self.reboots != reboots:
-            self._current_ns = self._previous_ns = self.timesync_offset_ns = None
+            self._current_ns = self._previous_ns = self._timesync_ns = None
         offset = received_ns - boot_ns
         if received_ns >= self._window_end_ns or self._current_ns is None:
             self._previous_ns, self._current_ns = self._current_ns, offset
@@ -176,11 +176,23 @@ class BootClock:
         assert best is not None
         return min(received_ns, round(boot_ns) + best)
 
+    def set_timesync(self, offset_ns: int | None) -> None:
+        """Take TIMESYNC's offset (ours - boot); None takes it away.
+
+        TIMESYNC's boot time has 64 bits and does not wrap, so the offset may be off by whole
+        turns of the 32-bit counter; the messages' own arrival tells by how many.
+        """
+        self._timesync_ns = None
+        arrived = self.offset_ns
+        if offset_ns is not None and arrived is not None:
+            offset_ns += round((arrived - offset_ns) / (WRAP_MS * MS)) * WRAP_MS * MS
+        self._timesync_ns = offset_ns
+
     @property
     def offset_ns(self) -> int | None:
         """Our clock minus the boot clock; None before anything was heard."""
-        if self.timesync_offset_ns is not None:
-            return self.timesync_offset_ns
+        if self._timesync_ns is not None:
+            return self._timesync_ns
         if self._current_ns is None:
             return None
         previous = self._current_ns if self._previous_ns is None else self._previous_ns

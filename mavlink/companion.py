@@ -62,6 +62,7 @@ class Companion:
         history: VehicleHistory,
         now_ns: int,
         kept_parameters: Mapping[str, float] | None = None,
+        unix_us: Callable[[], int] = lambda: 0,
     ) -> None:
         self.config = config
         self.control = control
@@ -69,7 +70,7 @@ class Companion:
         self.history = history
         self.counts: Counter[str] = Counter()
         self.load: ComputerLoad | None = None  # not measured yet
-        self.unix_us: Callable[[], int] = lambda: 0
+        self._unix_us = unix_us
         self._start_ns = self._now_ns = now_ns
         self._outbox = Outbox()
         self._decoder = Decoder()
@@ -220,7 +221,7 @@ class Companion:
             return
         if self.timesync.answer(message.tc1, message.ts1, now_ns):
             clock = self._clocks.setdefault(packet.component, BootClock())
-            clock.timesync_offset_ns = self.timesync.offset_ns
+            clock.set_timesync(self.timesync.offset_ns)
 
     # Out.
 
@@ -289,7 +290,7 @@ class Companion:
         if component == CAMERA:
             message = self.camera.message(number, index)
         elif number == LOAD_STATUS and self.load is not None:
-            message = computer_status(self.load, self.unix_us(), self._boot_ms())
+            message = computer_status(self.load, self._unix_us(), self._boot_ms())
         else:
             message = None
         if message is None:
@@ -302,7 +303,7 @@ class Companion:
 
     def _send_load(self) -> None:
         if self.load is not None:
-            self.send(computer_status(self.load, self.unix_us(), self._boot_ms()))
+            self.send(computer_status(self.load, self._unix_us(), self._boot_ms()))
 
     def _send_motion(self) -> None:
         for message in motion_values(self.control.status(), self._boot_ms()):

@@ -10,7 +10,7 @@ send servo angles with flags 44, which claim the horizon. Hence the override by 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,7 +31,7 @@ YAW_IN_VEHICLE_FRAME = 32
 YAW_IN_EARTH_FRAME = 64
 
 STRAIGHT_RAD = math.radians(0.05)
-TILT_LAG = 30  # samples
+TILT_LAG = 30
 TILTED_RAD = math.radians(1.0)
 SAME_RAD = math.radians(0.3)
 CLEAR_RAD = math.radians(0.05)
@@ -147,31 +147,35 @@ class FrameVerdict:
     decided: bool  # the turns told the frames apart
 
 
+Ends = tuple[Quaternion, Quaternion]
+"""A rotation at the first and at the second of two pictures."""
+
+
 def judge_frame(
-    q_sent: Sequence[Quaternion],
-    q_ned_body: Sequence[Quaternion],
-    q_seen_steps: Iterable[Quaternion],
+    q_sent: Sequence[Ends], q_ned_body: Sequence[Ends], q_seen_steps: Sequence[Quaternion]
 ) -> FrameVerdict | None:
     """The frame of a gimbal's quaternions that agrees with the rotation seen by the camera.
 
-    ``q_sent`` and ``q_ned_body`` are N attitudes at the instants of N pictures;
-    ``q_seen_steps`` the N-1 rotations ``q_head(k)_head(k+1)`` measured between the pictures,
-    in the head's axes. None when there is nothing to compare. ``decided`` needs the best
-    frame to disagree less than half as much as the next one that means something else.
+    For N pairs of pictures: what the gimbal sent and the body's attitude at both, and the
+    rotation ``q_head(first)_head(second)`` measured between them, in the head's axes. None
+    when there is nothing to compare. ``decided`` needs the best frame to disagree less than
+    half as much as the next one that means something else.
     """
-    steps = list(q_seen_steps)
-    if len(q_sent) != len(q_ned_body) or len(steps) != len(q_sent) - 1:
+    if not len(q_sent) == len(q_ned_body) == len(q_seen_steps):
         raise ValueError(
-            f"judge_frame needs N, N and N-1 rotations, got "
-            f"{len(q_sent)}, {len(q_ned_body)} and {len(steps)}"
+            f"judge_frame needs as many of each, got "
+            f"{len(q_sent)}, {len(q_ned_body)} and {len(q_seen_steps)}"
         )
-    if not steps:
+    if not q_sent:
         return None
-    heads = {
-        frame: [to_earth(q, frame, body) for q, body in zip(q_sent, q_ned_body, strict=True)]
+    heads: dict[GimbalFrame, list[Ends]] = {
+        frame: [
+            (to_earth(a, frame, body_a), to_earth(b, frame, body_b))
+            for (a, b), (body_a, body_b) in zip(q_sent, q_ned_body, strict=True)
+        ]
         for frame in GimbalFrame
     }
-    rms = {frame: _disagreement(heads[frame], steps) for frame in GimbalFrame}
+    rms = {frame: _disagreement(heads[frame], q_seen_steps) for frame in GimbalFrame}
     best = min(rms, key=lambda frame: rms[frame])
     # A frame that means the same attitudes all along is no rival.
     rivals = [rms[f] for f in GimbalFrame if _largest_angle(heads[f], heads[best]) > SAME_RAD]
@@ -180,34 +184,36 @@ def judge_frame(
     return FrameVerdict(best, rms[best], second, decided and bool(rivals))
 
 
-def _disagreement(heads: Sequence[Quaternion], steps: Sequence[Quaternion]) -> float:
+def _disagreement(heads: Sequence[Ends], steps: Sequence[Quaternion]) -> float:
     """Root mean square angle in rad between the steps of the heads and those seen."""
     squares = [
         angle_between(multiply(conjugate(a), b), seen) ** 2
-        for a, b, seen in zip(heads, heads[1:], steps, strict=False)
+        for (a, b), seen in zip(heads, steps, strict=True)
     ]
     return math.sqrt(sum(squares) / len(squares))
 
 
-def _largest_angle(a: Sequence[Quaternion], b: Sequence[Quaternion]) -> float:
-    return max(angle_between(p, q) for p, q in zip(a, b, strict=True))
+def _largest_angle(a: Sequence[Ends], b: Sequence[Ends]) -> float:
+    return max(
+        angle_between(p, q) for pair in zip(a, b, strict=True) for p, q in zip(*pair, strict=True)
+    )
 
 
 def steadiest_frame(
-    q_sent: Sequence[Quaternion], q_ned_body: Sequence[Quaternion]
+    q_sent: Sequence[Quaternion], q_ned_body: Sequence[Quaternion], lag: int = TILT_LAG
 ) -> GimbalFrame | None:
     """BODY or SERVO when a head that claims the horizon moves as only such a mount does.
 
     A mount that keeps the horizon shows a steady tilt while the body's tilt changes. When the
     tilt it sends changes against the body's instead, so that only the one composed with the
-    body's attitude is steady, its angles are relative to the body. Looks at pairs of samples
-    between which the body tilted by a degree; None when the claim stands, or when there are
-    too few pairs to tell.
+    body's attitude is steady, its angles are relative to the body. Looks at pairs of samples,
+    ``lag`` apart, between which the body tilted by a degree; None when the claim stands, or
+    when there are too few pairs to tell.
     """
     pairs = [
-        (i, i + TILT_LAG)
-        for i in range(len(q_sent) - TILT_LAG)
-        if math.dist(_down(q_ned_body[i]), _down(q_ned_body[i + TILT_LAG])) > TILTED_RAD
+        (i, i + lag)
+        for i in range(len(q_sent) - lag)
+        if math.dist(_down(q_ned_body[i]), _down(q_ned_body[i + lag])) > TILTED_RAD
     ]
     if len(pairs) < 20:
         return None

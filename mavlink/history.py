@@ -27,7 +27,9 @@ M_PER_DEG = 111_319.49  # along a meridian, and along the equator
 ACCURACY_GAP_NS = 3_000_000_000
 FRAMES = tuple(GimbalFrame)
 GIMBAL_DEVICES = (154, 171, 172, 173, 174, 175)
-JUDGE_EVERY = 100  # gimbal samples between two looks at what their quaternion refers to
+JUDGE_EVERY_NS = 10_000_000_000  # between two looks at what a gimbal's quaternion refers to
+JUDGE_LAG_NS = 3_000_000_000
+JUDGED_SAMPLES = 600
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +64,7 @@ class VehicleHistory:
         self._range = Track()  # distance
         self._terrain = Track()  # agl sigma
         self._gimbals: dict[tuple[int, int], Track] = {}  # (rank, component): w x y z frame
-        self._judged: dict[tuple[int, int], tuple[int, GimbalFrame | None]] = {}  # samples then
+        self._judged: dict[tuple[int, int], tuple[int, GimbalFrame | None]] = {}  # when
 
     @property
     def first_ns(self) -> int | None:
@@ -80,6 +82,24 @@ class VehicleHistory:
         """Every attitude with its time in ns, oldest first."""
         with self._lock:
             return [(AttitudeSample(None, _quaternion(r)), t) for t, r in self._attitude.items()]
+
+    def claimed_at(self, time_ns: int) -> tuple[Quaternion, Quaternion] | None:
+        """(the gimbal's quaternion as it was sent, ``q_ned_body``) at an instant, if known."""
+        with self._lock:
+            body = self._attitude.around(time_ns)
+            if body is None:
+                return None
+            q_body = slerp(_quaternion(body.before), _quaternion(body.after), body.fraction)
+            for key in self._gimbal_order():
+                at = self._gimbals[key].around(time_ns)
+                if at is not None:
+                    sent = slerp(_quaternion(at.before), _quaternion(at.after), at.fraction)
+                    return sent, q_body
+        return None
+
+    def _gimbal_order(self) -> list[tuple[int, int]]:
+        """The lowest rank says most; among equals the gimbal itself before its relay."""
+        return sorted(self._gimbals, key=lambda k: (k[0], k[1] not in GIMBAL_DEVICES, k[1]))
 
     def heads(self) -> list[tuple[int, Quaternion]]:
         """The camera head's attitude at every gimbal sample, or the body's without a gimbal."""
@@ -170,9 +190,7 @@ class VehicleHistory:
         return q
 
     def _tell_gimbal(self, state: _Assembly, q_body: Quaternion | None) -> None:
-        # The lowest rank says most; among equals the gimbal itself before its relay.
-        order = sorted(self._gimbals, key=lambda k: (k[0], k[1] not in GIMBAL_DEVICES, k[1]))
-        for key in order:
+        for key in self._gimbal_order():
             at = self._gimbals[key].around(state.time_ns)
             q = None if at is None else self._gimbal_at(key, at, q_body)
             if at is None or q is None:
@@ -213,21 +231,28 @@ class VehicleHistory:
         if claimed is not GimbalFrame.VEHICLE:
             return claimed
         track = self._gimbals[key]
-        looked, better = self._judged.get(key, (0, None))
-        if len(track) >= looked + JUDGE_EVERY:
+        newest = track.last_ns or 0
+        looked_ns, better = self._judged.get(key, (0, None))
+        if newest - looked_ns > JUDGE_EVERY_NS:
             better = self._steadiest(track) or better
-            self._judged[key] = (len(track), better)
+            self._judged[key] = (newest, better)
         return better or claimed
 
     def _steadiest(self, track: Track) -> GimbalFrame | None:
+        """Judged on a thinned track: it is done now and then while flying."""
         sent: list[Quaternion] = []
         bodies: list[Quaternion] = []
-        for time_ns, row in track.items()[-5000:]:
+        samples = track.items()
+        samples = samples[:: max(1, len(samples) // JUDGED_SAMPLES)]
+        for time_ns, row in samples:
             at = self._attitude.around(time_ns)
             if at is not None:
                 sent.append(_quaternion(row))
                 bodies.append(slerp(_quaternion(at.before), _quaternion(at.after), at.fraction))
-        return steadiest_frame(sent, bodies)
+        if len(samples) < 2:
+            return None
+        spacing_ns = (samples[-1][0] - samples[0][0]) / (len(samples) - 1)
+        return steadiest_frame(sent, bodies, max(1, round(JUDGE_LAG_NS / spacing_ns)))
 
     def _tell_position(self, state: _Assembly) -> Bracket | None:
         at = self._position.around(state.time_ns)

@@ -1,4 +1,4 @@
-"""How late the camera's stamps are, from the rotation that camera and vehicle both feel.
+"""What the pictures' own rotation says of telemetry: the camera's latency, the gimbal's frame.
 
 A frame stamped ``t`` was exposed at ``t - latency``. The rotation speed seen between frames,
 shifted by the latency, must follow the vehicle's (VINS calls it ``td``, DOI
@@ -16,11 +16,14 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
+from mavlink.gimbal import FrameVerdict, judge_frame
+from mavlink.history import VehicleHistory
 from mavlink.quaternion import Quaternion, angle_between
 
 F64 = npt.NDArray[np.float64]
 
 LEAST_STEPS = 60
+LEAST_FRAMES = 20
 LEAST_SPREAD_RAD_S = 0.02  # calmer flight tells nothing
 LEAST_CORRELATION = 0.7
 LONGEST_GAP_S = 0.25  # between attitudes
@@ -36,6 +39,34 @@ class LatencyEstimate:
     sigma_ms: float
     correlation: float  # of the two speeds at that latency, 0 to 1
     steps: int  # frames that took part
+
+
+class FrameWatch:
+    """Collects rotations between frames and says what the gimbal's quaternion refers to."""
+
+    def __init__(self, history: VehicleHistory) -> None:
+        self._history = history
+        self._runs: deque[tuple[int, int, Quaternion]] = deque(maxlen=KEPT)
+
+    def add(self, first_ns: int, second_ns: int, q_step: Quaternion) -> None:
+        """Take in ``q_head(first)_head(second)``, seen between two frames, in the head's axes."""
+        if second_ns > first_ns:
+            self._runs.append((first_ns, second_ns, q_step))
+
+    def verdict(self, latency_ms: float = 0.0) -> FrameVerdict | None:
+        """The frame that agrees with the pictures; None with less than twenty to go by."""
+        shift = round(latency_ms * 1e6)
+        sent: list[tuple[Quaternion, Quaternion]] = []
+        bodies: list[tuple[Quaternion, Quaternion]] = []
+        steps: list[Quaternion] = []
+        for first_ns, second_ns, step in self._runs:
+            first = self._history.claimed_at(first_ns - shift)
+            second = self._history.claimed_at(second_ns - shift)
+            if first is not None and second is not None:
+                sent.append((first[0], second[0]))
+                bodies.append((first[1], second[1]))
+                steps.append(step)
+        return judge_frame(sent, bodies, steps) if len(steps) >= LEAST_FRAMES else None
 
 
 class LatencyWatch:

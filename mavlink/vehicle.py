@@ -104,9 +104,14 @@ class VehicleLink:
         self._signing = self._make_signing()
         self.presence = Presence(config.presence, secrets.randbits(32) or 1, now_ns)
         self._companion = Companion(
-            config.companion, control, self.presence, self.history, now_ns, self._memory.parameters
+            config.companion,
+            control,
+            self.presence,
+            self.history,
+            now_ns,
+            self._memory.parameters,
+            lambda: time.time_ns() // 1000,
         )
-        self._companion.unix_us = lambda: time.time_ns() // 1000
         self._inbox = Inbox(BACKLOG)
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -260,7 +265,7 @@ class VehicleLink:
             now_ns = self._alive_ns = time.monotonic_ns()
             if now_ns >= timer_ns or self._is_served:
                 self._is_served = False
-                self._guard(lambda now_ns=now_ns: self._companion.tick(now_ns))  # type: ignore[misc]
+                self._guard(partial(self._companion.tick, now_ns))
                 timer_ns = self._companion.next_timer()
             self._send(self._companion.take())
             if now_ns >= save_ns or self._memory.is_stale(self._companion.parameters.revision):

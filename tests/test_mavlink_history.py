@@ -17,6 +17,7 @@ from mavlink.gimbal import (
     to_earth,
 )
 from mavlink.history import M_PER_DEG, HistoryConfig, VehicleHistory
+from mavlink.latency import FrameWatch
 from mavlink.quaternion import Quaternion
 from mavlink.samples import (
     AccuracySample,
@@ -407,17 +408,30 @@ def test_the_pictures_decide_between_frames() -> None:
     mount = Rotation.from_euler("Y", -1.2)
     heads = [body * mount for body in bodies]
     noise = [Rotation.from_rotvec(rng.normal(0, 1e-3, 3)) for _ in heads]
-    steps = [of_scipy(a.inv() * b * n) for a, b, n in zip(heads, heads[1:], noise, strict=False)]
-    verdict = judge_frame([of_scipy(mount)] * 40, [of_scipy(b) for b in bodies], steps)
+    watch = FrameWatch(history := VehicleHistory())
+    for k, body in enumerate(bodies):
+        history.add(AttitudeSample(None, of_scipy(body)), T0 + k * 100 * MS)
+        claimed = GimbalSample(None, of_scipy(mount), GimbalFrame.VEHICLE, 154, 0)
+        history.add(claimed, T0 + k * 100 * MS)
+    for k in range(39):
+        if k == 10:
+            assert watch.verdict() is None
+        step = of_scipy(heads[k].inv() * heads[k + 1] * noise[k])
+        # The camera's stamps are 30 ms late.
+        watch.add(T0 + (100 * k + 30) * MS, T0 + (100 * k + 130) * MS, step)
+    verdict = watch.verdict(30.0)
     assert verdict is not None and verdict.decided
     assert verdict.frame in (GimbalFrame.BODY, GimbalFrame.SERVO)
     assert verdict.rms_rad < 0.003
 
 
 def test_judging_needs_matching_lists() -> None:
-    with pytest.raises(ValueError, match="N, N and N-1"):
-        judge_frame([quaternion.IDENTITY], [], [])
-    assert judge_frame([quaternion.IDENTITY], [quaternion.IDENTITY], []) is None
+    ends = (quaternion.IDENTITY, quaternion.IDENTITY)
+    with pytest.raises(ValueError, match="as many of each"):
+        judge_frame([ends], [], [])
+    assert judge_frame([], [], []) is None
+    still = judge_frame([ends], [ends], [quaternion.IDENTITY])
+    assert still is not None and not still.decided
 
 
 def test_a_live_history_forgets_and_a_wrong_sample_is_refused() -> None:

@@ -340,6 +340,15 @@ def test_the_live_clock_never_dates_a_sample_after_its_arrival() -> None:
     assert abs(np.median(late[500:])) < 2 * MS and max(late[500:]) < 8 * MS
 
 
+def test_timesync_of_an_autopilot_that_is_up_for_months() -> None:
+    clock = BootClock()
+    wraps = 3 * 2**32 * MS
+    arrival, boot_ns = 900 * S, 5_000 * S + wraps  # the message shows only the lower 32 bits
+    assert clock.time_of(boot_ns // MS % 2**32, arrival + 30 * MS) == arrival + 30 * MS
+    clock.set_timesync(arrival - boot_ns)
+    assert clock.time_of(boot_ns // MS % 2**32 + 100, arrival + 150 * MS) == arrival + 100 * MS
+
+
 def test_an_autopilot_that_restarts_starts_the_history_over() -> None:
     station = Station()
     station.feed(packed(beat()))
