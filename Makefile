@@ -33,7 +33,8 @@ bench: $(STAMP)
 	$(BIN)/skyrelief bench $(ARGS)
 
 trials: $(STAMP)
-	$(BIN)/python -m pytest -m trial $(ARGS)
+	SKYRELIEF_TRIALS=whole SKYRELIEF_TRIALS_TABLE=trials.md $(BIN)/python -m pytest -m trial $(ARGS)
+	@cat trials.md
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

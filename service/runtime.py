@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from service.cameras.source import CameraSource
     from service.scan import Scan
     from service.stream.records import PoseRecord
+    from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
 
@@ -43,8 +44,8 @@ HUNG_S = 180.0
 """A scan without a processed frame for so long is restarted by the watchdog; the compilers
 of the first frames may take minutes on a small board."""
 
-FIRST_RETRY_S, LAST_RETRY_S = 0.5, 10.0
-"""Back-off between attempts to open a camera again."""
+FIRST_RETRY_S, LAST_RETRY_S = 1.0, 8.0
+"""Back-off between attempts to open a camera or to scan again; names of scans are seconds."""
 
 
 class Daemon:
@@ -66,6 +67,8 @@ class Daemon:
         self._scan_started_s = 0.0
         self._progress_s = time.monotonic()
         self._reported = 0
+        self._retry_at_s: float | None = None
+        self._retry_s = FIRST_RETRY_S
         self.vehicle = VehicleLink(VehicleConfig(links=config.mavlink.links), self)
 
     # ---- life ----------------------------------------------------------------------------
@@ -86,6 +89,7 @@ class Daemon:
             while not self._quit.wait(0.25):
                 self.vehicle.set_health(self._health())
                 was_armed = self._follow_arming(was_armed)
+                self._retry()
                 if time.monotonic() - self._progress_s < HUNG_S or self.phase is not Phase.SCANNING:
                     notifier.alive(self.phase.value)
         finally:
@@ -200,6 +204,7 @@ class Daemon:
         if self._worker is not None and self._worker.is_alive():
             return Answer(Result.TEMPORARILY_REJECTED, f"a scan is {self.phase.value}")
         self.fault = ""
+        self._retry_at_s = None
         self._stop_scan.clear()
         self._paused.clear()
         self.phase = Phase.SCANNING
@@ -210,6 +215,7 @@ class Daemon:
 
     def stop_scan(self) -> Handled:
         """Close the running scan; the files are written after the answer."""
+        self._retry_at_s = None
         self._stop_scan.set()
         return ACCEPTED
 
@@ -305,6 +311,16 @@ class Daemon:
         self.fault = text
         log.error("%s", text)
         self.vehicle.statustext(f"Scan failed: {text}", CRITICAL)
+        if not (self._stop_scan.is_set() or self._quit.is_set()):
+            log.warning("scanning again in %.1f s", self._retry_s)
+            self._retry_at_s = time.monotonic() + self._retry_s
+            self._retry_s = min(2 * self._retry_s, LAST_RETRY_S)
+
+    def _retry(self) -> None:
+        """Start the next scan when a fault ended the last one and nobody stopped it."""
+        due = self._retry_at_s is not None and time.monotonic() >= self._retry_at_s
+        if due and not (self._worker is not None and self._worker.is_alive()):
+            self.start_scan()
 
     def _scan_once(self) -> None:
         """Open the camera, scan until stopped or the recording ends, close the scan."""
@@ -341,15 +357,25 @@ class Daemon:
         finally:
             self.phase = Phase.FINALISING
             self.vehicle.record(None)
-            summary = self._scan.close()
-            write_deliverables(folder, store, {})
-            self.vehicle.statustext(
-                f"Scan {scan_id}: {summary['clouds']} clouds, {summary['distance_m']:.0f} m"
-            )
-            if link is not None:
-                link.drain(self.config.datalink.drain_s)
-                link.close()
-            store.close()
+            try:
+                self._close_scan(self._scan, store)
+            finally:
+                write_deliverables(folder, store, {})
+                if link is not None:
+                    link.drain(self.config.datalink.drain_s)
+                    link.close()
+                store.close()
+
+    def _close_scan(self, scan: Scan, store: ScanStore) -> None:
+        """Finish the scan; when the pipeline cannot, what is stored is kept as interrupted."""
+        try:
+            summary = scan.close()
+        except Exception:
+            store.finish({"interrupted": True})
+            raise
+        self.vehicle.statustext(
+            f"Scan {scan.inputs.scan_id}: {summary['clouds']} clouds, {summary['distance_m']:.0f} m"
+        )
 
     def _open_camera(self) -> CameraSource | None:
         """The camera at its own pace, tried until it answers; None when stopped meanwhile."""
@@ -389,6 +415,7 @@ class Daemon:
         self._progress_s = time.monotonic()
         if scan.recorder.clouds > self._reported and scan.recorder.last is not None:
             self._reported = scan.recorder.clouds
+            self._retry_s = FIRST_RETRY_S
             self.vehicle.report_keyframe(_keyframe_report(scan.recorder.last))
 
     def _end_scan(self) -> None:

@@ -1,0 +1,247 @@
+"""Trials that try to break the daemon: kills, broken settings, faults; short here.
+
+The whole of them: ``make trials``, which writes a table of what was tried and what came of it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mavlink.control import Phase
+from service.config import load_config
+from service.errors import OutsideError
+from service.runtime import Daemon
+from service.stream.store import ScanStore
+
+DEMO = Path(__file__).resolve().parents[1] / "demo" / "caliterra"
+WHOLE = os.environ.get("SKYRELIEF_TRIALS") == "whole"
+KILLS = 50 if WHOLE else 2
+PATIENCE_S = 120.0
+
+pytestmark = [pytest.mark.trial, pytest.mark.timeout(3600 if WHOLE else 280)]
+
+Record = Callable[[str, int, str], None]
+
+
+@pytest.fixture(scope="module")
+def record() -> Iterator[Record]:
+    """Collects (fault, times tried, outcome); writes the table where ``make trials`` asks."""
+    rows: list[tuple[str, int, str]] = []
+    yield lambda fault, times, outcome: rows.append((fault, times, outcome))
+    target = os.environ.get("SKYRELIEF_TRIALS_TABLE")
+    if target:
+        lines = ["| fault | times | outcome |", "|---|---|---|"]
+        lines += [f"| {fault} | {times} | {outcome} |" for fault, times, outcome in rows]
+        Path(target).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Service:
+    """The daemon as a process of its own, looking at the demo flight as its camera."""
+
+    def __init__(self, folder: Path, start: str, environment: dict[str, str] | None = None) -> None:
+        self.port = free_port()
+        self.configuration = folder / "skyrelief.toml"
+        self.scans = folder / "scans"
+        self.configuration.write_text(
+            f'[camera]\nsource = "images:{DEMO / "frames"}?interval_s=1.0"\n'
+            f'model = "{DEMO / "camera.yaml"}"\n'
+            f'[scan]\nfolder = "{self.scans}"\nstart = "{start}"\n'
+            '[compute]\nbackend = "cpu"\nguide_width = 320\n'
+            f'[health]\nhttp = "127.0.0.1:{self.port}"\n'
+        )
+        self.log = folder / "log.txt"
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "service.cli", "run", "--config", str(self.configuration)],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env={**os.environ, **(environment or {})},
+            )
+
+    def __enter__(self) -> Service:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    def get(self, path: str) -> dict[str, Any] | None:
+        """The JSON answer of the health page; None while nobody answers."""
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{self.port}{path}", timeout=5) as page:
+                return dict(json.loads(page.read()))
+        except urllib.error.HTTPError as error:
+            with error:
+                return dict(json.loads(error.read()))
+        except OSError:
+            return None
+
+    def until(self, reached: Callable[[], Any], what: str) -> None:
+        """Wait for ``reached``; fails with the log when the process ends or time runs out."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not reached():
+            alive = self.process.poll() is None
+            assert alive and time.monotonic() < deadline, f"{what}:\n{self.log.read_text()[-3000:]}"
+            time.sleep(0.05)
+
+    def until_up(self) -> None:
+        self.until(lambda: (self.get("/status") or {}).get("state") not in (None, "starting"), "up")
+
+    def stop(self) -> int:
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(timeout=PATIENCE_S)
+
+
+def stored(scans: Path) -> set[tuple[str, int, int, int]]:
+    """(scan, keyframe, layer, checksum) of every chunk that a store has acknowledged."""
+    found = set()
+    for path in scans.glob("*/scan.db"):
+        try:
+            with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as db:
+                rows = db.execute("SELECT seq, layer, crc FROM chunks").fetchall()
+        except sqlite3.Error:
+            continue  # being made
+        found |= {(path.parent.name, *row) for row in rows}
+    return found
+
+
+def test_kill_9_loses_nothing_that_was_stored(tmp_path: Path, record: Record) -> None:
+    rng = random.Random(5)
+    scans = tmp_path / "scans"
+    acknowledged: set[tuple[str, int, int, int]] = set()
+    for _ in range(KILLS):
+        with Service(tmp_path, "on-boot") as service:
+            before, more = stored(scans), rng.randint(1, 4)
+
+            def enough(before: Any = before, more: int = more) -> bool:
+                return len(stored(scans) - before) >= more
+
+            service.until(enough, "chunks")
+            time.sleep(rng.uniform(0.0, 0.5))
+            acknowledged |= stored(scans)
+            service.process.kill()
+            service.process.wait()
+        time.sleep(1.0)  # names of scans are seconds
+    with Service(tmp_path, "on-command") as service:
+        for folder in scans.iterdir():
+            service.until((folder / "scan.json").is_file, f"recovery of {folder.name}")
+        assert service.stop() == 0
+    assert len(acknowledged) >= KILLS
+    assert acknowledged <= stored(scans)
+    for folder in scans.iterdir():
+        assert json.loads((folder / "scan.json").read_text())["finished"] is True
+        assert (folder / "cloud.laz").stat().st_size > 0
+    record("kill -9 while scanning", KILLS, f"0 of {len(acknowledged)} stored chunks lost")
+
+
+def test_term_closes_the_scan(tmp_path: Path, record: Record) -> None:
+    with Service(tmp_path, "on-boot") as service:
+        service.until(lambda: stored(service.scans), "a chunk")
+        assert service.stop() == 0
+        (folder,) = service.scans.iterdir()
+        with ScanStore.open(folder / "scan.db") as store:
+            assert store.finished
+            assert store.summary is not None
+            assert "interrupted" not in store.summary
+        assert (folder / "preview.jpg").is_file()
+    record("TERM while scanning", 1, "scan closed, files written")
+
+
+def test_broken_configuration_at_reload_changes_nothing(tmp_path: Path, record: Record) -> None:
+    path = str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(path)
+        systemd.settimeout(PATIENCE_S)
+        with Service(tmp_path, "on-command", {"NOTIFY_SOCKET": path}) as service:
+            assert systemd.recv(100) == b"READY=1"
+            assert systemd.recv(100).startswith(b"WATCHDOG=1")
+            service.until_up()
+            good = service.configuration.read_text()
+            for broken in ("[scan\n", "[scan]\nbaselin = 3\n", "[scan]\nbaseline = -3\n", "\0\1\2"):
+                service.configuration.write_text(broken)
+                service.process.send_signal(signal.SIGHUP)
+                service.until(lambda: "stays as it was" in service.log.read_text(), "refusal")
+                service.log.write_text("")
+            service.configuration.write_text(good.replace("[scan]\n", "[scan]\nbaseline = 3\n"))
+            service.process.send_signal(signal.SIGHUP)
+            service.until(lambda: "in force: scan.baseline" in service.log.read_text(), "reload")
+            assert (service.get("/healthz") or {}).get("ok") is True
+            assert service.stop() == 0
+            told: list[bytes] = []
+            while not told or told[-1] != b"STOPPING=1":
+                told.append(systemd.recv(100))
+    record("broken configuration at reload", 4, "refused, service unharmed")
+
+
+def test_a_scan_that_fails_is_started_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: Record
+) -> None:
+    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
+    daemon._booted = True
+    faults: list[Exception] = [OutsideError("camera gone"), RuntimeError("ours"), OSError("disk")]
+    tried = len(faults)
+    scanning = []
+
+    def scan_once() -> None:
+        if faults:
+            raise faults.pop(0)
+        scanning.append(daemon.phase)
+        daemon._stop_scan.wait(PATIENCE_S)
+
+    monkeypatch.setattr(daemon, "_scan_once", scan_once)
+    monkeypatch.setattr("service.runtime.FIRST_RETRY_S", 0.01)
+    daemon._retry_s = 0.01
+    daemon.start_scan()
+    deadline = time.monotonic() + PATIENCE_S
+    while not scanning and time.monotonic() < deadline:
+        daemon._retry()
+        time.sleep(0.005)
+    assert scanning == [Phase.SCANNING]
+    assert daemon.fault == ""
+    daemon.stop_scan()
+    daemon._end_scan()
+    daemon._retry()
+    assert daemon.phase is Phase.IDLE  # stopped by the operator: it stays so
+    record("faults of camera, disk and our own code", tried, "scanning again each time")
+
+
+def test_stopping_ends_the_retries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
+    daemon._booted = True
+
+    def scan_once() -> None:
+        raise OutsideError("camera gone")
+
+    monkeypatch.setattr(daemon, "_scan_once", scan_once)
+    daemon._retry_s = 0.0
+    daemon.start_scan()
+    assert daemon._worker is not None
+    daemon._worker.join()
+    assert daemon.fault == "camera gone"
+    assert daemon._retry_at_s is not None
+    daemon.stop_scan()
+    daemon._retry()
+    assert daemon.phase is Phase.IDLE
+    assert daemon.fault == "camera gone"
