@@ -98,7 +98,7 @@ export class Stage {
     const centre = box.getCenter(new THREE.Vector3());
     const reach = Math.max(box.getSize(new THREE.Vector3()).length(), 1);
     this.controls.target.copy(centre);
-    this.camera.position.copy(centre).add(new THREE.Vector3(0, -0.36 * reach, 0.42 * reach));
+    this.camera.position.copy(centre).add(new THREE.Vector3(0, -0.4 * reach, 0.47 * reach));
     this.camera.near = reach / 2000;
     this.camera.far = reach * 20;
     this.camera.updateProjectionMatrix();
