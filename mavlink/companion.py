@@ -71,6 +71,7 @@ class Companion:
         self.counts: Counter[str] = Counter()
         self.load: ComputerLoad | None = None  # not measured yet
         self._unix_us = unix_us
+        self._listeners: dict[str, list[Callable[[Any], None]]] = {}
         self._start_ns = self._now_ns = now_ns
         self._outbox = Outbox()
         self._decoder = Decoder()
@@ -111,6 +112,8 @@ class Companion:
             self.counts["not understood"] += 1
             return
         name = message.get_type()
+        for listener in self._listeners.get(name, ()):
+            listener(message)
         if packet.message_id == HEARTBEAT:
             self.presence.hear(message, now_ns)
         elif name in READERS:
@@ -284,6 +287,10 @@ class Companion:
     def send(self, message: Any) -> None:
         """Send a message of the onboard computer to everyone."""
         self._outbox.put(ONBOARD, message)
+
+    def listen(self, name: str, listener: Callable[[Any], None]) -> None:
+        """Call back with every message of a name, whoever sends it."""
+        self._listeners.setdefault(name, []).append(listener)
 
     def send_requested(self, component: int, number: int, index: int, link: int) -> bool:
         """Send a message that was asked for; False when the component has no such message."""

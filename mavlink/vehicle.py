@@ -15,9 +15,11 @@ import secrets
 import sys
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from mavlink import status as texts
 from mavlink.camera import KeyframeReport
@@ -35,7 +37,7 @@ from mavlink.presence import Health, Presence, PresenceConfig
 from mavlink.recorder import Recorder
 from mavlink.signing import Signing, read_key
 from mavlink.status import ComputerLoad
-from mavlink.wire import numbers_of
+from mavlink.wire import dialect, numbers_of
 
 log = logging.getLogger(__name__)
 
@@ -44,6 +46,7 @@ SAVE_EVERY_NS = 30 * S
 TELEMETRY = numbers_of(READERS)
 BACKLOG = 10_000  # packets waiting for the protocol's thread
 STUCK_NS = 10 * S
+TUNNEL_ROOM = 128
 BEAT_NICE = -10  # needs LimitNICE or root; without it the thread runs like the others
 
 
@@ -168,6 +171,18 @@ class VehicleLink:
     def report_keyframe(self, keyframe: KeyframeReport) -> None:
         """Tell ground stations of a keyframe."""
         self._served(lambda: self._companion.report(keyframe))
+
+    def send_tunnel(self, payload_type: int, payload: bytes) -> None:
+        """Send up to 128 bytes to everyone by TUNNEL; ValueError when there are more."""
+        if len(payload) > TUNNEL_ROOM:
+            raise ValueError(f"a TUNNEL holds {TUNNEL_ROOM} bytes, got {len(payload)}")
+        padded = list(payload.ljust(TUNNEL_ROOM, b"\0"))
+        message = dialect.MAVLink_tunnel_message(0, 0, payload_type, len(payload), padded)
+        self._do(lambda: self._companion.send(message))
+
+    def listen(self, name: str, listener: Callable[[Any], None]) -> None:
+        """Call back, in the protocol's thread, with every message of a name such as TUNNEL."""
+        self._do(lambda: self._companion.listen(name, listener))
 
     def report_odometry(self, odometry: Odometry, time_ns: int) -> bool:
         """Send our estimate to the autopilot, stamped with its clock at our monotonic time.

@@ -684,6 +684,33 @@ def test_senseless_links_are_refused(text: str) -> None:
         VehicleConfig(links=(text,))
 
 
+def test_tunnels_and_the_radios_state_pass_through_the_same_link() -> None:
+    port = free_port()
+    with (
+        Daemon(f"udpin:127.0.0.1:{port}") as daemon,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer,
+    ):
+        free: list[int] = []
+        daemon.link.listen("RADIO_STATUS", lambda message: free.append(message.txbuf))
+        peer.connect(("127.0.0.1", port))
+        peer.settimeout(10.0)
+        radio = dialect.MAVLink_radio_status_message(1, 1, 87, 1, 1, 0, 0)
+        peer.send(bytes(radio.pack(dialect.MAVLink(None, 51, 68))))
+        until(lambda: free == [87])
+        daemon.link.send_tunnel(40_000, b"tile")
+        ear, framer = dialect.MAVLink(None), Framer()
+
+        def tunnel() -> Any:
+            found = [p for p in framer.feed(peer.recv(4096)) if p.message_id == 385]
+            return ear.decode(bytearray(found[0].data)) if found else None
+
+        message = until(tunnel)
+        assert message.payload_type == 40_000
+        assert bytes(message.payload[: message.payload_length]) == b"tile"
+        with pytest.raises(ValueError, match="128 bytes"):
+            daemon.link.send_tunnel(40_000, bytes(129))
+
+
 def test_a_full_disk_ends_the_log_and_nothing_else(caplog: pytest.LogCaptureFixture) -> None:
     full = Path("/dev/full")
     if not full.exists():
