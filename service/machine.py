@@ -10,7 +10,10 @@ import os
 import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mavlink.status import ComputerLoad
 
 THROTTLED_NOW = 0b1111  # Raspberry Pi: under-voltage, frequency capped, throttled, soft limit
 
@@ -24,26 +27,83 @@ class Machine:
     throttled: bool | None = None  # right now, for heat or lack of power
     power_w: float | None = None  # drawn in all
     memory_free_mib: float | None = None  # available without swapping
+    memory_total_mib: float | None = None
     resident_mib: float | None = None  # of this process
     load: float | None = None  # runnable threads per core, 1 minute
     disk_free_mib: float | None = None
+    disk_total_mib: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """The readings that there are."""
         return {key: value for key, value in asdict(self).items() if value is not None}
 
 
+class CoreLoad:
+    """How busy each core was since the last look, from the kernel's tick counters."""
+
+    def __init__(self, root: Path = Path("/")) -> None:
+        """Take the first look."""
+        self._file = root / "proc/stat"
+        self._last = self._read()
+
+    def percent(self) -> tuple[int, ...]:
+        """Percent per core since the last call; empty where the kernel does not tell."""
+        now = self._read()
+        pairs = zip(now, self._last, strict=False)
+        self._last = now
+        return tuple(
+            round(100.0 * (1.0 - (idle - idle0) / (total - total0))) if total > total0 else 0
+            for (idle, total), (idle0, total0) in pairs
+        )
+
+    def _read(self) -> list[tuple[int, int]]:
+        """(idle ticks, all ticks) of each core."""
+        cores = []
+        for line in _text(self._file).splitlines():
+            name, *ticks = line.split()
+            if name.startswith("cpu") and name != "cpu" and len(ticks) >= 5:
+                counts = [int(t) for t in ticks[:8]]
+                cores.append((counts[3] + counts[4], sum(counts)))
+        return cores
+
+
+def computer_load(machine: Machine, cores: tuple[int, ...], keep_free_mib: float) -> ComputerLoad:
+    """The readings as the operator's ground station gets them over MAVLink."""
+    from mavlink.status import ComputerLoad
+
+    def used(free: float | None, total: float | None) -> int | None:
+        return None if free is None or total is None else round(total - free)
+
+    def whole(value: float | None) -> int | None:
+        return None if value is None else round(value)
+
+    free = machine.disk_free_mib
+    return ComputerLoad(
+        cpu_percent=cores,
+        temperature_c=whole(machine.temperature_c),
+        ram_used_mib=used(machine.memory_free_mib, machine.memory_total_mib),
+        ram_total_mib=whole(machine.memory_total_mib),
+        storage_used_mib=used(free, machine.disk_total_mib),
+        storage_total_mib=whole(machine.disk_total_mib),
+        throttled=bool(machine.throttled),
+        disk_full=free is not None and free < max(100.0, 0.5 * keep_free_mib),
+    )
+
+
 def read_machine(disk: Path, root: Path = Path("/")) -> Machine:
     """The readings now; ``disk`` is any path on the disk of the scans."""
+    disk_free_mib, disk_total_mib = _disk_mib(disk)
     return Machine(
         model=_text(root / "proc/device-tree/model") or os.uname().machine,
         temperature_c=_hottest(root),
         throttled=_throttled(root),
         power_w=_power_w(root),
         memory_free_mib=_field_mib(root / "proc/meminfo", "MemAvailable:"),
+        memory_total_mib=_field_mib(root / "proc/meminfo", "MemTotal:"),
         resident_mib=_field_mib(root / "proc/self/status", "VmRSS:"),
         load=_load(root),
-        disk_free_mib=_disk_free_mib(disk),
+        disk_free_mib=disk_free_mib,
+        disk_total_mib=disk_total_mib,
     )
 
 
@@ -87,13 +147,15 @@ def _load(root: Path) -> float | None:
     return float(text.split()[0]) / (os.cpu_count() or 1) if text else None
 
 
-def _disk_free_mib(disk: Path) -> float | None:
+def _disk_mib(disk: Path) -> tuple[float | None, float | None]:
+    """(free, total) of the disk that holds ``disk`` or the nearest folder above it."""
     while not disk.exists() and disk != disk.parent:
         disk = disk.parent
     try:
-        return shutil.disk_usage(disk).free / 2**20
+        usage = shutil.disk_usage(disk)
     except OSError:
-        return None
+        return None, None
+    return usage.free / 2**20, usage.total / 2**20
 
 
 def _field_mib(path: Path, name: str) -> float | None:

@@ -23,7 +23,7 @@ from mavlink.vehicle import VehicleConfig, VehicleLink
 from service.config import Config, change, reload
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.health import HealthServer, Notifier
-from service.machine import read_machine
+from service.machine import CoreLoad, computer_load, read_machine
 from service.retention import close_open_scans, make_room
 from service.version import software
 
@@ -133,12 +133,18 @@ class Daemon:
             log.warning("configuration: after a restart: %s", ", ".join(waiting))
 
     def _tidy(self) -> None:
-        """Close what a crash left open, then keep the disk from filling up."""
+        """Close what a crash left open; then watch the machine and keep room on the disk."""
         folder = Path(self.config.scan.folder)
+        cores = CoreLoad()
         close_open_scans(folder, self._started_s)
-        while not self._quit.wait(10.0):
-            scan = self._scan.inputs.scan_id if self._scan is not None else ""
-            make_room(folder, self.config.scan.keep_free_mib, scan)
+        while not self._quit.wait(2.0):
+            keep_free_mib = self.config.scan.keep_free_mib
+            self.vehicle.set_load(
+                computer_load(read_machine(folder), cores.percent(), keep_free_mib)
+            )
+            make_room(
+                folder, keep_free_mib, self._scan.inputs.scan_id if self._scan is not None else ""
+            )
 
     def quit(self) -> None:
         """Close a running scan, then let :meth:`run` return."""

@@ -15,7 +15,7 @@ import pytest
 from service.config import Config, load_config, reload
 from service.errors import OutsideError
 from service.health import HealthServer, Notifier, metrics_text
-from service.machine import read_machine
+from service.machine import CoreLoad, Machine, computer_load, read_machine
 from service.retention import close_open_scans, make_room
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
@@ -139,6 +139,34 @@ def test_machine_of_a_raspberry_pi_and_a_jetson(tmp_path: Path) -> None:
     found = read_machine(tmp_path, tmp_path)
     assert found.throttled is False
     assert found.power_w == pytest.approx(7.56)
+
+
+def test_load_as_the_operator_sees_it(tmp_path: Path) -> None:
+    stat = tmp_path / "proc" / "stat"
+    stat.parent.mkdir()
+    stat.write_text(
+        "cpu 9 9 9 9 9 9 9 9\ncpu0 100 0 0 900 0 0 0 0\ncpu1 0 0 0 500 500 0 0 0\nintr 1\n"
+    )
+    cores = CoreLoad(tmp_path)
+    stat.write_text("cpu 9 9 9 9 9 9 9 9\ncpu0 175 0 0 925 0 0 0 0\ncpu1 0 0 0 550 550 0 0 0\n")
+    busy = cores.percent()
+    assert busy == (75, 0)
+    assert CoreLoad(tmp_path / "none").percent() == ()
+    machine = Machine(
+        "m",
+        temperature_c=61.6,
+        memory_free_mib=1000.0,
+        memory_total_mib=4000.0,
+        disk_free_mib=500.0,
+        disk_total_mib=9000.0,
+    )
+    load = computer_load(machine, busy, keep_free_mib=2048.0)
+    assert (load.cpu_percent, load.temperature_c) == ((75, 0), 62)
+    assert (load.ram_used_mib, load.ram_total_mib) == (3000, 4000)
+    assert (load.storage_used_mib, load.storage_total_mib) == (8500, 9000)
+    assert load.disk_full
+    assert not load.throttled
+    assert computer_load(Machine("m"), (), 0.0).ram_used_mib is None
 
 
 def test_this_machine_can_be_read(tmp_path: Path) -> None:
