@@ -28,6 +28,7 @@ from mavlink.messages import CAMERA, ONBOARD, Address, Outbox, Outgoing
 from mavlink.parameters import YAW_FRAME, Parameters
 from mavlink.presence import Presence
 from mavlink.rates import WANTED_HZ, RateKeeper
+from mavlink.samples import OF_AUTOPILOT
 from mavlink.status import ComputerLoad, StatusTexts, computer_status, motion_values
 from mavlink.streams import Streams
 from mavlink.timesync import TimesyncFilter
@@ -134,7 +135,8 @@ class Companion:
         if autopilot is not None and packet.component == autopilot[1]:
             self.rates.heard(name)
         sample = decode(message)
-        if sample is None:
+        speaker = 1 if autopilot is None else autopilot[1]
+        if sample is None or (packet.component != speaker and isinstance(sample, OF_AUTOPILOT)):
             return
         self.counts["samples"] += 1
         if sample.boot_ms is None:

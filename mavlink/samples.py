@@ -74,3 +74,7 @@ class GimbalSample(Sample):
     frame: GimbalFrame
     component: int
     rank: int  # 0 GIMBAL_DEVICE_ATTITUDE_STATUS, 1 MOUNT_ORIENTATION, 2 MOUNT_STATUS
+
+
+OF_AUTOPILOT = (AttitudeSample, PositionSample, AccuracySample)
+"""What only the autopilot may say: a gimbal or camera that says it means itself."""

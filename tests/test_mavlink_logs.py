@@ -172,6 +172,19 @@ def test_the_vehicle_with_an_attitude_is_taken_not_the_ground_station(tmp_path: 
     assert any("several vehicles" in w and "7" in w for w in log.warnings)
 
 
+def test_the_attitude_of_a_gimbal_is_not_the_vehicles_in_a_log(tmp_path: Path) -> None:
+    writer = TlogWriter()
+    fly(writer, 10, lambda t: T0_US + round(t * US), lambda t: 9_000 + t * 1000)
+    gimbal = dialect.MAVLink_heartbeat_message(26, 8, 0, 0, 4, 3)
+    for k in range(100):
+        writer.add(T0_US + k * US // 10, gimbal, 1, 154)
+        writer.add(T0_US + k * US // 10, attitude(500 + 100 * k, -2.0), 1, 154)
+    for k in range(100):  # and it restarts
+        writer.add(T0_US + 10 * US + k * US // 10, attitude(500 + 100 * k, -2.0), 1, 154)
+    log = load_telemetry(writer.save(tmp_path / "a.tlog"))
+    assert len(log.history) == 200 and log.warnings == ()
+
+
 # tlog: damage
 
 

@@ -340,6 +340,16 @@ def test_the_live_clock_never_dates_a_sample_after_its_arrival() -> None:
     assert abs(np.median(late[500:])) < 2 * MS and max(late[500:]) < 8 * MS
 
 
+def test_the_attitude_of_a_gimbal_is_not_the_vehicles() -> None:
+    station = Station()
+    station.feed(packed(beat()))
+    for k in range(20):
+        station.feed(packed(attitude(1_000 + 50 * k, 0.1)))
+        station.feed(packed(attitude(77_000 + 50 * k, -1.0), (1, 154)))
+        station.wait(0.05)
+    assert {round(q.q_ned_body[1], 3) for q, _ in station.history.attitudes()} == {0.05}
+
+
 def test_timesync_of_an_autopilot_that_is_up_for_months() -> None:
     clock = BootClock()
     wraps = 3 * 2**32 * MS

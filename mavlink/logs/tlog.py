@@ -13,7 +13,7 @@ from mavlink.decode import READERS, decode
 from mavlink.framing import Decoder, Packet, check_packet, packet_length
 from mavlink.history import HistoryConfig, VehicleHistory
 from mavlink.logs import TelemetryLog, finish
-from mavlink.samples import AttitudeSample, Sample
+from mavlink.samples import OF_AUTOPILOT, AttitudeSample, Sample
 from mavlink.wire import numbers_of
 
 STAMP = 8
@@ -84,15 +84,17 @@ def _stamp_stands(
 def load(path: Path, config: HistoryConfig) -> TelemetryLog:
     """The history of the one autopilot in a telemetry log."""
     counts: Counter[str] = Counter()
-    streams, autopilots, sessions = _collect(path, counts)
+    streams, autopilots = _collect(path, counts)
     warnings: list[str] = []
-    system = _vehicle(streams, autopilots, warnings)
+    system = _vehicle(streams, {number for number, _ in autopilots}, warnings)
     history = VehicleHistory(config)
     for key, stream in streams.items():
         if key[0] == system:
-            _place(history, key, stream, streams, warnings)
-    if sessions:
-        warnings.append(f"the autopilot started again {sessions} time(s) in this log")
+            speaks = key[:2] in autopilots or not autopilots
+            _place(history, key, stream, streams, speaks, warnings)
+    restarts = max((n for *sender, n in streams if tuple(sender) in autopilots), default=0)
+    if restarts:
+        warnings.append(f"the autopilot started again {restarts} time(s) in this log")
     if counts["skipped_bytes"]:
         warnings.append(f"{counts['skipped_bytes']} damaged bytes were skipped")
     return finish(path, history, counts, warnings)
@@ -102,11 +104,12 @@ Key = tuple[int, int, int]
 """System, component, boot session."""
 
 
-def _collect(path: Path, counts: Counter[str]) -> tuple[dict[Key, _Stream], set[int], int]:
+def _collect(path: Path, counts: Counter[str]) -> tuple[dict[Key, _Stream], set[tuple[int, int]]]:
+    """The samples by sender and session, and the (system, component) of autopilots."""
     decoder = Decoder()
     streams: dict[Key, _Stream] = {}
     counters: dict[tuple[int, int], BootCounter] = {}
-    autopilots: set[int] = set()
+    autopilots: set[tuple[int, int]] = set()
     with path.open("rb") as file:
         for stamp_ns, packet in packets(file, counts):
             counts["packets"] += 1
@@ -118,7 +121,7 @@ def _collect(path: Path, counts: Counter[str]) -> tuple[dict[Key, _Stream], set[
             sender = (packet.system, packet.component)
             if packet.message_id == HEARTBEAT:
                 if message.autopilot != NO_AUTOPILOT:
-                    autopilots.add(packet.system)
+                    autopilots.add(sender)
                 continue
             sample = decode(message)
             if sample is None:
@@ -130,7 +133,7 @@ def _collect(path: Path, counts: Counter[str]) -> tuple[dict[Key, _Stream], set[
             stream.stamps.append(stamp_ns)
             stream.samples.append(sample)
             stream.boots.append(boot)
-    return streams, autopilots, sum(c.session for k, c in counters.items() if k[0] in autopilots)
+    return streams, autopilots
 
 
 def _vehicle(streams: dict[Key, _Stream], autopilots: set[int], warnings: list[str]) -> int | None:
@@ -153,20 +156,22 @@ def _place(
     key: Key,
     stream: _Stream,
     streams: dict[Key, _Stream],
+    speaks: bool,
     warnings: list[str],
 ) -> None:
+    """Put a stream's samples in; those of the vehicle itself only when its autopilot speaks."""
     fit = _fit(stream)
     if fit is None:  # a sender without a clock of its own goes by the autopilot's
         others = (_fit(s) for k, s in streams.items() if k[0] == key[0] and k != key)
         fit = next((f for f in others if f is not None), None)
-    if fit is not None and not fit.is_real_time and key[1] == 1:
+    if fit is not None and not fit.is_real_time and speaks:
         warnings.append(
             f"the log's stamps ran at {1.0 / fit.rate:.2f} of the autopilot's clock; "
             "the autopilot's clock is used from the first stamp on"
         )
-
     for stamp, boot, sample in zip(stream.stamps, stream.boots, stream.samples, strict=True):
-        history.add(sample, _time(fit, stamp, boot))
+        if speaks or not isinstance(sample, OF_AUTOPILOT):
+            history.add(sample, _time(fit, stamp, boot))
 
 
 def _fit(stream: _Stream) -> BootFit | None:
