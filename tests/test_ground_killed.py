@@ -91,7 +91,7 @@ def test_killed_and_restarted_on_both_sides(tmp_path: Path) -> None:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     onboard = tmp_path / "scan.db"
-    drone = start(DRONE, str(onboard), endpoint, "40")
+    drone = start(DRONE, str(onboard), endpoint, "30")
     ground = start(GROUND, str(tmp_path / "ground"), endpoint)
     try:
         time.sleep(1.5)
@@ -100,7 +100,7 @@ def test_killed_and_restarted_on_both_sides(tmp_path: Path) -> None:
         ground = start(GROUND, str(tmp_path / "ground"), endpoint)
         time.sleep(0.5)
         kill(drone)
-        drone = start(DRONE, str(onboard), endpoint, "40")
+        drone = start(DRONE, str(onboard), endpoint, "30")
         assert drone.stdout is not None
         assert drone.stdout.readline() == "drained True\n"
     finally:
@@ -108,7 +108,7 @@ def test_killed_and_restarted_on_both_sides(tmp_path: Path) -> None:
         kill(ground)
     received = tmp_path / "ground" / "drone-a" / "scan-1" / "scan.db"
     with ScanStore.open(onboard) as a, ScanStore.open(received) as b:
-        assert a.seqs() == list(range(40))
+        assert a.seqs() == list(range(30))
         assert a.numbers() == b.numbers()
         for left, right in zip(a.keyframes(), b.keyframes(), strict=True):
             np.testing.assert_array_equal(left.depth.depth_m, right.depth.depth_m)

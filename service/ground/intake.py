@@ -22,7 +22,7 @@ SMALL, FINE = range(2)
 
 GRACE_S = 1.0
 """An item the drone has had for less than this may still come by itself."""
-STALL_S = 8.0
+STALL_S = 4.0
 REST_S = 2.0
 """Pause after a request that brought nothing."""
 
@@ -49,6 +49,7 @@ class _Request:
     serial: int
     news_at: float
     brought: int = 0
+    moved: bool = False  # a part came
 
 
 class ScanIntake:
@@ -91,7 +92,8 @@ class ScanIntake:
                 self.progress.duplicates += part.index == 0
                 continue
             for request in self._requests.values():
-                request.news_at = now if request.kind == part.kind else request.news_at
+                if request.kind == part.kind:
+                    request.news_at, request.moved = now, True
             record = self._assembler.add(part, now)
             if record is not None:
                 news = self._store(part.kind, part.number, record, now) or news
@@ -156,7 +158,7 @@ class ScanIntake:
         if request is None or request.serial != serial:
             return
         del self._requests[slot]
-        if request.brought == 0:
+        if request.brought == 0 and not request.moved:
             self._rest_until[slot] = now + REST_S
 
     def _free(self, slot: int, now: float) -> bool:

@@ -71,10 +71,11 @@ class TokenBucket:
 class RateEstimate:
     """What the link really carries, from what the far end says it received.
 
-    Bytes sent and not yet received beyond the least of late are a queue. When two reports in
-    a row find more than half a second of it, the allowed rate falls below what came through
-    at best of late; then it climbs, fast to where the queue began and slowly from there on.
-    One stall of a lossy link is no queue.
+    Bytes sent and not yet received beyond the least of late are a queue, or lost. When two
+    reports in a row find more than half a second of them, the allowed rate falls below what
+    came through at best of late; then it climbs, fast to where that began and slowly from
+    there on. One stall of a lossy link is no queue. Losses that a lower rate does not lessen
+    are the link's own and no reason to fall again.
     """
 
     QUEUE_S = 0.5
@@ -86,6 +87,8 @@ class RateEstimate:
     SILENCE_S = 10.0  # after a gap, begin anew
     REST = 2  # reports after a fall that are not judged
     PATIENCE = 2  # bad reports in a row before the rate falls
+    SAME = 0.6  # a share lost that shrank by less than this did not depend on the rate
+    FORGET = 0.99  # per report, of the share lost that is taken for the link's own
 
     def __init__(self, configured_bytes_s: float) -> None:
         self.configured_bytes_s = configured_bytes_s
@@ -93,31 +96,32 @@ class RateEstimate:
         self._knee = configured_bytes_s
         self._at = -math.inf
         self._received = 0
-        self._under_way: deque[int] = deque(maxlen=20)
+        self._totals: deque[tuple[int, int]] = deque(maxlen=20)  # sent, received
         self._through: deque[float] = deque(maxlen=4)
         self._rest = 0
         self._bad = 0
+        self._lost_at_fall = 0.0
+        self._own_loss = 0.0
 
     def report(self, sent_bytes: int, received_bytes: int, now: float) -> float:
         """The rate to use, given the totals sent and received so far."""
         passed = now - self._at
         if passed < self.LEAST_S:
             return self.rate_bytes_s
-        self._through.append((received_bytes - self._received) / passed)
-        through = max(self._through)
         anew = passed > self.SILENCE_S or received_bytes < self._received
-        self._at, self._received = now, received_bytes
         if anew:
-            self._under_way.clear()
+            self._totals.clear()
             self._through.clear()
-        self._under_way.append(sent_bytes - received_bytes)
-        queue = self._under_way[-1] - min(self._under_way)
+        self._through.append(max(0, received_bytes - self._received) / passed)
+        self._at, self._received = now, received_bytes
+        self._totals.append((sent_bytes, received_bytes))
+        self._own_loss *= self.FORGET
         if self._rest > 0:
             self._rest -= 1
-        elif not anew and queue > max(self.QUEUE_LEAST_BYTES, self.QUEUE_S * through):
+        elif self._is_bad():
             self._bad += 1
             if self._bad >= self.PATIENCE:
-                self._fall(through)
+                self._judge()
         else:
             self._bad = 0
             step = self.CLIMB if self.rate_bytes_s < self._knee else self.CREEP
@@ -125,9 +129,25 @@ class RateEstimate:
             self.rate_bytes_s = min(self.configured_bytes_s, climbed)
         return self.rate_bytes_s
 
-    def _fall(self, through: float) -> None:
-        least = self.FLOOR * self.configured_bytes_s
-        self._knee = max(least, 0.9 * through)
-        self.rate_bytes_s = max(least, min(self.rate_bytes_s, self.FALL * through))
-        self._under_way.clear()
+    def _is_bad(self) -> bool:
+        under_way = [sent - received for sent, received in self._totals]
+        queue = under_way[-1] - min(under_way)
+        own = self._own_loss * (self._totals[-1][0] - self._totals[0][0])
+        return queue - own > max(self.QUEUE_LEAST_BYTES, self.QUEUE_S * max(self._through))
+
+    def _judge(self) -> None:
+        """Fall, or take what is lost for the link's own."""
+        (sent0, received0), (sent1, received1) = self._totals[0], self._totals[-1]
+        lost = 1.0 - (received1 - received0) / max(1, sent1 - sent0)
+        if lost > 0 and self._lost_at_fall > 0 and lost > self.SAME * self._lost_at_fall:
+            self._own_loss = min(0.9, 1.2 * lost)
+            self._lost_at_fall = 0.0
+            self._knee = self.configured_bytes_s
+        else:
+            self._lost_at_fall = lost
+            least = self.FLOOR * self.configured_bytes_s
+            through = max(self._through)
+            self._knee = max(least, 0.9 * through)
+            self.rate_bytes_s = max(least, min(self.rate_bytes_s, self.FALL * through))
+        self._totals.clear()
         self._rest, self._bad = self.REST, 0

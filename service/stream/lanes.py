@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, replace
 
 from service.stream.messages import Ask
-from service.stream.parts import HEAD_BYTES, Part, split
+from service.stream.parts import HEAD_BYTES, MAX_PARTS, Part, split, split_in
 from service.stream.ranges import RangeSet
 from service.stream.store import ScanStore
 
@@ -154,13 +154,22 @@ class AskedLane:
         parts: list[Part] = []
         size = 0
         while request.left and size < part_bytes:
-            loaded = load(request.store, request.kind, request.left.popleft(), part_bytes)
-            wanted = request.ask.parts
-            if wanted is not None and loaded and loaded[0].count == request.ask.parts_of:
-                loaded = [part for part in loaded if part.index in wanted]
+            loaded = _wanted(request, request.left.popleft(), part_bytes)
             parts += loaded
             size += sum(len(part.payload) + HEAD_BYTES for part in loaded)
         return parts
+
+
+def _wanted(request: Request, number: int, part_bytes: int) -> list[Part]:
+    """The parts of a record that the request names, cut as the station knows it."""
+    record = request.store.record(request.kind, number)
+    if record is None:
+        return []
+    ask = request.ask
+    if ask.parts is None or not 0 < ask.parts_of <= MAX_PARTS:
+        return split(request.kind, number, record, part_bytes)
+    cut = split_in(request.kind, number, record, ask.parts_of)
+    return [part for part in cut if part.index in ask.parts or part.count != ask.parts_of]
 
 
 def _bundle(request: Request, parts: list[Part], part_bytes: int) -> list[Outgoing]:

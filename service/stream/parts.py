@@ -57,13 +57,19 @@ class Part:
 
 
 def split(kind: str, number: int, record: bytes, part_bytes: int) -> list[Part]:
-    """The parts of ``record``, each of at most ``part_bytes`` of it."""
-    step = max(part_bytes, -(-len(record) // MAX_PARTS), 1)
-    count = max(1, -(-len(record) // step))
+    """The parts of ``record``, equally large but for the last, each of at most ``part_bytes``."""
+    count = max(1, -(-len(record) // max(part_bytes, 1)))
+    return split_in(kind, number, record, min(count, MAX_PARTS))
+
+
+def split_in(kind: str, number: int, record: bytes, count: int) -> list[Part]:
+    """The ``count`` parts of ``record``; fewer when it has fewer bytes."""
+    step = max(1, -(-len(record) // count))
     crc = zlib.crc32(record)
+    pieces = [record[at : at + step] for at in range(0, max(1, len(record)), step)]
     return [
-        Part(kind, number, k, count, len(record), crc, record[k * step : (k + 1) * step])
-        for k in range(count)
+        Part(kind, number, k, len(pieces), len(record), crc, piece)
+        for k, piece in enumerate(pieces)
     ]
 
 
