@@ -222,15 +222,22 @@ class Daemon:
     def stop_scan(self) -> Handled:
         """Close the running scan; the files are written after the answer."""
         self._retry_at_s = None
-        self._stop_scan.set()
+        self._stop_feeding()
         return ACCEPTED
+
+    def _stop_feeding(self) -> None:
+        """Make the scan's thread come to its end, also where it waits for a dead camera."""
+        self._stop_scan.set()
+        scan = self._scan
+        if scan is not None:
+            scan.source.close()
 
     def finalise(self) -> Handled:
         """Close the scan and answer when everything is written out."""
         if self._worker is None or not self._worker.is_alive():
             return ACCEPTED
         self._closing = Work()
-        self._stop_scan.set()
+        self._stop_feeding()
         return self._closing
 
     def pause(self) -> Handled:
@@ -425,7 +432,7 @@ class Daemon:
             self.vehicle.report_keyframe(_keyframe_report(scan.recorder.last))
 
     def _end_scan(self) -> None:
-        self._stop_scan.set()
+        self._stop_feeding()
         if self._worker is not None:
             self._worker.join()
 

@@ -163,6 +163,28 @@ def test_live_pictures_are_not_held_back() -> None:
     assert frame.time_ns == 3600 * 10**9
 
 
+def test_waiting_for_a_dead_camera_can_be_ended() -> None:
+    source = LiveSource(opener(clip(6), OSError("gone")), "test", QUICK)
+    paces = paced(source)
+    frames = iter(paces)
+    next(frames)
+    threading.Timer(0.5, paces.close).start()
+    assert len(list(frames)) < 6
+    paces.close()
+
+
+def test_a_paced_recording_can_be_ended(tmp_path: Path) -> None:
+    """Its pictures are hours apart; closing does not wait for the next one."""
+    data = clip(3)
+    path = tmp_path / "v.mkv"
+    path.write_bytes(data)
+    recording = open_camera(str(path))
+    recording._start_s = -3600  # type: ignore[attr-defined]
+    paces = paced(recording)
+    threading.Timer(0.3, paces.close).start()
+    assert list(paces) == []
+
+
 @pytest.mark.parametrize(
     "wrong", [{"first_retry_s": 9.0}, {"stall_s": 0.0}, {"frozen_s": -1.0}, {"first_retry_s": 0.0}]
 )

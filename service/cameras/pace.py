@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterator
-from threading import Condition, Thread
+from threading import Condition, Event, Thread
 
 from service.cameras.source import CameraFrame, CameraSource
 
@@ -23,6 +23,8 @@ class Paced:
         self._kept = kept
         self._news = Condition()
         self._ended = False
+        self._closed = Event()
+        self._reader: Thread | None = None
         self._fault: Exception | None = None
         self.dropped = 0
         self.description, self.size_px = source.description, source.size_px
@@ -32,11 +34,12 @@ class Paced:
         self.warnings = source.warnings
 
     def __iter__(self) -> Iterator[CameraFrame]:
-        Thread(target=self._read, name="paced camera", daemon=True).start()
+        self._reader = Thread(target=self._read, name="paced camera", daemon=True)
+        self._reader.start()
         while True:
             with self._news:
-                self._news.wait_for(lambda: self._waiting or self._ended)
-                if not self._waiting:
+                self._news.wait_for(lambda: self._waiting or self._ended or self._closed.is_set())
+                if not self._waiting or self._closed.is_set():
                     break
                 frame = self._waiting.popleft()
             yield frame
@@ -46,16 +49,23 @@ class Paced:
             self.warnings.append(f"{self.dropped} frames came faster than they could be used")
 
     def close(self) -> None:
-        """Let go of the source."""
-        self._source.close()
+        """End the iteration at once, from any thread, and let go of the source.
+
+        A recording is let go by the thread that reads it, not under its hands.
+        """
+        with self._news:
+            self._closed.set()
+            self._news.notify_all()
+        if self._source.is_live or self._reader is None or not self._reader.is_alive():
+            self._source.close()
 
     def _read(self) -> None:
         start = time.monotonic_ns()
         try:
             for frame in self._source:
-                wait_ns = frame.time_ns - (time.monotonic_ns() - start)
-                if wait_ns > 0 and not self._source.is_live:
-                    time.sleep(wait_ns * 1e-9)
+                early_s = 1e-9 * (frame.time_ns - (time.monotonic_ns() - start))
+                if self._closed.wait(0.0 if self._source.is_live else max(0.0, early_s)):
+                    break
                 with self._news:
                     self._waiting.append(frame)
                     if len(self._waiting) > self._kept:
@@ -65,6 +75,7 @@ class Paced:
         except Exception as error:  # handed to the thread that iterates
             self._fault = error
         finally:
+            self._source.close()
             with self._news:
                 self._ended = True
                 self._news.notify_all()
