@@ -10,7 +10,7 @@ from numba import njit, prange
 
 from recon.types import F32, F64, DepthMap, DisparityMap, StereoPair
 
-LABEL_SIGMA_PX = 0.25
+LABEL_SIGMA_PX = 0.075
 """Sigma of a label of full confidence, in pixels of the grid that was matched."""
 
 MIN_CONFIDENCE = 0.05
@@ -64,7 +64,7 @@ def reproject(
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _label(px: Any, x: float, y: float) -> float:  # pragma: no cover - compiled
+def _label(px: Any, x: Any, y: Any) -> Any:  # pragma: no cover - compiled
     """Label at a place: bilinear where the four around it agree, else the nearest; or NaN."""
     height, width = px.shape
     i, j = int(np.rint(x)), int(np.rint(y))

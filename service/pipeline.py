@@ -123,7 +123,8 @@ class Pipeline:
             tracked = self.odometry.track(grey, frame.seq, frame.time_ns, prior, mask)
         if tracked.T_odom_camera is None:
             self.refusals[tracked.reason] += 1
-            return Step(tracked, prior, _by_telemetry(frame.seq, prior))
+            placed = _by_telemetry(frame.seq, prior) if tracked.state == "lost" else None
+            return Step(tracked, prior, placed)
         key = self.odometry.keyframes[-1]
         viewpoint = self.viewpoints.offer(frame, picture, tracked, key, prior)
         if viewpoint is not None:

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from recon import bundle, se3
+from recon.bundle import I64
 from recon.types import F64
 
 K = np.array([[1000.0, 0, 640], [0, 1000.0, 360], [0, 0, 1]])
 
 
-def flight(seed: int, cameras: int = 6, points: int = 400) -> tuple[F64, F64, F64, F64, F64]:
+def flight(seed: int, cameras: int = 6, points: int = 400) -> tuple[F64, F64, I64, I64, F64]:
     """Poses (C, 4, 4), points, and the observations: camera, point and pixel."""
     rng = np.random.default_rng(seed)
     X = np.c_[rng.uniform(-60, 60, (points, 2)), rng.uniform(0, 10, points)]
@@ -29,7 +30,7 @@ def flight(seed: int, cameras: int = 6, points: int = 400) -> tuple[F64, F64, F6
             pt.append(n)
             uv.append(pixel[n])
     ids, index = np.unique(pt, return_inverse=True)
-    return np.stack(poses), X[ids], np.array(cam), index, np.array(uv)
+    return np.stack(poses), X[ids], np.array(cam, np.int64), index.astype(np.int64), np.array(uv)
 
 
 def disturbed(T: F64, rng: np.random.Generator) -> F64:

@@ -32,7 +32,7 @@ def view(seq: int, centre: tuple[float, float, float], turn: tuple[float, float,
 
 
 def ground(rng: np.random.Generator, n: int = 500, relief: float = 6.0) -> F64:
-    return np.c_[rng.uniform(-30, 30, (n, 2)), rng.uniform(0, relief, n)]
+    return np.asarray(np.c_[rng.uniform(-30, 30, (n, 2)), rng.uniform(0, relief, n)])
 
 
 DIRECTIONS = [(5.0, 0.0, 0.0), (-5.0, 0.0, 0.0), (0.0, 5.0, 0.3), (3.0, -4.0, -0.5)]

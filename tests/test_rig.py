@@ -1,0 +1,111 @@
+"""Vehicle states and picture tags as priors on the camera's pose."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from mavlink.state import VehicleState
+from recon.frames import rotation_from_rpy, rpy_from_rotation
+from recon.se3 import quaternion_from_rotation
+from recon.types import F64
+from service.cameras.source import GeoTag
+from service.config import CameraConfig, FusionConfig, ScanConfig
+from service.rig import ASSUMED_AGL_M, Rig, attitude_of
+
+
+def rig(camera: CameraConfig | None = None, fusion: FusionConfig | None = None) -> Rig:
+    return Rig(camera or CameraConfig(), ScanConfig(), fusion or FusionConfig())
+
+
+def q(roll: float, pitch: float, yaw: float) -> F64:
+    degrees = (math.radians(a) for a in (roll, pitch, yaw))
+    return quaternion_from_rotation(rotation_from_rpy(*degrees))
+
+
+def up_and_right(R_world_camera: F64 | None) -> tuple[F64, F64, F64]:
+    """Where the picture's right, its top, and the view point to, in ENU."""
+    assert R_world_camera is not None
+    return R_world_camera[:, 0], -R_world_camera[:, 1], R_world_camera[:, 2]
+
+
+def test_a_nadir_camera_of_a_vehicle_heading_east() -> None:
+    """The picture's top points where the nose does, the view straight down."""
+    prior = rig().prior(VehicleState(0, q_ned_body_wxyz=q(0, 0, 90), sigma_yaw_rad=0.1), None)
+    right, top, view = up_and_right(prior.R_world_camera)
+    np.testing.assert_allclose(view, [0, 0, -1], atol=1e-9)
+    np.testing.assert_allclose(top, [1, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(right, [0, -1, 0], atol=1e-9)
+
+
+def test_roll_to_the_right_looks_to_the_left() -> None:
+    state = VehicleState(0, q_ned_body_wxyz=q(10, 0, 0), sigma_yaw_rad=0.1)
+    _, _, view = up_and_right(rig().prior(state, None).R_world_camera)
+    assert view[0] == pytest.approx(-math.sin(math.radians(10)))
+
+
+def test_the_gimbal_counts_before_the_body_unless_the_mount_is_fixed() -> None:
+    state = VehicleState(
+        0, q_ned_body_wxyz=q(5, 5, 0), q_ned_gimbal_wxyz=q(0, -90, 0), sigma_yaw_rad=0.1
+    )
+    _, top, view = up_and_right(rig().prior(state, None).R_world_camera)
+    np.testing.assert_allclose(view, [0, 0, -1], atol=1e-9)
+    np.testing.assert_allclose(top, [0, 1, 0], atol=1e-9)
+    fixed = rig(CameraConfig(mount="fixed")).prior(state, None)
+    assert fixed.R_world_camera is not None and abs(fixed.R_world_camera[0, 2]) > 0.05
+
+
+def test_the_first_position_is_the_origin() -> None:
+    some = rig()
+    state = VehicleState(0, lat_deg=47.0, lon_deg=8.0, alt_amsl_m=500.0, sigma_h_m=1.0)
+    first = some.prior(state, None)
+    np.testing.assert_allclose(first.position_m, 0.0, atol=1e-6)
+    north = VehicleState(0, lat_deg=47.001, lon_deg=8.0, alt_amsl_m=510.0, sigma_h_m=1.0)
+    second = some.prior(north, None)
+    assert second.position_m is not None and some.georeference == "gnss"
+    np.testing.assert_allclose(second.position_m, [0.0, 111.2, 10.0], atol=0.2)
+
+
+def test_a_picture_tag_serves_when_there_is_no_telemetry() -> None:
+    some = rig()
+    tag = GeoTag(30.0, -98.0, 300.0, ypr_deg=(90.0, -90.0, 0.0), relative_alt_m=80.0)
+    prior = some.prior(None, tag)
+    assert some.georeference == "exif" and prior.agl_m == 80.0
+    _, top, view = up_and_right(prior.R_world_camera)
+    np.testing.assert_allclose(view, [0, 0, -1], atol=1e-9)
+    np.testing.assert_allclose(top, [1, 0, 0], atol=1e-9)
+
+
+def test_without_anything_the_prior_says_how_little_it_knows() -> None:
+    some = rig()
+    prior = some.prior(None, None)
+    assert prior.position_m is None and prior.agl_m == ASSUMED_AGL_M
+    assert prior.sigma_yaw_rad > 1.0 and prior.sigma_tilt_rad > 0.05
+    assert not some.height_known(None, None)
+
+
+def test_each_part_of_the_telemetry_can_be_switched_off() -> None:
+    state = VehicleState(
+        0, q_ned_body_wxyz=q(20, 0, 0), lat_deg=47.0, lon_deg=8.0, alt_amsl_m=500.0,
+        alt_agl_m=70.0, sigma_yaw_rad=0.1,
+    )  # fmt: skip
+    blind = rig(fusion=FusionConfig(gnss=False, attitude=False, altitude=False))
+    prior = blind.prior(state, None)
+    assert prior.position_m is None and prior.sigma_yaw_rad > 1.0
+    assert prior.agl_m == ASSUMED_AGL_M
+    assert rig().prior(state, None).agl_m == 70.0
+
+
+def test_attitude_of_a_pose_is_that_of_the_head() -> None:
+    prior = rig().prior(VehicleState(0, q_ned_gimbal_wxyz=q(3, -60, 120)), None)
+    assert prior.R_world_camera is not None
+    T = np.eye(4)
+    T[:3, :3] = prior.R_world_camera
+    np.testing.assert_allclose(np.degrees(attitude_of(T)), [3, -60, 120], atol=1e-6)
+
+
+@pytest.mark.parametrize("rpy", [(0.1, 0.2, 0.3), (-0.5, 1.2, -3.0), (0.0, -math.pi / 2, 1.0)])
+def test_angles_and_rotations_undo_each_other(rpy: tuple[float, float, float]) -> None:
+    np.testing.assert_allclose(rpy_from_rotation(rotation_from_rpy(*rpy)), rpy, atol=1e-7)
