@@ -70,7 +70,12 @@ def load_debug(path: Path) -> dict[str, Array] | None:
             f"{path} cannot be read ({error}); replay with keep_debug again"
         ) from error
     for name, array in arrays.items():
-        if array.ndim != DEBUG_KEYS[name] or array.dtype.kind not in "fu" or not array.size:
+        grey = name.startswith("raw") and array.ndim == 2  # a drone without colour
+        if (
+            (array.ndim != DEBUG_KEYS[name] and not grey)
+            or array.dtype.kind not in "fu"
+            or not array.size
+        ):
             raise InputError(f"{path}: {name} is {array.dtype}{array.shape}, not an image")
     return arrays
 

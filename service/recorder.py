@@ -11,6 +11,7 @@ import numpy as np
 
 from recon.trajectory import Placed
 from recon.types import F64
+from service.inspection import save_debug
 from service.pipeline import Anchorage, Pipeline, Step
 from service.rig import attitude_of
 from service.stream.codec import CodecConfig, encode
@@ -136,6 +137,8 @@ class Recorder:
             self.points += int((keyframe.fresh & np.isfinite(keyframe.depth.depth_m)).sum())
             self.chunk_bytes += sum(map(len, layers))
             self._encoded_scale[keyframe.seq] = self.pipeline.trajectory.place(keyframe.seq).scale
+        if self.pipeline.debug and step.keyframes:
+            save_debug(self.store.path.parent, step.keyframes[-1].seq, self.pipeline.debug)
         moved = [self._repose(p) for p in step.moved if p.seq in self._encoded_scale]
         if moved:
             self.store.add_reposes(moved)
