@@ -37,7 +37,7 @@ def disturbed(T: F64, rng: np.random.Generator) -> F64:
     out = T.copy()
     for c in range(2, len(T)):
         out[c] = se3.exp(np.r_[rng.normal(0, 0.01, 3), rng.normal(0, 0.5, 3)]) @ T[c]
-    return out
+    return np.asarray(out)
 
 
 def test_exact_pixels_bring_the_poses_back() -> None:

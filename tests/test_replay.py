@@ -193,7 +193,7 @@ def test_bad_input_gets_one_line_and_exit_code_two(
     case: str, flight: Path, tmp_path: Path
 ) -> None:
     arguments, words = bad_inputs(flight, tmp_path)[case]
-    more = [] if "--out" in arguments else ["--out", tmp_path / "scan"]
+    more: list[str | Path] = [] if "--out" in arguments else ["--out", tmp_path / "scan"]
     done = skyrelief("replay", *arguments, *more)
     last = done.stderr.strip().splitlines()[-1]
     assert done.returncode == 2, done.stderr

@@ -61,6 +61,7 @@ def test_the_first_position_is_the_origin() -> None:
     some = rig()
     state = VehicleState(0, lat_deg=47.0, lon_deg=8.0, alt_amsl_m=500.0, sigma_h_m=1.0)
     first = some.prior(state, None)
+    assert first.position_m is not None
     np.testing.assert_allclose(first.position_m, 0.0, atol=1e-6)
     north = VehicleState(0, lat_deg=47.001, lon_deg=8.0, alt_amsl_m=510.0, sigma_h_m=1.0)
     second = some.prior(north, None)
