@@ -117,6 +117,7 @@ class UdpPort:
 
     def __init__(self, spec: LinkSpec) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._buffer = memoryview(bytearray(LONGEST))
         self._peers: dict[tuple[str, int], int] = {}
         self._fixed: tuple[str, int] | None = None
         try:
@@ -132,12 +133,12 @@ class UdpPort:
     def read(self) -> bytes:
         """The next datagram."""
         try:
-            data, peer = self._socket.recvfrom(LONGEST)
+            length, peer = self._socket.recvfrom_into(self._buffer)
         except (TimeoutError, ConnectionRefusedError):
             return b""
         if self._fixed is None and (peer in self._peers or len(self._peers) < MAX_PEERS):
             self._peers[peer] = time.monotonic_ns()
-        return data
+        return bytes(self._buffer[:length])
 
     def write(self, data: bytes) -> None:
         """Send to all; a peer that is not there is no failure of the link."""
