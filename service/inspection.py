@@ -140,7 +140,7 @@ def coloured(title: str, values: Array, unit: str, colours: int = cv2.COLORMAP_T
     return Panel(f"{text}, {share:.0f} % known", np.asarray(image, np.uint8))
 
 
-def sheet(panels: Sequence[Panel], heading: str, columns: int = 2) -> U8:
+def sheet(panels: Sequence[Panel], heading: str, columns: int = 3) -> U8:
     """(h, w, 3) BGR: the panels in rows, each with its title above it."""
     fitted = [_fitted(panel) for panel in panels]
     rows = [fitted[n : n + columns] for n in range(0, len(fitted), columns)]
