@@ -18,3 +18,25 @@ def open_datalink(store: ScanStore, config: Config) -> Datalink | None:
     from service.stream.link import DatalinkSender
 
     return DatalinkSender(store, config.datalink)
+
+
+def open_backlog(config: Config) -> Datalink | None:
+    """A sender of earlier scans that the ground lacks, for the time between flights.
+
+    None when no ground station is configured or it has everything. Close it before a scan.
+    """
+    from pathlib import Path
+
+    from service.stream.backlog import open_undelivered
+
+    if not (config.datalink.connect or config.datalink.listen):
+        return None
+    stores = open_undelivered(Path(config.scan.folder))
+    if not stores:
+        return None
+    from service.stream.link import DatalinkSender
+
+    sender = DatalinkSender(None, config.datalink, config.scan.drone_name)
+    for store in stores:
+        sender.add(store, owned=True)
+    return sender

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from service.config import DatalinkConfig
 from service.errors import OutsideError, SkyreliefError
 from service.stream.lanes import Outgoing
-from service.stream.messages import unpack_ask, unpack_held
+from service.stream.messages import Held, missing, unpack_ask, unpack_held
 from service.stream.outbox import Outbox
 from service.stream.radio_link import RadioSender
 from service.stream.ranges import ranges_from_text
@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 
 MAX_WAITING_EVENTS = 100_000
 RETRY_S = 1.0
+KEEP_HELD_S = 10.0
+"""How often a ground station's report is written to the store while it lacks something."""
 
 PRIORITIES = ("REAL_TIME", "INTERACTIVE_HIGH", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND")
 """Zenoh's priority of each lane of the outbox."""
@@ -56,12 +58,13 @@ class DatalinkSender:
 
     All puts happen on a thread of its own. Without endpoints in ``config`` nothing is opened.
     Raises InputError when an endpoint or a name cannot be used; a ground station that is not
-    there yet is waited for.
+    there yet is waited for. Between flights ``store`` is None and ``drone`` says whose scans
+    :meth:`add` will bring.
     """
 
-    def __init__(self, store: ScanStore, config: DatalinkConfig) -> None:
+    def __init__(self, store: ScanStore | None, config: DatalinkConfig, drone: str = "") -> None:
         self._config = config
-        self._drone = check_name(store.header.drone, "drone")
+        self._drone = check_name(drone if store is None else store.header.drone, "drone")
         self._session_config = SessionConfig(
             mode="router" if config.listen or len(config.connect) > 1 else "client",
             connect=config.connect,
@@ -81,12 +84,15 @@ class DatalinkSender:
         self._connected = False
         self._queries: dict[int, Any] = {}
         self._thread: threading.Thread | None = None
-        self.add(store)
+        self._kept_at: dict[str, float] = {}
+        self._owned: list[ScanStore] = []
+        if store is not None:
+            self.add(store)
         if config.connect or config.listen:
             self._thread = threading.Thread(target=self._run, name="datalink", daemon=True)
             self._thread.start()
         self._radio = None
-        if config.radio:
+        if config.radio and store is not None:
             tunnel = TunnelConfig(config.radio_baud / 10, config.radio_share)
             self._radio = RadioSender(store, tunnel, config.radio, lambda: not self._listened())
 
@@ -96,9 +102,14 @@ class DatalinkSender:
 
     # The scan's side
 
-    def add(self, store: ScanStore) -> None:
-        """Offer another scan of this drone too, such as one that the ground still lacks."""
+    def add(self, store: ScanStore, owned: bool = False) -> None:
+        """Offer another scan of this drone too, such as one that the ground still lacks.
+
+        An ``owned`` store is closed with the sender.
+        """
         scan_id = check_name(store.header.scan_id, "scan")
+        if owned:
+            self._owned.append(store)
 
         def news(kind: str, number: int) -> None:
             self._post(lambda now: self._outbox.news(scan_id, kind, number, now))
@@ -108,6 +119,14 @@ class DatalinkSender:
         store.listen(news)
         self._stores.append((store, news))
         self._wake.set()
+
+    def remove(self, store: ScanStore) -> None:
+        """Offer a scan no more; the store stays open."""
+        with self._lock:
+            self._outbox.remove(store.header.scan_id)
+        for entry in [entry for entry in self._stores if entry[0] is store]:
+            store.unlisten(entry[1])
+            self._stores.remove(entry)
 
     def set_budget(self, budget_kbit_s: float, share: float | None = None) -> None:
         """Change the link's rate, in flight."""
@@ -144,7 +163,7 @@ class DatalinkSender:
         return True
 
     def close(self) -> None:
-        """Stop sending; the stores stay open."""
+        """Stop sending; stores that are not owned stay open."""
         self._stop.set()
         self._wake.set()
         if self._thread is not None:
@@ -156,6 +175,8 @@ class DatalinkSender:
         for store, news in self._stores:
             store.unlisten(news)
         self._stores.clear()
+        while self._owned:
+            self._owned.pop().close()
 
     def _post(self, event: Callable[[float], None]) -> None:
         self._events.append(event)
@@ -242,7 +263,21 @@ class DatalinkSender:
         parts = str(sample.key_expr).split("/")
         if held is not None and len(parts) == 5:
             scan_id, peer = parts[2], parts[4]
-            self._post(lambda now: self._outbox.held(scan_id, peer, held, now))
+            self._post(lambda now: self._heard(scan_id, peer, held, now))
+
+    def _heard(self, scan_id: str, peer: str, held: Held, now: float) -> None:
+        """Take in a report; now and then it is kept in the scan's store."""
+        self._outbox.held(scan_id, peer, held, now)
+        store = next((s for s, _ in self._stores if s.header.scan_id == scan_id), None)
+        if store is None:
+            return
+        whole = not missing(store.numbers(), held.numbers)
+        if whole or now - self._kept_at.get(scan_id, -KEEP_HELD_S) >= KEEP_HELD_S:
+            self._kept_at[scan_id] = now
+            try:
+                store.set_held(peer, held.numbers)
+            except OutsideError as error:
+                log.warning("%s", error)
 
     def _on_look(self, query: zenoh.Query) -> None:
         query.drop()

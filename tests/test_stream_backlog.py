@@ -1,0 +1,81 @@
+"""Earlier scans that the ground lacks are found after a crash and sent between flights."""
+
+from __future__ import annotations
+
+import dataclasses
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.config import Config
+from service.datalink import open_backlog
+from service.ground import receiver as receiver_module
+from service.ground.receiver import Receiver, ReceiverConfig
+from service.stream.backlog import delivered, open_undelivered
+from service.stream.records import PoseRecord, ScanHeader
+from service.stream.session import SessionConfig
+from service.stream.store import ScanStore
+
+pytest.importorskip("zenoh")
+
+
+def make_scan(scans: Path, name: str, finished: bool = True, held: bool = False) -> None:
+    with ScanStore.create(scans / name / "scan.db", ScanHeader(name, "red", 1)) as store:
+        for k in range(5):
+            store.add_pose(PoseRecord(k, np.eye(4), np.eye(6)))
+        if finished:
+            store.finish({"points": 1})
+        if held:
+            store.set_held("base", store.numbers())
+
+
+def test_only_what_was_not_delivered_is_offered(tmp_path: Path) -> None:
+    make_scan(tmp_path, "done", held=True)
+    make_scan(tmp_path, "open")
+    make_scan(tmp_path, "crashed", finished=False)
+    make_scan(tmp_path, "flying", finished=False)
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "scan.db").write_text("no database " * 100)
+    stores = open_undelivered(tmp_path, but=tmp_path / "flying" / "scan.db")
+    try:
+        assert {s.header.scan_id for s in stores} == {"open", "crashed"}
+        assert all(s.finished and not delivered(s) for s in stores)
+    finally:
+        for store in stores:
+            store.close()
+    with ScanStore.open(tmp_path / "flying" / "scan.db") as flying:
+        assert not flying.finished
+
+
+def test_the_backlog_reaches_the_ground_and_is_then_empty(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(receiver_module, "_deliver", lambda *_: None)
+    scans = tmp_path / "scans"
+    make_scan(scans, "one")
+    make_scan(scans, "two", finished=False)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    base = Config()
+    config = dataclasses.replace(
+        base,
+        scan=dataclasses.replace(base.scan, folder=str(scans), drone="red"),
+        datalink=dataclasses.replace(base.datalink, connect=(endpoint,)),
+    )
+    ground = Receiver(
+        ReceiverConfig(tmp_path / "ground", SessionConfig(mode="router", listen=(endpoint,)))
+    )
+    ground.start()
+    link = open_backlog(config)
+    assert link is not None
+    try:
+        assert link.drain(15.0)
+    finally:
+        link.close()
+        ground.close()
+    assert open_backlog(config) is None
+    with ScanStore.open(tmp_path / "ground" / "red" / "two" / "scan.db") as two:
+        assert two.summary == {"interrupted": True} and len(list(two.poses())) == 5
