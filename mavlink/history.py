@@ -21,7 +21,7 @@ from mavlink.samples import (
     TerrainSample,
 )
 from mavlink.state import VehicleState
-from mavlink.track import Bracket, Row, Track
+from mavlink.track import MAX_GAP_NS, Bracket, Row, Track
 
 M_PER_DEG = 111_319.49  # along a meridian, and along the equator
 ACCURACY_GAP_NS = 3_000_000_000
@@ -78,6 +78,13 @@ class VehicleHistory:
         times = [t.last_ns for t in (self._attitude, self._position) if t.last_ns is not None]
         return max(times, default=None)
 
+    def covers(self, time_ns: int) -> bool:
+        """True when no stream that still flows may say more of ``time_ns``."""
+        with self._lock:
+            newest = [t.last_ns for t in (self._attitude, self._position, *self._gimbals.values())]
+        flowing = [t for t in newest if t is not None and t > time_ns - MAX_GAP_NS]
+        return all(t >= time_ns for t in flowing)
+
     def attitudes(self) -> list[tuple[AttitudeSample, int]]:
         """Every attitude with its time in ns, oldest first."""
         with self._lock:
@@ -106,7 +113,7 @@ class VehicleHistory:
         with self._lock:
             times = {t for track in self._gimbals.values() for t, _ in track.items()}
             bodies = [(t, _quaternion(r)) for t, r in self._attitude.items()]
-        states = [(t, self.state_at(t)) for t in sorted(times)]
+        states = [(t, VehicleHistory.state_at(self, t)) for t in sorted(times)]
         found = [
             (t, _quaternion(tuple(map(float, s.q_ned_gimbal_wxyz))))
             for t, s in states

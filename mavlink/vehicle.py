@@ -27,9 +27,10 @@ from mavlink.companion import Companion, CompanionConfig
 from mavlink.control import ScanControl
 from mavlink.decode import READERS
 from mavlink.framing import Framer, Packet
-from mavlink.history import HistoryConfig, VehicleHistory
+from mavlink.history import HistoryConfig
 from mavlink.inbox import Inbox, Job
 from mavlink.link import Link, LinkSpec, parse_link
+from mavlink.live_history import LiveHistory
 from mavlink.messages import Outgoing
 from mavlink.odometry import Odometry, odometry_message
 from mavlink.packer import Packer
@@ -101,7 +102,7 @@ class VehicleLink:
     def __init__(self, config: VehicleConfig, control: ScanControl) -> None:
         self.config = config
         now_ns = time.monotonic_ns()
-        self.history = VehicleHistory(config.history)
+        self.history = LiveHistory(config.history)
         self.recorder = Recorder()
         self._memory = _Memory(config.state_dir)
         self._signing = self._make_signing()

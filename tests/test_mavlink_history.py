@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from mavlink.gimbal import (
 )
 from mavlink.history import M_PER_DEG, HistoryConfig, VehicleHistory
 from mavlink.latency import FrameWatch
+from mavlink.live_history import LiveHistory
 from mavlink.quaternion import Quaternion
 from mavlink.samples import (
     AccuracySample,
@@ -432,6 +435,36 @@ def test_judging_needs_matching_lists() -> None:
     assert judge_frame([], [], []) is None
     still = judge_frame([ends], [ends], [quaternion.IDENTITY])
     assert still is not None and not still.decided
+
+
+def test_a_live_history_waits_for_the_far_side_of_a_frame() -> None:
+    history = LiveHistory(patience_s=5.0)
+    now = time.monotonic_ns()
+    for k in range(10):
+        history.add(AttitudeSample(None, quaternion.IDENTITY), now - (600 - 50 * k) * MS)
+    frame = now - 90 * MS  # the newest attitude is 60 ms older than the frame
+    late = AttitudeSample(None, quaternion.from_rpy(0.0, 0.0, 0.3))
+    timer = threading.Timer(0.05, lambda: history.add(late, now - 50 * MS))
+    timer.start()
+    state = history.state_at(frame)
+    timer.join()
+    assert state is not None and state.q_ned_body_wxyz is not None
+    # 60 of the 100 ms between the attitudes have passed.
+    assert angle(state.q_ned_body_wxyz, quaternion.from_rpy(0.0, 0.0, 0.18)) < 1e-6
+
+
+def test_a_live_history_does_not_wait_in_vain() -> None:
+    impatient = LiveHistory(patience_s=0.01)
+    now = time.monotonic_ns()
+    impatient.add(AttitudeSample(None, quaternion.IDENTITY), now - 100 * MS)
+    assert impatient.state_at(now - 20 * MS) is None  # nothing comes
+    history = LiveHistory(patience_s=1000.0)  # would stand still for ever if it waited
+    history.add(AttitudeSample(None, quaternion.IDENTITY), now)
+    assert history.state_at(now) is not None  # there already
+    assert history.state_at(now + 2000 * S) is None  # far ahead
+    assert history.state_at(now - 3 * S) is None  # long past
+    history.add(position(50.0, 8.0, 580.0, (0.0, 0.0, 0.0)), now - 5 * S)
+    assert history.state_at(now) is not None  # a stream that has dried up
 
 
 def test_a_live_history_forgets_and_a_wrong_sample_is_refused() -> None:
