@@ -95,6 +95,10 @@ def _vote(
         v = int(np.floor(K[1, 1] * cy / cz + K[1, 2] + 0.5))
         if not (WINDOW_PX <= u < w - WINDOW_PX and WINDOW_PX <= v < h - WINDOW_PX):
             continue
+        here = depth[v, u]
+        if abs(here - cz) <= AGREES_SIGMAS * (float(sigma[p]) + float(depth_sigma[v, u])):
+            confirmed[p] += max(views[v, u], 1)
+            continue
         known = 0
         behind = 0
         agrees = False

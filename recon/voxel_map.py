@@ -104,6 +104,11 @@ class VoxelMap:
         """Number of voxels that hold surface."""
         return self._count
 
+    @property
+    def nbytes(self) -> int:
+        """Memory held, in bytes."""
+        return sum(a.nbytes for a in (self._keys, self._ids, self._sigma, self._seen))
+
     def fresh(self, depth: DepthMap) -> Bool:
         """(h, w) pixels whose surface is new, or clearly better than what is held."""
         c = self.config

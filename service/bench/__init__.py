@@ -24,6 +24,7 @@ BENCHMARKS: dict[str, str] = {
     "matching": "service.bench.matching:run",
     "pose": "service.bench.pose:run",
     "icp": "service.bench.icp:run",
+    "map": "service.bench.map:run",
     "mavlink": "service.bench.mavlink:run",
     "codec": "service.bench.codec:run",
     "link": "service.bench.link:run",
