@@ -114,6 +114,7 @@ class Odometry:
         self._lost = 0
         self._last: tuple[int, F64, PosePrior] | None = None  # time, T_odom_camera, prior
         self._velocity = np.zeros(3)
+        self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
 
     # ---- one frame -------------------------------------------------------------------
 
@@ -128,6 +129,7 @@ class Odometry:
             mask: (H, W) non-zero where the picture is valid.
         """
         pyramid = matching.Pyramid.build(grey, self.config.matching.search_levels)
+        self._gap_ns, self._frame_ns = time_ns - self._frame_ns, time_ns
         if not self.keyframes:
             return self._start(grey, pyramid, seq, time_ns, prior, mask)
         if not self._metric:
@@ -149,7 +151,7 @@ class Odometry:
     ) -> Tracked:
         """Count a frame without a pose; after too many, or at a still, begin a new segment."""
         self._lost += 1
-        still = time_ns - self.keyframes[-1].time_ns > 1e9 * self.config.still_gap_s
+        still = self._gap_ns > 1e9 * self.config.still_gap_s
         if self._lost >= (2 if still else self.config.lost_after):
             self._start(grey, pyramid, seq, time_ns, prior, mask)
         return Tracked("lost", self.segment, reason=reason)
@@ -166,7 +168,6 @@ class Odometry:
         """Begin a segment at this frame."""
         corners = matching.harris_grid(grey, self.config.matching, mask)
         if corners.uv_px.shape[0] < 2 * self.config.min_tracks:
-            self.keyframes = []
             return Tracked("lost", self.segment, reason="too little texture")
         self.segment += 1
         self._metric, self._lost = False, 0

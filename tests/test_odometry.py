@@ -1,0 +1,151 @@
+"""The odometry over a flat, textured ground whose pictures are exact homographies."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.odometry import Odometry, OdometryConfig, Tracked
+from recon.types import F64, U8, Camera, PosePrior
+
+K = np.array([[400.0, 0, 239.5], [0, 400.0, 179.5], [0, 0, 1]])
+CAMERA = Camera(K, np.zeros(5), (480, 360))
+M_PER_PX = 0.12
+DOWN = np.diag([1.0, -1, -1])
+
+
+@pytest.fixture(scope="module")
+def ground() -> U8:
+    """A texture with detail at all scales, 240 m across."""
+    rng = np.random.default_rng(0)
+    out = np.zeros((2000, 2000), np.float32)
+    for size in (8, 25, 80, 250, 1000, 2000):
+        layer = rng.normal(0, 1, (size, size)).astype(np.float32)
+        out += cv2.resize(layer, (2000, 2000), interpolation=cv2.INTER_CUBIC)
+    out = (out - out.mean()) / out.std() * 45 + 128
+    return np.asarray(np.clip(out, 0, 255).astype(np.uint8))
+
+
+def photograph(ground: U8, T_world_camera: F64) -> U8:
+    """What the camera sees of the plane z = 0."""
+    R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    plane = np.array([[M_PER_PX, 0, -120.0], [0, M_PER_PX, -120.0], [0, 0, 1]])
+    H = K @ R.T @ (np.c_[np.eye(3)[:, :2], -t] @ plane)
+    return np.asarray(cv2.warpPerspective(ground, H, (480, 360), flags=cv2.INTER_AREA), np.uint8)
+
+
+def poses(n: int, step_m: float = 1.5, wobble: float = 0.02, seed: int = 1) -> list[F64]:
+    rng = np.random.default_rng(seed)
+    out = []
+    for i in range(n):
+        R = se3.so3_exp(np.r_[rng.normal(0, wobble, 2), 0.4 + rng.normal(0, wobble)]) @ DOWN
+        out.append(se3.compose(R, np.array([step_m * i - 50.0, 0.3 * step_m * i - 20, 60.0])))
+    return out
+
+
+def prior_of(T: F64, rng: np.random.Generator) -> PosePrior:
+    """Telemetry with an attitude good to half a degree, a fix to 0.3 m and a height to 1 m."""
+    R = se3.so3_exp(rng.normal(0, 0.008, 3)) @ T[:3, :3]
+    position = T[:3, 3] + rng.normal(0, 0.3, 3)
+    return PosePrior(R, 0.01, 0.03, position, np.full(3, 0.5), 60.0 + rng.normal(0, 1.0), 2.0)
+
+
+def fly(
+    ground: U8, track: list[F64], telemetry: bool, pictures: dict[int, U8] | None = None
+) -> tuple[Odometry, list[Tracked]]:
+    """Run the odometry at 5 Hz; ``pictures`` replaces some of the frames."""
+    rng = np.random.default_rng(2)
+    odometry, out = Odometry(CAMERA, OdometryConfig()), []
+    for i, T in enumerate(track):
+        picture = photograph(ground, T)
+        picture = (pictures or {}).get(i, picture)
+        prior = prior_of(T, rng) if telemetry else PosePrior(DOWN, 0.1, 3.0, agl_m=60.0)
+        out.append(odometry.track(picture, i, i * 200_000_000, prior))
+    return odometry, out
+
+
+def drift(track: list[F64], found: list[Tracked]) -> float:
+    """RMS distance after the best similarity, in metres."""
+    pairs = [
+        (f.T_odom_camera[:3, 3], T[:3, 3])
+        for f, T in zip(found, track, strict=True)
+        if f.T_odom_camera is not None
+    ]
+    a, b = (np.array(x) for x in zip(*pairs, strict=True))
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+    U, S, Vt = np.linalg.svd(b.T @ a)
+    flip = np.diag([1, 1, np.linalg.det(U @ Vt)])
+    scale = np.trace(np.diag(S) @ flip) / np.sum(a**2)
+    return float(np.sqrt(np.mean(np.sum((scale * a @ (U @ flip @ Vt).T - b) ** 2, axis=1))))
+
+
+@pytest.mark.parametrize("telemetry", [True, False])
+def test_flat_ground_is_followed_without_loss(ground: U8, telemetry: bool) -> None:
+    track = poses(40)
+    odometry, found = fly(ground, track, telemetry)
+    assert odometry.segment == 0
+    assert sum(f.state in ("tracked", "keyframe") for f in found) >= 34
+    assert drift(track, found) < 0.006 * 60.0
+
+
+def test_blank_frames_are_bridged_and_named(ground: U8) -> None:
+    track = poses(30)
+    blank = np.full((360, 480), 120, np.uint8)
+    _, found = fly(ground, track, True, {15: blank, 16: blank})
+    assert found[15].state == found[16].state == "lost" and found[15].reason
+    assert found[17].state in ("tracked", "keyframe") and found[17].segment == 0
+    assert drift(track, found) < 0.006 * 60.0
+
+
+def test_a_sudden_change_of_exposure_is_survived(ground: U8) -> None:
+    track = poses(20)
+    dark = {
+        i: np.asarray(photograph(ground, T) * 0.5 + 10, np.uint8)
+        for i, T in enumerate(track)
+        if i >= 10
+    }
+    _, found = fly(ground, track, True, dark)
+    assert all(f.state in ("tracked", "keyframe") for f in found[9:])
+
+
+def test_hovering_makes_no_surface(ground: U8) -> None:
+    track = poses(15, step_m=0.0, wobble=0.01)
+    _, found = fly(ground, track, True)
+    assert not any(f.state == "keyframe" for f in found)
+    assert {f.state for f in found[1:]} == {"waiting"}
+
+
+def test_pure_rotation_makes_no_surface(ground: U8) -> None:
+    turned = [
+        se3.compose(se3.so3_exp(np.array([0.0, 0.0, 0.05 * i])) @ DOWN, np.array([0.0, 0, 60]))
+        for i in range(15)
+    ]
+    _, found = fly(ground, turned, True)
+    assert not any(f.state == "keyframe" for f in found)
+
+
+def test_another_place_begins_a_new_segment(ground: U8) -> None:
+    """A jump to where nothing of the map is seen is a loss, then a fresh start."""
+    track = poses(12)
+    far = [T.copy() for T in poses(24, seed=5)]
+    for T in far:
+        T[:3, 3] += [70.0, 60.0, 0.0]
+    odometry, found = fly(ground, track + far, True)
+    after = found[12:]
+    assert after[0].state == "lost"
+    assert odometry.segment == 1
+    assert any(f.state == "keyframe" and f.segment == 1 for f in after)
+
+
+def test_noise_is_not_followed() -> None:
+    rng = np.random.default_rng(3)
+    odometry = Odometry(CAMERA)
+    states = [
+        odometry.track(
+            rng.integers(0, 255, (360, 480), dtype=np.uint8), i, i * 200_000_000, PosePrior()
+        ).state
+        for i in range(12)
+    ]
+    assert "keyframe" not in states and "tracked" not in states
