@@ -287,6 +287,8 @@ class VehicleLink:
             if now_ns >= save_ns or self._memory.is_stale(self._companion.parameters.revision):
                 save_ns = now_ns + SAVE_EVERY_NS
                 self._save()
+        for job in self._inbox.take(0.0):
+            self._guard(job)
         self._send(self._companion.take())
 
     def _guard(self, job: Job) -> None:

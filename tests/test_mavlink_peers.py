@@ -711,6 +711,21 @@ def test_tunnels_and_the_radios_state_pass_through_the_same_link() -> None:
             daemon.link.send_tunnel(40_000, bytes(129))
 
 
+def test_the_last_word_is_said() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        peer.bind(("127.0.0.1", 0))
+        peer.settimeout(10.0)
+        with Daemon(f"udpout:127.0.0.1:{peer.getsockname()[1]}") as daemon:
+            assert peer.recv(4096)
+            daemon.link.statustext("Service stops")
+        peer.setblocking(False)
+        heard = b""
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                heard += peer.recv(4096)
+        assert b"Service stops" in heard
+
+
 def test_a_full_disk_ends_the_log_and_nothing_else(caplog: pytest.LogCaptureFixture) -> None:
     full = Path("/dev/full")
     if not full.exists():
