@@ -252,6 +252,13 @@ def first_hit(  # type: ignore[no-untyped-def]
                     i = min(max(i, bi * BLOCK), min((bi + 1) * BLOCK, nx) - 1)
                 continue
             ui, uj = bi, bj
+            if dz < 0.0 and za > block_z[bj, bi, 1]:  # fall to the block's highest point at once
+                t = max(t, (block_z[bj, bi, 1] - oz) / dz)
+                za = oz + dz * t
+                i = int(np.floor((ox + dx * t - x0) / cell_m))
+                j = int(np.floor((oy + dy * t - y0) / cell_m))
+                i = min(max(i, bi * BLOCK), min((bi + 1) * BLOCK, nx) - 1)
+                j = min(max(j, bj * BLOCK), min((bj + 1) * BLOCK, ny) - 1)
         te, axis = _exit(x0, y0, cell_m, i, j, ox, oy, ix, iy)
         zb = oz + dz * min(te, t_out)
         if min(za, zb) <= column_z[j, i, 1] and max(za, zb) >= column_z[j, i, 0]:
