@@ -113,6 +113,13 @@ class Daemon:
         """How it goes, for /status and /metrics."""
         health, status = self._health(), self.status()
         figures = {"speed_m_s": status.speed_m_s, "distance_m": status.distance_m}
+        scan = self._scan
+        if scan is not None:
+            figures |= {
+                "frames": scan.recorder.frames,
+                "clouds": scan.recorder.clouds,
+                "points": scan.recorder.points,
+            }
         return {
             "ok": health is not Health.CRITICAL,
             "state": self.phase.value if self._booted else "starting",
@@ -366,8 +373,9 @@ class Daemon:
         self._scan, self._reported = Scan(inputs, store), 0
         self.vehicle.statustext(f"Scan {scan_id} started")
         try:
-            self._feed(self._scan, source)
+            self._scan.run(self._stop_scan, self._on_frame, self._paused)
         finally:
+            source.close()
             self.phase = Phase.FINALISING
             self.vehicle.record(None)
             try:
@@ -406,23 +414,6 @@ class Daemon:
                 self._stop_scan.wait(wait_s)
                 wait_s = min(2 * wait_s, LAST_RETRY_S)
         return None
-
-    def _feed(self, scan: Scan, source: CameraSource) -> None:
-        """Frames into the scan; a camera that dies is opened again and the scan goes on."""
-        while True:
-            try:
-                scan.run(self._stop_scan, self._on_frame, self._paused)
-                break
-            except OutsideError as error:
-                log.warning("camera lost: %s", error)
-                self.vehicle.statustext(f"Camera lost: {error}", WARNING)
-                source.close()
-                again = self._open_camera()
-                if again is None:
-                    return
-                source = again
-                scan.replace_source(source, _zero_ns(source))
-        source.close()
 
     def _on_frame(self, scan: Scan) -> None:
         self._progress_s = time.monotonic()

@@ -134,10 +134,6 @@ class Scan:
             if progress is not None:
                 progress(self)
 
-    def replace_source(self, source: CameraSource, epoch_ns: int) -> None:
-        """Go on with another source, whose time 0 is ``epoch_ns`` on the history's clock."""
-        self.source, self.epoch_ns = source, epoch_ns
-
     def close(self) -> dict[str, Any]:
         """Write what is left and close the scan in the store; return its figures."""
         elapsed = max(time.monotonic() - self._started, 1e-9)

@@ -8,6 +8,9 @@ from __future__ import annotations
 import json
 import os
 import random
+import resource
+import shlex
+import shutil
 import signal
 import socket
 import sqlite3
@@ -59,13 +62,20 @@ def free_port() -> int:
 class Service:
     """The daemon as a process of its own, looking at the demo flight as its camera."""
 
-    def __init__(self, folder: Path, start: str, environment: dict[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        start: str,
+        environment: dict[str, str] | None = None,
+        camera: str = f"images:{DEMO / 'frames'}?interval_s=1.0",
+        model: Path = DEMO / "camera.yaml",
+        largest_file_bytes: int | None = None,
+    ) -> None:
         self.port = free_port()
         self.configuration = folder / "skyrelief.toml"
         self.scans = folder / "scans"
         self.configuration.write_text(
-            f'[camera]\nsource = "images:{DEMO / "frames"}?interval_s=1.0"\n'
-            f'model = "{DEMO / "camera.yaml"}"\n'
+            f'[camera]\nsource = "{camera}"\nmodel = "{model}"\n'
             f'[scan]\nfolder = "{self.scans}"\nstart = "{start}"\n'
             '[compute]\nbackend = "cpu"\nguide_width = 320\n'
             f'[health]\nhttp = "127.0.0.1:{self.port}"\n'
@@ -78,6 +88,7 @@ class Service:
                 stdout=log,
                 stderr=log,
                 env={**os.environ, **(environment or {})},
+                preexec_fn=lambda: _limit_files(largest_file_bytes),
             )
 
     def __enter__(self) -> Service:
@@ -112,6 +123,12 @@ class Service:
     def stop(self) -> int:
         self.process.send_signal(signal.SIGTERM)
         return self.process.wait(timeout=PATIENCE_S)
+
+
+def _limit_files(largest_bytes: int | None) -> None:
+    """In the child: writing beyond ``largest_bytes`` of any file fails, as on a full disk."""
+    if largest_bytes is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (largest_bytes, largest_bytes))
 
 
 def stored(scans: Path) -> set[tuple[str, int, int, int]]:
@@ -154,6 +171,75 @@ def test_kill_9_loses_nothing_that_was_stored(tmp_path: Path, record: Record) ->
         assert json.loads((folder / "scan.json").read_text())["finished"] is True
         assert (folder / "cloud.laz").stat().st_size > 0
     record("kill -9 while scanning", KILLS, f"0 of {len(acknowledged)} stored chunks lost")
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs the ffmpeg command")
+def test_camera_dies_and_comes_back(tmp_path: Path, record: Record) -> None:
+    port = free_port()
+    model = tmp_path / "camera.yaml"
+    text = (DEMO / "camera.yaml").read_text().replace("1600", "320").replace("1200", "240")
+    model.write_text(
+        text.replace("1161.8", "232.4").replace("799.5", "159.5").replace("599.5", "119.5")
+    )
+
+    def send() -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            shlex.split(
+                f"ffmpeg -v error -re -stream_loop -1 -framerate 2 -pattern_type glob -i "
+                f"'{DEMO}/frames/*.jpg' -vf scale=320:240 -c:v libx264 -preset ultrafast "
+                f"-tune zerolatency -g 2 -f mpegts udp://127.0.0.1:{port}?pkt_size=1316"
+            ),
+            stdin=subprocess.DEVNULL,
+        )
+
+    deaths = 10 if WHOLE else 1
+    sender = send()
+    try:
+        camera = f"stream:udp://127.0.0.1:{port}"
+        with Service(tmp_path, "on-boot", camera=camera, model=model) as service:
+
+            def frames() -> int:
+                return int((service.get("/status") or {}).get("frames", 0))
+
+            service.until(lambda: frames() >= 2, "pictures")
+            for _ in range(deaths):
+                sender.kill()
+                sender.wait()
+                losses = told(service)
+                service.until(lambda n=losses: told(service) > n, "the loss being noticed")  # type: ignore[misc]
+                before = frames()
+                sender = send()
+                service.until(lambda n=before: frames() > n, "pictures again")  # type: ignore[misc]
+            scans = list(service.scans.iterdir())
+            assert service.stop() == 0
+        assert len(scans) == 1, "the scan goes on, it is not begun anew"
+    finally:
+        sender.kill()
+        sender.wait()
+    record("camera stream dies", deaths, "same scan goes on when it is back")
+
+
+def test_full_disk_keeps_what_is_stored(tmp_path: Path, record: Record) -> None:
+    with Service(tmp_path, "on-boot", largest_file_bytes=400_000) as service:
+        service.until(lambda: "Scan failed" in service.log.read_text() or failed(service), "fault")
+        service.until(lambda: len(list(service.scans.glob("*/scan.db"))) >= 2, "a new attempt")
+        first = min(service.scans.iterdir())
+        acknowledged = {row for row in stored(service.scans) if row[0] == first.name}
+        service.stop()
+    assert acknowledged
+    with ScanStore.open(first / "scan.db") as store:
+        assert set(store.seqs()) == {row[1] for row in acknowledged}
+        assert list(store.keyframes())
+    record("disk full while scanning", 1, "stored chunks sound, scanning tried again")
+
+
+def told(service: Service) -> int:
+    """How often the log speaks of the camera's stream."""
+    return service.log.read_text().count("service.cameras.live: udp")
+
+
+def failed(service: Service) -> bool:
+    return (service.get("/status") or {}).get("fault") not in (None, "")
 
 
 def test_term_closes_the_scan(tmp_path: Path, record: Record) -> None:
