@@ -23,7 +23,7 @@ from service.config import DatalinkConfig
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream import codec
 from service.stream.link import DatalinkSender
-from service.stream.records import PoseRecord, ScanHeader
+from service.stream.records import PoseRecord, ScanHeader, pack_pose
 from service.stream.session import SessionConfig
 from service.stream.store import ScanStore
 
@@ -43,6 +43,10 @@ class Trial:
     drones: int = 1
     drain_s: float = 240.0
 
+
+KINDS = (("pose", "poses"), ("k0", "coarse layers"), ("k1", "fine layers"))
+DELIVERED = "delivered of what was made"
+BUSIEST = "busiest second on the wire, of the budget"
 
 RADIO = Trial(LinkModel(1000.0, 0.1, 0.03, ((12.0, 32.0),)))
 FLEET = Trial(LinkModel(1000.0, 0.05, 0.0), flight_s=15.0, keyframes_hz=2.0, drones=10)
@@ -72,27 +76,53 @@ class Outcome:
 
 
 def run(options: BenchOptions) -> list[BenchResult]:
-    """The trial and the fleet, each as a handful of figures."""
-    return [*_report("link", fly(RADIO)), *_report("link fleet of ten", fly(FLEET))]
+    """The trial against plain Zenoh puts over the same link, and the fleet."""
+    plain = fly_plain(RADIO)
+    peer = {
+        DELIVERED: 100 * plain.delivered / plain.made,
+        BUSIEST: 100 * plain.busiest_share,
+        **{
+            what: value
+            for kind, name in KINDS
+            for what, value in _latencies(name, plain.latency_s.get(kind, []))
+        },
+    }
+    return [*_report("link", fly(RADIO), peer), *_report("link fleet of ten", fly(FLEET), {})]
 
 
-def _report(name: str, outcome: Outcome) -> list[BenchResult]:
+def _latencies(what: str, latencies: list[float]) -> list[tuple[str, float]]:
+    if not latencies:
+        return []
+    return [
+        (f"latency of {what}, median", float(np.median(latencies))),
+        (f"latency of {what}, 95 %", float(np.percentile(latencies, 95))),
+        (f"latency of {what}, worst", max(latencies)),
+    ]
+
+
+def _report(name: str, outcome: Outcome, peer: dict[str, float]) -> list[BenchResult]:
     rows = [
-        ("delivered of what was made", 100 * outcome.delivered / outcome.made, "%"),
+        (DELIVERED, 100 * outcome.delivered / outcome.made, "%"),
         ("least served drone at the flight's end, coarse layers", 100 * outcome.least_share, "%"),
-        ("busiest second on the wire, of the budget", 100 * outcome.busiest_share, "%"),
+        (BUSIEST, 100 * outcome.busiest_share, "%"),
         ("bytes on the wire per byte stored", outcome.sent_over_stored, ""),
         ("records that came twice", float(outcome.duplicates), ""),
         ("time to fetch the rest after the flight", outcome.drain_s, "s"),
         ("processor, all parts together", 100 * outcome.cpu_share, "% of a core"),
     ]
-    for kind, what in (("pose", "poses"), ("k0", "coarse layers"), ("k1", "fine layers")):
-        latencies = outcome.latency_s.get(kind, [])
-        if latencies:
-            rows.append((f"latency of {what}, median", float(np.median(latencies)), "s"))
-            rows.append((f"latency of {what}, 95 %", float(np.percentile(latencies, 95)), "s"))
-            rows.append((f"latency of {what}, worst", max(latencies), "s"))
-    return [BenchResult(name, what, value, unit) for what, value, unit in rows]
+    for kind, what in KINDS:
+        rows += [(w, v, "s") for w, v in _latencies(what, outcome.latency_s.get(kind, []))]
+    return [
+        BenchResult(
+            name,
+            what,
+            value,
+            unit,
+            peer="plain Zenoh put" if what in peer else "",
+            peer_value=peer.get(what),
+        )
+        for what, value, unit in rows
+    ]
 
 
 def fly(trial: Trial) -> Outcome:
@@ -123,6 +153,67 @@ def _fly(trial: Trial, folder: Path) -> Outcome:
         drone.store.close()
     ground.close()
     return outcome
+
+
+def fly_plain(trial: Trial) -> Outcome:
+    """The same production put on Zenoh as it comes: no store, no budget, default settings."""
+    import zenoh
+
+    from service.stream.session import zenoh_config
+
+    ground_port, port = _free_port(), _free_port()
+    came: dict[tuple[str, int], float] = {}
+
+    def on_sample(sample: zenoh.Sample) -> None:
+        _, kind, number = str(sample.key_expr).split("/")
+        came.setdefault((kind, int(number)), time.monotonic())
+
+    endpoints = f"tcp/127.0.0.1:{ground_port}", f"tcp/127.0.0.1:{port}"
+    ground = zenoh.open(zenoh_config(SessionConfig(mode="router", listen=endpoints[:1])))
+    ground.declare_subscriber("bench/*/*", on_sample)
+    emulator = LinkEmulator(trial.link, port, ground_port, udp=False)
+    emulator.start()
+    plain = zenoh.Config()
+    plain.insert_json5("mode", '"client"')
+    plain.insert_json5("connect/endpoints", f'["{endpoints[1]}"]')
+    plain.insert_json5("scouting/multicast/enabled", "false")
+    plain.insert_json5("transport/shared_memory/enabled", "false")
+    drone = zenoh.open(plain)
+    made: dict[tuple[str, int], float] = {}
+    patterns = [make_keyframe(k, SIZE_PX, strip(SIZE_PX, 20 + k), seed=1 + k) for k in range(4)]
+    pose = pack_pose(PoseRecord(0, np.eye(4), np.eye(6)))
+    began, cpu = time.monotonic(), time.process_time()
+    for seq in range(round(trial.flight_s * trial.keyframes_hz)):
+        time.sleep(max(0.0, began + seq / trial.keyframes_hz - time.monotonic()))
+        layers = codec.encode(replace(patterns[seq % 4], seq=seq), time.time_ns())
+        now = time.monotonic()
+        for kind, data in (("pose", pose), ("k0", layers[0]), ("k1", layers[1])):
+            made[kind, seq] = now
+            drone.put(f"bench/{kind}/{seq}", data)
+    landed = time.monotonic()
+    while time.monotonic() - landed < 60.0 and (
+        time.monotonic() - max(came.values(), default=landed) < 10.0
+    ):
+        time.sleep(0.2)
+    ended = time.monotonic()
+    drone.close()
+    emulator.close()
+    ground.close()
+    latency: dict[str, list[float]] = {}
+    for item, at in came.items():
+        if _is_up(trial.link, made[item] - emulator.started):
+            latency.setdefault(item[0], []).append(at - made[item])
+    return Outcome(
+        delivered=len(came),
+        made=len(made),
+        least_share=sum(kind == "k0" for kind, _ in came) / (len(made) / 3),
+        latency_s=latency,
+        busiest_share=emulator.up.busiest_window_bytes() / (trial.link.rate_kbit_s * 125 * SHARE),
+        sent_over_stored=0.0,
+        duplicates=0,
+        drain_s=ended - landed,
+        cpu_share=(time.process_time() - cpu) / (ended - began),
+    )
 
 
 def _take_off(trial: Trial, folder: Path, number: int, ground_port: int) -> _Drone:

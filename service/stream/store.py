@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from recon.types import DepthMap, Keyframe, Pose
 from service.errors import InputError
 from service.stream import codec, layer
 from service.stream.database import SCHEMA_VERSION, Database
+from service.stream.inventory import Inventory, Listener
 from service.stream.radio_messages import unpack_pose as unpack_radio_pose
 from service.stream.radio_messages import unpack_tile
 from service.stream.radio_tiles import keyframe_of
@@ -37,8 +38,6 @@ from service.stream.records import (
     unpack_repose,
 )
 
-Listener = Callable[[str, int], None]
-
 
 class ScanStore:
     """One scan's database. Safe for one writer and several readers, in threads.
@@ -51,7 +50,6 @@ class ScanStore:
         self.path = path
         self.quota_bytes = quota_bytes
         self.refused = 0
-        self._listeners: list[Listener] = []
         self._db = Database(path)
         self._lock = self._db.lock
         if header is not None:
@@ -60,7 +58,7 @@ class ScanStore:
         self._header = self._read_header()
         total = self._db.one("SELECT TOTAL(LENGTH(data)) FROM chunks")
         self.chunk_bytes = int(total[0]) if total else 0
-        self._load_numbers()
+        self._inventory = Inventory(self._db)
 
     @classmethod
     def create(
@@ -164,12 +162,12 @@ class ScanStore:
             fresh = [
                 (head, data)
                 for head, data in zip(heads, layers, strict=True)
-                if head.seq not in self._numbers.setdefault(f"k{head.layer}", RangeSet())
+                if head.seq not in self._inventory.of(f"k{head.layer}")
             ]
             self._db.write([(sql, _chunk_row(head, data)) for head, data in fresh])
             for head, data in fresh:
                 self.chunk_bytes += len(data)
-                self._note(f"k{head.layer}", head.seq)
+                self._inventory.note(f"k{head.layer}", head.seq)
             return len(fresh)
 
     def chunk(self, seq: int, number: int) -> bytes | None:
@@ -226,11 +224,11 @@ class ScanStore:
         if pose is None:
             return False
         with self._lock:
-            if number in self._numbers["pose"]:
+            if number in self._inventory.of("pose"):
                 return False
             row = (number, pose.time_unix_ns, data)
             self._db.write([("INSERT INTO poses VALUES (?, ?, ?)", row)])
-            self._note("pose", number)
+            self._inventory.note("pose", number)
             return True
 
     def poses(self) -> Iterator[PoseRecord]:
@@ -242,7 +240,7 @@ class ScanStore:
             pose = unpack_pose(bytes(data))
             if pose is not None:
                 yield pose
-        if not self._numbers["pose"]:
+        if not self._inventory.of("pose"):
             sql = "SELECT data FROM radio WHERE kind = 'pose' ORDER BY number"
             for (data,) in self._db.all(sql):
                 found = unpack_radio_pose(bytes(data))
@@ -264,7 +262,7 @@ class ScanStore:
             rows = [(first + i, r.seq, r.revision, pack_repose(r)) for i, r in enumerate(reposes)]
             self._db.write([(sql, row) for row in rows])
             for number, seq, revision, _ in rows:
-                self._enforce(number, seq, revision)
+                self._inventory.note_repose(number, seq, revision)
 
     def put_repose(self, number: int, data: bytes) -> bool:
         """Store a packed re-pose under the drone's number; False if it is no news."""
@@ -272,23 +270,12 @@ class ScanStore:
         if repose is None:
             return False
         with self._lock:
-            if number in self._known_reposes:
+            if self._inventory.has_repose(number):
                 return False
             row = (number, repose.seq, repose.revision, data)
             self._db.write([("INSERT INTO reposes VALUES (?, ?, ?, ?)", row)])
-            self._enforce(number, repose.seq, repose.revision)
+            self._inventory.note_repose(number, repose.seq, repose.revision)
             return True
-
-    def _enforce(self, number: int, seq: int, revision: int) -> None:
-        """Note a re-pose; of each keyframe only the one in force is offered to the link."""
-        self._known_reposes.add(number)
-        before = self._in_force.get(seq)
-        if before is not None and before[0] > revision:
-            return
-        if before is not None:
-            self._numbers["repose"].discard(before[1])
-        self._in_force[seq] = (revision, number)
-        self._note("repose", number)
 
     def repose(self, seq: int) -> Repose | None:
         """The newest re-pose of keyframe ``seq``."""
@@ -330,7 +317,7 @@ class ScanStore:
 
     def _put_whole(self, kind: str, number: int, data: bytes) -> bool:
         with self._lock:
-            if number in self._numbers[kind] or zlib.crc32(data) != number:
+            if number in self._inventory.of(kind) or zlib.crc32(data) != number:
                 return False
             header = header_from_json(data) if kind == "header" else self._header
             if header is None or not _is_object(data):
@@ -341,53 +328,24 @@ class ScanStore:
 
     def numbers(self) -> dict[str, RangeSet]:
         """Kind to the numbers of what is stored; of re-poses only those in force."""
-        with self._lock:
-            return {kind: ranges.copy() for kind, ranges in self._numbers.items() if ranges}
+        return self._inventory.all()
 
     def numbers_of(self, kind: str) -> RangeSet:
         """The numbers of what is stored of one kind; not to be changed."""
-        return self._numbers.get(kind, RangeSet())
+        return self._inventory.of(kind)
 
     def listen(self, listener: Listener) -> None:
         """Have ``listener(kind, number)`` called after each new item, by the writing thread."""
-        with self._lock:
-            self._listeners.append(listener)
+        self._inventory.listen(listener)
 
     def unlisten(self, listener: Listener) -> None:
         """End what :meth:`listen` began."""
-        with self._lock:
-            self._listeners.remove(listener)
-
-    def _note(self, kind: str, number: int) -> None:
-        self._numbers[kind].add(number)
-        for listener in self._listeners:
-            listener(kind, number)
+        self._inventory.unlisten(listener)
 
     def _set_whole(self, kind: str, data: bytes) -> None:
         with self._lock:
             self._db.set(kind, data.decode())
-            self._note_whole(kind, data)
-
-    def _note_whole(self, kind: str, data: bytes) -> None:
-        self._numbers[kind] = RangeSet()
-        self._note(kind, zlib.crc32(data))
-
-    def _load_numbers(self) -> None:
-        self._numbers: dict[str, RangeSet] = {"header": RangeSet(), "summary": RangeSet()}
-        self._numbers["pose"] = RangeSet.of(r[0] for r in self._db.all("SELECT id FROM poses"))
-        self._numbers["repose"] = RangeSet()
-        self._known_reposes = RangeSet()
-        self._in_force: dict[int, tuple[int, int]] = {}
-        for number, seq, revision in self._db.all(
-            "SELECT id, seq, revision FROM reposes ORDER BY id"
-        ):
-            self._enforce(number, seq, revision)
-        for kind in ("header", "summary"):
-            text = self._db.get(kind)
-            if text is not None:
-                self._note_whole(kind, text.encode())
-        for seq, number in self._db.all("SELECT seq, layer FROM chunks ORDER BY layer, seq"):
-            self._numbers.setdefault(f"k{number}", RangeSet()).add(seq)
+            self._inventory.note_whole(kind, data)
 
     def set_held(self, peer: str, numbers: dict[str, RangeSet]) -> None:
         """Note what ``peer`` says it holds."""

@@ -1,0 +1,83 @@
+"""What a store holds, by kind and number, kept in memory; and who is told of news."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+
+from service.stream.database import Database
+from service.stream.ranges import RangeSet
+
+Listener = Callable[[str, int], None]
+
+
+class Inventory:
+    """The numbers of the items of one scan; guarded by the database's lock.
+
+    Header and summary are numbered by the CRC-32 of their JSON, so that a change shows. Of the
+    re-poses of a keyframe only the one in force counts.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._lock = database.lock
+        self._listeners: list[Listener] = []
+        self._numbers = {kind: RangeSet() for kind in ("header", "summary", "pose", "repose")}
+        self._reposes = RangeSet()
+        self._in_force: dict[int, tuple[int, int]] = {}  # keyframe to revision, number
+        self._load(database)
+
+    def _load(self, database: Database) -> None:
+        self._numbers["pose"] = RangeSet.of(r[0] for r in database.all("SELECT id FROM poses"))
+        for number, seq, revision in database.all("SELECT id, seq, revision FROM reposes"):
+            self.note_repose(number, seq, revision)
+        for kind in ("header", "summary"):
+            text = database.get(kind)
+            if text is not None:
+                self.note_whole(kind, text.encode())
+        for seq, layer in database.all("SELECT seq, layer FROM chunks ORDER BY layer, seq"):
+            self._numbers.setdefault(f"k{layer}", RangeSet()).add(seq)
+
+    def all(self) -> dict[str, RangeSet]:
+        """Kind to numbers; kinds without any are left out."""
+        with self._lock:
+            return {kind: ranges.copy() for kind, ranges in self._numbers.items() if ranges}
+
+    def of(self, kind: str) -> RangeSet:
+        """The numbers of one kind; not to be changed."""
+        return self._numbers.setdefault(kind, RangeSet())
+
+    def has_repose(self, number: int) -> bool:
+        """Whether that re-pose is stored, in force or not."""
+        return number in self._reposes
+
+    def note(self, kind: str, number: int) -> None:
+        """Take in a new item and tell the listeners."""
+        self.of(kind).add(number)
+        for listener in self._listeners:
+            listener(kind, number)
+
+    def note_whole(self, kind: str, data: bytes) -> None:
+        """Take in a new header or summary, which replaces the former."""
+        self._numbers[kind] = RangeSet()
+        self.note(kind, zlib.crc32(data))
+
+    def note_repose(self, number: int, seq: int, revision: int) -> None:
+        """Take in a re-pose; the highest revision, then the highest number, is in force."""
+        self._reposes.add(number)
+        before = self._in_force.get(seq)
+        if before is not None:
+            if before > (revision, number):
+                return
+            self._numbers["repose"].discard(before[1])
+        self._in_force[seq] = (revision, number)
+        self.note("repose", number)
+
+    def listen(self, listener: Listener) -> None:
+        """Have ``listener(kind, number)`` called after each new item, by the writing thread."""
+        with self._lock:
+            self._listeners.append(listener)
+
+    def unlisten(self, listener: Listener) -> None:
+        """End what :meth:`listen` began."""
+        with self._lock:
+            self._listeners.remove(listener)
