@@ -28,7 +28,8 @@ FILLED_CONFIDENCE = 0.05
 """Confidence of a pixel that only its neighbours speak for."""
 
 _CHUNK = 16
-_NOISE = 0.2 * COST_UNIT
+NOISE = 0.2 * COST_UNIT
+"""Mean cost below which a window is taken for plain."""
 
 
 def select(
@@ -180,7 +181,7 @@ def _select(
                     u = 2 * i + parity
                     label = np.int64(best[i])
                     partner = u - label - min_disparity
-                    evidence = (mean[u] - box[label, u]) / (mean[u] + window * np.float32(_NOISE))
+                    evidence = (mean[u] - box[label, u]) / (mean[u] + window * np.float32(NOISE))
                     margin = np.float32(second[i] - low[i]) / np.float32(2 * truncation)
                     confidence[v, u] = 0
                     if partner < 0 or partner >= width:

@@ -95,8 +95,8 @@ def _joint_bilateral(coarse: DisparityMap, guide: U8, config: UpsamplingConfig) 
     shape = (guide.shape[0], guide.shape[1])
     h, w = coarse.px.shape
     scale = float(np.sqrt(0.5 * np.log2(np.e)) / config.range_sigma)
-    base_y, spatial_y = _window(h, shape[0], config)
-    base_x, spatial_x = _window(w, shape[1], config)
+    base_y, spatial_y = window(h, shape[0], config)
+    base_x, spatial_x = window(w, shape[1], config)
     pad = -shape[1] % TILE
     padded = -config.diameter_px % GROUP
     out, sure = np.empty((2, *shape), np.float32)
@@ -115,7 +115,7 @@ def _joint_bilateral(coarse: DisparityMap, guide: U8, config: UpsamplingConfig) 
     return DisparityMap(out, sure)
 
 
-def _window(taps: int, fine: int, config: UpsamplingConfig) -> tuple[I32, F32]:
+def window(taps: int, fine: int, config: UpsamplingConfig) -> tuple[I32, F32]:
     """First tap of each fine pixel along one axis (fine,) and log2 of s (fine, diameter)."""
     q = (np.arange(fine) + 0.5) * (taps / fine) - 0.5
     first = np.ceil(q - config.diameter_px / 2).astype(np.int32)

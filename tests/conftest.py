@@ -93,3 +93,8 @@ class HouseFlight:
 def house() -> HouseFlight:
     """The flight over the house."""
     return HouseFlight()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--device cuda`` runs the tests of the backends on a GPU."""
+    parser.addoption("--device", default="cpu", choices=("cpu", "cuda"), help="of the backends")

@@ -42,6 +42,8 @@ class Backend(Protocol):
 
 BACKENDS: dict[str, str] = {
     "cpu": "recon.backends.cpu:CpuBackend",
+    "torch": "recon.backends.torch_backend:TorchBackend",
+    "onnx": "recon.backends.onnx_backend:OnnxBackend",
 }
 """Name to ``module:class``; imported on first use."""
 

@@ -1,0 +1,97 @@
+"""The heavy operations by ONNX Runtime, with the fastest provider that it brings."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import onnxruntime  # type: ignore[import-untyped]
+
+from recon.backends.onnx_dense import stereo_model, upsampling_model
+from recon.belief_propagation import BeliefPropagationConfig, believe
+from recon.matching_cost import check_pair
+from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration
+from recon.upsampling import UpsamplingConfig, check_guide, guide_at_taps, upsample
+
+if TYPE_CHECKING:
+    from recon.registration import IcpConfig
+
+PROVIDERS = ("TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider")
+"""Fastest first; ONNX Runtime falls back along the list."""
+
+KEPT_SESSIONS = 8
+
+
+class OnnxBackend:
+    """Builds one model per shape and keeps its session; needs no torch.
+
+    ICP is the compiled one: it is not part of the dense stage.
+    """
+
+    name = "onnx"
+
+    def __init__(self) -> None:
+        found = onnxruntime.get_available_providers()
+        self.providers = [p for p in PROVIDERS if p in found]
+        if not self.providers:
+            raise RuntimeError(f"ONNX Runtime offers none of {', '.join(PROVIDERS)}")
+        self.device = self.providers[0].removesuffix("ExecutionProvider").lower()
+        self._sessions: dict[Any, Any] = {}
+
+    def belief_propagation(
+        self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
+    ) -> DisparityMap:
+        """Labels of the left view, (h, w); Eq. 1."""
+        check_pair(left, right, labels)
+        size = (left.shape[0], left.shape[1])
+        key = ("stereo", size, labels, config)
+        if key not in self._sessions:
+            self._open(key, stereo_model(size, labels, config))
+        px, confidence = self._run(key, {"left": left, "right": right})
+        return believe(left, px, confidence, config)
+
+    def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
+        """``coarse`` (h, w) at the size of ``guide`` (H, W, 3), values unscaled; Eq. 2."""
+        check_guide(coarse, guide)
+        if config.method != "bilateral":
+            return upsample(coarse, guide, config)
+        shape = (coarse.px.shape[0], coarse.px.shape[1])
+        size = (guide.shape[0], guide.shape[1])
+        key = ("upsample", shape, size, config)
+        if key not in self._sessions:
+            self._open(key, upsampling_model(shape, size, config))
+        taps = guide_at_taps(guide, shape)
+        given: dict[str, Array] = {
+            "px": coarse.px,
+            "confidence": coarse.confidence,
+            "taps": taps,
+            "guide": guide,
+        }
+        return DisparityMap(*self._run(key, given))
+
+    def register(
+        self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
+    ) -> Registration:
+        """Projective point-to-plane ICP from the given start."""
+        from recon.registration import register_projective
+
+        return register_projective(source, target, T_target_source, config)
+
+    def _open(self, key: Any, model: bytes) -> None:
+        while len(self._sessions) >= KEPT_SESSIONS:
+            self._sessions.pop(next(iter(self._sessions)))
+        self._sessions[key] = open_session(model, self.providers)
+
+    def _run(self, key: Any, given: dict[str, Array]) -> tuple[Array, Array]:
+        first, second = self._sessions[key].run(None, given)
+        return first.copy(), second.copy()
+
+
+def open_session(model: bytes, providers: list[str]) -> Any:
+    """A session for an ONNX file; ValueError, with the reason, when it cannot be used."""
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(model, options, providers=providers)
+    except Exception as error:  # ONNX Runtime's own exceptions share no base class
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"ONNX Runtime cannot use the model: {first}") from error

@@ -1,0 +1,281 @@
+"""The dense stage as ONNX models of fixed shapes: the same numbers as the compiled backend.
+
+Integers are held exactly in float32, as in :mod:`recon.backends.torch_dense`; tensors are
+(labels, h, w), messages (4, labels, h, w).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from onnx import TensorProto
+
+from recon.backends.onnx_graph import Graph, Value
+from recon.belief_propagation import BeliefPropagationConfig
+from recon.disparity_selection import NOISE, RADIUS, SURE_EVIDENCE
+from recon.matching_cost import CENSUS_RADIUS, COST_UNIT
+from recon.message_passing import FULL_WEIGHT
+from recon.upsampling import MIN_CONFIDENCE, RANGE_FLOOR, UpsamplingConfig, window
+
+FAR = 1.0e6
+
+
+def stereo_model(size: tuple[int, int], labels: int, config: BeliefPropagationConfig) -> bytes:
+    """An ONNX file: ``left`` and ``right`` (h, w) uint8 to ``px`` and ``confidence`` (h, w).
+
+    Iterations and levels are written out. The results are those before
+    :func:`recon.belief_propagation.believe`.
+    """
+    graph = Graph()
+    left = graph.input("left", TensorProto.UINT8, size).numbers()
+    right = graph.input("right", TensorProto.UINT8, size).numbers()
+    cost = _matching_cost(graph, left, right, size, labels, config)
+    belief = _propagate(graph, cost, left, size, labels, config)
+    px, confidence = _select(graph, belief, cost, size, labels, config)
+    graph.output(px, "px", size)
+    graph.output(confidence, "confidence", size)
+    return graph.model(f"belief propagation, {labels} labels, {config}")
+
+
+def _census(graph: Graph, image: Value, size: tuple[int, int]) -> Value:
+    """(48, h, w): 1 where the neighbour is darker."""
+    h, w = size
+    r = CENSUS_RADIUS
+    padded = image.pad([r, r], [r, r], None)
+    bits = []
+    for j in range(2 * r + 1):
+        for i in range(2 * r + 1):
+            if (j, i) != (r, r):
+                darker = padded.part(0, j, j + h).part(1, i, i + w).less(image).numbers()
+                bits.append(graph.op("Unsqueeze", darker, np.array([0], np.int64)))
+    return graph.join(bits, 0)
+
+
+def _matching_cost(
+    graph: Graph, left: Value, right: Value, size: tuple[int, int], labels: int,
+    config: BeliefPropagationConfig,
+) -> Value:  # fmt: skip
+    """(L, h, w), as :func:`recon.matching_cost.matching_cost`."""
+    c = config.cost
+    h, w = size
+    bits_left, bits_right = _census(graph, left, size), _census(graph, right, size)
+    lift = np.array([0], np.int64)
+    grey_left, grey_right = (graph.op("Unsqueeze", image, lift) for image in (left, right))
+    layers = []
+    for label in range(labels):
+        shift = label + config.min_disparity
+        first, last = min(max(0, shift), w), max(min(w, w + shift), 0)
+        if first >= last:
+            layers.append(graph.constant(np.full((1, h, w), FAR, np.float32)))
+            continue
+        here, there = (first, last), (first - shift, last - shift)
+        bits = (bits_left.part(2, *here) - bits_right.part(2, *there)).abs().sum(0)
+        grey = (grey_left.part(2, *here) - grey_right.part(2, *there)).abs()
+        seen = bits.at_most(float(c.census_truncation)) * float(round(c.census_weight * COST_UNIT))
+        seen = seen + grey.at_most(float(c.difference_truncation)) * float(
+            round(c.difference_weight * COST_UNIT)
+        )
+        layers.append(seen.pad([0, 0, first], [0, 0, w - last], FAR))
+    cost = graph.join(layers, 0)
+    best = cost.min(0)
+    unseen = graph.where(best.less(FAR), best + float(round(c.unseen * COST_UNIT)), 0.0)
+    return graph.where(cost.less(FAR), cost, unseen)
+
+
+def _edge_weights(
+    graph: Graph, image: Value, size: tuple[int, int], config: BeliefPropagationConfig
+) -> list[Value]:
+    """Weight of the edge above and to the left, two (h, w)."""
+    fall = (1 - config.edge_floor) / config.edge_contrast
+    weights = []
+    for axis, length in enumerate(size):
+        step = (image.part(axis, 1, length) - image.part(axis, 0, length - 1)).abs()
+        step = step.pad([1 - axis, axis], [0, 0])
+        share = (step * -fall + 1.0).at_least(config.edge_floor)
+        weights.append((share * float(FULL_WEIGHT)).round())
+    return weights
+
+
+def _propagate(
+    graph: Graph, cost: Value, image: Value, size: tuple[int, int], labels: int,
+    config: BeliefPropagationConfig,
+) -> Value:  # fmt: skip
+    """(L, h, w) beliefs (Eq. 1)."""
+    pyramid, sizes = [_cut(cost, config)], [size]
+    edges = [_edge_weights(graph, image, size, config)]
+    while len(pyramid) < config.levels and min(sizes[-1]) >= 8:
+        h, w = sizes[-1]
+        lift = graph.op("Unsqueeze", pyramid[-1].pad([0] * 3, [0, h % 2, w % 2]), _AXIS_0)
+        pooled = graph.op("AveragePool", lift, kernel_shape=[2, 2], strides=[2, 2]) * 4.0
+        pyramid.append(_cut(graph.op("Squeeze", pooled, _AXIS_0), config))
+        edges.append(_coarser_weights(edges[-1], h, w))
+        sizes.append(((h + 1) // 2, (w + 1) // 2))
+    messages = graph.constant(np.zeros((4, labels, *sizes[-1]), np.float32))
+    for level in range(len(pyramid) - 1, -1, -1):
+        h, w = sizes[level]
+        if level < len(pyramid) - 1:
+            messages = messages.take(np.arange(h) // 2, 2).take(np.arange(w) // 2, 3)
+        slope = _per_direction(graph, edges[level], (h, w), COST_UNIT)
+        cut = _per_direction(graph, edges[level], (h, w), config.truncation)
+        colour = np.add.outer(np.arange(h), np.arange(w)) % 2
+        for t in range(config.iterations):
+            fresh = _outgoing(graph, pyramid[level], messages, slope, cut, (h, w), labels, config)
+            messages = graph.where(graph.constant(colour == t % 2), fresh, messages)
+    arrived = _arriving(graph, messages, size).sum(0)
+    return pyramid[0] + graph.op("Squeeze", arrived, _AXIS_0)
+
+
+_AXIS_0 = np.array([0], np.int64)
+
+
+def _cut(data: Value, config: BeliefPropagationConfig) -> Value:
+    return (data - data.min(0)).at_most(4.0 * config.truncation)
+
+
+def _coarser_weights(fine: list[Value], h: int, w: int) -> list[Value]:
+    above, before = (edge.pad([0, 0], [h % 2, w % 2], None) for edge in fine)
+    rows, columns = above.every(0, 0, 2), before.every(1, 0, 2)
+    return [
+        ((rows.every(1, 0, 2) + rows.every(1, 1, 2)) * 0.5).floor(),
+        ((columns.every(0, 0, 2) + columns.every(0, 1, 2)) * 0.5).floor(),
+    ]
+
+
+def _per_direction(graph: Graph, edges: list[Value], size: tuple[int, int], unit: int) -> Value:
+    """(4, 1, h, w) smoothness of the edge that a message up, down, left and right crosses."""
+    h, w = size
+    above, before = ((edge * (unit / FULL_WEIGHT)).floor() for edge in edges)
+    below = above.part(0, 1, h).pad([0, 0], [1, 0])
+    after = before.part(1, 1, w).pad([0, 0], [0, 1])
+    lift = np.array([0, 1], np.int64)
+    return graph.join([graph.op("Unsqueeze", e, lift) for e in (above, below, before, after)], 0)
+
+
+def _arriving(graph: Graph, messages: Value, size: tuple[int, int]) -> Value:
+    """(4, L, h, w) from below, above, right and left; zero from beyond the border."""
+    h, w = size
+    one = [messages.part(0, k, k + 1) for k in range(4)]
+    return graph.join(
+        [
+            one[0].part(2, 1, h).pad([0] * 4, [0, 0, 1, 0]),
+            one[1].part(2, 0, h - 1).pad([0, 0, 1, 0], [0] * 4),
+            one[2].part(3, 1, w).pad([0] * 4, [0, 0, 0, 1]),
+            one[3].part(3, 0, w - 1).pad([0, 0, 0, 1], [0] * 4),
+        ],
+        0,
+    )
+
+
+def _outgoing(
+    graph: Graph, data: Value, messages: Value, slope: Value, cut: Value, size: tuple[int, int],
+    labels: int, config: BeliefPropagationConfig,
+) -> Value:  # fmt: skip
+    """Lower envelope of all other news."""
+    arriving = _arriving(graph, messages, size)
+    rest = data + arriving.sum(0) - arriving.take([1, 0, 3, 2], 0)
+    steps = min(math.ceil(config.truncation / COST_UNIT) + 1, labels - 1)
+    wide = rest.pad([0, steps, 0, 0], [0, steps, 0, 0], FAR)
+    best = rest
+    for k in range(1, steps + 1):
+        ahead = wide.part(1, steps + k, steps + k + labels)
+        behind = wide.part(1, steps - k, steps - k + labels)
+        best = best.at_most(ahead.at_most(behind) + slope * float(k))
+    return (best - rest.min(1)).at_most(cut)
+
+
+def _select(
+    graph: Graph, belief: Value, cost: Value, size: tuple[int, int], labels: int,
+    config: BeliefPropagationConfig,
+) -> tuple[Value, Value]:  # fmt: skip
+    """Labels and confidence (h, w), as :func:`recon.disparity_selection.select`."""
+    w = size[1]
+    index = np.arange(labels, dtype=np.float32)[:, None, None]
+    partner = np.arange(w, dtype=np.float32)[None, None, :] - index - config.min_disparity
+    seen = ((partner >= 0) & (partner < w)).astype(np.float32)
+    winner = graph.op("ArgMin", belief, axis=0, keepdims=1)
+    best = winner.numbers()
+    beside = (best * -1.0 + graph.constant(index)).abs().less(1.5)
+    second = graph.where(beside, FAR, belief).min(0)
+    area = (2 * RADIUS + 1) ** 2
+    pooled = graph.op(
+        "AveragePool", graph.op("Unsqueeze", cost, _AXIS_0), kernel_shape=[2 * RADIUS + 1] * 2,
+        pads=[RADIUS] * 4, count_include_pad=1,
+    )  # fmt: skip
+    box = (graph.op("Squeeze", pooled, _AXIS_0) * float(area)).round()
+    mean = (box * seen).sum(0) / np.maximum(seen.sum(axis=0, keepdims=True), 1)
+    here, a, b = (
+        graph.op(
+            "GatherElements",
+            box,
+            (best + float(step)).at_least(0.0).at_most(labels - 1.0).cast(TensorProto.INT64),
+            axis=0,
+        )
+        for step in (0, -1, 1)
+    )
+    a, b = a - here, b - here
+    steep = a.at_least(b)
+    offset = ((a - b) / (steep.at_least(1.0) * 2.0)).at_least(-0.5).at_most(0.5)
+    edge = graph.op("Or", best.less(0.5), best.above(labels - 1.5))
+    px = best + graph.where(graph.op("Or", edge, steep.less(0.5)), 0.0, offset)
+    evidence = (mean - here) / (mean + area * NOISE)
+    margin = (second - belief.min(0)) / (2.0 * config.truncation)
+    believed = margin.above(0.0)
+    if config.min_evidence > 0:
+        doubtful = evidence.less(config.min_evidence)
+        believed = graph.op("And", believed, graph.op("Not", doubtful))
+    sure = (evidence.at_least(0.01) / SURE_EVIDENCE).at_most(1.0)
+    column = np.arange(w, dtype=np.float32)[None, None, :] - config.min_disparity
+    there = best * -1.0 + column
+    outside = graph.op("Or", there.less(-0.5), there.above(w - 0.5))
+    believed = graph.op("And", believed, graph.op("Not", outside))
+    confidence = graph.where(believed, margin.at_most(1.0) * sure, 0.0)
+    px = graph.where(outside, math.nan, px)
+    return graph.op("Squeeze", px, _AXIS_0), graph.op("Squeeze", confidence, _AXIS_0)
+
+
+def upsampling_model(
+    coarse: tuple[int, int], fine: tuple[int, int], config: UpsamplingConfig
+) -> bytes:
+    """An ONNX file of Eq. 2 with every tap.
+
+    Inputs ``px`` and ``confidence`` (h, w) float32, ``taps`` (h, w, 3) and ``guide`` (H, W, 3)
+    uint8; results ``fine_px`` and ``fine_confidence`` (H, W).
+    """
+    graph = Graph()
+    px = graph.input("px", TensorProto.FLOAT, coarse)
+    confidence = graph.input("confidence", TensorProto.FLOAT, coarse)
+    taps = graph.input("taps", TensorProto.UINT8, (*coarse, 3)).numbers()
+    guide = graph.input("guide", TensorProto.UINT8, (*fine, 3)).numbers()
+    unknown = graph.op("IsNaN", px)
+    trust = graph.where(unknown, 0.0, confidence.at_least(MIN_CONFIDENCE))
+    value = graph.where(unknown, 0.0, px) * trust
+    known = graph.where(unknown, 0.0, graph.constant(np.ones(coarse, np.float32)))
+    lifted = [graph.op("Unsqueeze", v, _AXIS_0) for v in (trust, value, known)]
+    layers = graph.join([graph.op("Transpose", taps, perm=[2, 0, 1]), *lifted], 0)
+    image = graph.op("Transpose", guide, perm=[2, 0, 1])
+    everything = graph.constant(np.zeros((1, *fine), np.float32))
+    sums = graph.constant(np.zeros((3, *fine), np.float32))
+    (first_y, log_y), (first_x, log_x) = (
+        window(n, m, config) for n, m in zip(coarse, fine, strict=True)
+    )
+    for j in range(config.diameter_px):
+        rows = layers.take(np.clip(first_y + j, 0, coarse[0] - 1), 1)
+        for i in range(config.diameter_px):
+            tap = rows.take(np.clip(first_x + i, 0, coarse[1] - 1), 2)
+            step = image - tap.part(0, 0, 3)
+            tonal = (step * step).sum(0) * (-0.5 / config.range_sigma**2)
+            alike = graph.op("Exp", tonal.at_least(RANGE_FLOOR * math.log(2)))
+            inside_y = (first_y + j >= 0) & (first_y + j < coarse[0])
+            inside_x = (first_x + i >= 0) & (first_x + i < coarse[1])
+            near_y = (np.exp2(log_y[:, j]) * inside_y).astype(np.float32)[None, :, None]
+            near_x = (np.exp2(log_x[:, i]) * inside_x).astype(np.float32)[None, None, :]
+            weight = alike * near_y * near_x
+            everything = everything + weight
+            sums = sums + weight * tap.part(0, 3, 6)
+    good = sums.part(0, 2, 3).above(everything * config.min_support)
+    fine_px = graph.where(good, sums.part(0, 1, 2) / sums.part(0, 0, 1), math.nan)
+    sure = graph.where(good, sums.part(0, 0, 1) / everything, 0.0)
+    graph.output(graph.op("Squeeze", fine_px, _AXIS_0), "fine_px", fine)
+    graph.output(graph.op("Squeeze", sure, _AXIS_0), "fine_confidence", fine)
+    return graph.model(f"joint bilateral upsampling, {config}")

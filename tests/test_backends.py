@@ -1,0 +1,194 @@
+"""The contract of every backend against the NumPy references.
+
+Tolerances: beliefs are integers and equal in every backend, so labels agree to 1e-3 px and
+unknown pixels exactly (rounding of the sub-pixel division is all that differs); upsampling
+agrees to 0.01 px (the compiled kernel's exponential is good to 8e-5); ICP agrees within a
+twentieth of its own sigma. ``--device cuda`` runs the torch backend on a GPU.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import cv2
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.backends import BACKENDS, Backend, load_backend, reference
+from recon.belief_propagation import BeliefPropagationConfig
+from recon.matching_cost import MatchingCostConfig, matching_cost
+from recon.registration import IcpConfig
+from recon.types import F64, U8, DepthMap, DisparityMap
+from recon.upsampling import UpsamplingConfig
+
+NEEDS = {"cpu": "numba", "torch": "torch", "onnx": "onnxruntime"}
+BELIEVE_ALL = BeliefPropagationConfig(
+    min_evidence=0, min_contrast=0, occlusion_tolerance=-1, speckle_px=0
+)
+
+
+@pytest.fixture(params=sorted(BACKENDS))
+def backend(request: pytest.FixtureRequest) -> Backend:
+    """Each backend of the table; on the device of ``--device`` where it has a choice."""
+    name = str(request.param)
+    if find_spec(NEEDS[name]) is None:
+        pytest.skip(f"{NEEDS[name]} is not installed")
+    device = str(request.config.getoption("--device"))
+    if name == "torch":
+        from recon.backends.torch_backend import TorchBackend
+
+        return TorchBackend(device)
+    if device != "cpu":
+        pytest.skip(f"{name} chooses its own device")
+    return load_backend(name)
+
+
+def pair(height: int, width: int, labels: int, first: int = 0) -> tuple[U8, U8]:
+    """A textured pair with a step of disparity within the window of labels."""
+    rng = np.random.default_rng(height + width)
+    canvas = cv2.GaussianBlur(rng.normal(128, 90, (height, width + 240)), (0, 0), 1.1)
+    canvas = np.clip(canvas, 0, 255).astype(np.uint8)
+    v, u = np.mgrid[0:height, 0:width]
+    d = first + np.where((u > width // 2) & (v > height // 3), labels - 2, labels // 3)
+    left = canvas[v, u - d + 120]
+    return np.ascontiguousarray(left), np.ascontiguousarray(canvas[:, 120 : 120 + width])
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "labels", "settings"),
+    [
+        (36, 64, 16, {}),
+        (45, 83, 7, {"iterations": 4, "levels": 3}),
+        (24, 70, 33, {"min_disparity": -3}),
+        (30, 61, 5, {"min_disparity": 4, "smoothness_truncation": 4.0}),
+        (9, 40, 2, {"iterations": 1, "levels": 1, "edge_floor": 1.0}),
+        (8, 8, 12, {}),
+    ],
+)
+def test_labels_minimise_the_reference_beliefs(
+    backend: Backend, height: int, width: int, labels: int, settings: dict[str, float]
+) -> None:
+    """Every size, label count, border and smoothness: the winner is the reference's."""
+    config = BeliefPropagationConfig(
+        **{  # type: ignore[arg-type]
+            "min_evidence": 0, "min_contrast": 0, "occlusion_tolerance": -1, "speckle_px": 0,
+            **settings,
+        }
+    )  # fmt: skip
+    left, right = pair(height, width, labels, config.min_disparity)
+    cost = matching_cost(left, right, labels, MatchingCostConfig(), config.min_disparity)
+    belief = reference.beliefs(cost, left, config.iterations, config.levels, config.smoothness)
+    winner = belief.argmin(axis=2)
+    low = belief.min(axis=2)
+    clear = (belief == low[..., None]).sum(axis=2) == 1
+    column = np.arange(width)[None, :]
+    partner = column - winner - config.min_disparity
+    inside = (partner >= 0) & (partner < width)
+    found = backend.belief_propagation(left, right, labels, config)
+    assert found.px.shape == found.confidence.shape == (height, width)
+    assert np.isnan(found.px[~inside]).all()
+    known = np.isfinite(found.px)
+    assert (known <= inside).all()
+    # rounding halves: an offset of exactly half a label lies between two winners
+    assert (np.abs(found.px - winner) <= 0.5 + 1e-4)[known & clear].all()
+    assert known[inside & clear].mean() > 0.9 or labels == 2
+
+
+@pytest.mark.parametrize("fill", [False, True])
+def test_disparity_equals_the_compiled_backend(backend: Backend, fill: bool) -> None:
+    left, right = pair(72, 128, 16)
+    config = BeliefPropagationConfig(fill_occluded=fill)
+    want = load_backend("cpu").belief_propagation(left, right, 16, config)
+    got = backend.belief_propagation(left, right, 16, config)
+    np.testing.assert_array_equal(np.isnan(got.px), np.isnan(want.px))
+    np.testing.assert_allclose(got.px, want.px, atol=1e-3)
+    np.testing.assert_allclose(got.confidence, want.confidence, atol=1e-4)
+    again = backend.belief_propagation(right, right, 16, config)  # the same shapes, new images
+    np.testing.assert_allclose(
+        again.px, load_backend("cpu").belief_propagation(right, right, 16, config).px, atol=1e-3
+    )
+    np.testing.assert_array_equal(got.px, backend.belief_propagation(left, right, 16, config).px)
+
+
+def test_blank_images_stay_unknown(backend: Backend) -> None:
+    blank = np.full((40, 60), 128, np.uint8)
+    found = backend.belief_propagation(blank, blank, 8, BeliefPropagationConfig())
+    assert np.isnan(found.px).all()
+    assert (found.confidence == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("coarse", "fine", "holes"),
+    [((18, 32), (72, 128), 0.2), ((18, 32), (76, 135), 0.0), ((7, 9), (30, 31), 0.5)],
+)
+def test_upsampling_equals_the_reference(
+    backend: Backend, coarse: tuple[int, int], fine: tuple[int, int], holes: float
+) -> None:
+    rng = np.random.default_rng(1)
+    px = rng.uniform(0, 16, coarse).astype(np.float32)
+    px[rng.random(coarse) < holes] = np.nan
+    confidence = np.where(np.isnan(px), 0, rng.random(coarse)).astype(np.float32)
+    patches = rng.integers(0, 256, (5, 7, 3), np.uint8)
+    guide = np.asarray(cv2.resize(patches, (fine[1], fine[0])), np.uint8)
+    given = DisparityMap(px, confidence)
+    for config in (UpsamplingConfig(), UpsamplingConfig(diameter_px=3, range_sigma=30)):
+        got, want = backend.upsample(given, guide, config), reference.upsample(given, guide, config)
+        assert got.px.shape == fine
+        assert (np.isnan(got.px) != np.isnan(want.px)).mean() < 2e-3
+        both = np.isfinite(got.px) & np.isfinite(want.px)
+        np.testing.assert_allclose(got.px[both], want.px[both], atol=0.01)
+        np.testing.assert_allclose(got.confidence[both], want.confidence[both], atol=1e-3)
+    guided = backend.upsample(given, guide, UpsamplingConfig(method="guided"))
+    assert guided.px.shape == fine
+
+
+def hills(T_world_camera: F64, seed: int) -> DepthMap:
+    """A depth image of rolling ground, cast ray by ray, with noise of 2 cm."""
+    K = np.array([[100.0, 0, 79.5], [0, 100.0, 44.5], [0, 0, 1]])
+    v, u = np.mgrid[0:90, 0:160]
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.shape)], axis=-1)
+    direction = rays @ T_world_camera[:3, :3].T
+    z = np.full(u.shape, 40.0)
+    for _ in range(60):
+        p = T_world_camera[:3, 3] + direction * z[..., None]
+        ground = 3 * np.sin(p[..., 0] / 5) * np.cos(p[..., 1] / 6) + 0.02 * p[..., 0] ** 2
+        z += 0.7 * (p[..., 2] - ground)
+    z = z + np.random.default_rng(seed).normal(0, 0.02, z.shape)
+    sigma = np.full(z.shape, 0.02, np.float32)
+    return DepthMap(z.astype(np.float32), sigma, np.ones(z.shape, np.uint8), K, T_world_camera)
+
+
+def test_icp_finds_the_motion_and_agrees_with_the_compiled_one(backend: Backend) -> None:
+    down = np.diag([1.0, -1.0, -1.0])
+    T_a = se3.compose(down, np.array([0.0, 0.0, 40.0]))
+    turn = cv2.Rodrigues(np.array([0.01, -0.015, 0.02]))[0].astype(np.float64)
+    T_b = se3.compose(down @ turn, np.array([1.2, -0.8, 40.5]))
+    source, target = hills(T_b, 1), hills(T_a, 2)
+    truth = se3.inverse(T_a) @ T_b
+    start = se3.compose(np.eye(3), np.array([0.4, 0.3, -0.3])) @ truth
+    got = backend.register(source, target, start, IcpConfig())
+    assert got.verdict == "converged"
+    off = se3.inverse(truth) @ got.T_target_source
+    assert np.linalg.norm(off[:3, 3]) < 0.02
+    assert np.linalg.norm(se3.so3_log(off[:3, :3])) < 1e-3
+    want = load_backend("cpu").register(source, target, start, IcpConfig())
+    between = se3.inverse(want.T_target_source) @ got.T_target_source
+    assert np.linalg.norm(between[:3, 3]) < 0.005
+    np.testing.assert_allclose(got.inlier_share, want.inlier_share, atol=0.02)
+    far = se3.compose(np.eye(3), np.array([500.0, 0, 0]))
+    assert backend.register(source, target, far, IcpConfig()).verdict == "rejected"
+
+
+def test_bad_input_is_named(backend: Backend) -> None:
+    image = np.zeros((20, 30), np.uint8)
+    with pytest.raises(ValueError, match="one size"):
+        backend.belief_propagation(image, image[:, :-1], 16, BELIEVE_ALL)
+    given = DisparityMap(np.zeros((20, 30), np.float32), np.ones((20, 30), np.float32))
+    with pytest.raises(ValueError, match="smaller"):
+        backend.upsample(given, np.zeros((10, 10, 3), np.uint8), UpsamplingConfig())
+
+
+def test_unknown_backend_is_named() -> None:
+    with pytest.raises(ValueError, match="there are cpu"):
+        load_backend("abacus")
