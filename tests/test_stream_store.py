@@ -153,6 +153,29 @@ def test_wrong_files_are_refused_in_one_line(tmp_path: Path) -> None:
         ScanStore.create(tmp_path / "a.db", HEADER)
 
 
+def test_a_damaged_file_gives_back_what_can_be_read(tmp_path: Path) -> None:
+    path = tmp_path / "scan.db"
+    with ScanStore.create(path, HEADER) as store:
+        for seq in range(12):
+            store.add_keyframe(seq, codec.encode(keyframe(seq), seq))
+            store.add_pose(pose(seq))
+    whole = bytearray(path.read_bytes())
+    middle = len(whole) // 2 // 4096 * 4096
+    whole[middle : middle + 8192] = bytes(8192)
+    path.write_bytes(whole)
+    with ScanStore.open(path) as store:
+        assert store.header == HEADER
+        kept = store.seqs()
+        assert 4 <= len(kept) <= 12
+        for frame in store.keyframes():
+            direct = codec.decode(codec.encode(keyframe(frame.seq), frame.seq))
+            assert direct is not None
+            if frame.depth.depth_m.shape == direct.depth.depth_m.shape:
+                np.testing.assert_array_equal(frame.depth.depth_m, direct.depth.depth_m)
+        store.add_pose(pose(99))
+    assert (tmp_path / "scan.db.damaged").exists()
+
+
 WRITER = """
 import sys
 from service.stream.store import ScanStore

@@ -13,7 +13,7 @@ from service.errors import InputError, OutsideError
 log = logging.getLogger(__name__)
 
 SCHEMA_VERSION = 1
-_SCHEMA = """
+SCHEMA = """
 CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS chunks (
     seq INTEGER NOT NULL, layer INTEGER NOT NULL, layers INTEGER NOT NULL,
@@ -48,7 +48,7 @@ class Database:
             self._connection = sqlite3.connect(path, check_same_thread=False, timeout=10.0)
             self._connection.execute("PRAGMA journal_mode=WAL")
             self._connection.execute("PRAGMA synchronous=FULL")
-            self._connection.executescript(_SCHEMA)
+            self._connection.executescript(SCHEMA)
         except sqlite3.Error as error:
             raise InputError(f"{path} is not a scan database ({error})") from error
 

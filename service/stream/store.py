@@ -21,7 +21,7 @@ import numpy as np
 from recon.types import DepthMap, Keyframe, Pose
 from service.errors import InputError
 from service.stream import codec, layer
-from service.stream.database import SCHEMA_VERSION, Database
+from service.stream.database import SCHEMA, SCHEMA_VERSION, Database
 from service.stream.inventory import Inventory, Listener
 from service.stream.radio_messages import unpack_pose as unpack_radio_pose
 from service.stream.radio_messages import unpack_tile
@@ -37,6 +37,7 @@ from service.stream.records import (
     unpack_pose,
     unpack_repose,
 )
+from service.stream.rescue import is_sound, rescue
 
 
 class ScanStore:
@@ -83,6 +84,8 @@ class ScanStore:
         path = Path(path)
         if not path.is_file():
             raise InputError(f"{path} does not exist; it should be a scan.db")
+        if not is_sound(path):
+            rescue(path, SCHEMA)
         return cls(path, None, quota_bytes)
 
     def close(self) -> None:
