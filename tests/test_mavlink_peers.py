@@ -26,6 +26,7 @@ from mavlink.camera import KeyframeReport
 from mavlink.control import Answer, Result, Work
 from mavlink.framing import Framer
 from mavlink.link import LinkSpec, parse_link
+from mavlink.logs import load_telemetry
 from mavlink.logs.tlog import packets
 from mavlink.presence import Health
 from mavlink.recorder import Recorder
@@ -669,6 +670,7 @@ def test_a_fault_in_the_service_does_not_cost_the_link(caplog: pytest.LogCapture
         ("tcp:host:5760", LinkSpec("tcp", "host", 5760)),
         ("serial:/dev/ttyTHS1:921600", LinkSpec("serial", "/dev/ttyTHS1", 921600)),
         ("serial:/dev/ttyACM0", LinkSpec("serial", "/dev/ttyACM0", 57600)),
+        ("tlog:/data/a:b.tlog", LinkSpec("tlog", "/data/a:b.tlog", 0)),
         ("/dev/ttyACM0,115200", LinkSpec("serial", "/dev/ttyACM0", 115200)),
     ],
 )
@@ -724,6 +726,25 @@ def test_the_last_word_is_said() -> None:
             while True:
                 heard += peer.recv(4096)
         assert b"Service stops" in heard
+
+
+def test_a_recorded_flight_comes_in_as_if_it_flew_now(tmp_path: Path) -> None:
+    turn = Path(__file__).parent / "data" / "mavlink" / "arducopter_turn.tlog"
+    recorded = load_telemetry(turn).history
+    began = (recorded.first_ns or 0) + 2 * S
+    with Daemon(f"tlog:{turn}") as daemon:
+        history = daemon.link.history
+        until(lambda: (history.last_ns or 0) - (history.first_ns or 0) > 3 * S)
+        start = history.first_ns
+        assert start is not None and daemon.link.report().autopilot == (1, 1)
+        live = history.state_at(start + 2 * S)
+    kept = recorded.state_at(began)
+    assert live is not None and kept is not None
+    assert live.alt_agl_m == pytest.approx(kept.alt_agl_m, abs=0.1)
+    assert live.q_ned_body_wxyz is not None and kept.q_ned_body_wxyz is not None
+    assert abs(float(live.q_ned_body_wxyz @ kept.q_ned_body_wxyz)) > 0.9999
+    with Daemon(f"tlog:{tmp_path / 'none.tlog'}") as daemon:
+        until(lambda: "No such file" in daemon.link.report().links[0].last_error)
 
 
 def test_a_full_disk_ends_the_log_and_nothing_else(caplog: pytest.LogCaptureFixture) -> None:
