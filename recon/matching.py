@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon import harris, patch_search
+from recon.affine_trend import affine_trend
 from recon.phase_correlation import GlobalShift, global_shift
 from recon.types import F32, F64, U8, Bool
 
@@ -214,19 +215,14 @@ def _consensus(uv: F64, residual: F64, good: Bool, tolerance_px: float) -> F64 |
     """(N, 2) affine trend of ``residual`` over ``uv`` seen by most good points, else None."""
     if np.count_nonzero(good) < 12:
         return None
-    basis = np.column_stack([np.ones(len(uv)), uv / 1000.0])
-    some = np.flatnonzero(good)[:: max(np.count_nonzero(good) // 300, 1)]
-    x, y = basis[some], residual[some]
-    trend = np.zeros((3, 2))
-    trend[0] = np.median(y, axis=0)
-    for scale in (8.0, 4.0, 2.0, 1.0, 1.0):
-        distance = np.hypot(*(y - x @ trend).T)
-        weighted = x / (1.0 + (distance / (scale * tolerance_px))[:, None] ** 2) ** 2
-        trend = np.linalg.solve(weighted.T @ x + 1e-6 * np.eye(3), weighted.T @ y)
-    agree = np.linalg.norm(y - x @ trend, axis=1) < 2 * tolerance_px
+    x, y = uv[good], residual[good]
+    trend = np.empty((3, 2))
+    affine_trend(x, y, np.median(y, axis=0), tolerance_px, trend)
+    everywhere = trend[0] + uv @ (trend[1:] / 1000.0)
+    agree = np.hypot(*(y - everywhere[good]).T) < 2 * tolerance_px
     if np.count_nonzero(agree) < max(12, 0.4 * len(y)):
         return None
-    return np.asarray(basis @ trend)
+    return np.asarray(everywhere)
 
 
 def _start(radius_px: float, levels: int, config: MatchingConfig) -> tuple[int, int]:
