@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ BOOT_BEFORE_VIDEO_S = 100.0
 GIMBAL_COMPONENT = 154
 ROLL_LOCK, PITCH_LOCK, YAW_IN_VEHICLE_FRAME, YAW_IN_EARTH_FRAME = 4, 8, 32, 64
 HEIGHT_OF_GROUND = Callable[[F64, F64], F64]
+Timed = tuple[Any, int, float]
+"""A message, the component that sends it, and when, in seconds since the first frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,19 +52,14 @@ def packets(
     """(seconds since the first frame, MAVLink 2 packet) in the order of time."""
     from pymavlink.dialects.v20 import common as dialect  # type: ignore[import-untyped]
 
-    timed: list[tuple[float, int, Any, int]] = []
-    for message, component, t in _messages(
-        sensors, origin, epoch_unix_s, ground_height, options, dialect
-    ):
-        timed.append((t, len(timed), message, component))
-    timed.sort(key=lambda item: item[:2])
-    # A video piped without its start time is taken to begin with the log.
-    timed = [item for item in timed if item[0] >= -options.lead_s]
+    kinds = _kinds(sensors, origin, epoch_unix_s, ground_height, options, dialect)
     senders = {
         1: dialect.MAVLink(None, srcSystem=1, srcComponent=1),
         GIMBAL_COMPONENT: dialect.MAVLink(None, srcSystem=1, srcComponent=GIMBAL_COMPONENT),
     }
-    for t, _, message, component in timed:
+    for message, component, t in heapq.merge(*kinds, key=lambda item: item[2]):
+        if t < -options.lead_s:  # a video piped without its time is taken to begin with the log
+            continue
         if options.gap_s and options.gap_s[0] <= t < options.gap_s[1]:
             continue
         sender = senders[component]
@@ -90,27 +88,31 @@ def _boot_ms(t: F64) -> npt.NDArray[np.int64]:
     return np.asarray(np.round((t + BOOT_BEFORE_VIDEO_S) * 1e3), np.int64)
 
 
-def _messages(
+def _kinds(
     sensors: Sensors,
     origin: LocalFrame,
     epoch_unix_s: float,
     ground_height: HEIGHT_OF_GROUND,
     options: TelemetryOptions,
     dialect: Any,
-) -> Iterator[tuple[Any, int, float]]:
-    """(message, component, time) of every kind, each kind in its own order."""
+) -> list[Iterator[Timed]]:
+    """The messages kind by kind, each kind in the order of time."""
     duration = sensors.flight.plan.duration_s
-    yield from _housekeeping(origin, epoch_unix_s, duration, dialect)
-    yield from _attitude(sensors, duration, dialect)
-    yield from _gimbal(sensors, duration, options, dialect)
-    yield from _position(sensors, origin, duration, dialect)
+    kinds = [
+        _housekeeping(origin, epoch_unix_s, duration, dialect),
+        _attitude(sensors, duration, dialect),
+        _gimbal(sensors, duration, options, dialect),
+        _position(sensors, origin, duration, dialect),
+        _satellites(sensors, origin, duration, dialect),
+    ]
     if options.rangefinder:
-        yield from _range(sensors, ground_height, duration, dialect)
+        kinds.append(_range(sensors, ground_height, duration, dialect))
+    return kinds
 
 
 def _housekeeping(
     origin: LocalFrame, epoch_unix_s: float, duration_s: float, dialect: Any
-) -> Iterator[tuple[Any, int, float]]:
+) -> Iterator[Timed]:
     """HEARTBEAT (armed, in a mission), SYSTEM_TIME and HOME_POSITION, once a second."""
     lat, lon = round(origin.lat_deg * 1e7), round(origin.lon_deg * 1e7)
     level = [1.0, 0.0, 0.0, 0.0]
@@ -125,9 +127,7 @@ def _housekeeping(
         yield home, 1, float(t) + 0.002
 
 
-def _attitude(
-    sensors: Sensors, duration_s: float, dialect: Any
-) -> Iterator[tuple[Any, int, float]]:
+def _attitude(sensors: Sensors, duration_s: float, dialect: Any) -> Iterator[Timed]:
     """ATTITUDE at 50 Hz."""
     t = _times(50.0, duration_s)
     rpy = sensors.vehicle_rpy(t)
@@ -140,7 +140,7 @@ def _attitude(
 
 def _gimbal(
     sensors: Sensors, duration_s: float, options: TelemetryOptions, dialect: Any
-) -> Iterator[tuple[Any, int, float]]:
+) -> Iterator[Timed]:
     """GIMBAL_DEVICE_ATTITUDE_STATUS at 20 Hz, from the gimbal's own component."""
     t = _times(20.0, duration_s) + 0.003
     R = sensors.R_ned_gimbal(t)
@@ -160,8 +160,8 @@ def _gimbal(
 
 def _position(
     sensors: Sensors, origin: LocalFrame, duration_s: float, dialect: Any
-) -> Iterator[tuple[Any, int, float]]:
-    """GLOBAL_POSITION_INT at 10 Hz and GPS_RAW_INT at 5 Hz."""
+) -> Iterator[Timed]:
+    """GLOBAL_POSITION_INT at 10 Hz."""
     t = _times(10.0, duration_s) + 0.001
     at = sensors.estimate(t)
     geodetic = origin.to_geodetic(at)
@@ -174,6 +174,12 @@ def _position(
             int(boot), lat, lon, round(geodetic[k, 2] * 1e3), round(at[k, 2] * 1e3), *ned,
             round(float(yaw[k]) * 100) % 36000,
         ), 1, float(t[k])  # fmt: skip
+
+
+def _satellites(
+    sensors: Sensors, origin: LocalFrame, duration_s: float, dialect: Any
+) -> Iterator[Timed]:
+    """GPS_RAW_INT at 5 Hz."""
     t = _times(5.0, duration_s) + 0.004
     geodetic = origin.to_geodetic(sensors.gps(t))
     v = sensors.flight.velocity(t)
@@ -189,7 +195,7 @@ def _position(
 
 def _range(
     sensors: Sensors, ground_height: HEIGHT_OF_GROUND, duration_s: float, dialect: Any
-) -> Iterator[tuple[Any, int, float]]:
+) -> Iterator[Timed]:
     """DISTANCE_SENSOR straight down at 10 Hz, up to 120 m."""
     t = _times(10.0, duration_s) + 0.002
     at = sensors.flight.position(t)
