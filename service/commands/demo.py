@@ -167,6 +167,7 @@ def _figures(out: Path, received: Path, seconds: float) -> dict[str, Any]:
     return {
         "scan_folder": str(out / "onboard"),
         "ground_folder": str(received),
+        "ground_store": str(out / "ground"),
         "keyframes": onboard["counts"]["keyframes"],
         "points": onboard["counts"]["points"],
         "ground_points": ground["counts"]["points"],
@@ -190,7 +191,8 @@ Look at it:
   {onboard}/preview.jpg   colour and relief from above; any picture viewer
   {onboard}/cloud.laz     coloured points, EPSG:{report["epsg"]}, metres above sea level;
                           CloudCompare, QGIS, Potree
-  {onboard}/trajectory.csv and scan.json: where the camera was, what was used, how good it is"""
+  {onboard}/trajectory.csv and scan.json: where the camera was, what was used, how good it is
+  skyrelief ground --store {report["ground_store"]} --portal 127.0.0.1:8080   in a browser"""
 
 
 def _read(path: Path) -> dict[str, Any]:
