@@ -321,6 +321,36 @@ def test_ctl_steers_a_scan() -> None:
         assert daemon.control.asked == ["start_scan", "SR_BASELINE_M=2.5", "stop_scan"]
 
 
+@pytest.mark.parametrize("as_json", [True, False])
+def test_ctl_watches(as_json: bool) -> None:
+    pytest.importorskip("mavsdk")
+    port = free_port()
+    with Daemon(f"udpout:127.0.0.1:{port}") as daemon:
+        done = threading.Event()
+
+        def talk() -> None:
+            k = 0
+            while not done.wait(0.2):
+                k += 1
+                daemon.link.statustext(f"Scan text {k}")
+                daemon.link.report_keyframe(KeyframeReport(1, 47.3, 8.5, 512.0, 80.0))
+
+        talker = threading.Thread(target=talk)
+        talker.start()
+        watched = run_ctl(port, "watch", "--seconds", "2", *(["--json"] if as_json else []))
+        done.set()
+        talker.join()
+    assert watched.returncode == 0, watched.stderr
+    lines = watched.stdout.splitlines()
+    if as_json:
+        messages = {message["message"]: message for message in map(json.loads, lines)}
+        assert messages["STATUSTEXT"]["text"].startswith("Scan text")
+        assert messages["CAMERA_IMAGE_CAPTURED"]["component"] == 100
+    else:
+        assert any(line.startswith("Scan text") for line in lines)
+        assert any("at 47.3000000, 8.5000000, 512.0 m" in line for line in lines)
+
+
 def test_ctl_says_when_nobody_or_the_wrong_one_answers() -> None:
     pytest.importorskip("mavsdk")
     port = free_port()
