@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import threading
 import time
@@ -91,6 +92,7 @@ class DatalinkSender:
         if config.connect or config.listen:
             self._thread = threading.Thread(target=self._run, name="datalink", daemon=True)
             self._thread.start()
+        atexit.register(self.close)  # Zenoh aborts a process that ends around an open session
         self._radio = None
         if config.radio and store is not None:
             tunnel = TunnelConfig(config.radio_baud / 10, config.radio_share)
@@ -164,6 +166,7 @@ class DatalinkSender:
 
     def close(self) -> None:
         """Stop sending; stores that are not owned stay open."""
+        atexit.unregister(self.close)
         self._stop.set()
         self._wake.set()
         if self._thread is not None:
