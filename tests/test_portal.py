@@ -24,6 +24,7 @@ from service.errors import InputError, OutsideError
 from service.ground.http import Portal, PortalConfig, open_portal, parse_address
 from service.ground.library import Library
 from service.ground.live import SIGMA_STEP_M, LiveFeed, StoreIndex
+from service.ground.vehicle import Vehicle
 from service.scan_folder import write_deliverables
 from service.stream.codec import encode
 from service.stream.records import Repose, ScanHeader
@@ -439,3 +440,91 @@ def test_unfit_tokens_and_certificates_are_said(store: Path, tmp_path: Path) -> 
     ):
         with pytest.raises(InputError):
             open_portal("127.0.0.1:0", store, **options)
+
+
+class FakeOperator:
+    """Stands in for mavsdk: answers orders and lets a test say what the vehicle sends."""
+
+    system = 7
+
+    def __init__(self, result: int = 0) -> None:
+        self.result, self.closed = result, False
+        self.commands: list[tuple[int, int, tuple[float, ...]]] = []
+        self.callbacks: dict[str, Any] = {}
+
+    def subscribe(self, name: str, callback: Any) -> None:
+        self.callbacks[name] = callback
+
+    def command(self, number: int, component: int, params: tuple[float, ...] = ()) -> Any:
+        from service.ground.operator import Ack
+
+        self.commands.append((number, component, params))
+        return Ack(7, component, self.result)
+
+    def __exit__(self, *_: object) -> None:
+        self.closed = True
+
+
+def test_orders_and_figures_of_the_vehicle(store: Path) -> None:
+    fake = FakeOperator()
+    vehicle = Vehicle("udpin://x", lambda _: fake)  # type: ignore[arg-type, return-value]
+    portal = Portal(PortalConfig(store, port=0, token=TOKEN), vehicle=vehicle)
+    portal.start()
+    vehicle.start()
+    try:
+        client = Client(portal)
+        deadline = time.monotonic() + 5
+        while not client.ask("/api/vehicle")[1]["connected"]:
+            assert time.monotonic() < deadline
+        assert client.ask("/api/vehicle", "POST", {"action": "start"}, token=None)[0] == 401
+        assert fake.commands == []
+        status, answer, _ = client.ask("/api/vehicle", "POST", {"action": "start"})
+        assert (status, answer["result"]) == (200, "accepted")
+        client.ask("/api/vehicle", "POST", {"action": "baseline", "metres": 2.5})
+        assert [(c[0], c[2][:1]) for c in fake.commands] == [(2500, ()), (206, (2.5,))]
+        for bad in (
+            {"action": "fly"},
+            {"action": "baseline"},
+            {"action": "start", "metres": 1},
+            {"action": "baseline", "metres": -1},
+            {"action": "baseline", "metres": True},
+        ):
+            assert client.ask("/api/vehicle", "POST", bad)[0] == 400
+        fake.result = 1
+        status, answer, _ = client.ask("/api/vehicle", "POST", {"action": "stop"})
+        assert status == 503 and "rejected" in answer["error"]
+        fake.callbacks["SYS_STATUS"](1, {"voltage_battery": 15200, "battery_remaining": 71})
+        fake.callbacks["GPS_RAW_INT"](1, {"satellites_visible": 14})
+        fake.callbacks["GLOBAL_POSITION_INT"](
+            1, {"lat": 470001000, "lon": 80000000, "relative_alt": 42500}
+        )
+        fake.callbacks["HOME_POSITION"](1, {"latitude": 470000000, "longitude": 80000000})
+        figures = client.ask("/api/vehicle")[1]
+        assert (figures["battery_percent"], figures["battery_volts"]) == (71.0, 15.2)
+        assert (figures["satellites"], figures["height_above_home_m"]) == (14.0, 42.5)
+        assert figures["home_distance_m"] == pytest.approx(11.12, abs=0.1)
+        assert figures["speed_m_s"] is None
+    finally:
+        portal.close()
+        vehicle.close()
+    assert fake.closed
+
+
+def test_without_a_vehicle_orders_are_refused(client: Client) -> None:
+    assert client.ask("/api/vehicle")[1] == {"connected": None}
+    status, answer, _ = client.ask("/api/vehicle", "POST", {"action": "start"})
+    assert status == 404 and "--vehicle" in answer["error"]
+
+
+def test_a_vehicle_that_is_not_there_says_so() -> None:
+    def nobody(_: str) -> Any:
+        raise OutsideError("no companion heard")
+
+    vehicle = Vehicle("udpin://x", nobody)
+    vehicle.start()
+    deadline = time.monotonic() + 5
+    while vehicle.figures()["trouble"] != "no companion heard":
+        assert time.monotonic() < deadline
+    with pytest.raises(OutsideError, match="no companion heard"):
+        vehicle.order("start", None)
+    vehicle.close()

@@ -58,6 +58,10 @@ def ground(
     portal_tls: Annotated[
         tuple[Path, Path] | None, typer.Option(help="the portal's certificate and key")
     ] = None,
+    vehicle: Annotated[
+        str | None,
+        typer.Option(help="MAVLink of the vehicle for the portal: udpin://0.0.0.0:14550"),
+    ] = None,
     once: Annotated[bool, typer.Option("--once", help="end when a scan is complete")] = False,
     idle_exit_s: Annotated[
         float | None, typer.Option(help="end when nothing new came for so many seconds")
@@ -96,7 +100,7 @@ def ground(
     page = None
     try:
         if portal is not None:
-            page = _open_portal(portal, receiver, store, portal_token, portal_tls)
+            page = _open_portal(portal, receiver, store, portal_token, portal_tls, vehicle)
         _watch(receiver, radios, once, idle_exit_s)
         entries = receiver.progress()
     finally:
@@ -114,15 +118,20 @@ def _open_portal(
     store: Path,
     token: Path | None,
     tls: tuple[Path, Path] | None,
+    endpoint: str | None,
 ) -> Portal:
     """The portal, started; its address is printed."""
     try:
         from service.ground.http import open_portal
+        from service.ground.vehicle import Vehicle
     except ModuleNotFoundError as error:
         raise OutsideError(
             f"the portal needs the package {error.name}; pip install 'skyrelief[ground]'"
         ) from error
-    page = open_portal(address, store, receiver.progress, token, tls)
+    vehicle = None if endpoint is None else Vehicle(endpoint)
+    page = open_portal(address, store, receiver.progress, token, tls, vehicle)
+    if vehicle is not None:
+        vehicle.start()
     print(f"portal: {page.url}", file=sys.stderr, flush=True)
     return page
 

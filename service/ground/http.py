@@ -6,16 +6,13 @@ is needed for everything and must be given by the operator. Nothing is fetched f
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import json
 import logging
 import secrets
 import socket
-import sqlite3
 import threading
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -34,21 +31,20 @@ from starlette.responses import (
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket
 
-from service.errors import InputError, OutsideError, SkyreliefError
+from service.errors import InputError, OutsideError
 from service.ground.guard import LARGEST_BODY_BYTES, Guard, is_loopback
 from service.ground.jobs import Jobs
 from service.ground.library import Library
-from service.ground.live import LiveFeed, StoreIndex
+from service.ground.live_socket import serve_live
 from service.ground.openapi import DOCUMENT
-from service.stream.store import ScanStore
+from service.ground.vehicle import Vehicle
 
 log = logging.getLogger(__name__)
 
 PAGE = Path(__file__).parent / "web" / "dist"
 MOST_LIVE_VIEWS = 16
-POLL_S = 0.25
 NO_PAGE = (
     "<!doctype html><meta charset=utf-8><title>skyrelief</title><h1>skyrelief</h1>"
     "<p>The page was not built when skyrelief was installed. Build it with <code>npm ci</code>"
@@ -100,12 +96,18 @@ class Portal:
     """The web server, on a thread of its own between :meth:`start` and :meth:`close`."""
 
     def __init__(
-        self, config: PortalConfig, progress: Callable[[], list[dict[str, Any]]] | None = None
+        self,
+        config: PortalConfig,
+        progress: Callable[[], list[dict[str, Any]]] | None = None,
+        vehicle: Vehicle | None = None,
     ) -> None:
         """``progress`` gives one entry per scan being received (``Receiver.progress``)."""
         self.config = config
         self.token = config.token or secrets.token_urlsafe(24)
-        self._app = portal_app(config.store, self.token, is_loopback(config.host), progress)
+        self._app = portal_app(
+            config.store, self.token, is_loopback(config.host), progress, vehicle
+        )
+        self._vehicle = vehicle
         self._socket: socket.socket | None = None
         self._server: Any = None
         self._thread: threading.Thread | None = None
@@ -151,13 +153,15 @@ class Portal:
         self._thread.start()
 
     def close(self) -> None:
-        """End; open connections are closed."""
+        """End; open connections and the vehicle are let go."""
         if self._server is not None and self._thread is not None:
             self._server.should_exit = True
             self._server.force_exit = True
             self._thread.join(timeout=5.0)
         if self._socket is not None:
             self._socket.close()
+        if self._vehicle is not None:
+            self._vehicle.close()
 
 
 @dataclass(slots=True, eq=False)
@@ -167,6 +171,7 @@ class _State:
     library: Library
     jobs: Jobs
     progress: Callable[[], list[dict[str, Any]]]
+    vehicle: Vehicle | None
     live_views: int = 0
     started: float = field(default_factory=time.monotonic)
 
@@ -176,9 +181,10 @@ def portal_app(
     token: str,
     local: bool,
     progress: Callable[[], list[dict[str, Any]]] | None = None,
+    vehicle: Vehicle | None = None,
 ) -> ASGIApp:
     """The portal as an ASGI application; ``local`` when only this machine can reach it."""
-    state = _State(Library(store), Jobs(), progress or (list))
+    state = _State(Library(store), Jobs(), progress or list, vehicle)
     one = "/api/scans/{drone}/{scan}"
     routes: list[Any] = [
         Route("/", _page),
@@ -193,6 +199,8 @@ def portal_app(
         Route("/api/bin/{name}/restore", _restore, methods=["POST"]),
         Route("/api/import", _import, methods=["POST"]),
         Route("/api/status", _status),
+        Route("/api/vehicle", _figures, methods=["GET"]),
+        Route("/api/vehicle", _order, methods=["POST"]),
         Route("/api/openapi.json", lambda _: JSONResponse(DOCUMENT)),
         Route("/metrics", _metrics),
     ]
@@ -324,6 +332,24 @@ def _status(request: Request) -> Response:
     )
 
 
+def _figures(request: Request) -> Response:
+    vehicle = _portal(request).vehicle
+    return JSONResponse({"connected": None} if vehicle is None else vehicle.figures())
+
+
+async def _order(request: Request) -> Response:
+    """An order to the vehicle; the answer is the companion's own."""
+    body = await _body(request)
+    vehicle = _portal(request).vehicle
+    if vehicle is None:
+        raise InputError("no vehicle: start with 'skyrelief ground --vehicle ENDPOINT'")
+    metres = body.get("metres")
+    if metres is not None and (isinstance(metres, bool) or not isinstance(metres, (int, float))):
+        raise InputError("metres is a number")
+    answer = await run_in_threadpool(vehicle.order, str(body.get("action", "")), metres)
+    return JSONResponse(answer)
+
+
 def _metrics(request: Request) -> Response:
     """The receiver's figures in the text form of Prometheus."""
     lines = ["# TYPE skyrelief_received_bytes counter", "# TYPE skyrelief_keyframes gauge"]
@@ -351,41 +377,10 @@ async def _live(socket: WebSocket) -> None:
         return
     await socket.accept()
     state.live_views += 1
-    store = index = None
     try:
-        store = await run_in_threadpool(ScanStore.open, folder / "scan.db")
-        index = StoreIndex(store.path)
-        feed = LiveFeed(store, index, _most_points(socket))
-        gone = asyncio.create_task(_until_gone(socket))
-        while not gone.done():
-            for message in await run_in_threadpool(lambda: list(feed.news())):
-                await _send(socket, message)
-            await asyncio.wait({gone}, timeout=POLL_S)
-    except (SkyreliefError, sqlite3.Error, WebSocketDisconnect, RuntimeError) as error:
-        log.debug("live view of %s ended: %s", folder, error)
+        await serve_live(socket, folder)
     finally:
         state.live_views -= 1
-        for opened in (index, store):
-            if opened is not None:
-                await run_in_threadpool(opened.close)
-        with contextlib.suppress(RuntimeError, WebSocketDisconnect):
-            await socket.close()
-
-
-def _most_points(socket: WebSocket) -> int | None:
-    text = socket.query_params.get("points", "")
-    return min(max(int(text), 100), 1_000_000) if text.isdigit() and len(text) < 9 else None
-
-
-def _send(socket: WebSocket, message: str | bytes) -> Awaitable[None]:
-    return socket.send_text(message) if isinstance(message, str) else socket.send_bytes(message)
-
-
-async def _until_gone(socket: WebSocket) -> None:
-    """Return when the browser closed the connection; what it sends is not read."""
-    with contextlib.suppress(WebSocketDisconnect, RuntimeError):
-        while (await socket.receive())["type"] != "websocket.disconnect":
-            pass
 
 
 def open_portal(
@@ -394,6 +389,7 @@ def open_portal(
     progress: Callable[[], list[dict[str, Any]]] | None = None,
     token_file: Path | None = None,
     tls: tuple[Path, Path] | None = None,
+    vehicle: Vehicle | None = None,
 ) -> Portal:
     """A started portal at ``HOST:PORT`` on the scans below ``store``.
 
@@ -413,6 +409,6 @@ def open_portal(
         if not path.is_file():
             raise InputError(f"portal certificate {path}: no such file")
     certificate, key = (str(path) for path in tls) if tls else ("", "")
-    portal = Portal(PortalConfig(store, host, port, token, certificate, key), progress)
+    portal = Portal(PortalConfig(store, host, port, token, certificate, key), progress, vehicle)
     portal.start()
     return portal

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from service.exports import EXPORTERS
+from service.ground.vehicle import BUTTONS
 
 
 def _operation(
@@ -80,6 +81,18 @@ DOCUMENT: dict[str, Any] = {
             )
         ),
         "/api/status": _path(get=_operation("What is being received.", "the status")),
+        "/api/vehicle": _path(
+            get=_operation("Battery, satellites, speed, height, distance from home.", "figures"),
+            post=_operation(
+                "Give an order to the companion.",
+                "its answer",
+                True,
+                {
+                    "action": {"type": "string", "enum": list(BUTTONS)},
+                    "metres": {"type": "number", "minimum": 0, "maximum": 1000},
+                },
+            ),
+        ),
         "/metrics": _path(get=_operation("Figures for Prometheus.", "text")),
     },
 }

@@ -66,3 +66,18 @@ export function liveAddress(s: { drone: string; scan: string }): string {
   const scheme = location.protocol === "https:" ? "wss:" : "ws:";
   return `${scheme}//${location.host}${place(s)}/live`;
 }
+
+export interface Vehicle {
+  connected: boolean | null;
+  trouble?: string | null;
+  battery_percent?: number | null;
+  battery_volts?: number | null;
+  satellites?: number | null;
+  speed_m_s?: number | null;
+  height_above_home_m?: number | null;
+  home_distance_m?: number | null;
+}
+
+export const vehicle = (): Promise<Vehicle> => ask("/api/vehicle");
+export const order = (action: string, metres?: number): Promise<{ result: string }> =>
+  ask("/api/vehicle", "POST", metres === undefined ? { action } : { action, metres });

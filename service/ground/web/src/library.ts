@@ -2,6 +2,7 @@
 
 import * as api from "./api";
 import { count, date, el, size, tell } from "./dom";
+import { vehicleStrip } from "./vehicle";
 
 const KINDS = [
   "laz", "copc", "ply", "dsm", "ortho", "contours", "glb", "geojson", "kml", "mcap",
@@ -14,7 +15,7 @@ export async function showLibrary(root: HTMLElement): Promise<void> {
   const bin = el("section", { className: "bin" });
   const again = (): void => void load().catch(tell);
   root.replaceChildren(
-    el("header", {}, el("h1", { textContent: "skyrelief" }), search, importForm(again)),
+    el("header", {}, el("h1", { textContent: "skyrelief" }), search, vehicleStrip(), importForm(again)),
     list,
     bin,
   );

@@ -7,12 +7,13 @@ import { LiveView, type LastPose, type News } from "./live";
 import { Ruler } from "./measure";
 import { Cloud, COLOURS, type Colour } from "./points";
 import { canDraw, Stage } from "./stage";
+import { vehicleStrip } from "./vehicle";
 
 /** Shows a scan; returns what closes it. */
 export function showView(root: HTMLElement, drone: string, name: string): () => void {
   const figures = el("div", { className: "figures" });
   const state = el("span", { className: "state" });
-  const bar = el("nav", {}, el("a", { href: "#/", textContent: "‹ scans" }), el("b", { textContent: name }), state);
+  const bar = el("nav", {}, el("a", { href: "#/", textContent: "‹ scans" }), el("b", { textContent: name }), state, vehicleStrip());
   const host = el("div", { className: "stage" });
   root.replaceChildren(el("div", { className: "view" }, bar, host, figures));
   const id = { drone, scan: name };

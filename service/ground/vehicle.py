@@ -1,0 +1,151 @@
+"""The vehicle beside the portal: its figures, and the operator's orders with their answers."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from service.commands.ctl import order
+from service.errors import InputError, OutsideError
+
+if TYPE_CHECKING:
+    from service.ground.operator import Operator
+
+log = logging.getLogger(__name__)
+
+BUTTONS = ("start", "stop", "pause", "resume", "photo", "baseline")
+"""Orders that the portal offers; all but ``baseline`` take nothing."""
+
+SEARCH_S = 5.0
+STALE_S = 10.0
+EARTH_M = 6_371_000.0
+HEARD = ("SYS_STATUS", "GPS_RAW_INT", "VFR_HUD", "ATTITUDE", "GLOBAL_POSITION_INT", "HOME_POSITION")
+"""Messages kept for the figures."""
+
+
+class Vehicle:
+    """Looks for a companion on a MAVLink endpoint, on a thread of its own.
+
+    ``connect`` makes the :class:`service.ground.operator.Operator`; it raises OutsideError
+    while nobody is there.
+    """
+
+    def __init__(self, endpoint: str, connect: Callable[[str], Operator] | None = None) -> None:
+        self.endpoint = endpoint
+        self._connect = connect or _operator
+        self._operator: Operator | None = None
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        self._heard: dict[str, tuple[float, dict[str, Any]]] = {}
+        self._trouble = "looking for the companion"
+        self._thread = threading.Thread(target=self._search, name="vehicle", daemon=True)
+
+    def start(self) -> None:
+        """Begin to look."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Let go of the link."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(timeout=2 * SEARCH_S)
+        with self._lock:
+            if self._operator is not None:
+                self._operator.__exit__(None, None, None)
+                self._operator = None
+
+    def order(self, action: str, metres: float | None) -> dict[str, Any]:
+        """Give an order and return its answer.
+
+        Raises InputError for an unknown one, OutsideError when it was not carried out.
+        """
+        if action not in BUTTONS:
+            raise InputError(f"action is one of {', '.join(BUTTONS)}")
+        if (action == "baseline") != (metres is not None):
+            raise InputError("baseline takes metres (0 follows the altitude), no other does")
+        if metres is not None and not (math.isfinite(metres) and 0.0 <= metres <= 1000.0):
+            raise InputError("metres are 0 to 1000")
+        with self._lock:
+            if self._operator is None:
+                raise OutsideError(f"no vehicle: {self._trouble}")
+            return order(self._operator, action, metres)
+
+    def figures(self) -> dict[str, Any]:
+        """Battery, satellites, speed, height, attitude, distance from home; None if not heard."""
+        status, gps, hud = (self._last(n) for n in ("SYS_STATUS", "GPS_RAW_INT", "VFR_HUD"))
+        attitude, place = self._last("ATTITUDE"), self._last("GLOBAL_POSITION_INT")
+        volts = _number(status, "voltage_battery")
+        percent = _number(status, "battery_remaining")
+        return {
+            "connected": self._operator is not None,
+            "trouble": None if self._operator is not None else self._trouble,
+            "battery_percent": percent if percent is not None and percent >= 0 else None,
+            "battery_volts": volts / 1000 if volts is not None and volts < 65535 else None,
+            "satellites": _number(gps, "satellites_visible"),
+            "speed_m_s": _number(hud, "groundspeed"),
+            "height_above_home_m": _scaled(place, "relative_alt", 1e-3),
+            "home_distance_m": _home_distance(place, self._last("HOME_POSITION")),
+            **{
+                f"{name}_deg": _scaled(attitude, name, 180 / math.pi)
+                for name in ("roll", "pitch", "yaw")
+            },
+        }
+
+    def _search(self) -> None:
+        while not self._stop.is_set():
+            try:
+                operator = self._connect(self.endpoint)
+            except (InputError, OutsideError) as error:
+                self._trouble = str(error)
+                self._stop.wait(1.0)
+                continue
+            for name in HEARD:
+                operator.subscribe(name, self._keeper(name))
+            with self._lock:
+                self._operator = operator
+            log.info("companion of system %d found at %s", operator.system, self.endpoint)
+            return
+
+    def _keeper(self, name: str) -> Callable[[int, dict[str, Any]], None]:
+        def keep(_: int, fields: dict[str, Any]) -> None:
+            self._heard[name] = (time.monotonic(), fields)
+
+        return keep
+
+    def _last(self, name: str) -> dict[str, Any]:
+        """The last message of a kind; empty when it is old. Home does not grow old."""
+        at, fields = self._heard.get(name, (0.0, {}))
+        fresh = name == "HOME_POSITION" or time.monotonic() - at < STALE_S
+        return fields if fresh else {}
+
+
+def _operator(endpoint: str) -> Operator:
+    from service.ground.operator import Operator
+
+    return Operator(endpoint, None, SEARCH_S)
+
+
+def _number(fields: dict[str, Any], name: str) -> float | None:
+    value = fields.get(name)
+    usable = isinstance(value, (int, float)) and math.isfinite(value)
+    return round(float(value), 3) if usable and value is not None else None
+
+
+def _scaled(fields: dict[str, Any], name: str, unit: float) -> float | None:
+    value = _number(fields, name)
+    return None if value is None else round(value * unit, 2)
+
+
+def _home_distance(place: dict[str, Any], home: dict[str, Any]) -> float | None:
+    """Metres over ground from home, on a sphere: right to half a percent."""
+    lat, lon = _number(place, "lat"), _number(place, "lon")
+    home_lat, home_lon = _number(home, "latitude"), _number(home, "longitude")
+    if lat is None or lon is None or home_lat is None or home_lon is None:
+        return None
+    north = math.radians((lat - home_lat) * 1e-7)
+    east = math.radians((lon - home_lon) * 1e-7) * math.cos(math.radians(lat * 1e-7))
+    return round(EARTH_M * math.hypot(north, east), 1)

@@ -1,0 +1,50 @@
+// The vehicle's figures and the operator's buttons; hidden where no vehicle was named.
+
+import * as api from "./api";
+import { el, tell } from "./dom";
+
+/** A strip of figures and buttons that keeps itself up to date while it is in the page. */
+export function vehicleStrip(): HTMLElement {
+  const figures = el("span", { className: "state" });
+  const strip = el("span", { className: "vehicle", hidden: true }, figures);
+  for (const action of ["start", "stop"]) {
+    strip.append(el("button", { textContent: action === "start" ? "Start scan" : "Stop scan", onclick: () => give(action) }));
+  }
+  strip.append(el("button", { textContent: "Baseline", onclick: baseline }));
+  const refresh = async (): Promise<void> => {
+    const now = await api.vehicle().catch(() => ({ connected: null }) as api.Vehicle);
+    strip.hidden = now.connected === null;
+    figures.textContent = now.connected ? words(now) : (now.trouble ?? "");
+    const wait = now.connected === null ? 10000 : 1000;
+    setTimeout(() => strip.isConnected && void refresh(), wait);
+  };
+  void refresh();
+  return strip;
+}
+
+function words(v: api.Vehicle): string {
+  const parts: string[] = [];
+  const add = (value: number | null | undefined, text: (x: number) => string): void => {
+    if (value !== null && value !== undefined) parts.push(text(value));
+  };
+  add(v.battery_percent, (x) => `battery ${x.toFixed(0)} %`);
+  add(v.battery_volts, (x) => `${x.toFixed(1)} V`);
+  add(v.satellites, (x) => `${x} satellites`);
+  add(v.speed_m_s, (x) => `${x.toFixed(1)} m/s`);
+  add(v.height_above_home_m, (x) => `${x.toFixed(1)} m up`);
+  add(v.home_distance_m, (x) => `${x.toFixed(0)} m from home`);
+  return parts.join(" · ") || "connected";
+}
+
+function give(action: string): void {
+  if (confirm(`${action} the scan on the vehicle?`))
+    void api.order(action).then((a) => tell(`${action}: ${a.result}`), tell);
+}
+
+function baseline(): void {
+  const text = prompt("Baseline in metres; 0 follows the altitude", "0");
+  if (text === null) return;
+  const metres = Number(text);
+  if (!Number.isFinite(metres)) return tell("not a number");
+  void api.order("baseline", metres).then((a) => tell(`baseline ${metres} m: ${a.result}`), tell);
+}
