@@ -113,7 +113,8 @@ class Trajectory:
         """Keyframes whose world pose changed since it was told by more than is worth it.
 
         In flight a change must exceed ``repose_m`` and a tenth of the pose's own sigma, or
-        each fix of a poor receiver would move the whole scan; ``final`` ones only the first.
+        each fix of a poor receiver would move the whole scan. At the end (``final``) every
+        change is told, so that the result does not hang on when corrections were asked for.
         """
         out = []
         for node in self._nodes.values():
@@ -127,7 +128,8 @@ class Trajectory:
             turn = float(np.linalg.norm(change[:3])) * reach
             growth = abs(now.scale / scale_old - 1.0) * reach
             sigma = float(np.sqrt(np.trace(now.covariance[3:, 3:])))
-            least = max(self.config.repose_m, 0.0 if final else self.config.repose_sigmas * sigma)
+            least = max(self.config.repose_m, self.config.repose_sigmas * sigma)
+            least = 1e-6 if final else least
             if shift + turn + growth > least:
                 out.append(now)
         return out

@@ -1,13 +1,14 @@
 """Figure 1 of the paper: pictures and telemetry in, posed depth images out.
 
-No I/O, no threads: :mod:`service.recorder` writes what comes out, and the commands feed it.
+The upper half of the figure is here, the lower (stereo to ICP) in :mod:`service.dense`. No
+I/O: :mod:`service.recorder` writes what comes out, and the commands feed it.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter, deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -15,40 +16,17 @@ import numpy as np
 from mavlink.state import VehicleState
 from recon import se3
 from recon.backends import Backend
-from recon.belief_propagation import BeliefPropagationConfig
-from recon.camera_model import Undistorter, scaled, scaled_K
-from recon.depth_fusion import FusionConfig, fuse
+from recon.camera_model import Undistorter, scaled
 from recon.exposure import stretch
 from recon.odometry import Odometry, OdometryConfig, OdometryKeyframe, Tracked
-from recon.registration import IcpConfig
-from recon.reprojection import PairDepth, reproject
-from recon.trajectory import Placed, Trajectory
-from recon.types import (
-    F64,
-    U8,
-    Array,
-    Camera,
-    DepthMap,
-    Frame,
-    Keyframe,
-    Pose,
-    PosePrior,
-    StereoPair,
-)
-from recon.upsampling import UpsamplingConfig
-from recon.virtual_stereo import (
-    Refusal,
-    View,
-    VirtualStereoConfig,
-    drop_unseen,
-    plane_relief,
-    rectify,
-)
-from recon.voxel_map import VoxelMap, VoxelMapConfig
+from recon.trajectory import Placed
+from recon.types import F64, U8, Camera, Frame, Keyframe, PosePrior
+from recon.virtual_stereo import View
 from service.cameras.source import GeoTag
 from service.config import Config, ScanConfig
+from service.dense import Dense, Job
 from service.rig import Rig
-from service.stopwatch import Stopwatch
+from service.side_by_side import SideBySide
 from service.viewpoints import Viewpoint, Viewpoints
 
 
@@ -75,9 +53,15 @@ class Step:
 
 
 class Pipeline:
-    """One scan: feed :meth:`step` every frame in order, then call :meth:`finish`."""
+    """One scan: feed :meth:`step` every frame in order, then call :meth:`finish`.
 
-    def __init__(self, camera: Camera, config: Config, backend: Backend) -> None:
+    Tracking runs in the caller's thread, reconstruction beside it. ``live`` lets old work give
+    way when it cannot keep up; otherwise nothing is dropped.
+    """
+
+    def __init__(
+        self, camera: Camera, config: Config, backend: Backend, live: bool = False
+    ) -> None:
         """Raises ValueError for an unusable camera model."""
         self.config = config
         self.rig = Rig(config.camera, config.scan, config.fusion)
@@ -87,27 +71,16 @@ class Pipeline:
             OdometryConfig(base_to_height=config.scan.base_to_height),
         )
         self.viewpoints = Viewpoints(config.scan, config.compute.pairs)
-        self.trajectory = Trajectory()
-        self.stopwatch = Stopwatch()
+        self.dense = Dense(config, backend, self.viewpoints.least_base_to_height)
+        self.stopwatch = self.dense.stopwatch
         self.refusals: Counter[str] = Counter()
-        self.registrations: Counter[str] = Counter()
-        self.pairs = 0
-        self.debug: dict[str, Array] = {}
-        self._backend = backend
-        self._stereo = VirtualStereoConfig(
-            least_base_to_height=self.viewpoints.least_base_to_height,
-            width_px=config.compute.stereo_width,
-            guide_width_px=config.compute.guide_width,
-            guided=config.compute.upsample,
-            labels=config.compute.labels,
+        self._jobs: SideBySide[Job, Keyframe | None] = SideBySide(
+            self.dense.reconstruct, 3, live, beside=not config.scan.keep_debug
         )
-        self._bp = BeliefPropagationConfig(iterations=config.compute.iterations)
-        self._jbu, self._icp, self._fusion = UpsamplingConfig(), IcpConfig(), FusionConfig()
-        self._map: VoxelMap | None = None
         self._waiting: deque[Viewpoint] = deque()
-        self._registered: tuple[Viewpoint, DepthMap | None, F64] | None = None
+        self._asked: deque[Viewpoint] = deque(maxlen=8)  # whose reconstruction was asked for
+        self._views: dict[int, Viewpoint] = {}  # asked for and not done yet
         self._carriers: dict[int, list[Anchorage]] = {}  # per segment, what is on the chain
-        self._relief = (0.0, 0.0)
 
     # ---- one frame, as in Figure 1 -----------------------------------------------------
 
@@ -129,25 +102,33 @@ class Pipeline:
         viewpoint = self.viewpoints.offer(frame, picture, tracked, key, prior)
         if viewpoint is not None:
             self._waiting.append(viewpoint)
-        keyframes = self._reconstruct_ready()
+        self._ask_for_ready()
+        keyframes = self._collect()
         anchor = Anchorage(frame.seq, key, se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera)
         is_view = viewpoint is not None
-        return Step(tracked, prior, self.place(anchor), is_view, anchor, keyframes, self._moved())
+        moved = self._moved() if keyframes else ()
+        return Step(tracked, prior, self.place(anchor), is_view, anchor, keyframes, moved)
 
     def set_baseline(self, config: ScanConfig) -> None:
         """Follow another ``scan.baseline`` from the next frame on."""
         self.viewpoints.set_baseline(config)
-        least = self.viewpoints.least_base_to_height
-        self._stereo = replace(self._stereo, least_base_to_height=least)
+        self.dense.set_least_base_to_height(self.viewpoints.least_base_to_height)
 
-    def forget_map(self) -> None:
-        """Count every surface as new again."""
-        self._map = None
+    @property
+    def dropped(self) -> int:
+        """Views that were not reconstructed because newer ones came faster."""
+        return self._jobs.dropped
+
+    def all_refusals(self) -> Counter[str]:
+        """Frames and pairs not used, by reason."""
+        return self.refusals + self.dense.refusals
 
     def finish(self) -> Step:
-        """The viewpoints still waiting for partners, and the last corrections."""
+        """The views still waiting for partners, and the last corrections."""
+        self._ask_for_ready(everything=True)
+        keyframes = self._collect(everything=True)
+        self._jobs.close()
         tracked = Tracked("lost", self.odometry.segment, reason="end of the recording")
-        keyframes = self._reconstruct_ready(everything=True)
         return Step(tracked, PosePrior(), keyframes=keyframes, moved=self._moved(final=True))
 
     def _pictures(self, image: U8) -> tuple[U8, U8, U8 | None]:
@@ -163,127 +144,42 @@ class Pipeline:
             mask = np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST), np.uint8)
         return picture, stretch(np.asarray(grey, np.uint8), mask > 0), None if mask.all() else mask
 
-    # ---- a viewpoint whose partners are there ------------------------------------------
+    # ---- reconstruction beside it ------------------------------------------------------
 
-    def _reconstruct_ready(self, everything: bool = False) -> tuple[Keyframe, ...]:
-        done = []
+    def _ask_for_ready(self, everything: bool = False) -> None:
+        """Hand over the views whose partners are there."""
         while self._waiting and (everything or self.viewpoints.ready(self._waiting[0])):
-            keyframe = self._reconstruct(self._waiting.popleft())
-            if keyframe is not None:
-                done.append(keyframe)
-        return tuple(done)
+            viewpoint = self._waiting.popleft()
+            self._views[viewpoint.seq] = viewpoint
+            self._jobs.offer(self._job(viewpoint))
+            self._asked.append(viewpoint)
 
-    def _reconstruct(self, viewpoint: Viewpoint) -> Keyframe | None:
-        """Stereo with every partner, fused, registered and compared with the map."""
-        view = self._view(viewpoint)
+    def _job(self, viewpoint: Viewpoint) -> Job:
         points, _ = self.odometry.landmarks(viewpoint.key)
-        points = se3.transform(se3.inverse(viewpoint.T_key_camera), points)
-        W, H = self.undistorter.camera.size_px
-        size = (self.config.compute.stereo_width, round(self.config.compute.stereo_width * H / W))
-        K = scaled_K(view.K, size[0] / W, size[1] / H)
-        depths = []
-        for partner in self.viewpoints.partners(viewpoint):
-            with self.stopwatch("rectify"):
-                pair = rectify(view, self._view(partner), points, self._stereo, self._relief)
-            if isinstance(pair, Refusal):
-                self.refusals[pair.reason] += 1
-                continue
-            depths.append(self._pair_depth(pair, K, size, view, partner))
-        depth = None
-        if depths:
-            with self.stopwatch("fuse"):
-                depth = fuse(depths, K, view.T_odom_camera, self._fusion)
-                self._relief = plane_relief(depth, self._relief)
-        self._register(viewpoint, view.T_odom_camera, depth, points)
-        return None if depth is None else self._keyframe(viewpoint, depth)
-
-    def _pair_depth(
-        self, pair: StereoPair, K: F64, size: tuple[int, int], view: View, partner: Viewpoint
-    ) -> PairDepth:
-        """Belief propagation, upsampling and reprojection of one pair."""
-        self.pairs += 1
-        with self.stopwatch("belief propagation"):  # Eq. 1
-            coarse = self._backend.belief_propagation(pair.left, pair.right, pair.labels, self._bp)
-            coarse = drop_unseen(coarse, pair)
-        fine = coarse
-        if pair.guide is not None:
-            with self.stopwatch("upsample"):  # Eq. 2
-                fine = self._backend.upsample(coarse, pair.guide, self._jbu)
-        with self.stopwatch("reproject"):  # Eq. 3
-            depth = reproject(fine, pair, K, size)
-        if self.config.scan.keep_debug:
-            self.debug = {
-                "raw_left": view.grey if view.bgr is None else view.bgr,
-                "raw_right": partner.grey if partner.bgr is None else partner.bgr,
-                "rect_left": pair.left,
-                "rect_right": pair.right,
-                "disparity": coarse.px,
-                "upsampled": fine.px,
-            }
-        return depth
-
-    def _register(
-        self, viewpoint: Viewpoint, T_odom_camera: F64, depth: DepthMap | None, points: F64
-    ) -> None:
-        """ICP onto the keyframe before; both estimates of the step, weighted, go on the chain."""
-        T_map = T_odom_camera
-        covariance = viewpoint.key.covariance + np.diag([1e-4**2] * 3 + [0.005**2] * 3)
-        before = self._registered
-        if before is not None and before[0].key.segment == viewpoint.key.segment:
-            step = se3.inverse(before[0].T_odom_camera) @ T_odom_camera
-            A = se3.adjoint(step)
-            covariance = A @ covariance @ A.T
-            if depth is not None and before[1] is not None:
-                with self.stopwatch("icp"):
-                    found = self._backend.register(depth, before[1], step, self._icp)
-                self.registrations[found.verdict] += 1
-                if found.converged:
-                    step, covariance = se3.average(
-                        step, covariance, found.T_target_source, found.covariance
-                    )
-            T_map = before[2] @ step
-        self._registered = (viewpoint, depth, T_map)
-        self._carriers.setdefault(viewpoint.key.segment, []).append(
-            Anchorage(viewpoint.seq, viewpoint.key, viewpoint.T_key_camera)
-        )
-        up = T_odom_camera[:3, :3].T[:, 2]
-        height = -float(np.median(points @ up)) if len(points) else None
-        self.trajectory.add(
-            viewpoint.seq, viewpoint.key.segment, T_map, covariance, viewpoint.prior, height
-        )
-
-    def _keyframe(self, viewpoint: Viewpoint, depth: DepthMap) -> Keyframe:
-        """The keyframe in the world, in metres, with what is new in it marked."""
-        T_map = self.trajectory.map_pose(viewpoint.seq)
-        with self.stopwatch("map"):
-            in_map = DepthMap(depth.depth_m, depth.sigma_m, depth.views, depth.K, T_map)
-            if self._map is None:
-                ground_m = float(np.nanmedian(depth.depth_m)) / depth.K[0, 0]
-                self._map = VoxelMap(VoxelMapConfig(voxel_m=max(2.0 * ground_m, 1e-3)))
-            fresh = self._map.fresh(in_map)
-            self._map.insert(in_map, fresh)
-        placed = self.trajectory.place(viewpoint.seq)
-        self.trajectory.tell(placed)
-        h, w = depth.depth_m.shape
-        metric = DepthMap(
-            depth.depth_m * np.float32(placed.scale),
-            depth.sigma_m * np.float32(placed.scale),
-            depth.views,
-            depth.K,
-            placed.T_world_camera,
-        )
+        segment = viewpoint.key.segment
         assert viewpoint.bgr is not None
-        colour = cv2.resize(viewpoint.bgr, (w, h), interpolation=cv2.INTER_AREA)
-        if self.config.scan.keep_debug:
-            self.debug |= {"depth_m": metric.depth_m, "sigma_m": metric.sigma_m, "bgr": colour}
-        return Keyframe(
-            viewpoint.seq,
-            viewpoint.time_ns,
-            metric,
-            np.asarray(colour, np.uint8),
-            Pose(placed.T_world_camera, placed.covariance, placed.sources),
-            fresh,
+        return Job(
+            self._view(viewpoint),
+            viewpoint.bgr,
+            segment,
+            viewpoint.prior,
+            tuple(self._view(p) for p in self.viewpoints.partners(viewpoint)),
+            se3.transform(se3.inverse(viewpoint.T_key_camera), points),
+            viewpoint.key.covariance,
+            {v.seq: v.T_odom_camera for v in self._asked if v.key.segment == segment},
         )
+
+    def _collect(self, everything: bool = False) -> tuple[Keyframe, ...]:
+        """Keyframes that are done, in order."""
+        out = []
+        for job, keyframe in self._jobs.finished(everything):
+            viewpoint = self._views.pop(job.view.seq)
+            self._carriers.setdefault(job.segment, []).append(
+                Anchorage(viewpoint.seq, viewpoint.key, viewpoint.T_key_camera)
+            )
+            if keyframe is not None:
+                out.append(keyframe)
+        return tuple(out)
 
     # ---- poses -------------------------------------------------------------------------
 
@@ -307,12 +203,14 @@ class Pipeline:
         i = bisect_right(carriers, anchor.seq, key=lambda c: c.seq)
         carrier = carriers[max(i - 1, 0)]
         T_carrier = carrier.key.T_odom_camera @ carrier.T_key_camera
-        return self.trajectory.ride(carrier.seq, se3.inverse(T_carrier) @ T_odom_camera)
+        with self.dense.lock:
+            return self.dense.trajectory.ride(carrier.seq, se3.inverse(T_carrier) @ T_odom_camera)
 
     def _moved(self, final: bool = False) -> tuple[Placed, ...]:
-        moved = self.trajectory.moved(final)
-        for placed in moved:
-            self.trajectory.tell(placed)
+        with self.dense.lock:
+            moved = self.dense.trajectory.moved(final)
+            for placed in moved:
+                self.dense.trajectory.tell(placed)
         return tuple(moved)
 
 

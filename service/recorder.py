@@ -39,14 +39,13 @@ class Recorder:
     def __init__(self, store: ScanStore, pipeline: Pipeline, clock_offset_ns: int = 0) -> None:
         """``clock_offset_ns`` takes the frames' clock to unix time."""
         self.store, self.pipeline = store, pipeline
-        self.points = self.clouds = self.frames = self.chunk_bytes = 0
+        self.points = self.keyframes = self.frames = self.chunk_bytes = 0
         self.states: Counter[str] = Counter()
         self.distance_m = self.speed_m_s = self.turn_rate_rad_s = 0.0
         self.last: PoseRecord | None = None
         self._offset_ns = clock_offset_ns
         self._codec = CodecConfig()
         self._told: list[_Told] = []
-        self._encoded_scale: dict[int, float] = {}
         self._revision: Counter[int] = Counter()
         self._last: tuple[int, F64] | None = None  # unix ns and T_world_camera of the last pose
         self._origin_written = False
@@ -91,21 +90,23 @@ class Recorder:
             "frames_tracked": self.states["tracked"] + self.states["keyframe"],
             "frames_lost": self.states["lost"],
             "segments": pipeline.odometry.segment + 1,
-            "pairs": pipeline.pairs,
-            "clouds": self.clouds,
+            "pairs": pipeline.dense.pairs,
+            "dropped": pipeline.dropped,
+            "clouds": pipeline.dense.pairs,  # one per stereo pair, Eq. 3
+            "keyframes": self.keyframes,
             "points": self.points,
             "chunk_bytes": self.chunk_bytes,
             "distance_m": round(self.distance_m, 2),
             "georeference": pipeline.rig.georeference,
             "scale": self._scale(),
             "stage_ms": {k: round(v, 2) for k, v in pipeline.stopwatch.mean_ms().items()},
-            "refusals": dict(pipeline.refusals),
-            "registrations": dict(pipeline.registrations),
+            "refusals": dict(pipeline.all_refusals()),
+            "registrations": dict(pipeline.dense.registrations),
         }
 
     def _scale(self) -> dict[str, Any]:
         """What the metric scale rests on, and its relative sigma."""
-        found = self.pipeline.trajectory.similarity(max(self.pipeline.odometry.segment, 0))
+        found = self.pipeline.dense.trajectory.similarity(max(self.pipeline.odometry.segment, 0))
         if found is None:
             return {"from": "first telemetry", "sigma": None}
         return {
@@ -133,13 +134,12 @@ class Recorder:
                 layers = encode(keyframe, keyframe.time_ns + self._offset_ns, self._codec)
             with self.pipeline.stopwatch("store"):
                 self.store.add_keyframe(keyframe.seq, layers)
-            self.clouds += 1
+            self.keyframes += 1
             self.points += int((keyframe.fresh & np.isfinite(keyframe.depth.depth_m)).sum())
             self.chunk_bytes += sum(map(len, layers))
-            self._encoded_scale[keyframe.seq] = self.pipeline.trajectory.place(keyframe.seq).scale
-        if self.pipeline.debug and step.keyframes:
-            save_debug(self.store.path.parent, step.keyframes[-1].seq, self.pipeline.debug)
-        moved = [self._repose(p) for p in step.moved if p.seq in self._encoded_scale]
+        if self.pipeline.dense.debug and step.keyframes:
+            save_debug(self.store.path.parent, step.keyframes[-1].seq, self.pipeline.dense.debug)
+        moved = [self._repose(p) for p in step.moved if p.seq in self.pipeline.dense.encoded_scale]
         if moved:
             self.store.add_reposes(moved)
 
@@ -149,7 +149,7 @@ class Recorder:
             placed.seq,
             self._revision[placed.seq],
             placed.T_world_camera,
-            placed.scale / self._encoded_scale[placed.seq],
+            placed.scale / self.pipeline.dense.encoded_scale[placed.seq],
             placed.covariance,
         )
 

@@ -19,12 +19,13 @@ from mavlink.camera import KeyframeReport
 from mavlink.control import ACCEPTED, Answer, Handled, Phase, Power, Result, ScanStatus, Work
 from mavlink.presence import Health
 from mavlink.status import CRITICAL, INFO, WARNING
-from mavlink.vehicle import VehicleConfig, VehicleLink
+from mavlink.vehicle import VehicleLink
 from service.config import Config, change, reload
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.health import HealthServer, Notifier
 from service.machine import CoreLoad, computer_load, read_machine
 from service.retention import close_open_scans, make_room
+from service.vehicle_config import vehicle_config
 from service.version import software
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ class Daemon:
         self._reported = 0
         self._retry_at_s: float | None = None
         self._retry_s = FIRST_RETRY_S
-        self.vehicle = VehicleLink(VehicleConfig(links=config.mavlink.links), self)
+        self.vehicle = VehicleLink(vehicle_config(config), self)
 
     # ---- life ----------------------------------------------------------------------------
 
@@ -117,7 +118,7 @@ class Daemon:
         if scan is not None:
             figures |= {
                 "frames": scan.recorder.frames,
-                "clouds": scan.recorder.clouds,
+                "clouds": scan.recorder.keyframes,
                 "points": scan.recorder.points,
             }
         return {
@@ -275,7 +276,7 @@ class Daemon:
         """Forget which surface is known, so that everything counts as new again."""
         if self._scan is None:
             return Answer(Result.DENIED, "no scan is running")
-        self._scan.pipeline.forget_map()
+        self._scan.pipeline.dense.forget_map()
         return ACCEPTED
 
     def self_test(self) -> Handled:
@@ -417,8 +418,8 @@ class Daemon:
 
     def _on_frame(self, scan: Scan) -> None:
         self._progress_s = time.monotonic()
-        if scan.recorder.clouds > self._reported and scan.recorder.last is not None:
-            self._reported = scan.recorder.clouds
+        if scan.recorder.keyframes > self._reported and scan.recorder.last is not None:
+            self._reported = scan.recorder.keyframes
             self._retry_s = FIRST_RETRY_S
             self.vehicle.report_keyframe(_keyframe_report(scan.recorder.last))
 

@@ -162,8 +162,8 @@ class Scan:
                 f"no telemetry: the scale assumes {ASSUMED_AGL_M:g} m above ground; "
                 "set scan.assumed_agl_m to the true height"
             )
-        if frames and self.recorder.clouds == 0:
-            top = self.pipeline.refusals.most_common(2)
+        if frames and self.recorder.keyframes == 0:
+            top = self.pipeline.all_refusals().most_common(2)
             why = "; ".join(f"{reason} ({n})" for reason, n in top) or "too few frames"
             out.append(f"nothing was reconstructed: {why}")
         return out

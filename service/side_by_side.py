@@ -1,0 +1,58 @@
+"""Reconstruction beside tracking: one worker thread, a bounded queue, results in order."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Generic, TypeVar
+
+In = TypeVar("In")
+Out = TypeVar("Out")
+
+
+class SideBySide(Generic[In, Out]):
+    """Runs ``work`` on what is offered, in a thread of its own and in order.
+
+    A recording drops nothing: a full queue makes :meth:`offer` wait. Live, the oldest work that
+    has not begun gives way and :attr:`dropped` counts it. Without a thread (``beside`` False)
+    the work is done within :meth:`offer`.
+    """
+
+    def __init__(
+        self, work: Callable[[In], Out], most_waiting: int, live: bool, beside: bool = True
+    ) -> None:
+        self._work, self._most, self._live = work, most_waiting, live
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="dense") if beside else None
+        self._queue: deque[tuple[In, Future[Out]]] = deque()
+        self.dropped = 0
+
+    def offer(self, item: In) -> None:
+        """Hand over one piece of work."""
+        if self._worker is None:
+            done: Future[Out] = Future()
+            done.set_result(self._work(item))
+            self._queue.append((item, done))
+            return
+        self._queue.append((item, self._worker.submit(self._work, item)))
+        waiting = [f for _, f in self._queue if not f.done()]
+        if len(waiting) <= self._most:
+            return
+        if not self._live:
+            waiting[0].exception()  # waits
+        elif any(f.cancel() for f in waiting[1:]):
+            self.dropped += 1
+
+    def finished(self, everything: bool = False) -> list[tuple[In, Out]]:
+        """What is done, in order; ``everything`` waits for the rest. Raises what work raised."""
+        out = []
+        while self._queue and (everything or self._queue[0][1].done()):
+            item, future = self._queue.popleft()
+            if not future.cancelled():
+                out.append((item, future.result()))
+        return out
+
+    def close(self) -> None:
+        """Let the thread end; what has not begun is not done."""
+        if self._worker is not None:
+            self._worker.shutdown(wait=True, cancel_futures=True)

@@ -1,0 +1,59 @@
+"""Work beside the caller: order, waiting, giving way, faults."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+
+from service.side_by_side import SideBySide
+
+
+def test_results_come_in_order_and_nothing_is_dropped() -> None:
+    def work(n: int) -> int:
+        time.sleep(0.002 * (n % 3))
+        return n * n
+
+    jobs = SideBySide(work, most_waiting=2, live=False)
+    out = []
+    for n in range(30):
+        jobs.offer(n)
+        out += jobs.finished()
+    out += jobs.finished(everything=True)
+    jobs.close()
+    assert out == [(n, n * n) for n in range(30)] and jobs.dropped == 0
+
+
+def test_live_the_oldest_that_has_not_begun_gives_way() -> None:
+    gate = threading.Event()
+
+    def work(n: int) -> int:
+        gate.wait(5)
+        return n
+
+    jobs = SideBySide(work, most_waiting=2, live=True)
+    for n in range(10):
+        jobs.offer(n)
+    gate.set()
+    kept = [n for n, _ in jobs.finished(everything=True)]
+    jobs.close()
+    assert kept[0] == 0 and kept[-1] == 9 and len(kept) == 3 and jobs.dropped == 7
+
+
+def test_a_fault_reaches_the_caller() -> None:
+    def work(n: int) -> int:
+        raise RuntimeError("no luck")
+
+    jobs = SideBySide(work, most_waiting=2, live=False)
+    jobs.offer(1)
+    with pytest.raises(RuntimeError, match="no luck"):
+        jobs.finished(everything=True)
+    jobs.close()
+
+
+def test_without_a_thread_the_work_is_done_at_once() -> None:
+    seen = []
+    jobs: SideBySide[int, None] = SideBySide(seen.append, most_waiting=2, live=True, beside=False)
+    jobs.offer(1)
+    assert seen == [1] and len(jobs.finished()) == 1
