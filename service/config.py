@@ -60,9 +60,12 @@ class MavlinkConfig:
         (), "as pymavlink writes them: serial:/dev/…:921600, udpin:…, tcp:…"
     )
     system_id: int = key(0, "the vehicle's system id; 0 takes the first autopilot that is heard")
-    gimbal_yaw_frame: Literal["auto", "vehicle", "earth"] = key(
-        "auto", "what the gimbal's yaw refers to; auto trusts the flags that the gimbal sends"
+    gimbal_yaw_frame: Literal["auto", "vehicle", "earth", "body", "servo"] = key(
+        "auto", "what the gimbal's angles refer to; auto trusts its flags unless they cannot be"
     )
+    signing_key: str = key("", "file with the 32-byte key of signed links, mode 600")
+    odometry: bool = key(False, "send our motion estimate to the autopilot (ODOMETRY)")
+    memory: str = key("", "folder that keeps tuned parameters and the signing time over restarts")
 
     def __post_init__(self) -> None:
         """Check ranges."""
