@@ -5,14 +5,22 @@ from __future__ import annotations
 import ctypes.util
 import logging
 import time
+from collections.abc import Callable
 from importlib.util import find_spec
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from recon.backends import BACKENDS, Backend, load_backend
 from recon.belief_propagation import BeliefPropagationConfig
+from recon.types import F64, U8, DepthMap, DisparityMap, Registration
 from recon.upsampling import UpsamplingConfig
 from service.errors import InputError, OutsideError
+
+if TYPE_CHECKING:
+    from recon.registration import IcpConfig
+
+Result = TypeVar("Result")
 
 log = logging.getLogger(__name__)
 
@@ -21,14 +29,72 @@ TRIAL_LABELS = 16
 TRIAL_ROUNDS = 5
 
 
+class FallbackBackend:
+    """A backend on a device, and the CPU for the day that the device fails.
+
+    After the first RuntimeError (out of memory, device lost) the operation is done again on
+    the CPU, and so is everything after it; ``failure`` then says why.
+    """
+
+    def __init__(self, backend: Backend) -> None:
+        self._backend = backend
+        self.failure: str | None = None
+
+    @property
+    def name(self) -> str:
+        """Of the backend that works."""
+        return self._backend.name
+
+    @property
+    def device(self) -> str:
+        """Of the backend that works."""
+        return self._backend.device
+
+    def belief_propagation(
+        self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
+    ) -> DisparityMap:
+        """See :class:`recon.backends.Backend`."""
+        return self._run(lambda b: b.belief_propagation(left, right, labels, config))
+
+    def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
+        """See :class:`recon.backends.Backend`."""
+        return self._run(lambda b: b.upsample(coarse, guide, config))
+
+    def register(
+        self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
+    ) -> Registration:
+        """See :class:`recon.backends.Backend`."""
+        return self._run(lambda b: b.register(source, target, T_target_source, config))
+
+    def _run(self, operation: Callable[[Backend], Result]) -> Result:
+        try:
+            return operation(self._backend)
+        except (RuntimeError, MemoryError) as error:
+            if self._backend.name == "cpu":
+                raise
+            self.failure = str(error).splitlines()[0] if str(error) else type(error).__name__
+            log.error(
+                "backend %s on %s failed (%s): the CPU goes on",
+                self.name,
+                self.device,
+                self.failure,
+            )
+            self._backend = load_backend("cpu")
+            return operation(self._backend)
+
+
 def choose_backend(name: str = "auto") -> Backend:
     """The backend called ``name``, or for ``"auto"`` the fastest in a short measured trial.
 
     Raises InputError for an unknown name and OutsideError, with the reason, when a named
     backend cannot run here.
     """
-    if name != "auto":
-        return named_backend(name)
+    chosen = named_backend(name) if name != "auto" else fastest_backend()
+    return chosen if chosen.name == "cpu" else FallbackBackend(chosen)
+
+
+def fastest_backend() -> Backend:
+    """The fastest of those that work, in a short measured trial."""
     working: list[Backend] = []
     for candidate in BACKENDS:
         reason = pointless(candidate)

@@ -27,6 +27,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "inspect": ("service.commands.inspect:inspect", "Every stage of a keyframe as one picture."),
     "calibrate": ("service.commands.calibrate:calibrate", "Camera model from a chessboard."),
     "stereo": ("service.commands.stereo:stereo", "The stereo stage alone."),
+    "export-model": ("service.commands.export_model:export_model", "The dense stage as ONNX."),
     "config": ("service.commands.config:config", "Check, show or print the configuration."),
     "doctor": ("service.commands.doctor:doctor", "What works here, what does not."),
     "bench": ("service.commands.bench:bench", "Benchmarks, each against a peer."),

@@ -20,8 +20,15 @@ if TYPE_CHECKING:
 class Backend(Protocol):
     """What a backend offers to the pipeline."""
 
-    name: str
-    device: str
+    @property
+    def name(self) -> str:
+        """As in the table."""
+        ...
+
+    @property
+    def device(self) -> str:
+        """Where it computes, such as "cpu" or "cuda"."""
+        ...
 
     def belief_propagation(
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig

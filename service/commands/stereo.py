@@ -12,6 +12,7 @@ import typer
 from service.errors import InputError, OutsideError
 
 if TYPE_CHECKING:
+    from recon.backends import Backend
     from recon.belief_propagation import BeliefPropagationConfig
     from recon.types import F32, U8
 
@@ -24,6 +25,9 @@ def stereo(
     min_disparity: Annotated[int, typer.Option(help="the smallest disparity, px")] = 0,
     iterations: Annotated[int, typer.Option(help="of belief propagation, per level")] = 5,
     backend: Annotated[str, typer.Option(help="auto, cpu, torch or onnx")] = "auto",
+    model: Annotated[
+        Path | None, typer.Option(help="a learned model instead: the TOML that declares it")
+    ] = None,
     checked: Annotated[
         bool, typer.Option("--checked", help="unknown where the pair does not prove it")
     ] = False,
@@ -48,11 +52,12 @@ def stereo(
     check_output(out, ".npy")
     if picture is not None:
         check_output(picture, ".png")
-    from service.backend_choice import choose_backend
-
-    chosen = choose_backend(backend)
+    chosen = open_matcher(backend, model)
     start = time.perf_counter()
-    found = chosen.belief_propagation(grey_left, grey_right, labels, config)
+    try:
+        found = chosen.belief_propagation(grey_left, grey_right, labels, config)
+    except ValueError as error:
+        raise InputError(f"stereo: {error}") from error
     seconds = time.perf_counter() - start
     write(out, picture, found.px + config.min_disparity, labels, min_disparity)
     known = float((found.px == found.px).mean())
@@ -61,6 +66,17 @@ def stereo(
         print(json.dumps(report | {"seconds": seconds, "size_px": grey_left.shape[::-1]}))
     else:
         print(f"{out}: {_size(grey_left)}, {100 * known:.1f} % known, {chosen.name}")
+
+
+def open_matcher(backend: str, model: Path | None) -> Backend:
+    """The backend of that name, or the operator's learned model."""
+    if model is not None:
+        from service.learned_model import load_learned_model
+
+        return load_learned_model(model)
+    from service.backend_choice import choose_backend
+
+    return choose_backend(backend)
 
 
 def matching_config(iterations: int, min_disparity: int, checked: bool) -> BeliefPropagationConfig:

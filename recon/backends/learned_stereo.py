@@ -1,0 +1,120 @@
+"""A learned stereo model that the operator brings, behind the backend protocol.
+
+Two rectified images in, one disparity out, by ONNX Runtime. What the model expects is declared
+and checked when it is loaded, before anything flies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from recon.backends.onnx_backend import OnnxBackend, open_session
+from recon.belief_propagation import BeliefPropagationConfig, believe
+from recon.matching_cost import check_pair
+from recon.types import F32, U8, DisparityMap
+
+
+@dataclass(frozen=True, slots=True)
+class LearnedStereoConfig:
+    """How the model is fed; the file beside it says so."""
+
+    height: int  # px of the images that it takes
+    width: int
+    left: str = "left"  # names of its inputs and of the output that is used
+    right: str = "right"
+    disparity: str = "disparity"
+    layout: str = "nchw"  # or "nhwc"
+    channels: int = 3  # 1 or 3; grey is repeated
+    scale: float = 1 / 255  # of the grey levels, before mean and deviation
+    mean: float = 0.0
+    deviation: float = 1.0
+    disparity_scale: float = 1.0  # pixels per unit of its output; negative turns the sign
+    confidence: float = 0.5  # given to its disparities: it reports none
+
+    def __post_init__(self) -> None:
+        if self.layout not in ("nchw", "nhwc") or self.channels not in (1, 3):
+            raise ValueError("layout is 'nchw' or 'nhwc' and channels 1 or 3")
+        if min(self.height, self.width) < 8 or self.deviation <= 0 or self.disparity_scale == 0:
+            raise ValueError("height and width are at least 8, deviation and scale not zero")
+        if not 0 < self.confidence <= 1:
+            raise ValueError("confidence is above 0 and at most 1")
+
+    @property
+    def image_shape(self) -> tuple[int, ...]:
+        """Of one input."""
+        if self.layout == "nchw":
+            return (1, self.channels, self.height, self.width)
+        return (1, self.height, self.width, self.channels)
+
+
+class LearnedStereoBackend(OnnxBackend):
+    """The onnx backend with the model's disparity in place of belief propagation's.
+
+    Contrast, visibility and speckles are checked as for every backend. Raises ValueError when
+    the model's inputs or output are not as declared, with what was expected and found.
+    """
+
+    name = "learned"
+
+    def __init__(self, model: bytes, config: LearnedStereoConfig) -> None:
+        super().__init__()
+        self.config = config
+        self._model = open_session(model, self.providers)
+        found = {i.name: (tuple(i.shape), i.type) for i in self._model.get_inputs()}
+        for name in (config.left, config.right):
+            _check(name, found, config.image_shape)
+        if len(found) != 2:
+            raise ValueError(f"the model takes {sorted(found)}; two images were expected")
+        outputs = [o.name for o in self._model.get_outputs()]
+        if config.disparity not in outputs:
+            raise ValueError(f"output {config.disparity!r} was expected, found {outputs}")
+
+    def belief_propagation(
+        self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
+    ) -> DisparityMap:
+        """The model's disparity less ``config.min_disparity``, NaN outside the labels."""
+        check_pair(left, right, labels)
+        h, w = left.shape
+        if h > self.config.height or w > self.config.width:
+            most = f"{self.config.width}x{self.config.height}"
+            raise ValueError(f"the model takes images up to {most}, not {w}x{h}")
+        given = {self.config.left: self._image(left), self.config.right: self._image(right)}
+        (raw,) = self._model.run([self.config.disparity], given)
+        plane = np.asarray(raw, np.float32).squeeze()
+        if plane.shape != (self.config.height, self.config.width):
+            raise ValueError(
+                f"the model gave {np.shape(raw)}; one plane of "
+                f"{self.config.height}x{self.config.width} was expected"
+            )
+        px: F32 = plane[:h, :w] * np.float32(self.config.disparity_scale)
+        px = px - np.float32(config.min_disparity)
+        partner = np.arange(w)[None, :] - px - config.min_disparity
+        sound = (px >= 0) & (px <= labels - 1) & (partner > -0.5) & (partner < w - 0.5)
+        confidence = np.where(sound, self.config.confidence, 0).astype(np.float32)
+        return believe(left, np.where(sound, px, np.nan).astype(np.float32), confidence, config)
+
+    def _image(self, grey: U8) -> Any:
+        """The image as the model takes it; a smaller one is continued by its border."""
+        c = self.config
+        pad = ((0, c.height - grey.shape[0]), (0, c.width - grey.shape[1]))
+        level = (np.pad(grey, pad, mode="edge").astype(np.float32) * c.scale - c.mean) / c.deviation
+        axis = 1 if c.layout == "nchw" else 3
+        image = np.repeat(np.expand_dims(level[None], axis), c.channels, axis=axis)
+        return np.ascontiguousarray(image, np.float32)
+
+
+def _check(name: str, found: dict[str, tuple[Any, str]], shape: tuple[int, ...]) -> None:
+    """ValueError unless the model has this input; free sizes (names, None) fit any number."""
+    if name not in found:
+        raise ValueError(f"input {name!r} was expected, found {sorted(found)}")
+    its_shape, kind = found[name]
+    fits = len(its_shape) == len(shape) and all(
+        not isinstance(a, int) or a == b for a, b in zip(its_shape, shape, strict=True)
+    )
+    if kind != "tensor(float)" or not fits:
+        raise ValueError(
+            f"input {name!r}: float32 {list(shape)} was expected, found {kind} {list(its_shape)}"
+        )
