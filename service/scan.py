@@ -89,7 +89,9 @@ class Scan:
     def __init__(self, inputs: ScanInputs, store: ScanStore) -> None:
         self.inputs, self.store, self.source = inputs, store, inputs.source
         self.epoch_ns = inputs.epoch_ns
-        self.pipeline = Pipeline(inputs.camera, inputs.config, inputs.backend)
+        self.pipeline = Pipeline(
+            inputs.camera, inputs.config, inputs.backend, live=inputs.source.is_live
+        )
         self.recorder = Recorder(store, self.pipeline, inputs.unix_offset_ns)
         self.tagged = self.odd_sized = self.heights = 0
         self._started = time.monotonic()

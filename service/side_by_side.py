@@ -36,7 +36,7 @@ class SideBySide(Generic[In, Out]):
             return
         self._queue.append((item, self._worker.submit(self._work, item)))
         waiting = [f for _, f in self._queue if not f.done()]
-        if len(waiting) <= self._most:
+        if len(waiting) <= self._most + 1:  # one is being worked on
             return
         if not self._live:
             waiting[0].exception()  # waits

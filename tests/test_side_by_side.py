@@ -53,7 +53,7 @@ def test_a_fault_reaches_the_caller() -> None:
 
 
 def test_without_a_thread_the_work_is_done_at_once() -> None:
-    seen = []
+    seen: list[int] = []
     jobs: SideBySide[int, None] = SideBySide(seen.append, most_waiting=2, live=True, beside=False)
     jobs.offer(1)
     assert seen == [1] and len(jobs.finished()) == 1
