@@ -1,0 +1,188 @@
+"""Places seen before: candidates by overlap of the views, each verified before it is believed.
+
+Verification is independent of the pose graph: corners of one keyframe with their depths are
+matched in the other's picture (ZSSD), give a pose by EPnP, and the two depth maps must then
+agree by ICP. Whether a loop that passes may bend the map is for
+:meth:`recon.pose_graph.PoseGraph.add_loop` to say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from recon import matching, pnp, se3
+from recon.camera_model import project, rays
+from recon.registration import IcpConfig, register_projective
+from recon.types import F32, F64, U8, Bool, DepthMap
+
+__all__ = ["LoopClosure", "LoopConfig", "LoopView", "candidates", "verify"]
+
+
+@dataclass(frozen=True, slots=True)
+class LoopConfig:
+    """Parameters of the search for loops."""
+
+    least_gap: int = 15  # keyframes between the two ends of a loop
+    least_overlap: float = 0.35  # of the later view in the earlier one
+    search_share: float = 0.12  # of the picture's width, about the predicted places
+    least_confidence: float = 1.4  # of the global shift, tried when the prediction fails
+    min_matches: int = 40
+    max_disagreement: float = 4.0  # chi-square per degree of freedom between EPnP and ICP
+    matching: matching.MatchingConfig = field(default_factory=matching.MatchingConfig)
+    pnp: pnp.PnpConfig = field(default_factory=lambda: pnp.PnpConfig(min_inliers=30))
+    icp: IcpConfig = field(default_factory=IcpConfig)
+
+    def __post_init__(self) -> None:
+        """Raise ValueError when a parameter makes no sense."""
+        if self.least_gap < 1 or self.min_matches < 6:
+            raise ValueError("least_gap must be at least 1, min_matches at least 6")
+        if not (0 < self.least_overlap <= 1 and 0 < self.search_share <= 0.5):
+            raise ValueError("least_overlap must be in (0, 1], search_share in (0, 0.5]")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopView:
+    """A keyframe as the search for loops needs it."""
+
+    gray: U8  # (H, W) without distortion
+    K: F64  # (3, 3) px of the picture
+    depth: DepthMap  # metres; of the same camera at any size
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopClosure:
+    """A verified motion between two keyframes."""
+
+    T_a_b: F64  # (4, 4) m
+    covariance: F64  # (6, 6) left perturbation in a's camera frame
+    matches: int
+    sources: tuple[str, ...]  # of "epnp", "icp"
+
+
+def candidates(
+    poses: Mapping[int, F64], newest: int, K: F64, size_px: tuple[int, int], depth_m: float,
+    config: LoopConfig | None = None,
+) -> list[tuple[int, float]]:  # fmt: skip
+    """Earlier keyframes that see what ``newest`` sees, with the share of its view, best first.
+
+    ``poses`` are T_world_camera (4, 4) by keyframe number, ``depth_m`` the usual depth.
+    """
+    config = config or LoopConfig()
+    W, H = size_px
+    u, v = np.meshgrid(np.linspace(0, W - 1, 17), np.linspace(0, H - 1, 11))
+    grid = rays(K, np.column_stack([u.ravel(), v.ravel()])) * depth_m
+    ground = se3.transform(poses[newest], grid)
+    order = list(poses)
+    position = order.index(newest)
+    found = []
+    for seq in order[: max(position - config.least_gap + 1, 0)]:
+        seen = project(K, se3.transform(se3.inverse(poses[seq]), ground))
+        inside = (seen >= 0).all(axis=1) & (seen <= [W - 1, H - 1]).all(axis=1)
+        share = float(np.mean(inside))
+        if share >= config.least_overlap:
+            found.append((seq, share))
+    here = poses[newest][:3, 3]
+    return sorted(
+        found, key=lambda item: (-item[1], float(np.linalg.norm(poses[item[0]][:3, 3] - here)))
+    )
+
+
+def verify(
+    a: LoopView, b: LoopView, T_a_b_guess: F64, config: LoopConfig | None = None
+) -> LoopClosure | None:
+    """The motion between two keyframes that may see the same place, or None when they do not.
+
+    ``T_a_b_guess`` (4, 4) is the pose graph's word. Where it is too far off, the global shift
+    between the pictures is tried.
+    """
+    config = config or LoopConfig()
+    uv, points = _landmarks(a, config)
+    if len(uv) < config.min_matches:
+        return None
+    pyramids = tuple(matching.Pyramid.build(v.gray, config.matching.search_levels) for v in (a, b))
+    T_b_a = se3.inverse(T_a_b_guess)
+    predicted = project(b.K, se3.transform(T_b_a, points))
+    warp = _warp(a.K, b.K, T_b_a, float(np.median(points[:, 2])))
+    solved = _pose(pyramids, uv, points, predicted, warp, b, T_b_a, config)
+    if solved is None and a.gray.shape == b.gray.shape:
+        shift = matching.global_shift(a.gray, b.gray)
+        if shift.confidence >= config.least_confidence:
+            solved = _pose(pyramids, uv, points, shift.apply(uv), shift.A, b, None, config)
+    if solved is None:
+        return None
+    T_a_b = se3.inverse(solved.T_camera_points)
+    A = se3.adjoint(T_a_b)
+    return _with_icp(a, b, T_a_b, A @ solved.covariance @ A.T, solved, config)
+
+
+def _landmarks(view: LoopView, config: LoopConfig) -> tuple[F64, F64]:
+    """(N, 2) corners with a known depth and their (N, 3) points in the camera frame."""
+    corners = matching.harris_grid(view.gray, config.matching).uv_px.astype(np.float64)
+    h, w = view.depth.depth_m.shape
+    H, W = view.gray.shape
+    place = np.rint((corners + 0.5) * [w / W, h / H] - 0.5).astype(np.int64)
+    place = np.clip(place, 0, [w - 1, h - 1])
+    depth = view.depth.depth_m[place[:, 1], place[:, 0]].astype(np.float64)
+    known = np.isfinite(depth) & ~_at_edge(view.depth.depth_m, place)
+    return corners[known], rays(view.K, corners[known]) * depth[known, None]
+
+
+def _at_edge(depth: F32, place: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Bool:
+    """(N,) True next to a depth edge or a hole, where a corner's depth is anyone's guess."""
+    h, w = depth.shape
+    here = depth[place[:, 1], place[:, 0]]
+    spread = np.zeros(len(place))
+    for dv, du in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        v, u = np.clip(place[:, 1] + dv, 0, h - 1), np.clip(place[:, 0] + du, 0, w - 1)
+        spread = np.maximum(spread, np.abs(depth[v, u] - here))
+    return np.asarray(~(spread < 0.03 * here))
+
+
+def _warp(K_a: F64, K_b: F64, T_b_a: F64, depth_m: float) -> F64:
+    """(2, 2) map of offsets in a to offsets in b for level ground at the picture's centre."""
+    centre = np.array([[K_a[0, 2], K_a[1, 2]]])
+    steps = centre + np.array([[0.0, 0.0], [8.0, 0.0], [0.0, 8.0]])
+    there = project(K_b, se3.transform(T_b_a, rays(K_a, steps) * depth_m))
+    return np.asarray(((there[1:] - there[0]) / 8.0).T)
+
+
+def _pose(
+    pyramids: tuple[matching.Pyramid, ...], uv: F64, points: F64, predicted: F64, warp: F64,
+    b: LoopView, prior: F64 | None, config: LoopConfig,
+) -> pnp.PnpResult | None:  # fmt: skip
+    """EPnP pose of b from a's landmarks found in it."""
+    radius = config.search_share * b.gray.shape[1]
+    found = matching.match(
+        pyramids[0], uv, pyramids[1], predicted, radius, warp, config.matching
+    )  # fmt: skip
+    if np.count_nonzero(found.ok) < config.min_matches:
+        return None
+    seen = found.uv_px[found.ok].astype(np.float64)
+    solved = pnp.solve(points[found.ok], seen, b.K, config.pnp, prior)
+    if solved is None or solved.inlier_share < 0.5:
+        return None
+    return solved
+
+
+def _with_icp(
+    a: LoopView, b: LoopView, T_a_b: F64, covariance: F64, solved: pnp.PnpResult,
+    config: LoopConfig,
+) -> LoopClosure | None:  # fmt: skip
+    """The loop after the depth maps had their say; None when they contradict."""
+    count = int(np.count_nonzero(solved.inliers))
+    # Depths of one keyframe err together, which the pixels do not show.
+    depth = float(np.nanmedian(a.depth.depth_m))
+    sigma = float(np.nanmedian(a.depth.sigma_m))
+    covariance = covariance + np.diag([(sigma / depth) ** 2 * 0.01] * 3 + [(0.3 * sigma) ** 2] * 3)
+    aligned = register_projective(b.depth, a.depth, T_a_b, config.icp)
+    if not aligned.converged:
+        return None
+    difference = se3.log(aligned.T_target_source @ se3.inverse(T_a_b))
+    spread = covariance + aligned.covariance
+    if float(difference @ np.linalg.solve(spread, difference)) / 6.0 > config.max_disagreement:
+        return None
+    T, covariance = se3.average(T_a_b, covariance, aligned.T_target_source, aligned.covariance)
+    return LoopClosure(T, covariance, count, ("epnp", "icp"))

@@ -1,0 +1,184 @@
+"""Loops between rendered views of one place, and none between views of different places."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import pytest
+import scipy.ndimage as ndi
+
+from recon import se3
+from recon.camera_model import rays, scaled_K
+from recon.loop_closure import LoopConfig, LoopView, candidates, verify
+from recon.pose_graph import PoseGraph
+from recon.types import F64, DepthMap, PosePrior
+
+SIZE = (640, 360)
+K = np.array([[450.0, 0, 319.5], [0, 450.0, 179.5], [0, 0, 1.0]])
+NADIR = np.diag([1.0, -1.0, -1.0])
+METRES_PER_TEXEL = 0.12
+
+
+@lru_cache(maxsize=2)
+def texture(seed: int) -> F64:
+    """(1600, 1600) ground of 192 m a side."""
+    rng = np.random.default_rng(seed)
+    total = np.zeros((1600, 1600))
+    for k in range(7):
+        small = ndi.gaussian_filter(rng.normal(size=((1600 >> k) + 4, (1600 >> k) + 4)), 1.2)
+        layer = cv2.resize(small, None, fx=2.0**k, fy=2.0**k, interpolation=cv2.INTER_CUBIC)
+        total += 2 ** (0.3 * k) * layer[:1600, :1600]
+    return np.asarray(128 + 50 * (total - total.mean()) / total.std())
+
+
+def height(x: F64, y: F64) -> F64:
+    return np.asarray(1.5 * np.sin(x / 7 + 1) * np.cos(y / 9) + 0.7 * np.sin(x / 3.1 + y / 4.3))
+
+
+def camera(x: float, y: float, z: float, yaw: float) -> F64:
+    turn = se3.so3_exp(np.array([0.01, -0.02, yaw]))
+    return se3.compose(NADIR @ turn, np.array([x, y, z]))
+
+
+def view(T: F64, seed: int = 0, ground: int = 1, sigma_m: float = 0.08) -> LoopView:
+    """A picture with noise and a depth map at half its size with noise."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]].astype(np.float64)
+    directions = rays(K, np.column_stack([u.ravel(), v.ravel()])) @ T[:3, :3].T
+    t = np.full(len(directions), T[2, 3])
+    for _ in range(12):  # gentle hills: the fixed point converges
+        p = T[:3, 3] + directions * t[:, None]
+        t += (p[:, 2] - height(p[:, 0], p[:, 1])) / -directions[:, 2]
+    p = (T[:3, 3] + directions * t[:, None]).reshape(SIZE[1], SIZE[0], 3)
+    places = (p[..., :2] / METRES_PER_TEXEL + 800).astype(np.float32)
+    colour = cv2.remap(
+        texture(ground).astype(np.float32), places[..., 0], places[..., 1], cv2.INTER_CUBIC
+    )
+    gray = np.clip(np.round(colour + rng.normal(size=colour.shape) * 2), 0, 255).astype(np.uint8)
+    depth = t.reshape(SIZE[1], SIZE[0])
+    small = cv2.resize(depth, (320, 180), interpolation=cv2.INTER_AREA)
+    small = small + rng.normal(size=small.shape) * sigma_m
+    return LoopView(
+        gray, K,
+        DepthMap(
+            small.astype(np.float32), np.full(small.shape, sigma_m, np.float32),
+            np.full(small.shape, 2, np.uint8), scaled_K(K, 0.5, 0.5), np.eye(4),
+        ),
+    )  # fmt: skip
+
+
+A = camera(0.0, 0.0, 40.0, 0.0)
+
+
+@pytest.mark.parametrize("yaw", [0.1, 1.6, 3.1])
+def test_a_place_seen_again_is_found_from_any_side(yaw: float) -> None:
+    B = camera(5.0, -3.0, 41.0, yaw)
+    truth = se3.inverse(A) @ B
+    guess = se3.exp(np.array([0.01, -0.01, 0.03, 1.2, -0.9, 0.6])) @ truth
+    loop = verify(view(A, 1), view(B, 2), guess)
+    assert loop is not None
+    error = se3.log(loop.T_a_b @ se3.inverse(truth))
+    below = np.array([[0.0, 0.0, 40.0]])
+    miss = se3.transform(loop.T_a_b, below) - se3.transform(truth, below)
+    assert np.linalg.norm(miss) < 0.08
+    assert error @ np.linalg.solve(loop.covariance, error) < 30
+    assert loop.sources == ("epnp", "icp") and loop.matches > 60
+
+
+def test_a_guess_far_off_is_helped_by_the_pictures() -> None:
+    B = camera(4.0, 2.0, 40.0, 0.8)
+    truth = se3.inverse(A) @ B
+    guess = se3.exp(np.array([0.0, 0.0, 1.0, 14.0, -9.0, 0.0])) @ truth
+    loop = verify(view(A, 1), view(B, 2), guess)
+    assert loop is not None
+    miss = se3.transform(loop.T_a_b @ se3.inverse(truth), np.array([[0.0, 0.0, 40.0]]))
+    assert np.linalg.norm(miss - [[0.0, 0.0, 40.0]]) < 0.1
+
+
+def test_another_place_is_no_loop() -> None:
+    B = camera(3.0, 2.0, 40.0, 0.2)
+    guess = se3.inverse(A) @ B
+    assert verify(view(A, 1), view(B, 2, ground=3), guess) is None
+    assert verify(view(A, 1), view(camera(60.0, 55.0, 40.0, 0.2), 2), guess) is None
+
+
+def test_the_same_picture_over_another_relief_is_no_loop() -> None:
+    """Perfect matches whose depths contradict: the ground moved, or a picture repeats."""
+    B = camera(3.0, 2.0, 40.0, 0.2)
+    a, b = view(A, 1), view(B, 2)
+    v, u = np.mgrid[0:180, 0:320]
+    bent = b.depth.depth_m + 2.5 * np.sin(u / 20.0) * np.cos(v / 25.0)
+    other = DepthMap(
+        bent.astype(np.float32), b.depth.sigma_m, b.depth.views, b.depth.K, b.depth.T_world_camera
+    )
+    assert verify(a, LoopView(b.gray, K, other), se3.inverse(A) @ B) is None
+
+
+def test_without_texture_or_depth_there_is_no_loop() -> None:
+    B = camera(3.0, 2.0, 40.0, 0.2)
+    a, b, guess = view(A, 1), view(B, 2), se3.inverse(A) @ B
+    blank = LoopView(np.full_like(a.gray, 120), K, a.depth)
+    hollow = DepthMap(
+        np.full_like(a.depth.depth_m, np.nan), a.depth.sigma_m, a.depth.views, a.depth.K, np.eye(4)
+    )
+    assert verify(blank, b, guess) is None
+    assert verify(a, blank, guess) is None
+    assert verify(LoopView(a.gray, K, hollow), b, guess) is None
+
+
+def lawnmower() -> dict[int, F64]:
+    """Two legs of thirty keyframes, 12 m apart, flown there and back."""
+    out = {i: camera(4.0 * i, 0.0, 40.0, 0.0) for i in range(30)}
+    return out | {30 + i: camera(4.0 * (29 - i), 12.0, 40.0, np.pi) for i in range(30)}
+
+
+def test_candidates_are_the_earlier_views_of_the_same_ground() -> None:
+    poses = lawnmower()
+    found = candidates(poses, 55, K, SIZE, 40.0)
+    assert found and all(seq <= 55 - 15 for seq, _ in found)
+    shares = [share for _, share in found]
+    assert shares == sorted(shares, reverse=True) and shares[-1] >= 0.35
+    # Keyframe 55 is over x = 16 m: the first leg passed there at keyframe 4.
+    assert abs(found[0][0] - 4) <= 1
+    assert candidates(poses, 10, K, SIZE, 40.0) == []
+
+
+def test_two_verified_loops_close_the_map() -> None:
+    """The whole way: views that overlap, verification, and the graph's own doubt."""
+    poses = lawnmower()
+    rng = np.random.default_rng(0)
+    graph = PoseGraph()
+    odom = poses[0]
+    covariance = np.diag([1e-3**2] * 3 + [0.04**2] * 3)
+    last = poses[0]
+    for i, T in poses.items():
+        if i:
+            noise = se3.exp(rng.multivariate_normal(np.zeros(6), covariance))
+            odom = odom @ noise @ se3.inverse(last) @ T
+        last = T
+        graph.add_keyframe(i, i * 10**9, 0, odom, covariance, PosePrior())
+    flown = graph.poses()
+    before = np.linalg.norm(
+        (se3.inverse(flown[4]) @ flown[55] - se3.inverse(poses[4]) @ poses[55])[:3, 3]
+    )
+    bent = []
+    for a, b in ((4, 55), (6, 53)):
+        guess = se3.inverse(flown[a]) @ flown[b]
+        loop = verify(view(poses[a], a), view(poses[b], b), guess)
+        assert loop is not None
+        bent.append(graph.add_loop(a, b, loop.T_a_b, loop.covariance))
+    assert bent == [False, True]
+    closed = graph.poses()
+    after = np.linalg.norm(
+        (se3.inverse(closed[4]) @ closed[55] - se3.inverse(poses[4]) @ poses[55])[:3, 3]
+    )
+    assert after < 0.15 < before
+
+
+def test_wrong_parameters_are_named() -> None:
+    with pytest.raises(ValueError, match="least_gap"):
+        LoopConfig(least_gap=0)
+    with pytest.raises(ValueError, match="least_overlap"):
+        LoopConfig(least_overlap=0.0)
