@@ -29,6 +29,7 @@ class PnpConfig:
     min_inlier_share: float = 0.3  # of the points given
     max_sigma_share: float = 0.03  # sigma of the position over the median depth, at most
     floor_px: float = 0.1  # least error assumed of a match, 1 sigma
+    prior_share: float = 0.7  # of the points near the prior's pixels: no random draw needed
     max_prior_rotation_rad: float = 0.35  # a pose this far from the prior needs most points
 
     def __post_init__(self) -> None:
@@ -75,7 +76,7 @@ def solve(
     """The pose that projects ``points_m`` (N, 3) to ``uv_px`` (N, 2), or None without trust.
 
     ``K`` (3, 3) is of the undistorted picture. ``prior_T_camera_points`` (4, 4) competes with
-    RANSAC's answer as a start, and a result that turns far away from it must explain most of
+    EPnP's answer as a start, and a result that turns far away from it must explain most of
     the points. Points or pixels that are not finite are outliers. None: too few inliers, too
     loose a fit, or points so placed that the position stays open. Raises ValueError on wrong
     shapes.
@@ -93,10 +94,8 @@ def solve(
     middle = np.median(points[finite], axis=0)
     local, pixels = points[finite] - middle, uv[finite]
     shift = se3.compose(np.eye(3), middle)
-    starts = [] if prior_T_camera_points is None else [prior_T_camera_points @ shift]
-    ransac = _ransac(local, pixels, K, config)
-    if ransac is not None:
-        starts.append(ransac)
+    prior = None if prior_T_camera_points is None else prior_T_camera_points @ shift
+    starts = _starts(local, pixels, K, prior, config)
     T = _best(starts, local, pixels, K, config)
     if T is None:
         return None
@@ -104,6 +103,29 @@ def solve(
     inliers = np.zeros(len(points), bool)
     inliers[finite] = error <= config.threshold_px
     return _judge(T @ se3.inverse(shift), points, uv, K, inliers, prior_T_camera_points, config)
+
+
+def _starts(points: F64, uv: F64, K: F64, prior: F64 | None, config: PnpConfig) -> list[F64]:
+    """Poses to start from: the prior, and EPnP's.
+
+    Where the prior already explains most points to a few pixels, EPnP takes those; a random
+    draw could find nothing larger. Else RANSAC draws.
+    """
+    if prior is not None:
+        near = _errors(prior, points, uv, K) <= 3.0 * config.threshold_px
+        if np.mean(near) >= config.prior_share:
+            direct = _epnp(points[near], uv[near], K)
+            return [prior] if direct is None else [prior, direct]
+    drawn = _ransac(points, uv, K, config)
+    return [T for T in (prior, drawn) if T is not None]
+
+
+def _epnp(points: F64, uv: F64, K: F64) -> F64 | None:
+    """(4, 4) EPnP pose of all points, or None. Eq. (6), (7)."""
+    found, rvec, tvec = cv2.solvePnP(points, uv, K, None, flags=cv2.SOLVEPNP_EPNP)
+    if not found or not (np.isfinite(rvec).all() and np.isfinite(tvec).all()):
+        return None
+    return _motion(rvec, tvec)
 
 
 def _ransac(points: F64, uv: F64, K: F64, config: PnpConfig) -> F64 | None:

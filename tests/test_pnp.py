@@ -141,6 +141,17 @@ def test_a_prior_helps_where_outliers_win_the_draw() -> None:
     assert found == 6
 
 
+@pytest.mark.parametrize("relief_m", [12.0, 0.0])
+def test_a_near_prior_gives_the_same_pose_without_drawing(relief_m: float) -> None:
+    for seed in range(6):
+        s = scene(seed, relief_m=relief_m, outliers=0.2)
+        prior = se3.exp(np.array([0.001, -0.001, 0.002, 0.05, 0.04, -0.1])) @ s.T
+        drawn, near = pnp.solve(s.points, s.uv, K), pnp.solve(s.points, s.uv, K, None, prior)
+        assert drawn is not None and near is not None
+        np.testing.assert_allclose(near.T_camera_points, drawn.T_camera_points, atol=2e-3)
+        assert np.mean(near.inliers == drawn.inliers) > 0.99
+
+
 def test_a_wrong_prior_does_no_harm() -> None:
     s = scene(5)
     prior = se3.exp(np.array([0.3, -0.4, 1.0, 30.0, 2.0, -9.0])) @ s.T
