@@ -74,9 +74,10 @@ class Undistorter:
         self._maps: tuple[F32, F32] | None = None
         self.valid: U8 = np.full((camera.size_px[1], camera.size_px[0]), 255, np.uint8)
         if np.any(camera.distortion):
-            self._maps = cv2.initUndistortRectifyMap(
+            u_px, v_px = cv2.initUndistortRectifyMap(
                 camera.K, camera.distortion, np.eye(3), camera.K, camera.size_px, cv2.CV_32FC1
             )
+            self._maps = np.asarray(u_px, np.float32), np.asarray(v_px, np.float32)
             self.valid = np.asarray(
                 cv2.remap(self.valid, *self._maps, cv2.INTER_NEAREST), dtype=np.uint8
             )
