@@ -1,8 +1,8 @@
 """The files of a finished (or still growing) scan, made from its store alone.
 
 Drone and ground hold the same store, so both make the same files: ``cloud.laz``,
-``trajectory.tum``, ``trajectory.csv``, ``scan.json`` and ``preview.jpg``. Each is written
-beside its place and then renamed, so a reader never sees half a file.
+``trajectory.tum``, ``trajectory.csv``, ``scan.json``, ``preview.jpg`` and ``report.html``.
+Each is written beside its place and then renamed, so a reader never sees half a file.
 """
 
 from __future__ import annotations
@@ -28,13 +28,14 @@ from service.fused_cloud import FusedCloud, fused_cloud
 from service.georeference import LocalFrame
 from service.las import write_laz
 from service.preview import blank_preview, draw_preview
+from service.report import report_html
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
 
 CLOUD, TUM, CSV = "cloud.laz", "trajectory.tum", "trajectory.csv"
-SUMMARY, PREVIEW = "scan.json", "preview.jpg"
+SUMMARY, PREVIEW, REPORT = "scan.json", "preview.jpg", "report.html"
 NO_GEOREFERENCE = (
     "no georeference: coordinates are metres east, north and up of the scan's own origin"
 )
@@ -80,8 +81,12 @@ def write_deliverables(
         part.write_text(_tum(poses), encoding="ascii")
     with writing(folder / CSV) as part:
         part.write_text(_csv(poses), encoding="utf-8")
+    preview = _preview(raster, poses, summary)
     with writing(folder / PREVIEW) as part:
-        part.write_bytes(_preview(raster, poses, summary))
+        part.write_bytes(preview)
+    with writing(folder / REPORT) as part:
+        page = report_html(summary, poses, fused.cloud, raster, preview)
+        part.write_text(page, encoding="utf-8")
     with writing(folder / SUMMARY) as part:
         part.write_text(json.dumps(summary, indent=2, sort_keys=True) + "\n", encoding="utf-8")
     return summary

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,16 @@ from recon import se3
 from recon.types import F64
 from service.errors import OutsideError
 from service.georeference import LocalFrame
-from service.scan_folder import CLOUD, CSV, PREVIEW, SUMMARY, TUM, latest, write_deliverables
+from service.scan_folder import (
+    CLOUD,
+    CSV,
+    PREVIEW,
+    REPORT,
+    SUMMARY,
+    TUM,
+    latest,
+    write_deliverables,
+)
 from service.stream.records import Repose, ScanHeader
 from service.stream.store import ScanStore
 
@@ -89,7 +99,7 @@ def test_both_ends_write_the_same_bytes(tmp_path: Path, house: HouseFlight) -> N
         write_deliverables(tmp_path / "air", air, {})
         write_deliverables(tmp_path / "ground", ground, {})
         ground.close()
-    for name in (CLOUD, TUM, CSV, SUMMARY, PREVIEW):
+    for name in (CLOUD, TUM, CSV, SUMMARY, PREVIEW, REPORT):
         assert (tmp_path / "air" / name).read_bytes() == (tmp_path / "ground" / name).read_bytes()
 
 
@@ -171,3 +181,22 @@ def test_nothing_half_written_is_left(tmp_path: Path, house: HouseFlight) -> Non
             write_deliverables(tmp_path / "blocked", store, {})
         write_deliverables(tmp_path, store, {})
     assert not list(tmp_path.rglob("*.part"))
+
+
+def test_the_report_says_what_was_flown_and_nothing_runs_in_it(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    with house.flown(tmp_path) as store:
+        store.update_header(notes=("<script>alert(1)</script>",))
+        run = {"frames": 5, "refusals": {"too <little> motion": 3}, "stage_ms": {"track": 2.5}}
+        write_deliverables(tmp_path, store, run)
+    page = (tmp_path / REPORT).read_text()
+    assert "<script" not in page and "&lt;script&gt;" in page
+    assert "too &lt;little&gt; motion" in page
+    assert "EPSG:32632" in page and "47.3900000" in page
+    assert page.count("data:image/png;base64,") == 2
+    assert page.count("<svg") == 4  # no height above ground was recorded
+    assert "http" not in page  # nothing is fetched
+    rows = dict(re.findall(r"<tr><td>(.*?)</td><td>(.*?)</td></tr>", page))
+    assert rows["lasted"] == "4 s"
+    assert rows["speed, median"] == "5.0 m/s"
