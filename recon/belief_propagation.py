@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from recon.disparity_selection import check_visibility, select
-from recon.matching_cost import COST_UNIT, MatchingCostConfig, check_pair, matching_cost
+from recon.matching_cost import COST_UNIT, MatchingCostConfig, check_pair, matching_cost, plain
 from recon.message_passing import MAX_TRUNCATION, Smoothness, propagate
 from recon.types import F32, U8, DisparityMap
 
@@ -75,7 +75,9 @@ def belief_propagation(
     """
     check_pair(left, right, labels)
     cost = matching_cost(left, right, labels, config.cost, config.min_disparity)
-    data, messages = propagate(cost, left, config.iterations, config.levels, config.smoothness)
+    data, messages = propagate(
+        cost, plain(left), config.iterations, config.levels, config.smoothness
+    )
     px, confidence = select(
         data, messages, cost, config.min_disparity, config.truncation, config.min_evidence
     )

@@ -46,7 +46,7 @@ def select(
     height, _, width = cost.shape
     px = np.empty((height, width), np.float32)
     confidence = np.empty((height, width), np.float32)
-    _select(data, messages, cost, min_disparity, truncation, min_evidence, px, confidence)
+    _select(data, messages, cost, min_disparity, truncation, float(min_evidence), px, confidence)
     return px, confidence
 
 
@@ -61,7 +61,7 @@ def check_visibility(
     surface that is no wider than the step in disparity. What is neither believed nor filled
     becomes NaN.
     """
-    _check_visibility(px, confidence, min_disparity, tolerance, fill)
+    _check_visibility(px, confidence, min_disparity, float(tolerance), bool(fill))
 
 
 @njit(cache=True, nogil=True)

@@ -71,6 +71,7 @@ def matching_cost(
     pixel's best seen label, so that neighbours decide. Raises ValueError for bad shapes.
     """
     check_pair(left, right, labels)
+    left, right = plain(left), plain(right)
     height, width = left.shape
     cost = np.empty((height, labels, width), np.int16)
     _cost_volume(
@@ -87,6 +88,14 @@ def matching_cost(
         cost,
     )
     return cost
+
+
+def plain(array: Any) -> Any:
+    """The array, or a copy: in C order and writeable, as the kernels are compiled for.
+
+    Any other kind would be compiled anew, which takes seconds, in flight.
+    """
+    return np.require(array, requirements=["C", "W"])
 
 
 def check_pair(left: U8, right: U8, labels: int) -> None:

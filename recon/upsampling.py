@@ -17,6 +17,7 @@ import numpy.typing as npt
 from numba import njit, prange, types
 from numba.extending import intrinsic
 
+from recon.matching_cost import plain
 from recon.types import F32, U8, Bool, DisparityMap
 
 I32 = npt.NDArray[np.int32]
@@ -102,13 +103,13 @@ def _joint_bilateral(coarse: DisparityMap, guide: U8, config: UpsamplingConfig) 
     out, sure = np.empty((2, *shape), np.float32)
     _bilateral(
         _taps(coarse, guide, scale),
-        guide,
+        plain(guide),
         np.pad(base_x, (0, pad), mode="edge"),
         base_y,
         np.pad(spatial_x, ((0, pad), (0, padded)), constant_values=OUTSIDE),
         np.ascontiguousarray(spatial_y.T),
         scale,
-        config.min_support,
+        float(config.min_support),
         out,
         sure,
     )
@@ -128,7 +129,8 @@ def _taps(coarse: DisparityMap, guide: U8, scale: float) -> F32:
     """Colour (3), confidence * disparity, confidence and known, as (h, 6, w) float32."""
     h, w = coarse.px.shape
     taps = np.empty((h, CHANNELS, w), np.float32)
-    _fill_taps(coarse.px, coarse.confidence, guide_at_taps(guide, (h, w)), scale, taps)
+    colour = guide_at_taps(guide, (h, w))
+    _fill_taps(plain(coarse.px), plain(coarse.confidence), colour, scale, taps)
     return taps
 
 

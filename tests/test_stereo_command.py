@@ -65,7 +65,9 @@ def test_writes_disparity_in_pixels(
     assert report["known_share"] == pytest.approx(np.isfinite(px).mean())
     assert abs(np.nanmedian(px[:, 20:]) - 9.5) < 0.1
     assert np.isfinite(px[:, 24:]).mean() > 0.98
-    assert np.shape(cv2.imread(str(picture))) == (80, 160, 3)
+    drawn = cv2.imread(str(picture))
+    assert drawn is not None
+    assert drawn.shape == (80, 160, 3)
 
 
 @pytest.mark.parametrize(

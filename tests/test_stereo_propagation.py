@@ -270,6 +270,32 @@ def test_result_does_not_depend_on_the_number_of_threads() -> None:
     np.testing.assert_array_equal(many.confidence, one.confidence)
 
 
+def test_read_only_and_strided_images_compile_nothing_new() -> None:
+    from recon import disparity_selection, message_passing, upsampling
+    from recon.types import DisparityMap
+
+    image = np.random.default_rng(0).integers(0, 256, (40, 60), np.uint8)
+    guide = np.random.default_rng(1).integers(0, 256, (80, 120, 3), np.uint8)
+    kernels = (
+        message_passing._sweeps, message_passing._weights, disparity_selection._select,
+        disparity_selection._check_visibility, upsampling._bilateral, upsampling._fill_taps,
+    )  # fmt: skip
+
+    def once(image: U8, guide: U8, config: BeliefPropagationConfig) -> DisparityMap:
+        found = belief_propagation(image, image, 4, config)
+        return upsampling.upsample(found, guide, upsampling.UpsamplingConfig())
+
+    want = once(image, guide, BeliefPropagationConfig())
+    before = [len(kernel.signatures) for kernel in kernels]
+    strided = np.repeat(image, 2, axis=1)[:, ::2]
+    strided.flags.writeable = False
+    large = np.repeat(guide, 2, axis=1)[:, ::2]
+    large.flags.writeable = False
+    got = once(strided, large, replace(BeliefPropagationConfig(), occlusion_tolerance=1))
+    np.testing.assert_array_equal(got.px, want.px)
+    assert [len(kernel.signatures) for kernel in kernels] == before
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (3, 5), (7, 64), (8, 63)])
 def test_small_images_do_not_fail(shape: tuple[int, int]) -> None:
     image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
