@@ -269,50 +269,51 @@ def _interpolate(window: Any, fu: float, fv: float, pitch: int, rows: Any, out: 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _template(large: Any, n: int, pitch: int, kernels: Any) -> float:
-    """Fill ``kernels`` (4, n * pitch) from ``large`` (n + 2 squared); return its contrast.
+    """Fill kernels 0 to 2 of ``kernels`` (4, n * pitch) from ``large``; return its contrast.
 
-    Kernel 0 is the template, zero-mean and unit; 1 and 2 combine its slopes so that their
-    products with a patch are the Gauss-Newton step along u and v; they are free of constants
-    and of the template itself, so brightness and contrast do not move the step. Kernel 3 is
-    one inside the patch. Zero when the template has no two-dimensional texture.
+    ``large`` (n + 2, pitch) holds the patch and a border of one. Kernel 0 is the template,
+    zero-mean and unit; 1 and 2 combine its slopes so that their products with a patch are the
+    Gauss-Newton step along u and v; they are free of constants and of the template itself, so
+    brightness and contrast do not move the step. Kernel 3, given, is one inside the patch.
+    Zero when the template has no two-dimensional texture. Flat runs: rows have one pitch.
     """
-    kernels[:] = np.float32(0)
     patch, gx, gy, inside = kernels[0], kernels[1], kernels[2], kernels[3]
-    mean, power = 0.0, 0.0
-    for y in range(1, n + 1):
-        for x in range(1, n + 1):
-            mean += large[y, x]
-            power += large[y, x] * large[y, x]
-    mean /= n * n
-    power -= n * n * mean * mean
+    size, area = n * pitch - 3, np.float32(n * n)  # the last three lie outside the patch
+    flat = large.reshape(-1)
+    up, left, middle = flat[1:], flat[pitch:], flat[pitch + 1 :]
+    right, down = flat[pitch + 2 :], flat[2 * pitch + 1 :]
+    total, squares = np.float32(0), np.float32(0)
+    for i in range(size):
+        patch[i] = inside[i] * (middle[i] - np.float32(128))
+        total += patch[i]
+        squares += patch[i] * patch[i]
+    mean = total / area
+    power = squares - total * mean
     if power < 1e-3:
         return 0.0
-    scale = 1.0 / np.sqrt(power)
-    mx, my, dx, dy = 0.0, 0.0, 0.0, 0.0
-    for y in range(n):
-        for x in range(n):
-            i = y * pitch + x
-            patch[i] = scale * (large[y + 1, x + 1] - mean)
-            gx[i] = 0.5 * scale * (large[y + 1, x + 2] - large[y + 1, x])
-            gy[i] = 0.5 * scale * (large[y + 2, x + 1] - large[y, x + 1])
-            inside[i] = 1.0
-            mx += gx[i]
-            my += gy[i]
-            dx += gx[i] * patch[i]
-            dy += gy[i] * patch[i]
-    a, b, c = 0.0, 0.0, 0.0
-    for y in range(n):
-        for x in range(n):
-            i = y * pitch + x
-            gx[i] -= mx / (n * n) + dx * patch[i]
-            gy[i] -= my / (n * n) + dy * patch[i]
-            a += gx[i] * gx[i]
-            b += gy[i] * gy[i]
-            c += gx[i] * gy[i]
+    scale = np.float32(1.0 / np.sqrt(power))
+    half = np.float32(0.5) * scale
+    mx, my, dx, dy = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+    for i in range(size):
+        patch[i] = scale * (patch[i] - mean * inside[i])
+        gx[i] = half * inside[i] * (right[i] - left[i])
+        gy[i] = half * inside[i] * (down[i] - up[i])
+        mx += gx[i]
+        my += gy[i]
+        dx += gx[i] * patch[i]
+        dy += gy[i] * patch[i]
+    mx, my = mx / area, my / area
+    a, b, c = np.float32(0), np.float32(0), np.float32(0)
+    for i in range(size):
+        gx[i] -= mx * inside[i] + dx * patch[i]
+        gy[i] -= my * inside[i] + dy * patch[i]
+        a += gx[i] * gx[i]
+        b += gy[i] * gy[i]
+        c += gx[i] * gy[i]
     det = a * b - c * c
-    if det <= 1e-4 * (a + b) * (a + b):
+    if det <= np.float32(1e-4) * (a + b) * (a + b):
         return 0.0
-    for i in range(n * pitch):
+    for i in range(size):
         along = (b * gx[i] - c * gy[i]) / det
         gy[i] = (a * gy[i] - c * gx[i]) / det
         gx[i] = along
@@ -354,8 +355,10 @@ def refine(
     n = 2 * radius + 1
     pitch = n + 3
     for chunk in prange((N + CHUNK - 1) // CHUNK):
-        large = np.empty((n + 2, n + 2), np.float32)
-        kernels = np.empty((4, n * pitch), np.float32)
+        large = np.zeros((n + 2, pitch), np.float32)
+        kernels = np.zeros((4, n * pitch), np.float32)
+        for y in range(n):
+            kernels[3, y * pitch : y * pitch + n] = np.float32(1)
         window = np.empty(pitch * pitch, np.float32)
         rows, other = np.zeros(pitch * pitch, np.float32), np.empty(n * pitch, np.float32)
         sums = np.empty(4)
