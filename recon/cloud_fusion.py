@@ -5,7 +5,7 @@ The voxel keys are those of :mod:`recon.voxel_map`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from numba import njit
@@ -28,17 +28,56 @@ def fuse(clouds: Iterable[PointCloud], voxel_m: float) -> PointCloud:
     neighbours in one depth image, so together they count as the best of them for sigma and
     views; clouds count as independent down to CORRELATED_SHARE. A single-view point that
     stands alone is left out when surface seen more often, above or below it, contradicts it.
-    Order is that of the voxel keys, whatever the order of points in a cloud. Raises
-    ValueError for a voxel size that is not positive.
+    Order is that of the voxel keys (x first), whatever the order of points in a cloud.
+    Raises ValueError for a voxel size that is not positive.
+    """
+    return fuse_strips([lambda: clouds], [-np.inf, np.inf], voxel_m)
+
+
+def fuse_strips(
+    strips: Sequence[Callable[[], Iterable[PointCloud]]], edges_m: Sequence[float], voxel_m: float
+) -> PointCloud:
+    """As :func:`fuse`, one strip of x after the other, so that the sums of one are held.
+
+    ``strips[n]`` gives the clouds that reach into ``edges_m[n] <= x < edges_m[n + 1]``; their
+    points outside are passed over. Finite edges are moved to the voxel border below them, so
+    the result is that of the whole.
     """
     if not (np.isfinite(voxel_m) and voxel_m > 0.0):
         raise ValueError(f"voxel_m is {voxel_m}, must be positive")
-    sums = _Sums()
-    frame = "world"
-    for number, cloud in enumerate(clouds):
-        frame = cloud.frame
-        sums.add(cloud, number, 1.0 / voxel_m)
-    return sums.cloud(frame)
+    borders = np.floor(np.asarray(edges_m, np.float64) / voxel_m)
+    keys, clouds = [], []
+    for strip, low, high in zip(strips, borders[:-1], borders[1:], strict=True):
+        sums = _Sums()
+        for number, cloud in enumerate(strip()):
+            sums.add(_between(cloud, low, high, voxel_m), number, 1.0 / voxel_m)
+        key, mean = sums.means()
+        keys.append(key)
+        clouds.append(mean)
+    whole = PointCloud(
+        *(
+            np.concatenate([getattr(cloud, name) for cloud in clouds])
+            for name in ("xyz_m", "rgb", "sigma_m", "views")
+        )
+    )
+    lone = _lone_contradicted(np.concatenate(keys), whole.xyz_m, whole.sigma_m, whole.views)
+    return whole if not lone.any() else without(whole, lone)
+
+
+def without(cloud: PointCloud, mask: Bool) -> PointCloud:
+    """The points of ``cloud`` that ``mask`` (N,) does not mark."""
+    keep = ~mask
+    return PointCloud(
+        cloud.xyz_m[keep], cloud.rgb[keep], cloud.sigma_m[keep], cloud.views[keep], cloud.frame
+    )
+
+
+def _between(cloud: PointCloud, low: float, high: float, voxel_m: float) -> PointCloud:
+    """The points whose voxel's x index lies in [low, high)."""
+    if low == -np.inf and high == np.inf:
+        return cloud
+    index = np.floor(cloud.xyz_m[:, 0].astype(np.float64) * (1.0 / voxel_m))
+    return without(cloud, ~((index >= low) & (index < high)))
 
 
 class _Sums:
@@ -93,8 +132,8 @@ class _Sums:
             self.tags,
         )
 
-    def cloud(self, frame: str) -> PointCloud:
-        """The means."""
+    def means(self) -> tuple[I64, PointCloud]:
+        """The voxel keys, sorted, and the mean point of each."""
         at = np.flatnonzero(self.keys != -1)
         at = at[np.argsort(self.keys[at])]
         keys, rows = self.keys[at], self.ids[at]
@@ -103,10 +142,8 @@ class _Sums:
         rgb = np.clip(np.rint(self.rgb[rows] / weight[:, None]), 0, 255).astype(np.uint8)
         best = 1.0 / np.sqrt(self.info[rows, 2])
         sigma = np.maximum(1.0 / np.sqrt(self.info[rows, 0]), CORRELATED_SHARE * best)
-        sigma = sigma.astype(np.float32)
         views = np.minimum(self.tags[rows, 1], 255).astype(np.uint8)
-        keep = ~_lone_contradicted(keys, xyz, sigma, views)
-        return PointCloud(xyz[keep], rgb[keep], sigma[keep], views[keep], frame)
+        return keys, PointCloud(xyz, rgb, sigma.astype(np.float32), views)
 
 
 @njit(cache=True, nogil=True)

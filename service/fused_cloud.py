@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
-from recon.cloud_fusion import cloud_of, fuse
+from recon.cloud_fusion import cloud_of, fuse_strips, without
 from recon.free_space import seen_through
-from recon.types import PointCloud
+from recon.types import F64, PointCloud
 from recon.voxel_map import ground_sample_m
 from service.stream.store import ScanStore
 
-LARGEST_POINTS = 20_000_000
-"""Fused points at most; a scan that would have more gets larger voxels, and a note."""
+STRIP_POINTS = 4_000_000
+"""Points fused at a time; the sums of a strip take some hundred bytes each."""
+
+LARGEST_POINTS = 60_000_000
+"""Points before fusion at most; a scan with more gets larger voxels, and a note."""
 
 SMALLEST_VOXEL_M = 1e-3
+DEFAULT_VOXEL_M = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,33 +36,81 @@ class FusedCloud:
     notes: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Extent:
+    """What one keyframe covers."""
+
+    seq: int
+    points: int
+    ground_sample_m: float
+    west_m: float
+    east_m: float
+
+
 def fused_cloud(store: ScanStore, voxel_m: float | None = None) -> FusedCloud:
     """All keyframes of ``store`` fused; voxels of the ground sample distance by default.
 
-    Points that other keyframes see through are left out. The store is read three times, so
-    that memory holds one keyframe and the fused points only.
+    Points that other keyframes see through are left out. The store is read several times,
+    so that memory holds the fused points, and the sums of one strip of the site at a time.
     """
-    samples, points = [], 0
-    for keyframe in store.keyframes():
-        sample = ground_sample_m(keyframe.depth)
-        if sample is not None:
-            samples.append(sample)
-        points += int(np.isfinite(keyframe.depth.depth_m).sum())
-    sample = float(np.median(samples)) if samples else None
-    size = max(voxel_m or sample or 0.25, SMALLEST_VOXEL_M)
+    extents = _extents(store)
+    points = sum(e.points for e in extents)
+    sample = float(np.median([e.ground_sample_m for e in extents])) if extents else None
+    size = max(voxel_m or sample or DEFAULT_VOXEL_M, SMALLEST_VOXEL_M)
     notes: tuple[str, ...] = ()
     if points > LARGEST_POINTS:
         size *= float(np.sqrt(points / LARGEST_POINTS))
         notes = (f"{points} points before fusion: voxels enlarged to {size:.3f} m",)
-    cloud = fuse(_clouds(store), size)
+    edges = strip_edges(extents, STRIP_POINTS)
+    strips = [_strip(store, extents, a, b) for a, b in pairwise(edges)]
+    cloud = fuse_strips(strips, edges, size)
     if len(cloud):
-        keep = ~seen_through(cloud, (k.depth for k in store.keyframes()))
-        cloud = PointCloud(
-            cloud.xyz_m[keep], cloud.rgb[keep], cloud.sigma_m[keep], cloud.views[keep]
-        )
-    return FusedCloud(cloud, size, sample, len(samples), points, notes)
+        seqs = [e.seq for e in extents]
+        depths = (k.depth for seq in seqs if (k := store.keyframe(seq)) is not None)
+        cloud = without(cloud, seen_through(cloud, depths))
+    return FusedCloud(cloud, size, sample, len(extents), points, notes)
 
 
-def _clouds(store: ScanStore) -> Iterator[PointCloud]:
+def _extents(store: ScanStore) -> list[_Extent]:
+    """The keyframes that hold points."""
+    out = []
     for keyframe in store.keyframes():
-        yield cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh)
+        sample = ground_sample_m(keyframe.depth)
+        cloud = cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh)
+        if sample is not None and len(cloud):
+            x = cloud.xyz_m[:, 0]
+            out.append(_Extent(keyframe.seq, len(cloud), sample, float(x.min()), float(x.max())))
+    return out
+
+
+def strip_edges(extents: Iterable[_Extent], most_points: int) -> list[float]:
+    """Edges in x, from -inf to inf, between which lie about ``most_points`` at most.
+
+    A keyframe's points are taken as evenly spread over its width.
+    """
+    ends = [(e.west_m, e.points / max(e.east_m - e.west_m, 1e-3)) for e in extents]
+    ends += [(e.east_m, -e.points / max(e.east_m - e.west_m, 1e-3)) for e in extents]
+    if not ends:
+        return [-np.inf, np.inf]
+    table: F64 = np.array(sorted(ends))
+    x, density = table[:, 0], np.cumsum(table[:, 1])
+    held = np.concatenate([[0.0], np.cumsum(density[:-1] * np.diff(x))])
+    count = max(1, int(np.ceil(held[-1] / most_points)))
+    inner = np.interp(held[-1] * np.arange(1, count) / count, held, x)
+    return [-np.inf, *(float(v) for v in inner), np.inf]
+
+
+def _strip(
+    store: ScanStore, extents: list[_Extent], low_m: float, high_m: float
+) -> Callable[[], Iterator[PointCloud]]:
+    """The clouds of the keyframes that reach into a strip, read when asked for."""
+    margin = 1.0  # the edges are moved by up to a voxel
+    seqs = [e.seq for e in extents if e.east_m >= low_m - margin and e.west_m <= high_m + margin]
+
+    def clouds() -> Iterator[PointCloud]:
+        for seq in seqs:
+            keyframe = store.keyframe(seq)
+            if keyframe is not None:
+                yield cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh)
+
+    return clouds

@@ -25,7 +25,7 @@ def placed(cloud: PointCloud, frame: LocalFrame | None) -> F64:
 
 
 def las_header(xyz_m: F64, frame: LocalFrame | None, started_unix_ns: int) -> laspy.LasHeader:
-    """The header for points ``xyz_m``; its dates come from the scan, not from the clock."""
+    """The header for points about ``xyz_m``; its dates come from the scan, not from the clock."""
     import laspy
     from pyproj import CRS
 
@@ -37,7 +37,7 @@ def las_header(xyz_m: F64, frame: LocalFrame | None, started_unix_ns: int) -> la
         ]
     )
     header.scales = np.full(3, SCALE_M)
-    header.offsets = np.floor(xyz_m.min(axis=0)) if len(xyz_m) else np.zeros(3)
+    header.offsets = np.floor(xyz_m[0]) if len(xyz_m) else np.zeros(3)
     header.generating_software = "skyrelief"
     header.system_identifier = "camera stereo"
     when = dt.datetime.fromtimestamp(started_unix_ns / 1e9, dt.timezone.utc)
@@ -56,16 +56,16 @@ def write_laz(
     """
     import laspy
 
-    xyz = placed(cloud, frame)
-    header = las_header(xyz, frame, started_unix_ns)
+    header = las_header(placed(_cut(cloud, slice(0, 1)), frame), frame, started_unix_ns)
     kind: dict[str, Any] = {"do_compress": laz, "closefd": False}
     with open(path, "wb") as file, laspy.open(file, "w", header=header, **kind) as out:
-        for at in range(0, len(xyz), CHUNK_POINTS):
-            cut = slice(at, at + CHUNK_POINTS)
-            part = PointCloud(
-                cloud.xyz_m[cut], cloud.rgb[cut], cloud.sigma_m[cut], cloud.views[cut]
-            )
-            out.write_points(point_record(header, xyz[cut], part))
+        for at in range(0, len(cloud), CHUNK_POINTS):
+            part = _cut(cloud, slice(at, at + CHUNK_POINTS))
+            out.write_points(point_record(header, placed(part, frame), part))
+
+
+def _cut(cloud: PointCloud, cut: slice) -> PointCloud:
+    return PointCloud(cloud.xyz_m[cut], cloud.rgb[cut], cloud.sigma_m[cut], cloud.views[cut])
 
 
 def point_record(

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from recon import se3
 from recon.types import F64
 from service.errors import OutsideError
+from service.fused_cloud import _Extent, fused_cloud, strip_edges
 from service.georeference import LocalFrame
 from service.scan_folder import (
     CLOUD,
@@ -200,3 +201,29 @@ def test_the_report_says_what_was_flown_and_nothing_runs_in_it(
     rows = dict(re.findall(r"<tr><td>(.*?)</td><td>(.*?)</td></tr>", page))
     assert rows["lasted"] == "4 s"
     assert rows["speed, median"] == "5.0 m/s"
+
+
+def test_a_large_site_is_fused_strip_by_strip_to_the_same_cloud(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with house.flown(tmp_path) as store:
+        whole = fused_cloud(store)
+        monkeypatch.setattr("service.fused_cloud.STRIP_POINTS", 9000)
+        strips = fused_cloud(store)
+        monkeypatch.setattr("service.fused_cloud.LARGEST_POINTS", 18_000)
+        coarse = fused_cloud(store)
+    for name in ("xyz_m", "rgb", "sigma_m", "views"):
+        np.testing.assert_array_equal(getattr(strips.cloud, name), getattr(whole.cloud, name))
+    assert coarse.voxel_m == pytest.approx(2 * whole.voxel_m)
+    assert "enlarged" in coarse.notes[0]
+
+
+def test_strips_hold_equal_shares() -> None:
+    extents = [_Extent(k, 1000, 0.2, 5.0 * k, 5.0 * k + 40.0) for k in range(100)]
+    edges = strip_edges(extents, 9000)
+    assert edges[0] == -np.inf and edges[-1] == np.inf
+    assert len(edges) == 13
+    x = np.concatenate([np.linspace(e.west_m, e.east_m, 1000) for e in extents])
+    shares = np.histogram(x, [x.min() - 1, *edges[1:-1], x.max() + 1])[0]
+    assert shares.max() < 9000
+    assert strip_edges([], 10) == [-np.inf, np.inf]

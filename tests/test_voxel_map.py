@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.cloud_fusion import CORRELATED_SHARE, fuse
+from recon.cloud_fusion import CORRELATED_SHARE, fuse, fuse_strips
 from recon.types import F64, Bool, DepthMap, PointCloud
 from recon.voxel_map import VoxelMap, VoxelMapConfig, ground_sample_m
 
@@ -252,3 +252,23 @@ def test_unusable_points_are_left_out() -> None:
 def test_voxel_size_must_be_positive() -> None:
     with pytest.raises(ValueError, match="voxel_m"):
         fuse([], 0.0)
+
+
+def test_fusing_in_strips_gives_the_same_points() -> None:
+    rng = np.random.default_rng(8)
+    n = 4000
+    clouds = [
+        PointCloud(
+            rng.uniform([-20, -5, 0], [20, 5, 9], (n, 3)).astype(np.float32),
+            rng.integers(0, 256, (n, 3), dtype=np.uint8),
+            rng.uniform(0.05, 0.5, n).astype(np.float32),
+            rng.integers(1, 3, n).astype(np.uint8),
+        )
+        for _ in range(5)
+    ]
+    whole = fuse(clouds, 0.7)
+    edges = [-np.inf, -11.3, 0.0, 0.1, 6.66, np.inf]
+    parts = fuse_strips([lambda: clouds] * 5, edges, 0.7)
+    assert len(whole) < 5 * n
+    for name in ("xyz_m", "rgb", "sigma_m", "views"):
+        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
