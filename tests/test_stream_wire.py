@@ -96,7 +96,7 @@ def read_layer(data: bytes) -> dict[str, Any]:
         picture = imagecodecs.jpegls_decode(sections[1])
         codes = {(v, u): int(picture[v, u]) for v in range(h) for u in range(w) if mask[v][u]}
     sigma = imagecodecs.jpegls_decode(sections[2])
-    views = imagecodecs.jpegls_decode(sections[3])
+    views = imagecodecs.jpegls_decode(sections[3]) if sections[3] else np.ones((h, w), int)
     colour = np.asarray(Image.open(io.BytesIO(sections[4])))
     pixels = {
         (x + u, y + v): (

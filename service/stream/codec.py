@@ -30,7 +30,7 @@ class CodecConfig:
     reference_depth_m: float = 60.0
     colour_quality: int = 80  # JPEG, 1 to 100
     coarse_width_px: int = 80
-    coarse_depth_rms_m: float = 0.05
+    coarse_depth_rms_m: float = 0.1
     coarse_colour_quality: int = 25
     depth_method: int = planes.METHOD_PREDICTION  # or planes.METHOD_JPEG_LS
 
@@ -123,7 +123,7 @@ def _layer(
             planes.encode_mask(cut.known),
             planes.encode_depth(codes, cut.known, config.depth_method),
             planes.encode_sigma(cut),
-            planes.encode_views(cut),
+            planes.encode_views(cut) if layer == layers - 1 else b"",
             planes.encode_colour(cut, quality),
         )
     h, w = keyframe.depth.depth_m.shape

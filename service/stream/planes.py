@@ -210,7 +210,7 @@ def decode_sigma(data: bytes, w: int, h: int) -> F32 | None:
     return _enlarge(table.astype(np.float32)[np.minimum(codes, 255)], SIGMA_BLOCK_PX, w, h)
 
 
-# Views: least count of 2x2 blocks.
+# Views: least count of 2x2 blocks; coarse layers do not tell.
 
 
 def encode_views(planes: Planes) -> bytes:
@@ -226,7 +226,9 @@ def encode_views(planes: Planes) -> bytes:
 
 
 def decode_views(data: bytes, w: int, h: int) -> U8 | None:
-    """(h, w) counts of views."""
+    """(h, w) counts of views; an empty section means one."""
+    if not data:
+        return np.ones((h, w), np.uint8)
     codes = _open_jpeg_ls(data, -(-w // VIEWS_BLOCK_PX), -(-h // VIEWS_BLOCK_PX))
     if codes is None:
         return None

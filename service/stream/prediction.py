@@ -123,14 +123,17 @@ def _residuals(c: I64, k: I64, size: tuple[int, int], weights: I64) -> U16:
     at = 0
     for v in range(h):
         start = (v + MARGIN) * row + MARGIN
+        # Slices keep the compiler from checking every index for being negative.
+        known, code = k[start : start + w], c[start : start + w]
+        west_known, west = k[start - 1 : start - 1 + w], c[start - 1 : start - 1 + w]
         for u in range(w):
-            base[u] = _base(c, k, start + u, row, last)
-            if k[start + u]:
-                last = c[start + u]
+            base[u] = west[u] if west_known[u] else _base(c, k, start + u, row, last)
+            if known[u]:
+                last = code[u]
         _guess_row(real, there, start, row, base, f, guess)
         for u in range(w):
-            if k[start + u]:
-                r = ((c[start + u] - np.int64(guess[u]) + 32768) & 0xFFFF) - 32768
+            if known[u]:
+                r = ((code[u] - np.int64(guess[u]) + 32768) & 0xFFFF) - 32768
                 out[at] = (r << 1) ^ (r >> 63)
                 at += 1
     return out[:at]

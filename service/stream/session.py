@@ -105,6 +105,11 @@ def zenoh_config(config: SessionConfig) -> zenoh.Config:
         "connect/endpoints": [_small_buffer(e) for e in config.connect],
         "connect/timeout_ms": 0,
         "connect/exit_on_failure": config.mode == "client",
+        "connect/retry": {
+            "period_init_ms": 500,
+            "period_max_ms": 2000,
+            "period_increase_factor": 1.5,
+        },
         "listen/endpoints": list(config.listen),
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
