@@ -193,12 +193,12 @@ def _select(
                         confidence[v, u] = min(np.float32(1), margin) * min(np.float32(1), sure)
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _check_visibility(
     px: Any, confidence: Any, min_disparity: int, tolerance: float, fill: bool
 ) -> None:  # pragma: no cover - compiled
     height, width = px.shape
-    for v in prange(height):
+    for v in range(height):
         row = px[v]
         nearest = np.full(width, np.float32(-np.inf), np.float32)
         hidden = np.zeros(width, np.bool_)

@@ -120,10 +120,10 @@ def census(image: U8) -> U64:
     return words
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _census(padded: Any, words: Any) -> None:  # pragma: no cover - compiled
     height, width = words.shape
-    for v in prange(height):
+    for v in range(height):
         row = words[v]
         row[:] = np.uint64(0)
         centre = padded[v + CENSUS_RADIUS, CENSUS_RADIUS : CENSUS_RADIUS + width]

@@ -29,6 +29,9 @@ I16 = npt.NDArray[np.int16]
 LANES = 32
 """Cells that are updated together; LLVM spreads them over the registers that there are."""
 
+BAND_ROWS = 80
+"""Rows that are worth a thread: waiting for it costs more than a smaller band."""
+
 MAX_TRUNCATION = 2048
 """The largest truncation for which no sum leaves 16 bits."""
 
@@ -126,8 +129,11 @@ def propagate(
     for data, weight in zip(reversed(pyramid), reversed(weights), strict=True):
         messages = _start(messages, data, weight.shape[2])
         edges = _edges(weight, data.shape[3], smoothness.slope, truncation)
-        bands = max(1, min(get_num_threads(), data.shape[0] // (2 * iterations)))
-        _sweeps(data, messages, edges, weight.shape[2], iterations, bands)
+        bands = min(get_num_threads(), data.shape[0] // max(BAND_ROWS, 2 * iterations))
+        if bands > 1:
+            _sweeps(data, messages, edges, weight.shape[2], iterations, bands)
+        else:
+            _sweep_band(data, messages, edges, weight.shape[2], iterations, 0, 1)
     return pyramid[0], messages
 
 
@@ -136,13 +142,13 @@ def cells_of(width: int) -> int:
     return ((width + 1) // 2 // LANES + 1) * LANES
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _split(cost: Any, truncation: int) -> Any:  # pragma: no cover - compiled
     """(h, L, w) to (h, 2, L, cells), each pixel less its least cost and cut."""
     height, labels, width = cost.shape
     cells = ((width + 1) // 2 // LANES + 1) * LANES
     data = np.empty((height, 2, labels, cells), np.int16)
-    for v in prange(height):
+    for v in range(height):
         low = cost[v, 0].copy()
         for label in range(1, labels):
             row = cost[v, label]
@@ -161,7 +167,7 @@ def _split(cost: Any, truncation: int) -> Any:  # pragma: no cover - compiled
     return data
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _coarser(
     fine: Any, width: int, cells: int, truncation: int
 ) -> Any:  # pragma: no cover - compiled
@@ -169,7 +175,7 @@ def _coarser(
     fine_height, _, labels, _ = fine.shape
     height = (fine_height + 1) // 2
     data = np.empty((height, 2, labels, cells), np.int16)
-    for v in prange(height):
+    for v in range(height):
         below = 2 * v + 1 < fine_height
         top = np.int16(4 * truncation)
         for parity in range(2):
@@ -194,7 +200,7 @@ def _coarser(
     return data
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _start(coarse: Any, data: Any, width: int) -> Any:  # pragma: no cover - compiled
     """The messages that a level starts from: those of the coarser cells that it divides.
 
@@ -203,7 +209,7 @@ def _start(coarse: Any, data: Any, width: int) -> Any:  # pragma: no cover - com
     height, _, labels, cells = data.shape
     messages = np.zeros((4, height + 2, 2, labels, cells), np.int16)  # lanes beyond rows are read
     known = coarse.shape[4]
-    for r in prange(height + 2):
+    for r in range(height + 2):
         for direction in range(4):
             if r in (0, height + 1):
                 messages[direction, r] = 0
@@ -365,32 +371,57 @@ def _update_row(
         )
 
 
+@njit(cache=True, nogil=True)
+def _masks(width: int, cells: int) -> Any:  # pragma: no cover - compiled
+    """(2, cells) -1 where a cell of that parity is a pixel, else 0."""
+    masks = np.zeros((2, cells), np.int16)
+    masks[0, : (width + 1) // 2] = -1
+    masks[1, : width // 2] = -1
+    return masks
+
+
+@njit(cache=True, nogil=True)
+def _sweep_band(
+    data: Any, messages: Any, edges: Any, width: int, iterations: int, band: int, bands: int
+) -> None:  # pragma: no cover - compiled
+    """All iterations of a band of rows, as far as it can go alone, in one pass of the memory.
+
+    Iteration t of a row needs iteration t - 1 of the rows beside it, so a band does one row
+    less at each inner edge per iteration.
+    """
+    height, _, labels, cells = data.shape
+    masks = _masks(width, cells)
+    scratch = np.empty(labels * 4 * LANES, np.int16)
+    first, last = height * band // bands, height * (band + 1) // bands
+    for front in range(first, last + iterations):
+        for t in range(iterations):
+            v = front - t
+            begin = first + t if band > 0 else 0
+            end = last - t if band < bands - 1 else height
+            if begin <= v < end:
+                _update_row(data, messages, v, t & 1, edges, masks, scratch)
+
+
+@njit(cache=True, nogil=True)
+def _sweep_gap(
+    data: Any, messages: Any, edges: Any, width: int, iterations: int, edge: int
+) -> None:  # pragma: no cover - compiled
+    """What the bands on both sides of row ``edge`` left out."""
+    labels, cells = data.shape[2], data.shape[3]
+    masks = _masks(width, cells)
+    scratch = np.empty(labels * 4 * LANES, np.int16)
+    for t in range(1, iterations):
+        for v in range(edge - t, edge + t):
+            _update_row(data, messages, v, t & 1, edges, masks, scratch)
+
+
 @njit(cache=True, nogil=True, parallel=True)
 def _sweeps(
     data: Any, messages: Any, edges: Any, width: int, iterations: int, bands: int
 ) -> None:  # pragma: no cover - compiled
-    """Run the iterations of one level, each band of rows in one go so that it stays in cache.
-
-    Iteration t of a row needs iteration t - 1 of the rows beside it. A band does what it can
-    alone (one row less at each inner edge per iteration), then the gaps are filled.
-    """
-    height, _, labels, cells = data.shape
-    masks = np.zeros((2, cells), np.int16)
-    masks[0, : (width + 1) // 2] = -1
-    masks[1, : width // 2] = -1
+    """All iterations of a level, the bands in parallel."""
     for band in prange(bands):
-        scratch = np.empty(labels * 4 * LANES, np.int16)
-        first, last = height * band // bands, height * (band + 1) // bands
-        for front in range(first, last + iterations):
-            for t in range(iterations):
-                v = front - t
-                begin = first + t if band > 0 else 0
-                end = last - t if band < bands - 1 else height
-                if begin <= v < end:
-                    _update_row(data, messages, v, t & 1, edges, masks, scratch)
+        _sweep_band(data, messages, edges, width, iterations, band, bands)
     for band in prange(1, bands):
-        scratch = np.empty(labels * 4 * LANES, np.int16)
-        edge = height * band // bands
-        for t in range(1, iterations):
-            for v in range(edge - t, edge + t):
-                _update_row(data, messages, v, t & 1, edges, masks, scratch)
+        edge = data.shape[0] * band // bands
+        _sweep_gap(data, messages, edges, width, iterations, edge)

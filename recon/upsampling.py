@@ -134,11 +134,11 @@ def _taps(coarse: DisparityMap, guide: U8, scale: float) -> F32:
     return taps
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _fill_taps(
     px: Any, confidence: Any, colour: Any, scale: float, taps: Any
 ) -> None:  # pragma: no cover - compiled
-    for v in prange(px.shape[0]):
+    for v in range(px.shape[0]):
         for u in range(px.shape[1]):
             known = not np.isnan(px[v, u])
             c = max(confidence[v, u], np.float32(MIN_CONFIDENCE)) if known else np.float32(0)

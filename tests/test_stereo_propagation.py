@@ -258,7 +258,8 @@ def test_exposure_change_is_survived() -> None:
 def test_result_does_not_depend_on_the_number_of_threads() -> None:
     import numba
 
-    _, left, right = box_scene()
+    _, *views = box_scene()
+    left, right = (np.tile(view, (4, 1)) for view in views)  # tall enough for several bands
     many = belief_propagation(left, right, 20, BeliefPropagationConfig())
     threads = numba.get_num_threads()
     numba.set_num_threads(1)

@@ -44,10 +44,12 @@ def warm_up() -> None:
     from recon.registration import IcpConfig
 
     rng = np.random.default_rng(0)
-    guide = rng.integers(0, 256, (64, 96, 3), np.uint8)
+    guide = rng.integers(0, 256, (180, 320, 3), np.uint8)  # rows enough for several threads
     grey = np.ascontiguousarray(guide[:, :, 0])
     backend = CpuBackend()
-    found = backend.belief_propagation(grey, grey, 4, BeliefPropagationConfig(levels=2))
+    for fill in (False, True):
+        matching = BeliefPropagationConfig(fill_occluded=fill)
+        found = backend.belief_propagation(grey, grey, 4, matching)
     backend.upsample(found, guide, UpsamplingConfig())
     depth = DepthMap(
         np.full((64, 96), 50, np.float32),

@@ -92,7 +92,6 @@ def matching_config(iterations: int, min_disparity: int, checked: bool) -> Belie
             min_evidence=0.1,
             min_contrast=0.3,
             fill_occluded=True,
-            speckle_px=0,
         )
     except ValueError as error:
         raise InputError(f"stereo: {error}") from error
