@@ -27,6 +27,7 @@ rm -rf "$out"
 mkdir -p "$out/wheels"
 cp -r "$here/deploy" "$here/systemd" "$here/pyproject.toml" "$here/README.md" "$out/"
 
+[[ $extras == *ground* ]] || export SKYRELIEF_NO_PORTAL=1
 "$python" -m pip wheel -q --disable-pip-version-check --no-deps -w "$out/wheels" "$here"
 wheel=$(find "$out/wheels" -name 'skyrelief-*.whl')
 

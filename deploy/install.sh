@@ -74,6 +74,8 @@ build_version() {
   rm -rf "$part"
   mkdir -p "$versions"
   site=$(site_packages)
+  # The portal's page is for the ground only.
+  [[ $unit == skyrelief-ground ]] || export SKYRELIEF_NO_PORTAL=1
   say "making $target${site:+ (with the packages of the system)}"
   # shellcheck disable=SC2086  # empty or one word
   "$python" -m venv $site "$part"
