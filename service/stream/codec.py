@@ -26,7 +26,7 @@ class CodecConfig:
     ``depth_rms_m`` at ``reference_depth_m``; the error grows with the depth squared.
     """
 
-    depth_rms_m: float = 0.004
+    depth_rms_m: float = 0.00398
     reference_depth_m: float = 60.0
     colour_quality: int = 80  # JPEG, 1 to 100
     coarse_width_px: int = 80
@@ -71,7 +71,7 @@ def encode(
     _check(keyframe, w, h)
     with np.errstate(invalid="ignore"):
         known = keyframe.fresh & (depth.depth_m > 1e-3) & (depth.depth_m < 1e5)
-    fine = planes.Planes(depth.depth_m, depth.sigma_m, depth.views, keyframe.bgr, known)
+    fine = planes.planes_of(depth, keyframe.bgr, known)
     factor = -(-w // config.coarse_width_px)
     fine_place = (0, 1, 1) if factor == 1 else (1, 2, 1)
     fine_layer = _layer(

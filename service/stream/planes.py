@@ -13,7 +13,7 @@ import imagecodecs
 import numpy as np
 import numpy.typing as npt
 
-from recon.types import F32, U8, Array, Bool
+from recon.types import F32, U8, Array, Bool, DepthMap
 from service.stream import mask_coder, prediction
 
 U16 = npt.NDArray[np.uint16]
@@ -36,7 +36,7 @@ class Planes:
     """What a layer carries, pixel by pixel; all but ``known`` is arbitrary where not known."""
 
     depth_m: F32  # (h, w)
-    sigma_m: F32  # (h, w)
+    sigma_m: F32  # (h, w), 0 where there is none
     views: U8  # (h, w)
     bgr: U8  # (h, w, 3)
     known: Bool  # (h, w)
@@ -48,6 +48,14 @@ class Planes:
         return Planes(
             self.depth_m[cut], self.sigma_m[cut], self.views[cut], self.bgr[cut], self.known[cut]
         )
+
+
+def planes_of(depth: DepthMap, bgr: U8, known: Bool) -> Planes:
+    """The planes of a depth map and its colour."""
+    with np.errstate(invalid="ignore"):
+        good = known & (depth.sigma_m > 0) & (depth.sigma_m < 1e6)
+    sigma = depth.sigma_m if good.all() else np.where(good, depth.sigma_m, np.float32(0))
+    return Planes(depth.depth_m, sigma.astype(np.float32, copy=False), depth.views, bgr, known)
 
 
 def bounding_box(known: Bool) -> tuple[int, int, int, int]:
@@ -74,6 +82,14 @@ def block_mean(plane: F32, factor: int) -> F32:
     return np.asarray(cv2.resize(plane, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
 
 
+def _share(known: Bool, factor: int) -> F32:
+    """The share of each block that is known."""
+    h, w = known.shape
+    if h % factor == 0 and w % factor == 0 and known.all():
+        return np.ones((h // factor, w // factor), np.float32)
+    return block_mean(known.astype(np.float32), factor)
+
+
 def _middle(plane: Array, factor: int) -> Array:
     """The pixel in the middle of each block (the last one where the block is cut off)."""
     h, w = plane.shape[:2]
@@ -84,8 +100,7 @@ def _middle(plane: Array, factor: int) -> Array:
 
 def reduce(full: Planes, factor: int) -> Planes:
     """``full`` at 1/factor of its size; a block is known when a quarter of it is."""
-    weight = full.known.astype(np.float32)
-    share = block_mean(weight, factor)
+    share = _share(full.known, factor)
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(full.known, np.float32(1.0) / full.depth_m, np.float32(0.0))
     scale = 1.0 / np.maximum(share, 1e-6)
@@ -102,10 +117,11 @@ def reduce(full: Planes, factor: int) -> Planes:
     else:
         masked = (full.bgr * full.known[..., None]).astype(np.float32)
         bgr = _near(block_mean(masked, factor) * scale[..., None], 0, 255)
-        views = _near(block_mean(full.views * weight, factor) * scale, 0, 255)
+        masked = (full.views * full.known).astype(np.float32)
+        views = _near(block_mean(masked, factor) * scale, 0, 255)
     return Planes(
         np.asarray(1.0 / np.where(known, mean, 1.0), np.float32),
-        np.asarray(block_mean(_finite_sigma(full), factor) * scale, np.float32),
+        np.asarray(block_mean(full.sigma_m, factor) * scale, np.float32),
         np.clip(views, 1, MAX_VIEWS),
         bgr,
         known,
@@ -114,11 +130,6 @@ def reduce(full: Planes, factor: int) -> Planes:
 
 def _near(values: Array, low: int, high: int) -> U8:
     return np.clip(np.rint(values), low, high).astype(np.uint8)
-
-
-def _finite_sigma(planes: Planes) -> F32:
-    good = planes.known & (planes.sigma_m > 0) & (planes.sigma_m < 1e6)
-    return np.where(good, planes.sigma_m, np.float32(0)).astype(np.float32)
 
 
 def _fill_back(values: Array, known: Bool) -> Array:
@@ -187,8 +198,8 @@ def decode_depth(data: bytes, known: Bool, method: int, low: float, step: float)
 
 def encode_sigma(planes: Planes) -> bytes:
     """The section of sigma: one code per block of SIGMA_BLOCK_PX."""
-    sigma = _finite_sigma(planes)
-    share = block_mean((sigma > 0).astype(np.float32), SIGMA_BLOCK_PX)
+    sigma = planes.sigma_m
+    share = _share(sigma > 0, SIGMA_BLOCK_PX)
     has = share > 0
     if not has.any():
         return b""

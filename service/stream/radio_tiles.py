@@ -16,7 +16,7 @@ GRID_WIDTH_PX = 40
 def tiles_of(coarse: Keyframe) -> list[Tile]:
     """The tiles of a keyframe's coarse layer that hold anything, at most 40 px across."""
     depth = coarse.depth
-    full = planes.Planes(depth.depth_m, depth.sigma_m, depth.views, coarse.bgr, coarse.fresh)
+    full = planes.planes_of(depth, coarse.bgr, coarse.fresh)
     factor = -(-full.known.shape[1] // GRID_WIDTH_PX)
     small = planes.reduce(full, factor)
     K = np.array(depth.K)
