@@ -36,6 +36,7 @@ log = logging.getLogger(__name__)
 
 CLOUD, TUM, CSV = "cloud.laz", "trajectory.tum", "trajectory.csv"
 SUMMARY, PREVIEW, REPORT = "scan.json", "preview.jpg", "report.html"
+PREVIEW_CELLS = 6e6
 NO_GEOREFERENCE = (
     "no georeference: coordinates are metres east, north and up of the scan's own origin"
 )
@@ -126,14 +127,17 @@ def latest(poses: Iterator[PoseRecord]) -> list[PoseRecord]:
     return sorted({p.time_unix_ns: p for p in poses}.values(), key=lambda p: p.time_unix_ns)
 
 
-def surface(fused: FusedCloud) -> Raster | None:
-    """The upper surface in the scan's own ENU metres, or None without points."""
+def surface(fused: FusedCloud, most_cells: float = PREVIEW_CELLS) -> Raster | None:
+    """The upper surface in the scan's own ENU metres, or None without points.
+
+    Cells are the voxels, doubled until there are at most ``most_cells`` in the rectangle.
+    """
     if not len(fused.cloud):
         return None
     xy = fused.cloud.xyz_m[:, :2].astype(np.float64)
     cell = fused.voxel_m
     span = np.ptp(xy, axis=0)
-    while float(np.prod(span / cell + 2.0)) > 40e6:
+    while float(np.prod(span / cell + 2.0)) > most_cells:
         cell *= 2.0
     return rasterise(fused.cloud, grid_over(xy, cell, margin_cells=1))
 

@@ -16,6 +16,7 @@ from service.exports.glb import glb
 from service.exports.view import ExportOptions, ScanView
 from service.scan_folder import surface, writing
 
+MESH_CELLS = 16e6
 METHODS = ("auto", "height", "poisson")
 OBLIQUE_SHARE = 0.25
 """Above this share of keyframes that look more than 30 degrees off nadir, auto is Poisson."""
@@ -59,7 +60,7 @@ def write_mesh(
 
 def _height(scan: ScanView, largest_faces: int, options: ExportOptions) -> tuple[Mesh, U8 | None]:
     options.progress("fusing the cloud")
-    raster = surface(scan.fused)
+    raster = surface(scan.fused, MESH_CELLS)
     if raster is None:
         raise ValueError("it has no points")
     options.progress("filling and smoothing the surface")
