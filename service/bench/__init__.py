@@ -21,10 +21,12 @@ from typing import Any
 BENCHMARKS: dict[str, str] = {
     "stereo": "service.bench.stereo:run",
     "upsample": "service.bench.upsample:run",
+    "gpu": "service.bench.gpu:run",
     "matching": "service.bench.matching:run",
     "pose": "service.bench.pose:run",
     "icp": "service.bench.icp:run",
     "map": "service.bench.map:run",
+    "pipeline": "service.bench.pipeline:run",
     "mavlink": "service.bench.mavlink:run",
     "codec": "service.bench.codec:run",
     "link": "service.bench.link:run",

@@ -162,6 +162,9 @@ def _epoch(
 
     if video_epoch is not None:
         epoch_ns = round(video_epoch * 1e9)
+    elif log is not None and log.clock != "unix":  # time 0 of the video, or of the autopilot
+        epoch_ns = 0 if log.clock == "video" else log.first_ns
+        notes.append(f"the log holds no date: times count from the start of the {log.clock}")
     elif source.epoch_unix_ns is not None:
         epoch_ns = source.epoch_unix_ns
     elif log is not None:
