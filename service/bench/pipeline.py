@@ -17,7 +17,7 @@ import numpy as np
 
 from recon import se3
 from recon.belief_propagation import BeliefPropagationConfig
-from recon.types import F64, U8, Camera, DepthMap, DisparityMap, Registration
+from recon.types import F32, F64, U8, Camera, DepthMap, DisparityMap, Registration
 from service.bench import BenchOptions, BenchResult
 
 SIZE = (1280, 720)
