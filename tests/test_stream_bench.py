@@ -1,0 +1,62 @@
+"""The link emulator does what it says, and a short trial over it loses nothing."""
+
+from __future__ import annotations
+
+import pytest
+
+from service.bench.link_emulator import LinkModel, Traffic, _Pipe
+
+WIRE = 1400 + 52
+
+
+def test_a_pipe_serialises_at_its_rate_and_delays() -> None:
+    pipe = _Pipe(LinkModel(rate_kbit_s=1000.0, delay_s=0.05), 0.0, 1)
+    out = [pipe.send(1400, 0.0, stream=True) for _ in range(10)]
+    for k, at in enumerate(out):
+        assert at == pytest.approx((k + 1) * WIRE / 125_000 + 0.05)
+    assert pipe.backlog_bytes(0.0) == pytest.approx(10 * WIRE)
+
+
+def test_a_cut_holds_a_stream_and_swallows_datagrams() -> None:
+    model = LinkModel(rate_kbit_s=1000.0, delay_s=0.0, cuts=((1.0, 3.0),))
+    stream, datagrams = _Pipe(model, 0.0, 1), _Pipe(model, 0.0, 1)
+    assert stream.send(100, 1.5, stream=True) == pytest.approx(3.0 + 152 / 125_000)
+    assert datagrams.send(100, 1.5, stream=False) is None
+    assert datagrams.send(100, 3.5, stream=False) is not None
+
+
+def test_loss_has_its_share_and_stalls_a_stream() -> None:
+    model = LinkModel(rate_kbit_s=1e6, delay_s=0.1, loss=0.03)
+    datagrams = _Pipe(model, 0.0, 7)
+    lost = sum(datagrams.send(100, float(k), stream=False) is None for k in range(5000))
+    assert 100 < lost < 200
+    stream = _Pipe(model, 0.0, 7)
+    late = [k for k in range(5000) if (stream.send(100, float(k), True) or 0) - k > 0.25]
+    assert len(late) == lost
+
+
+def test_the_busiest_window_is_found() -> None:
+    traffic = Traffic([(0.0, 10), (0.9, 20), (1.5, 30), (1.8, 40), (5.0, 5)])
+    assert traffic.busiest_window_bytes() == 90
+    assert traffic.total_bytes() == 105
+
+
+def test_a_short_trial_with_a_cut_delivers_everything() -> None:
+    pytest.importorskip("zenoh")
+    from service.bench.link import Trial, fly
+
+    link = LinkModel(rate_kbit_s=3000.0, delay_s=0.02, loss=0.02, cuts=((2.0, 3.5),))
+    outcome = fly(Trial(link, flight_s=5.0, keyframes_hz=3.0, drain_s=60.0))
+    assert outcome.made == 45
+    assert outcome.delivered == outcome.made
+    assert outcome.busiest_share < 1.3
+
+
+def test_keyframes_of_the_bench_are_what_they_say() -> None:
+    import numpy as np
+
+    from service.bench.keyframes import make_keyframe, strip
+
+    frame = make_keyframe()
+    assert float(frame.depth.depth_m.min()) > 40 and float(frame.depth.depth_m.max()) < 110
+    assert 0.18 < float(np.mean(strip((320, 180)))) < 0.26
