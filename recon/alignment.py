@@ -17,6 +17,10 @@ from recon import se3
 from recon.types import F64, PosePrior
 
 
+LEANING_SHARE = 0.6
+"""Sigma of a height, as a share of it, per unit of (1 - cosine) that the view leans."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity:
     """``x_world = scale * R @ x_odom + t``; covariance of (rotation, translation, log scale)."""
@@ -73,7 +77,9 @@ def _residuals(R: F64, t: F64, log_scale: float, anchors: Sequence[Anchor]) -> t
             jac.append(J * info[:, None])
             group += [3 * i + 1] * 3
         if p.agl_m is not None and a.height is not None and a.height > 0:
-            info_h = p.agl_m / p.sigma_agl_m
+            # The height is measured straight below; a leaning camera sees ground elsewhere.
+            lean = 1.0 - abs(float(R[2] @ a.T_odom_camera[:3, 2]))
+            info_h = p.agl_m / (p.sigma_agl_m + LEANING_SHARE * lean * p.agl_m)
             J = np.zeros((1, 7))
             J[0, 6] = info_h
             rows.append(np.array([(log_scale + np.log(a.height / p.agl_m)) * info_h]))
