@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.reprojection import points_from_depth, reproject
+from recon.reprojection import LABEL_SIGMA_PX, points_from_depth, reproject
 from recon.types import F64, DepthMap, DisparityMap, StereoPair
 
 K = np.array([[190.0, 0, 159.5], [0, 190.0, 89.5], [0, 0, 1]])
@@ -63,16 +63,16 @@ def test_keyframe_turned_against_the_rectified_view() -> None:
 
 
 def test_sigma_is_the_spread_of_depths_under_label_noise() -> None:
-    """Propagation by sampling: a quarter of a label of noise gives the sigma that is claimed."""
+    """propagation by sampling: noise of one label sigma gives the sigma that is claimed."""
     pair = pair_for(np.array([0, 0, 8.0]), 0.8)
     labels = labels_of(np.full((180, 320), 60.0), pair)
     sigma = reproject(labels, pair, K, SIZE).sigma_m
     shaken = []
     for seed in range(60):
-        shift = np.random.default_rng(seed).normal(0, 0.25)
+        shift = np.random.default_rng(seed).normal(0, LABEL_SIGMA_PX)
         moved = DisparityMap((labels.px + shift).astype(np.float32), labels.confidence)
         shaken.append(float(np.median(reproject(moved, pair, K, SIZE).depth_m)))
-    assert np.std(shaken) == pytest.approx(float(np.median(sigma)), rel=0.25)
+    assert np.std(shaken) == pytest.approx(float(np.median(sigma)), rel=0.3)
 
 
 def test_sigma_grows_as_confidence_falls() -> None:
