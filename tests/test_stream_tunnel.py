@@ -29,7 +29,7 @@ from service.stream.radio_messages import (
     unpack_tile,
 )
 from service.stream.radio_tiles import keyframe_of, tiles_of
-from service.stream.records import PoseRecord, ScanHeader
+from service.stream.records import PoseRecord, Repose, ScanHeader
 from service.stream.records import unpack_pose as unpack_record
 from service.stream.session import SessionConfig
 from service.stream.store import ScanStore
@@ -170,7 +170,8 @@ def test_a_map_of_100_m_arrives_in_flight_within_the_share(tmp_path: Path) -> No
             if rng.random() < 0.1:
                 continue
             for _, kind, number, part, data in intake.receive(payload):
-                ground.add_radio(kind, number, part, data)
+                if kind != "header":
+                    ground.add_radio(kind, number, part, data)
         points = np.concatenate([world_points(frame) for frame in ground.keyframes()])
         error = points[:, 2] - ground_m(points[:, 0], points[:, 1])
         assert float(np.sqrt(np.mean(error**2))) < 0.5
@@ -185,6 +186,39 @@ def test_a_map_of_100_m_arrives_in_flight_within_the_share(tmp_path: Path) -> No
             assert record is not None and ground.put_record("k1", seq, record)
         for a, b in zip(onboard.keyframes(), ground.keyframes(), strict=True):
             np.testing.assert_array_equal(a.depth.depth_m, b.depth.depth_m)
+
+
+def drain(sender: TunnelSender, start: float, seconds: float) -> list[bytes]:
+    out, now = [], start
+    while now < start + seconds:
+        todo = sender.next(now)
+        if isinstance(todo, bytes):
+            out.append(todo)
+        else:
+            now += min(todo, 0.05)
+    return out
+
+
+def test_a_late_origin_and_corrections_reach_the_ground(tmp_path: Path) -> None:
+    bare = ScanHeader(HEADER.scan_id, HEADER.drone, HEADER.started_unix_ns)
+    with ScanStore.create(tmp_path / "a.db", bare) as store:
+        sender = TunnelSender(store, TunnelConfig(radio_bytes_s=50_000), 0.0)
+        store.listen(sender.news)
+        store.add_keyframe(0, codec.encode(keyframe(0, 0.0), 0))
+        drain(sender, 0.0, 5.0)
+        store.update_header(origin_lat_deg=47.5, origin_lon_deg=8.25)
+        moved = se3.compose(R_DOWN, np.array([5.0, 20.0, 66.0]))
+        store.add_repose(Repose(0, 1, moved, 1.1, np.eye(6)))
+        later = drain(sender, 5.0, 5.0)
+        headers = [header for p in later if (header := unpack_announce(p)) is not None]
+        tiles = [tile[1] for p in later if (tile := unpack_tile(p)) is not None]
+        assert headers[0].origin_lat_deg == 47.5
+        again = keyframe_of(tiles)
+        assert again is not None
+        np.testing.assert_allclose(again.depth.T_world_camera, moved, atol=0.01)
+        plain = coarse(keyframe(0, 0.0))
+        ratio = np.nanmedian(again.depth.depth_m) / np.nanmedian(plain.depth.depth_m)
+        assert ratio == pytest.approx(1.1, abs=0.02)
 
 
 def test_a_full_radio_buffer_slows_it_down_and_an_empty_one_speeds_it_up(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.ground.intake import FINE, SMALL, ScanIntake
 from service.stream.messages import count, pack_ask, pack_held, unpack_head
+from service.stream.radio_messages import RADIO_NOTE
 from service.stream.records import ScanHeader
 from service.stream.session import NAME, ROOT, SessionConfig, check_endpoints, open_session
 from service.stream.store import ScanStore
@@ -321,9 +322,10 @@ class Receiver:
                 continue
             store = scan.intake.store
             try:
-                if store.header.started_unix_ns == 0:
+                provisional = not store.header.started_unix_ns or RADIO_NOTE in store.header.notes
+                if provisional and header != store.header:
                     store.put_header(header)
-                if store.add_radio(kind, number, part, data):
+                if kind != "header" and store.add_radio(kind, number, part, data):
                     scan.radio_messages += 1
                     scan.unwritten = True
                     self.last_news_at = now

@@ -24,6 +24,8 @@ U16 = npt.NDArray[np.uint16]
 PAYLOAD_TYPE = 42_432
 """TUNNEL.payload_type of these messages; 32768 and above is for private use."""
 MAX_BYTES = 128
+RADIO_NOTE = "from the narrow radio"
+"""In the notes of a header that came by radio; the drone's own takes its place later."""
 ANNOUNCE, POSE, TILE = 0x11, 0x12, 0x13
 CELLS = 8
 """A tile is CELLS x CELLS."""
@@ -99,7 +101,7 @@ def unpack_announce(data: bytes) -> ScanHeader | None:
         origin_alt_amsl_m=_finite(alt),
         epsg=epsg or None,
         georeference="none" if math.isnan(lat) else "gnss",
-        notes=("from the narrow radio",),
+        notes=(RADIO_NOTE,),
     )
 
 

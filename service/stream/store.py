@@ -112,8 +112,7 @@ class ScanStore:
     def put_header(self, header: ScanHeader) -> None:
         """Replace the whole header."""
         with self._lock:
-            self._set_whole("header", header.to_json())
-            self._header = header
+            self._set_whole("header", header.to_json(), header)
 
     @property
     def summary(self) -> dict[str, Any] | None:
@@ -128,7 +127,8 @@ class ScanStore:
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Close the scan with its ``summary`` (must be JSON)."""
-        self._set_whole("summary", json.dumps(summary, sort_keys=True).encode())
+        data = json.dumps(summary, sort_keys=True).encode()
+        self._set_whole("summary", data, self._header)
 
     # Chunks
 
@@ -287,9 +287,15 @@ class ScanStore:
         return None if row is None else unpack_repose(bytes(row[0]))
 
     def add_radio(self, kind: str, number: int, part: int, data: bytes) -> bool:
-        """Store a message of the narrow radio ("tile" or "pose"); False if it is no news."""
-        row = (kind, number, part, data)
-        return self._db.write([("INSERT OR IGNORE INTO radio VALUES (?, ?, ?, ?)", row)]) > 0
+        """Store a message of the narrow radio ("tile" or "pose"), the newest of its number;
+        False if it is no news."""
+        with self._lock:
+            sql = "SELECT 1 FROM radio WHERE kind = ? AND number = ? AND part = ? AND data = ?"
+            if self._db.one(sql, (kind, number, part, data)) is not None:
+                return False
+            row = (kind, number, part, data)
+            self._db.write([("INSERT OR REPLACE INTO radio VALUES (?, ?, ?, ?)", row)])
+            return True
 
     # What the link asks
 
@@ -325,8 +331,7 @@ class ScanStore:
             header = header_from_json(data) if kind == "header" else self._header
             if header is None or not _is_object(data):
                 return False
-            self._set_whole(kind, data)
-            self._header = header
+            self._set_whole(kind, data, header)
             return True
 
     def numbers(self) -> dict[str, RangeSet]:
@@ -345,9 +350,10 @@ class ScanStore:
         """End what :meth:`listen` began."""
         self._inventory.unlisten(listener)
 
-    def _set_whole(self, kind: str, data: bytes) -> None:
+    def _set_whole(self, kind: str, data: bytes, header: ScanHeader) -> None:
         with self._lock:
             self._db.set(kind, data.decode())
+            self._header = header
             self._inventory.note_whole(kind, data)
 
     def set_held(self, peer: str, numbers: dict[str, RangeSet]) -> None:

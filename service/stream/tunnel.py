@@ -7,12 +7,16 @@ the radio's buffer fills. What was sent is repeated while there is nothing new.
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from service.stream import codec
 from service.stream.budget import TokenBucket
 from service.stream.radio_messages import (
+    Tile,
     pack_announce,
     pack_pose,
     pack_tile,
@@ -22,7 +26,7 @@ from service.stream.radio_messages import (
     unpack_tile,
 )
 from service.stream.radio_tiles import tiles_of
-from service.stream.records import PoseRecord, ScanHeader
+from service.stream.records import PoseRecord, Repose, ScanHeader, unpack_repose
 from service.stream.records import unpack_pose as unpack_record
 from service.stream.store import ScanStore
 
@@ -30,6 +34,8 @@ ANNOUNCE_EVERY_S = 10.0
 POSE_EVERY_S = 1.0
 REPEATS = 2
 MAX_WAITING = 2000
+MOVED_M, TURNED, RESCALED = 0.5, 0.01, 0.01
+"""A correction beyond any of these is worth sending a keyframe's tiles again."""
 MAVLINK_OVERHEAD_BYTES = 17
 """Header, checksum and TUNNEL's own fields around each payload."""
 
@@ -45,8 +51,9 @@ class TunnelConfig:
 
 @dataclass(slots=True, eq=False)
 class _Waiting:
-    payload: bytes
+    tile: Tile
     repeats: int = REPEATS
+    payload: bytes = b""  # as it was offered last
 
 
 class TunnelSender:
@@ -57,6 +64,8 @@ class TunnelSender:
         self._store = store
         self._config = config
         self._announcement = pack_announce(store.header)
+        self._tiles: deque[Tile] = deque(maxlen=MAX_WAITING)  # all that were ever made
+        self._moved: dict[int, Repose] = {}  # keyframe to the correction last sent
         self._tag = tag_of(store.header.drone, store.header.scan_id)
         self._factor = 1.0
         self._bucket = TokenBucket(config.radio_bytes_s * config.share, now)
@@ -69,17 +78,55 @@ class TunnelSender:
 
     def news(self, kind: str, number: int) -> None:
         """The store has a new item."""
-        data = self._store.record(kind, number) if kind in ("k0", "pose") else None
+        if kind == "header":
+            self._announcement, self._announce_at = pack_announce(self._store.header), -math.inf
+            return
+        data = self._store.record(kind, number) if kind in ("k0", "pose", "repose") else None
         if data is None:
             return
         if kind == "pose":
             pose = unpack_record(data)
             self._pose = None if pose is None else (number, pose)
+        elif kind == "repose":
+            repose = unpack_repose(data)
+            if repose is not None:
+                self._correct(repose)
+        else:
+            coarse = codec.decode([data])
+            tiles = tiles_of(coarse) if coarse is not None else []
+            self._tiles.extend(tiles)
+            self._fresh.extend(_Waiting(tile) for tile in tiles)
+
+    def _correct(self, repose: Repose) -> None:
+        """Send a keyframe's tiles once more when it moved by more than they are coarse."""
+        before = self._moved.get(repose.seq)
+        tiles = [tile for tile in self._tiles if tile.seq == repose.seq]
+        if not tiles:
             return
-        coarse = codec.decode([data])
-        if coarse is not None:
-            for tile in tiles_of(coarse):
-                self._fresh.append(_Waiting(pack_tile(self._tag, tile)))
+        T = tiles[0].T_world_camera if before is None else before.T_world_camera
+        scale = 1.0 if before is None else before.scale
+        moved_m = float(np.linalg.norm(repose.T_world_camera[:3, 3] - T[:3, 3]))
+        turned = float(np.linalg.norm(repose.T_world_camera[:3, :3] - T[:3, :3]))
+        if moved_m < MOVED_M and turned < TURNED and abs(repose.scale / scale - 1) < RESCALED:
+            return
+        self._moved[repose.seq] = repose
+        self._again.extendleft(
+            _Waiting(tile, 1)
+            for tile in tiles
+            if not any(waiting.tile is tile for waiting in (*self._fresh, *self._again))
+        )
+
+    def _pack(self, tile: Tile) -> bytes:
+        """The tile at its keyframe's newest pose."""
+        repose = self._store.repose(tile.seq)
+        if repose is not None:
+            tile = replace(
+                tile,
+                T_world_camera=repose.T_world_camera,
+                depth_m=tile.depth_m * np.float32(repose.scale),
+                sigma_m=tile.sigma_m * repose.scale,
+            )
+        return pack_tile(self._tag, tile)
 
     def radio_status(self, free_percent: int, now: float) -> None:
         """The radio says how much of its buffer is free (RADIO_STATUS.txbuf)."""
@@ -112,18 +159,22 @@ class TunnelSender:
         if self._pose is not None and now >= self._pose_at:
             return pack_pose(self._tag, *self._pose)
         queue = self._fresh or self._again
-        return queue[-1].payload if queue else None
+        if not queue:
+            return None
+        if not queue[-1].payload:
+            queue[-1].payload = self._pack(queue[-1].tile)
+        return queue[-1].payload
 
     def _sent(self, payload: bytes, now: float) -> None:
         if payload is self._announcement:
             self._announce_at = now + ANNOUNCE_EVERY_S
         elif self._pose is not None and now >= self._pose_at:
             self._pose, self._pose_at = None, now + POSE_EVERY_S
-        elif self._fresh:
-            self._again.appendleft(self._fresh.pop())
         else:
-            waiting = self._again.pop()
-            waiting.repeats -= 1
+            queue = self._fresh or self._again
+            waiting = queue.pop()
+            waiting.repeats -= queue is self._again
+            waiting.payload = b""
             if waiting.repeats > 0:
                 self._again.appendleft(waiting)
 
@@ -132,6 +183,7 @@ class TunnelSender:
 class TunnelIntake:
     """What the ground makes of the radio's messages: (header, kind, number, part, bytes).
 
+    The kind is "header" for an announcement, else "tile" or "pose".
     Messages that come before their scan's announcement are kept, up to MAX_WAITING.
     """
 
@@ -150,7 +202,7 @@ class TunnelIntake:
             ready = [item[1:] for item in self.waiting if item[0] == tag]
             for item in [item for item in self.waiting if item[0] == tag]:
                 self.waiting.remove(item)
-            return [(header, *item) for item in ready]
+            return [(header, "header", 0, 0, payload), *((header, *item) for item in ready)]
         found = _item(payload)
         if found is None:
             self.dropped += 1
