@@ -42,9 +42,7 @@ def _left_jacobian(w: F64) -> F64:
     if angle < 1e-6:
         return np.asarray(np.eye(3) + 0.5 * W + W @ W / 6.0)
     return np.asarray(
-        np.eye(3)
-        + (1 - np.cos(angle)) / angle**2 * W
-        + (angle - np.sin(angle)) / angle**3 * W @ W
+        np.eye(3) + (1 - np.cos(angle)) / angle**2 * W + (angle - np.sin(angle)) / angle**3 * W @ W
     )
 
 
