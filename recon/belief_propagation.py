@@ -19,6 +19,9 @@ from recon.disparity_selection import check_visibility, select
 from recon.matching_cost import COST_UNIT, MatchingCostConfig, check_pair, matching_cost, plain
 from recon.message_passing import MAX_TRUNCATION, Smoothness, propagate
 from recon.types import F32, U8, DisparityMap
+from recon.workspace import Workspace
+
+_space = Workspace()
 
 SPECKLE_STEP = 16
 """Sixteenths of a label: neighbours further apart than one label belong to two surfaces."""
@@ -74,7 +77,9 @@ def belief_propagation(
     ``l`` matches ``right[v, u - l - config.min_disparity]``. Raises ValueError for bad input.
     """
     check_pair(left, right, labels)
-    cost = matching_cost(left, right, labels, config.cost, config.min_disparity)
+    height, width = left.shape
+    volume = _space.take("cost", (height, labels, width))
+    cost = matching_cost(left, right, labels, config.cost, config.min_disparity, volume)
     data, messages = propagate(
         cost, plain(left), config.iterations, config.levels, config.smoothness
     )

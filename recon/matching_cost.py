@@ -62,18 +62,24 @@ class MatchingCostConfig:
 
 
 def matching_cost(
-    left: U8, right: U8, labels: int, config: MatchingCostConfig, min_disparity: int = 0
+    left: U8,
+    right: U8,
+    labels: int,
+    config: MatchingCostConfig,
+    min_disparity: int = 0,
+    out: I16 | None = None,
 ) -> I16:
     """Cost of every label of every left pixel, (h, labels, w) int16 in ``1 / COST_UNIT``.
 
     Label ``l`` of left pixel (u, v) is compared with ``right[v, u - l - min_disparity]``. A
     partner outside the right image is unseen: it costs ``config.unseen`` more than the
-    pixel's best seen label, so that neighbours decide. Raises ValueError for bad shapes.
+    pixel's best seen label, so that neighbours decide. ``out`` is filled and returned when it
+    is given. Raises ValueError for bad shapes.
     """
     check_pair(left, right, labels)
     left, right = plain(left), plain(right)
     height, width = left.shape
-    cost = np.empty((height, labels, width), np.int16)
+    cost = np.empty((height, labels, width), np.int16) if out is None else out
     _cost_volume(
         left,
         right,

@@ -23,6 +23,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from recon.types import U8
+from recon.workspace import Workspace
 
 I16 = npt.NDArray[np.int16]
 
@@ -41,6 +42,8 @@ UP, DOWN, LEFT, RIGHT = 0, 1, 2, 3
 """Where a message travels."""
 
 _FAR = 16383
+
+_space = Workspace()
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,24 +119,32 @@ def propagate(
 
     ``cost`` is (h, L, w) int16, at least 0; ``image`` (h, w) uint8 says where surfaces may end.
     Coarse to fine, each level runs ``iterations``, each of which updates one colour of the
-    checkerboard.
+    checkerboard. The arrays are used again by the next call of the same thread.
     """
     truncation = smoothness.truncation
-    pyramid = [_split(cost, truncation)]
+    height, labels, width = cost.shape
+    pyramid = [_space.take("data 0", (height, 2, labels, cells_of(width)))]
+    _split(cost, truncation, pyramid[0])
     weights = [smoothness.weights(image)]
     while len(pyramid) < levels and min(weights[-1].shape[1:]) >= 8:
         weights.append(_coarser_weights(weights[-1]))
-        w = weights[-1].shape[2]
-        pyramid.append(_coarser(pyramid[-1], w, cells_of(w), truncation))
-    messages = np.zeros((4, 1, 2, pyramid[0].shape[2], 1), np.int16)
-    for data, weight in zip(reversed(pyramid), reversed(weights), strict=True):
-        messages = _start(messages, data, weight.shape[2])
-        edges = _edges(weight, data.shape[3], smoothness.slope, truncation)
-        bands = min(get_num_threads(), data.shape[0] // max(BAND_ROWS, 2 * iterations))
+        _, h, w = weights[-1].shape
+        pyramid.append(_space.take(f"data {len(pyramid)}", (h, 2, labels, cells_of(w))))
+        _coarser(pyramid[-2], w, truncation, pyramid[-1])
+    messages = np.zeros((4, 1, 2, labels, 1), np.int16)
+    for level in range(len(pyramid) - 1, -1, -1):
+        data, weight = pyramid[level], weights[level]
+        h, _, _, cells = data.shape
+        w = weight.shape[2]
+        finer = _space.take(f"messages {level}", (4, h + 2, 2, labels, cells))
+        _start(messages, w, finer)
+        messages = finer
+        edges = _edges(weight, cells, smoothness.slope, truncation)
+        bands = min(get_num_threads(), h // max(BAND_ROWS, 2 * iterations))
         if bands > 1:
-            _sweeps(data, messages, edges, weight.shape[2], iterations, bands)
+            _sweeps(data, messages, edges, w, iterations, bands)
         else:
-            _sweep_band(data, messages, edges, weight.shape[2], iterations, 0, 1)
+            _sweep_band(data, messages, edges, w, iterations, 0, 1)
     return pyramid[0], messages
 
 
@@ -143,11 +154,9 @@ def cells_of(width: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _split(cost: Any, truncation: int) -> Any:  # pragma: no cover - compiled
+def _split(cost: Any, truncation: int, data: Any) -> None:  # pragma: no cover - compiled
     """(h, L, w) to (h, 2, L, cells), each pixel less its least cost and cut."""
     height, labels, width = cost.shape
-    cells = ((width + 1) // 2 // LANES + 1) * LANES
-    data = np.empty((height, 2, labels, cells), np.int16)
     for v in range(height):
         low = cost[v, 0].copy()
         for label in range(1, labels):
@@ -164,17 +173,15 @@ def _split(cost: Any, truncation: int) -> Any:  # pragma: no cover - compiled
                     u = 2 * i + parity
                     out[i] = min(np.int16(row[u] - low[u]), top)
                 out[count:] = 0
-    return data
 
 
 @njit(cache=True, nogil=True)
 def _coarser(
-    fine: Any, width: int, cells: int, truncation: int
-) -> Any:  # pragma: no cover - compiled
+    fine: Any, width: int, truncation: int, data: Any
+) -> None:  # pragma: no cover - compiled
     """Sum of the costs of 2x2 pixels, less its least, cut again to what can matter."""
     fine_height, _, labels, _ = fine.shape
     height = (fine_height + 1) // 2
-    data = np.empty((height, 2, labels, cells), np.int16)
     for v in range(height):
         below = 2 * v + 1 < fine_height
         top = np.int16(4 * truncation)
@@ -197,17 +204,15 @@ def _coarser(
                 out = data[v, parity, label]
                 for i in range(count):
                     out[i] = min(np.int16(out[i] - low[i]), top)
-    return data
 
 
 @njit(cache=True, nogil=True)
-def _start(coarse: Any, data: Any, width: int) -> Any:  # pragma: no cover - compiled
+def _start(coarse: Any, width: int, messages: Any) -> None:  # pragma: no cover - compiled
     """The messages that a level starts from: those of the coarser cells that it divides.
 
     Only the colour that the first sweep reads is filled; the sweep writes the other.
     """
-    height, _, labels, cells = data.shape
-    messages = np.zeros((4, height + 2, 2, labels, cells), np.int16)  # lanes beyond rows are read
+    height, labels, cells = messages.shape[1] - 2, messages.shape[3], messages.shape[4]
     known = coarse.shape[4]
     for r in range(height + 2):
         for direction in range(4):
@@ -215,6 +220,8 @@ def _start(coarse: Any, data: Any, width: int) -> Any:  # pragma: no cover - com
                 messages[direction, r] = 0
                 continue
             parity = r & 1  # row r - 1 + colour 1
+            # The cell before the first one of the row's other parity is read as a neighbour.
+            messages[direction, r, 1 - parity, labels - 1, cells - 1] = 0
             for label in range(labels):
                 out = messages[direction, r, parity, label]
                 if known == 1:
@@ -226,7 +233,6 @@ def _start(coarse: Any, data: Any, width: int) -> Any:  # pragma: no cover - com
                     out[2 * i] = even[i]
                     out[2 * i + 1] = odd[i]
                 out[(width + 1 - parity) // 2 :] = 0
-    return messages
 
 
 @intrinsic

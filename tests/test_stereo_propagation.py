@@ -297,6 +297,25 @@ def test_read_only_and_strided_images_compile_nothing_new() -> None:
     assert [len(kernel.signatures) for kernel in kernels] == before
 
 
+def test_memory_that_is_used_again_leaves_no_trace() -> None:
+    """Other sizes, labels and images in between change nothing, nor does another thread."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    _, left, right = box_scene()
+    config = BeliefPropagationConfig()
+    first = belief_propagation(left, right, 20, config)
+    kept = first.px.copy()
+    belief_propagation(right, left, 20, config)
+    belief_propagation(left[:51, :99], right[:51, :99], 7, config)
+    belief_propagation(left[:, :179], right[:, :179], 20, config)
+    np.testing.assert_array_equal(first.px, kept)
+    np.testing.assert_array_equal(belief_propagation(left, right, 20, config).px, kept)
+    with ThreadPoolExecutor(3) as pool:
+        jobs = [pool.submit(belief_propagation, left, right, 20, config) for _ in range(9)]
+    for job in jobs:
+        np.testing.assert_array_equal(job.result().px, kept)
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (3, 5), (7, 64), (8, 63)])
 def test_small_images_do_not_fail(shape: tuple[int, int]) -> None:
     image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
