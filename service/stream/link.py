@@ -156,13 +156,23 @@ class DatalinkSender:
             )
 
     def drain(self, timeout_s: float) -> bool:
-        """Wait until a ground station holds everything; False when the time is up."""
+        """Wait until a ground station holds everything; False when the time is up.
+
+        With the narrow radio alone it waits until all was sent once, and is False: the radio
+        carries only the coarse map.
+        """
         deadline = time.monotonic() + timeout_s
         while not self.progress.complete:
-            if self._thread is None or time.monotonic() >= deadline:
+            if time.monotonic() >= deadline or not self._may_send():
                 return False
             time.sleep(0.05)
         return True
+
+    def _may_send(self) -> bool:
+        """Whether anything is still on its way, by IP or by radio."""
+        if self._thread is not None:
+            return True
+        return self._radio is not None and not self._radio.all_sent
 
     def close(self) -> None:
         """Stop sending; stores that are not owned stay open."""

@@ -114,6 +114,11 @@ class RadioSender:
         """Bytes handed to the radio."""
         return self._tunnel.sent_bytes
 
+    @property
+    def all_sent(self) -> bool:
+        """Whether everything has been sent at least once; nobody confirms it on the radio."""
+        return not self._events and self._tunnel.all_sent
+
     def close(self) -> None:
         """Stop sending."""
         self._stop.set()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -52,9 +53,16 @@ def tiles_of(coarse: Keyframe) -> list[Tile]:
 
 
 def keyframe_of(tiles: Sequence[Tile]) -> Keyframe | None:
-    """The keyframe that tiles of one grid show; None when there are none."""
+    """The keyframe that tiles of one grid show; None when there are none.
+
+    While a correction is under way some tiles have the old pose and scale and some the new:
+    only those of the pose that most of them share are used.
+    """
     if not tiles:
         return None
+    poses = Counter(tile.T_world_camera.tobytes() for tile in tiles)
+    shared = poses.most_common(1)[0][0]
+    tiles = [tile for tile in tiles if tile.T_world_camera.tobytes() == shared]
     first = tiles[0]
     w, h = first.grid_px
     rows, columns = -(-h // CELLS), -(-w // CELLS)

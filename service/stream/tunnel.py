@@ -110,11 +110,8 @@ class TunnelSender:
         if moved_m < MOVED_M and turned < TURNED and abs(repose.scale / scale - 1) < RESCALED:
             return
         self._moved[repose.seq] = repose
-        self._again.extendleft(
-            _Waiting(tile, 1)
-            for tile in tiles
-            if not any(waiting.tile is tile for waiting in (*self._fresh, *self._again))
-        )
+        waiting = {id(entry.tile) for entry in self._fresh}
+        self._fresh.extendleft(_Waiting(tile) for tile in tiles if id(tile) not in waiting)
 
     def _pack(self, tile: Tile) -> bytes:
         """The tile at its keyframe's newest pose."""
@@ -152,6 +149,11 @@ class TunnelSender:
         self.sent_bytes += size
         self._sent(chosen, now)
         return chosen
+
+    @property
+    def all_sent(self) -> bool:
+        """Whether every tile has been sent at least once."""
+        return not self._fresh
 
     def _choose(self, now: float) -> bytes | None:
         if now >= self._announce_at:
