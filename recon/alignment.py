@@ -17,8 +17,11 @@ from recon import se3
 from recon.types import F64, PosePrior
 
 
-LEANING_SHARE = 0.6
-"""Sigma of a height, as a share of it, per unit of (1 - cosine) that the view leans."""
+WANDER_SHARE = 0.4
+"""Of a fix's sigma, what differs between fixes of one flight; the rest is common to all."""
+
+LEANING_SHARE = 2.0
+"""Sigma of a height, as a share of it, per unit of (1 - cosine) off the vertical."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +52,27 @@ class Anchor:
 
     T_odom_camera: F64  # (4, 4)
     prior: PosePrior
-    height: float | None  # of the camera above the ground seen, in odometry units
+    height: float | None  # of the camera above ground that it sees, in odometry units
+    lean: float = 0.0  # 1 - cosine of how far off the vertical that ground is seen
+
+
+def height_above(points: F64, up: F64) -> tuple[float, float] | None:
+    """Height above the ground nearest below, and how far off the vertical that is seen.
+
+    Args:
+        points: (N, 3) ground in the camera's frame.
+        up: (3,) unit vector upwards in that frame.
+
+    The height is the median over the sixth of the points that lie most nearly below; the
+    second number is 1 - cosine of their angle from the vertical. None under 12 points.
+    """
+    if len(points) < 12:
+        return None
+    drop = -(points @ up)
+    cosine = drop / np.linalg.norm(points, axis=1)
+    below = np.argsort(-cosine)[: max(12, len(points) // 6)]
+    height = float(np.median(drop[below]))
+    return (height, 1.0 - float(np.median(cosine[below]))) if height > 0 else None
 
 
 def _residuals(R: F64, t: F64, log_scale: float, anchors: Sequence[Anchor]) -> tuple[F64, F64, F64]:
@@ -70,16 +93,15 @@ def _residuals(R: F64, t: F64, log_scale: float, anchors: Sequence[Anchor]) -> t
             group += [3 * i] * len(w)
         if p.position_m is not None and p.sigma_position_m is not None:
             x = scale * R @ a.T_odom_camera[:3, 3]
-            info = 1.0 / p.sigma_position_m
+            info = 1.0 / (WANDER_SHARE * p.sigma_position_m)
             J = np.zeros((3, 7))
             J[:, :3], J[:, 3:6], J[:, 6] = -se3.hat(x), np.eye(3), x
             rows.append((x + t - p.position_m) * info)
             jac.append(J * info[:, None])
             group += [3 * i + 1] * 3
         if p.agl_m is not None and a.height is not None and a.height > 0:
-            # The height is measured straight below; a leaning camera sees ground elsewhere.
-            lean = 1.0 - abs(float(R[2] @ a.T_odom_camera[:3, 2]))
-            info_h = p.agl_m / (p.sigma_agl_m + LEANING_SHARE * lean * p.agl_m)
+            # The height is measured straight below; ground seen elsewhere may lie otherwise.
+            info_h = p.agl_m / (p.sigma_agl_m + LEANING_SHARE * a.lean * p.agl_m)
             J = np.zeros((1, 7))
             J[0, 6] = info_h
             rows.append(np.array([(log_scale + np.log(a.height / p.agl_m)) * info_h]))
@@ -104,7 +126,7 @@ def fit(anchors: Sequence[Anchor], iterations: int = 30) -> Similarity | None:
     Residuals of one sensor over one flight are correlated (a GNSS fix wanders, a compass is
     off by a constant), so the covariance is inflated by the number of anchors: it never gets
     better than that of one reading, except for scale and heading, which are differences
-    along the track.
+    along the track. What all fixes have in common goes into the position's covariance.
     """
     usable = [
         a for a in anchors if a.prior.R_world_camera is not None or a.prior.position_m is not None
@@ -127,6 +149,9 @@ def fit(anchors: Sequence[Anchor], iterations: int = 30) -> Similarity | None:
         if np.abs(step).max() < 1e-7:
             break
     covariance = np.asarray(np.linalg.inv(H) * max(1.0, 0.2 * len(usable)), np.float64)
+    common = [a.prior.sigma_position_m for a in usable if a.prior.sigma_position_m is not None]
+    if common:
+        covariance[3:6, 3:6] += np.diag(np.mean(np.square(common), axis=0))
     return Similarity(float(np.exp(log_scale)), R, t, covariance, _sources(usable))
 
 

@@ -32,6 +32,7 @@ class _Node:
     covariance: F64  # (6, 6) of the step from the node before, left, camera frame
     prior: PosePrior
     height: float | None
+    lean: float
     told: tuple[F64, float] | None = None  # world pose and scale last published
 
 
@@ -62,19 +63,20 @@ class Trajectory:
         T_map_camera: F64,
         covariance: F64,
         prior: PosePrior,
-        height: float | None,
+        height: tuple[float, float] | None,
     ) -> None:
         """Append a keyframe to its segment and fit the segment's place in the world anew.
 
-        ``height`` is the camera's height above the ground it sees, in odometry units.
+        ``height`` comes from :func:`recon.alignment.height_above`, in odometry units.
         """
-        node = _Node(seq, segment, T_map_camera, covariance, prior, height)
+        above, lean = height if height is not None else (None, 0.0)
+        node = _Node(seq, segment, T_map_camera, covariance, prior, above, lean)
         self._nodes[seq] = node
         nodes = self._segments.setdefault(segment, [])
         nodes.append(node)
         if len(nodes) >= self.config.least_anchors:
             self._similarity[segment] = alignment.fit(
-                [Anchor(n.T_map_camera, n.prior, n.height) for n in nodes]
+                [Anchor(n.T_map_camera, n.prior, n.height, n.lean) for n in nodes]
             )
 
     def __contains__(self, seq: int) -> bool:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from recon import se3
+from recon.alignment import height_above
 from recon.backends import Backend
 from recon.belief_propagation import BeliefPropagationConfig
 from recon.camera_model import scaled_K
@@ -155,8 +156,7 @@ class Dense:
                 )
             T_map = self._before[2] @ step
         self._before = (job.view.seq, depth, T_map)
-        up = job.view.T_odom_camera[:3, :3].T[:, 2]
-        height = -float(np.median(job.points @ up)) if len(job.points) else None
+        height = height_above(job.points, job.view.T_odom_camera[2, :3])
         with self.lock:
             self.trajectory.add(job.view.seq, job.segment, T_map, covariance, job.prior, height)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.alignment import Anchor, fit
+from recon.alignment import Anchor, fit, height_above
 from recon.types import F64, PosePrior
 
 
@@ -116,3 +116,18 @@ def test_covariance_of_the_scale_covers_its_error() -> None:
         ratios.append(abs(math.log(found.scale)) / found.sigma_scale)
     assert np.mean(np.array(ratios) < 1.0) > 0.6
     assert max(ratios) < 4.0
+
+
+def test_height_is_that_of_the_ground_most_nearly_below() -> None:
+    """A camera leaning forward over ground that rises ahead: the height is that of its foot."""
+    rng = np.random.default_rng(0)
+    xy = rng.uniform([-30, 5], [30, 90], (600, 2))
+    ground = np.c_[xy, 0.2 * xy[:, 1]]
+    lean = se3.so3_exp(np.array([math.radians(-65 + 180), 0.0, 0.0]))  # view 65 degrees down
+    T = se3.compose(lean, np.array([0.0, 0.0, 60.0]))
+    points = se3.transform(se3.inverse(T), ground)
+    found = height_above(points, T[2, :3])
+    assert found is not None
+    assert found[0] == pytest.approx(60.0 - 0.2 * 12.0, abs=1.5)
+    assert 0.0 < found[1] < 0.1
+    assert height_above(points[:5], T[2, :3]) is None
