@@ -16,7 +16,6 @@ import numpy as np
 from recon import se3
 from recon.types import F64, PosePrior
 
-
 WANDER_SHARE = 0.4
 """Of a fix's sigma, what differs between fixes of one flight; the rest is common to all."""
 

@@ -17,9 +17,7 @@ def track(n: int = 30) -> list[F64]:
     out = []
     for i in range(n):
         R = se3.so3_exp(np.array([0.02 * math.sin(i), 0.02 * math.cos(2 * i), 0.05 * i]))
-        out.append(
-            se3.compose(R @ np.diag([1.0, -1, -1]), np.array([4.0 * i, 0.02 * i * i, 60.0]))
-        )
+        out.append(se3.compose(R @ np.diag([1.0, -1, -1]), np.array([4.0 * i, 0.02 * i * i, 60.0])))
     return out
 
 

@@ -189,9 +189,7 @@ CASES = (
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_bad_input_gets_one_line_and_exit_code_two(
-    case: str, flight: Path, tmp_path: Path
-) -> None:
+def test_bad_input_gets_one_line_and_exit_code_two(case: str, flight: Path, tmp_path: Path) -> None:
     arguments, words = bad_inputs(flight, tmp_path)[case]
     more: list[str | Path] = [] if "--out" in arguments else ["--out", tmp_path / "scan"]
     done = skyrelief("replay", *arguments, *more)
