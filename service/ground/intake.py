@@ -77,8 +77,9 @@ class ScanIntake:
             if kind.startswith("k"):
                 for number in numbers:
                     self._seen.setdefault((kind, number), now)
+        # What the very first head names was made before anybody listened: it is due at once.
+        self._heads.append((now - GRACE_S if self.head is None else now, head))
         self.head, self.head_at = head, now
-        self._heads.append((now, head))
 
     def on_items(self, message: bytes, now: float) -> bool:
         """Parts of records; True when something new was stored.
