@@ -3,7 +3,7 @@
 Section 2.3 of the paper: corners of two earlier views (the left and right image of the
 virtual stereo camera) are found again in the new frame, each view gives a pose by EPnP
 (Eq. 6-7) and the two are averaged. Between the frames that become keyframes, landmarks are
-triangulated and the last keyframes are adjusted together (:mod:`recon.bundle`).
+triangulated and the last keyframes are adjusted together (:mod:`recon.keyframe_window`).
 
 The odometry works in a frame of its own that starts at the first telemetry pose; scale,
 heading and position are corrected afterwards by :mod:`recon.alignment`.
@@ -15,14 +15,11 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from recon import bundle, matching, pnp, se3, two_view
-from recon.camera_model import rays
-from recon.landmarks import Landmarks
+from recon import matching, pnp, prediction, se3, two_view
+from recon.keyframe_window import OdometryKeyframe, adjust_window, landmarks, triangulate
+from recon.landmarks import I64, Landmarks
 from recon.types import F64, U8, Bool, Camera, PosePrior
-
-I64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,26 +48,6 @@ class OdometryConfig:
             raise ValueError(f"window must hold 3 keyframes or more, got {self.window}")
 
 
-@dataclass(slots=True, eq=False)
-class OdometryKeyframe:
-    """A keyframe inside the odometry; its pose is refined while it is in the window."""
-
-    seq: int
-    time_ns: int
-    segment: int
-    T_camera_odom: F64  # (4, 4)
-    covariance: F64  # (6, 6) left perturbation of T_camera_odom
-    prior: PosePrior
-    pyramid: matching.Pyramid
-    uv: F64  # (N, 2) corners
-    landmark: I64  # (N,) number in ``map``, -1 none yet
-    map: Landmarks  # of its segment, in the odometry's frame
-
-    @property
-    def T_odom_camera(self) -> F64:
-        return se3.inverse(self.T_camera_odom)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracked:
     """What one frame gave."""
@@ -91,13 +68,6 @@ class _Located:
     pose: pnp.PnpResult  # camera from odometry
     uv: F64  # (N, 2) of the keyframe's corners
     ok: Bool  # (N,) found, and not contradicted by the pose
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Prediction:
-    uv: F64  # (N, 2) where the corners should be
-    warp: F64  # (N, 2, 2) or (2, 2) offsets in the keyframe to offsets in the frame
-    radius_px: float
 
 
 class Odometry:
@@ -206,14 +176,17 @@ class Odometry:
     ) -> Tracked:
         """Wait until the camera has moved enough, then make the first landmarks."""
         first = self.keyframes[0]
-        R_b_a = _relative_rotation(first.prior, prior)
+        R_b_a = prediction.relative_rotation(first.prior, prior)
         uv, ok = self._match_without_map(grey, pyramid, first, prior, R_b_a)
         if ok.sum() < 2 * self.config.min_tracks:
             return self._missed(
                 grey, pyramid, seq, time_ns, prior, mask, "too few matches with the first frame"
             )
         self._lost = 0
-        if _base_to_height(first.uv[ok], uv[ok], self.K, R_b_a) < 0.7 * self.config.base_to_height:
+        if (
+            prediction.base_to_height(first.uv[ok], uv[ok], self.K, R_b_a)
+            < 0.7 * self.config.base_to_height
+        ):
             return Tracked(
                 "waiting", self.segment, tracks=int(ok.sum()), reason="too little motion"
             )
@@ -245,7 +218,7 @@ class Odometry:
         """Enter the two-view points into the table; return metres per unit of the baseline."""
         first = self.keyframes[0]
         T_odom_a = first.T_odom_camera
-        scale = _metric_scale(view, first.prior, prior, T_odom_a)
+        scale = prediction.metric_scale(view, first.prior, prior, T_odom_a)
         points = se3.transform(T_odom_a, view.points[view.inliers] * scale)
         first.landmark[rows] = first.map.add(points)
         return scale
@@ -260,14 +233,14 @@ class Odometry:
     ) -> tuple[F64, Bool]:
         """(N, 2) pixels and (N,) success of the first frame's corners in a new frame."""
         best: tuple[F64, Bool] | None = None
-        for prediction in self._predictions_2d(grey, first, prior, R_b_a):
+        for guess in self._predictions_2d(grey, first, prior, R_b_a):
             found = matching.match(
                 first.pyramid,
                 first.uv.astype(np.float32),
                 pyramid,
-                prediction.uv.astype(np.float32),
-                prediction.radius_px,
-                prediction.warp.astype(np.float32),
+                guess.uv.astype(np.float32),
+                guess.radius_px,
+                guess.warp.astype(np.float32),
                 self.config.matching,
             )
             if best is None or found.ok.sum() > best[1].sum():
@@ -279,9 +252,9 @@ class Odometry:
 
     def _predictions_2d(
         self, grey: U8, key: OdometryKeyframe, prior: PosePrior, R_b_a: F64 | None
-    ) -> list[_Prediction]:
+    ) -> list[prediction.Prediction]:
         """Guesses of where a keyframe's corners went, best first, without landmarks."""
-        W = self.camera.size_px[0]
+        radius_px = self.config.wide_search_share * self.camera.size_px[0]
         out = []
         if R_b_a is not None:
             height = prior.agl_m or 0.0
@@ -292,21 +265,15 @@ class Odometry:
                 t = R_b_a @ R_a.T @ (key.prior.position_m - prior.position_m) / height
             n = key.T_camera_odom[:3, 2]  # up, seen from the camera
             H = self.K @ (R_b_a - np.outer(t, n)) @ np.linalg.inv(self.K)
-            out.append(self._by_homography(H, key.uv, self.config.wide_search_share * W))
+            out.append(prediction.by_homography(H, key.uv, radius_px))
         shift = matching.global_shift(key.pyramid.levels[0], grey)
         if shift is not None and shift.confidence > self.config.least_shift_confidence:
             H = np.eye(3)
             H[:2, :2], H[:2, 2] = shift.A, shift.shift_px
-            out.append(self._by_homography(H, key.uv, self.config.wide_search_share * W))
+            out.append(prediction.by_homography(H, key.uv, radius_px))
         if not out:
-            out.append(self._by_homography(np.eye(3), key.uv, self.config.wide_search_share * W))
+            out.append(prediction.by_homography(np.eye(3), key.uv, radius_px))
         return out
-
-    def _by_homography(self, H: F64, uv: F64, radius_px: float) -> _Prediction:
-        there = cv2.perspectiveTransform(uv[:, None], H)[:, 0].astype(np.float64)
-        return _Prediction(there, _local_affine(H, uv, there), radius_px)
-
-    # ---- the pose of a frame against landmarks ----------------------------------------
 
     def _locate(
         self, grey: U8, pyramid: matching.Pyramid, time_ns: int, prior: PosePrior
@@ -340,7 +307,7 @@ class Odometry:
         last_ns, T_last, last_prior = self._last
         dt = (time_ns - last_ns) * 1e-9
         R = T_last[:3, :3]
-        turn = _relative_rotation(last_prior, prior)
+        turn = prediction.relative_rotation(last_prior, prior)
         if turn is not None:
             R = R @ turn.T
         t = T_last[:3, 3] + self._velocity * dt
@@ -386,7 +353,10 @@ class Odometry:
         stride: int = 1,
     ) -> _Located | str:
         """EPnP pose of the frame from one keyframe's landmarks, or why there is none."""
-        prediction, visible = self._predict_3d(key, T_camera_odom, share)
+        radius_px = share * self.camera.size_px[0]
+        guess, visible = prediction.on_landmarks(
+            key, self.K, self.camera.size_px, T_camera_odom, radius_px
+        )
         if stride > 1:
             visible &= key.map.known(key.landmark) & (np.arange(len(visible)) % stride == 0)
         index = np.flatnonzero(visible)
@@ -397,14 +367,14 @@ class Odometry:
             key.pyramid,
             key.uv[index].astype(np.float32),
             pyramid,
-            prediction.uv[index].astype(np.float32),
-            prediction.radius_px,
-            prediction.warp[index].astype(np.float32),
+            guess.uv[index].astype(np.float32),
+            guess.radius_px,
+            guess.warp[index].astype(np.float32),
             self.config.matching,
         )
         ok = np.zeros(len(key.uv), np.bool_)
         ok[index] = found.ok
-        uv = prediction.uv.copy()
+        uv = guess.uv.copy()
         uv[index] = found.uv_px
         mapped = key.map.known(key.landmark)
         known = np.flatnonzero(ok & mapped)
@@ -427,27 +397,9 @@ class Odometry:
                 return solved
         return None
 
-    def _predict_3d(
-        self, key: OdometryKeyframe, T_camera_odom: F64, share: float
-    ) -> tuple[_Prediction, Bool]:
-        """Where the keyframe's corners fall for a start pose; corners without a landmark
-        are taken to lie on the plane through the landmarks."""
-        T_new_key = T_camera_odom @ key.T_odom_camera
-        known = key.map.known(key.landmark)
-        P_key = se3.transform(key.T_camera_odom, key.map[key.landmark[known]])
-        plane = _inverse_depth_plane(self.K, P_key)
-        H = self.K @ (T_new_key[:3, :3] + np.outer(T_new_key[:3, 3], plane)) @ np.linalg.inv(self.K)
-        uv = cv2.perspectiveTransform(key.uv[:, None], H)[:, 0].astype(np.float64)
-        warp = _local_affine(H, key.uv, uv)
-        P_new = se3.transform(T_new_key, P_key)
-        uv[known] = P_new[:, :2] / P_new[:, 2:] * [self.K[0, 0], self.K[1, 1]] + self.K[:2, 2]
-        W, Hh = self.camera.size_px
-        visible = np.all((uv > 8) & (uv < [W - 8, Hh - 8]), axis=1) & np.isfinite(uv[:, 0])
-        return _Prediction(uv, warp, share * W), visible
-
     def _agrees(self, T_camera_odom: F64, prior: PosePrior, key: OdometryKeyframe) -> bool:
         """False when vision turned otherwise than telemetry since the keyframe."""
-        turn = _relative_rotation(key.prior, prior)
+        turn = prediction.relative_rotation(key.prior, prior)
         if turn is None:
             return True
         seen = T_camera_odom[:3, :3] @ key.T_odom_camera[:3, :3]
@@ -507,9 +459,10 @@ class Odometry:
     ) -> None:
         """Append a keyframe: tracked corners, new landmarks, fresh corners; adjust the window."""
         key = self.keyframes[-1]
-        self._triangulate(key, T_camera_odom, uv, ok)
+        least = 0.5 * self.config.least_base_to_height
+        triangulate(key, T_camera_odom, uv, ok, self.K, least, self.config.loose_px)
         kept = np.flatnonzero(ok)
-        fresh = _fresh_corners(grey, uv[kept], self.config.matching, mask)
+        fresh = prediction.fresh_corners(grey, uv[kept], self.config.matching, mask)
         new = OdometryKeyframe(
             seq,
             time_ns,
@@ -523,7 +476,7 @@ class Odometry:
             key.map,
         )
         self.keyframes.append(new)
-        self._adjust_window()
+        adjust_window(self.keyframes[-self.config.window - 2 :], self.K)
         self._forget()
 
     def _forget(self) -> None:
@@ -537,181 +490,13 @@ class Odometry:
         if (seen >= 0).any():
             window[0].map.forget_before(int(seen[seen >= 0].min()))
 
-    def _triangulate(self, key: OdometryKeyframe, T_camera_odom: F64, uv: F64, ok: Bool) -> None:
-        """Landmarks for the keyframe's matched corners that have none yet."""
-        rows = np.flatnonzero(ok & (key.landmark < 0))
-        if rows.size == 0:
-            return
-        points, angle = bundle.triangulate(
-            key.T_camera_odom, T_camera_odom, self.K, key.uv[rows], uv[rows]
-        )
-        error = np.maximum(
-            two_view.reprojection_error(key.T_camera_odom, points, self.K, key.uv[rows]),
-            two_view.reprojection_error(T_camera_odom, points, self.K, uv[rows]),
-        )
-        gate_px = max(1.5, 2.0 * float(np.median(error)))
-        good = (error < min(gate_px, self.config.loose_px)) & (
-            angle > 0.5 * self.config.least_base_to_height
-        )
-        key.landmark[rows[good]] = key.map.add(points[good])
-        ok[rows[error >= gate_px]] = False
-
-    def _adjust_window(self) -> None:
-        """Bundle-adjust the last keyframes; the two oldest of them hold the frame and scale."""
-        window = self.keyframes[-self.config.window - 2 :]
-        fixed = 1 if len(window) == 2 else 2
-        cam, pt, uv = [], [], []
-        for c, key in enumerate(window):
-            rows = np.flatnonzero(key.map.known(key.landmark))
-            cam.append(np.full(rows.size, c, np.int64))
-            pt.append(key.landmark[rows])
-            uv.append(key.uv[rows])
-        point = np.concatenate(pt)
-        ids, index, counts = np.unique(point, return_inverse=True, return_counts=True)
-        use = counts[index] >= 2
-        ids, index = np.unique(point[use], return_inverse=True)
-        base, table = self._baseline(window), window[0].map
-        free = np.arange(len(window)) >= fixed
-        result = bundle.adjust(
-            np.stack([k.T_camera_odom for k in window]),
-            table[ids],
-            np.concatenate(cam)[use],
-            index.astype(np.int64),
-            np.concatenate(uv)[use],
-            self.K,
-            free,
-        )
-        for c in np.flatnonzero(free):
-            window[c].T_camera_odom = result.T_camera_world[c]
-            window[c].covariance = result.covariance[c]
-        table[ids] = result.points_m
-        self._drop_outliers(window, ids, index, np.concatenate(cam)[use], result.residual_px)
-        if len(window) == 2:
-            self._restore_baseline(window, base)
-
-    @staticmethod
-    def _baseline(window: list[OdometryKeyframe]) -> float:
-        moved = window[1].T_camera_odom @ window[0].T_odom_camera
-        return float(np.linalg.norm(moved[:3, 3]))
-
-    def _restore_baseline(self, window: list[OdometryKeyframe], base: float) -> None:
-        """Two views leave the scale open; put it back to where it was."""
-        factor = base / max(self._baseline(window), 1e-9)
-        origin = window[0].T_odom_camera[:3, 3]
-        window[0].map.scale_about(origin, factor)
-        T = window[1].T_odom_camera
-        T[:3, 3] = origin + (T[:3, 3] - origin) * factor
-        window[1].T_camera_odom = se3.inverse(T)
-
-    def _drop_outliers(
-        self,
-        window: list[OdometryKeyframe],
-        ids: I64,
-        index: I64,
-        cam: I64,
-        residual_px: F64,
-    ) -> None:
-        """Remove observations far off; a landmark left with one view is dropped."""
-        bad = residual_px > max(2.5, 4.0 * float(np.median(residual_px)))
-        for c in np.unique(cam[bad]):
-            gone = ids[index[bad & (cam == c)]]
-            key = window[c]
-            key.landmark[np.isin(key.landmark, gone)] = -1
-        good = np.bincount(index[~bad], minlength=len(ids))
-        window[0].map[ids[good < 2]] = np.nan
-
-    # ---- what the dense stages ask -----------------------------------------------------
-
     def median_depth(self, key: OdometryKeyframe) -> float:
         """Median depth of the keyframe's landmarks, in odometry units; NaN without any."""
-        _, depth = self.landmarks(key)
+        _, depth = landmarks(key)
         return float(np.median(depth)) if depth.size else float("nan")
-
-    def landmarks(self, key: OdometryKeyframe) -> tuple[F64, F64]:
-        """(N, 3) points in the keyframe's camera and (N,) their depths, in odometry units."""
-        points = key.map[key.landmark[key.map.known(key.landmark)]]
-        P = se3.transform(key.T_camera_odom, points)
-        P = P[P[:, 2] > 0]
-        return P, P[:, 2]
 
 
 def _averaged(left: pnp.PnpResult, right: pnp.PnpResult) -> pnp.PnpResult:
     """The right view's pose averaged with the left's, both of one frame in one map."""
     mean = pnp.average_left_right(left, right, np.eye(4))
     return replace(right, T_camera_points=mean.T_camera_points, covariance=mean.covariance)
-
-
-def _relative_rotation(a: PosePrior, b: PosePrior) -> F64 | None:
-    """R_b_a from two attitudes; None when one is missing or only assumed from the mount."""
-    if a.R_world_camera is None or b.R_world_camera is None:
-        return None
-    if max(a.sigma_yaw_rad, b.sigma_yaw_rad) > 1.0:
-        return None
-    return np.asarray(b.R_world_camera.T @ a.R_world_camera)
-
-
-def _base_to_height(uv_a: F64, uv_b: F64, K: F64, R_b_a: F64 | None) -> float:
-    """Median motion of the matches in focal lengths, with the turn taken out when known.
-
-    Without an attitude the turn about the optical axis and the mean shift that a tilt would
-    give cannot be told from motion; the shift is then counted as motion.
-    """
-    a, b = rays(K, uv_a), rays(K, uv_b)
-    if R_b_a is not None:
-        a = a @ R_b_a.T
-        a = a / a[:, 2:]
-        return float(np.median(np.linalg.norm(b - a, axis=1)))
-    A, _ = cv2.estimateAffinePartial2D(
-        np.ascontiguousarray(a[:, :2]), np.ascontiguousarray(b[:, :2]), ransacReprojThreshold=0.01
-    )
-    return float(np.linalg.norm(A[:, 2])) if A is not None else 0.0
-
-
-def _metric_scale(
-    view: two_view.TwoView, first: PosePrior, second: PosePrior, T_odom_a: F64
-) -> float:
-    """Metres per baseline: from the height above ground, else from the distance flown."""
-    if first.agl_m is not None and first.agl_m > 0:
-        up_a = T_odom_a[:3, :3].T[:, 2]
-        height = -float(np.median(view.points[view.inliers] @ up_a))
-        if height > 0:
-            return first.agl_m / height
-    if first.position_m is not None and second.position_m is not None:
-        flown = float(np.linalg.norm(second.position_m - first.position_m))
-        if flown > 0:
-            return flown
-    return 1.0
-
-
-def _local_affine(H: F64, uv: F64, there: F64) -> F64:
-    """(N, 2, 2) Jacobian of the homography at each pixel."""
-    w = uv @ H[2, :2] + H[2, 2]
-    return np.asarray((H[None, :2, :2] - there[:, :, None] * H[2, :2]) / w[:, None, None])
-
-
-def _inverse_depth_plane(K: F64, P: F64) -> F64:
-    """(3,) q with ``1 / z = q . ray`` for the plane through camera points (N, 3)."""
-    if len(P) < 3:
-        return np.array([0.0, 0.0, 1.0 / max(float(np.median(P[:, 2])) if len(P) else 1.0, 1e-6)])
-    ray = P / P[:, 2:]
-    target = 1.0 / P[:, 2]
-    weights = np.ones(len(P))
-    q = np.zeros(3)
-    for _ in range(5):
-        A = ray * weights[:, None]
-        q = np.linalg.solve(A.T @ ray + 1e-9 * np.eye(3), A.T @ target)
-        error = np.abs(ray @ q - target)
-        scale = max(1.4826 * float(np.median(error)), 1e-9)
-        weights = 1.0 / (1.0 + (error / (2 * scale)) ** 2)
-    return np.asarray(q)
-
-
-def _fresh_corners(grey: U8, kept: F64, config: matching.MatchingConfig, mask: U8 | None) -> F64:
-    """(N, 2) corners in grid cells that no kept track occupies."""
-    corners = matching.harris_grid(grey, config, mask).uv_px.astype(np.float64)
-    H, W = grey.shape
-    taken = np.zeros((config.grid, config.grid), np.bool_)
-    cell = (kept / [W, H] * config.grid).astype(np.int64).clip(0, config.grid - 1)
-    taken[cell[:, 1], cell[:, 0]] = True
-    cell = (corners / [W, H] * config.grid).astype(np.int64).clip(0, config.grid - 1)
-    return np.asarray(corners[~taken[cell[:, 1], cell[:, 0]]])

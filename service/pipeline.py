@@ -18,7 +18,8 @@ from recon import se3
 from recon.backends import Backend
 from recon.camera_model import Undistorter, scaled
 from recon.exposure import stretch
-from recon.odometry import Odometry, OdometryConfig, OdometryKeyframe, Tracked
+from recon.keyframe_window import OdometryKeyframe, landmarks
+from recon.odometry import Odometry, OdometryConfig, Tracked
 from recon.trajectory import Placed
 from recon.types import F64, U8, Camera, Frame, Keyframe, PosePrior
 from recon.virtual_stereo import View
@@ -155,7 +156,7 @@ class Pipeline:
             self._asked.append(viewpoint)
 
     def _job(self, viewpoint: Viewpoint) -> Job:
-        points, _ = self.odometry.landmarks(viewpoint.key)
+        points, _ = landmarks(viewpoint.key)
         segment = viewpoint.key.segment
         assert viewpoint.bgr is not None
         return Job(

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 
 from recon import se3
-from recon.odometry import OdometryKeyframe, Tracked
+from recon.keyframe_window import OdometryKeyframe
+from recon.odometry import Tracked
 from recon.types import F64, U8, Frame, PosePrior
 from service.config import ScanConfig, parse_baseline
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from recon import se3
+from recon.keyframe_window import OdometryKeyframe
 from recon.landmarks import Landmarks
 from recon.matching import Pyramid
-from recon.odometry import OdometryKeyframe, Tracked
+from recon.odometry import Tracked
 from recon.types import Camera, Frame, PosePrior
 from service.config import ScanConfig
 from service.viewpoints import Viewpoint, Viewpoints, frames_apart
