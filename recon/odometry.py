@@ -62,6 +62,18 @@ class Tracked:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Incoming:
+    """A new frame on its way in."""
+
+    grey: U8  # (H, W) undistorted
+    pyramid: matching.Pyramid
+    seq: int
+    time_ns: int
+    prior: PosePrior
+    mask: U8 | None  # (H, W) non-zero where the picture is valid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Located:
     """A frame's pose and the keyframe's corners found in it."""
 
@@ -99,89 +111,77 @@ class Odometry:
             mask: (H, W) non-zero where the picture is valid.
         """
         pyramid = matching.Pyramid.build(grey, self.config.matching.search_levels)
+        new = _Incoming(grey, pyramid, seq, time_ns, prior, mask)
         self._gap_ns, self._frame_ns = time_ns - self._frame_ns, time_ns
         if not self.keyframes:
-            return self._start(grey, pyramid, seq, time_ns, prior, mask)
+            return self._start(new)
         if not self._metric:
-            return self._second_view(grey, pyramid, seq, time_ns, prior, mask)
-        found = self._locate(grey, pyramid, time_ns, prior)
+            return self._second_view(new)
+        found = self._locate(new)
         if isinstance(found, str):
-            return self._missed(grey, pyramid, seq, time_ns, prior, mask, found)
-        return self._accept(grey, pyramid, seq, time_ns, prior, mask, found)
+            return self._missed(new, found)
+        return self._accept(new, found)
 
     def _missed(
         self,
-        grey: U8,
-        pyramid: matching.Pyramid,
-        seq: int,
-        time_ns: int,
-        prior: PosePrior,
-        mask: U8 | None,
+        new: _Incoming,
         reason: str,
     ) -> Tracked:
         """Count a frame without a pose; after too many, or at a still, begin a new segment."""
         self._lost += 1
         still = self._gap_ns > 1e9 * self.config.still_gap_s
         if self._lost >= (2 if still else self.config.lost_after):
-            self._start(grey, pyramid, seq, time_ns, prior, mask)
+            self._start(new)
         return Tracked("lost", self.segment, reason=reason)
 
     def _start(
         self,
-        grey: U8,
-        pyramid: matching.Pyramid,
-        seq: int,
-        time_ns: int,
-        prior: PosePrior,
-        mask: U8 | None,
+        new: _Incoming,
     ) -> Tracked:
         """Begin a segment at this frame."""
-        corners = matching.harris_grid(grey, self.config.matching, mask)
+        corners = matching.harris_grid(new.grey, self.config.matching, new.mask)
         if corners.uv_px.shape[0] < 2 * self.config.min_tracks:
             return Tracked("lost", self.segment, reason="too little texture")
         self.segment += 1
         self._metric, self._lost = False, 0
         self._velocity = np.zeros(3)
-        R = prior.R_world_camera if prior.R_world_camera is not None else np.diag([1.0, -1, -1])
-        t = prior.position_m if prior.position_m is not None else np.zeros(3)
+        R = (
+            new.prior.R_world_camera
+            if new.prior.R_world_camera is not None
+            else np.diag([1.0, -1, -1])
+        )
+        t = new.prior.position_m if new.prior.position_m is not None else np.zeros(3)
         T_odom_camera = se3.compose(R, t)
         uv = corners.uv_px.astype(np.float64)
         self.keyframes = [
             OdometryKeyframe(
-                seq,
-                time_ns,
+                new.seq,
+                new.time_ns,
                 self.segment,
                 se3.inverse(T_odom_camera),
                 np.zeros((6, 6)),
-                prior,
-                pyramid,
+                new.prior,
+                new.pyramid,
                 uv,
                 np.full(len(uv), -1, np.int64),
                 Landmarks(),
             )
         ]
-        self._last = (time_ns, T_odom_camera, prior)
+        self._last = (new.time_ns, T_odom_camera, new.prior)
         return Tracked("started", self.segment, T_odom_camera, np.zeros((6, 6)))
 
     # ---- the second view --------------------------------------------------------------
 
     def _second_view(
         self,
-        grey: U8,
-        pyramid: matching.Pyramid,
-        seq: int,
-        time_ns: int,
-        prior: PosePrior,
-        mask: U8 | None,
+        new: _Incoming,
     ) -> Tracked:
         """Wait until the camera has moved enough, then make the first landmarks."""
         first = self.keyframes[0]
-        R_b_a = prediction.relative_rotation(first.prior, prior)
-        uv, ok = self._match_without_map(grey, pyramid, first, prior, R_b_a)
+        R_b_a = prediction.relative_rotation(first.prior, new.prior)
+        uv, ok = self._match_without_map(new, first, R_b_a)
         if ok.sum() < 2 * self.config.min_tracks:
-            return self._missed(
-                grey, pyramid, seq, time_ns, prior, mask, "too few matches with the first frame"
-            )
+            return self._missed(new, "too few matches with the first frame")
         self._lost = 0
         if (
             prediction.base_to_height(first.uv[ok], uv[ok], self.K, R_b_a)
@@ -194,17 +194,15 @@ class Odometry:
         turn = 0.12 if R_b_a is not None else np.pi
         view = two_view.solve(first.uv[ok], uv[ok], self.K, R_b_a, turn, up_a)
         if view is None or view.parallax_rad < self.config.least_base_to_height:
-            return self._missed(
-                grey, pyramid, seq, time_ns, prior, mask, "no certain motion between two frames"
-            )
+            return self._missed(new, "no certain motion between two frames")
         matched = np.flatnonzero(ok)
         ok[matched[~view.inliers]] = False
-        scale = self._first_landmarks(view, matched[view.inliers], prior)
+        scale = self._first_landmarks(view, matched[view.inliers], new.prior)
         second = se3.compose(view.T_b_a[:3, :3], view.T_b_a[:3, 3] * scale)
         T_camera_odom = second @ first.T_camera_odom
         self._metric = True
-        self._add_keyframe(grey, pyramid, seq, time_ns, prior, mask, T_camera_odom, uv, ok)
-        self._update_motion(time_ns, self.keyframes[-1].T_odom_camera, prior)
+        self._add_keyframe(new, T_camera_odom, uv, ok)
+        self._update_motion(new.time_ns, self.keyframes[-1].T_odom_camera, new.prior)
         return Tracked(
             "keyframe",
             self.segment,
@@ -225,19 +223,17 @@ class Odometry:
 
     def _match_without_map(
         self,
-        grey: U8,
-        pyramid: matching.Pyramid,
+        new: _Incoming,
         first: OdometryKeyframe,
-        prior: PosePrior,
         R_b_a: F64 | None,
     ) -> tuple[F64, Bool]:
         """(N, 2) pixels and (N,) success of the first frame's corners in a new frame."""
         best: tuple[F64, Bool] | None = None
-        for guess in self._predictions_2d(grey, first, prior, R_b_a):
+        for guess in self._predictions_2d(new, first, R_b_a):
             found = matching.match(
                 first.pyramid,
                 first.uv.astype(np.float32),
-                pyramid,
+                new.pyramid,
                 guess.uv.astype(np.float32),
                 guess.radius_px,
                 guess.warp.astype(np.float32),
@@ -251,22 +247,22 @@ class Odometry:
         return best
 
     def _predictions_2d(
-        self, grey: U8, key: OdometryKeyframe, prior: PosePrior, R_b_a: F64 | None
+        self, new: _Incoming, key: OdometryKeyframe, R_b_a: F64 | None
     ) -> list[prediction.Prediction]:
         """Guesses of where a keyframe's corners went, best first, without landmarks."""
         radius_px = self.config.wide_search_share * self.camera.size_px[0]
         out = []
         if R_b_a is not None:
-            height = prior.agl_m or 0.0
+            height = new.prior.agl_m or 0.0
             t = np.zeros(3)
-            if prior.position_m is not None and key.prior.position_m is not None and height > 0:
+            if new.prior.position_m is not None and key.prior.position_m is not None and height > 0:
                 R_a = key.prior.R_world_camera
                 assert R_a is not None
-                t = R_b_a @ R_a.T @ (key.prior.position_m - prior.position_m) / height
+                t = R_b_a @ R_a.T @ (key.prior.position_m - new.prior.position_m) / height
             n = key.T_camera_odom[:3, 2]  # up, seen from the camera
             H = self.K @ (R_b_a - np.outer(t, n)) @ np.linalg.inv(self.K)
             out.append(prediction.by_homography(H, key.uv, radius_px))
-        shift = matching.global_shift(key.pyramid.levels[0], grey)
+        shift = matching.global_shift(key.pyramid.levels[0], new.grey)
         if shift is not None and shift.confidence > self.config.least_shift_confidence:
             H = np.eye(3)
             H[:2, :2], H[:2, 2] = shift.A, shift.shift_px
@@ -275,39 +271,35 @@ class Odometry:
             out.append(prediction.by_homography(np.eye(3), key.uv, radius_px))
         return out
 
-    def _locate(
-        self, grey: U8, pyramid: matching.Pyramid, time_ns: int, prior: PosePrior
-    ) -> _Located | str:
+    def _locate(self, new: _Incoming) -> _Located | str:
         """The frame against the last keyframe, averaged with the one before; or why not."""
         right = self.keyframes[-1]
         reason = "no match"
-        for T_camera_odom, share in self._predicted_poses(grey, time_ns, prior, right):
-            found = self._pose_from(right, pyramid, T_camera_odom, share)
+        for T_camera_odom, share in self._predicted_poses(new, right):
+            found = self._pose_from(right, new.pyramid, T_camera_odom, share)
             if isinstance(found, str):
                 reason = found
                 continue
             T = found.pose.T_camera_points
-            if not self._agrees(T, prior, right):
+            if not self._agrees(T, new.prior, right):
                 reason = "vision and attitude disagree"
                 continue
             if len(self.keyframes) > 1:
                 left = self._pose_from(
-                    self.keyframes[-2], pyramid, T, 0.5 * self.config.search_share, stride=3
+                    self.keyframes[-2], new.pyramid, T, 0.5 * self.config.search_share, stride=3
                 )
                 if isinstance(left, _Located):
                     found = replace(found, pose=_averaged(left.pose, found.pose))
             return found
         return reason
 
-    def _predicted_poses(
-        self, grey: U8, time_ns: int, prior: PosePrior, key: OdometryKeyframe
-    ) -> list[tuple[F64, float]]:
+    def _predicted_poses(self, new: _Incoming, key: OdometryKeyframe) -> list[tuple[F64, float]]:
         """Start poses T_camera_odom with their search radius share, most trusted first."""
         assert self._last is not None
         last_ns, T_last, last_prior = self._last
-        dt = (time_ns - last_ns) * 1e-9
+        dt = (new.time_ns - last_ns) * 1e-9
         R = T_last[:3, :3]
-        turn = prediction.relative_rotation(last_prior, prior)
+        turn = prediction.relative_rotation(last_prior, new.prior)
         if turn is not None:
             R = R @ turn.T
         t = T_last[:3, 3] + self._velocity * dt
@@ -316,7 +308,7 @@ class Odometry:
         by_motion = (se3.inverse(se3.compose(R, t)), share)
         by_picture: list[tuple[F64, float]] = []
         if still or self._lost > 0:
-            by_picture = self._pose_by_picture(grey, key, turn, R)
+            by_picture = self._pose_by_picture(new.grey, key, turn, R)
         if still and turn is None:
             return [*by_picture, by_motion]
         wide = (by_motion[0], self.config.wide_search_share)
@@ -409,12 +401,7 @@ class Odometry:
 
     def _accept(
         self,
-        grey: U8,
-        pyramid: matching.Pyramid,
-        seq: int,
-        time_ns: int,
-        prior: PosePrior,
-        mask: U8 | None,
+        new: _Incoming,
         found: _Located,
     ) -> Tracked:
         """Keep the pose; make the frame a keyframe when it has moved enough."""
@@ -426,13 +413,13 @@ class Odometry:
         share = ok.sum() / max(len(key.uv), 1)
         turned = float(np.linalg.norm(se3.so3_log(moved[:3, :3])))
         T_odom_camera = se3.inverse(T_camera_odom)
-        self._update_motion(time_ns, T_odom_camera, prior)
+        self._update_motion(new.time_ns, T_odom_camera, new.prior)
         self._lost = 0
         if base < self.config.base_to_height and share > 0.45 and turned < 0.25:
             return Tracked("tracked", self.segment, T_odom_camera, covariance, int(ok.sum()), base)
-        self._add_keyframe(grey, pyramid, seq, time_ns, prior, mask, T_camera_odom, found.uv, ok)
+        self._add_keyframe(new, T_camera_odom, found.uv, ok)
         last = self.keyframes[-1]
-        self._last = (time_ns, last.T_odom_camera, prior)
+        self._last = (new.time_ns, last.T_odom_camera, new.prior)
         return Tracked(
             "keyframe", self.segment, last.T_odom_camera, last.covariance, int(ok.sum()), base
         )
@@ -447,12 +434,7 @@ class Odometry:
 
     def _add_keyframe(
         self,
-        grey: U8,
-        pyramid: matching.Pyramid,
-        seq: int,
-        time_ns: int,
-        prior: PosePrior,
-        mask: U8 | None,
+        new: _Incoming,
         T_camera_odom: F64,
         uv: F64,
         ok: Bool,
@@ -462,20 +444,20 @@ class Odometry:
         least = 0.5 * self.config.least_base_to_height
         triangulate(key, T_camera_odom, uv, ok, self.K, least, self.config.loose_px)
         kept = np.flatnonzero(ok)
-        fresh = prediction.fresh_corners(grey, uv[kept], self.config.matching, mask)
-        new = OdometryKeyframe(
-            seq,
-            time_ns,
+        fresh = prediction.fresh_corners(new.grey, uv[kept], self.config.matching, new.mask)
+        key_new = OdometryKeyframe(
+            new.seq,
+            new.time_ns,
             self.segment,
             T_camera_odom,
             np.zeros((6, 6)),
-            prior,
-            pyramid,
+            new.prior,
+            new.pyramid,
             np.vstack([uv[kept], fresh]),
             np.concatenate([key.landmark[kept], np.full(len(fresh), -1, np.int64)]),
             key.map,
         )
-        self.keyframes.append(new)
+        self.keyframes.append(key_new)
         adjust_window(self.keyframes[-self.config.window - 2 :], self.K)
         self._forget()
 
