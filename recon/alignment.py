@@ -19,6 +19,9 @@ from recon.types import F64, PosePrior
 WANDER_SHARE = 0.4
 """Of a fix's sigma, what differs between fixes of one flight; the rest is common to all."""
 
+INDEPENDENT_HEIGHTS = 4.0
+"""Heights of one flight count as so many: they share the ground's relief or an assumption."""
+
 LEANING_SHARE = 2.0
 """Sigma of a height, as a share of it, per unit of (1 - cosine) off the vertical."""
 
@@ -77,6 +80,8 @@ def height_above(points: F64, up: F64) -> tuple[float, float] | None:
 def _residuals(R: F64, t: F64, log_scale: float, anchors: Sequence[Anchor]) -> tuple[F64, F64, F64]:
     """Whitened residuals (M,), Jacobian (M, 7) and the row's group for robust weights (M,)."""
     scale = float(np.exp(log_scale))
+    heights = sum(a.prior.agl_m is not None and a.height is not None for a in anchors)
+    thinned = min(1.0, (INDEPENDENT_HEIGHTS / max(heights, 1)) ** 0.5)
     rows: list[F64] = []
     jac: list[F64] = []
     group: list[int] = []
@@ -100,7 +105,7 @@ def _residuals(R: F64, t: F64, log_scale: float, anchors: Sequence[Anchor]) -> t
             group += [3 * i + 1] * 3
         if p.agl_m is not None and a.height is not None and a.height > 0:
             # The height is measured straight below; ground seen elsewhere may lie otherwise.
-            info_h = p.agl_m / (p.sigma_agl_m + LEANING_SHARE * a.lean * p.agl_m)
+            info_h = thinned * p.agl_m / (p.sigma_agl_m + LEANING_SHARE * a.lean * p.agl_m)
             J = np.zeros((1, 7))
             J[0, 6] = info_h
             rows.append(np.array([(log_scale + np.log(a.height / p.agl_m)) * info_h]))
