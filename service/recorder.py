@@ -91,7 +91,6 @@ class Recorder:
             "frames_lost": self.states["lost"],
             "segments": pipeline.odometry.segment + 1,
             "pairs": pipeline.dense.pairs,
-            "dropped": pipeline.dropped,
             "clouds": pipeline.dense.pairs,  # one per stereo pair, Eq. 3
             "keyframes": self.keyframes,
             "points": self.points,
@@ -101,8 +100,14 @@ class Recorder:
             "scale": self._scale(),
             "stage_ms": {k: round(v, 2) for k, v in pipeline.stopwatch.mean_ms().items()},
             "refusals": dict(pipeline.all_refusals()),
+            "drops": self._drops(),
             "registrations": dict(pipeline.dense.registrations),
         }
+
+    def _drops(self) -> dict[str, int]:
+        """What was not used, by reason."""
+        late = {"newer views came faster": self.pipeline.dropped} if self.pipeline.dropped else {}
+        return dict(self.pipeline.all_refusals()) | late
 
     def _scale(self) -> dict[str, Any]:
         """What the metric scale rests on, and its relative sigma."""
