@@ -151,6 +151,9 @@ class Pipeline:
         """Hand over the views whose partners are there."""
         while self._waiting and (everything or self.viewpoints.ready(self._waiting[0])):
             viewpoint = self._waiting.popleft()
+            if not self.viewpoints.confirmed(viewpoint):
+                self.refusals["seen by two views only"] += 1
+                continue
             self._views[viewpoint.seq] = viewpoint
             self._jobs.offer(self._job(viewpoint))
             self._asked.append(viewpoint)

@@ -7,7 +7,7 @@ every m frames, evenly, as the paper does (two of every ten).
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass
 
 import cv2
@@ -50,6 +50,7 @@ class Viewpoints:
         self._kept: deque[Viewpoint] = deque(maxlen=kept)
         self._between: deque[Viewpoint] = deque(maxlen=8 * partners if partners > kept - 2 else 0)
         self._most_partners = partners
+        self._views_of: Counter[int] = Counter()  # views by segment
         self._take_next = False
         self.set_baseline(config)
 
@@ -90,6 +91,7 @@ class Viewpoints:
             return None
         self._take_next = False
         self._kept.append(view)
+        self._views_of[view.key.segment] += 1
         return view
 
     def _wants(self, seq: int, tracked: Tracked) -> bool:
@@ -105,8 +107,20 @@ class Viewpoints:
         return bool(np.linalg.norm(moved) >= self._amount)
 
     def ready(self, view: Viewpoint) -> bool:
-        """True when a later view has come, so that the view has partners on both sides."""
-        return bool(self._kept) and self._kept[-1] is not view
+        """True when the view has two neighbours to pair with, or its segment is over."""
+        if not self._kept or self._kept[-1] is view:
+            return False
+        if self._mode != "auto" or self._kept[-1].key.segment != view.key.segment:
+            return True
+        return sum(v.key.segment == view.key.segment for v in self._kept) >= 3
+
+    def confirmed(self, view: Viewpoint) -> bool:
+        """False for a stretch of two views: what one pair alone claims, nothing contradicts.
+
+        Clouds in the sky or a false first motion would otherwise become surface. A baseline
+        that the operator fixed pairs each view once and is taken at its word.
+        """
+        return self._mode != "auto" or self._views_of[view.key.segment] >= 3
 
     def partners(self, view: Viewpoint) -> list[Viewpoint]:
         """The views to pair it with, the best first.

@@ -44,8 +44,22 @@ def test_partners_are_the_nearest_of_the_same_segment() -> None:
     middle = kept[1]
     assert middle is not None and views.ready(middle)
     assert sorted(v.seq for v in views.partners(middle)) == [1, 3]
+    assert views.confirmed(middle)
     last = kept[3]
     assert last is not None and not views.ready(last)
+
+
+def test_two_views_alone_confirm_nothing() -> None:
+    views = Viewpoints(ScanConfig())
+    first = offer(views, 0, 0.0, "started")
+    offer(views, 1, 5.0, "keyframe")
+    assert first is not None and not views.ready(first) and not views.confirmed(first)
+    offer(views, 2, 10.0, "keyframe")
+    assert views.ready(first) and views.confirmed(first)
+    fixed = Viewpoints(ScanConfig(baseline=2.0))
+    left = offer(fixed, 0, 0.0, "started")
+    offer(fixed, 1, 2.5, "tracked")
+    assert left is not None and fixed.ready(left) and fixed.confirmed(left)
 
 
 @pytest.mark.parametrize(("baseline", "seqs"), [("2/10", [0, 10, 20, 30]), ("3/10", [0, 5, 10])])
