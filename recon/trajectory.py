@@ -29,7 +29,6 @@ class _Node:
     seq: int
     segment: int
     T_map_camera: F64  # (4, 4) in the segment's chain
-    covariance: F64  # (6, 6) of the step from the node before, left, camera frame
     prior: PosePrior
     height: float | None
     lean: float
@@ -61,7 +60,6 @@ class Trajectory:
         seq: int,
         segment: int,
         T_map_camera: F64,
-        covariance: F64,
         prior: PosePrior,
         height: tuple[float, float] | None,
     ) -> None:
@@ -70,7 +68,7 @@ class Trajectory:
         ``height`` comes from :func:`recon.alignment.height_above`, in odometry units.
         """
         above, lean = height if height is not None else (None, 0.0)
-        node = _Node(seq, segment, T_map_camera, covariance, prior, above, lean)
+        node = _Node(seq, segment, T_map_camera, prior, above, lean)
         self._nodes[seq] = node
         nodes = self._segments.setdefault(segment, [])
         nodes.append(node)

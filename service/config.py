@@ -86,7 +86,6 @@ class ScanConfig:
     assumed_agl_m: float | None = key(
         None, "height above ground when telemetry has none; gives the scan its scale"
     )
-    keyframe_overlap: float = key(0.8, "a new keyframe when less of the last one is still seen")
     keep_free_mib: float = key(
         2048.0, "the oldest finished scans are deleted to keep so much of the disk; 0: never", True
     )
@@ -96,7 +95,6 @@ class ScanConfig:
         """Check ranges and the notation of the baseline."""
         _within("scan.base_to_height", self.base_to_height, 0.005, 1.0)
         _within("scan.keep_free_mib", self.keep_free_mib, 0, 1e9)
-        _within("scan.keyframe_overlap", self.keyframe_overlap, 0.1, 0.99)
         if self.assumed_agl_m is not None:
             _within("scan.assumed_agl_m", self.assumed_agl_m, 0.5, 10_000)
         parse_baseline(self.baseline)

@@ -76,7 +76,11 @@ class Pipeline:
         self.stopwatch = self.dense.stopwatch
         self.refusals: Counter[str] = Counter()
         self._jobs: SideBySide[Job, Keyframe | None] = SideBySide(
-            self.dense.reconstruct, 3, live, beside=not config.scan.keep_debug
+            self.dense.reconstruct,
+            3,
+            live,
+            beside=not config.scan.keep_debug,
+            threads=config.compute.threads,
         )
         self._waiting: deque[Viewpoint] = deque()
         self._asked: deque[Viewpoint] = deque(maxlen=8)  # whose reconstruction was asked for

@@ -9,7 +9,7 @@ import numpy as np
 
 from mavlink.state import VehicleState
 from recon import se3
-from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
+from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy, rpy_from_rotation
 from recon.types import F64, PosePrior
 from service.cameras.source import GeoTag
 from service.config import CameraConfig, FusionConfig, ScanConfig
@@ -132,6 +132,4 @@ class Rig:
 
 def attitude_of(T_world_camera: F64) -> tuple[float, float, float]:
     """(roll, pitch, yaw) rad of the optical head (gimbal axes) in NED: pitch -pi/2 is nadir."""
-    from recon.frames import rpy_from_rotation
-
     return rpy_from_rotation(R_ENU_NED @ T_world_camera[:3, :3] @ R_GIMBAL_CAMERA.T)

@@ -19,16 +19,23 @@ class SideBySide(Generic[In, Out]):
     A recording drops nothing: a full queue makes :meth:`offer` wait. Live, the oldest work that
     has not begun gives way and :attr:`dropped` counts it. Without a thread (``beside`` False)
     the work is done within :meth:`offer`. Compiled kernels share the cores between the two:
-    two that each want all of them only wait for one another.
+    two that each want all of them only wait for one another. ``threads`` are what both use
+    together; 0 is one per core.
     """
 
     def __init__(
-        self, work: Callable[[In], Out], most_waiting: int, live: bool, beside: bool = True
+        self,
+        work: Callable[[In], Out],
+        most_waiting: int,
+        live: bool,
+        beside: bool = True,
+        threads: int = 0,
     ) -> None:
         self._work, self._most, self._live = work, most_waiting, live
         self._worker: ThreadPoolExecutor | None = None
         if beside:
-            half = max(1, numba.config.NUMBA_NUM_THREADS // 2)
+            most = numba.config.NUMBA_NUM_THREADS
+            half = max(1, min(threads or most, most) // 2)
             numba.set_num_threads(half)  # of the calling thread: the other half is the worker's
             self._worker = ThreadPoolExecutor(1, "dense", numba.set_num_threads, (half,))
         self._queue: deque[tuple[In, Future[Out]]] = deque()
