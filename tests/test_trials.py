@@ -285,7 +285,7 @@ def test_a_scan_that_fails_is_started_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: Record
 ) -> None:
     daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
-    daemon._booted = True
+    daemon.actions.is_ready = True
     faults: list[Exception] = [OutsideError("camera gone"), RuntimeError("ours"), OSError("disk")]
     tried = len(faults)
     scanning = []
@@ -293,41 +293,41 @@ def test_a_scan_that_fails_is_started_again(
     def scan_once() -> None:
         if faults:
             raise faults.pop(0)
-        scanning.append(daemon.phase)
-        daemon._stop_scan.wait(PATIENCE_S)
+        scanning.append(daemon.scanning.phase)
+        daemon.scanning._stop.wait(PATIENCE_S)
 
-    monkeypatch.setattr(daemon, "_scan_once", scan_once)
-    monkeypatch.setattr("service.runtime.FIRST_RETRY_S", 0.01)
-    daemon._retry_s = 0.01
-    daemon.start_scan()
+    monkeypatch.setattr(daemon.scanning, "_scan_once", scan_once)
+    monkeypatch.setattr("service.scanning.FIRST_RETRY_S", 0.01)
+    daemon.scanning._retry_s = 0.01
+    daemon.actions.start_scan()
     deadline = time.monotonic() + PATIENCE_S
     while not scanning and time.monotonic() < deadline:
-        daemon._retry()
+        daemon.scanning.retry()
         time.sleep(0.005)
     assert scanning == [Phase.SCANNING]
-    assert daemon.fault == ""
-    daemon.stop_scan()
-    daemon._end_scan()
-    daemon._retry()
-    assert daemon.phase is Phase.IDLE  # stopped by the operator: it stays so
+    assert daemon.scanning.fault == ""
+    daemon.actions.stop_scan()
+    daemon.scanning.end()
+    daemon.scanning.retry()
+    assert daemon.scanning.phase is Phase.IDLE  # stopped by the operator: it stays so
     record("faults of camera, disk and our own code", tried, "scanning again each time")
 
 
 def test_stopping_ends_the_retries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
-    daemon._booted = True
+    daemon.actions.is_ready = True
 
     def scan_once() -> None:
         raise OutsideError("camera gone")
 
-    monkeypatch.setattr(daemon, "_scan_once", scan_once)
-    daemon._retry_s = 0.0
-    daemon.start_scan()
-    assert daemon._worker is not None
-    daemon._worker.join()
-    assert daemon.fault == "camera gone"
-    assert daemon._retry_at_s is not None
-    daemon.stop_scan()
-    daemon._retry()
-    assert daemon.phase is Phase.IDLE
-    assert daemon.fault == "camera gone"
+    monkeypatch.setattr(daemon.scanning, "_scan_once", scan_once)
+    daemon.scanning._retry_s = 0.0
+    daemon.actions.start_scan()
+    assert daemon.scanning._worker is not None
+    daemon.scanning._worker.join()
+    assert daemon.scanning.fault == "camera gone"
+    assert daemon.scanning._retry_at_s is not None
+    daemon.actions.stop_scan()
+    daemon.scanning.retry()
+    assert daemon.scanning.phase is Phase.IDLE
+    assert daemon.scanning.fault == "camera gone"

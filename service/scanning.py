@@ -1,0 +1,270 @@
+"""The scan's thread: open the camera, scan, close the scan, and scan again after a fault.
+
+This is the only place that catches what the outside world throws at a scan.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mavlink.camera import KeyframeReport
+from mavlink.control import ACCEPTED, Answer, Phase, Result, Work
+from mavlink.status import CRITICAL, WARNING
+from mavlink.vehicle import VehicleLink
+from service.config import Config, ScanConfig
+from service.errors import InputError, OutsideError, SkyreliefError
+
+if TYPE_CHECKING:
+    from recon.backends import Backend
+    from recon.types import Camera
+    from service.cameras.source import CameraSource
+    from service.scan import Scan
+    from service.stream.records import PoseRecord
+    from service.stream.store import ScanStore
+
+log = logging.getLogger(__name__)
+
+FIRST_RETRY_S, LAST_RETRY_S = 1.0, 8.0
+"""Back-off between attempts to open a camera or to scan again; names of scans are seconds."""
+
+
+class Scanning:
+    """One scan at a time, on a thread of its own."""
+
+    vehicle: VehicleLink
+    """Telemetry and the operator; set by who owns both, before the first scan."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.phase = Phase.IDLE
+        self.fault = ""
+        self.scan: Scan | None = None
+        self.started_s = self.progress_s = time.monotonic()
+        self._backend: Backend | None = None
+        self._camera: Camera | None = None
+        self._stop, self._ended = threading.Event(), threading.Event()
+        self._paused = threading.Event()
+        self._worker: threading.Thread | None = None
+        self._closing: Work | None = None
+        self._reported = 0
+        self._retry_at_s: float | None = None
+        self._retry_s = FIRST_RETRY_S
+
+    def load(self) -> None:
+        """The heavy part of the start: camera model and backend; InputError without them."""
+        from service.camera_file import load_camera
+        from service.compute import open_backend
+
+        if not self.config.camera.source:
+            raise InputError("camera.source is not set; give it in the configuration file")
+        if not self.config.camera.model:
+            raise InputError(
+                "camera.model is not set; make one with 'skyrelief calibrate' and name it"
+            )
+        self._camera = load_camera(Path(self.config.camera.model))
+        self._backend = open_backend(self.config.compute)
+        log.info("ready: backend %s", self._backend.name)
+
+    # ---- what may be asked of it -----------------------------------------------------------
+
+    @property
+    def is_running(self) -> bool:
+        """True from the start of a scan until its files are written."""
+        return self._worker is not None and self._worker.is_alive()
+
+    @property
+    def scan_id(self) -> str:
+        """Of the scan that runs; else empty."""
+        scan = self.scan
+        return scan.inputs.scan_id if scan is not None else ""
+
+    def start(self) -> None:
+        """Start a scan; to be asked while none is running."""
+        self.fault = ""
+        self._retry_at_s = None
+        self._stop.clear()
+        self._paused.clear()
+        self.phase = Phase.SCANNING
+        self.started_s = self.progress_s = time.monotonic()
+        self._worker = threading.Thread(target=self._work, name="scan", daemon=True)
+        self._worker.start()
+
+    def stop(self) -> None:
+        """Close the running scan, also where it waits for a dead camera, and start no other."""
+        self._retry_at_s = None
+        self._stop_feeding()
+
+    def _stop_feeding(self) -> None:
+        self._stop.set()
+        scan = self.scan
+        if scan is not None:
+            scan.source.close()
+
+    def finalise(self) -> Work:
+        """Close the running scan; done when everything is written out."""
+        self._closing = Work()
+        self._stop_feeding()
+        return self._closing
+
+    def pause(self) -> None:
+        """Take no frames until :meth:`resume`."""
+        self._paused.set()
+        self.phase = Phase.PAUSED
+
+    def resume(self) -> None:
+        """Go on after a pause."""
+        self._paused.clear()
+        self.phase = Phase.SCANNING
+        self.progress_s = time.monotonic()
+
+    def set_baseline(self, config: ScanConfig) -> None:
+        """Follow another ``scan.baseline``, also in the scan that runs."""
+        scan = self.scan
+        if scan is not None:
+            scan.pipeline.set_baseline(config)
+
+    def retry(self) -> None:
+        """Start the next scan when a fault ended the last one and nobody stopped it."""
+        due = self._retry_at_s is not None and time.monotonic() >= self._retry_at_s
+        if due and not self.is_running:
+            self.start()
+
+    def end(self) -> None:
+        """Close the running scan, wait for its files, and start no other."""
+        self._ended.set()
+        self._stop_feeding()
+        if self._worker is not None:
+            self._worker.join()
+
+    # ---- the scan's thread ------------------------------------------------------------------
+
+    def _work(self) -> None:
+        try:
+            self._scan_once()
+        except SkyreliefError as error:
+            self._fail(str(error))
+        except Exception as error:
+            log.exception("the scan ended with a fault of ours")
+            self._fail(f"internal fault: {error}")
+        finally:
+            self.scan = None
+            self.phase = Phase.IDLE
+            if self._closing is not None:
+                failed = Answer(Result.FAILED, self.fault)
+                self._closing.finish(failed if self.fault else ACCEPTED)
+                self._closing = None
+
+    def _fail(self, text: str) -> None:
+        self.fault = text
+        log.error("%s", text)
+        self.vehicle.statustext(f"Scan failed: {text}", CRITICAL)
+        if not (self._stop.is_set() or self._ended.is_set()):
+            log.warning("scanning again in %.1f s", self._retry_s)
+            self._retry_at_s = time.monotonic() + self._retry_s
+            self._retry_s = min(2 * self._retry_s, LAST_RETRY_S)
+
+    def _scan_once(self) -> None:
+        """Open the camera, scan until stopped or the recording ends, close the scan."""
+        from service.datalink import open_datalink
+        from service.scan import Scan, ScanInputs, create_store
+        from service.scan_folder import write_deliverables
+
+        assert self._camera is not None and self._backend is not None
+        source = self._open_camera()
+        if source is None:
+            return
+        scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        folder = Path(self.config.scan.folder) / scan_id
+        offset = time.time_ns() - time.monotonic_ns()
+        inputs = ScanInputs(
+            source,
+            self._camera,
+            self.config,
+            self._backend,
+            folder,
+            scan_id,
+            _zero_ns(source),
+            unix_offset_ns=offset,
+            history=self.vehicle.history,
+            extra={"backend": self._backend.name, "source": source.description},
+        )
+        store = create_store(inputs)
+        self.vehicle.record(folder / "link.tlog")
+        link = open_datalink(store, self.config)
+        self.scan, self._reported = Scan(inputs, store), 0
+        self.vehicle.statustext(f"Scan {scan_id} started")
+        try:
+            self.scan.run(self._stop, self._on_frame, self._paused)
+        finally:
+            source.close()
+            self.phase = Phase.FINALISING
+            self.vehicle.record(None)
+            try:
+                self._close_scan(self.scan, store)
+            finally:
+                write_deliverables(folder, store, {})
+                if link is not None:
+                    link.drain(self.config.datalink.drain_s)
+                    link.close()
+                store.close()
+
+    def _close_scan(self, scan: Scan, store: ScanStore) -> None:
+        """Finish the scan; when the pipeline cannot, what is stored is kept as interrupted."""
+        try:
+            summary = scan.close()
+        except Exception:
+            store.finish({"interrupted": True})
+            raise
+        self.vehicle.statustext(
+            f"Scan {scan.inputs.scan_id}: {summary['clouds']} clouds, {summary['distance_m']:.0f} m"
+        )
+
+    def _open_camera(self) -> CameraSource | None:
+        """The camera at its own pace, tried until it answers; None when stopped meanwhile."""
+        from service.cameras import open_camera
+        from service.cameras.pace import paced
+
+        wait_s = FIRST_RETRY_S
+        while not (self._stop.is_set() or self._ended.is_set()):
+            try:
+                source = open_camera(self.config.camera.source)
+                return source if source.is_live else paced(source)
+            except OutsideError as error:
+                log.warning("%s; trying again in %.1f s", error, wait_s)
+                self.vehicle.statustext(f"Camera: {error}", WARNING)
+                self._stop.wait(wait_s)
+                wait_s = min(2 * wait_s, LAST_RETRY_S)
+        return None
+
+    def _on_frame(self, scan: Scan) -> None:
+        self.progress_s = time.monotonic()
+        if scan.recorder.keyframes > self._reported and scan.recorder.last is not None:
+            self._reported = scan.recorder.keyframes
+            self._retry_s = FIRST_RETRY_S
+            self.vehicle.report_keyframe(_keyframe_report(scan.recorder.last))
+
+
+def _keyframe_report(pose: PoseRecord) -> KeyframeReport:
+    """What ground stations are told of a keyframe, from the newest pose."""
+    from recon.frames import rotation_from_rpy
+    from recon.se3 import quaternion_from_rotation
+
+    q = quaternion_from_rotation(rotation_from_rpy(pose.roll_rad, pose.pitch_rad, pose.yaw_rad))
+    return KeyframeReport(
+        unix_us=pose.time_unix_ns // 1000,
+        lat_deg=pose.lat_deg,
+        lon_deg=pose.lon_deg,
+        alt_amsl_m=pose.alt_amsl_m,
+        alt_agl_m=pose.agl_m,
+        q_ned_camera_wxyz=(float(q[0]), float(q[1]), float(q[2]), float(q[3])),
+    )
+
+
+def _zero_ns(source: CameraSource) -> int:
+    """Monotonic clock at the source's time 0: its own word if it is live, else now."""
+    start_ns = source.start_monotonic_ns
+    return time.monotonic_ns() if start_ns is None else start_ns
