@@ -40,7 +40,7 @@ from recon.virtual_stereo import (
     rectify,
 )
 from recon.voxel_map import VoxelMap, VoxelMapConfig
-from service.config import Config
+from service.config import ComputeConfig, Config
 from service.stopwatch import Stopwatch
 
 
@@ -97,15 +97,20 @@ class Dense:
         """Accept baselines as short as ``least`` of the distance."""
         self.stereo = replace(self.stereo, least_base_to_height=least)
 
+    def set_effort(self, compute: ComputeConfig) -> None:
+        """Reconstruct at another width, with or without upsampling, from the next view on."""
+        self.stereo = replace(self.stereo, width_px=compute.stereo_width, guided=compute.upsample)
+
     def reconstruct(self, job: Job) -> Keyframe | None:
         """Stereo with every partner, fused, registered and compared with the map."""
         H, W = job.view.grey.shape
-        size = (self.stereo.width_px, round(self.stereo.width_px * H / W))
+        stereo = self.stereo  # may be set anew meanwhile
+        size = (stereo.width_px, round(stereo.width_px * H / W))
         K = scaled_K(job.view.K, size[0] / W, size[1] / H)
         depths = []
         for partner in job.partners:
             with self.stopwatch("rectify"):
-                pair = rectify(job.view, partner, job.points, self.stereo, self._relief)
+                pair = rectify(job.view, partner, job.points, stereo, self._relief)
             if isinstance(pair, Refusal):
                 self.refusals[pair.reason] += 1
                 continue

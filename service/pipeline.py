@@ -24,7 +24,7 @@ from recon.trajectory import Placed
 from recon.types import F64, U8, Camera, Frame, Keyframe, PosePrior
 from recon.virtual_stereo import View
 from service.cameras.source import GeoTag
-from service.config import Config, ScanConfig
+from service.config import ComputeConfig, Config, ScanConfig
 from service.dense import Dense, Job
 from service.rig import Rig
 from service.side_by_side import SideBySide
@@ -118,6 +118,11 @@ class Pipeline:
         """Follow another ``scan.baseline`` from the next frame on."""
         self.viewpoints.set_baseline(config)
         self.dense.set_least_base_to_height(self.viewpoints.least_base_to_height)
+
+    def set_effort(self, compute: ComputeConfig) -> None:
+        """Follow another ``pairs``, ``stereo_width`` and ``upsample`` from the next view on."""
+        self.viewpoints.set_partners(compute.pairs)
+        self.dense.set_effort(compute)
 
     @property
     def dropped(self) -> int:

@@ -60,6 +60,11 @@ class Viewpoints:
         self._stride = frames_apart(int(self._amount), every) if self._mode == "frames" else 0
         self._partners = self._most_partners if self._mode == "auto" else 1
 
+    def set_partners(self, most: int) -> None:
+        """Pair each view with at most ``most`` others from now on, where the baseline is "auto"."""
+        self._most_partners = most
+        self._partners = most if self._mode == "auto" else 1
+
     def take_next(self) -> None:
         """Make the next frame with a pose a view, whatever the baseline asks for."""
         self._take_next = True

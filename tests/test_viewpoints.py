@@ -89,3 +89,13 @@ def test_the_operator_can_ask_for_the_next_frame() -> None:
 
 def test_frames_apart() -> None:
     assert frames_apart(2, 10) == 10 and frames_apart(1, 5) == 5 and frames_apart(6, 10) == 2
+
+
+def test_fewer_partners_from_now_on() -> None:
+    views = Viewpoints(ScanConfig(), partners=4)
+    kept = [offer(views, i, 5.0 * i, "started" if i == 0 else "keyframe") for i in range(5)]
+    middle = kept[2]
+    assert middle is not None
+    assert len(views.partners(middle)) == 4
+    views.set_partners(2)
+    assert sorted(v.seq for v in views.partners(middle)) == [1, 3]
