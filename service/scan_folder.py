@@ -1,7 +1,8 @@
 """The files of a finished (or still growing) scan, made from its store alone.
 
 Drone and ground hold the same store, so both make the same files: ``cloud.laz``,
-``trajectory.tum``, ``trajectory.csv``, ``scan.json``, ``preview.jpg`` and ``report.html``.
+``trajectory.tum``, ``trajectory.csv``, ``scan.json``, ``preview.jpg``, ``coverage.png``,
+``coverage.json`` and ``report.html``.
 Each is written beside its place and then renamed, so a reader never sees half a file.
 """
 
@@ -69,6 +70,8 @@ def write_deliverables(
 
     Raises OutsideError when the folder cannot be written.
     """
+    from service.coverage import write_coverage_files
+
     header = store.header
     frame = local_frame(header)
     poses = latest(store.poses())
@@ -82,6 +85,8 @@ def write_deliverables(
         part.write_text(_tum(poses), encoding="ascii")
     with writing(folder / CSV) as part:
         part.write_text(_csv(poses), encoding="utf-8")
+    coverage = write_coverage_files(folder, store)
+    summary["coverage"] = None if coverage is None else coverage.figures()
     preview = _preview(raster, poses, summary)
     with writing(folder / PREVIEW) as part:
         part.write_bytes(preview)

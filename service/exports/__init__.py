@@ -17,6 +17,7 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
         "contours.geojson",
         "Height contours, GeoJSON.",
     ),
+    "coverage": ("service.coverage:write_coverage", "coverage.tif", "Views, sigma, height, COG."),
     "geojson": ("service.exports.flight:write_geojson", "flight.geojson", "The flight, GeoJSON."),
     "kml": ("service.exports.flight:write_kml", "flight.kml", "The flight, KML."),
     "colmap": (

@@ -27,7 +27,7 @@ def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
     bands = np.stack(
         [np.where(known, raster.height_m, NODATA_M), np.where(known, raster.sigma_m, NODATA_M)]
     ).astype(np.float32)
-    _write_cog(scan, out, raster.grid, bands, ("height AMSL, m", "sigma, m"), nodata=NODATA_M)
+    write_cog(scan, out, raster.grid, bands, ("height AMSL, m", "sigma, m"), nodata=NODATA_M)
 
 
 def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
@@ -35,10 +35,10 @@ def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
     raster = fill_holes(scan.raster(options.cell_m))
     opacity = np.where(raster.known, 255, 0).astype(np.uint8)
     bands = np.concatenate([raster.rgb.transpose(2, 0, 1), opacity[None]])
-    _write_cog(scan, out, raster.grid, bands, ("red", "green", "blue", "opacity"))
+    write_cog(scan, out, raster.grid, bands, ("red", "green", "blue", "opacity"))
 
 
-def _write_cog(
+def write_cog(
     scan: ScanView,
     out: Path,
     grid: Grid,
@@ -46,7 +46,7 @@ def _write_cog(
     names: tuple[str, ...],
     nodata: float | None = None,
 ) -> None:
-    """(bands, rows, cols) as Cloud Optimized GeoTIFF in the scan's UTM zone."""
+    """Write (bands, rows, cols) as Cloud Optimized GeoTIFF in the scan's UTM zone."""
     import rasterio
     from rasterio.enums import ColorInterp
     from rasterio.io import MemoryFile

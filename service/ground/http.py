@@ -33,6 +33,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
+from service.coverage import LiveCoverages
 from service.errors import InputError, OutsideError
 from service.ground.guard import LARGEST_BODY_BYTES, Guard, is_loopback
 from service.ground.jobs import Jobs
@@ -172,6 +173,7 @@ class _State:
     jobs: Jobs
     progress: Callable[[], list[dict[str, Any]]]
     vehicle: Vehicle | None
+    coverages: LiveCoverages = field(default_factory=LiveCoverages)
     live_views: int = 0
     started: float = field(default_factory=time.monotonic)
 
@@ -194,6 +196,8 @@ def portal_app(
         Route(one, _delete, methods=["DELETE"]),
         Route(one + "/files/{name}", _file),
         Route(one + "/exports", _export, methods=["POST"]),
+        Route(one + "/coverage.png", _coverage),
+        Route(one + "/coverage.json", _coverage),
         WebSocketRoute(one + "/live", _live),
         Route("/api/bin", _bin),
         Route("/api/bin/{name}/restore", _restore, methods=["POST"]),
@@ -273,6 +277,17 @@ def _file(request: Request) -> Response:
     return FileResponse(path, filename=f"{request.path_params['scan']}-{path.name}")
 
 
+def _coverage(request: Request) -> Response:
+    """The coverage layer as it is now, also of a scan that still grows."""
+    state = _portal(request)
+    found = state.coverages.of(state.library.folder(*_names(request)))
+    if found is None:
+        raise InputError("no surface yet")
+    if request.url.path.endswith(".png"):
+        return Response(found.png_bytes(), media_type="image/png")
+    return Response(found.json_bytes(), media_type="application/json")
+
+
 async def _label(request: Request) -> Response:
     body = await _body(request)
     unknown = set(body) - {"title", "tags"}
@@ -292,6 +307,7 @@ def _delete(request: Request) -> Response:
             raise HTTPException(409, "this scan is open at the receiver; delete it after a restart")
     if state.jobs.busy(state.library.folder(drone, scan)):
         raise HTTPException(409, "a deliverable of this scan is being made; wait for it")
+    state.coverages.forget(state.library.folder(drone, scan))
     return JSONResponse({"bin": state.library.delete(drone, scan)})
 
 

@@ -37,6 +37,8 @@ FILES: dict[str, str] = {
     "dsm.tif": "surface model",
     "ortho.tif": "orthophoto",
     "contours.geojson": "contours",
+    "coverage.tif": "coverage: views, sigma, height",
+    "coverage.png": "coverage, picture",
     "mesh.glb": "textured mesh",
     "trajectory.tum": "trajectory, TUM",
     "trajectory.csv": "trajectory, table",

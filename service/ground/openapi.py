@@ -63,6 +63,12 @@ DOCUMENT: dict[str, Any] = {
                 {"kind": {"type": "string", "enum": list(EXPORTERS)}},
             ),
         ),
+        **{
+            f"/api/scans/{{drone}}/{{scan}}/coverage.{kind}": _path(
+                "drone", "scan", get=_operation(f"How well the ground was seen, {what}.", what)
+            )
+            for kind, what in (("png", "a picture"), ("json", "figures and corners"))
+        },
         "/api/scans/{drone}/{scan}/live": _path(
             "drone",
             "scan",
