@@ -145,6 +145,7 @@ class FrameVerdict:
     rms_rad: float  # disagreement of the frame chosen, per step
     runner_up_rms_rad: float
     decided: bool  # the turns told the frames apart
+    refuted: tuple[GimbalFrame, ...] = ()  # those that disagree clearly more
 
 
 Ends = tuple[Quaternion, Quaternion]
@@ -178,10 +179,12 @@ def judge_frame(
     rms = {frame: _disagreement(heads[frame], q_seen_steps) for frame in GimbalFrame}
     best = min(rms, key=lambda frame: rms[frame])
     # A frame that means the same attitudes all along is no rival.
-    rivals = [rms[f] for f in GimbalFrame if _largest_angle(heads[f], heads[best]) > SAME_RAD]
-    second = min(rivals, default=math.inf)
-    decided = second > 2.0 * rms[best] and second - rms[best] > CLEAR_RAD
-    return FrameVerdict(best, rms[best], second, decided and bool(rivals))
+    rivals = [f for f in GimbalFrame if _largest_angle(heads[f], heads[best]) > SAME_RAD]
+    second = min((rms[f] for f in rivals), default=math.inf)
+    refuted = tuple(
+        f for f in rivals if rms[f] > 2.0 * rms[best] and rms[f] - rms[best] > CLEAR_RAD
+    )
+    return FrameVerdict(best, rms[best], second, bool(rivals) and refuted == tuple(rivals), refuted)
 
 
 def _disagreement(heads: Sequence[Ends], steps: Sequence[Quaternion]) -> float:

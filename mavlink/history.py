@@ -65,6 +65,7 @@ class VehicleHistory:
         self._terrain = Track()  # agl sigma
         self._gimbals: dict[tuple[int, int], Track] = {}  # (rank, component): w x y z frame
         self._judged: dict[tuple[int, int], tuple[int, GimbalFrame | None]] = {}  # when
+        self._seen: GimbalFrame | None = None  # by the pictures
 
     @property
     def first_ns(self) -> int | None:
@@ -108,11 +109,12 @@ class VehicleHistory:
         """The lowest rank says most; among equals the gimbal itself before its relay."""
         return sorted(self._gimbals, key=lambda k: (k[0], k[1] not in GIMBAL_DEVICES, k[1]))
 
-    def heads(self) -> list[tuple[int, Quaternion]]:
+    def heads(self, since_ns: int = 0) -> list[tuple[int, Quaternion]]:
         """The camera head's attitude at every gimbal sample, or the body's without a gimbal."""
         with self._lock:
-            times = {t for track in self._gimbals.values() for t, _ in track.items()}
-            bodies = [(t, _quaternion(r)) for t, r in self._attitude.items()]
+            tracks = self._gimbals.values()
+            times = {t for track in tracks for t, _ in track.items() if t >= since_ns}
+            bodies = [(t, _quaternion(r)) for t, r in self._attitude.items() if t >= since_ns]
         states = [(t, VehicleHistory.state_at(self, t)) for t in sorted(times)]
         found = [
             (t, _quaternion(tuple(map(float, s.q_ned_gimbal_wxyz))))
@@ -136,6 +138,20 @@ class VehicleHistory:
         """Read gimbal messages in another way from now on, those already kept as well."""
         with self._lock:
             self.config = replace(self.config, gimbal=gimbal)
+
+    def gimbal_frame(self) -> GimbalFrame | None:
+        """What the quaternion of the gimbal that counts is taken to refer to; None without one."""
+        with self._lock:
+            for key in self._gimbal_order():
+                row = self._gimbals[key].last_row
+                if row is not None:
+                    return self._frame(key, FRAMES[int(row[4])])
+        return None
+
+    def trust_pictures(self, frame: GimbalFrame) -> None:
+        """Read the gimbal as the pictures say from now on, unless the configuration says how."""
+        with self._lock:
+            self._seen = frame
 
     def clear(self) -> None:
         """Forget everything, as after a reboot of the autopilot."""
@@ -231,10 +247,15 @@ class VehicleHistory:
         return slerp(earth[0], earth[1], at.fraction)
 
     def _frame(self, key: tuple[int, int], claimed: GimbalFrame) -> GimbalFrame:
-        """What the quaternion refers to: by configuration, else as claimed unless it cannot be."""
+        """What the quaternion refers to.
+
+        By configuration, else by the pictures, else as claimed unless it cannot be.
+        """
         chosen = self.config.gimbal.yaw_frame
         if chosen != "auto":
             return GimbalFrame(chosen)
+        if self._seen is not None:
+            return self._seen
         if claimed is not GimbalFrame.VEHICLE:
             return claimed
         track = self._gimbals[key]

@@ -42,14 +42,22 @@ class CameraConfig:
     mount_roll_deg: float = key(0.0, "fixed mount: roll of the optical axis in the body frame")
     mount_pitch_deg: float = key(-90.0, "fixed mount: -90 looks straight down, 0 looks ahead")
     mount_yaw_deg: float = key(0.0, "fixed mount: 0 puts the picture's top towards the nose")
-    latency_ms: float = key(0.0, "from mid-exposure to the picture's time stamp")
+    latency_ms: float | str = key(
+        0.0,
+        "from mid-exposure to the picture's time stamp; auto: as the pictures' rotation says",
+        live=True,
+    )
 
     def __post_init__(self) -> None:
         """Check ranges."""
         _within("camera.mount_roll_deg", self.mount_roll_deg, -180, 180)
         _within("camera.mount_pitch_deg", self.mount_pitch_deg, -180, 180)
         _within("camera.mount_yaw_deg", self.mount_yaw_deg, -360, 360)
-        _within("camera.latency_ms", self.latency_ms, -10_000, 10_000)
+        if isinstance(self.latency_ms, str):
+            if self.latency_ms != "auto":
+                raise ValueError(f"camera.latency_ms {self.latency_ms!r} is not 'auto' or a number")
+        else:
+            _within("camera.latency_ms", self.latency_ms, -10_000, 10_000)
 
 
 @dataclass(frozen=True, slots=True)

@@ -123,6 +123,8 @@ class Daemon:
         self.scanning.config, taken, waiting = reload(self.config, wanted)
         if "scan.baseline" in taken:
             self.scanning.set_baseline(self.config.scan)
+        if "camera.latency_ms" in taken:
+            self.scanning.set_latency(self.config.camera)
         log.info("configuration: now in force: %s", ", ".join(taken) or "nothing new")
         if waiting:
             log.warning("configuration: after a restart: %s", ", ".join(waiting))

@@ -21,6 +21,7 @@ from service.recorder import Recorder
 from service.rig import ASSUMED_AGL_M
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
+from service.telemetry_check import TelemetryCheck
 from service.version import software
 
 log = logging.getLogger(__name__)
@@ -56,6 +57,8 @@ class ScanInputs:
     history: VehicleHistory | None = None
     notes: tuple[str, ...] = ()
     extra: dict[str, Any] = field(default_factory=dict)  # goes into scan.json
+    latency_ms: float = 0.0  # the camera's, with camera.latency_ms = "auto" until it is found
+    tell: Callable[[str], None] = log.warning  # the operator
 
 
 def create_store(inputs: ScanInputs) -> ScanStore:
@@ -93,6 +96,9 @@ class Scan:
             inputs.camera, inputs.config, inputs.backend, live=inputs.source.is_live
         )
         self.recorder = Recorder(store, self.pipeline, inputs.unix_offset_ns)
+        self.check = TelemetryCheck(
+            inputs.config.camera, inputs.history, inputs.tell, inputs.latency_ms
+        )
         self.tagged = self.odd_sized = self.heights = 0
         self._started = time.monotonic()
 
@@ -104,7 +110,7 @@ class Scan:
             self.odd_sized += 1
             return None
         time_ns = self.epoch_ns + frame.time_ns
-        exposed_ns = time_ns - round(inputs.config.camera.latency_ms * 1e6)
+        exposed_ns = self.check.exposed_ns(time_ns)
         # Containers round times by up to 11 us; rounded alike, a pipe and a file agree.
         exposed_ns = round(exposed_ns / TIME_STEP_NS) * TIME_STEP_NS
         state = inputs.history.state_at(exposed_ns) if inputs.history is not None else None
@@ -113,6 +119,7 @@ class Scan:
         step = self.pipeline.step(
             Frame(frame.image, exposed_ns, frame.seq, inputs.camera), state, frame.geotag
         )
+        self.check.add(time_ns, step.tracked)
         self.recorder.write(step, exposed_ns, state.alt_agl_m if state is not None else None)
         return step
 
@@ -139,7 +146,8 @@ class Scan:
     def close(self) -> dict[str, Any]:
         """Write what is left and close the scan in the store; return its figures."""
         elapsed = max(time.monotonic() - self._started, 1e-9)
-        extra = {
+        self.check.finish()
+        extra = self.check.summary() | {
             "frames_tagged": self.tagged,
             "frames_of_another_size": self.odd_sized,
             "seconds": round(elapsed, 2),
@@ -152,7 +160,7 @@ class Scan:
 
     def _doubts(self) -> list[str]:
         """What the reader of this scan must know."""
-        out = []
+        out = list(self.check.told.values())
         if self.odd_sized:
             W, H = self.inputs.camera.size_px
             out.append(f"{self.odd_sized} frames were not {W}x{H} like the camera model: left out")

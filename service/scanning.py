@@ -15,7 +15,7 @@ from mavlink.camera import KeyframeReport
 from mavlink.control import ACCEPTED, Answer, Phase, Result, Work
 from mavlink.status import CRITICAL, WARNING
 from mavlink.vehicle import VehicleLink
-from service.config import Config, ScanConfig
+from service.config import CameraConfig, Config, ScanConfig
 from service.errors import InputError, OutsideError, SkyreliefError
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ class Scanning:
         self._reported = 0
         self._retry_at_s: float | None = None
         self._retry_s = FIRST_RETRY_S
+        self._latency_ms = 0.0  # of the camera, as the last scan found it
 
     def load(self) -> None:
         """The heavy part of the start: camera model and backend; InputError without them."""
@@ -127,6 +128,12 @@ class Scanning:
         if scan is not None:
             scan.pipeline.set_baseline(config)
 
+    def set_latency(self, config: CameraConfig) -> None:
+        """Follow another ``camera.latency_ms``, also in the scan that runs."""
+        scan = self.scan
+        if scan is not None:
+            scan.check.set_camera(config)
+
     def retry(self) -> None:
         """Start the next scan when a fault ended the last one and nobody stopped it."""
         due = self._retry_at_s is not None and time.monotonic() >= self._retry_at_s
@@ -191,6 +198,8 @@ class Scanning:
             unix_offset_ns=offset,
             history=self.vehicle.history,
             extra={"backend": self._backend.name, "source": source.description},
+            latency_ms=self._latency_ms,
+            tell=lambda text: self.vehicle.statustext(text, WARNING),
         )
         store = create_store(inputs)
         self.vehicle.record(folder / "link.tlog")
@@ -219,6 +228,8 @@ class Scanning:
         except Exception:
             store.finish({"interrupted": True})
             raise
+        if scan.check.latency is not None and scan.check.latency.is_settled:
+            self._latency_ms = scan.check.latency.latency_ms
         self.vehicle.statustext(
             f"Scan {scan.inputs.scan_id}: {summary['clouds']} clouds, {summary['distance_m']:.0f} m"
         )

@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from mavlink import quaternion
+from mavlink.frame_watch import FrameWatch
 from mavlink.gimbal import (
     GimbalConfig,
     frame_of_flags,
@@ -19,7 +20,6 @@ from mavlink.gimbal import (
     to_earth,
 )
 from mavlink.history import M_PER_DEG, HistoryConfig, VehicleHistory
-from mavlink.latency import FrameWatch
 from mavlink.live_history import LiveHistory
 from mavlink.quaternion import Quaternion
 from mavlink.samples import (
@@ -405,27 +405,33 @@ def test_the_pictures_decide_between_frames() -> None:
     rng = np.random.default_rng(5)
     bodies = [
         Rotation.from_euler("ZYX", [0.02 * k, 0.1 * math.sin(k), 0.1 * math.cos(2 * k)])
-        for k in range(40)
+        for k in range(260)
     ]
     # A camera fixed to the body, whose "gimbal" reports a constant body-relative attitude.
     mount = Rotation.from_euler("Y", -1.2)
     heads = [body * mount for body in bodies]
     noise = [Rotation.from_rotvec(rng.normal(0, 1e-3, 3)) for _ in heads]
     watch = FrameWatch(history := VehicleHistory())
+    assert history.gimbal_frame() is None
     for k, body in enumerate(bodies):
         history.add(AttitudeSample(None, of_scipy(body)), T0 + k * 100 * MS)
         claimed = GimbalSample(None, of_scipy(mount), GimbalFrame.VEHICLE, 154, 0)
         history.add(claimed, T0 + k * 100 * MS)
-    for k in range(39):
-        if k == 10:
-            assert watch.verdict() is None
+    for k in range(259):
+        if k == 150:
+            assert watch.verdict() is None  # too few turns of a second
         step = of_scipy(heads[k].inv() * heads[k + 1] * noise[k])
         # The camera's stamps are 30 ms late.
         watch.add(T0 + (100 * k + 30) * MS, T0 + (100 * k + 130) * MS, step)
     verdict = watch.verdict(30.0)
     assert verdict is not None and verdict.decided
     assert verdict.frame in (GimbalFrame.BODY, GimbalFrame.SERVO)
-    assert verdict.rms_rad < 0.003
+    assert set(verdict.refuted) == {GimbalFrame.EARTH, GimbalFrame.VEHICLE}
+    assert verdict.rms_rad < 0.006
+    history.trust_pictures(GimbalFrame.EARTH)
+    assert history.gimbal_frame() is GimbalFrame.EARTH
+    history.set_gimbal(GimbalConfig(yaw_frame="servo"))
+    assert history.gimbal_frame() is GimbalFrame.SERVO  # the configuration stands
 
 
 def test_judging_needs_matching_lists() -> None:

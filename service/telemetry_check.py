@@ -1,0 +1,174 @@
+"""What the pictures say of the telemetry: the camera's latency, the gimbal's frame.
+
+The operator is told once; the latency found is applied when ``camera.latency_ms`` is "auto",
+the gimbal's frame when ``mavlink.gimbal_yaw_frame`` is "auto".
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+from mavlink.frame_watch import FrameWatch
+from mavlink.gimbal import FrameVerdict
+from mavlink.history import VehicleHistory
+from mavlink.latency import LatencyEstimate, LatencyWatch
+from mavlink.quaternion import Quaternion
+from mavlink.samples import GimbalFrame
+from recon.frames import R_GIMBAL_CAMERA
+from recon.odometry import Tracked
+from recon.se3 import quaternion_from_rotation
+from recon.types import F64
+from service.config import CameraConfig
+
+log = logging.getLogger(__name__)
+
+LOOK_NS = 10_000_000_000
+REACH_NS = 100_000_000_000  # how far back frames and telemetry are compared
+SLEW = 0.1  # of the time that passes, so that frames stay in order when the latency changes
+WORTH_TELLING_MS = 10.0
+
+
+class TelemetryCheck:
+    """Feed it every tracked frame; it says when a frame was exposed, and what it found."""
+
+    def __init__(
+        self,
+        camera: CameraConfig,
+        history: VehicleHistory | None,
+        tell: Callable[[str], None] = log.warning,
+        first_guess_ms: float = 0.0,
+    ) -> None:
+        """``first_guess_ms`` is taken with "auto" until there is an estimate."""
+        self.latency: LatencyEstimate | None = None
+        self.frame: FrameVerdict | None = None
+        self.told: dict[str, str] = {}  # by subject
+        self._history, self._tell = history, tell
+        self._fixed = camera.mount == "fixed"
+        self._guess_ms = first_guess_ms
+        self._camera = camera
+        self.applied_ms = self._wanted_ms()
+        self._turns = LatencyWatch()
+        self._frames = None if history is None or self._fixed else FrameWatch(history)
+        self._last: tuple[int, int, F64] | None = None  # stamp, segment, R_odom_camera
+        self._seen_ns: int | None = None
+        self._next_ns: int | None = None
+
+    # ---- the latency in force ------------------------------------------------------------
+
+    def set_camera(self, camera: CameraConfig) -> None:
+        """Follow another ``camera.latency_ms`` from the next frame on."""
+        self._camera = camera
+
+    def _wanted_ms(self) -> float:
+        """The latency to apply: as configured, or as found."""
+        configured = self._camera.latency_ms
+        if not isinstance(configured, str):
+            return float(configured)
+        settled = self.latency is not None and self.latency.is_settled
+        return self.latency.latency_ms if settled and self.latency else self._guess_ms
+
+    def exposed_ns(self, stamp_ns: int) -> int:
+        """When the frame of this stamp was exposed; later for every later frame."""
+        passed_ms = 0.0 if self._seen_ns is None else max(0, stamp_ns - self._seen_ns) * 1e-6
+        self._seen_ns = stamp_ns
+        change = self._wanted_ms() - self.applied_ms
+        self.applied_ms += max(-SLEW * passed_ms, min(SLEW * passed_ms, change))
+        return stamp_ns - round(self.applied_ms * 1e6)
+
+    # ---- what the pictures say -------------------------------------------------------------
+
+    def add(self, stamp_ns: int, tracked: Tracked) -> None:
+        """Take in a frame's pose by vision, at its stamp, and look at all of them now and then."""
+        if self._history is None:
+            return
+        T = tracked.T_odom_camera
+        last, self._last = self._last, None
+        if T is not None:
+            self._last = (stamp_ns, tracked.segment, T[:3, :3].copy())
+            if last is not None and last[1] == tracked.segment:
+                self._turn(last[0], stamp_ns, last[2].T @ T[:3, :3])
+        if self._next_ns is None:
+            self._next_ns = stamp_ns + LOOK_NS
+        elif stamp_ns >= self._next_ns:
+            self._next_ns = stamp_ns + LOOK_NS
+            self._look(self._history, stamp_ns)
+
+    def _turn(self, first_ns: int, second_ns: int, R_first_second: F64) -> None:
+        R = R_GIMBAL_CAMERA @ R_first_second @ R_GIMBAL_CAMERA.T  # in the head's axes
+        w, x, y, z = (float(v) for v in quaternion_from_rotation(R))
+        q: Quaternion = (w, x, y, z)
+        self._turns.add(first_ns, second_ns, q)
+        if self._frames is not None:
+            self._frames.add(first_ns, second_ns, q)
+
+    def finish(self) -> None:
+        """Look once more, at the end of a scan."""
+        if self._history is not None and self._seen_ns is not None:
+            self._look(self._history, self._seen_ns)
+
+    def _look(self, history: VehicleHistory, now_ns: int) -> None:
+        since_ns = now_ns - REACH_NS
+        if self._fixed:
+            bodies = [(t, sample.q_ned_body) for sample, t in history.attitudes()]
+            found = self._turns.estimate([body for body in bodies if body[0] >= since_ns])
+        else:
+            found = self._turns.estimate(history.heads(since_ns))
+        self.latency = found or self.latency
+        if found is not None and found.is_settled:
+            self._tell_latency(found)
+        if self._frames is not None:
+            settled = self.latency is not None and self.latency.is_settled
+            latency = self.latency.latency_ms if settled and self.latency else self.applied_ms
+            self.frame = self._frames.verdict(latency) or self.frame
+            self._judge_frame(history)
+
+    def _tell_latency(self, found: LatencyEstimate) -> None:
+        text = f"Camera latency {found.latency_ms:.0f} ms by the pictures"
+        off_ms = abs(found.latency_ms - self.applied_ms)
+        if isinstance(self._camera.latency_ms, str):
+            self._once("latency", f"{text}: applied")
+        elif off_ms > max(WORTH_TELLING_MS, 3.0 * found.sigma_ms):
+            self._once("latency", f"{text}, {self.applied_ms:.0f} ms is set")
+
+    def _judge_frame(self, history: VehicleHistory) -> None:
+        """Correct what the gimbal claims when the pictures refute it."""
+        verdict, used = self.frame, history.gimbal_frame()
+        if verdict is None or not verdict.decided or used not in verdict.refuted:
+            return
+        seen = f"Gimbal angles refer to {_WORDS[verdict.frame]} by the pictures"
+        if history.config.gimbal.yaw_frame == "auto":
+            history.trust_pictures(verdict.frame)
+            self._once("frame", f"{seen}: applied")
+        else:
+            self._once("frame", f"{seen}; {used.value} is set" if used else seen)
+
+    def _once(self, subject: str, text: str) -> None:
+        if subject not in self.told:
+            self.told[subject] = text
+            self._tell(text)
+
+    def summary(self) -> dict[str, Any]:
+        """What was found, fit for JSON; empty without telemetry."""
+        if self._history is None:
+            return {}
+        found, frame, used = self.latency, self.frame, self._history.gimbal_frame()
+        latency: dict[str, Any] = {"applied_ms": round(self.applied_ms, 1)}
+        if found is not None:
+            latency |= {
+                "estimate_ms": round(found.latency_ms, 1),
+                "sigma_ms": round(found.sigma_ms, 1),
+                "correlation": round(found.correlation, 3),
+            }
+        seen = frame.frame.value if frame is not None and frame.decided else None
+        gimbal = {"used": used.value if used is not None else None, "by_pictures": seen}
+        return {"camera_latency": latency} | ({"gimbal_frame": gimbal} if used is not None else {})
+
+
+_WORDS = {
+    GimbalFrame.EARTH: "the earth",
+    GimbalFrame.VEHICLE: "the vehicle's heading",
+    GimbalFrame.BODY: "the vehicle's body",
+    GimbalFrame.SERVO: "servos on the body",
+}

@@ -1,0 +1,154 @@
+"""What the pictures say of the telemetry, from tracked frames to the operator's words."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mavlink.gimbal import GimbalConfig
+from mavlink.history import HistoryConfig, VehicleHistory
+from mavlink.quaternion import Quaternion
+from mavlink.samples import AttitudeSample, GimbalFrame, GimbalSample
+from recon.frames import R_GIMBAL_CAMERA
+from recon.odometry import Tracked
+from service.config import CameraConfig
+from service.telemetry_check import TelemetryCheck
+
+S = 1_000_000_000
+LATE_S = 0.07
+
+
+def body(t: float, strength: float = 1.0) -> Rotation:
+    roll = strength * 0.1 * math.sin(2.9 * t)
+    pitch = strength * 0.08 * math.sin(1.7 * t + 0.5)
+    return Rotation.from_euler("ZYX", [strength * 0.8 * math.sin(0.3 * t), pitch, roll])
+
+
+def quaternion_of(R: Rotation) -> Quaternion:
+    x, y, z, w = map(float, R.as_quat())
+    return (w, x, y, z)
+
+
+def history_of(gimbal: str, strength: float, config: GimbalConfig | None = None) -> VehicleHistory:
+    """Telemetry of a camera fixed at 60 degrees below the nose.
+
+    The gimbal is "none", "honest" (earth), or "wrong": body-relative, but claims the earth.
+    """
+    history = VehicleHistory(HistoryConfig(gimbal=config or GimbalConfig()))
+    mount = Rotation.from_euler("Y", -math.pi / 3)
+    for k in range(45 * 25):
+        t = k / 25
+        history.add(AttitudeSample(None, quaternion_of(body(t, strength))), k * S // 25)
+        if gimbal == "honest":
+            q = quaternion_of(body(t, strength) * mount)
+            history.add(GimbalSample(None, q, GimbalFrame.EARTH, 154, 0), k * S // 25)
+        elif gimbal == "wrong":
+            claimed = GimbalSample(None, quaternion_of(mount), GimbalFrame.EARTH, 154, 0)
+            history.add(claimed, k * S // 25)
+    return history
+
+
+def fly(
+    check: TelemetryCheck, strength: float = 1.0, noise_rad: float = 5e-4, gap: bool = False
+) -> list[int]:
+    """Forty seconds of frames whose stamps are 70 ms late; the times of exposure."""
+    rng = np.random.default_rng(2)
+    mount = Rotation.from_euler("Y", -math.pi / 3)
+    exposed = []
+    for k in range(40 * 15):
+        t = 1.0 + k / 15
+        noise = Rotation.from_rotvec(rng.normal(0.0, noise_rad, 3))
+        T = np.eye(4)
+        T[:3, :3] = (body(t, strength) * mount * noise).as_matrix() @ R_GIMBAL_CAMERA
+        stamp = round((t + LATE_S) * S)
+        lost = gap and 200 <= k < 205
+        exposed.append(check.exposed_ns(stamp))
+        segment = int(gap and k >= 205)
+        check.add(stamp, Tracked("lost" if lost else "tracked", segment, None if lost else T))
+    check.finish()
+    return exposed
+
+
+@pytest.mark.parametrize("gimbal", ["none", "honest"])
+def test_the_latency_is_shown_and_not_applied_unless_asked(gimbal: str) -> None:
+    told: list[str] = []
+    check = TelemetryCheck(CameraConfig(), history_of(gimbal, 1.0), told.append)
+    exposed = fly(check, gap=True)
+    assert exposed[-1] == round((1.0 + 599 / 15 + LATE_S) * S)
+    latency = check.summary()["camera_latency"]
+    assert latency["applied_ms"] == 0.0
+    assert latency["estimate_ms"] == pytest.approx(70.0, abs=10.0)
+    assert abs(latency["estimate_ms"] - 70.0) < 3.0 * latency["sigma_ms"]
+    assert len(told) == 1 and told[0].endswith("by the pictures, 0 ms is set")
+
+
+def test_auto_applies_what_was_found_and_keeps_the_frames_in_order() -> None:
+    told: list[str] = []
+    check = TelemetryCheck(CameraConfig(latency_ms="auto"), history_of("none", 1.0), told.append)
+    exposed = fly(check)
+    assert all(b > a for a, b in pairwise(exposed))
+    assert check.applied_ms == pytest.approx(70.0, abs=10.0)
+    assert exposed[-1] == pytest.approx((1.0 + 599 / 15) * S, abs=0.01 * S)
+    assert len(told) == 1 and told[0].endswith("applied")
+    again = TelemetryCheck(CameraConfig(latency_ms="auto"), None, told.append, 70.0)
+    assert again.exposed_ns(S) == S - 70_000_000  # what the last scan found serves at once
+
+
+def test_a_right_setting_needs_no_words_and_can_change_in_flight() -> None:
+    told: list[str] = []
+    check = TelemetryCheck(CameraConfig(latency_ms=68.0), history_of("honest", 1.0), told.append)
+    assert fly(check)[0] == round((1.0 + LATE_S) * S) - 68_000_000
+    assert told == []
+    check.set_camera(CameraConfig(latency_ms=20.0))
+    before = check.exposed_ns(60 * S)
+    check.set_camera(CameraConfig(latency_ms=500.0))
+    after = check.exposed_ns(60 * S + S // 15)
+    assert check.applied_ms == pytest.approx(20.0 + 100.0 / 15, abs=0.1) and after > before
+
+
+def test_a_calm_flight_is_given_no_latency() -> None:
+    told: list[str] = []
+    check = TelemetryCheck(CameraConfig(latency_ms="auto"), history_of("none", 0.0), told.append)
+    fly(check, 0.0)
+    assert check.latency is None and told == [] and check.applied_ms == 0.0
+    assert check.summary()["camera_latency"] == {"applied_ms": 0.0}
+    silent = TelemetryCheck(CameraConfig(), None, told.append)
+    fly(silent)
+    assert silent.summary() == {} and told == []
+
+
+def test_a_gimbal_that_claims_the_wrong_frame_is_corrected_and_told_once() -> None:
+    told: list[str] = []
+    history = history_of("wrong", 1.0)
+    check = TelemetryCheck(CameraConfig(), history, told.append)
+    fly(check)
+    assert history.gimbal_frame() in (GimbalFrame.BODY, GimbalFrame.SERVO)
+    frame = check.summary()["gimbal_frame"]
+    assert frame["by_pictures"] in ("body", "servo") and frame["used"] == frame["by_pictures"]
+    assert sum(text.startswith("Gimbal angles refer to") for text in told) == 1
+    state = history.state_at(30 * S)
+    assert state is not None and state.q_ned_gimbal_wxyz is not None
+    w, x, y, z = state.q_ned_gimbal_wxyz
+    truth = body(30.0) * Rotation.from_euler("Y", -math.pi / 3)
+    assert (truth.inv() * Rotation.from_quat([x, y, z, w])).magnitude() < 0.01
+
+
+def test_a_frame_that_was_configured_stands_against_the_pictures() -> None:
+    told: list[str] = []
+    history = history_of("wrong", 1.0, GimbalConfig(yaw_frame="earth"))
+    fly(TelemetryCheck(CameraConfig(), history, told.append))
+    assert history.gimbal_frame() is GimbalFrame.EARTH
+    (text,) = [text for text in told if "Gimbal" in text]
+    assert text.endswith("; earth is set")
+
+
+def test_an_honest_gimbal_is_left_alone() -> None:
+    told: list[str] = []
+    history = history_of("honest", 1.0)
+    fly(TelemetryCheck(CameraConfig(), history, told.append))
+    assert history.gimbal_frame() is GimbalFrame.EARTH
+    assert not any("Gimbal" in text for text in told)
