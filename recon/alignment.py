@@ -12,8 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from recon import se3
+from recon.track_alignment import umeyama
 from recon.types import F64, PosePrior
 
 WANDER_SHARE = 0.4
@@ -24,6 +27,14 @@ INDEPENDENT_HEIGHTS = 4.0
 
 LEANING_SHARE = 2.0
 """Sigma of a height, as a share of it, per unit of (1 - cosine) off the vertical."""
+
+HUBER = 2.5
+"""Whitened residuals beyond this lose weight."""
+
+WILD = 12.5
+"""Fixes beyond this are left out once the fit stands, unless they are more than half."""
+
+I64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,6 +58,13 @@ class Similarity:
             self.R @ T_odom_camera[:3, :3], self.scale * self.R @ T_odom_camera[:3, 3] + self.t
         )
 
+    def inverse_pose(self, T_world_camera: F64) -> F64:
+        """(4, 4) T_odom_camera of a pose in the world."""
+        return se3.compose(
+            self.R.T @ T_world_camera[:3, :3],
+            self.R.T @ (T_world_camera[:3, 3] - self.t) / self.scale,
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Anchor:
@@ -56,6 +74,14 @@ class Anchor:
     prior: PosePrior
     height: float | None  # of the camera above ground that it sees, in odometry units
     lean: float = 0.0  # 1 - cosine of how far off the vertical that ground is seen
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Metres per unit of the odometry by one kind of reading, with its relative sigma."""
+
+    metres: float
+    sigma: float
 
 
 def height_above(points: F64, up: F64) -> tuple[float, float] | None:
@@ -77,51 +103,76 @@ def height_above(points: F64, up: F64) -> tuple[float, float] | None:
     return (height, 1.0 - float(np.median(cosine[below]))) if height > 0 else None
 
 
-def _residuals(R: F64, t: F64, log_scale: float, anchors: Sequence[Anchor]) -> tuple[F64, F64, F64]:
-    """Whitened residuals (M,), Jacobian (M, 7) and the row's group for robust weights (M,)."""
-    scale = float(np.exp(log_scale))
-    heights = sum(a.prior.agl_m is not None and a.height is not None for a in anchors)
-    thinned = min(1.0, (INDEPENDENT_HEIGHTS / max(heights, 1)) ** 0.5)
-    rows: list[F64] = []
-    jac: list[F64] = []
-    group: list[int] = []
-    for i, a in enumerate(anchors):
-        p = a.prior
-        if p.R_world_camera is not None:
-            w = _turn(R @ a.T_odom_camera[:3, :3], p)
-            info = 1.0 / np.array([p.sigma_tilt_rad, p.sigma_tilt_rad, p.sigma_yaw_rad])[: len(w)]
-            J = np.zeros((len(w), 7))
-            J[:, : len(w)] = np.diag(info)
-            rows.append(w * info)
-            jac.append(J)
-            group += [3 * i] * len(w)
-        if p.position_m is not None and p.sigma_position_m is not None:
-            x = scale * R @ a.T_odom_camera[:3, 3]
-            info = 1.0 / (WANDER_SHARE * p.sigma_position_m)
-            J = np.zeros((3, 7))
-            J[:, :3], J[:, 3:6], J[:, 6] = -se3.hat(x), np.eye(3), x
-            rows.append((x + t - p.position_m) * info)
-            jac.append(J * info[:, None])
-            group += [3 * i + 1] * 3
-        if p.agl_m is not None and a.height is not None and a.height > 0:
-            # The height is measured straight below; ground seen elsewhere may lie otherwise.
-            info_h = thinned * p.agl_m / (p.sigma_agl_m + LEANING_SHARE * a.lean * p.agl_m)
-            J = np.zeros((1, 7))
-            J[0, 6] = info_h
-            rows.append(np.array([(log_scale + np.log(a.height / p.agl_m)) * info_h]))
-            jac.append(J)
-            group += [3 * i + 2]
-    return np.concatenate(rows), np.concatenate(jac), np.asarray(group, np.float64)
+def height_ratio(anchor: Anchor) -> tuple[float, float] | None:
+    """Log of height by telemetry over height by vision, and its sigma; None without both."""
+    agl, height = anchor.prior.agl_m, anchor.height
+    if agl is None or height is None or not height > 0:
+        return None
+    # The height is measured straight below; ground seen elsewhere may lie otherwise.
+    sigma = anchor.prior.sigma_agl_m / agl + LEANING_SHARE * anchor.lean
+    return float(np.log(agl / height)), sigma
 
 
-def _turn(R_world_camera: F64, prior: PosePrior) -> F64:
-    """(3,) world rotation from the prior's attitude to this one; (2,) tilt alone when the
-    prior's heading is unknown (sigma over one rad)."""
-    assert prior.R_world_camera is not None
-    if prior.sigma_yaw_rad < 1.0:
-        return se3.so3_log(R_world_camera @ prior.R_world_camera.T)
-    up = R_world_camera @ prior.R_world_camera[2]  # where the prior's up points now
-    return np.array([-up[1], up[0]])
+class _Readings:
+    """The anchors' readings as arrays, by kind; rows of one reading form a group."""
+
+    def __init__(self, anchors: Sequence[Anchor]) -> None:
+        turned = [a for a in anchors if a.prior.R_world_camera is not None]
+        fixed = [a for a in anchors if _has_fix(a.prior)]
+        heights = [h for a in anchors if (h := height_ratio(a)) is not None]
+        self.R_odom = _stack([a.T_odom_camera[:3, :3] for a in turned], (3, 3))
+        self.R_prior = _stack([a.prior.R_world_camera for a in turned], (3, 3))
+        self.sigma_turn = _stack(
+            [[a.prior.sigma_tilt_rad] * 2 + [a.prior.sigma_yaw_rad] for a in turned], (3,)
+        )
+        self.heading_known = self.sigma_turn[:, 2] < 1.0
+        self.x = _stack([a.T_odom_camera[:3, 3] for a in fixed], (3,))
+        self.fix = _stack([a.prior.position_m for a in fixed], (3,))
+        self.sigma_fix = _stack([a.prior.sigma_position_m for a in fixed], (3,))
+        self.log_ratio = _stack([h[0] for h in heights], ())
+        thinned = min(1.0, (INDEPENDENT_HEIGHTS / max(len(heights), 1)) ** 0.5)
+        self.sigma_log = _stack([h[1] for h in heights], ()) / thinned
+
+    def linearised(self, R: F64, t: F64, log_scale: float) -> tuple[F64, F64, I64]:
+        """Whitened residuals (M,), Jacobian (M, 7) and the row's group (M,)."""
+        n, m, k = len(self.R_odom), len(self.fix), len(self.log_ratio)
+        turn, J_turn = self._turns(R)
+        y = np.exp(log_scale) * self.x @ R.T
+        info = 1.0 / (WANDER_SHARE * self.sigma_fix)
+        J_fix = np.zeros((m, 3, 7))
+        J_fix[:, 0, 1], J_fix[:, 1, 2], J_fix[:, 2, 0] = y[:, 2], y[:, 0], y[:, 1]
+        J_fix[:, 0, 2], J_fix[:, 1, 0], J_fix[:, 2, 1] = -y[:, 1], -y[:, 2], -y[:, 0]
+        J_fix[:, :, 3:6], J_fix[:, :, 6] = np.eye(3), y
+        J_height = np.zeros((k, 7))
+        J_height[:, 6] = 1.0 / self.sigma_log
+        r = [turn.ravel(), ((y + t - self.fix) * info).ravel()]
+        r.append((log_scale - self.log_ratio) / self.sigma_log)
+        J = [J_turn.reshape(-1, 7), (J_fix * info[:, :, None]).reshape(-1, 7), J_height]
+        group = np.r_[np.repeat(np.arange(n + m), 3), np.arange(n + m, n + m + k)]
+        return np.concatenate(r), np.concatenate(J), group
+
+    def _turns(self, R: F64) -> tuple[F64, F64]:
+        """(n, 3) whitened rotations from the attitudes and their (n, 3, 7) Jacobian.
+
+        Of an attitude whose heading is unknown, the tilt alone.
+        """
+        n = len(self.R_odom)
+        J = np.zeros((n, 3, 7))
+        if n == 0:
+            return np.zeros((0, 3)), J
+        seen = R @ self.R_odom
+        turn = Rotation.from_matrix(seen @ self.R_prior.transpose(0, 2, 1)).as_rotvec()
+        up = np.einsum("nij,nj->ni", seen, self.R_prior[:, 2])  # where the prior's up points now
+        tilt = np.column_stack([-up[:, 1], up[:, 0], np.zeros(n)])
+        info = 1.0 / self.sigma_turn
+        info[~self.heading_known, 2] = 0.0
+        J[:, :, :3] = np.eye(3) * info[:, :, None]
+        return np.where(self.heading_known[:, None], turn, tilt) * info, J
+
+    @property
+    def fix_groups(self) -> tuple[int, int]:
+        """Numbers of the first group of a fix, and after the last."""
+        return len(self.R_odom), len(self.R_odom) + len(self.fix)
 
 
 def fit(anchors: Sequence[Anchor], iterations: int = 30) -> Similarity | None:
@@ -132,17 +183,63 @@ def fit(anchors: Sequence[Anchor], iterations: int = 30) -> Similarity | None:
     better than that of one reading, except for scale and heading, which are differences
     along the track. What all fixes have in common goes into the position's covariance.
     """
-    usable = [
-        a for a in anchors if a.prior.R_world_camera is not None or a.prior.position_m is not None
-    ]
+    usable = [a for a in anchors if a.prior.R_world_camera is not None or _has_fix(a.prior)]
     if not usable:
         return None
-    R, t, log_scale = _start(usable)
-    H = np.eye(7)
-    for _ in range(iterations):
-        r, J, group = _residuals(R, t, log_scale, usable)
-        norms = np.sqrt(np.bincount(group.astype(np.int64), weights=r**2))
-        weight = np.minimum(1.0, 2.5 / np.maximum(norms, 1e-9))[group.astype(np.int64)]
+    readings = _Readings(usable)
+    found = [_solve(readings, *start, iterations) for start in _starts(usable, readings)]
+    R, t, log_scale, H, _ = min(found, key=lambda f: f[4])
+    covariance = np.asarray(np.linalg.inv(H) * max(1.0, 0.2 * len(usable)), np.float64)
+    if len(readings.fix):
+        covariance[3:6, 3:6] += np.diag(np.mean(np.square(readings.sigma_fix), axis=0))
+    return Similarity(float(np.exp(log_scale)), R, t, covariance, _sources(readings))
+
+
+def scales(anchors: Sequence[Anchor], at: Similarity) -> tuple[Scale | None, Scale | None]:
+    """The scale by position fixes alone and by heights alone, each with its sigma.
+
+    None where the track flown or the readings say nothing.
+    """
+    r = _Readings(anchors)
+    by_fixes = by_heights = None
+    if len(r.fix) >= 4:
+        x, y = (r.x - r.x.mean(0)) @ at.R.T, r.fix - np.median(r.fix, axis=0)
+        near = np.abs(at.scale * r.x @ at.R.T + at.t - r.fix) < 5.0 * r.sigma_fix
+        w = (near.all(axis=1)[:, None]) / r.sigma_fix**2
+        power = float(np.sum(w * x**2))
+        if power > 0:
+            scale = float(np.sum(w * x * (y - np.sum(w * y, 0) / np.sum(w, 0)))) / power
+            # Errors of fixes wander slowly: all of them together count as a few.
+            sigma = np.sqrt(max(len(x) / INDEPENDENT_HEIGHTS, 1.0) / power) / max(scale, 1e-9)
+            by_fixes = Scale(scale, float(sigma)) if scale > 0 else None
+    if len(r.log_ratio):
+        spread = 1.0 / float(np.sqrt(np.sum(1.0 / r.sigma_log**2)))
+        by_heights = Scale(float(np.exp(np.median(r.log_ratio))), spread)
+    return by_fixes, by_heights
+
+
+def _has_fix(prior: PosePrior) -> bool:
+    return prior.position_m is not None and prior.sigma_position_m is not None
+
+
+def _stack(rows: Sequence[object], shape: tuple[int, ...]) -> F64:
+    return np.asarray(rows, np.float64).reshape(len(rows), *shape)
+
+
+def _solve(
+    readings: _Readings, R: F64, t: F64, log_scale: float, iterations: int
+) -> tuple[F64, F64, float, F64, float]:
+    """Gauss-Newton with Huber's weights: R, t, log scale, information (7, 7) and cost."""
+    first, last = readings.fix_groups
+    kept = np.ones(0)
+    H, cost = np.eye(7), np.inf
+    for i in range(iterations + 10):
+        r, J, group = readings.linearised(R, t, log_scale)
+        norms = np.sqrt(np.bincount(group, weights=r**2))
+        if len(kept) == 0:
+            kept = np.ones(len(norms))
+        weight = (kept * np.minimum(1.0, HUBER / np.maximum(norms, 1e-9)))[group]
+        cost = float(np.sum(np.where(norms < HUBER, 0.5 * norms**2, HUBER * (norms - HUBER / 2))))
         H = (J * weight[:, None]).T @ J + np.diag([1e-6] * 6 + [1e-4])
         step = np.linalg.solve(H, -(J * weight[:, None]).T @ r)
         step[:3] = np.clip(step[:3], -0.5, 0.5)
@@ -150,52 +247,45 @@ def fit(anchors: Sequence[Anchor], iterations: int = 30) -> Similarity | None:
         R = se3.so3_exp(step[:3]) @ R
         t = t + step[3:6]
         log_scale += float(step[6])
-        if np.abs(step).max() < 1e-7:
-            break
-    covariance = np.asarray(np.linalg.inv(H) * max(1.0, 0.2 * len(usable)), np.float64)
-    common = [a.prior.sigma_position_m for a in usable if a.prior.sigma_position_m is not None]
-    if common:
-        covariance[3:6, 3:6] += np.diag(np.mean(np.square(common), axis=0))
-    return Similarity(float(np.exp(log_scale)), R, t, covariance, _sources(usable))
+        if np.abs(step).max() < 1e-7 or i >= iterations - 1:
+            wild = norms[first:last] > WILD
+            if kept.all() and wild.any() and 2 * wild.sum() < len(wild):
+                kept[first:last][wild] = 0.0
+            else:
+                break
+    return R, t, log_scale, H, cost
 
 
-def _start(anchors: Sequence[Anchor]) -> tuple[F64, F64, float]:
-    """Rotation of the first attitude, position of the mean fix, scale one or from the spread."""
+def _starts(anchors: Sequence[Anchor], readings: _Readings) -> list[tuple[F64, F64, float]]:
+    """Rotation, shift and log scale to begin with: by the attitude, and by the track.
+
+    The second matters when the compass is far off or there is none: then only the track of
+    the fixes tells the heading.
+    """
     R = np.eye(3)
     for a in anchors:
         if a.prior.R_world_camera is not None:
             R = a.prior.R_world_camera @ a.T_odom_camera[:3, :3].T
             break
-    fixes = [a for a in anchors if a.prior.position_m is not None]
-    if not fixes:
-        return R, -R @ anchors[0].T_odom_camera[:3, 3], 0.0
-    x = np.array([R @ a.T_odom_camera[:3, 3] for a in fixes])
-    y = np.array([a.prior.position_m for a in fixes])
-    R, x = _turn_to_fixes(R, x, y, anchors)
-    return R, np.asarray(np.median(y - x, axis=0)), 0.0
+    if not len(readings.fix):
+        return [(R, -R @ anchors[0].T_odom_camera[:3, 3], 0.0)]
+    x = readings.x @ R.T
+    starts = [(R, np.asarray(np.median(readings.fix - x, axis=0)), 0.0)]
+    if len(x) >= 4:
+        weight = 1.0 / np.mean(readings.sigma_fix**2, axis=1)
+        scale, turn, _ = umeyama(x, readings.fix, weight, True)
+        if scale > 0:
+            shift = np.asarray(np.median(readings.fix - scale * x @ turn.T, axis=0))
+            starts.append((turn @ R, shift, float(np.log(scale))))
+    return starts
 
 
-def _turn_to_fixes(R: F64, x: F64, y: F64, anchors: Sequence[Anchor]) -> tuple[F64, F64]:
-    """Heading from the track when no attitude tells it (sigma of yaw over one rad)."""
-    yaws = [a.prior.sigma_yaw_rad for a in anchors if a.prior.R_world_camera is not None]
-    if yaws and min(yaws) < 1.0:
-        return R, x
-    dx, dy = x[:, :2] - x[:, :2].mean(0), y[:, :2] - y[:, :2].mean(0)
-    turn = np.arctan2(
-        np.sum(dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]),
-        np.sum(dx[:, 0] * dy[:, 0] + dx[:, 1] * dy[:, 1]),
-    )
-    Rz = se3.so3_exp(np.array([0.0, 0.0, float(turn)]))
-    return Rz @ R, x @ Rz.T
-
-
-def _sources(anchors: Sequence[Anchor]) -> tuple[str, ...]:
-    priors = [a.prior for a in anchors]
+def _sources(readings: _Readings) -> tuple[str, ...]:
     out = []
-    if any(p.R_world_camera is not None and p.sigma_yaw_rad < 1.0 for p in priors):
+    if readings.heading_known.any():
         out.append("attitude")
-    if any(p.agl_m is not None for p in priors):
+    if len(readings.log_ratio):
         out.append("altitude")
-    if any(p.position_m is not None for p in priors):
+    if len(readings.fix):
         out.append("gnss")
     return tuple(out)

@@ -43,21 +43,6 @@ def matrix(pose: Any) -> F64:
     return np.asarray(pose.matrix(), np.float64)
 
 
-def altitude_error(measured_m: float) -> Any:
-    """Error function of (pose, bias): camera height plus bias less the reading."""
-
-    def error(factor: Any, values: Any, jacobians: Any) -> F64:
-        pose_key, bias_key = factor.keys()
-        pose = values.atPose3(pose_key)
-        if jacobians is not None:
-            jacobians[0] = np.concatenate([np.zeros(3), pose.rotation().matrix()[2]])[None]
-            jacobians[1] = np.eye(1)
-        height = pose.translation()[2] + values.atVector(bias_key)[0]
-        return np.array([height - measured_m])
-
-    return error
-
-
 def scaled_motion_error(T_a_b: F64) -> Any:
     """Error function of (pose a, pose b, log scale): their motion against the scaled ``T_a_b``."""
     R, t = T_a_b[:3, :3].copy(), T_a_b[:3, 3].copy()

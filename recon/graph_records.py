@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon import se3
-from recon.track_alignment import mean_rotation
 from recon.types import F64, PosePrior
 
 
@@ -16,40 +15,46 @@ class PoseGraphConfig:
     """Parameters of the pose graph."""
 
     sigma_scale: float = 0.1  # of a segment's scale after its alignment, before the readings
-    sigma_step: float = 0.003  # of one vision motion's length: scale drifts step by step
-    max_align_sigma: float = 0.04  # rad and share; the track must fix heading and scale this well
-    correlation_s: float = 10.0  # readings of one sensor closer in time than this err together
+    sigma_scale_walk: float = 0.003  # change of the scale per twenty keyframes
+    sigma_step: float = 0.002  # of one vision motion, as a share of its length
+    least_anchors: int = 3  # keyframes of a segment before telemetry places it
+    fix_s: float = 60.0  # a receiver's error wanders with this time constant
+    precise_fix_s: float = 10.0  # and that of an RTK fix, under 0.3 m, with this one
+    attitude_s: float = 40.0  # an attitude's
+    altitude_s: float = 120.0  # a barometer's
+    altitude_slack_m: float = 3.0  # beyond its gate, until a barometer is said to have stepped
+    blocks_per_height: float = 2.0  # heights over ground of so many blocks count as one
     gate_sigmas: float = 5.0  # readings further from the prediction are left out
     huber_sigmas: float = 1.5
-    sigma_scale_walk: float = 0.005  # change of the scale per twenty keyframes
-    sigma_altitude_bias_m: float = 10.0
-    sigma_altitude_walk_m: float = 0.3  # change of the bias per twenty keyframes
     sigma_link_m: float = 3.0  # per second without vision
     sigma_link_rad: float = 0.3
     loop_window: int = 15  # keyframes within which two loops support each other
 
     def __post_init__(self) -> None:
         """Raise ValueError when a parameter makes no sense."""
-        for name in ("sigma_scale", "sigma_step", "max_align_sigma", "gate_sigmas", "huber_sigmas",
-                     "sigma_altitude_bias_m", "sigma_link_m", "sigma_link_rad"):  # fmt: skip
+        for name in ("sigma_scale", "sigma_scale_walk", "sigma_step", "gate_sigmas",
+                     "huber_sigmas", "sigma_link_m", "sigma_link_rad"):  # fmt: skip
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.correlation_s < 0 or self.loop_window < 1:
-            raise ValueError("correlation_s must not be negative, loop_window at least 1")
+        if min(self.fix_s, self.precise_fix_s, self.attitude_s, self.altitude_s) < 0:
+            raise ValueError("time constants must not be negative")
+        if self.loop_window < 1 or self.least_anchors < 2:
+            raise ValueError("loop_window must be at least 1, least_anchors at least 2")
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Node:
     """One keyframe and what is known of it."""
 
+    seq: int
     key: int  # in the graph
     time_ns: int
     segment: int
-    T_odom_camera: F64
+    T_odom_camera: F64  # (4, 4) in the segment's chain
     covariance: F64  # (6, 6) of the motion since the node before, left, in that camera's frame
     prior: PosePrior
-    altitude_m: float | None
-    sigma_altitude_m: float
+    height: float | None = None  # above the ground that it sees, in odometry units
+    lean: float = 0.0  # 1 - cosine of how far off the vertical that ground is seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,19 +65,12 @@ class Loop:
     b: int
     T_a_b: F64  # (4, 4) m
     covariance: F64  # (6, 6) left perturbation in a's frame
+    growth: float = 1.0  # of b's depth, to fit a's
 
-
-def leveller(nodes: list[Node]) -> F64:
-    """(3, 3) rotation of the odometry's frame by the mean of all attitudes."""
-    return mean_rotation(
-        np.array(
-            [
-                n.prior.R_world_camera @ n.T_odom_camera[:3, :3].T
-                for n in nodes
-                if n.prior.R_world_camera is not None
-            ]
-        )
-    )
+    @property
+    def ends(self) -> tuple[int, int]:
+        """Both keyframes, the earlier first."""
+        return self.a, self.b
 
 
 def loops_agree(one: Loop, other: Loop, T_a_a: F64, T_b_b: F64, limit: float) -> bool:

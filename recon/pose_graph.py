@@ -1,29 +1,50 @@
 """One consistent trajectory: vision, attitude, altitude, GNSS and loops in one pose graph.
 
-An incremental smoother (iSAM2, Kaess et al. 2012, doi:10.1177/0278364911430419, by GTSAM)
-holds a pose per keyframe. Vision gives the motion between keyframes; its frame is brought to
-the world by a similarity fit (Umeyama 1991, doi:10.1109/34.88573) before any position enters,
-because a frame with a wrong heading or scale would be sheared by them. Until the track flown
-supports that fit, poses stay in the odometry's frame and say so.
+A pose per keyframe, in the world and in metres. Vision gives the motion between keyframes; a
+segment's frame is brought to the world by one similarity from all its telemetry
+(:mod:`recon.alignment`), because a frame with a wrong heading or scale would be sheared by
+single readings. About that similarity the graph bends the track as far as the readings, each
+with its own wander, and the loops outweigh vision.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from recon import graph_factors, se3
-from recon.graph_factors import matrix, pose3
-from recon.graph_records import Loop, Node, PoseGraphConfig, leveller, loops_agree
-from recon.track_alignment import Similarity, align_track
+from recon import alignment, graph_factors, se3
+from recon.alignment import Anchor, Scale, Similarity
+from recon.graph_factors import pose3
+from recon.graph_readings import BLOCK, Readings
+from recon.graph_records import Loop, Node, PoseGraphConfig, loops_agree
+from recon.smoother import ROUNDS, Smoother, moved_covariance
 from recon.types import F64, Pose, PosePrior
 
-__all__ = ["PoseGraph", "PoseGraphConfig"]
+__all__ = ["Edge", "PoseGraph", "PoseGraphConfig"]
 
-_CHI2_LIMIT = 22.5  # 99.9 % of chi-square with six degrees of freedom
-_BLOCK = 20  # keyframes that share one scale and one altitude bias
+CHI2_LIMIT = 22.5
+"""99.9 % of chi-square with six degrees of freedom."""
+
+MOST_PENDING = 50
+"""Loops that wait for one that agrees; older ones are forgotten."""
+
+REFIT_GROWTH = 1.3
+"""A segment's similarity is fitted again when its keyframes have grown by so much."""
+
+SOURCES = ("vision", "attitude", "altitude", "gnss", "loop", "dead reckoning")
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """A loop as reports show it."""
+
+    a: int  # number of the earlier keyframe
+    b: int
+    accepted: bool  # False: none that agrees was found
 
 
 class PoseGraph:
@@ -35,28 +56,32 @@ class PoseGraph:
     def __init__(self, config: PoseGraphConfig | None = None) -> None:
         """An empty graph."""
         self.config = config or PoseGraphConfig()
-        self.counts: Counter[str] = Counter()  # readings left out, by reason
+        self._kept_counts: Counter[str] = Counter()  # of what happens once, whatever is rebuilt
         self._nodes: dict[int, Node] = {}  # by keyframe number, in order of time
-        self._similarity: dict[int, Similarity] = {}  # by segment, once aligned
-        self._local: dict[int, Similarity] = {}  # by segment, until then
+        self._segments: dict[int, list[Node]] = {}
+        self._frames: dict[int, Similarity] = {}  # by segment, once telemetry or a loop tells
+        self._fitted: dict[int, int] = {}  # keyframes that the segment's frame was fitted to
+        self._tied: set[int] = set()  # segments that a loop has placed
         self._loops: list[Loop] = []
         self._pending: list[Loop] = []
         self._start()
 
-    @property
-    def aligned(self) -> bool:
-        """True when the newest segment's frame is the world's, by fixes."""
-        if not self._nodes:
-            return False
-        return self._newest().segment in self._similarity
+    @classmethod
+    def batch(
+        cls,
+        nodes: Sequence[Node],
+        loops: Sequence[Loop] = (),
+        config: PoseGraphConfig | None = None,
+    ) -> PoseGraph:
+        """The graph of all keyframes and accepted loops at once, solved."""
+        graph = cls(config)
+        for node in nodes:
+            graph._keep(node)
+        graph._loops = list(loops)
+        graph.solve()
+        return graph
 
-    @property
-    def scale(self) -> float:
-        """Metres per unit of the newest segment's odometry."""
-        node = self._newest()
-        keys, _ = self._drifting.get(("s", node.segment), ([], 0))
-        change = self._scalar(keys[-1]) if keys else 0.0
-        return self._frame(node).scale * float(np.exp(change))
+    # ---- what goes in --------------------------------------------------------------------------
 
     def add_keyframe(
         self,
@@ -66,8 +91,7 @@ class PoseGraph:
         T_odom_camera: F64,
         covariance: F64,
         prior: PosePrior,
-        altitude_m: float | None = None,
-        sigma_altitude_m: float = 2.0,
+        height: tuple[float, float] | None = None,
     ) -> Pose:
         """The new keyframe's pose after all that is known.
 
@@ -77,132 +101,203 @@ class PoseGraph:
             T_odom_camera: (4, 4) in the segment's frame.
             covariance: (6, 6) of the motion since the last keyframe, a left perturbation in
                 the last camera's frame, in units of the odometry.
-            prior: attitude and position of this moment; parts may be missing.
-            altitude_m: barometric or other height in world z, up to a constant bias.
+            prior: telemetry's word on this moment; parts may be missing.
+            height: above ground as :func:`recon.alignment.height_above` gives it.
         """
         if self._nodes and seq <= next(reversed(self._nodes)):
             raise ValueError(f"keyframe {seq} does not come after {next(reversed(self._nodes))}")
         if T_odom_camera.shape != (4, 4) or covariance.shape != (6, 6):
             raise ValueError("T_odom_camera must be (4, 4) and covariance (6, 6)")
+        above, lean = height if height is not None else (None, 0.0)
         node = Node(
-            len(self._nodes), time_ns, segment, np.array(T_odom_camera, np.float64),
-            np.array(covariance, np.float64), self._fresh(prior), altitude_m, sigma_altitude_m,
+            seq, len(self._nodes), time_ns, segment, np.array(T_odom_camera, np.float64),
+            np.array(covariance, np.float64), self._fresh(prior), above, lean,
         )  # fmt: skip
         last = self._newest() if self._nodes else None
-        self._nodes[seq] = node
-        if segment not in self._similarity and self._try_alignment(segment):
+        self._keep(node)
+        if self._refit(segment):
             self.rebuild()
         else:
             self._insert(node, last)
-            self._flush()
+            self._smoother.update()
         return self.pose(seq)
 
-    def add_loop(self, a: int, b: int, T_a_b: F64, covariance: F64) -> bool:
+    def add_loop(
+        self, a: int, b: int, T_a_b: F64, covariance: F64, growth: float = 1.0
+    ) -> bool:  # fmt: skip
         """True when the loop bent the graph; False while it waits for another that agrees.
 
         ``T_a_b`` (4, 4) in metres between the cameras of keyframes ``a`` and ``b``, with a
-        ``covariance`` (6, 6) as a left perturbation in a's frame. One loop alone is not
-        believed: a repeated texture gives perfect matches at the wrong place. A second one
-        nearby must close the same circle.
+        ``covariance`` (6, 6) as a left perturbation in a's frame; ``growth`` is what b's depths
+        must be multiplied by to fit a's. One loop alone is not believed: a repeated texture
+        gives perfect matches at the wrong place. A second one nearby must close the same circle.
         """
         if a not in self._nodes or b not in self._nodes or a == b:
             raise ValueError(f"keyframes {a} and {b} are not two of the graph")
         if a > b:
-            a, b = b, a
+            a, b, growth = b, a, 1.0 / growth
             T_a_b, covariance = graph_factors.reversed_motion(T_a_b, covariance)
-        loop = Loop(a, b, T_a_b, covariance)
+        loop = Loop(a, b, T_a_b, covariance, growth)
         support = [other for other in self._pending + self._loops if self._agree(loop, other)]
         if not support:
             self._pending.append(loop)
-            self.counts["loop waits"] += 1
+            self._pending = self._pending[-MOST_PENDING:]
+            self._kept_counts["loop waits"] += 1
             return False
         fresh = [loop, *(other for other in support if other in self._pending)]
         self._pending = [other for other in self._pending if other not in support]
         self._loops += fresh
+        if self._tie(loop):
+            self.rebuild()
+            return True
         for item in fresh:
-            self._graph.add(self._loop_factor(item))
-        self._flush(extra_rounds=20)
+            self._add_loop_factor(item)
+        self._smoother.update(now=True, rounds=ROUNDS)
         return True
+
+    def solve(self) -> None:
+        """Fit every segment's frame once more to all its telemetry, and build all anew."""
+        for segment, nodes in self._segments.items():
+            if len(nodes) >= self.config.least_anchors:
+                self._fitted.pop(segment, None)
+                self._refit(segment)
+        self.rebuild()
+
+    # ---- what comes out ------------------------------------------------------------------------
+
+    @property
+    def aligned(self) -> bool:
+        """True when the newest segment's frame is the world's, by fixes."""
+        frame = self._frames.get(self._newest().segment) if self._nodes else None
+        return frame is not None and "gnss" in frame.sources
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Readings and loops left out, by reason."""
+        return self._kept_counts + self._left_out
+
+    @property
+    def loops(self) -> list[Edge]:
+        """All loops that were offered."""
+        found = [Edge(loop.a, loop.b, True) for loop in self._loops]
+        return found + [Edge(loop.a, loop.b, False) for loop in self._pending]
+
+    def records(self) -> tuple[list[Node], list[Loop]]:
+        """Keyframes and accepted loops, from which :meth:`batch` makes the same graph."""
+        return list(self._nodes.values()), list(self._loops)
+
+    def similarity(self, segment: int) -> Similarity | None:
+        """What brings a segment's odometry to the world; None before telemetry or a loop does."""
+        return self._frames.get(segment)
+
+    def node(self, seq: int) -> Node:
+        """What is known of keyframe ``seq``. Raises KeyError for an unknown one."""
+        return self._nodes[seq]
+
+    def __contains__(self, seq: int) -> bool:
+        return seq in self._nodes
+
+    def __len__(self) -> int:
+        return len(self._nodes)
 
     def pose(self, seq: int) -> Pose:
         """The pose of keyframe ``seq`` with its covariance and sources."""
         node = self._nodes[seq]
-        T, covariance = self._state(node.key)
-        return Pose(T, covariance, tuple(sorted(self._sources[node.key])))
+        T, covariance = self._smoother.state(node.key)
+        used = self._sources[node.key]
+        return Pose(T, covariance, tuple(name for name in SOURCES if name in used))
+
+    def scale(self, seq: int) -> float:
+        """Metres per unit of the odometry at keyframe ``seq``."""
+        node = self._nodes[seq]
+        key = self._scale_of[node.key]
+        return self._frame(node).scale * float(np.exp(self._smoother.scalar(key) if key else 0.0))
 
     def poses(self) -> dict[int, F64]:
         """(4, 4) T_world_camera of every keyframe."""
-        values = self._isam.calculateEstimate()
-        return {seq: matrix(values.atPose3(n.key)) for seq, n in self._nodes.items()}
+        return dict(zip(self._nodes, self._smoother.poses(), strict=True))
 
-    # ---- building ----------------------------------------------------------------------------
+    def scales(self) -> F64:
+        """(N,) metres per unit of the odometry, in the order of the keyframes."""
+        known = {key: self._smoother.scalar(key) for key in set(self._scale_of) if key}
+        frames = [self._frame(node).scale for node in self._nodes.values()]
+        drift = [known.get(key, 0.0) for key in self._scale_of]
+        return np.asarray(np.array(frames, np.float64) * np.exp(np.array(drift, np.float64)))
+
+    def residuals(self) -> dict[str, F64]:
+        """Whitened residuals by kind of factor: "vision", "attitude", "position", "altitude",
+        "height", "loop", "link" and "prior"; (n, dimension) each."""
+        self._smoother.update(now=True)
+        return self._smoother.residuals()
+
+    def scale_readings(self, segment: int) -> tuple[Scale | None, Scale | None]:
+        """A segment's scale by fixes alone and by heights alone."""
+        frame = self._frames.get(segment)
+        if frame is None:
+            return None, None
+        return alignment.scales(self._anchors(segment), frame)
+
+    # ---- building ------------------------------------------------------------------------------
 
     def _start(self) -> None:
         import gtsam
 
         self._gtsam = gtsam
-        parameters = gtsam.ISAM2Params()
-        solver = gtsam.ISAM2GaussNewtonParams()
-        solver.setWildfireThreshold(0.01)  # rad and m; smaller corrections are not passed on
-        parameters.setOptimizationParams(solver)
-        parameters.setRelinearizeThreshold(0.3)
-        parameters.relinearizeSkip = 10
-        self._isam: Any = gtsam.ISAM2(parameters)
-        self._graph: Any = gtsam.NonlinearFactorGraph()
-        self._values: Any = gtsam.Values()
-        self._sources: dict[int, set[str]] = {}
-        # Keys of a drifting scalar and the number of keyframes when the last was made.
-        self._drifting: dict[tuple[str, int], tuple[list[int], int]] = {}
-        # Pose and covariance of the newest keyframe, predicted while it is not in the smoother.
-        self._head: tuple[int, F64, F64] | None = None
+        self._smoother = Smoother()
+        self._left_out: Counter[str] = Counter()
+        offset_m = self._altitude_offset()
+        self._readings = Readings(self.config, self._smoother, self._left_out, offset_m)
+        self._sources: list[set[str]] = []
+        self._scale_of: list[int] = []  # key of each keyframe's scale; 0 while it has none
+        self._blocks: dict[int, tuple[list[int], int]] = {}  # keys of scales, keyframe of the last
 
     def rebuild(self) -> None:
-        """Make the whole graph anew from all readings and the segments' present similarities."""
+        """Make the whole graph anew from all readings and the segments' present frames."""
         self._start()
         last: Node | None = None
         for i, node in enumerate(self._nodes.values()):
             self._insert(node, last)
             if i % 50 == 49:
-                self._flush()
+                self._smoother.update(now=True)
             last = node
-        self._flush()
+        self._smoother.update(now=True)
         for loop in self._loops:
-            self._graph.add(self._loop_factor(loop))
-        self._flush(extra_rounds=20)
+            self._add_loop_factor(loop)
+        self._smoother.update(now=True, rounds=ROUNDS)
 
-    def _flush(self, extra_rounds: int = 0) -> None:
-        self._isam.update(self._graph, self._values)
-        for _ in range(extra_rounds):
-            self._isam.update()
-        self._graph.resize(0)
-        self._values.clear()
-        self._head = None
+    def _altitude_offset(self) -> float | None:
+        """Altitude less world z over all placed keyframes; None without any."""
+        apart = [
+            n.prior.altitude_m - self._frames[n.segment].pose(n.T_odom_camera)[2, 3]
+            for n in self._nodes.values()
+            if n.prior.altitude_m is not None and n.segment in self._frames
+        ]
+        return float(np.median(apart)) if apart else None
 
-    def _state(self, key: int) -> tuple[F64, F64]:
-        """Pose and left covariance of a keyframe, predicted if it is not in the smoother yet."""
-        if self._head is not None and self._head[0] == key:
-            return self._head[1], self._head[2]
-        T = self._estimate(key)
-        right = np.asarray(self._isam.marginalCovariance(key), np.float64)
-        state = (key, T, graph_factors.left_covariance(T, right))
-        if key == len(self._nodes) - 1:
-            self._head = state
-        return state[1], state[2]
+    def _keep(self, node: Node) -> None:
+        self._nodes[node.seq] = node
+        self._segments.setdefault(node.segment, []).append(node)
 
     def _insert(self, node: Node, last: Node | None) -> None:
-        self._sources[node.key] = set()
+        self._sources.append(set())
+        self._scale_of.append(0)
         if last is None:
             T, spread = self._first(node)
         else:
-            T_last, spread_last = self._state(last.key)
+            T_last, spread_last = self._smoother.state(last.key)
             motion, covariance = self._motion(node, last, T_last)
             T = T_last @ motion
-            A = se3.adjoint(T_last)
-            spread = np.asarray(spread_last + A @ covariance @ A.T)
+            spread = moved_covariance(spread_last, T_last, covariance)
             self._connect(node, last, motion, covariance)
-        self._values.insert(node.key, pose3(T))
-        self._head = (node.key, T, spread)
-        self._add_readings(node, last, T, spread)
+        self._smoother.add_pose(node.key, T, spread)
+        gap_s = 1e9 if last is None else max((node.time_ns - last.time_ns) * 1e-9, 1e-3)
+        is_placed = node.segment in self._frames
+        used = self._readings.add(node, gap_s, T, spread, is_placed)
+        if is_placed and self._readings.height(
+            node, self._scale_key(node), self._frame(node).scale
+        ):
+            used.add("altitude")
+        self._sources[node.key] |= used
 
     def _first(self, node: Node) -> tuple[F64, F64]:
         """Pose and covariance of the first keyframe: loose where readings will tell.
@@ -210,11 +305,12 @@ class PoseGraph:
         The gauge that no reading ever fixes is held at the start.
         """
         T = self._frame(node).pose(node.T_odom_camera)
-        sigma_t = 50.0 if node.segment in self._similarity else 0.01
+        sigma_t = 50.0 if "gnss" in self._frame(node).sources else 0.01
         sigma_r = 1.0 if node.prior.R_world_camera is not None else 0.01
         sigma = np.array([sigma_r] * 3 + [sigma_t] * 3)
         noise = self._gtsam.noiseModel.Diagonal.Sigmas(sigma)
-        self._graph.add(self._gtsam.PriorFactorPose3(node.key, pose3(T), noise))
+        self._smoother.add(self._gtsam.PriorFactorPose3(node.key, pose3(T), noise), "prior")
+        self._sources[node.key].add("vision")
         return T, graph_factors.left_covariance(T, np.diag(sigma**2))
 
     def _connect(self, node: Node, last: Node, motion: F64, covariance: F64) -> None:
@@ -223,51 +319,48 @@ class PoseGraph:
         noise = gtsam.noiseModel.Gaussian.Covariance(
             graph_factors.right_covariance(motion, covariance)
         )
-        if node.segment != last.segment or node.segment not in self._similarity:
-            self._graph.add(gtsam.BetweenFactorPose3(last.key, node.key, pose3(motion), noise))
+        if node.segment != last.segment or node.segment not in self._frames:
+            kind = "vision" if node.segment == last.segment else "link"
+            factor = gtsam.BetweenFactorPose3(last.key, node.key, pose3(motion), noise)
+            self._smoother.add(factor, kind)
             return
-        scale = self._slow("s", node.segment, self.config.sigma_scale, self.config.sigma_scale_walk)
-        keys = [last.key, node.key, scale]
+        keys = [last.key, node.key, self._scale_key(node)]
         error = graph_factors.scaled_motion_error(motion)
-        self._graph.add(gtsam.CustomFactor(noise, keys, error))
+        self._smoother.add(gtsam.CustomFactor(noise, keys, error), "vision")
 
-    def _slow(self, letter: str, group: int, sigma: float, walk: float, begin: float = 0.0) -> int:
-        """Key of a scalar that drifts, a new one every twenty keyframes; made when missing.
+    def _scale_key(self, node: Node) -> int:
+        """Key of the node's scale, a new one every twenty keyframes; made when missing.
 
         Blocks keep the smoother incremental: one variable for the whole flight would tie every
         keyframe to the newest reading.
         """
         gtsam = self._gtsam
-        keys, since = self._drifting.get((letter, group), ([], 0))
-        if keys and len(self._sources) - since < _BLOCK:
+        keys, since = self._blocks.get(node.segment, ([], 0))
+        if keys and node.key - since < BLOCK:
+            self._scale_of[node.key] = keys[-1]
             return keys[-1]
-        key = int(gtsam.symbol(letter, len(keys) + 1_000_000 * group))
+        key = int(gtsam.symbol("s", len(keys) + 1_000_000 * node.segment))
         one = gtsam.noiseModel.Isotropic
         if keys:
-            value = self._scalar(keys[-1])
+            value, walk = self._smoother.scalar(keys[-1]), self.config.sigma_scale_walk
             hold = gtsam.BetweenFactorVector(keys[-1], key, np.zeros(1), one.Sigma(1, walk))
         else:
-            value = begin
+            value, sigma = 0.0, self.config.sigma_scale
             hold = gtsam.PriorFactorVector(key, np.zeros(1), one.Sigma(1, sigma))
-        self._graph.add(hold)
-        self._values.insert(key, np.array([value]))
-        self._drifting[letter, group] = ([*keys, key], len(self._sources))
+        self._smoother.add(hold, "scale")
+        self._smoother.add_scalar(key, value)
+        self._blocks[node.segment] = ([*keys, key], node.key)
+        self._scale_of[node.key] = key
         return key
 
-    def _scalar(self, key: int) -> float:
-        if self._values.exists(key):
-            return float(self._values.atVector(key)[0])
-        return float(self._isam.calculateEstimateVector(key)[0])
-
     def _frame(self, node: Node) -> Similarity:
-        """The segment's similarity; until there is one, its own frame turned to the attitude."""
-        if node.segment in self._similarity:
-            return self._similarity[node.segment]
-        if node.segment not in self._local:
-            R = node.prior.R_world_camera
-            turn = np.eye(3) if R is None else R @ node.T_odom_camera[:3, :3].T
-            self._local[node.segment] = Similarity(1.0, turn, np.zeros(3), 1.0)
-        return self._local[node.segment]
+        """The segment's frame; until there is one, its own turned to the attitude."""
+        if node.segment in self._frames:
+            return self._frames[node.segment]
+        first = self._segments[node.segment][0]
+        R = first.prior.R_world_camera
+        turn = np.eye(3) if R is None else R @ first.T_odom_camera[:3, :3].T
+        return Similarity(1.0, turn, np.zeros(3), np.eye(7))
 
     def _motion(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
         """T_last_node in metres and its (6, 6) covariance, left, in last's frame."""
@@ -282,89 +375,33 @@ class PoseGraph:
         return motion, covariance
 
     def _link(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
-        """Dead reckoning where vision was lost: telemetry's motion, or none, with wide sigmas."""
-        self.counts["stretch without vision"] += 1
-        T = T_last.copy()
-        a, b = last.prior, node.prior
-        if b.R_world_camera is not None:
-            T[:3, :3] = b.R_world_camera
-        if a.position_m is not None and b.position_m is not None:
-            T[:3, 3] = T_last[:3, 3] + b.position_m - a.position_m
-        elif node.segment in self._similarity:
-            T[:3, 3] = self._frame(node).pose(node.T_odom_camera)[:3, 3]
+        """Dead reckoning where vision was lost: telemetry's motion, else the last one's, wide."""
+        self._left_out["stretch without vision"] += 1
         seconds = max((node.time_ns - last.time_ns) * 1e-9, 1.0)
-        sigma = np.array(
-            [self.config.sigma_link_rad] * 3 + [self.config.sigma_link_m * seconds + 5.0] * 3
-        )
+        frame = self._frames.get(node.segment)
+        if frame is not None:  # already placed, by telemetry or by a loop
+            T = frame.pose(node.T_odom_camera)
+        else:
+            T = self._dead_reckoned(node, last, T_last, seconds)
+        sigma_r = self.config.sigma_link_rad if node.prior.sigma_yaw_rad < 1.0 else 1.5
+        sigma = np.array([sigma_r] * 3 + [self.config.sigma_link_m * seconds + 5.0] * 3)
         self._sources[node.key].add("dead reckoning")
         return se3.inverse(T_last) @ T, np.diag(sigma**2)
 
-    # ---- readings ----------------------------------------------------------------------------
-
-    def _add_readings(self, node: Node, last: Node | None, T: F64, spread: F64) -> None:
-        seconds = self.config.correlation_s
-        gap = 1e9 if last is None else max((node.time_ns - last.time_ns) * 1e-9, 1e-3)
-        # Readings that err together count as one per correlation time.
-        inflate = float(np.sqrt(max(1.0, seconds / gap)))
-        self._add_attitude(node, T, spread, inflate)
-        if node.segment not in self._similarity:
-            return
-        lever = np.hstack([-se3.hat(T[:3, 3]), np.eye(3)])
-        place = lever @ spread @ lever.T
-        self._add_position(node, T, place, inflate)
-        self._add_altitude(node, T, inflate)
-
-    def _add_attitude(self, node: Node, T: F64, spread: F64, inflate: float) -> None:
-        prior = node.prior
-        if prior.R_world_camera is None:
-            return
-        sigma = np.array([prior.sigma_tilt_rad, prior.sigma_tilt_rad, prior.sigma_yaw_rad])
-        turn = se3.so3_log(prior.R_world_camera @ T[:3, :3].T)
-        allowed = self.config.gate_sigmas * np.sqrt(np.diag(spread)[:3] + sigma**2)
-        if abs(turn[2]) > allowed[2]:
-            self.counts["heading off"] += 1
-            sigma[2] = np.pi
-        if np.any(np.abs(turn[:2]) > allowed[:2]):
-            self.counts["tilt off"] += 1
-            return
-        R = se3.so3_exp(np.array([turn[0], turn[1], turn[2] if sigma[2] < 3 else 0.0])) @ T[:3, :3]
-        covariance = R.T @ np.diag((sigma * inflate) ** 2) @ R
-        noise = self._robust(self._gtsam.noiseModel.Gaussian.Covariance(covariance))
-        self._graph.add(self._gtsam.PoseRotationPrior3D(node.key, self._gtsam.Rot3(R), noise))
-        self._sources[node.key].add("attitude")
-
-    def _add_position(self, node: Node, T: F64, place: F64, inflate: float) -> None:
-        prior = node.prior
-        if prior.position_m is None or prior.sigma_position_m is None:
-            return
-        sigma = np.maximum(prior.sigma_position_m, 0.005)
-        apart = np.abs(prior.position_m - T[:3, 3])
-        if np.any(apart > self.config.gate_sigmas * np.sqrt(np.diag(place) + sigma**2)):
-            self.counts["position off"] += 1
-            return
-        noise = self._robust(self._gtsam.noiseModel.Diagonal.Sigmas(sigma * inflate))
-        self._graph.add(self._gtsam.GPSFactor(node.key, prior.position_m, noise))
-        self._sources[node.key].add("gnss")
-
-    def _add_altitude(self, node: Node, T: F64, inflate: float) -> None:
-        if node.altitude_m is None:
-            return
-        gtsam = self._gtsam
-        begin = node.altitude_m - T[2, 3]
-        bias = self._slow(
-            "b", 0, self.config.sigma_altitude_bias_m, self.config.sigma_altitude_walk_m, begin
-        )
-        noise = self._robust(gtsam.noiseModel.Isotropic.Sigma(1, node.sigma_altitude_m * inflate))
-        self._graph.add(
-            gtsam.CustomFactor(
-                noise, [node.key, bias], graph_factors.altitude_error(node.altitude_m)
-            )
-        )
-        self._sources[node.key].add("altitude")
-
-    def _robust(self, noise: Any) -> Any:
-        model = self._gtsam.noiseModel
-        return model.Robust.Create(model.mEstimator.Huber.Create(self.config.huber_sigmas), noise)
+    def _dead_reckoned(self, node: Node, last: Node, T_last: F64, seconds: float) -> F64:
+        """(4, 4) where a new segment's first keyframe should be."""
+        T: F64 = T_last.copy()
+        a, b = last.prior, node.prior
+        if b.R_world_camera is not None and b.sigma_yaw_rad < 1.0:
+            T[:3, :3] = b.R_world_camera
+        if a.position_m is not None and b.position_m is not None:
+            T[:3, 3] = T_last[:3, 3] + b.position_m - a.position_m
+            return T
+        before = self._segments[last.segment][-2:]
+        if len(before) == 2 and before[1].time_ns > before[0].time_ns:
+            step = T_last[:3, 3] - self._smoother.pose(before[0].key)[:3, 3]
+            T[:3, 3] += step * seconds / ((before[1].time_ns - before[0].time_ns) * 1e-9)
+        return T
 
     def _fresh(self, prior: PosePrior) -> PosePrior:
         """The prior without its position when the receiver repeats its last one."""
@@ -373,54 +410,87 @@ class PoseGraph:
         before = self._newest().prior.position_m
         if before is None or not np.array_equal(before, prior.position_m):
             return prior
-        self.counts["position frozen"] += 1
-        return PosePrior(
-            prior.R_world_camera, prior.sigma_tilt_rad, prior.sigma_yaw_rad, prior.position_m, None,
-            prior.agl_m, prior.sigma_agl_m,
-        )  # fmt: skip
+        self._kept_counts["position frozen"] += 1
+        return replace(prior, sigma_position_m=None)
 
-    # ---- alignment and loops -----------------------------------------------------------------
+    # ---- frames and loops ----------------------------------------------------------------------
 
-    def _try_alignment(self, segment: int) -> bool:
-        nodes = [n for n in self._nodes.values() if n.segment == segment]
-        fixed = [n for n in nodes if n.prior.sigma_position_m is not None]
-        places = [n.prior.position_m for n in fixed if n.prior.position_m is not None]
-        sigmas = [n.prior.sigma_position_m for n in fixed if n.prior.sigma_position_m is not None]
-        if len(places) < 4 or len(places) != len(sigmas):
+    def _anchors(self, segment: int) -> list[Anchor]:
+        return [Anchor(n.T_odom_camera, n.prior, n.height, n.lean) for n in self._segments[segment]]
+
+    def _refit(self, segment: int) -> bool:
+        """True when the segment's frame was fitted anew, which is due as the segment grows."""
+        nodes = self._segments[segment]
+        due = max(self.config.least_anchors, int(REFIT_GROWTH * self._fitted.get(segment, 0)))
+        if len(nodes) < due or segment in self._tied:
             return False
-        level = any(n.prior.R_world_camera is not None for n in nodes)
-        tilt = leveller(nodes) if level else np.eye(3)
-        track = np.array([tilt @ n.T_odom_camera[:3, 3] for n in fixed])
-        found = align_track(
-            track, np.array(places), np.array(sigmas), level, self.config.max_align_sigma
-        )
+        self._fitted[segment] = len(nodes)
+        found = alignment.fit(self._anchors(segment))
         if found is None:
             return False
-        self._similarity[segment] = Similarity(found.scale, found.R @ tilt, found.t, found.sigma)
+        if "gnss" not in found.sources and nodes[0].key > 0:
+            found = self._kept_in_place(found, nodes[0])
+        self._frames[segment] = found
+        return True
+
+    def _kept_in_place(self, found: Similarity, first: Node) -> Similarity:
+        """A frame without fixes, moved so that its first keyframe stays where it is, and turned
+        to its heading there when no compass tells one."""
+        T = self._smoother.pose(first.key)
+        R = found.R
+        if "attitude" not in found.sources:
+            ahead, now = T[:3, :3], R @ first.T_odom_camera[:3, :3]
+            turn = ahead @ now.T
+            yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+            R = se3.so3_exp(np.array([0.0, 0.0, float(yaw)])) @ R
+        t = T[:3, 3] - found.scale * R @ first.T_odom_camera[:3, 3]
+        return replace(found, R=R, t=t)
+
+    def _tie(self, loop: Loop) -> bool:
+        """True when a loop between segments now places the later one, which no fix does."""
+        a, b = self._nodes[loop.a], self._nodes[loop.b]
+        frame = self._frames.get(b.segment)
+        placed = frame is not None and "gnss" in frame.sources
+        if a.segment == b.segment or placed or b.segment in self._tied:
+            return False
+        T = self._smoother.pose(a.key) @ loop.T_a_b
+        scale = self.scale(loop.b) * loop.growth
+        R = T[:3, :3] @ b.T_odom_camera[:3, :3].T
+        t = T[:3, 3] - scale * R @ b.T_odom_camera[:3, 3]
+        covariance = np.eye(7) if frame is None else frame.covariance
+        sources = () if frame is None else frame.sources
+        self._frames[b.segment] = Similarity(scale, R, t, covariance, sources)
+        self._tied.add(b.segment)
         return True
 
     def _agree(self, one: Loop, other: Loop) -> bool:
         """True when two loops, joined by the track between their ends, close on themselves."""
         window = self.config.loop_window
-        near = abs(one.a - other.a) <= window and abs(one.b - other.b) <= window
-        if not near or (one.a == other.a and one.b == other.b):
+        near = all(self._apart(*pair) <= window for pair in zip(one.ends, other.ends, strict=True))
+        if not near or one.ends == other.ends:
             return False
         ends = (one.a, other.a, other.b, one.b)
-        a, a_other, b_other, b = (self._estimate(self._nodes[i].key) for i in ends)
-        return loops_agree(
-            one, other, se3.inverse(a) @ a_other, se3.inverse(b_other) @ b, _CHI2_LIMIT
-        )
+        a, a_other, b_other, b = (self._smoother.pose(self._nodes[i].key) for i in ends)
+        T_a_a, T_b_b = se3.inverse(a) @ a_other, se3.inverse(b_other) @ b
+        return loops_agree(one, other, T_a_a, T_b_b, CHI2_LIMIT)
 
-    def _loop_factor(self, loop: Loop) -> Any:
+    def _apart(self, seq: int, other: int) -> int:
+        """Keyframes from one to the other; many between segments."""
+        one, two = self._nodes[seq], self._nodes[other]
+        return abs(one.key - two.key) if one.segment == two.segment else 1_000_000
+
+    def _add_loop_factor(self, loop: Loop) -> None:
         a, b = self._nodes[loop.a].key, self._nodes[loop.b].key
         noise = self._gtsam.noiseModel.Gaussian.Covariance(
             graph_factors.right_covariance(loop.T_a_b, loop.covariance)
         )
         self._sources[b].add("loop")
-        return self._gtsam.BetweenFactorPose3(a, b, pose3(loop.T_a_b), self._robust(noise))
+        factor: Any = self._gtsam.BetweenFactorPose3(a, b, pose3(loop.T_a_b), self._robust(noise))
+        self._smoother.add(factor, "loop")
+
+    def _robust(self, noise: Any) -> Any:
+        model = self._gtsam.noiseModel
+        return model.Robust.Create(model.mEstimator.Huber.Create(self.config.huber_sigmas), noise)
 
     def _newest(self) -> Node:
         return next(reversed(self._nodes.values()))
-
-    def _estimate(self, key: int) -> F64:
-        return matrix(self._isam.calculateEstimatePose3(key))

@@ -49,6 +49,8 @@ class PosePrior:
     sigma_position_m: F64 | None = None  # (3,) ENU, 1 sigma
     agl_m: float | None = None  # height of the camera above the ground below it
     sigma_agl_m: float = 5.0
+    altitude_m: float | None = None  # world z up to a constant, as a barometer gives it
+    sigma_altitude_m: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

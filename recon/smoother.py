@@ -1,0 +1,145 @@
+"""Poses and drifting scalars held by iSAM2, fed in batches that grow with it.
+
+Kaess et al. 2012, doi:10.1177/0278364911430419, by GTSAM. One update costs a little more with
+every pose held, so updates become rarer at the same rate: the mean cost stays flat. Poses not
+yet in the smoother are predictions with their own covariance.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from recon import graph_factors, se3
+from recon.graph_factors import matrix, pose3
+from recon.types import F64
+
+POSES_PER_WAIT = 400
+"""One more pose waits between two updates for each so many that are held."""
+
+WILDFIRE = 1e-3
+"""rad and m; corrections smaller than this are not passed on."""
+
+RELINEARISE = 0.3
+"""rad and m; what moved further is linearised again, at every tenth update."""
+
+ROUNDS = 20
+"""Updates after a change that moves many poses; two of them linearise again."""
+
+
+class Smoother:
+    """Poses by key 0, 1, 2 …; scalars by other keys."""
+
+    def __init__(self) -> None:
+        import gtsam
+
+        self._gtsam = gtsam
+        parameters = gtsam.ISAM2Params()
+        solver = gtsam.ISAM2GaussNewtonParams()
+        solver.setWildfireThreshold(WILDFIRE)
+        parameters.setOptimizationParams(solver)
+        parameters.setRelinearizeThreshold(RELINEARISE)
+        parameters.relinearizeSkip = 10
+        self._isam: Any = gtsam.ISAM2(parameters)
+        self._graph: Any = gtsam.NonlinearFactorGraph()
+        self._values: Any = gtsam.Values()
+        self._kinds: list[str] = []
+        self._waiting: dict[int, tuple[F64, F64]] = {}  # pose and its left covariance
+        self._held = 0
+        self._newest: tuple[int, F64, F64] | None = None  # asked for most often
+
+    def __len__(self) -> int:
+        return self._held + len(self._waiting)
+
+    # ---- what goes in --------------------------------------------------------------------------
+
+    def add(self, factor: Any, kind: str) -> None:
+        """Take a factor; its residuals are told under ``kind``."""
+        self._graph.add(factor)
+        self._kinds.append(kind)
+
+    def add_pose(self, key: int, T: F64, covariance: F64) -> None:
+        """A new pose (4, 4) with its predicted left covariance (6, 6); keys follow each other."""
+        if key != len(self):
+            raise ValueError(f"the next pose has key {len(self)}, got {key}")
+        self._values.insert(key, pose3(T))
+        self._waiting[key] = (T, covariance)
+
+    def add_scalar(self, key: int, value: float) -> None:
+        """A new scalar with its first value."""
+        self._values.insert(key, np.array([value]))
+
+    def update(self, now: bool = False, rounds: int = 0) -> bool:
+        """True when what waits went into the smoother: enough of it waits, or ``now``."""
+        if not now and len(self._waiting) <= self._held // POSES_PER_WAIT:
+            return False
+        self._isam.update(self._graph, self._values)
+        for _ in range(rounds):
+            self._isam.update()
+        self._graph.resize(0)
+        self._values.clear()
+        self._held += len(self._waiting)
+        self._waiting.clear()
+        self._newest = None
+        return True
+
+    # ---- what comes out ------------------------------------------------------------------------
+
+    def pose(self, key: int) -> F64:
+        """(4, 4) best estimate of a pose."""
+        if key in self._waiting:
+            return self._waiting[key][0]
+        return matrix(self._isam.calculateEstimatePose3(key))
+
+    def state(self, key: int) -> tuple[F64, F64]:
+        """A pose and its (6, 6) left covariance."""
+        if key in self._waiting:
+            return self._waiting[key]
+        if self._newest is not None and self._newest[0] == key:
+            return self._newest[1], self._newest[2]
+        T = self.pose(key)
+        right = np.asarray(self._isam.marginalCovariance(key), np.float64)
+        covariance = graph_factors.left_covariance(T, right)
+        if key == self._held - 1:
+            self._newest = (key, T, covariance)
+        return T, covariance
+
+    def scalar(self, key: int) -> float:
+        """Best estimate of a scalar."""
+        if self._values.exists(key):
+            return float(self._values.atVector(key)[0])
+        return float(self._isam.calculateEstimateVector(key)[0])
+
+    def poses(self) -> F64:
+        """(N, 4, 4) of all poses in the order of their keys."""
+        rows = np.asarray(
+            self._gtsam.utilities.extractPose3(self._isam.calculateEstimate()), np.float64
+        )
+        out = np.tile(np.eye(4), (len(self), 1, 1))
+        if self._held:
+            out[: self._held, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
+            out[: self._held, :3, 3] = rows[:, 9:]
+        for key, (T, _) in self._waiting.items():
+            out[key] = T
+        return out
+
+    def residuals(self) -> dict[str, F64]:
+        """Whitened residuals of all factors in the smoother by kind, one row per factor.
+
+        Robust losses are left out: a residual is the error over its sigma.
+        """
+        values, factors = self._isam.calculateEstimate(), self._isam.getFactorsUnsafe()
+        out: dict[str, list[F64]] = {}
+        for i, kind in enumerate(self._kinds[: factors.size()]):
+            noise = factors.at(i).noiseModel()
+            noise = noise.noise() if hasattr(noise, "noise") else noise
+            error = noise.whiten(factors.at(i).unwhitenedError(values))
+            out.setdefault(kind, []).append(np.asarray(error, np.float64))
+        return {kind: np.array(rows) for kind, rows in out.items()}
+
+
+def moved_covariance(spread: F64, T: F64, covariance: F64) -> F64:
+    """(6, 6) left covariance after a motion with left ``covariance`` in the frame of ``T``."""
+    A = se3.adjoint(T)
+    return np.asarray(spread + A @ covariance @ A.T)
