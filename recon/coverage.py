@@ -71,7 +71,9 @@ class CoverageGrid:
     sigma_m: F32  # (rows, cols) best 1 sigma of a point in the cell
     height_m: F32  # (rows, cols) mean by the inverse of the variance
     seen_s: F32  # (rows, cols) when a surface was last measured, seconds from the first keyframe
-    inside: Bool  # (rows, cols) within the hull of what was flown
+    inside: Bool  # (rows, cols) within what was flown: the hull of the pictures' middles, and
+    # a quarter of a picture about it
+    core: Bool  # (rows, cols) within that hull itself
 
     @property
     def known(self) -> Bool:
@@ -83,11 +85,18 @@ class CoverageGrid:
         """(rows, cols) cells within the hull where no surface was measured."""
         return self.inside & ~self.known
 
-    def weak(self, least_views: int, most_sigma_m: float) -> Bool:
-        """(rows, cols) cells within the hull that are gaps, seldom seen or uncertain."""
+    def seldom(self, least_views: int) -> Bool:
+        """(rows, cols) cells of the core that too few pictures cover; ends of lines are not."""
+        return np.asarray(self.core & (self.views < least_views))
+
+    def unsure(self, most_sigma_m: float) -> Bool:
+        """(rows, cols) cells of what was flown whose surface is less sure than that."""
         with np.errstate(invalid="ignore"):
-            poor = (self.views < least_views) | (self.sigma_m > most_sigma_m)
-        return np.asarray(self.inside & (poor | ~self.known))
+            return np.asarray(self.inside & (self.sigma_m > most_sigma_m))
+
+    def weak(self, least_views: int, most_sigma_m: float) -> Bool:
+        """(rows, cols) cells worth another flight: gaps, seldom seen or unsure."""
+        return np.asarray(self.gaps | self.seldom(least_views) | self.unsure(most_sigma_m))
 
 
 def usual_cell_m(depth: DepthMap) -> float | None:
@@ -214,7 +223,7 @@ class CoverageMap:
             np.where(where, cut["sigma"], nan),
             np.where(where, cut["height"], nan),
             np.where(where, cut["seen_s"], nan),
-            self._hull(grid),
+            *self._hull(grid),
         )
 
     # ---- footprints ------------------------------------------------------------------------
@@ -237,8 +246,8 @@ class CoverageMap:
             if cells is not None:
                 cells.views[here] += change * mask[there].astype(np.int32)
 
-    def _hull(self, grid: Grid) -> Bool:
-        """Cells within the convex hull of the pictures' middles and a quarter picture about it."""
+    def _hull(self, grid: Grid) -> tuple[Bool, Bool]:
+        """Cells within what was flown, and its core, as CoverageGrid has them."""
         places = list(self._footprints.values())
         middles = np.array([p.centre_m for p in places])
         width = np.array([np.linalg.norm(p.corners_m[1] - p.corners_m[0]) for p in places])
@@ -248,7 +257,7 @@ class CoverageMap:
         spots = np.rint(grid.pixels(middles)).astype(np.int32)
         cv2.fillConvexPoly(mask, cv2.convexHull(spots[:, None]), 1)
         far = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5)
-        return np.asarray(far <= around)
+        return np.asarray(far <= around), mask > 0
 
     # ---- surface ---------------------------------------------------------------------------
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from recon.coverage import CoverageGrid, CoverageMap, usual_cell_m
+from recon.coverage import CoverageGrid, CoverageMap, Footprint, usual_cell_m
 from recon.raster import Grid
 from recon.types import U8, Array, DepthMap
 from service.georeference import LocalFrame
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from service.exports.view import ExportOptions, ScanView
 
 PICTURE, FIGURES = "coverage.png", "coverage.json"
-LEAST_VIEWS = 4
-"""Pictures of a place below which it counts as weak: a surface takes three, one to spare."""
+LEAST_VIEWS = 3
+"""Pictures of a place below which it counts as weak: two alone can agree on what is wrong."""
 
 MOST_SIGMAS = 3.0
 """A surface is weak where its sigma is this many times the scan's median."""
@@ -62,7 +62,7 @@ class Coverage:
 
     layer: CoverageGrid
     frame: LocalFrame | None
-    keyframes: int
+    footprints: tuple[Footprint, ...]  # of the keyframes, in order of their number
     limits: Limits
 
     @cached_property
@@ -94,7 +94,7 @@ class Coverage:
             "cell_m": layer.grid.cell_m,
             "bounds_m": [round(v, 3) for v in self.bounds_m],
             "corners_lat_lon": self.corners_lat_lon(),
-            "keyframes": self.keyframes,
+            "keyframes": len(self.footprints),
             "measured_m2": round(float(known.sum()) * area, 1),
             "flown_m2": round(float(inside.sum()) * area, 1),
             "gaps_m2": round(float(layer.gaps.sum()) * area, 1),
@@ -118,8 +118,8 @@ class Coverage:
         shade = np.array(BEST) * (1 - share) + np.array(USUAL) * share
         out[..., :3] = np.where(known[..., None], shade, 0).astype(np.uint8)
         for cells, colour in (
-            (inside & known & (layer.sigma_m > limits.most_sigma_m), UNSURE),
-            (inside & (layer.views < limits.least_views), SELDOM),
+            (layer.unsure(limits.most_sigma_m), UNSURE),
+            (layer.seldom(limits.least_views), SELDOM),
             (layer.gaps, GAP),
         ):
             out[cells, :3] = colour
@@ -156,14 +156,15 @@ class LiveCoverage:
             if before != state:
                 self._put(seq, finer=before is not None and before[0] != state[0])
                 self._state[seq] = state
-        layer = None
-        if self._map is not None:
-            self._map.refill(self._depths(self._map.stale()))
-            layer = self._map.grid()
+        if self._map is None:
+            return None
+        self._map.refill(self._depths(self._map.stale()))
+        layer = self._map.grid()
         if layer is None or not layer.known.any():
             return None
+        places = tuple(place for _, place in sorted(self._map.footprints.items()))
         limits = Limits(LEAST_VIEWS, MOST_SIGMAS * float(np.median(layer.sigma_m[layer.known])))
-        return Coverage(layer, local_frame(self._store.header), len(self._state), limits)
+        return Coverage(layer, local_frame(self._store.header), places, limits)
 
     def _put(self, seq: int, finer: bool) -> None:
         keyframe = self._store.keyframe(seq)
