@@ -17,7 +17,7 @@ from mavlink.camera_definition import FILE, URI, camera_definition, definition_v
 from mavlink.clock import BootClock
 from mavlink.command_desk import CommandDesk, decode_call
 from mavlink.commands import load_commands
-from mavlink.control import ACCEPTED, Answer, Result, ScanControl
+from mavlink.control import Answer, Result, ScanControl
 from mavlink.decode import READERS, decode
 from mavlink.extended_parameters import ExtendedParameters
 from mavlink.framing import Decoder, Packet
@@ -25,7 +25,7 @@ from mavlink.ftp import FileServer
 from mavlink.gimbal import YAW_FRAMES
 from mavlink.history import VehicleHistory
 from mavlink.messages import CAMERA, ONBOARD, Address, Outbox, Outgoing
-from mavlink.parameters import YAW_FRAME, Parameters
+from mavlink.parameters import YAW_FRAME, Parameters, with_defaults
 from mavlink.presence import Presence
 from mavlink.rates import WANTED_HZ, RateKeeper
 from mavlink.samples import OF_AUTOPILOT
@@ -47,6 +47,7 @@ class CompanionConfig:
     """What the companion asks for and offers."""
 
     camera: CameraConfig = field(default_factory=CameraConfig)
+    parameters: Mapping[str, float] = field(default_factory=dict)  # defaults of this aircraft
     wanted_hz: Mapping[str, float] = field(default_factory=lambda: dict(WANTED_HZ))
     load_every_s: float = 2.0
     motion_every_s: float = 1.0
@@ -81,7 +82,12 @@ class Companion:
         self.rates = RateKeeper(config.wanted_hz)
         self.streams = Streams(self._outbox)
         self.texts = StatusTexts(self._outbox)
-        self.parameters = Parameters(self._outbox, self._parameter_changed, kept_parameters)
+        self.parameters = Parameters(
+            self._outbox,
+            self._parameter_changed,
+            kept_parameters,
+            with_defaults(config.parameters),
+        )
         self._extended = ExtendedParameters(self.parameters, self._outbox)
         table = self.parameters.table
         definition = camera_definition(config.camera.vendor, config.camera.model, table)
@@ -200,10 +206,10 @@ class Companion:
             self._outbox.put(target.component, reply, link)
 
     def _parameter_changed(self, name: str, value: float) -> Answer:
-        if name != YAW_FRAME:
-            return self.control.parameter_changed(name, value)
-        self._set_yaw_frame(value)
-        return ACCEPTED
+        answer = self.control.parameter_changed(name, value)
+        if name == YAW_FRAME and answer.result is Result.ACCEPTED:
+            self._set_yaw_frame(value)
+        return answer
 
     def announce_kept(self) -> None:
         """Tell the service the parameters that were kept from an earlier run."""

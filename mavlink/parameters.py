@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from mavlink.control import Answer, Result
@@ -48,12 +48,21 @@ class Parameter:
 
 PARAMETERS: tuple[Parameter, ...] = (
     Parameter("SR_BASELINE_M", 0.0, 0.0, 200.0, "Stereo baseline, 0 automatic", (), "m", 0.5),
-    Parameter("SR_RESOLUTION_M", 0.1, 0.01, 5.0, "Map resolution", (), "m", 0.01),
-    Parameter("SR_LINK_KBIT_S", 1000.0, 0.0, 100_000.0, "Datalink budget", (), "kbit/s", 10.0),
+    Parameter("SR_RESOLUTION_M", 0.0, 0.0, 5.0, "Map resolution, 0 automatic", (), "m", 0.01),
+    Parameter("SR_LINK_KBIT_S", 1000.0, 1.0, 100_000.0, "Datalink budget", (), "kbit/s", 10.0),
     Parameter(YAW_FRAME, 0.0, 0.0, len(YAW_FRAMES) - 1.0, "Gimbal yaw frame", options=YAW_FRAMES),
     Parameter("SR_CAM_LATENCY", 0.0, -500.0, 2000.0, "Camera latency", (), "ms", 5.0),
+    Parameter("SR_CAM_LAT_AUTO", 0.0, 0.0, 1.0, "Apply the latency found", ("off", "on")),
 )
-"""The next parameter is one line here and one case in the service."""
+"""The next parameter is one line here and one in the service's table."""
+
+
+def with_defaults(values: Mapping[str, float]) -> tuple[Parameter, ...]:
+    """The table with other defaults; those out of range are left as they are."""
+    return tuple(
+        replace(p, default=values[p.name]) if p.accepts(values.get(p.name, math.nan)) else p
+        for p in PARAMETERS
+    )
 
 
 class Parameters:
@@ -93,6 +102,18 @@ class Parameters:
         """Put a value that the service no longer takes back to its default."""
         i = self._index[name]
         self._values[i] = _real32(self.table[i].default)
+
+    def adopt(self, values: Mapping[str, float]) -> None:
+        """Take other defaults, which hold from now on, and show them."""
+        table = list(self.table)
+        for name, value in values.items():
+            i = self._index[name]
+            if table[i].accepts(value):
+                table[i] = replace(table[i], default=value)
+                self._values[i] = _real32(value)
+                self.revision += 1
+                self._send(i)
+        self.table = tuple(table)
 
     def change(self, name: str, value: float) -> Answer:
         """Set a value, unless it is out of range or the service refuses it."""

@@ -15,7 +15,7 @@ import secrets
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -204,6 +204,10 @@ class VehicleLink:
         """Every parameter's value by name."""
         return self._companion.parameters.values()
 
+    def show_parameters(self, values: Mapping[str, float]) -> None:
+        """Let these hold, as the configuration says by now, and tell ground stations."""
+        self._do(lambda: self._companion.parameters.adopt(values))
+
     def record(self, path: Path | None) -> None:
         """Keep a .tlog of all links in a file from now on; None ends it."""
         if path is None:
@@ -327,7 +331,7 @@ class VehicleLink:
     def _save(self) -> None:
         parameters = self._companion.parameters
         timestamp = 0 if self._signing is None else self._signing.timestamp
-        self._memory.save(parameters.values(), parameters.revision, timestamp)
+        self._memory.save(parameters.kept(), parameters.revision, timestamp)
 
 
 class _Memory:

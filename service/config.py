@@ -42,10 +42,9 @@ class CameraConfig:
     mount_roll_deg: float = key(0.0, "fixed mount: roll of the optical axis in the body frame")
     mount_pitch_deg: float = key(-90.0, "fixed mount: -90 looks straight down, 0 looks ahead")
     mount_yaw_deg: float = key(0.0, "fixed mount: 0 puts the picture's top towards the nose")
-    latency_ms: float | str = key(
-        0.0,
-        "from mid-exposure to the picture's time stamp; auto: as the pictures' rotation says",
-        live=True,
+    latency_ms: float = key(0.0, "from mid-exposure to the picture's time stamp", live=True)
+    latency: Literal["fixed", "auto"] = key(
+        "fixed", "fixed: latency_ms; auto: latency_ms until the pictures' rotation says", live=True
     )
 
     def __post_init__(self) -> None:
@@ -53,11 +52,7 @@ class CameraConfig:
         _within("camera.mount_roll_deg", self.mount_roll_deg, -180, 180)
         _within("camera.mount_pitch_deg", self.mount_pitch_deg, -180, 180)
         _within("camera.mount_yaw_deg", self.mount_yaw_deg, -360, 360)
-        if isinstance(self.latency_ms, str):
-            if self.latency_ms != "auto":
-                raise ValueError(f"camera.latency_ms {self.latency_ms!r} is not 'auto' or a number")
-        else:
-            _within("camera.latency_ms", self.latency_ms, -10_000, 10_000)
+        _within("camera.latency_ms", self.latency_ms, -10_000, 10_000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +92,17 @@ class ScanConfig:
     keep_free_mib: float = key(
         2048.0, "the oldest finished scans are deleted to keep so much of the disk; 0: never", True
     )
+    resolution_m: float = key(
+        0.0, "edge of the map's voxels, from the next scan on; 0: as the pictures allow", live=True
+    )
     keep_debug: bool = key(False, "keep what 'skyrelief inspect' shows of every stage")
 
     def __post_init__(self) -> None:
         """Check ranges and the notation of the baseline."""
         _within("scan.base_to_height", self.base_to_height, 0.005, 1.0)
         _within("scan.keep_free_mib", self.keep_free_mib, 0, 1e9)
+        if self.resolution_m != 0.0:
+            _within("scan.resolution_m", self.resolution_m, 0.01, 100)
         if self.assumed_agl_m is not None:
             _within("scan.assumed_agl_m", self.assumed_agl_m, 0.5, 10_000)
         parse_baseline(self.baseline)
@@ -226,16 +226,19 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
     return config
 
 
-def reload(running: Config, wanted: Config) -> tuple[Config, list[str], list[str]]:
+def reload(
+    running: Config, wanted: Config, before: Config | None = None
+) -> tuple[Config, list[str], list[str]]:
     """``running`` with what of ``wanted`` may change live; names of the taken and the waiting.
 
-    The waiting ones differ too, but need a restart.
+    The waiting ones differ too, but need a restart. What ``wanted`` has in common with
+    ``before``, the last one wanted, stays as it is running: an operator may have tuned it.
     """
     taken, waiting = [], []
     for section, field in keys():
         old, new = getattr(running, section), getattr(wanted, section)
         value = getattr(new, field.name)
-        if value == getattr(old, field.name):
+        if value == getattr(getattr(before or running, section), field.name):
             continue
         name = f"{section}.{field.name}"
         if not field.metadata.get("live"):

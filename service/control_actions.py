@@ -11,9 +11,9 @@ from pathlib import Path
 
 from mavlink.control import ACCEPTED, Answer, Handled, Phase, Power, Result, ScanStatus, Work
 from mavlink.status import INFO, WARNING
-from service.config import change
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.scanning import Scanning
+from service.tuning import with_parameter
 
 LEAST_FREE_MIB = 500.0
 """The self-test fails with less than that on the disk."""
@@ -113,17 +113,11 @@ class ControlActions:
         return _systemctl("reboot" if action is Power.REBOOT else "poweroff")
 
     def parameter_changed(self, name: str, value: float) -> Answer:
-        """The baseline from now on: metres, 0 for automatic; other parameters are refused."""
-        if name != "SR_BASELINE_M":
-            return Answer(Result.UNSUPPORTED, f"{name} cannot change while running")
-        scanning = self._scanning
+        """Work by another value of a parameter, or say why not."""
         try:
-            scanning.config = change(
-                scanning.config, "scan.baseline", value if value > 0 else "auto"
-            )
+            self._scanning.follow(with_parameter(self._scanning.config, name, value))
         except InputError as error:
             return Answer(Result.DENIED, str(error))
-        scanning.set_baseline(scanning.config.scan)
         return ACCEPTED
 
     # ---- work of its own thread --------------------------------------------------------------

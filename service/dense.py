@@ -86,6 +86,7 @@ class Dense:
         self._bp = BeliefPropagationConfig(iterations=compute.iterations)
         self._jbu, self._icp, self._fusion = UpsamplingConfig(), IcpConfig(), FusionConfig()
         self._map: VoxelMap | None = None
+        self._resolution_m = config.scan.resolution_m
         self._before: tuple[int, DepthMap | None, F64] | None = None  # seq, depth, T_map_camera
         self._relief = (0.0, 0.0)
 
@@ -181,7 +182,8 @@ class Dense:
             in_map = DepthMap(depth.depth_m, depth.sigma_m, depth.views, depth.K, T_map)
             if self._map is None:
                 ground_m = float(np.nanmedian(depth.depth_m)) / depth.K[0, 0]
-                self._map = VoxelMap(VoxelMapConfig(voxel_m=max(2.0 * ground_m, 1e-3)))
+                voxel_m = max(2.0 * ground_m, self._resolution_m, 1e-3)
+                self._map = VoxelMap(VoxelMapConfig(voxel_m=voxel_m))
             fresh = self._map.fresh(in_map)
             self._map.insert(in_map, fresh)
         with self.lock:

@@ -23,6 +23,7 @@ from service.health import HealthServer, Notifier
 from service.machine import CoreLoad, computer_load, read_machine
 from service.retention import close_open_scans, make_room
 from service.scanning import Scanning
+from service.tuning import TUNABLES, parameters_of
 from service.vehicle_config import vehicle_config
 from service.version import software
 
@@ -41,6 +42,7 @@ class Daemon:
 
     def __init__(self, config: Config) -> None:
         self._started_s = time.time()
+        self._wanted = config  # as it was asked for last; operators may have tuned it since
         self._quit = threading.Event()
         self.scanning = Scanning(config)
         self.actions = ControlActions(self.scanning, self.quit)
@@ -120,11 +122,11 @@ class Daemon:
 
     def reload(self, wanted: Config) -> None:
         """Take over what of ``wanted`` may change while running; the rest waits for a restart."""
-        self.scanning.config, taken, waiting = reload(self.config, wanted)
-        if "scan.baseline" in taken:
-            self.scanning.set_baseline(self.config.scan)
-        if "camera.latency_ms" in taken:
-            self.scanning.set_latency(self.config.camera)
+        config, taken, waiting = reload(self.config, wanted, self._wanted)
+        self._wanted = wanted
+        self.scanning.follow(config)
+        tuned = parameters_of(config).items()
+        self.vehicle.show_parameters({n: v for n, v in tuned if TUNABLES[n].key in taken})
         log.info("configuration: now in force: %s", ", ".join(taken) or "nothing new")
         if waiting:
             log.warning("configuration: after a restart: %s", ", ".join(waiting))

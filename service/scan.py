@@ -37,6 +37,10 @@ class Datalink(Protocol):
         """Wait until the ground holds everything; False when the time is up."""
         ...
 
+    def set_budget(self, budget_kbit_s: float, share: float | None = None) -> None:
+        """Change the link's rate, in flight."""
+        ...
+
     def close(self) -> None:
         """Stop sending."""
         ...
@@ -57,7 +61,7 @@ class ScanInputs:
     history: VehicleHistory | None = None
     notes: tuple[str, ...] = ()
     extra: dict[str, Any] = field(default_factory=dict)  # goes into scan.json
-    latency_ms: float = 0.0  # the camera's, with camera.latency_ms = "auto" until it is found
+    latency_ms: float | None = None  # the camera's as an earlier scan found it
     tell: Callable[[str], None] = log.warning  # the operator
 
 

@@ -66,7 +66,8 @@ def write_deliverables(
     Args:
         extra: more figures of the run, kept with those of the store under ``run`` in
             scan.json; nothing here where the files shall be the same at both ends.
-        voxel_m: size of the fused voxels; by default the ground sample distance.
+        voxel_m: size of the fused voxels; by default ``scan.resolution_m`` of the scan's own
+            configuration, else the ground sample distance.
 
     Raises OutsideError when the folder cannot be written.
     """
@@ -75,7 +76,7 @@ def write_deliverables(
     header = store.header
     frame = local_frame(header)
     poses = latest(store.poses())
-    fused = fused_cloud(store, voxel_m)
+    fused = fused_cloud(store, voxel_m or _resolution_m(header))
     raster = surface(fused)
     run = (store.summary or {}) | extra
     summary = _summary(header, frame, poses, fused, raster, run, store.finished)
@@ -96,6 +97,13 @@ def write_deliverables(
     with writing(folder / SUMMARY) as part:
         part.write_text(json.dumps(summary, indent=2, sort_keys=True) + "\n", encoding="utf-8")
     return summary
+
+
+def _resolution_m(header: ScanHeader) -> float | None:
+    """``scan.resolution_m`` of the scan's configuration; None when it leaves that open."""
+    section = header.configuration.get("scan", {})
+    value = section.get("resolution_m") if isinstance(section, dict) else None
+    return float(value) if isinstance(value, int | float) and value > 0.0 else None
 
 
 @contextmanager

@@ -15,14 +15,14 @@ from mavlink.camera import KeyframeReport
 from mavlink.control import ACCEPTED, Answer, Phase, Result, Work
 from mavlink.status import CRITICAL, WARNING
 from mavlink.vehicle import VehicleLink
-from service.config import CameraConfig, Config, ScanConfig
+from service.config import Config
 from service.errors import InputError, OutsideError, SkyreliefError
 
 if TYPE_CHECKING:
     from recon.backends import Backend
     from recon.types import Camera
     from service.cameras.source import CameraSource
-    from service.scan import Scan
+    from service.scan import Datalink, Scan
     from service.stream.records import PoseRecord
     from service.stream.store import ScanStore
 
@@ -53,7 +53,8 @@ class Scanning:
         self._reported = 0
         self._retry_at_s: float | None = None
         self._retry_s = FIRST_RETRY_S
-        self._latency_ms = 0.0  # of the camera, as the last scan found it
+        self._latency_ms: float | None = None  # of the camera, as the last scan found it
+        self._link: Datalink | None = None  # of the scan that runs
 
     def load(self) -> None:
         """The heavy part of the start: camera model and backend; InputError without them."""
@@ -122,17 +123,15 @@ class Scanning:
         self.phase = Phase.SCANNING
         self.progress_s = time.monotonic()
 
-    def set_baseline(self, config: ScanConfig) -> None:
-        """Follow another ``scan.baseline``, also in the scan that runs."""
-        scan = self.scan
+    def follow(self, config: Config) -> None:
+        """Work by another configuration: what can change in flight also in the scan that runs."""
+        self.config = config
+        scan, link = self.scan, self._link
         if scan is not None:
-            scan.pipeline.set_baseline(config)
-
-    def set_latency(self, config: CameraConfig) -> None:
-        """Follow another ``camera.latency_ms``, also in the scan that runs."""
-        scan = self.scan
-        if scan is not None:
-            scan.check.set_camera(config)
+            scan.pipeline.set_baseline(config.scan)
+            scan.check.set_camera(config.camera)
+        if link is not None:
+            link.set_budget(config.datalink.budget_kbit_s, config.datalink.share)
 
     def retry(self) -> None:
         """Start the next scan when a fault ended the last one and nobody stopped it."""
@@ -203,7 +202,7 @@ class Scanning:
         )
         store = create_store(inputs)
         self.vehicle.record(folder / "link.tlog")
-        link = open_datalink(store, self.config)
+        link = self._link = open_datalink(store, self.config)
         self.scan, self._reported = Scan(inputs, store), 0
         self.vehicle.statustext(f"Scan {scan_id} started")
         try:
@@ -216,6 +215,7 @@ class Scanning:
                 self._close_scan(self.scan, store)
             finally:
                 write_deliverables(folder, store, {})
+                self._link = None
                 if link is not None:
                     link.drain(self.config.datalink.drain_s)
                     link.close()

@@ -1,6 +1,6 @@
 """What the pictures say of the telemetry: the camera's latency, the gimbal's frame.
 
-The operator is told once; the latency found is applied when ``camera.latency_ms`` is "auto",
+The operator is told once; the latency found is applied when ``camera.latency`` is "auto",
 the gimbal's frame when ``mavlink.gimbal_yaw_frame`` is "auto".
 """
 
@@ -38,15 +38,15 @@ class TelemetryCheck:
         camera: CameraConfig,
         history: VehicleHistory | None,
         tell: Callable[[str], None] = log.warning,
-        first_guess_ms: float = 0.0,
+        earlier_ms: float | None = None,
     ) -> None:
-        """``first_guess_ms`` is taken with "auto" until there is an estimate."""
+        """``earlier_ms``, found by an earlier scan, is taken with "auto" until there is news."""
         self.latency: LatencyEstimate | None = None
         self.frame: FrameVerdict | None = None
         self.told: dict[str, str] = {}  # by subject
         self._history, self._tell = history, tell
         self._fixed = camera.mount == "fixed"
-        self._guess_ms = first_guess_ms
+        self._earlier_ms = earlier_ms
         self._camera = camera
         self.applied_ms = self._wanted_ms()
         self._turns = LatencyWatch()
@@ -58,16 +58,17 @@ class TelemetryCheck:
     # ---- the latency in force ------------------------------------------------------------
 
     def set_camera(self, camera: CameraConfig) -> None:
-        """Follow another ``camera.latency_ms`` from the next frame on."""
+        """Follow another ``camera.latency`` or ``latency_ms`` from the next frame on."""
         self._camera = camera
 
     def _wanted_ms(self) -> float:
-        """The latency to apply: as configured, or as found."""
-        configured = self._camera.latency_ms
-        if not isinstance(configured, str):
-            return float(configured)
-        settled = self.latency is not None and self.latency.is_settled
-        return self.latency.latency_ms if settled and self.latency else self._guess_ms
+        """The latency to apply: as found if that is asked for, else as configured."""
+        if self._camera.latency == "auto":
+            if self.latency is not None and self.latency.is_settled:
+                return self.latency.latency_ms
+            if self._earlier_ms is not None:
+                return self._earlier_ms
+        return self._camera.latency_ms
 
     def exposed_ns(self, stamp_ns: int) -> int:
         """When the frame of this stamp was exposed; later for every later frame."""
@@ -127,7 +128,7 @@ class TelemetryCheck:
     def _tell_latency(self, found: LatencyEstimate) -> None:
         text = f"Camera latency {found.latency_ms:.0f} ms by the pictures"
         off_ms = abs(found.latency_ms - self.applied_ms)
-        if isinstance(self._camera.latency_ms, str):
+        if self._camera.latency == "auto":
             self._once("latency", f"{text}: applied")
         elif off_ms > max(WORTH_TELLING_MS, 3.0 * found.sigma_ms):
             self._once("latency", f"{text}, {self.applied_ms:.0f} ms is set")

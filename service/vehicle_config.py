@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mavlink.companion import CompanionConfig
 from mavlink.gimbal import GimbalConfig
 from mavlink.history import HistoryConfig
 from mavlink.presence import PresenceConfig
@@ -11,6 +12,7 @@ from mavlink.signing import read_key
 from mavlink.vehicle import VehicleConfig
 from service.config import Config
 from service.errors import InputError
+from service.tuning import parameters_of
 
 KEEP_S = 120.0
 """How long the live history reaches back; frames wait for the pipeline for less than that."""
@@ -26,6 +28,7 @@ def vehicle_config(config: Config) -> VehicleConfig:
         return VehicleConfig(
             links=mavlink.links,
             presence=PresenceConfig(system=mavlink.system_id or None),
+            companion=CompanionConfig(parameters=parameters_of(config)),
             history=HistoryConfig(
                 keep_s=KEEP_S, gimbal=GimbalConfig(yaw_frame=mavlink.gimbal_yaw_frame)
             ),

@@ -79,6 +79,10 @@ def test_voxels_are_as_fine_as_the_pixels_on_the_ground(tmp_path: Path, house: H
     with house.flown(tmp_path) as store:
         summary = write_deliverables(tmp_path, store, {})
         coarse = write_deliverables(tmp_path, store, {}, voxel_m=1.0)
+        store.update_header(configuration={"scan": {"resolution_m": 1.0}})  # the operator's wish
+        wished = write_deliverables(tmp_path, store, {})
+    assert wished["quality"]["voxel_m"] == 1.0
+    assert wished["counts"]["points"] == coarse["counts"]["points"]
     assert summary["quality"]["voxel_m"] == pytest.approx(40 / 140, abs=1e-3)
     assert coarse["quality"]["voxel_m"] == 1.0
     assert coarse["counts"]["points"] < summary["counts"]["points"] / 5

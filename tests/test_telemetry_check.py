@@ -88,13 +88,13 @@ def test_the_latency_is_shown_and_not_applied_unless_asked(gimbal: str) -> None:
 
 def test_auto_applies_what_was_found_and_keeps_the_frames_in_order() -> None:
     told: list[str] = []
-    check = TelemetryCheck(CameraConfig(latency_ms="auto"), history_of("none", 1.0), told.append)
+    check = TelemetryCheck(CameraConfig(latency="auto"), history_of("none", 1.0), told.append)
     exposed = fly(check)
     assert all(b > a for a, b in pairwise(exposed))
     assert check.applied_ms == pytest.approx(70.0, abs=10.0)
     assert exposed[-1] == pytest.approx((1.0 + 599 / 15) * S, abs=0.01 * S)
     assert len(told) == 1 and told[0].endswith("applied")
-    again = TelemetryCheck(CameraConfig(latency_ms="auto"), None, told.append, 70.0)
+    again = TelemetryCheck(CameraConfig(latency="auto"), None, told.append, 70.0)
     assert again.exposed_ns(S) == S - 70_000_000  # what the last scan found serves at once
 
 
@@ -112,7 +112,7 @@ def test_a_right_setting_needs_no_words_and_can_change_in_flight() -> None:
 
 def test_a_calm_flight_is_given_no_latency() -> None:
     told: list[str] = []
-    check = TelemetryCheck(CameraConfig(latency_ms="auto"), history_of("none", 0.0), told.append)
+    check = TelemetryCheck(CameraConfig(latency="auto"), history_of("none", 0.0), told.append)
     fly(check, 0.0)
     assert check.latency is None and told == [] and check.applied_ms == 0.0
     assert check.summary()["camera_latency"] == {"applied_ms": 0.0}

@@ -51,7 +51,7 @@ def replay(
         overrides.append(f"compute.backend={backend}")
     chosen = load_config(config, overrides)
     camera = _load_model(camera_model, chosen)
-    log = _load_telemetry(telemetry)
+    log = _load_telemetry(telemetry, chosen)
     source = open_camera(video)
     try:
         summary = _replay(source, camera, log, video_epoch, out, chosen, realtime, as_json)
@@ -67,14 +67,17 @@ def _load_model(path: Path | None, config: Config) -> Camera | None:
     return None if chosen is None else load_camera(chosen)
 
 
-def _load_telemetry(path: Path | None) -> TelemetryLog | None:
+def _load_telemetry(path: Path | None, config: Config) -> TelemetryLog | None:
+    from mavlink.gimbal import GimbalConfig
+    from mavlink.history import HistoryConfig
     from mavlink.logs import load_telemetry
     from service.errors import InputError
 
     if path is None:
         return None
+    gimbal = GimbalConfig(yaw_frame=config.mavlink.gimbal_yaw_frame)
     try:
-        return load_telemetry(path)
+        return load_telemetry(path, HistoryConfig(gimbal=gimbal))
     except ValueError as error:
         raise InputError(str(error)) from error
 

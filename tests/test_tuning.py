@@ -1,0 +1,203 @@
+"""Parameters of the operator, from MAVLink packets through the daemon to what they change."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mavlink.framing import Framer
+from mavlink.parameters import PARAMETERS
+from mavlink.wire import dialect
+from recon.types import Camera
+from service.cameras.images import open_images
+from service.config import Config, load_config
+from service.errors import InputError
+from service.runtime import Daemon
+from service.scan import Scan, ScanInputs, create_store
+from service.tuning import TUNABLES, parameters_of, with_parameter
+
+
+def until(done: Callable[[], Any], limit_s: float = 15.0) -> Any:
+    deadline = time.monotonic() + limit_s
+    while time.monotonic() < deadline:
+        value = done()
+        if value:
+            return value
+        time.sleep(0.01)
+    pytest.fail(f"nothing came in {limit_s} s")
+
+
+class Operator:
+    """A ground station's parameter page on a UDP link of a daemon that is not scanning."""
+
+    def __init__(self, folder: Path, *settings: str) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.settimeout(0.05)
+        port = self._socket.getsockname()[1]
+        overrides = [
+            f"scan.folder={folder}",
+            "health.http=",
+            f"mavlink.memory={folder / 'memory'}",
+            f"mavlink.links=udpout:127.0.0.1:{port}",
+        ]
+        self.daemon = Daemon(load_config(None, [*overrides, *settings]))
+        self.shown: dict[str, list[float]] = {}
+        self._framer, self._ear = Framer(), dialect.MAVLink(None)
+        self._mouth = dialect.MAVLink(None, 255, 190)
+        self._peer: Any = None
+
+    def __enter__(self) -> Operator:
+        self.daemon.vehicle.start()
+        until(lambda: self.heard() is not None and self._peer)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.daemon.vehicle.stop()
+        self._socket.close()
+
+    @property
+    def config(self) -> Config:
+        return self.daemon.config
+
+    def heard(self) -> dict[str, list[float]]:
+        """Values shown so far, by parameter."""
+        with contextlib.suppress(TimeoutError):
+            data, self._peer = self._socket.recvfrom(65536)
+            for packet in self._framer.feed(data):
+                if packet.message_id == 22:
+                    message = self._ear.decode(bytearray(packet.data))
+                    self.shown.setdefault(message.param_id, []).append(message.param_value)
+        return self.shown
+
+    def set(self, name: str, value: float) -> float:
+        """Set it and give the value that stands."""
+        before = len(self.shown.get(name, []))
+        message = dialect.MAVLink_param_set_message(1, 191, name.encode(), value, 9)
+        self._socket.sendto(bytes(message.pack(self._mouth)), self._peer)
+        until(lambda: len(self.heard().get(name, [])) > before)
+        return self.shown[name][-1]
+
+
+@pytest.fixture
+def operator(tmp_path: Path) -> Iterator[Operator]:
+    with Operator(tmp_path) as one:
+        yield one
+
+
+CASES: dict[str, tuple[float, str, object]] = {
+    "SR_BASELINE_M": (2.5, "scan.baseline", 2.5),
+    "SR_RESOLUTION_M": (0.5, "scan.resolution_m", 0.5),
+    "SR_LINK_KBIT_S": (64.0, "datalink.budget_kbit_s", 64.0),
+    "SR_YAW_FRAME": (3.0, "mavlink.gimbal_yaw_frame", "body"),
+    "SR_CAM_LATENCY": (70.0, "camera.latency_ms", 70.0),
+    "SR_CAM_LAT_AUTO": (1.0, "camera.latency", "auto"),
+}
+
+
+def value_of(config: Config, key: str) -> object:
+    section, _, field = key.partition(".")
+    return getattr(getattr(config, section), field)
+
+
+def test_every_parameter_has_its_key() -> None:
+    assert set(CASES) == set(TUNABLES) == {parameter.name for parameter in PARAMETERS}
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_a_parameter_is_set_refused_out_of_range_and_kept(tmp_path: Path, name: str) -> None:
+    value, key, expected = CASES[name]
+    (parameter,) = (p for p in PARAMETERS if p.name == name)
+    with Operator(tmp_path) as operator:
+        assert operator.set(name, value) == pytest.approx(value)
+        assert value_of(operator.config, key) == expected
+        for wrong in (parameter.high * 2 + 1, parameter.low - 1, float("nan"), float("inf")):
+            assert operator.set(name, wrong) == pytest.approx(value)
+            assert value_of(operator.config, key) == expected
+    with Operator(tmp_path) as again:
+        until(lambda: value_of(again.config, key) == expected)
+        assert again.daemon.vehicle.parameter(name) == pytest.approx(value)
+
+
+def test_what_the_key_refuses_is_refused_with_the_value_kept(operator: Operator) -> None:
+    assert operator.set("SR_RESOLUTION_M", 0.001) == 0.0
+    assert operator.config.scan.resolution_m == 0.0
+    with pytest.raises(InputError, match="resolution_m"):
+        with_parameter(operator.config, "SR_RESOLUTION_M", 0.001)
+
+
+def test_parameters_begin_as_the_file_says_and_follow_it(tmp_path: Path) -> None:
+    settings = ("scan.baseline=4", "camera.latency_ms=120", "mavlink.gimbal_yaw_frame=servo")
+    with Operator(tmp_path, *settings) as operator:
+        values = operator.daemon.vehicle.parameters()
+        assert values["SR_BASELINE_M"] == 4.0 and values["SR_CAM_LATENCY"] == 120.0
+        assert values["SR_YAW_FRAME"] == 4.0
+        operator.set("SR_CAM_LATENCY", 80.0)
+        wanted = [*settings, "scan.baseline=6", "datalink.budget_kbit_s=9"]
+        operator.daemon.reload(load_config(None, wanted))
+        until(lambda: operator.heard().get("SR_BASELINE_M") == [6.0])
+        until(lambda: operator.heard().get("SR_LINK_KBIT_S") == [9.0])
+        assert operator.config.camera.latency_ms == 80.0  # tuned, and the file says as before
+    # What was not tuned follows the file.
+    with Operator(tmp_path, "scan.resolution_m=0.3", "scan.baseline=2/10") as operator:
+        until(lambda: operator.config.camera.latency_ms == 80.0)
+        assert operator.daemon.vehicle.parameter("SR_RESOLUTION_M") == pytest.approx(0.3)
+        assert "SR_BASELINE_M" not in parameters_of(operator.config)
+        assert operator.config.scan.baseline == "2/10"
+
+
+class Budget:
+    """A datalink that takes note of its budget."""
+
+    def __init__(self) -> None:
+        self.budgets: list[tuple[float, float | None]] = []
+
+    def set_budget(self, budget_kbit_s: float, share: float | None = None) -> None:
+        self.budgets.append((budget_kbit_s, share))
+
+    def drain(self, timeout_s: float) -> bool:
+        return True
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> None:
+    import cv2
+
+    from recon.backends.cpu import CpuBackend
+
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    cv2.imwrite(str(pictures / "20260101000000000Z.png"), np.zeros((90, 160, 3), np.uint8))
+    source = open_images(str(pictures), {})
+    K = np.array([[140.0, 0.0, 79.5], [0.0, 140.0, 44.5], [0.0, 0.0, 1.0]])
+    camera = Camera(K, np.zeros(5), (160, 90))
+    operator.set("SR_RESOLUTION_M", 0.5)
+    inputs = ScanInputs(
+        source, camera, operator.config, CpuBackend(), tmp_path / "scan", "scan", 0,
+        history=operator.daemon.vehicle.history,
+    )  # fmt: skip
+    with create_store(inputs) as store:
+        assert store.header.configuration["scan"]["resolution_m"] == 0.5
+        scan = Scan(inputs, store)
+        scanning, link = operator.daemon.scanning, Budget()
+        scanning.scan, scanning._link = scan, link
+        operator.set("SR_LINK_KBIT_S", 64.0)
+        assert link.budgets[-1] == (64.0, operator.config.datalink.share)
+        operator.set("SR_BASELINE_M", 2.5)
+        assert scan.pipeline.viewpoints.least_base_to_height == pytest.approx(0.002)
+        scan.check.exposed_ns(10**9)
+        operator.set("SR_CAM_LATENCY", 70.0)
+        assert scan.check.exposed_ns(3 * 10**9) == 3 * 10**9 - 70_000_000
+        operator.set("SR_YAW_FRAME", 2.0)
+        assert operator.daemon.vehicle.history.config.gimbal.yaw_frame == "earth"
+        scanning.scan = None
+        scan.pipeline.finish()
