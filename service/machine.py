@@ -28,10 +28,17 @@ class Machine:
     power_w: float | None = None  # drawn in all
     memory_free_mib: float | None = None  # available without swapping
     memory_total_mib: float | None = None
+    memory_limit_free_mib: float | None = None  # to the limit that the service was given
     resident_mib: float | None = None  # of this process
     load: float | None = None  # runnable threads per core, 1 minute
     disk_free_mib: float | None = None
     disk_total_mib: float | None = None
+
+    @property
+    def memory_left_mib(self) -> float | None:
+        """What this process may still take: of the machine's memory or of its own limit."""
+        known = [m for m in (self.memory_free_mib, self.memory_limit_free_mib) if m is not None]
+        return min(known, default=None)
 
     def to_dict(self) -> dict[str, Any]:
         """The readings that there are."""
@@ -100,11 +107,31 @@ def read_machine(disk: Path, root: Path = Path("/")) -> Machine:
         power_w=_power_w(root),
         memory_free_mib=_field_mib(root / "proc/meminfo", "MemAvailable:"),
         memory_total_mib=_field_mib(root / "proc/meminfo", "MemTotal:"),
+        memory_limit_free_mib=_limit_free_mib(root),
         resident_mib=_field_mib(root / "proc/self/status", "VmRSS:"),
         load=_load(root),
         disk_free_mib=disk_free_mib,
         disk_total_mib=disk_total_mib,
     )
+
+
+def _limit_free_mib(root: Path) -> float | None:
+    """Room below the tightest memory limit of our control groups (v2); None without a limit."""
+    line = _text(root / "proc/self/cgroup")
+    if not line.startswith("0::/"):
+        return None
+    group = Path(line.removeprefix("0::/"))
+    rooms = []
+    for part in (group, *group.parents):
+        folder = root / "sys/fs/cgroup" / part
+        most, used = _number(folder / "memory.max"), _number(folder / "memory.current")
+        if most is not None and used is not None:
+            cache = 0.0
+            for entry in _text(folder / "memory.stat").splitlines():
+                if entry.startswith("inactive_file "):
+                    cache = float(entry.split()[1])
+            rooms.append((most - used + cache) / 2**20)
+    return min(rooms, default=None)
 
 
 def _hottest(root: Path) -> float | None:

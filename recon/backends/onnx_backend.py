@@ -79,10 +79,16 @@ class OnnxBackend:
     def _open(self, key: Any, model: bytes) -> None:
         while len(self._sessions) >= KEPT_SESSIONS:
             self._sessions.pop(next(iter(self._sessions)))
-        self._sessions[key] = open_session(model, self.providers)
+        try:
+            self._sessions[key] = open_session(model, self.providers)
+        except ValueError as error:  # our own model: it is the device that cannot
+            raise RuntimeError(str(error)) from error
 
     def _run(self, key: Any, given: dict[str, Array]) -> tuple[Array, Array]:
-        first, second = self._sessions[key].run(None, given)
+        try:
+            first, second = self._sessions[key].run(None, given)
+        except Exception as error:  # ONNX Runtime's own exceptions share no base class
+            raise RuntimeError(str(error)) from error
         return first.copy(), second.copy()
 
 

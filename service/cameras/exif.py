@@ -16,7 +16,7 @@ from service.cameras.source import GeoTag
 
 XMP_BYTES = 1 << 18  # DJI's block sits in the first 64 KiB
 DEFAULT_SIGMA_H_M = 5.0
-NAME_TIME = re.compile(r"(?<!\d)(20\d{6})[T_-]?(\d{6})[._]?(\d{1,3})?Z(?![A-Za-z0-9])")
+NAME_TIME = re.compile(r"(?<!\d)(20\d{6})[T_-]?(\d{6})[._]?(\d{1,6})?Z(?![A-Za-z0-9])")
 EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
 

@@ -1,0 +1,214 @@
+"""The ladder that a scan climbs down when the computer is too slow, too hot or short of memory.
+
+Readings in, moves out: no clock, no file, no thread. Down goes quickly, one step at a time, each
+given time to help; up goes slowly, and slower still when the last step up did not hold.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+from service.config import ComputeConfig
+
+
+class Level(IntEnum):
+    """How much is done with the pictures; each step keeps what the one before gave up."""
+
+    FULL = 0
+    LOWER_RATE = 1  # every second frame, half the stereo pairs
+    LOWER_RESOLUTION = 2  # the stereo pair at 0.7 of its width
+    NO_UPSAMPLING = 3
+    RECORD_ONLY = 4  # pictures go to the disk, to be reconstructed later
+
+    @property
+    def label(self) -> str:
+        """As the operator reads it."""
+        return self.name.lower().replace("_", " ")
+
+
+STRIDE = 2
+"""From LOWER_RATE on, one of so many frames is tracked."""
+
+NARROWER = 0.7
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """What was measured since the last look; None where the machine does not tell."""
+
+    views: int = 0  # that came to be reconstructed
+    late_views: int = 0  # of these, given up because newer ones came faster
+    frames: int = 0  # that the camera gave
+    late_frames: int = 0  # of these, never taken up
+    age_s: float = 0.0  # of the newest frame when it was taken up
+    temperature_c: float | None = None
+    throttled: bool | None = None
+    memory_free_mib: float | None = None  # to the limit of the service or of the machine
+
+
+@dataclass(frozen=True, slots=True)
+class LadderConfig:
+    """When to step, and how patiently."""
+
+    hottest_c: float = 90.0
+    cooler_c: float = 8.0  # below that before stepping up
+    least_memory_mib: float = 300.0  # half of it: straight to the last step
+    late_views: float = 0.25  # share of the views that may give way
+    late_frames: float = 0.6  # share of the frames that may pass unseen
+    oldest_s: float = 1.5  # age of a frame when it is taken up
+    hopeless: float = 2.5  # so many times these: reason enough to only record
+    patience_s: float = 6.0  # of strain before a step down, and between two
+    heat_patience_s: float = 20.0  # the same: metal cools slowly
+    calm_s: float = 30.0  # without strain before a step up; doubled when that did not hold
+    longest_calm_s: float = 240.0
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        if not 0.0 < self.calm_s <= self.longest_calm_s:
+            raise ValueError("ladder: 0 < calm_s <= longest_calm_s must hold")
+        if min(self.patience_s, self.heat_patience_s, self.oldest_s, self.hopeless) <= 0:
+            raise ValueError("ladder: patience, age and hopeless must be positive")
+
+
+@dataclass(frozen=True, slots=True)
+class Strain:
+    """What is too much."""
+
+    reason: str
+    patience_s: float
+    lowest: Level  # no further down for this reason
+    jump: bool = False  # to ``lowest`` at once
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """A step that was taken."""
+
+    level: Level
+    reason: str  # of a step down; empty on the way up
+
+    @property
+    def text(self) -> str:
+        """For the operator."""
+        if self.reason:
+            return f"Load: {self.level.label} ({self.reason})"
+        return f"Load: {self.level.label if self.level else 'full quality'} again"
+
+
+class Ladder:
+    """Where on the ladder the scan stands."""
+
+    def __init__(self, config: LadderConfig | None = None) -> None:
+        self.config = config or LadderConfig()
+        self.level = Level.FULL
+        self.reason = ""  # of the last step down; empty at FULL
+        self._strained_s = self._calm_since_s = math.nan  # since when; NaN: not now
+        self._moved_s = -math.inf
+        self._went_up = False
+        self._calm_s = self.config.calm_s
+
+    def update(self, readings: Readings, now_s: float) -> Move | None:
+        """The step to take at ``now_s`` of a clock that never goes back, if any."""
+        found = strain(readings, self.config)
+        if found is not None:
+            self._calm_since_s = math.nan
+            if math.isnan(self._strained_s):
+                self._strained_s = now_s
+            return self._down(found, now_s)
+        self._strained_s = math.nan
+        if not is_calm(readings, self.config):
+            self._calm_since_s = math.nan
+            return None
+        if math.isnan(self._calm_since_s):
+            self._calm_since_s = now_s
+        return self._up(now_s)
+
+    def _down(self, found: Strain, now_s: float) -> Move | None:
+        waited_s = now_s - max(self._strained_s, self._moved_s)
+        if self.level >= found.lowest or (waited_s < found.patience_s and not found.jump):
+            return None
+        if self._went_up and now_s - self._moved_s < 2.0 * self._calm_s:
+            self._calm_s = min(2.0 * self._calm_s, self.config.longest_calm_s)
+        self.level = found.lowest if found.jump else Level(self.level + 1)
+        self.reason = found.reason
+        self._moved_s, self._went_up = now_s, False
+        return Move(self.level, found.reason)
+
+    def _up(self, now_s: float) -> Move | None:
+        calm_s = now_s - max(self._calm_since_s, self._moved_s)
+        if self.level is Level.FULL:
+            if calm_s > self.config.longest_calm_s:
+                self._calm_s = self.config.calm_s
+            return None
+        if calm_s < self._calm_s:
+            return None
+        self.level = Level(self.level - 1)
+        self._moved_s, self._went_up = now_s, True
+        if self.level is Level.FULL:
+            self.reason = ""
+        return Move(self.level, "")
+
+
+def strain(readings: Readings, config: LadderConfig) -> Strain | None:
+    """What is too much in ``readings``: memory before heat before lag; None when nothing is."""
+    memory, heat = readings.memory_free_mib, readings.temperature_c
+    if memory is not None and memory < config.least_memory_mib:
+        text = f"{memory:.0f} MiB of memory left"
+        short = memory < 0.5 * config.least_memory_mib
+        return Strain(text, config.patience_s, Level.RECORD_ONLY, jump=short)
+    if heat is not None and heat > config.hottest_c:
+        return Strain(f"{heat:.0f} degrees", config.heat_patience_s, Level.RECORD_ONLY)
+    if readings.throttled:
+        return Strain("throttled", config.heat_patience_s, Level.NO_UPSAMPLING)
+    return _lag(readings, config)
+
+
+def _lag(readings: Readings, config: LadderConfig) -> Strain | None:
+    """The worst of what came late, if it is too late."""
+    views, frames = late_shares(readings)
+    found = (
+        (views / config.late_views, f"{100 * views:.0f} % of the views late"),
+        (readings.age_s / config.oldest_s, f"pictures {readings.age_s:.1f} s late"),
+        (frames / config.late_frames, f"{100 * frames:.0f} % of the pictures missed"),
+    )
+    times, reason = max(found)
+    if times <= 1.0:
+        return None
+    lowest = Level.RECORD_ONLY if times > config.hopeless else Level.NO_UPSAMPLING
+    return Strain(reason, config.patience_s, lowest)
+
+
+def late_shares(readings: Readings) -> tuple[float, float]:
+    """Shares of views and of frames that came too late, 0 to 1."""
+    return (
+        readings.late_views / max(readings.views, 1),
+        readings.late_frames / max(readings.frames, 1),
+    )
+
+
+def is_calm(readings: Readings, config: LadderConfig) -> bool:
+    """True when everything is well below what counts as strain: a step up may be tried."""
+    views, frames = late_shares(readings)
+    heat, memory = readings.temperature_c, readings.memory_free_mib
+    return (
+        not readings.throttled
+        and (heat is None or heat < config.hottest_c - config.cooler_c)
+        and (memory is None or memory > 1.5 * config.least_memory_mib)
+        and views < 0.5 * config.late_views
+        and frames < 0.75 * config.late_frames
+        and readings.age_s < 0.5 * config.oldest_s
+    )
+
+
+def lowered(compute: ComputeConfig, level: Level) -> ComputeConfig:
+    """``compute`` as it is at ``level``."""
+    if level >= Level.LOWER_RATE:
+        compute = replace(compute, pairs=max(1, compute.pairs // 2))
+    if level >= Level.LOWER_RESOLUTION:
+        width = max(64, 16 * round(NARROWER * compute.stereo_width / 16))
+        compute = replace(compute, stereo_width=min(width, compute.stereo_width))
+    if level >= Level.NO_UPSAMPLING:
+        compute = replace(compute, upsample=False)
+    return compute
