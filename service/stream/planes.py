@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.types import F32, U8, Array, Bool, DepthMap
-from service.stream import mask_coder, prediction
+from service.stream import mask_coder, plane_kernels, prediction
 
 U16 = npt.NDArray[np.uint16]
 
@@ -25,6 +25,8 @@ SIGMA_UNIT_M = 0.001
 SIGMA_STEPS_PER_OCTAVE = 4
 VIEWS_BLOCK_PX = 2
 MAX_VIEWS = 15
+MCU_PX = 16
+"""JPEG codes colour in blocks of this size."""
 MAX_CODE = 65535
 SPREAD = 0.03
 """A coarse pixel whose inverse depths differ by more than this share (rms) takes the middle
@@ -68,68 +70,12 @@ def bounding_box(known: Bool) -> tuple[int, int, int, int]:
     return x, y, int(columns[-1]) - x + 1, int(rows[-1]) - y + 1
 
 
-def block_mean(plane: F32, factor: int) -> F32:
-    """Mean of each factor x factor block, zeros beyond the edge counted in."""
-    h, w = plane.shape[:2]
-    rows, columns = -(-h // factor), -(-w // factor)
-    if rows * factor != h or columns * factor != w:
-        plane = np.asarray(
-            cv2.copyMakeBorder(
-                plane, 0, rows * factor - h, 0, columns * factor - w, cv2.BORDER_CONSTANT, value=0
-            ),
-            np.float32,
-        )
-    return np.asarray(cv2.resize(plane, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _share(known: Bool, factor: int) -> F32:
-    """The share of each block that is known."""
-    h, w = known.shape
-    if h % factor == 0 and w % factor == 0 and known.all():
-        return np.ones((h // factor, w // factor), np.float32)
-    return block_mean(known.astype(np.float32), factor)
-
-
-def _middle(plane: Array, factor: int) -> Array:
-    """The pixel in the middle of each block (the last one where the block is cut off)."""
-    h, w = plane.shape[:2]
-    v = np.minimum(np.arange(0, h, factor) + factor // 2, h - 1)
-    u = np.minimum(np.arange(0, w, factor) + factor // 2, w - 1)
-    return np.asarray(plane[v[:, None], u[None, :]])
-
-
 def reduce(full: Planes, factor: int) -> Planes:
     """``full`` at 1/factor of its size; a block is known when a quarter of it is."""
-    share = _share(full.known, factor)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = np.where(full.known, np.float32(1.0) / full.depth_m, np.float32(0.0))
-    scale = 1.0 / np.maximum(share, 1e-6)
-    mean = block_mean(inverse, factor) * scale
-    spread = block_mean(inverse * inverse, factor) * scale - mean * mean
-    torn = (spread > (SPREAD * mean) ** 2) & np.asarray(_middle(full.known, factor), np.bool_)
-    mean = np.where(torn, _middle(inverse, factor), mean)
-    known = (share >= 0.25) & (mean > 0)
-    h, w = known.shape
-    box = (0, 0, w * factor, h * factor)
-    if full.known.all() and full.known.shape == (box[3], box[2]):
-        bgr = np.asarray(cv2.resize(full.bgr, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
-        views = np.asarray(cv2.resize(full.views, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
-    else:
-        masked = (full.bgr * full.known[..., None]).astype(np.float32)
-        bgr = _near(block_mean(masked, factor) * scale[..., None], 0, 255)
-        masked = (full.views * full.known).astype(np.float32)
-        views = _near(block_mean(masked, factor) * scale, 0, 255)
-    return Planes(
-        np.asarray(1.0 / np.where(known, mean, 1.0), np.float32),
-        np.asarray(block_mean(full.sigma_m, factor) * scale, np.float32),
-        np.clip(views, 1, MAX_VIEWS),
-        bgr,
-        known,
+    depth, sigma, views, bgr, known = plane_kernels.reduce(
+        full.depth_m, full.sigma_m, full.views, full.bgr, full.known, factor, SPREAD
     )
-
-
-def _near(values: Array, low: int, high: int) -> U8:
-    return np.clip(np.rint(values), low, high).astype(np.uint8)
+    return Planes(depth, sigma, np.clip(views, 1, MAX_VIEWS), bgr, known)
 
 
 def _fill_back(values: Array, known: Bool) -> Array:
@@ -161,12 +107,16 @@ def decode_mask(data: bytes, w: int, h: int) -> Bool:
 def quantise(planes: Planes, step: float) -> tuple[U16, float, float]:
     """Codes of inverse depth, and the inverse depth of code 0 and the step, in 1/m.
 
-    Unknown pixels repeat the last known one. The step grows when 65536 codes are too few.
+    Codes of unknown pixels are arbitrary. The step grows when 65536 codes are too few.
     """
-    depth = _fill_back(planes.depth_m, planes.known)
-    low = np.float32(1.0 / float(depth.max()))
-    high = 1.0 / float(depth.min())
-    step32 = np.float32(max(step, (high - float(low)) / (MAX_CODE - 1)))
+    depth, known = planes.depth_m, planes.known
+    if known.all():
+        near, far = float(depth.min()), float(depth.max())
+    else:
+        near, far = plane_kernels.span(depth, known)
+        depth = np.where(known, depth, np.float32(far))
+    low = np.float32(1.0 / far)
+    step32 = np.float32(max(step, (1.0 / near - float(low)) / (MAX_CODE - 1)))
     codes = (1.0 / float(step32)) / depth.astype(np.float64)
     codes -= float(low) / float(step32) - 0.5
     return np.clip(codes, 0, MAX_CODE).astype(np.uint16), float(low), float(step32)
@@ -176,6 +126,7 @@ def encode_depth(codes: U16, known: Bool, method: int) -> bytes:
     """The codes by prediction, or as one JPEG-LS picture (8 bits deep when they fit)."""
     if method == METHOD_PREDICTION:
         return prediction.encode(codes, known)
+    codes = _fill_back(codes, known)
     picture = codes.astype(np.uint8) if codes.max() < 256 else codes
     return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(picture)))
 
@@ -198,12 +149,10 @@ def decode_depth(data: bytes, known: Bool, method: int, low: float, step: float)
 
 def encode_sigma(planes: Planes) -> bytes:
     """The section of sigma: one code per block of SIGMA_BLOCK_PX."""
-    sigma = planes.sigma_m
-    share = _share(sigma > 0, SIGMA_BLOCK_PX)
-    has = share > 0
+    mean = plane_kernels.block_means(planes.sigma_m, SIGMA_BLOCK_PX)
+    has = mean > 0
     if not has.any():
         return b""
-    mean = block_mean(sigma, SIGMA_BLOCK_PX) / np.maximum(share, 1e-6)
     octaves = np.log2(np.maximum(mean, SIGMA_UNIT_M) / SIGMA_UNIT_M)
     codes = np.clip(np.rint(octaves * SIGMA_STEPS_PER_OCTAVE) + 1, 1, 255).astype(np.uint8)
     return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(_fill_back(codes, has))))
@@ -226,13 +175,7 @@ def decode_sigma(data: bytes, w: int, h: int) -> F32 | None:
 
 def encode_views(planes: Planes) -> bytes:
     """The section of views: one count per block of VIEWS_BLOCK_PX, at most MAX_VIEWS."""
-    h, w = planes.known.shape
-    views = np.where(planes.known, np.clip(planes.views, 1, MAX_VIEWS), 255).astype(np.uint8)
-    padded = views
-    if h % 2 or w % 2:
-        padded = np.pad(views, ((0, h % 2), (0, w % 2)), constant_values=255)
-    least = np.minimum(padded[::2], padded[1::2])
-    least = np.minimum(least[:, ::2], least[:, 1::2])
+    least = plane_kernels.block_least(planes.views, planes.known, VIEWS_BLOCK_PX, MAX_VIEWS)
     return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(_fill_back(least, least != 255))))
 
 
@@ -251,7 +194,8 @@ def decode_views(data: bytes, w: int, h: int) -> U8 | None:
 
 def encode_colour(planes: Planes, quality: int) -> bytes:
     """The box as a JPEG; blocks without known pixels are flat, so they cost next to nothing."""
-    picture = planes.bgr if planes.known.all() else _calm(planes.bgr, planes.known)
+    whole = planes.known.all()
+    picture = planes.bgr if whole else plane_kernels.calm(planes.bgr, planes.known, MCU_PX)
     ok, data = cv2.imencode(
         ".jpg",
         np.ascontiguousarray(picture),
@@ -273,19 +217,6 @@ def decode_colour(data: bytes, w: int, h: int) -> U8 | None:
     if picture is None or picture.shape != (h, w, 3):
         return None
     return np.asarray(picture, np.uint8)
-
-
-def _calm(bgr: U8, known: Bool) -> U8:
-    """``bgr`` with unknown pixels set to the mean of the known ones in their 16x16 block."""
-    weight = known.astype(np.float32)
-    share = block_mean(weight, 16)
-    mean = block_mean(bgr * weight[..., None], 16) / np.maximum(share, 1e-6)[..., None]
-    has = share > 0
-    for k in range(3):
-        mean[..., k] = _fill_back(np.ascontiguousarray(mean[..., k]), has)
-    h, w = known.shape
-    flat = _enlarge(np.clip(np.rint(mean), 0, 255).astype(np.uint8), 16, w, h)
-    return np.where(known[..., None], bgr, flat)
 
 
 def _enlarge(blocks: Array, factor: int, w: int, h: int) -> Array:

@@ -44,6 +44,8 @@ ESCAPE = 255
 _PLANE = np.array([1.0, -1.0, 0, 0, 0, 0, 0, 0, 0])
 """Weights of plane prediction, W + N - NW: what the fit starts from."""
 _PRIOR = 20.0
+FIT_PIXELS = 2_500
+"""Pixels that the weights are fitted to, about."""
 
 
 MARGIN = 2
@@ -123,12 +125,14 @@ def _residuals(c: I64, k: I64, size: tuple[int, int], weights: I64) -> U16:
     at = 0
     for v in range(h):
         start = (v + MARGIN) * row + MARGIN
+        if not k[start : start + w].any():
+            continue
         # Slices keep the compiler from checking every index for being negative.
         known, code = k[start : start + w], c[start : start + w]
         west_known, west = k[start - 1 : start - 1 + w], c[start - 1 : start - 1 + w]
         for u in range(w):
-            base[u] = west[u] if west_known[u] else _base(c, k, start + u, row, last)
             if known[u]:
+                base[u] = west[u] if west_known[u] else _base(c, k, start + u, row, last)
                 last = code[u]
         _guess_row(real, there, start, row, base, f, guess)
         for u in range(w):
@@ -184,7 +188,7 @@ def _padded(plane: npt.NDArray[np.generic]) -> I64:
 def fit(c: I64, k: I64, size: tuple[int, int]) -> I64:
     """(9,) weights, 4096 is one, that predict the padded codes best; least squares about a
     plane."""
-    step = max(1, size[0] * size[1] // 5_000)
+    step = max(1, size[0] * size[1] // FIT_PIXELS)
     A, b = _normal_equations(c, k, size, step)
     A = A + np.tril(A, -1).T
     prior = _PRIOR * np.eye(WEIGHTS)

@@ -1,0 +1,140 @@
+"""The loops over pixels behind :mod:`service.stream.planes`, compiled."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from recon.types import F32, U8, Bool
+
+
+@numba.njit(cache=True, nogil=True)
+def span(depth: F32, known: Bool) -> tuple[float, float]:
+    """The least and the greatest of the known depths."""
+    least, greatest = np.float32(np.inf), np.float32(0.0)
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            if known[v, u]:
+                least = min(least, depth[v, u])
+                greatest = max(greatest, depth[v, u])
+    return float(least), float(greatest)
+
+
+@numba.njit(cache=True, nogil=True)
+def reduce(
+    depth: F32, sigma: F32, views: U8, bgr: U8, known: Bool, factor: int, spread: float
+) -> tuple[F32, F32, U8, U8, Bool]:
+    """Depth, sigma, views, colour and mask at 1/factor of the size.
+
+    Inverse depth is averaged; where it differs within a block by more than ``spread`` of its
+    mean (rms), the middle pixel is taken. A block is known when a quarter of it is.
+    """
+    h, w = depth.shape
+    rows, columns = -(-h // factor), -(-w // factor)
+    out_depth = np.ones((rows, columns), np.float32)
+    out_sigma = np.zeros((rows, columns), np.float32)
+    out_views = np.ones((rows, columns), np.uint8)
+    out_bgr = np.zeros((rows, columns, 3), np.uint8)
+    out_known = np.zeros((rows, columns), np.bool_)
+    for row in range(rows):
+        top, bottom = row * factor, min(h, (row + 1) * factor)
+        for column in range(columns):
+            left, right = column * factor, min(w, (column + 1) * factor)
+            count, total, squares, sigmas, seen = 0, 0.0, 0.0, 0.0, 0
+            blue, green, red = 0, 0, 0
+            for v in range(top, bottom):
+                for u in range(left, right):
+                    if known[v, u]:
+                        inverse = 1.0 / np.float64(depth[v, u])
+                        count += 1
+                        total += inverse
+                        squares += inverse * inverse
+                        sigmas += sigma[v, u]
+                        seen += views[v, u]
+                        blue += bgr[v, u, 0]
+                        green += bgr[v, u, 1]
+                        red += bgr[v, u, 2]
+            if 4 * count < factor * factor:
+                continue
+            mean = total / count
+            middle_v, middle_u = min(top + factor // 2, h - 1), min(left + factor // 2, w - 1)
+            torn = squares / count - mean * mean > (spread * mean) ** 2
+            if torn and known[middle_v, middle_u]:
+                mean = 1.0 / np.float64(depth[middle_v, middle_u])
+            out_known[row, column] = True
+            out_depth[row, column] = 1.0 / mean
+            out_sigma[row, column] = sigmas / count
+            out_views[row, column] = (seen + count // 2) // count
+            out_bgr[row, column, 0] = (blue + count // 2) // count
+            out_bgr[row, column, 1] = (green + count // 2) // count
+            out_bgr[row, column, 2] = (red + count // 2) // count
+    return out_depth, out_sigma, out_views, out_bgr, out_known
+
+
+@numba.njit(cache=True, nogil=True)
+def block_means(sigma: F32, block: int) -> F32:
+    """Mean of the values above 0 in each block, of which the others are 0; 0 for none."""
+    h, w = sigma.shape
+    rows, columns = -(-h // block), -(-w // block)
+    out = np.zeros((rows, columns), np.float32)
+    for row in range(rows):
+        for column in range(columns):
+            count, total = 0, np.float32(0.0)
+            for v in range(row * block, min(h, (row + 1) * block)):
+                for u in range(column * block, min(w, (column + 1) * block)):
+                    count += sigma[v, u] > 0
+                    total += sigma[v, u]
+            if count:
+                out[row, column] = total / np.float32(count)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def block_least(views: U8, known: Bool, block: int, most: int) -> U8:
+    """The least known value in each block, 1 to ``most``; 255 where there is none."""
+    h, w = views.shape
+    rows, columns = -(-h // block), -(-w // block)
+    out = np.full((rows, columns), 255, np.uint8)
+    line = np.empty(w, np.uint8)
+    for row in range(rows):
+        line[:] = 255
+        for v in range(row * block, min(h, (row + 1) * block)):
+            for u in range(w):
+                value = views[v, u] if known[v, u] else np.uint8(255)
+                line[u] = min(line[u], value)
+        for column in range(columns):
+            least = np.uint8(255)
+            for u in range(column * block, min(w, (column + 1) * block)):
+                least = min(least, line[u])
+            out[row, column] = least if least == 255 else min(max(least, 1), most)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def calm(bgr: U8, known: Bool, block: int) -> U8:
+    """The picture with unknown pixels at the mean of the known ones in their block; blocks
+    without any repeat the mean before them."""
+    h, w = known.shape
+    out = np.empty((h, w, 3), np.uint8)
+    mean = np.full(3, 128, np.int64)
+    for top in range(0, h, block):
+        bottom = min(h, top + block)
+        for left in range(0, w, block):
+            right = min(w, left + block)
+            count, blue, green, red = 0, 0, 0, 0
+            for v in range(top, bottom):
+                for u in range(left, right):
+                    if known[v, u]:
+                        count += 1
+                        blue += bgr[v, u, 0]
+                        green += bgr[v, u, 1]
+                        red += bgr[v, u, 2]
+            if count:
+                mean[0] = (blue + count // 2) // count
+                mean[1] = (green + count // 2) // count
+                mean[2] = (red + count // 2) // count
+            for v in range(top, bottom):
+                for u in range(left, right):
+                    for k in range(3):
+                        out[v, u, k] = bgr[v, u, k] if known[v, u] else mean[k]
+    return out
