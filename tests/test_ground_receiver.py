@@ -17,9 +17,10 @@ from service.errors import InputError, OutsideError
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream import codec
+from service.stream import link as link_module
 from service.stream.link import DatalinkSender
 from service.stream.records import PoseRecord, Repose, ScanHeader
-from service.stream.session import SessionConfig
+from service.stream.session import SessionConfig, open_session
 from service.stream.store import ScanStore
 
 pytest.importorskip("zenoh")
@@ -163,6 +164,34 @@ def test_both_ends_may_restart(tmp_path: Path) -> None:
     onboard.close()
 
 
+def test_a_session_on_which_stations_fell_silent_is_opened_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    endpoint = free_endpoint()
+    opened: list[float] = []
+
+    def counted(config: SessionConfig) -> object:
+        opened.append(time.monotonic())
+        return open_session(config)
+
+    monkeypatch.setattr(link_module, "open_session", counted)
+    monkeypatch.setattr(link_module, "SILENCE_S", 0.4)  # less than between two reports
+    onboard = new_store(tmp_path / "air")
+    ground = start_ground(tmp_path / "ground", endpoint)
+    link = DatalinkSender(onboard, fast(endpoint))
+    try:
+        assert wait_for(lambda: len(opened) >= 3)
+        fly(onboard, 0, 5)
+        onboard.finish({})
+        monkeypatch.setattr(link_module, "SILENCE_S", 5.0)
+        assert link.drain(20.0)
+    finally:
+        link.close()
+        ground.close()
+    assert_equal(onboard, ground.folder("drone-a", "scan-1") / "scan.db")
+    onboard.close()
+
+
 def test_two_drones_with_the_same_scan_id_and_a_late_second_ground(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     stores = [new_store(tmp_path / name, name) for name in ("red", "blue")]
@@ -195,7 +224,7 @@ def test_over_the_quota_the_ground_keeps_coarse_layers_and_says_so(tmp_path: Pat
     fly(onboard, 0, 6)
     onboard.finish({})
     session = SessionConfig(mode="router", listen=(endpoint,))
-    ground = Receiver(ReceiverConfig(tmp_path / "ground", session, quota_bytes=60_000))
+    ground = Receiver(ReceiverConfig(tmp_path / "ground", session, quota_bytes=120_000))
     ground.start()
     link = DatalinkSender(onboard, fast(endpoint))
     try:

@@ -17,10 +17,12 @@ def test_a_pipe_serialises_at_its_rate_and_delays() -> None:
     assert pipe.backlog_bytes(0.0) == pytest.approx(10 * WIRE)
 
 
-def test_a_cut_holds_a_stream_and_swallows_datagrams() -> None:
+def test_a_cut_holds_a_stream_until_tcp_tries_again_and_swallows_datagrams() -> None:
     model = LinkModel(rate_kbit_s=1000.0, delay_s=0.0, cuts=((1.0, 3.0),))
-    stream, datagrams = _Pipe(model, 0.0, 1), _Pipe(model, 0.0, 1)
-    assert stream.send(100, 1.5, stream=True) == pytest.approx(3.0 + 152 / 125_000)
+    datagrams = _Pipe(model, 0.0, 1)
+    # Sent at 1.5 s, again after 0.2, 0.4, 0.8 and 1.6 s.
+    assert datagrams.resumes(1.5, 0.2) == pytest.approx(1.5 + 0.2 + 0.4 + 0.8 + 1.6)
+    assert datagrams.resumes(0.5, 0.2) == 0.5
     assert datagrams.send(100, 1.5, stream=False) is None
     assert datagrams.send(100, 3.5, stream=False) is not None
 

@@ -212,6 +212,26 @@ def test_nothing_but_heads_is_sent_while_nobody_listens(tmp_path: Path) -> None:
     assert world.sent and all(m.topic == "head" for _, m in world.sent)
 
 
+def test_a_station_that_is_back_gets_the_newest_coarse_layers_at_once(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    world.produce(0, 2)
+    world.run(4.0)
+    world.cut = (world.now, world.now + 20.0)
+    world.run(9.0)
+    world.produce(2, 12)
+    world.run(11.0)
+    world.outbox.reconnected(world.now)
+    began = world.now
+    world.run(4.0)
+    ended: dict[str, float] = {}  # in the order in which they began
+    for at, message in world.sent:
+        if at >= began and "/k" in message.topic:
+            ended[message.topic] = at
+    assert list(ended)[:10] == [f"item/k0/{seq}" for seq in range(11, 1, -1)]
+    assert ended["item/k0/2"] - began < 3.0
+    assert world.ground.progress.duplicates == 0
+
+
 def test_detail_that_does_not_fit_waits_on_disk(tmp_path: Path) -> None:
     world = World(tmp_path, rate=2000.0)
     world.run(2.5)

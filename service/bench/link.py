@@ -30,7 +30,9 @@ from service.stream.store import ScanStore
 SIZE_PX = (320, 180)
 SHARE = 0.65
 SETTLE_S = 3.0
-"""Time after a cut in which the link is not counted as up: TCP and Zenoh find each other."""
+"""Time after a cut that is reported on its own: TCP and Zenoh find each other again."""
+PATIENCE_S = 20.0
+"""How long drone and ground may take to find each other before take-off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,9 +41,9 @@ class Trial:
 
     link: LinkModel
     flight_s: float = 45.0
-    keyframes_hz: float = 7.0
+    keyframes_hz: float = 10.0
     drones: int = 1
-    drain_s: float = 240.0
+    drain_s: float = 200.0
 
 
 KINDS = (("pose", "poses"), ("k0", "coarse layers"), ("k1", "fine layers"))
@@ -49,7 +51,7 @@ DELIVERED = "delivered of what was made"
 BUSIEST = "busiest second on the wire, of the budget"
 
 RADIO = Trial(LinkModel(1000.0, 0.1, 0.03, ((12.0, 32.0),)))
-FLEET = Trial(LinkModel(1000.0, 0.05, 0.0), flight_s=15.0, keyframes_hz=2.0, drones=10)
+FLEET = Trial(LinkModel(1000.0, 0.05, 0.0), flight_s=12.0, drones=10)
 
 
 @dataclass(slots=True, eq=False)
@@ -57,6 +59,7 @@ class _Drone:
     store: ScanStore
     sender: DatalinkSender
     emulator: LinkEmulator
+    found_s: float = 0.0  # from switching on until a ground station was heard
     made: dict[tuple[str, int], float] = field(default_factory=dict)
 
 
@@ -72,7 +75,11 @@ class Outcome:
     sent_over_stored: float
     duplicates: int
     drain_s: float
-    cpu_share: float  # of one core, drone and ground and emulator together
+    cpu_share: float  # of one core in flight: encoder, drones, grounds and emulators together
+    found_s: float = 0.0  # from switching on until the last drone heard its ground
+    settling_s: list[float] = field(default_factory=list)
+    """Latency of the coarse layers made in the first SETTLE_S after a cut."""
+    back_s: float = float("nan")  # from a cut's end to the first new coarse layer at the ground
 
 
 def run(options: BenchOptions) -> list[BenchResult]:
@@ -103,15 +110,29 @@ def _latencies(what: str, latencies: list[float]) -> list[tuple[str, float]]:
 def _report(name: str, outcome: Outcome, peer: dict[str, float]) -> list[BenchResult]:
     rows = [
         (DELIVERED, 100 * outcome.delivered / outcome.made, "%"),
+        ("drone and ground find each other after", outcome.found_s, "s"),
         ("least served drone at the flight's end, coarse layers", 100 * outcome.least_share, "%"),
         (BUSIEST, 100 * outcome.busiest_share, "%"),
         ("bytes on the wire per byte stored", outcome.sent_over_stored, ""),
         ("records that came twice", float(outcome.duplicates), ""),
         ("time to fetch the rest after the flight", outcome.drain_s, "s"),
-        ("processor, all parts together", 100 * outcome.cpu_share, "% of a core"),
+        (
+            "processor in flight: encoder, drone, ground and link",
+            100 * outcome.cpu_share,
+            "% of a core",
+        ),
     ]
     for kind, what in KINDS:
         rows += [(w, v, "s") for w, v in _latencies(what, outcome.latency_s.get(kind, []))]
+    if outcome.settling_s:
+        rows += [
+            ("from a cut's end to the next coarse layer", outcome.back_s, "s"),
+            (
+                f"latency of coarse layers of the first {SETTLE_S:.0f} s after it, worst",
+                max(outcome.settling_s),
+                "s",
+            ),
+        ]
     return [
         BenchResult(
             name,
@@ -136,9 +157,14 @@ def _fly(trial: Trial, folder: Path) -> Outcome:
     session = SessionConfig(mode="router", listen=(f"tcp/127.0.0.1:{ground_port}",))
     ground = _WatchedReceiver(ReceiverConfig(folder / "ground", session))
     ground.start()
-    drones = [_take_off(trial, folder, k, ground_port) for k in range(trial.drones)]
+    drones = [_switch_on(trial, folder, k, ground_port) for k in range(trial.drones)]
+    for drone in drones:
+        _find(drone)
     began, cpu = time.monotonic(), time.process_time()
+    for drone in drones:
+        drone.emulator.take_off(began)
     _produce(trial, drones, began)
+    cpu_share = (time.process_time() - cpu) / (time.monotonic() - began)
     least = min(_coarse_share(drone, ground) for drone in drones)
     landed = time.monotonic()
     for drone in drones:
@@ -146,7 +172,7 @@ def _fly(trial: Trial, folder: Path) -> Outcome:
     for drone in drones:
         drone.sender.drain(max(0.0, trial.drain_s - (time.monotonic() - landed)))
     ended = time.monotonic()
-    outcome = _outcome(trial, drones, ground, least, began, landed, ended, cpu)
+    outcome = _outcome(trial, drones, ground, least, ended - landed, cpu_share)
     for drone in drones:
         drone.sender.close()
         drone.emulator.close()
@@ -173,6 +199,7 @@ def fly_plain(trial: Trial) -> Outcome:
     ground.declare_subscriber("bench/*/*", on_sample)
     emulator = LinkEmulator(trial.link, port, ground_port, udp=False)
     emulator.start()
+    emulator.take_off(time.monotonic())
     plain = zenoh.Config()
     plain.insert_json5("mode", '"client"')
     plain.insert_json5("connect/endpoints", f'["{endpoints[1]}"]')
@@ -216,7 +243,15 @@ def fly_plain(trial: Trial) -> Outcome:
     )
 
 
-def _take_off(trial: Trial, folder: Path, number: int, ground_port: int) -> _Drone:
+def _find(drone: _Drone) -> None:
+    """Wait until the drone has heard its ground station."""
+    began = time.monotonic()
+    while not drone.sender.progress.listened and time.monotonic() - began < PATIENCE_S:
+        time.sleep(0.02)
+    drone.found_s = time.monotonic() - began
+
+
+def _switch_on(trial: Trial, folder: Path, number: int, ground_port: int) -> _Drone:
     port = _free_port()
     emulator = LinkEmulator(replace(trial.link, seed=number), port, ground_port, udp=False)
     emulator.start()
@@ -277,12 +312,12 @@ def _outcome(
     drones: Sequence[_Drone],
     ground: _WatchedReceiver,
     least: float,
-    began: float,
-    landed: float,
-    ended: float,
-    cpu: float,
+    drain_s: float,
+    cpu_share: float,
 ) -> Outcome:
     latency: dict[str, list[float]] = {}
+    settling: list[float] = []
+    back = [float("nan")]
     delivered = 0
     for drone in drones:
         name = drone.store.header.drone
@@ -291,8 +326,13 @@ def _outcome(
             if came is None:
                 continue
             delivered += 1
-            if _is_up(trial.link, at - drone.emulator.started):
+            made_s = at - drone.emulator.started
+            if _is_up(trial.link, made_s):
                 latency.setdefault(kind, []).append(came - at)
+            ended = _cut_before(trial.link, made_s)
+            if kind == "k0" and ended is not None:
+                settling.append(came - at)
+                back.append(came - drone.emulator.started - ended)
     budget = trial.link.rate_kbit_s * 125 * SHARE
     wire = sum(drone.emulator.up.total_bytes() for drone in drones)
     stored = sum(drone.store.chunk_bytes for drone in drones)
@@ -304,14 +344,22 @@ def _outcome(
         busiest_share=max(d.emulator.up.busiest_window_bytes() for d in drones) / budget,
         sent_over_stored=wire / max(1, stored),
         duplicates=sum(entry["duplicates"] for entry in ground.progress()),
-        drain_s=ended - landed,
-        cpu_share=(time.process_time() - cpu) / (ended - began),
+        drain_s=drain_s,
+        cpu_share=cpu_share,
+        found_s=max(drone.found_s for drone in drones),
+        settling_s=settling,
+        back_s=float(np.nanmin(back)) if settling else float("nan"),
     )
 
 
 def _is_up(link: LinkModel, at_s: float) -> bool:
     """Whether something captured then could travel: no cut just before or soon after."""
     return not any(first - 1.0 <= at_s < last + SETTLE_S for first, last in link.cuts)
+
+
+def _cut_before(link: LinkModel, at_s: float) -> float | None:
+    """When the cut ended that something captured then came soon after; None for none."""
+    return next((last for _, last in link.cuts if last <= at_s < last + SETTLE_S), None)
 
 
 def _free_port() -> int:

@@ -1,7 +1,8 @@
 """A radio link between two sockets of this machine: delay, rate, loss, cuts, byte counts.
 
-TCP is relayed as a stream; a lost segment holds the stream back for one retransmission, as
-TCP shows it to an application. UDP (QUIC) is relayed datagram by datagram and lost ones are
+TCP is relayed as a stream; a lost segment holds the stream back for one retransmission, and a
+cut until the retransmission after it, whose waits double (RFC 6298), as TCP shows it to an
+application. UDP (QUIC) is relayed datagram by datagram and lost ones are
 gone, so the transport's own recovery is at work.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import random
+import socket
 import threading
 import time
 from collections import deque
@@ -21,6 +23,12 @@ SEGMENT_HEADER_BYTES = 52
 CHUNK_BYTES = 1400
 QUEUE_BYTES = 32_768
 """The radio's own buffer; TCP is held back and UDP dropped beyond it."""
+SOCKET_BYTES = 4096
+"""Receive buffer of the relay: what a sender's system holds is in the sender's buffer."""
+ESTABLISHED = 1
+"""State of an open connection in TCP_INFO."""
+FIRST_WAIT_S, LEAST_WAIT_S = 1.0, 0.2
+"""TCP's first wait for an answer to a call, and the least for data."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +70,7 @@ class _Pipe:
 
     def __init__(self, model: LinkModel, started: float, seed: int) -> None:
         self._model = model
-        self._started = started
+        self.started = started
         self._random = random.Random(seed)
         self._free_at = started
         self.traffic = Traffic()
@@ -71,20 +79,34 @@ class _Pipe:
         """Bytes that wait for the radio."""
         return max(0.0, self._free_at - now) * self._model.rate_kbit_s * 125
 
-    def _after_cuts(self, at: float) -> float:
+    def cut_end(self, at: float) -> float | None:
+        """When the cut ends that the link is in at a time; None while it is up."""
         for first, last in self._model.cuts:
-            if self._started + first <= at < self._started + last:
-                at = self._started + last
+            if self.started + first <= at < self.started + last:
+                return self.started + last
+        return None
+
+    def resumes(self, at: float, wait_s: float) -> float:
+        """When TCP gets through what it first sends at a time and again after doubling waits."""
+        up = self.cut_end(at)
+        while up is not None and at < up:
+            at += wait_s
+            wait_s *= 2
         return at
+
+    @property
+    def wait_s(self) -> float:
+        """TCP's first wait for the acknowledgement of data."""
+        return max(LEAST_WAIT_S, 3 * self._model.delay_s)
 
     def send(self, size: int, now: float, stream: bool) -> float | None:
         """When ``size`` bytes come out at the far end; None for a datagram that is lost."""
         wire = size + SEGMENT_HEADER_BYTES * -(-size // SEGMENT_BYTES)
         self.traffic.log.append((now, wire))
-        begin = self._after_cuts(max(now, self._free_at))
+        begin = max(now, self._free_at)
         lost = self._random.random() < self._model.loss
         if not stream and (
-            lost or begin > max(now, self._free_at) or self.backlog_bytes(now) > QUEUE_BYTES
+            lost or self.cut_end(begin) is not None or self.backlog_bytes(now) > QUEUE_BYTES
         ):
             return None
         self._free_at = begin + wire / (self._model.rate_kbit_s * 125)
@@ -122,6 +144,12 @@ class LinkEmulator:
         """From the side that is called."""
         return self._down.traffic
 
+    def take_off(self, now: float) -> None:
+        """Count the times of the cuts from now on, and forget the traffic so far."""
+        self.started = self._up.started = self._down.started = now
+        self._up.traffic.log.clear()
+        self._down.traffic.log.clear()
+
     def start(self) -> None:
         """Begin to relay."""
         self._thread.start()
@@ -149,9 +177,13 @@ class LinkEmulator:
                 lambda: _UdpSide(self), local_addr=("127.0.0.1", self._ports[0])
             )
         else:
-            await asyncio.start_server(self._accept, "127.0.0.1", self._ports[0], limit=CHUNK_BYTES)
+            listener = socket.create_server(("127.0.0.1", self._ports[0]))
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SOCKET_BYTES)
+            await asyncio.start_server(self._accept, sock=listener, limit=CHUNK_BYTES)
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        now = time.monotonic()
+        await asyncio.sleep(self._up.resumes(now, FIRST_WAIT_S) - now)
         try:
             far_reader, far_writer = await asyncio.open_connection("127.0.0.1", self._ports[1])
         except OSError:
@@ -164,6 +196,11 @@ class LinkEmulator:
     async def _relay(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, pipe: _Pipe
     ) -> None:
+        """Carry one direction until its sender is done.
+
+        What comes out of a cut after the other end has closed is one segment, for that is
+        answered by a reset.
+        """
         waiting: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue()
         task = self._loop.create_task(self._deliver(waiting, writer))
         self._tasks.add(task)
@@ -171,7 +208,12 @@ class LinkEmulator:
         with contextlib.suppress(OSError):
             while data := await reader.read(CHUNK_BYTES):
                 now = time.monotonic()
+                late = pipe.resumes(now, pipe.wait_s) - now
+                await asyncio.sleep(late)
+                now = time.monotonic()
                 out = pipe.send(len(data), now, stream=True)
+                if late > 0 and _has_closed(writer):
+                    break
                 latest = max(latest, out or 0.0)  # a stream keeps its order
                 waiting.put_nowait((latest, data))
                 excess = pipe.backlog_bytes(now) - QUEUE_BYTES
@@ -191,6 +233,16 @@ class LinkEmulator:
                 writer.write(data)
                 await writer.drain()
         writer.close()
+
+
+def _has_closed(writer: asyncio.StreamWriter) -> bool:
+    """Whether the process at that end has closed its socket, or its system has."""
+    connection = writer.get_extra_info("socket")
+    try:
+        state = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0]
+    except OSError:
+        return True
+    return bool(state != ESTABLISHED)
 
 
 class _UdpSide(asyncio.DatagramProtocol):

@@ -23,12 +23,17 @@ SMALL, FINE = range(2)
 GRACE_S = 1.0
 """An item the drone has had for less than this may still come by itself."""
 STALL_S = 4.0
+SILENCE_S = 4.0
+"""A drone that told nothing for so long was away, or the link was; it knows no requests."""
 REST_S = 2.0
 """Pause after a request that brought nothing."""
 
 BATCH = {"header": 1, "summary": 1, "repose": 64, "pose": 64, "k0": 8}
 """How many items of a kind one request names; the order is that of asking."""
-FINE_BATCH = 2
+MOST_FINE = 16
+BRIEF_S, LONG_S = 1.5, 4.0
+"""Requests for fine layers name more of them when they are answered sooner, fewer when later,
+so that neither the round trip nor what is newer waits long."""
 
 
 @dataclass(slots=True)
@@ -47,6 +52,7 @@ class _Request:
     kind: str
     numbers: RangeSet
     serial: int
+    began: float
     news_at: float
     brought: int = 0
     moved: bool = False  # a part came
@@ -66,6 +72,7 @@ class ScanIntake:
         self._seen: dict[tuple[str, int], float] = {}
         self._requests: dict[int, _Request] = {}
         self._rest_until: dict[int, float] = {}
+        self._fine_batch = 2
         self._given_up: Numbers = {}
 
     # What comes
@@ -77,6 +84,9 @@ class ScanIntake:
             if kind.startswith("k"):
                 for number in numbers:
                     self._seen.setdefault((kind, number), now)
+        if now - self.head_at > SILENCE_S:
+            self._requests.clear()
+            self._rest_until.clear()
         # What the very first head names was made before anybody listened: it is due at once.
         self._heads.append((now - GRACE_S if self.head is None else now, head))
         self.head, self.head_at = head, now
@@ -149,7 +159,7 @@ class ScanIntake:
                 numbers = RangeSet([(first, first)])
                 ask = Ask(self._peer, RangeSet.of(parts), self._assembler.count(kind, first))
             self.progress.asked += 1
-            self._requests[slot] = _Request(kind, numbers, self.progress.asked, now)
+            self._requests[slot] = _Request(kind, numbers, self.progress.asked, now, now)
             return kind, numbers, ask
         return None
 
@@ -159,6 +169,10 @@ class ScanIntake:
         if request is None or request.serial != serial:
             return
         del self._requests[slot]
+        if slot == FINE and now - request.began > LONG_S:
+            self._fine_batch = max(1, self._fine_batch // 2)
+        elif slot == FINE and request.brought and now - request.began < BRIEF_S:
+            self._fine_batch = min(MOST_FINE, 2 * self._fine_batch)
         if request.brought == 0 and not request.moved:
             self._rest_until[slot] = now + REST_S
 
@@ -187,7 +201,7 @@ class ScanIntake:
 
     def _newest(self, kind: str, due: RangeSet, now: float) -> RangeSet:
         out = RangeSet()
-        room = BATCH.get(kind, FINE_BATCH)
+        room = BATCH.get(kind, self._fine_batch)
         for number in due.newest_first():
             touched = self._assembler.touched(kind, number)
             if touched is None or now - touched >= GRACE_S:

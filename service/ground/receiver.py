@@ -22,7 +22,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from service.errors import InputError, OutsideError, SkyreliefError
-from service.ground.intake import FINE, SMALL, ScanIntake
+from service.ground.intake import FINE, SILENCE_S, SMALL, ScanIntake
 from service.stream.messages import count, pack_ask, pack_held, unpack_head
 from service.stream.radio_messages import RADIO_NOTE
 from service.stream.records import ScanHeader
@@ -289,6 +289,8 @@ class Receiver:
         def arrived(now: float) -> None:
             scan = self._scan(*place)
             if scan is not None:
+                if now - scan.intake.head_at > SILENCE_S:
+                    scan.reported_at = -1e9  # the drone is back: say at once that we listen
                 before = scan.intake.missing()
                 scan.intake.on_head(head, now)
                 scan.changed = scan.changed or count(scan.intake.missing()) != count(before)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections import deque
 
-WINDOW_SHARE = 0.05
-"""The bucket holds this share of a second, so no 1 s window exceeds the rate by more."""
+WINDOW_SHARE = 0.03
+"""The bucket holds this share of a second, so no 1 s window exceeds the rate by more; the rest
+of 5 % is left to what buffers add on the way."""
 MIN_PART_BYTES = 512
 MAX_PART_BYTES = 16_384
 _ENVELOPE_BYTES = 80  # key expression, Zenoh framing
@@ -39,7 +40,7 @@ class TokenBucket:
 
     @property
     def depth_bytes(self) -> float:
-        """The most that may be saved up: 5 % of a second, but room for one small part."""
+        """The most that may be saved up: 3 % of a second, but room for one small part."""
         return max(self._rate * WINDOW_SHARE, float(wire_bytes(MIN_PART_BYTES)))
 
     @property
@@ -103,15 +104,19 @@ class RateEstimate:
         self._lost_at_fall = 0.0
         self._own_loss = 0.0
 
+    def begin_anew(self) -> None:
+        """Forget what was under way, such as on a connection that died; the rate stays."""
+        self._totals.clear()
+        self._through.clear()
+        self._bad = 0
+
     def report(self, sent_bytes: int, received_bytes: int, now: float) -> float:
         """The rate to use, given the totals sent and received so far."""
         passed = now - self._at
         if passed < self.LEAST_S:
             return self.rate_bytes_s
-        anew = passed > self.SILENCE_S or received_bytes < self._received
-        if anew:
-            self._totals.clear()
-            self._through.clear()
+        if passed > self.SILENCE_S or received_bytes < self._received:
+            self.begin_anew()
         self._through.append(max(0, received_bytes - self._received) / passed)
         self._at, self._received = now, received_bytes
         self._totals.append((sent_bytes, received_bytes))

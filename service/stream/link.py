@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import logging
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from service.config import DatalinkConfig
@@ -29,6 +30,17 @@ log = logging.getLogger(__name__)
 
 MAX_WAITING_EVENTS = 100_000
 RETRY_S = 1.0
+"""From one attempt to open a session to the next, at least; a tenth of it after a timeout."""
+SILENCE_S = 5.0
+"""When stations that were heard fall silent for so long, the session is opened anew: TCP
+waits longer and longer before it tries a dead connection again."""
+FIRST_PATIENCE_S, LEAST_PATIENCE_S = 10.0, 1.5
+PATIENCE = 3.0
+"""An attempt to open a session may take so many times what the last one took: a fresh call finds
+a link that is back sooner than one whose waits have grown."""
+PATIENT_ATTEMPT = 20
+CLOSING_S = 15.0
+"""Closing a session over a dead link takes Zenoh 10 s and more."""
 KEEP_HELD_S = 10.0
 """How often a ground station's report is written to the store while it lacks something."""
 
@@ -83,6 +95,9 @@ class DatalinkSender:
         self._wake = threading.Event()
         self._stop = threading.Event()
         self._connected = False
+        self._heard_at: float | None = None  # on the session that is open
+        self._opening_s = FIRST_PATIENCE_S / PATIENCE  # what the last session took to open
+        self._closing: list[threading.Thread] = []
         self._queries: dict[int, Any] = {}
         self._thread: threading.Thread | None = None
         self._kept_at: dict[str, float] = {}
@@ -180,8 +195,10 @@ class DatalinkSender:
         self._stop.set()
         self._wake.set()
         if self._thread is not None:
-            self._thread.join(timeout=5.0)
+            self._thread.join(timeout=CLOSING_S)
             self._thread = None
+        for closing in self._closing:
+            closing.join(timeout=CLOSING_S)
         if self._radio is not None:
             self._radio.close()
             self._radio = None
@@ -198,49 +215,71 @@ class DatalinkSender:
     # The link's side
 
     def _run(self) -> None:
+        attempt = 0
         while not self._stop.is_set():
+            began = time.monotonic()
+            attempt += 1
+            patience = max(PATIENCE * self._opening_s, LEAST_PATIENCE_S)
+            if attempt % PATIENT_ATTEMPT == 0:  # the link may have become a slower one
+                patience = FIRST_PATIENCE_S
             try:
-                session = open_session(self._session_config)
+                session = open_session(replace(self._session_config, open_timeout_s=patience))
             except OutsideError as error:
                 log.debug("%s", error)
-                self._stop.wait(RETRY_S)
+                pause = max(RETRY_S / 10, RETRY_S - (time.monotonic() - began))
+                self._stop.wait(pause)
                 continue
             except SkyreliefError as error:
                 log.error("datalink stays closed: %s", error)
                 return
+            self._opening_s = time.monotonic() - began
+            attempt = 0
             log.info("datalink open")
             try:
                 self._serve(session)
             finally:
                 self._connected = False
+                self._close_session(session)
+
+    def _close_session(self, session: zenoh.Session) -> None:
+        """Close it on a thread of its own: over a dead link that takes long."""
+
+        def close() -> None:
+            import zenoh
+
+            with contextlib.suppress(zenoh.ZError):
                 session.close()
 
-    def _serve(self, session: zenoh.Session) -> None:
-        import zenoh
+        self._queries.clear()
+        self._closing = [thread for thread in self._closing if thread.is_alive()]
+        self._closing.append(threading.Thread(target=close, name="datalink closing", daemon=True))
+        self._closing[-1].start()
 
+    def _serve(self, session: zenoh.Session) -> None:
+        """Send and answer until the stop, or until those who listened fall silent."""
         base = f"{ROOT}/{self._drone}"
-        subscriber = session.declare_subscriber(f"{base}/*/held/*", self._on_held)
-        queryable = session.declare_queryable(f"{base}/*/item/*/*", self._on_query)
-        heads = session.declare_queryable(f"{base}/*/head", self._on_look)
-        try:
-            while not self._stop.is_set() and not session.is_closed():
-                self._connected = True
-                self._wake.clear()
-                with self._lock:
-                    while self._events:
-                        self._events.popleft()(time.monotonic())
-                    todo = self._outbox.next(time.monotonic())
-                if isinstance(todo, Outgoing):
-                    self._send(session, todo)
-                else:
-                    self._wake.wait(todo)
-        finally:
-            try:
-                subscriber.undeclare()
-                queryable.undeclare()
-                heads.undeclare()
-            except zenoh.ZError as error:
-                log.debug("datalink closing: %s", error)
+        self._heard_at = None
+        # The session keeps these while it is open.
+        session.declare_subscriber(f"{base}/*/held/*", self._on_held)
+        session.declare_queryable(f"{base}/*/item/*/*", self._on_query)
+        session.declare_queryable(f"{base}/*/head", self._on_look)
+        with self._lock:
+            self._outbox.reconnected(time.monotonic())
+        while not self._stop.is_set() and not session.is_closed():
+            self._connected = True
+            self._wake.clear()
+            with self._lock:
+                while self._events:
+                    self._events.popleft()(time.monotonic())
+                todo = self._outbox.next(time.monotonic())
+            if isinstance(todo, Outgoing):
+                self._send(session, todo)
+            else:
+                self._wake.wait(todo)
+            heard = self._heard_at
+            if heard is not None and time.monotonic() - heard > SILENCE_S:
+                log.info("datalink silent; opening it anew")
+                return
 
     def _send(self, session: zenoh.Session, message: Outgoing) -> None:
         import zenoh
@@ -275,6 +314,7 @@ class DatalinkSender:
         held = unpack_held(sample.payload.to_bytes())
         parts = str(sample.key_expr).split("/")
         if held is not None and len(parts) == 5:
+            self._heard_at = time.monotonic()
             scan_id, peer = parts[2], parts[4]
             self._post(lambda now: self._heard(scan_id, peer, held, now))
 
@@ -304,6 +344,7 @@ class DatalinkSender:
             query.drop()
             return
         scan_id, kind = parts[2], parts[4]
+        self._heard_at = time.monotonic()
 
         def asked(now: float) -> None:
             token = id(query)

@@ -25,6 +25,8 @@ PEER_TIMEOUT_S = 8.0
 HEAD_AFTER_NEWS_S = 0.5
 HEAD_IDLE_S = 2.0
 HEAD_COMPLETE_S = 10.0
+POSE_ROOM, COARSE_ROOM, FINE_ROOM = 64, 32, 2
+"""Items that may wait in each live lane."""
 
 
 @dataclass(slots=True, eq=False)
@@ -45,7 +47,11 @@ class Outbox:
         self.bucket = TokenBucket(rate_bytes_s, now)
         self.sent_bytes = 0  # on the wire, as the bucket counts
         self._feeds: dict[str, _Feed] = {}
-        self._live = {POSE: LiveLane(64), COARSE: LiveLane(16), FINE: LiveLane(2)}
+        self._live = {
+            POSE: LiveLane(POSE_ROOM),
+            COARSE: LiveLane(COARSE_ROOM),
+            FINE: LiveLane(FINE_ROOM),
+        }
         self._asked = {ASKED: AskedLane(), BACKFILL: AskedLane()}
         self._heard: dict[str, float] = {}
         self._estimates: dict[tuple[str, str], RateEstimate] = {}
@@ -80,14 +86,34 @@ class Outbox:
 
     def held(self, scan_id: str, peer: str, report: Held, now: float) -> None:
         """A ground station reports what it holds."""
+        anew = not self.listened(now)
         self._hear(peer, now)
         feed = self._feeds.get(scan_id)
         if feed is None:
             return
         feed.held[peer] = report.numbers
+        if anew:
+            self._catch_up(feed, report.numbers)
         estimate = self._estimates.setdefault((scan_id, peer), RateEstimate(self._configured))
         estimate.report(feed.sent_bytes, report.received_bytes, now)
         self._adapt(now)
+
+    def _catch_up(self, feed: _Feed, held: Numbers) -> None:
+        """Put the newest coarse layers that a station lacks, when it listens at last."""
+        lacks = feed.store.numbers().get("k0", RangeSet()) - held.get("k0", RangeSet())
+        for number in reversed(list(islice(lacks.newest_first(), COARSE_ROOM))):
+            self._live[COARSE].push(feed.store, "k0", number)
+
+    def reconnected(self, now: float) -> None:
+        """The connection is a new one: nobody was heard on it, and nothing is under way."""
+        self._heard.clear()
+        for estimate in self._estimates.values():
+            estimate.begin_anew()
+        self._clear_live()
+        self._asked = {ASKED: AskedLane(), BACKFILL: AskedLane()}
+        self._head = None
+        for feed in self._feeds.values():
+            feed.head_due = now
 
     def set_rate(self, rate_bytes_s: float, now: float) -> None:
         """Change what may be sent per second; the link's own pace may keep it lower."""
@@ -142,8 +168,7 @@ class Outbox:
     def next(self, now: float) -> Outgoing | float:
         """The message to send now, or the seconds to wait; any event may shorten the wait."""
         if not self.listened(now):
-            for lane in self._live.values():
-                lane.clear()
+            self._clear_live()
         part_bytes = self.bucket.part_bytes
         for number in range(6):
             message = self._peek(number, part_bytes, now)
@@ -161,6 +186,10 @@ class Outbox:
             return replace(message, lane=number)
         due = min((feed.head_due for feed in self._feeds.values()), default=now + 1.0)
         return min(1.0, max(0.001, due - now))
+
+    def _clear_live(self) -> None:
+        for lane in self._live.values():
+            lane.clear()
 
     def _peek(self, lane: int, part_bytes: int, now: float) -> Outgoing | None:
         if lane == STATUS:

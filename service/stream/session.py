@@ -40,6 +40,7 @@ class SessionConfig:
     tls_certificate: str = ""
     tls_key: str = ""
     fleet_rights: bool = False  # enforce, as a router, what fleet.json beside tls_key allows
+    open_timeout_s: float = 10.0  # of one attempt to reach the other end
 
 
 def check_name(name: str, what: str) -> str:
@@ -104,6 +105,7 @@ def zenoh_config(config: SessionConfig) -> zenoh.Config:
         "mode": config.mode,
         "connect/endpoints": [_small_buffer(e) for e in config.connect],
         "connect/timeout_ms": 0,
+        "transport/unicast/open_timeout": round(1000 * config.open_timeout_s),
         "connect/exit_on_failure": config.mode == "client",
         "connect/retry": {
             "period_init_ms": 500,
