@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
-from recon.types import F32, F64, U8, Camera
+from recon.types import F64, U8, Camera
 
 
 def check_camera(camera: Camera) -> None:
@@ -71,16 +72,15 @@ class Undistorter:
         check_camera(camera)
         self.distorted = camera
         self.camera = Camera(camera.K, np.zeros(5), camera.size_px)
-        self._maps: tuple[F32, F32] | None = None
+        self._maps: tuple[npt.NDArray[np.int16], npt.NDArray[np.uint16]] | None = None
         self.valid: U8 = np.full((camera.size_px[1], camera.size_px[0]), 255, np.uint8)
         if np.any(camera.distortion):
             u_px, v_px = cv2.initUndistortRectifyMap(
-                camera.K, camera.distortion, np.eye(3), camera.K, camera.size_px, cv2.CV_32FC1
-            )
-            self._maps = np.asarray(u_px, np.float32), np.asarray(v_px, np.float32)
-            self.valid = np.asarray(
-                cv2.remap(self.valid, *self._maps, cv2.INTER_NEAREST), dtype=np.uint8
-            )
+                camera.K, camera.distortion, np.eye(3), camera.K, camera.size_px, cv2.CV_16SC2
+            )  # fixed point in 1/32 px, as remap rounds to anyway
+            self._maps = np.asarray(u_px, np.int16), np.asarray(v_px, np.uint16)
+            seen = cv2.remap(self.valid, *self._maps, cv2.INTER_LINEAR)
+            self.valid = np.where(seen == 255, 255, 0).astype(np.uint8)
 
     def image(self, image: U8) -> U8:
         """(H, W, 3) or (H, W) picture without distortion."""

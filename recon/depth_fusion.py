@@ -52,11 +52,12 @@ def _largest_group(
 ) -> int:  # pragma: no cover - compiled
     """The reading that most others agree with; ties go to the smaller sigma."""
     best, most = 0, -1
+    square = agree_sigmas * agree_sigmas
     for i in range(count):
         support = 0
         for j in range(count):
-            limit = agree_sigmas * np.sqrt(sigma[i] ** 2 + sigma[j] ** 2)
-            support += abs(inverse[i] - inverse[j]) <= limit
+            apart = inverse[i] - inverse[j]
+            support += apart * apart <= square * (sigma[i] * sigma[i] + sigma[j] * sigma[j])
         if support > most or (support == most and sigma[i] < sigma[best]):
             best, most = i, support
     return best

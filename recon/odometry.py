@@ -11,6 +11,7 @@ heading and position are corrected afterwards by :mod:`recon.alignment`.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -20,6 +21,9 @@ from recon import matching, pnp, prediction, se3, two_view
 from recon.keyframe_window import OdometryKeyframe, adjust_window, landmarks, triangulate
 from recon.landmarks import I64, Landmarks
 from recon.types import F64, U8, Bool, Camera, PosePrior
+
+OVERDUE = 1.3
+"""A blurred frame becomes a keyframe when the last is this many steps away."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +37,7 @@ class OdometryConfig:
     wide_search_share: float = 0.09  # and around a poor one
     min_tracks: int = 40  # fewer inliers: lost
     min_track_share: float = 0.25  # of the corners that should be visible
+    tracked_landmarks: int = 300  # enough for a pose; keyframes match all their corners
     max_tilt_error_rad: float = 0.35  # vision against attitude: more is a false solution
     loose_px: float = 6.0  # gate of a second try: a rolling shutter bends pictures that much
     lost_after: int = 8  # frames in a row without a pose before a new segment starts
@@ -71,6 +76,7 @@ class _Incoming:
     time_ns: int
     prior: PosePrior
     mask: U8 | None  # (H, W) non-zero where the picture is valid
+    blurred: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +86,7 @@ class _Located:
     pose: pnp.PnpResult  # camera from odometry
     uv: F64  # (N, 2) of the keyframe's corners
     ok: Bool  # (N,) found, and not contradicted by the pose
+    share: float  # of the keyframe's corners that are found, by those searched
 
 
 class Odometry:
@@ -96,12 +103,19 @@ class Odometry:
         self._lost = 0
         self._last: tuple[int, F64, PosePrior] | None = None  # time, T_odom_camera, prior
         self._velocity = np.zeros(3)
+        self._drift = np.eye(3)  # from the first frame's pixels to the last one's
         self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
 
     # ---- one frame -------------------------------------------------------------------
 
     def track(
-        self, grey: U8, seq: int, time_ns: int, prior: PosePrior, mask: U8 | None = None
+        self,
+        grey: U8,
+        seq: int,
+        time_ns: int,
+        prior: PosePrior,
+        mask: U8 | None = None,
+        blurred: bool = False,
     ) -> Tracked:
         """Pose of a new frame, or why there is none.
 
@@ -109,9 +123,10 @@ class Odometry:
             grey: (H, W) undistorted picture.
             prior: telemetry's word on this frame; parts may be missing.
             mask: (H, W) non-zero where the picture is valid.
+            blurred: a later frame makes a better keyframe, if it comes soon.
         """
         pyramid = matching.Pyramid.build(grey, self.config.matching.search_levels)
-        new = _Incoming(grey, pyramid, seq, time_ns, prior, mask)
+        new = _Incoming(grey, pyramid, seq, time_ns, prior, mask, blurred)
         self._gap_ns, self._frame_ns = time_ns - self._frame_ns, time_ns
         if not self.keyframes:
             return self._start(new)
@@ -144,7 +159,7 @@ class Odometry:
             return Tracked("lost", self.segment, reason="too little texture")
         self.segment += 1
         self._metric, self._lost = False, 0
-        self._velocity = np.zeros(3)
+        self._velocity, self._drift = np.zeros(3), np.eye(3)
         R = (
             new.prior.R_world_camera
             if new.prior.R_world_camera is not None
@@ -242,16 +257,18 @@ class Odometry:
             if best is None or found.ok.sum() > best[1].sum():
                 best = (found.uv_px.astype(np.float64), found.ok)
             if best[1].sum() > 0.5 * len(first.uv):
+                self._drift = prediction.common_affine(first.uv[best[1]], best[0][best[1]])
                 break
         assert best is not None
         return best
 
     def _predictions_2d(
         self, new: _Incoming, key: OdometryKeyframe, R_b_a: F64 | None
-    ) -> list[prediction.Prediction]:
+    ) -> Iterator[prediction.Prediction]:
         """Guesses of where a keyframe's corners went, best first, without landmarks."""
         radius_px = self.config.wide_search_share * self.camera.size_px[0]
-        out = []
+        if self._gap_ns <= 1e9 * self.config.still_gap_s:
+            yield prediction.by_homography(self._drift, key.uv, radius_px)
         if R_b_a is not None:
             height = new.prior.agl_m or 0.0
             t = np.zeros(3)
@@ -261,22 +278,24 @@ class Odometry:
                 t = R_b_a @ R_a.T @ (key.prior.position_m - new.prior.position_m) / height
             n = key.T_camera_odom[:3, 2]  # up, seen from the camera
             H = self.K @ (R_b_a - np.outer(t, n)) @ np.linalg.inv(self.K)
-            out.append(prediction.by_homography(H, key.uv, radius_px))
+            yield prediction.by_homography(H, key.uv, radius_px)
         shift = matching.global_shift(key.pyramid.levels[0], new.grey)
         if shift is not None and shift.confidence > self.config.least_shift_confidence:
             H = np.eye(3)
             H[:2, :2], H[:2, 2] = shift.A, shift.shift_px
-            out.append(prediction.by_homography(H, key.uv, radius_px))
-        if not out:
-            out.append(prediction.by_homography(np.eye(3), key.uv, radius_px))
-        return out
+            yield prediction.by_homography(H, key.uv, radius_px)
+        elif R_b_a is None:
+            yield prediction.by_homography(np.eye(3), key.uv, radius_px)
 
     def _locate(self, new: _Incoming) -> _Located | str:
         """The frame against the last keyframe, averaged with the one before; or why not."""
         right = self.keyframes[-1]
         reason = "no match"
+        still = self._gap_ns > 1e9 * self.config.still_gap_s
+        least = self.config.min_tracks
+        most = None if still else self.config.tracked_landmarks
         for T_camera_odom, share in self._predicted_poses(new, right):
-            found = self._pose_from(right, new.pyramid, T_camera_odom, share)
+            found = self._pose_from(right, new.pyramid, T_camera_odom, share, least, most)
             if isinstance(found, str):
                 reason = found
                 continue
@@ -284,14 +303,19 @@ class Odometry:
             if not self._agrees(T, new.prior, right):
                 reason = "vision and attitude disagree"
                 continue
-            if len(self.keyframes) > 1:
-                left = self._pose_from(
-                    self.keyframes[-2], new.pyramid, T, 0.5 * self.config.search_share, stride=3
-                )
-                if isinstance(left, _Located):
-                    found = replace(found, pose=_averaged(left.pose, found.pose))
-            return found
+            return self._with_left(new, found)
         return reason
+
+    def _with_left(self, new: _Incoming, found: _Located) -> _Located:
+        """The pose averaged with the one that the keyframe before gives, as the paper does."""
+        if len(self.keyframes) < 2:
+            return found
+        T, share = found.pose.T_camera_points, 0.5 * self.config.search_share
+        least, most = self.config.min_tracks // 3, self.config.tracked_landmarks // 2
+        left = self._pose_from(self.keyframes[-2], new.pyramid, T, share, least, most)
+        if isinstance(left, str):
+            return found
+        return replace(found, pose=_averaged(left.pose, found.pose))
 
     def _predicted_poses(self, new: _Incoming, key: OdometryKeyframe) -> list[tuple[F64, float]]:
         """Start poses T_camera_odom with their search radius share, most trusted first."""
@@ -342,18 +366,26 @@ class Odometry:
         pyramid: matching.Pyramid,
         T_camera_odom: F64,
         share: float,
-        stride: int = 1,
+        least: int,
+        most: int | None = None,
     ) -> _Located | str:
-        """EPnP pose of the frame from one keyframe's landmarks, or why there is none."""
+        """EPnP pose of the frame from one keyframe's landmarks, or why there is none.
+
+        ``least`` matches it takes; with ``most`` only about so many landmarks are searched and
+        no corner that has none, spread over the picture.
+        """
         radius_px = share * self.camera.size_px[0]
         guess, visible = prediction.on_landmarks(
             key, self.K, self.camera.size_px, T_camera_odom, radius_px
         )
-        if stride > 1:
-            visible &= key.map.known(key.landmark) & (np.arange(len(visible)) % stride == 0)
+        mapped = key.map.known(key.landmark)
+        in_view = float(visible.mean())
+        if most is not None:
+            rows = np.flatnonzero(visible & mapped)
+            visible[:] = False
+            visible[rows[:: max(1, len(rows) // most)]] = True
         index = np.flatnonzero(visible)
-        need = self.config.min_tracks // stride
-        if index.size < need:
+        if index.size < least:
             return "the view left the map"
         found = matching.match(
             key.pyramid,
@@ -368,17 +400,16 @@ class Odometry:
         ok[index] = found.ok
         uv = guess.uv.copy()
         uv[index] = found.uv_px
-        mapped = key.map.known(key.landmark)
         known = np.flatnonzero(ok & mapped)
         expected = int((visible & mapped).sum())
-        if known.size < max(need, self.config.min_track_share * expected):
+        if known.size < max(least, self.config.min_track_share * expected):
             return "too few matches"
         points = key.map[key.landmark[known]]
-        solved = self._solve(points, uv[known], T_camera_odom, max(need, int(0.5 * known.size)))
+        solved = self._solve(points, uv[known], T_camera_odom, max(least, int(0.5 * known.size)))
         if solved is None:
             return "no pose fits the matches"
         ok[known[~solved.inliers]] = False
-        return _Located(solved, uv, ok)
+        return _Located(solved, uv, ok, in_view * float(ok[index].mean()))
 
     def _solve(self, points: F64, uv: F64, start: F64, least: int) -> pnp.PnpResult | None:
         """EPnP with a tight gate, else with a loose one; None with fewer than ``least``."""
@@ -405,24 +436,26 @@ class Odometry:
         found: _Located,
     ) -> Tracked:
         """Keep the pose; make the frame a keyframe when it has moved enough."""
-        key, ok = self.keyframes[-1], found.ok
+        key = self.keyframes[-1]
         T_camera_odom, covariance = found.pose.T_camera_points, found.pose.covariance
         moved = T_camera_odom @ key.T_odom_camera
         depth = self.median_depth(key)
         base = float(np.linalg.norm(moved[:3, 3])) / max(depth, 1e-6)
-        share = ok.sum() / max(len(key.uv), 1)
+        tracks = int(found.ok.sum())
         turned = float(np.linalg.norm(se3.so3_log(moved[:3, :3])))
         T_odom_camera = se3.inverse(T_camera_odom)
         self._update_motion(new.time_ns, T_odom_camera, new.prior)
         self._lost = 0
-        if base < self.config.base_to_height and share > 0.45 and turned < 0.25:
-            return Tracked("tracked", self.segment, T_odom_camera, covariance, int(ok.sum()), base)
-        self._add_keyframe(new, T_camera_odom, found.uv, ok)
-        last = self.keyframes[-1]
+        due = self.config.base_to_height * (OVERDUE if new.blurred else 1.0)
+        if base < due and found.share > 0.45 and turned < 0.25:
+            return Tracked("tracked", self.segment, T_odom_camera, covariance, tracks, base)
+        share = 0.5 * self.config.search_share
+        whole = self._pose_from(key, new.pyramid, T_camera_odom, share, self.config.min_tracks)
+        found = found if isinstance(whole, str) else whole
+        self._add_keyframe(new, found.pose.T_camera_points, found.uv, found.ok)
+        last, tracks = self.keyframes[-1], int(found.ok.sum())
         self._last = (new.time_ns, last.T_odom_camera, new.prior)
-        return Tracked(
-            "keyframe", self.segment, last.T_odom_camera, last.covariance, int(ok.sum()), base
-        )
+        return Tracked("keyframe", self.segment, last.T_odom_camera, last.covariance, tracks, base)
 
     def _update_motion(self, time_ns: int, T_odom_camera: F64, prior: PosePrior) -> None:
         if self._last is not None and time_ns > self._last[0]:

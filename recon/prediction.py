@@ -25,6 +25,15 @@ def by_homography(H: F64, uv: F64, radius_px: float) -> Prediction:
     return Prediction(there, _local_affine(H, uv, there), radius_px)
 
 
+def common_affine(uv: F64, there: F64) -> F64:
+    """(3, 3) affine motion of pixels ``uv`` (N, 2) to ``there`` (N, 2), robust."""
+    A, _ = cv2.estimateAffine2D(uv, there, ransacReprojThreshold=8.0)
+    H = np.eye(3)
+    if A is not None:
+        H[:2] = A
+    return H
+
+
 def on_landmarks(
     key: OdometryKeyframe, K: F64, size_px: tuple[int, int], T_camera_odom: F64, radius_px: float
 ) -> tuple[Prediction, Bool]:

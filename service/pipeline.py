@@ -20,6 +20,7 @@ from recon.camera_model import Undistorter, scaled
 from recon.exposure import stretch
 from recon.keyframe_window import OdometryKeyframe, landmarks
 from recon.odometry import Odometry, OdometryConfig, Tracked
+from recon.sharpness import BlurWatch
 from recon.trajectory import Placed
 from recon.types import F64, U8, Camera, Frame, Keyframe, PosePrior
 from recon.virtual_stereo import View
@@ -28,7 +29,7 @@ from service.config import ComputeConfig, Config, ScanConfig
 from service.dense import Dense, Job
 from service.rig import Rig
 from service.side_by_side import SideBySide
-from service.viewpoints import Viewpoint, Viewpoints
+from service.viewpoints import Offer, Viewpoint, Viewpoints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +72,7 @@ class Pipeline:
             _within_width(self.undistorter.camera, 1280),
             OdometryConfig(base_to_height=config.scan.base_to_height),
         )
+        self._blur = BlurWatch()
         self.viewpoints = Viewpoints(config.scan, config.compute.pairs)
         self.dense = Dense(config, backend, self.viewpoints.least_base_to_height)
         self.stopwatch = self.dense.stopwatch
@@ -86,6 +88,8 @@ class Pipeline:
         self._asked: deque[Viewpoint] = deque(maxlen=8)  # whose reconstruction was asked for
         self._views: dict[int, Viewpoint] = {}  # asked for and not done yet
         self._carriers: dict[int, list[Anchorage]] = {}  # per segment, what is on the chain
+        self._segment = self.odometry.segment
+        self._latest: Offer | None = None  # the last tracked frame that did not become a view
 
     # ---- one frame, as in Figure 1 -----------------------------------------------------
 
@@ -98,15 +102,21 @@ class Pipeline:
         with self.stopwatch("undistort"):
             picture, grey, mask = self._pictures(frame.image)
         with self.stopwatch("track"):  # Harris and ZSSD (Eq. 4-5), EPnP (Eq. 6-7)
-            tracked = self.odometry.track(grey, frame.seq, frame.time_ns, prior, mask)
+            blurred = self._blur.blurred(grey)
+            tracked = self.odometry.track(grey, frame.seq, frame.time_ns, prior, mask, blurred)
+        if tracked.segment != self._segment:
+            self._end_segment()
+            self._segment = tracked.segment
         if tracked.T_odom_camera is None:
             self.refusals[tracked.reason] += 1
             placed = _by_telemetry(frame.seq, prior) if tracked.state == "lost" else None
             return Step(tracked, prior, placed)
         key = self.odometry.keyframes[-1]
-        viewpoint = self.viewpoints.offer(frame, picture, tracked, key, prior)
+        offer = Offer(frame.seq, frame.time_ns, picture, tracked, key, prior, blurred)
+        viewpoint = self.viewpoints.offer(offer)
         if viewpoint is not None:
             self._waiting.append(viewpoint)
+        self._latest = offer if viewpoint is None else None
         self._ask_for_ready()
         keyframes = self._collect()
         anchor = Anchorage(frame.seq, key, se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera)
@@ -135,11 +145,19 @@ class Pipeline:
 
     def finish(self) -> Step:
         """The views still waiting for partners, and the last corrections."""
+        self._end_segment()
         self._ask_for_ready(everything=True)
         keyframes = self._collect(everything=True)
         self._jobs.close()
         tracked = Tracked("lost", self.odometry.segment, reason="end of the recording")
         return Step(tracked, PosePrior(), keyframes=keyframes, moved=self._moved(final=True))
+
+    def _end_segment(self) -> None:
+        """Make a view of a stretch's last frame: only it shows what the camera saw last."""
+        viewpoint = self.viewpoints.end_stretch(self._latest)
+        if viewpoint is not None:
+            self._waiting.append(viewpoint)
+        self._latest = None
 
     def _pictures(self, image: U8) -> tuple[U8, U8, U8 | None]:
         """Undistorted picture, its grey version at the odometry's size, and the mask of that."""
@@ -162,6 +180,9 @@ class Pipeline:
             viewpoint = self._waiting.popleft()
             if not self.viewpoints.confirmed(viewpoint):
                 self.refusals["seen by two views only"] += 1
+                continue
+            if viewpoint.blurred:
+                self.refusals["blurred"] += 1
                 continue
             self._views[viewpoint.seq] = viewpoint
             self._jobs.offer(self._job(viewpoint))

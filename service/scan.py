@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event
@@ -13,6 +14,7 @@ from typing import Any, Protocol
 from mavlink.history import VehicleHistory
 from recon.backends import Backend
 from recon.types import Camera, Frame
+from service.cameras.ahead import ahead
 from service.cameras.source import CameraFrame, CameraSource
 from service.config import Config
 from service.errors import InputError
@@ -135,17 +137,19 @@ class Scan:
     ) -> None:
         """Feed every frame of the source until it ends or ``stop`` is set.
 
-        Frames that come while ``paused`` is set are passed over.
+        Frames that come while ``paused`` is set are passed over. A recording is decoded ahead.
         """
-        for frame in self.source:
-            if stop.is_set():
-                log.info("stopped; closing the scan")
-                break
-            if paused is not None and paused.is_set():
-                continue
-            self.feed(frame)
-            if progress is not None:
-                progress(self)
+        live = self.source.is_live
+        with nullcontext(self.source) if live else closing(ahead(self.source)) as frames:
+            for frame in frames:
+                if stop.is_set():
+                    log.info("stopped; closing the scan")
+                    break
+                if paused is not None and paused.is_set():
+                    continue
+                self.feed(frame)
+                if progress is not None:
+                    progress(self)
 
     def close(self) -> dict[str, Any]:
         """Write what is left and close the scan in the store; return its figures."""

@@ -16,8 +16,11 @@ import numpy as np
 from recon import se3
 from recon.keyframe_window import OdometryKeyframe
 from recon.odometry import Tracked
-from recon.types import F64, U8, Frame, PosePrior
+from recon.types import F64, U8, PosePrior
 from service.config import ScanConfig, parse_baseline
+
+LAST_VIEW_SHARE = 0.1
+"""A stretch's last frame becomes a view when it is this share of a usual step further on."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,11 +34,31 @@ class Viewpoint:
     key: OdometryKeyframe
     T_key_camera: F64  # (4, 4)
     prior: PosePrior
+    blurred: bool = False  # takes no part in stereo, only in the track
 
     @property
     def T_odom_camera(self) -> F64:
         """(4, 4) as refined by now."""
         return np.asarray(self.key.T_odom_camera @ self.T_key_camera)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Offer:
+    """A tracked frame that may become a view."""
+
+    seq: int
+    time_ns: int
+    picture: U8  # (H, W, 3) undistorted
+    tracked: Tracked  # with a pose
+    key: OdometryKeyframe  # the last one when it was tracked
+    prior: PosePrior
+    blurred: bool = False
+
+    @property
+    def T_odom_camera(self) -> F64:
+        """(4, 4) as tracked."""
+        assert self.tracked.T_odom_camera is not None
+        return self.tracked.T_odom_camera
 
 
 class Viewpoints:
@@ -49,6 +72,8 @@ class Viewpoints:
         """
         self._kept: deque[Viewpoint] = deque(maxlen=kept)
         self._between: deque[Viewpoint] = deque(maxlen=8 * partners if partners > kept - 2 else 0)
+        self._recent: deque[Viewpoint] = deque(maxlen=6)  # a quarter of a step apart
+        self._extra: tuple[Viewpoint, list[Viewpoint]] | None = None  # a last view's partner
         self._most_partners = partners
         self._views_of: Counter[int] = Counter()  # views by segment
         self._take_next = False
@@ -74,27 +99,57 @@ class Viewpoints:
         """The shortest baseline that stereo should accept: an operator's choice is kept."""
         return 0.03 if self._mode == "auto" else 0.002
 
-    def offer(
-        self,
-        frame: Frame,
-        picture: U8,
-        tracked: Tracked,
-        key: OdometryKeyframe,
-        prior: PosePrior,
-    ) -> Viewpoint | None:
+    def offer(self, offer: Offer) -> Viewpoint | None:
         """The frame as a view, when it is to be one."""
-        assert tracked.T_odom_camera is not None
-        wanted = self._take_next or self._wants(frame.seq, tracked)
-        if not wanted and not self._between.maxlen:
+        wanted = self._take_next or self._wants(offer.seq, offer.tracked)
+        if not wanted and not self._between.maxlen and not self._moved_on(offer):
             return None
-        grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
-        T_key_camera = se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera
-        bgr = picture if wanted else None
-        view = Viewpoint(frame.seq, frame.time_ns, bgr, grey, key, T_key_camera, prior)
+        view = _viewpoint(offer, wanted)
         if not wanted:
-            self._between.append(view)
+            if self._between.maxlen:
+                self._between.append(view)
+            else:
+                self._recent.append(view)
             return None
         self._take_next = False
+        return self._keep(view)
+
+    def end_stretch(self, offer: Offer | None) -> Viewpoint | None:
+        """The last frame of a stretch as a view, when it has moved on since the last view.
+
+        ``offer`` is that frame unless it is a view already. The ground that came into view
+        last is not in the view before; a frame between the two becomes its partner.
+        """
+        step = self._step(self._kept[-1].key.segment) if self._kept else None
+        if step is None:
+            return None
+        view = None
+        least = LAST_VIEW_SHARE * step
+        if offer is not None and not offer.blurred and _apart(offer, self._kept[-1]) >= least:
+            view = self._keep(_viewpoint(offer, wanted=True))
+        last = self._kept[-1]
+        near = [v for v in self._recent if v.key.segment == last.key.segment and not v.blurred]
+        near = [v for v in near if 0.5 * step <= _apart(v, last) < 0.9 * step]
+        near.sort(key=lambda v: abs(_apart(v, last) - 0.65 * step))
+        self._extra = (last, near[:1])
+        return view
+
+    def _step(self, segment: int) -> float | None:
+        """Distance between the last two views; None unless they are automatic and of it."""
+        same = [v for v in self._kept if v.key.segment == segment]
+        if self._mode != "auto" or len(same) < 2:
+            return None
+        return _apart(same[-1], same[-2])
+
+    def _moved_on(self, offer: Offer) -> bool:
+        """True a quarter of a step after the last frame that was remembered."""
+        step = self._step(offer.key.segment)
+        if step is None:
+            return False
+        last = max([self._kept[-1], *self._recent], key=lambda v: v.seq)
+        return last.key.segment == offer.key.segment and _apart(offer, last) > 0.25 * step
+
+    def _keep(self, view: Viewpoint) -> Viewpoint:
         self._kept.append(view)
         self._views_of[view.key.segment] += 1
         return view
@@ -134,25 +189,39 @@ class Viewpoints:
         baseline: the neighbour after it, or before it at the end of a segment.
         """
         candidates = [*self._kept, *self._between]
-        others = [v for v in candidates if v is not view and v.key.segment == view.key.segment]
+        segment = view.key.segment
+        others = [v for v in candidates if v.key.segment == segment and not v.blurred]
+        others = [v for v in others if v is not view]
         if self._mode != "auto":
             others.sort(key=lambda v: (v.seq < view.seq, abs(v.seq - view.seq)))
             return others[:1]
-        centre = view.T_odom_camera[:3, 3]
-        others.sort(key=lambda v: float(np.linalg.norm(v.T_odom_camera[:3, 3] - centre)))
+        others.sort(key=lambda v: _apart(v, view))
         if not self._between:
-            return others[: self._partners]
+            extra = self._extra[1] if self._extra and self._extra[0] is view else []
+            return [*extra, *others[: self._partners]]
         return self._spread(view, others)
 
     def _spread(self, view: Viewpoint, others: list[Viewpoint]) -> list[Viewpoint]:
         """Partners between half and twice the keyframes' spacing, evenly spread."""
-        centre = view.T_odom_camera[:3, 3]
-        base = [float(np.linalg.norm(v.T_odom_camera[:3, 3] - centre)) for v in others]
+        base = [_apart(v, view) for v in others]
         steps = [b for v, b in zip(others, base, strict=True) if v.bgr is not None]
         spacing = steps[0] if steps else 0.0
         good = [v for v, b in zip(others, base, strict=True) if 0.6 * spacing <= b <= 2.2 * spacing]
         picked = np.unique(np.linspace(0, len(good) - 1, self._partners).round().astype(int))
         return [good[i] for i in picked] if good else []
+
+
+def _apart(a: Viewpoint | Offer, b: Viewpoint) -> float:
+    return float(np.linalg.norm(a.T_odom_camera[:3, 3] - b.T_odom_camera[:3, 3]))
+
+
+def _viewpoint(offer: Offer, wanted: bool) -> Viewpoint:
+    grey = np.asarray(cv2.cvtColor(offer.picture, cv2.COLOR_BGR2GRAY), np.uint8)
+    T_key_camera = se3.inverse(offer.key.T_odom_camera) @ offer.T_odom_camera
+    bgr = offer.picture if wanted else None
+    return Viewpoint(
+        offer.seq, offer.time_ns, bgr, grey, offer.key, T_key_camera, offer.prior, offer.blurred
+    )
 
 
 def frames_apart(chosen: int, every: int) -> int:

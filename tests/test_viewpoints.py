@@ -10,16 +10,12 @@ from recon.keyframe_window import OdometryKeyframe
 from recon.landmarks import Landmarks
 from recon.matching import Pyramid
 from recon.odometry import Tracked
-from recon.types import Camera, Frame, PosePrior
+from recon.types import PosePrior
 from service.config import ScanConfig
-from service.viewpoints import Viewpoint, Viewpoints, frames_apart
-
-CAMERA = Camera(np.eye(3), np.zeros(5), (32, 32))
+from service.viewpoints import Offer, Viewpoint, Viewpoints, frames_apart
 
 
-def offer(
-    views: Viewpoints, seq: int, x_m: float, state: str, segment: int = 0
-) -> Viewpoint | None:
+def frame(seq: int, x_m: float, state: str, segment: int = 0, blurred: bool = False) -> Offer:
     T = se3.compose(np.eye(3), np.array([x_m, 0.0, 50.0]))
     key = OdometryKeyframe(
         seq, seq, segment, se3.inverse(T), np.eye(6), PosePrior(), Pyramid(()),
@@ -27,7 +23,13 @@ def offer(
     )  # fmt: skip
     picture = np.zeros((32, 32, 3), np.uint8)
     tracked = Tracked(state, segment, T, np.eye(6))
-    return views.offer(Frame(picture, seq, seq, CAMERA), picture, tracked, key, PosePrior())
+    return Offer(seq, seq, picture, tracked, key, PosePrior(), blurred)
+
+
+def offer(
+    views: Viewpoints, seq: int, x_m: float, state: str, segment: int = 0, blurred: bool = False
+) -> Viewpoint | None:
+    return views.offer(frame(seq, x_m, state, segment, blurred))
 
 
 def test_automatic_takes_the_odometrys_keyframes() -> None:
@@ -99,3 +101,29 @@ def test_fewer_partners_from_now_on() -> None:
     assert len(views.partners(middle)) == 4
     views.set_partners(2)
     assert sorted(v.seq for v in views.partners(middle)) == [1, 3]
+
+
+def test_blurred_views_are_nobodys_partner() -> None:
+    views = Viewpoints(ScanConfig(), partners=2)
+    kept = [
+        offer(views, i, 5.0 * i, "keyframe" if i else "started", blurred=i == 1) for i in range(5)
+    ]
+    first = kept[0]
+    assert first is not None and [v.seq for v in views.partners(first)] == [2, 3]
+
+
+def test_the_last_frame_of_a_stretch_becomes_a_view_when_it_shows_more() -> None:
+    views = Viewpoints(ScanConfig())
+    for i in range(3):
+        for j in range(10):
+            state = "tracked" if j else "keyframe" if i else "started"
+            assert (offer(views, 10 * i + j, 5.0 * i + 0.5 * j, state) is None) == (j > 0)
+    assert views.end_stretch(frame(20, 10.4, "tracked")) is None
+    assert views.end_stretch(frame(28, 14.0, "tracked", blurred=True)) is None
+    last = views.end_stretch(frame(28, 14.0, "tracked"))
+    assert last is not None and [v.seq for v in views.partners(last)] == [23, 20, 10, 0]
+    assert views.end_stretch(None) is None and len(views.partners(last)) == 4
+    fixed = Viewpoints(ScanConfig(baseline=2.0))
+    for i in range(3):
+        offer(fixed, i, 2.5 * i, "tracked" if i else "started")
+    assert fixed.end_stretch(frame(3, 6.5, "tracked")) is None

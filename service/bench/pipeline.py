@@ -10,6 +10,7 @@ from __future__ import annotations
 import tempfile
 import time
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import cv2
@@ -107,8 +108,7 @@ def _path(video: Path, folder: Path, upsample: bool, sgbm: bool) -> dict[str, fl
     store = create_store(inputs)
     start = time.perf_counter()
     scan = Scan(inputs, store)
-    for frame in source:
-        scan.feed(frame)
+    scan.run(Event())
     summary = scan.close()
     elapsed = time.perf_counter() - start
     source.close()

@@ -1,0 +1,55 @@
+"""A recording decoded ahead gives the same pictures, and lets go when nobody wants more."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from service.cameras.ahead import ahead
+from service.cameras.source import CameraFrame
+
+
+class Recording:
+    """Counts what was taken from it; breaks at ``fault_at``."""
+
+    description, size_px, epoch_unix_ns, start_monotonic_ns = "test", (4, 4), None, None
+    fps, is_live = 30.0, False
+
+    def __init__(self, count: int, fault_at: int | None = None) -> None:
+        self.count, self.fault_at, self.taken = count, fault_at, 0
+        self.warnings: list[str] = []
+
+    def __iter__(self) -> Iterator[CameraFrame]:
+        for i in range(self.count):
+            if i == self.fault_at:
+                raise OSError("the disk is gone")
+            self.taken += 1
+            yield CameraFrame(np.full((4, 4, 3), i, np.uint8), i, i, None, f"frame {i}")
+
+    def close(self) -> None: ...
+
+
+def test_every_picture_comes_in_order() -> None:
+    assert [f.seq for f in ahead(Recording(50))] == list(range(50))
+
+
+def test_a_fault_of_the_source_reaches_the_reader_after_the_pictures_before_it() -> None:
+    seen = []
+    with pytest.raises(OSError, match="disk is gone"):
+        for frame in ahead(Recording(50, fault_at=7)):
+            seen.append(frame.seq)
+    assert seen == list(range(7))
+
+
+def test_no_more_than_a_few_are_decoded_ahead_and_a_stop_ends_the_thread() -> None:
+    recording = Recording(1000)
+    frames = ahead(recording, kept=3)
+    assert next(frames).seq == 0
+    time.sleep(0.2)
+    assert recording.taken <= 1 + 3 + 1
+    frames.close()  # type: ignore[attr-defined]
+    assert not any(t.name == "decoder" for t in threading.enumerate())
