@@ -127,6 +127,14 @@ class ComputeConfig:
         True, "joint bilateral upsampling; without it depth is coarser and quicker"
     )
     pairs: int = key(4, "stereo pairs fused into a keyframe, at most")
+    relief: bool = key(
+        True,
+        "too slow, too hot or short of memory: lower rate, lower resolution, no upsampling, at "
+        "last only record; undone when it passes",
+        live=True,
+    )
+    hottest_c: float = key(90.0, "degrees of the hottest sensor that count as too hot", live=True)
+    least_memory_mib: float = key(300.0, "memory left that counts as short", live=True)
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -136,6 +144,8 @@ class ComputeConfig:
         _within("compute.iterations", self.iterations, 1, 100)
         _within("compute.pairs", self.pairs, 1, 64)
         _within("compute.guide_width", self.guide_width, 64, 8192)
+        _within("compute.hottest_c", self.hottest_c, 30, 150)
+        _within("compute.least_memory_mib", self.least_memory_mib, 0, 1e6)
         if self.guide_width < self.stereo_width:
             raise ValueError(
                 f"compute.guide_width {self.guide_width} is less than compute.stereo_width "

@@ -20,6 +20,7 @@ from service.config import Config, reload
 from service.control_actions import ControlActions
 from service.errors import OutsideError
 from service.health import HealthServer, Notifier
+from service.load_control import LoadControl
 from service.machine import CoreLoad, computer_load, read_machine
 from service.retention import close_open_scans, make_room
 from service.scanning import Scanning
@@ -45,6 +46,7 @@ class Daemon:
         self._wanted = config  # as it was asked for last; operators may have tuned it since
         self._quit = threading.Event()
         self.scanning = Scanning(config)
+        self.load_control = LoadControl(self.scanning)
         self.actions = ControlActions(self.scanning, self.quit)
         self.vehicle = self.scanning.vehicle = VehicleLink(vehicle_config(config), self.actions)
 
@@ -63,7 +65,8 @@ class Daemon:
             self.scanning.load()
             self.actions.is_ready = True
             notifier.ready()
-            threading.Thread(target=self._tidy, name="tidy", daemon=True).start()
+            for work in (self._recover, self._tidy):
+                threading.Thread(target=work, name=work.__name__[1:], daemon=True).start()
             if self.config.scan.start == "on-boot":
                 self.actions.start_scan()
             self._watch(notifier)
@@ -117,6 +120,9 @@ class Daemon:
             "software": software(),
             "scan": status.scan_id,
             "recording_s": status.recording_ms / 1e3,
+            "backend": self.scanning.backend_name,
+            "backend_failure": self.scanning.backend_failure,
+            "load": self.load_control.to_dict(),
             "machine": read_machine(Path(self.config.scan.folder)).to_dict(),
         } | {key: value for key, value in figures.items() if math.isfinite(value)}
 
@@ -131,16 +137,20 @@ class Daemon:
         if waiting:
             log.warning("configuration: after a restart: %s", ", ".join(waiting))
 
+    def _recover(self) -> None:
+        """Close what a crash or a power cut left open; then offer what the ground lacks."""
+        close_open_scans(Path(self.config.scan.folder), self._started_s)
+        self.scanning.offer_backlog()
+
     def _tidy(self) -> None:
-        """Close what a crash left open; then watch the machine and keep room on the disk."""
+        """Watch the machine, do less when it cannot keep up, keep room on the disk."""
         folder = Path(self.config.scan.folder)
         cores = CoreLoad()
-        close_open_scans(folder, self._started_s)
         while not self._quit.wait(2.0):
             keep_free_mib = self.config.scan.keep_free_mib
-            self.vehicle.set_load(
-                computer_load(read_machine(folder), cores.percent(), keep_free_mib)
-            )
+            machine = read_machine(folder)
+            self.vehicle.set_load(computer_load(machine, cores.percent(), keep_free_mib))
+            self.load_control.look(machine)
             make_room(folder, keep_free_mib, self.scanning.scan_id)
 
     def _health(self) -> Health:

@@ -16,13 +16,16 @@ from mavlink.control import ACCEPTED, Answer, Phase, Result, Work
 from mavlink.status import CRITICAL, WARNING
 from mavlink.vehicle import VehicleLink
 from service.config import Config
+from service.datalink import DaemonLink
+from service.degradation import Level, lowered
 from service.errors import InputError, OutsideError, SkyreliefError
 
 if TYPE_CHECKING:
     from recon.backends import Backend
     from recon.types import Camera
     from service.cameras.source import CameraSource
-    from service.scan import Datalink, Scan
+    from service.frame_gate import FrameGate
+    from service.scan import Scan
     from service.stream.records import PoseRecord
     from service.stream.store import ScanStore
 
@@ -30,6 +33,10 @@ log = logging.getLogger(__name__)
 
 FIRST_RETRY_S, LAST_RETRY_S = 1.0, 8.0
 """Back-off between attempts to open a camera or to scan again; names of scans are seconds."""
+
+
+LATER = "later"
+"""Folder within a scan's for pictures that were only kept."""
 
 
 class Scanning:
@@ -43,6 +50,8 @@ class Scanning:
         self.phase = Phase.IDLE
         self.fault = ""
         self.scan: Scan | None = None
+        self.gate: FrameGate | None = None
+        self.level = Level.FULL
         self.started_s = self.progress_s = time.monotonic()
         self._backend: Backend | None = None
         self._camera: Camera | None = None
@@ -54,7 +63,7 @@ class Scanning:
         self._retry_at_s: float | None = None
         self._retry_s = FIRST_RETRY_S
         self._latency_ms: float | None = None  # of the camera, as the last scan found it
-        self._link: Datalink | None = None  # of the scan that runs
+        self.link = DaemonLink()
 
     def load(self) -> None:
         """The heavy part of the start: camera model and backend; InputError without them."""
@@ -126,12 +135,29 @@ class Scanning:
     def follow(self, config: Config) -> None:
         """Work by another configuration: what can change in flight also in the scan that runs."""
         self.config = config
-        scan, link = self.scan, self._link
+        scan = self.scan
         if scan is not None:
             scan.pipeline.set_baseline(config.scan)
             scan.check.set_camera(config.camera)
-        if link is not None:
-            link.set_budget(config.datalink.budget_kbit_s, config.datalink.share)
+        self.link.follow(config)
+
+    def set_level(self, level: Level) -> None:
+        """Do less with the pictures, or more again, in this scan and in the next."""
+        self.level = level
+        scan, gate = self.scan, self.gate
+        if scan is not None and gate is not None:
+            scan.pipeline.set_effort(lowered(self.config.compute, level))
+            gate.level = level
+
+    @property
+    def backend_name(self) -> str:
+        """Of the backend that computes now; empty while starting."""
+        return self._backend.name if self._backend is not None else ""
+
+    @property
+    def backend_failure(self) -> str:
+        """Why the backend that was chosen gave way to the CPU; empty when it did not."""
+        return getattr(self._backend, "failure", None) or ""
 
     def retry(self) -> None:
         """Start the next scan when a fault ended the last one and nobody stopped it."""
@@ -145,6 +171,7 @@ class Scanning:
         self._stop_feeding()
         if self._worker is not None:
             self._worker.join()
+        self.link.rest()
 
     # ---- the scan's thread ------------------------------------------------------------------
 
@@ -155,14 +182,22 @@ class Scanning:
             self._fail(str(error))
         except Exception as error:
             log.exception("the scan ended with a fault of ours")
-            self._fail(f"internal fault: {error}")
+            first, *_ = str(error).strip().splitlines() or [type(error).__name__]
+            self._fail(f"internal fault: {first}")
         finally:
-            self.scan = None
+            self.scan = self.gate = None
             self.phase = Phase.IDLE
             if self._closing is not None:
                 failed = Answer(Result.FAILED, self.fault)
                 self._closing.finish(failed if self.fault else ACCEPTED)
                 self._closing = None
+            self.offer_backlog()
+
+    def offer_backlog(self) -> None:
+        """Send earlier scans that the ground lacks while none is flown."""
+        self.link.offer_backlog(
+            self.config, lambda: self.phase is Phase.IDLE and not self._ended.is_set()
+        )
 
     def _fail(self, text: str) -> None:
         self.fault = text
@@ -175,7 +210,7 @@ class Scanning:
 
     def _scan_once(self) -> None:
         """Open the camera, scan until stopped or the recording ends, close the scan."""
-        from service.datalink import open_datalink
+        from service.frame_gate import FrameGate
         from service.scan import Scan, ScanInputs, create_store
         from service.scan_folder import write_deliverables
 
@@ -185,15 +220,16 @@ class Scanning:
             return
         scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
         folder = Path(self.config.scan.folder) / scan_id
-        offset = time.time_ns() - time.monotonic_ns()
+        zero_ns, offset = _zero_ns(source), time.time_ns() - time.monotonic_ns()
+        gate = FrameGate(source, folder / LATER, zero_ns + offset, self._alive, self._paused)
         inputs = ScanInputs(
-            source,
+            gate,
             self._camera,
             self.config,
             self._backend,
             folder,
             scan_id,
-            _zero_ns(source),
+            zero_ns,
             unix_offset_ns=offset,
             history=self.vehicle.history,
             extra={"backend": self._backend.name, "source": source.description},
@@ -202,8 +238,9 @@ class Scanning:
         )
         store = create_store(inputs)
         self.vehicle.record(folder / "link.tlog")
-        link = self._link = open_datalink(store, self.config)
-        self.scan, self._reported = Scan(inputs, store), 0
+        self.link.take_off(store, self.config, self.vehicle)
+        self.scan, self.gate, self._reported = Scan(inputs, store), gate, 0
+        self.set_level(self.level)
         self.vehicle.statustext(f"Scan {scan_id} started")
         try:
             self.scan.run(self._stop, self._on_frame, self._paused)
@@ -215,10 +252,7 @@ class Scanning:
                 self._close_scan(self.scan, store)
             finally:
                 write_deliverables(folder, store, {})
-                self._link = None
-                if link is not None:
-                    link.drain(self.config.datalink.drain_s)
-                    link.close()
+                self.link.land(self.config)
                 store.close()
 
     def _close_scan(self, scan: Scan, store: ScanStore) -> None:
@@ -251,8 +285,11 @@ class Scanning:
                 wait_s = min(2 * wait_s, LAST_RETRY_S)
         return None
 
-    def _on_frame(self, scan: Scan) -> None:
+    def _alive(self) -> None:
         self.progress_s = time.monotonic()
+
+    def _on_frame(self, scan: Scan) -> None:
+        self._alive()
         if scan.recorder.keyframes > self._reported and scan.recorder.last is not None:
             self._reported = scan.recorder.keyframes
             self._retry_s = FIRST_RETRY_S

@@ -250,7 +250,7 @@ def test_term_closes_the_scan(tmp_path: Path, record: Record) -> None:
         with ScanStore.open(folder / "scan.db") as store:
             assert store.finished
             assert store.summary is not None
-            assert "interrupted" not in store.summary
+            assert "interrupted" not in store.summary, service.log.read_text()[-3000:]
         assert (folder / "preview.jpg").is_file()
     record("TERM while scanning", 1, "scan closed, files written")
 

@@ -1,0 +1,226 @@
+"""What a level does to the frames of a camera, and what the operator hears of it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Event
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from recon.backends import load_backend
+from recon.backends.cpu import CpuBackend
+from recon.belief_propagation import BeliefPropagationConfig
+from recon.types import U8, DisparityMap
+from service.backend_choice import FallbackBackend
+from service.cameras import CameraFrame, open_camera
+from service.cameras.source import CameraSource
+from service.config import load_config
+from service.degradation import Level
+from service.frame_gate import FrameGate, picture_name
+from service.machine import Machine
+from service.runtime import Daemon
+
+START_NS = 1_790_000_000_123_456_000
+
+
+class Film:
+    """A camera of a hundred numbered pictures, ten a second."""
+
+    def __init__(self, count: int = 100) -> None:
+        self.description, self.size_px = "film", (64, 48)
+        self.epoch_unix_ns: int | None = None
+        self.start_monotonic_ns: int | None = None
+        self.fps: float | None = 10.0
+        self.is_live = True
+        self.warnings: list[str] = []
+        self.dropped = 7
+        self._count = count
+
+    def __iter__(self) -> Iterator[CameraFrame]:
+        for i in range(self._count):
+            image = np.full((48, 64, 3), 2 * i, np.uint8)
+            yield CameraFrame(image, 100_000_000 * i, i, None, f"frame {i}")
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+class Kept(NamedTuple):
+    """A gate, and how often it said that it lives."""
+
+    gate: FrameGate
+    alive: list[int]
+
+
+def gate_over(source: CameraSource, folder: Path, level: Level, paused: bool = False) -> Kept:
+    alive: list[int] = []
+    stopped = Event()
+    if paused:
+        stopped.set()
+    gate = FrameGate(source, folder / "later", START_NS, lambda: alive.append(1), stopped)
+    gate.level = level
+    return Kept(gate, alive)
+
+
+@pytest.mark.parametrize("level", [Level.LOWER_RATE, Level.LOWER_RESOLUTION, Level.NO_UPSAMPLING])
+def test_lower_rate_passes_every_second_frame(level: Level, tmp_path: Path) -> None:
+    gate, alive = gate_over(Film(), tmp_path, level)
+    assert [f.seq for f in gate] == list(range(1, 100, 2))
+    assert len(alive) == 50
+    assert gate.late == 7
+    full, _ = gate_over(Film(), tmp_path, Level.FULL)
+    assert [f.seq for f in full] == list(range(100))
+    assert not (tmp_path / "later").exists()
+
+
+def test_record_only_keeps_pictures_that_a_replay_can_read(tmp_path: Path) -> None:
+    gate, alive = gate_over(Film(), tmp_path, Level.RECORD_ONLY)
+    assert list(gate) == []
+    assert len(alive) == 100
+    assert gate.kept == 50  # five of ten a second
+    assert "50 pictures were only kept in later/" in gate.warnings[0]
+    again = open_camera(f"images:{tmp_path / 'later'}")
+    frames = list(again)
+    assert len(frames) == 50
+    assert again.epoch_unix_ns == START_NS
+    assert [f.time_ns for f in frames] == [200_000_000 * i for i in range(50)]
+    assert abs(int(frames[10].image.mean()) - 40) <= 1
+    assert not list((tmp_path / "later").glob("*.part"))
+
+
+def test_levels_change_while_frames_come(tmp_path: Path) -> None:
+    gate, _ = gate_over(Film(), tmp_path, Level.FULL)
+    seen = []
+    for frame in gate:
+        seen.append(frame.seq)
+        if frame.seq == 9:
+            gate.level = Level.RECORD_ONLY
+            gate._alive = lambda: setattr(gate, "level", Level.FULL)
+    assert seen == [*range(10), *range(11, 100)]
+    assert gate.kept == 1
+
+
+def test_nothing_is_kept_while_paused_or_without_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate, _ = gate_over(Film(), tmp_path, Level.RECORD_ONLY, paused=True)
+    assert list(gate) == []
+    assert (gate.kept, gate.lost) == (0, 0)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(9, 8, 1))
+    full, alive = gate_over(Film(), tmp_path, Level.RECORD_ONLY)
+    assert list(full) == []
+    assert (full.kept, full.lost, len(alive)) == (0, 50, 100)
+
+
+def test_names_of_pictures_are_times() -> None:
+    assert picture_name(1_533_459_888_480_000_000) == "20180805090448480000Z.jpg"
+
+
+class Operator:
+    """Collects what is said."""
+
+    def __init__(self, daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.heard: list[str] = []
+        monkeypatch.setattr(daemon.vehicle, "statustext", lambda t, *_: self.heard.append(t))
+
+
+@pytest.fixture
+def daemon(tmp_path: Path) -> Daemon:
+    return Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
+
+
+def test_heat_is_told_acted_on_and_undone(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    operator = Operator(daemon, monkeypatch)
+    control = daemon.load_control
+    for now_s in range(0, 100, 2):
+        control.look(Machine("m", temperature_c=97.0), float(now_s))
+    assert daemon.scanning.level is Level.RECORD_ONLY
+    assert control.to_dict() == {"level": 4, "name": "record only", "reason": "97 degrees"}
+    for now_s in range(100, 400, 2):
+        control.look(Machine("m", temperature_c=60.0), float(now_s))
+    assert control.to_dict()["level"] == Level.FULL
+    assert operator.heard[0] == "Load: lower rate (97 degrees)"
+    assert operator.heard[3] == "Load: record only (97 degrees)"
+    assert operator.heard[-1] == "Load: full quality again"
+    assert len(operator.heard) == 8
+    assert daemon.snapshot()["load"]["level"] == 0
+
+
+def test_relief_can_be_switched_off(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    operator = Operator(daemon, monkeypatch)
+    for now_s in range(0, 60, 2):
+        daemon.load_control.look(Machine("m", temperature_c=97.0), float(now_s))
+    assert daemon.load_control.to_dict()["level"] == Level.LOWER_RESOLUTION
+    daemon.reload(load_config(None, ["compute.relief=false"]))
+    daemon.load_control.look(Machine("m", temperature_c=97.0), 60.0)
+    assert daemon.load_control.to_dict() == {"level": 0, "name": "full", "reason": ""}
+    heard = len(operator.heard)
+    for now_s in range(62, 200, 2):
+        assert daemon.load_control.look(Machine("m", temperature_c=97.0), float(now_s)) is None
+    assert len(operator.heard) == heard
+
+
+class Dying(CpuBackend):
+    """A device that runs out of memory after two pairs."""
+
+    name, device = "torch", "cuda"
+
+    def __init__(self) -> None:
+        self.left = 2
+
+    def belief_propagation(
+        self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
+    ) -> DisparityMap:
+        """As the CPU's, twice."""
+        if self.left == 0:
+            raise RuntimeError("CUDA out of memory. Tried to allocate 20 MiB\nmore")
+        self.left -= 1
+        return super().belief_propagation(left, right, labels, config)
+
+
+def test_a_device_that_fails_is_told_once_and_the_cpu_goes_on(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    operator = Operator(daemon, monkeypatch)
+    backend = FallbackBackend(Dying())
+    daemon.scanning._backend = backend
+    grey = np.zeros((48, 64), np.uint8)
+    arguments: tuple[Any, ...] = (grey, grey, 4, BeliefPropagationConfig())
+    truth = load_backend("cpu").belief_propagation(*arguments).px
+    for i in range(4):
+        found = backend.belief_propagation(*arguments).px
+        np.testing.assert_array_equal(found, truth)
+        daemon.load_control.look(Machine("m"), float(i))
+        assert len(operator.heard) == (i >= 2)
+    assert operator.heard == ["Compute device failed: CUDA out of memory. Tried to allocate 20 MiB"]
+    assert daemon.snapshot()["backend"] == "cpu"
+    assert "out of memory" in daemon.snapshot()["backend_failure"]
+
+
+def test_onnx_runtime_out_of_memory_falls_back_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its exceptions are no RuntimeErrors; neither running nor opening may end the scan."""
+    state = pytest.importorskip("onnxruntime.capi.onnxruntime_pybind11_state")
+    pytest.importorskip("onnx")
+    from recon.backends import onnx_backend
+
+    class Full:
+        """A session on a device without memory."""
+
+        def run(self, *_: object) -> None:
+            """Fails."""
+            raise state.RuntimeException("CUDA failure 2: out of memory")
+
+    def refuse(*_: object) -> None:
+        raise ValueError("ONNX Runtime cannot use the model: out of memory")
+
+    grey = np.zeros((48, 64), np.uint8)
+    for opener in (lambda *_: Full(), refuse):
+        monkeypatch.setattr(onnx_backend, "open_session", opener)
+        backend = FallbackBackend(load_backend("onnx"))
+        backend.belief_propagation(grey, grey, 4, BeliefPropagationConfig())
+        assert backend.name == "cpu"
+        assert backend.failure is not None and "out of memory" in backend.failure
