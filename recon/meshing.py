@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -61,13 +62,17 @@ def height_mesh(raster: Raster, largest_faces: int = 400_000) -> Mesh:
 
 
 def poisson_mesh(
-    cloud: PointCloud, towards_m: F64, spacing_m: float, trim_share: float = 0.03
+    cloud: PointCloud,
+    towards_m: F64,
+    spacing_m: float,
+    largest_faces: int = 400_000,
+    trim_share: float = 0.03,
 ) -> Mesh:
     """A closed-form surface through an oriented cloud, with colours per vertex.
 
     Screened Poisson (Kazhdan and Hoppe 2013, doi:10.1145/2487228.2487237) by Open3D; the
     ``trim_share`` of vertices with the least support is cut away, and so is what lies
-    farther than a few spacings from every point.
+    farther than a few spacings from every point. Above ``largest_faces`` flat parts are merged.
 
     Args:
         towards_m: (N, 3) a place that each point was seen from.
@@ -93,6 +98,8 @@ def poisson_mesh(
     far = _distance(np.asarray(mesh.vertices), cloud.xyz_m) > 4.0 * spacing_m
     loose = (density < np.quantile(density, trim_share)) | far
     mesh.remove_vertices_by_mask(loose.tolist())
+    if len(mesh.triangles) > largest_faces:
+        mesh = _reduced(mesh, largest_faces)
     colours = np.clip(np.rint(255.0 * np.asarray(mesh.vertex_colors)), 0, 255).astype(np.uint8)
     return Mesh(
         np.asarray(mesh.vertices).copy(), np.asarray(mesh.triangles, np.int32).copy(), None, colours
@@ -121,13 +128,74 @@ def _without_lone_vertices(vertices: F64, faces: I32) -> tuple[F64, I32]:
 
 
 def _simplified(vertices: F64, faces: I32, largest_faces: int) -> tuple[F64, I32]:
-    """About ``largest_faces`` triangles by quadric error (Garland and Heckbert 1997)."""
+    """About ``largest_faces`` triangles of the same surface."""
     import open3d as o3d
 
     mesh = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces)
     )
+    small = _reduced(mesh, largest_faces)
+    return np.asarray(small.vertices).copy(), np.asarray(small.triangles, np.int32).copy()
+
+
+def _reduced(mesh: Any, largest_faces: int) -> Any:
+    """An Open3D mesh reduced by quadric error (Garland and Heckbert 1997); colours stay."""
     small = mesh.simplify_quadric_decimation(largest_faces, boundary_weight=10.0)
     small.remove_degenerate_triangles()
     small.remove_unreferenced_vertices()
-    return np.asarray(small.vertices).copy(), np.asarray(small.triangles, np.int32).copy()
+    return small
+
+
+def cut(mesh: Mesh, box: tuple[float, float, float, float]) -> Mesh:
+    """The part of an untextured mesh inside (west, south, east, north), cut at its borders.
+
+    Triangles across a border are divided along it, so that tiles cut at the same border meet.
+    Infinite borders cut nothing.
+    """
+    for axis, side, limit in ((0, 1, box[0]), (1, 1, box[1]), (0, -1, box[2]), (1, -1, box[3])):
+        if np.isfinite(limit) and len(mesh.faces):
+            mesh = _half(mesh, side * (mesh.vertices_m[:, axis] - limit))
+    return mesh
+
+
+def _half(mesh: Mesh, inside_m: F64) -> Mesh:
+    """The part where ``inside_m`` (V,), linear over each triangle, is not negative."""
+    keep = inside_m >= 0.0
+    count = keep[mesh.faces].sum(axis=1)
+    parts = [mesh.faces[count == 3]]
+    # Turn the triangles so that the corner that differs from the two others comes first.
+    mixed = mesh.faces[(count == 1) | (count == 2)]
+    one = keep[mixed].sum(axis=1) == 1
+    first = np.argmax(keep[mixed] == one[:, None], axis=1)
+    mixed = np.take_along_axis(mixed, (first[:, None] + np.arange(3)) % 3, 1)
+    edges = np.concatenate([mixed[:, [0, 1]], mixed[:, [0, 2]]]).astype(np.int64)
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    total = len(mesh.vertices_m)
+    key, number = np.unique(low * total + high, return_inverse=True)
+    a, b = key // total, key % total
+    share = inside_m[a] / (inside_m[a] - inside_m[b])
+    vertices = [mesh.vertices_m, _between(mesh.vertices_m[a], mesh.vertices_m[b], share)]
+    new = number.reshape(2, -1) + total
+    parts.append(np.column_stack([mixed[one, 0], new[0, one], new[1, one]]))
+    two = ~one
+    parts.append(np.column_stack([new[0, two], mixed[two, 1], mixed[two, 2]]))
+    parts.append(np.column_stack([new[0, two], mixed[two, 2], new[1, two]]))
+    faces = np.concatenate(parts).astype(np.int32)
+    rgb = None
+    if mesh.rgb is not None:
+        mean = _between(mesh.rgb[a].astype(np.float64), mesh.rgb[b].astype(np.float64), share)
+        rgb = np.concatenate([mesh.rgb, np.rint(mean).astype(np.uint8)])
+    used: Bool = np.zeros(total + len(key), np.bool_)
+    used[faces.ravel()] = True
+    number = np.cumsum(used) - 1
+    return Mesh(
+        np.concatenate(vertices)[used],
+        number[faces].astype(np.int32),
+        None,
+        None if rgb is None else rgb[used],
+    )
+
+
+def _between(a: F64, b: F64, share: F64) -> F64:
+    """(N, 3) places at ``share`` of the way from ``a`` to ``b``."""
+    return np.asarray(a + share[:, None] * (b - a))

@@ -105,7 +105,7 @@ def test_glb_is_read_by_trimesh(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     mesh = height_mesh(raster(np.ones((12, 16), np.float32)))
     texture = np.full((12, 16, 3), (200, 100, 50), np.uint8)
-    (tmp_path / "a.glb").write_bytes(glb(mesh, texture, {"scan": "x"}))
+    (tmp_path / "a.glb").write_bytes(glb([(mesh, texture)], {"scan": "x"}))
     read = trimesh.load(tmp_path / "a.glb", force="mesh")
     assert read.faces.shape == mesh.faces.shape
     np.testing.assert_allclose(read.vertices[:, 1], 1.0, atol=1e-6)  # y is up
@@ -113,7 +113,7 @@ def test_glb_is_read_by_trimesh(tmp_path: Path) -> None:
     image = np.asarray(read.visual.material.baseColorTexture)
     np.testing.assert_allclose(image.reshape(-1, 3).mean(axis=0), [200, 100, 50], atol=4)
     coloured = Mesh(mesh.vertices_m, mesh.faces, None, np.full((len(mesh.vertices_m), 3), 128))
-    (tmp_path / "b.glb").write_bytes(glb(coloured, None, {}))
+    (tmp_path / "b.glb").write_bytes(glb([(coloured, None)], {}))
     # 128 in sRGB is 0.2159 of full light.
     o3d = pytest.importorskip("open3d")
     colours = np.asarray(o3d.io.read_triangle_mesh(str(tmp_path / "b.glb")).vertex_colors)
@@ -128,7 +128,8 @@ def test_the_command_meshes_the_house(tmp_path: Path, house: HouseFlight, method
     done = CliRunner().invoke(app, ["mesh", str(tmp_path), "--method", method, "--json"])
     assert done.exit_code == 0, done.exception
     figures = json.loads(done.stdout.splitlines()[-1])
-    assert figures["method"] == method
+    assert figures["method"] == method and figures["tiles"] == 1
+    assert figures["seen"] > 0.8
     mesh = trimesh.load(tmp_path / "mesh.glb", force="mesh")
     x, y, z = mesh.vertices[:, 0], -mesh.vertices[:, 2], mesh.vertices[:, 1]
     from_wall = np.maximum(np.abs(x - 10) - 6.0, np.abs(y - 2) - 4.0)
@@ -137,6 +138,14 @@ def test_the_command_meshes_the_house(tmp_path: Path, house: HouseFlight, method
     assert np.median(error) < 0.02
     assert np.quantile(error, 0.98) < 0.3
     assert ((z > 5.5) & clear).sum() > 50
+    atlas = np.asarray(mesh.visual.material.baseColorTexture)[..., :3]
+    uv = np.clip(mesh.visual.uv, 0, 0.9999) * [[1, -1]] + [[0, 1]]
+    at = (uv * [atlas.shape[1], atlas.shape[0]]).astype(int)
+    colour = atlas[np.minimum(at[:, 1], atlas.shape[0] - 1), at[:, 0]].astype(int)
+    roof = (z > 5.5) & (from_wall < -1.0)
+    assert np.median(colour[roof], axis=0) == pytest.approx([200, 40, 40], abs=15)
+    ground = (z < 0.5) & (from_wall > 1.0)
+    assert (colour[ground, 1] > colour[ground, 0]).mean() > 0.95  # grass, not roof
 
 
 def test_bad_requests_are_refused(tmp_path: Path, house: HouseFlight) -> None:

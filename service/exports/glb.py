@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -17,37 +18,50 @@ ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 LARGEST_TEXTURE_PX = 8192
 
 
-def glb(mesh: Mesh, texture: U8 | None, extras: dict[str, Any]) -> bytes:
-    """The file's bytes. ``texture`` is (h, w, 3) RGB for the mesh's uv; else its rgb is used.
+def glb(parts: Sequence[tuple[Mesh, U8 | None]], extras: dict[str, Any]) -> bytes:
+    """The file's bytes: one mesh per part, each with its picture.
 
-    glTF has y up: x stays east, y is up, z is south. ``extras`` go into the asset.
+    A picture is (h, w, 3) RGB for the mesh's uv; without one its rgb is used. glTF has y up:
+    x stays east, y is up, z is south. ``extras`` go into the asset.
     """
     blocks = _Blocks()
-    xyz = mesh.vertices_m[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
-    attributes = {
-        "POSITION": blocks.accessor(xyz.astype("<f4"), FLOAT, "VEC3", ARRAY_BUFFER, bounds=True)
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "skyrelief", "extras": extras},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": list(range(len(parts)))}],
+        "nodes": [{"mesh": n, "name": f"surface {n}"} for n in range(len(parts))],
+        "materials": [],
+        "meshes": [],
     }
+    for mesh, picture in parts:
+        _add(document, blocks, mesh, picture)
+    document["accessors"], document["bufferViews"] = blocks.accessors, blocks.views
+    document["buffers"] = [{"byteLength": len(blocks.data)}]
+    return _container(document, bytes(blocks.data))
+
+
+def _add(document: dict[str, Any], blocks: _Blocks, mesh: Mesh, picture: U8 | None) -> None:
+    """One mesh with its material into the document."""
     material: dict[str, Any] = {
         "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
         "extensions": {"KHR_materials_unlit": {}},
         "doubleSided": True,
     }
-    document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "skyrelief", "extras": extras},
-        "extensionsUsed": ["KHR_materials_unlit"],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "surface"}],
-        "materials": [material],
+    xyz = mesh.vertices_m[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
+    attributes = {
+        "POSITION": blocks.accessor(xyz.astype("<f4"), FLOAT, "VEC3", ARRAY_BUFFER, bounds=True)
     }
-    if texture is not None and mesh.uv is not None:
+    if picture is not None and mesh.uv is not None:
         attributes["TEXCOORD_0"] = blocks.accessor(
             mesh.uv.astype("<f4"), FLOAT, "VEC2", ARRAY_BUFFER
         )
-        document["images"] = [{"bufferView": blocks.view(_jpeg(texture)), "mimeType": "image/jpeg"}]
-        document["textures"] = [{"source": 0, "sampler": 0}]
+        images = document.setdefault("images", [])
+        images.append({"bufferView": blocks.view(_jpeg(picture)), "mimeType": "image/jpeg"})
+        textures = document.setdefault("textures", [])
+        textures.append({"source": len(images) - 1, "sampler": 0})
         document["samplers"] = [{"wrapS": 33071, "wrapT": 33071, "minFilter": 9987}]
-        material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+        material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": len(textures) - 1}
     elif mesh.rgb is not None:
         rgba = np.column_stack([_linear(mesh.rgb), np.full(len(mesh.rgb), 255, np.uint8)])
         attributes["COLOR_0"] = blocks.accessor(
@@ -56,12 +70,13 @@ def glb(mesh: Mesh, texture: U8 | None, extras: dict[str, Any]) -> bytes:
     indices = blocks.accessor(
         mesh.faces.astype("<u4").ravel(), UNSIGNED_INT, "SCALAR", ELEMENT_ARRAY_BUFFER
     )
-    document["meshes"] = [
-        {"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}
-    ]
-    document["accessors"], document["bufferViews"] = blocks.accessors, blocks.views
-    document["buffers"] = [{"byteLength": len(blocks.data)}]
-    return _container(document, bytes(blocks.data))
+    primitive = {
+        "attributes": attributes,
+        "indices": indices,
+        "material": len(document["materials"]),
+    }
+    document["meshes"].append({"primitives": [primitive]})
+    document["materials"].append(material)
 
 
 class _Blocks:

@@ -1,0 +1,100 @@
+"""The pictures that a mesh is textured from: the stored keyframes', or the video's own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from recon.camera_model import Undistorter, scaled_K
+from recon.texture_views import TextureView
+from recon.types import U8, Camera, Keyframe
+from service.cameras import open_camera
+from service.errors import InputError
+from service.stream.records import ScanHeader
+
+MOST_BYTES = 1_500_000_000
+"""All pictures of one tile together; more are made smaller."""
+
+SAME_TIME_NS = 5_000_000
+
+
+def stored_pictures(keyframes: Sequence[Keyframe]) -> list[TextureView]:
+    """A view per keyframe from the store: where it holds depth, at the depth's resolution."""
+    return [
+        TextureView(
+            np.dstack([k.bgr, np.where(k.fresh, 255, 0).astype(np.uint8)]),
+            k.depth.K,
+            k.depth.T_world_camera,
+        )
+        for k in keyframes
+    ]
+
+
+def video_pictures(
+    keyframes: Sequence[Keyframe], header: ScanHeader, video: Path, epoch_ns: int | None
+) -> list[TextureView]:
+    """A view per keyframe from the frame of ``video`` (file or folder) taken at its time.
+
+    The camera is the scan's own. ``epoch_ns`` is unix time of the video's start; by default
+    the scan's start. Keyframes without a frame keep their stored picture. Raises InputError
+    when the video is of another size, or none of its frames is a keyframe.
+    """
+    camera = _camera(header)
+    source = open_camera(str(video))
+    if source.size_px != camera.size_px:
+        source.close()
+        raise InputError(
+            f"{video}: {source.size_px[0]}x{source.size_px[1]} pictures, but the scan's camera "
+            f"is {camera.size_px[0]}x{camera.size_px[1]}; give the video that was flown"
+        )
+    start = header.started_unix_ns if epoch_ns is None else epoch_ns
+    undistort = Undistorter(camera)
+    shrink = min(1.0, (MOST_BYTES / (4.0 * np.prod(camera.size_px) * len(keyframes))) ** 0.5)
+    times = np.array([k.time_ns for k in keyframes], np.int64)
+    found: dict[int, TextureView] = {}
+    try:
+        for frame in source:
+            time_ns = start + frame.time_ns
+            nearest = int(np.abs(times - time_ns).argmin())
+            if abs(int(times[nearest]) - time_ns) <= SAME_TIME_NS:
+                picture = np.dstack([undistort.image(frame.image), undistort.valid])
+                pose = keyframes[nearest].depth.T_world_camera
+                found[nearest] = _view(picture, camera, pose, shrink)
+            if time_ns > times.max() + SAME_TIME_NS:
+                break
+    finally:
+        source.close()
+    if not found:
+        raise InputError(
+            f"{video}: no frame was taken at the time of a keyframe; give the --video-epoch "
+            "that the scan was made with"
+        )
+    rest = stored_pictures(keyframes)
+    return [found.get(n, rest[n]) for n in range(len(keyframes))]
+
+
+def _view(bgra: U8, camera: Camera, T_world_camera: np.ndarray, shrink: float) -> TextureView:
+    if shrink == 1.0:
+        return TextureView(bgra, camera.K, T_world_camera)
+    w, h = (max(2, round(side * shrink)) for side in camera.size_px)
+    small = np.asarray(cv2.resize(bgra, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
+    K = scaled_K(camera.K, w / camera.size_px[0], h / camera.size_px[1])
+    return TextureView(small, K, T_world_camera)
+
+
+def _camera(header: ScanHeader) -> Camera:
+    """The camera model written in the scan's header."""
+    try:
+        document = header.camera
+        return Camera(
+            np.array(document["K"], np.float64).reshape(3, 3),
+            np.array(document["distortion"], np.float64).reshape(5),
+            (int(document["width"]), int(document["height"])),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"scan {header.scan_id} holds no camera model; its video cannot be used"
+        ) from error

@@ -1,0 +1,206 @@
+"""A site in tiles: covered once, the same here and on a Dask cluster, sharper from its video."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+pytest.importorskip("open3d")
+
+from recon import triangle_grid
+from service.cameras import CameraFrame
+from service.cli import app
+from service.errors import InputError, OutsideError
+from service.exports import mesh_tiles, pictures
+from service.exports.mesh_tiles import Footprint, TileJob, TilePart, run_tiles, tile_boxes
+from service.stream.store import ScanStore
+
+if TYPE_CHECKING:
+    from conftest import HouseFlight
+
+
+def jobs(folder: Path, tiles: int = 2) -> list[TileJob]:
+    edges = [-np.inf, *np.linspace(0, 20, tiles + 1)[1:-1], np.inf]
+    return [
+        TileJob(str(folder), (west, -np.inf, east, np.inf), 0.3, "height", 60_000, 2048)
+        for west, east in pairwise(edges)
+    ]
+
+
+def same(a: list[TilePart], b: list[TilePart]) -> None:
+    assert len(a) == len(b)
+    for one, other in zip(a, b, strict=True):
+        np.testing.assert_array_equal(one.mesh.vertices_m, other.mesh.vertices_m)
+        np.testing.assert_array_equal(one.mesh.faces, other.mesh.faces)
+        np.testing.assert_array_equal(one.mesh.uv, other.mesh.uv)
+        np.testing.assert_array_equal(one.picture, other.picture)
+
+
+def test_boxes_cover_the_site_once_and_hold_no_more_than_asked() -> None:
+    prints = [
+        Footprint(n, 1000, 0.2, (10.0 * n, 5.0 * n, 10.0 * n + 30, 5.0 * n + 20)) for n in range(20)
+    ]
+    assert tile_boxes(prints, 100_000) == [mesh_tiles.EVERYWHERE]
+    boxes = tile_boxes(prints, 3000)
+    assert len(boxes) > 6
+    rng = np.random.default_rng(0)
+    for p in prints:
+        for x, y in rng.uniform(p.box[:2], p.box[2:], (50, 2)):
+            assert sum(w <= x < e and s <= y < n for w, s, e, n in boxes) == 1
+    for west, south, east, north in boxes:
+        held = 0.0
+        for p in prints:
+            over = max(0.0, min(p.box[2], east) - max(p.box[0], west))
+            over *= max(0.0, min(p.box[3], north) - max(p.box[1], south))
+            held += p.points * over / 600.0
+        assert held <= 3000.0 + 1e-6
+
+
+def test_tiles_together_are_the_whole(tmp_path: Path, house: HouseFlight) -> None:
+    house.flown(tmp_path).close()
+    (whole,) = run_tiles(jobs(tmp_path, 1), None, lambda _: None)
+    parts = run_tiles(jobs(tmp_path, 2), None, lambda _: None)
+    assert len(parts) == 2
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-15, 35, 60), np.linspace(-10, 10, 40)))
+    origins = np.column_stack([x, y, np.full(len(x), 100.0)])
+    down = np.tile([0.0, 0.0, -1.0], (len(x), 1))
+
+    def heights(part: TilePart) -> Any:
+        grid = triangle_grid.build(part.mesh.vertices_m, part.mesh.faces)
+        return 100.0 - grid.cast(origins, down)[0]
+
+    one, two = (heights(part) for part in parts)
+    assert (np.isfinite(one) ^ np.isfinite(two)).mean() > 0.99
+    together, alone = np.where(np.isfinite(one), one, two), heights(whole)
+    clear = np.abs(np.maximum(np.abs(x - 10) - 6.0, np.abs(y - 2) - 4.0)) > 1.0
+    assert np.nanmax(np.abs(together - alone)[clear]) < 0.1
+    assert (np.isfinite(together) == np.isfinite(alone)).mean() > 0.99
+
+
+@pytest.fixture
+def cluster() -> Iterator[Any]:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+    ) as one:
+        yield one
+
+
+def test_the_same_mesh_comes_from_a_cluster(
+    tmp_path: Path, house: HouseFlight, cluster: Any
+) -> None:
+    house.flown(tmp_path).close()
+    told: list[str] = []
+    here = run_tiles(jobs(tmp_path), None, lambda _: None)
+    there = run_tiles(jobs(tmp_path), cluster.scheduler_address, told.append)
+    assert [t for t in told if "came from the cluster" in t] == [
+        "tile 1 of 2 came from the cluster",
+        "tile 2 of 2 came from the cluster",
+    ]
+    same(here, there)
+
+
+def test_a_scheduler_that_goes_away_is_said_and_the_rest_made_here(
+    tmp_path: Path, house: HouseFlight, cluster: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    house.flown(tmp_path).close()
+    here = run_tiles(jobs(tmp_path), None, lambda _: None)
+    told: list[str] = []
+
+    def say(text: str) -> None:
+        told.append(text)
+        if text.startswith("tile 1"):
+            cluster.close()
+
+    same(here, run_tiles(jobs(tmp_path), cluster.scheduler_address, say))
+    assert len([t for t in told if "went away" in t]) == 1
+
+
+def test_a_scheduler_that_is_not_there_ends_in_one_line(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    house.flown(tmp_path).close()
+    monkeypatch.setattr(mesh_tiles, "CONNECT_S", 0.5)
+    with pytest.raises(OutsideError, match="no Dask scheduler answers"):
+        run_tiles(jobs(tmp_path), "tcp://127.0.0.1:9", lambda _: None)
+
+
+def test_the_command_cuts_a_large_site(tmp_path: Path, house: HouseFlight) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    house.flown(tmp_path).close()
+    done = CliRunner().invoke(app, ["mesh", str(tmp_path), "--tile-points", "30000", "--json"])
+    assert done.exit_code == 0, done.exception
+    figures = json.loads(done.stdout.splitlines()[-1])
+    assert figures["tiles"] > 1 and len(figures["texture_px"]) == figures["tiles"]
+    scene = trimesh.load(tmp_path / "mesh.glb")
+    assert len(scene.geometry) == figures["tiles"]
+    assert sum(len(g.faces) for g in scene.geometry.values()) == figures["faces"]
+
+
+class FakeVideo:
+    """Pictures twice as fine as the keyframes', one of them at each keyframe's second."""
+
+    def __init__(self, house: HouseFlight, size_px: tuple[int, int] = (320, 180)) -> None:
+        self.size_px, self.closed = size_px, False
+        self._house = house
+
+    def __iter__(self) -> Iterator[CameraFrame]:
+        for n in range(9):
+            big = cv2.resize(
+                self._house.keyframe(n // 2, 2.5 * n).bgr,
+                self.size_px,
+                interpolation=cv2.INTER_AREA,
+            )
+            yield CameraFrame(np.asarray(big, np.uint8), n * 500_000_000, n, None, f"frame {n}")
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_pictures_come_from_the_video_at_the_keyframes_times(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with house.flown(tmp_path) as store:
+        keyframes = list(store.keyframes())
+        K = np.array([[280.0, 0, 159.5], [0, 280.0, 89.5], [0, 0, 1]])
+        camera = {"K": K.ravel().tolist(), "distortion": [0.0] * 5, "width": 320, "height": 180}
+        header = replace(store.header, camera=camera)
+    video = FakeVideo(house)
+    monkeypatch.setattr(pictures, "open_camera", lambda _: video)
+    views = pictures.video_pictures(keyframes, header, tmp_path, None)
+    assert len(views) == 5 and video.closed
+    for view, keyframe in zip(views, keyframes, strict=True):
+        assert view.bgra.shape == (180, 320, 4) and (view.bgra[..., 3] == 255).all()
+        np.testing.assert_array_equal(view.T_world_camera, keyframe.depth.T_world_camera)
+        np.testing.assert_allclose(view.K, K)
+    late = pictures.video_pictures(keyframes, header, tmp_path, header.started_unix_ns + 3 * 10**9)
+    assert [v.bgra.shape[0] for v in late] == [90, 90, 90, 180, 180]  # the rest from the store
+    monkeypatch.setattr(pictures, "MOST_BYTES", 5 * 4 * 160 * 90)
+    small = pictures.video_pictures(keyframes, header, tmp_path, None)
+    assert {v.bgra.shape[:2] for v in small} == {(90, 160)}
+    np.testing.assert_allclose(small[0].K[0, 0], 140.0)
+    with pytest.raises(InputError, match="--video-epoch"):
+        pictures.video_pictures(keyframes, header, tmp_path, 0)
+    monkeypatch.setattr(pictures, "open_camera", lambda _: FakeVideo(house, (640, 360)))
+    with pytest.raises(InputError, match="640x360"):
+        pictures.video_pictures(keyframes, header, tmp_path, None)
+    with pytest.raises(InputError, match="no camera model"):
+        pictures.video_pictures(keyframes, replace(header, camera={}), tmp_path, None)
+
+
+def test_an_empty_scan_is_refused(tmp_path: Path) -> None:
+    from service.stream.records import ScanHeader
+
+    ScanStore.create(tmp_path / "scan.db", ScanHeader("x", "d", 0)).close()
+    failed = CliRunner().invoke(app, ["mesh", str(tmp_path)])
+    assert isinstance(failed.exception, InputError)

@@ -1,0 +1,246 @@
+"""Texturing against brute force, known exposures and the true pattern of the house's ground."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from recon import triangle_grid
+from recon.meshing import Mesh, cut, height_mesh
+from recon.raster import Grid, Raster
+from recon.texture_atlas import BORDER_PX, lay_out, pack
+from recon.texture_colour import fading, levels
+from recon.texture_labels import choose, energy, face_neighbours
+from recon.texture_views import CANDIDATES, Sightings, TextureView, consistent, look
+from recon.texturing import texture
+from recon.types import F64, U8, Array
+
+NADIR = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
+K = np.array([[200.0, 0.0, 159.5], [0.0, 200.0, 119.5], [0.0, 0.0, 1.0]])
+
+
+def sheet(step_m: float = 0.0, cells: int = 40, cell_m: float = 0.5) -> Mesh:
+    """A square about the origin; its eastern half stands ``step_m`` higher."""
+    height = np.zeros((cells, cells), np.float32)
+    height[:, cells // 2 :] = step_m
+    half = 0.5 * cells * cell_m
+    rgb = np.full((cells, cells, 3), 128, np.uint8)
+    raster = Raster(Grid(-half, half, cell_m, height.shape), height, height * 0 + 0.1, rgb)
+    mesh = height_mesh(raster)
+    return Mesh(mesh.vertices_m, mesh.faces, None, np.full((len(mesh.vertices_m), 3), 9, np.uint8))
+
+
+def pattern(x: Array, y: Array) -> Array:
+    """(..., 3) smooth RGB of the ground."""
+    waves = [np.sin(0.5 * x), np.cos(0.4 * y), np.sin(0.3 * (x + y))]
+    return 128.0 + 60.0 * np.stack(waves, axis=-1)
+
+
+def picture(eye: F64, gain: float = 1.0, offset: float = 0.0) -> TextureView:
+    """A nadir view of the pattern on level ground at height 0."""
+    v, u = np.mgrid[0:240, 0:320].astype(float)
+    x = eye[0] + (u - K[0, 2]) / K[0, 0] * eye[2]
+    y = eye[1] - (v - K[1, 2]) / K[1, 1] * eye[2]
+    bgr = np.clip(gain * pattern(x, y)[..., ::-1] + offset, 0, 255)
+    bgra: U8 = np.full((240, 320, 4), 255, np.uint8)
+    bgra[..., :3] = np.rint(bgr)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = NADIR, eye
+    return TextureView(bgra, K, T)
+
+
+def shown(textured: Mesh, atlas: U8) -> tuple[F64, F64]:
+    """Middles of the triangles and the atlas's colours there, by an own nearest look-up."""
+    assert textured.uv is not None
+    h, w = atlas.shape[:2]
+    uv = textured.uv[textured.faces].mean(axis=1)
+    at = np.clip((uv * [w, h]).astype(int), 0, [w - 1, h - 1])
+    return textured.vertices_m[textured.faces].mean(axis=1), atlas[at[:, 1], at[:, 0]].astype(float)
+
+
+def test_the_texture_shows_the_ground_where_it_is() -> None:
+    pytest.importorskip("open3d")
+    mesh = sheet()
+    views = [picture(np.array([x, y, 14.0])) for x in (-5.0, 5.0) for y in (-5.0, 5.0)]
+    done = texture(mesh, views)
+    assert done.seen_share > 0.99 and done.views_used == 4
+    middle, colour = shown(done.mesh, done.picture)
+    inner = np.abs(middle[:, :2]).max(axis=1) < 9.0
+    error = np.abs(colour - pattern(middle[:, 0], middle[:, 1]))[inner]
+    assert np.median(error) < 2.0
+    assert error.max() < 12.0
+    whole = np.linalg.norm(np.cross(*edges(mesh)), axis=1).sum()
+    assert np.linalg.norm(np.cross(*edges(done.mesh)), axis=1).sum() == pytest.approx(whole)
+
+
+def edges(mesh: Mesh) -> tuple[F64, F64]:
+    a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
+    return b - a, c - a
+
+
+def test_differently_exposed_views_leave_no_step_at_their_seam() -> None:
+    pytest.importorskip("open3d")
+    mesh = sheet()
+    views = [picture(np.array([-4.0, 0, 14.0])), picture(np.array([4.0, 0, 14.0]), 0.7, 12.0)]
+    done = texture(mesh, views)
+    middle, colour = shown(done.mesh, done.picture)
+    inner = np.abs(middle[:, :2]).max(axis=1) < 8.0
+    truth = pattern(middle[inner, 0], middle[inner, 1])
+    for channel in range(3):  # one gain and offset fit all of it: no step is left inside
+        line = np.polyfit(truth[:, channel], colour[inner, channel], 1)
+        assert np.abs(np.polyval(line, truth[:, channel]) - colour[inner, channel]).max() < 8.0
+
+
+def test_visibility_is_that_of_exact_rays() -> None:
+    pytest.importorskip("open3d")
+    mesh = sheet(step_m=10.0)
+    view = picture(np.array([6.0, 0.0, 30.0]))  # the step hides ground to its west
+    found = look(mesh, [view])
+    grid = triangle_grid.build(mesh.vertices_m, mesh.faces)
+    middle = mesh.vertices_m[mesh.faces].mean(axis=1)
+    eye = view.T_world_camera[:3, 3]
+    t, hit = grid.cast(eye, middle - eye)
+    seen = found.view[:, 0] == 0
+    assert 0.5 < seen.mean() < 0.95
+    assert (t[seen] > 0.97).all()
+    local = (middle - eye) @ NADIR
+    px = local[:, :2] / local[:, 2:] * 200.0 + K[:2, 2]
+    well_inside = (px > 12).all(axis=1) & (px < np.array([307, 227])).all(axis=1)
+    level = np.abs(np.cross(*edges(mesh))[:, 2]) > 0.2
+    missed = well_inside & level & (hit == np.arange(len(hit))) & ~seen
+    near_edge = np.abs(middle[:, 0] - 0.0) < 2.0
+    assert not (missed & ~near_edge).any()
+
+
+def test_resolution_falls_with_distance_and_slant() -> None:
+    pytest.importorskip("open3d")
+    found = look(sheet(), [picture(np.array([0.0, 0.0, h])) for h in (28.0, 14.0)])
+    row = int(np.argmin(np.abs(sheet().vertices_m[sheet().faces].mean(axis=1)).sum(axis=1)))
+    assert found.view[row, :2].tolist() == [1, 0]  # the nearer first
+    np.testing.assert_allclose(found.px_per_m[row, :2], [200 / 14, 200 / 28], rtol=0.02)
+
+
+def rows(view: list[list[int]], px: list[list[float]]) -> Sightings:
+    count = len(view)
+    out = Sightings(
+        np.full((count, CANDIDATES), -1, np.int32),
+        np.zeros((count, CANDIDATES), np.float32),
+        np.zeros((count, CANDIDATES, 3), np.float32),
+    )
+    for n in range(count):
+        out.view[n, : len(view[n])] = view[n]
+        out.px_per_m[n, : len(px[n])] = px[n]
+    return out
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_labels_reach_the_least_energy_found_by_trying_all(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    strip = np.array([[k, k + 1, k + 2] for k in range(8)], np.int32)
+    neighbours = face_neighbours(strip)
+    view, px = [], []
+    for _ in range(8):
+        order = rng.permutation(4)[:3]
+        view.append([int(v) for v in order])
+        px.append(sorted((float(p) for p in rng.uniform(3, 10, 3)), reverse=True))
+    found = rows(view, px)
+    slot = choose(found, neighbours)
+    least = min(
+        energy(found, neighbours, np.array(s, np.int32)) for s in product(range(3), repeat=8)
+    )
+    assert energy(found, neighbours, slot) == pytest.approx(least, abs=1e-5)
+
+
+def test_neighbours_share_an_edge() -> None:
+    mesh = sheet(cells=6)
+    neighbours = face_neighbours(mesh.faces)
+    for f, row in enumerate(neighbours):
+        for e, g in enumerate(row):
+            edge = {mesh.faces[f, e], mesh.faces[f, (e + 1) % 3]}
+            others = [h for h in range(len(mesh.faces)) if h != f and edge <= set(mesh.faces[h])]
+            assert others == ([g] if g >= 0 else [])
+
+
+def test_gains_and_offsets_are_found() -> None:
+    rng = np.random.default_rng(3)
+    count = 4000
+    true = rng.uniform(40, 200, (count, 3))
+    gain, offset = np.array([1.0, 0.8, 1.2]), np.array([0.0, 10.0, -8.0])
+    view = np.array([rng.permutation(3) for _ in range(count)])
+    found = rows(view.tolist(), [[3.0, 2.0, 1.0]] * count)
+    for k in range(3):
+        found.bgr[:, k] = true * gain[view[:, k], None] + offset[view[:, k], None]
+    found.bgr[:: count // 40, 0] += 60.0  # something moved
+    fixed = levels(found, 3)
+    grey = np.linspace(50, 180, 5)
+    seen = grey[None] * gain[:, None] + offset[:, None]
+    for channel in range(3):
+        flat = fixed[:, channel, :1] * seen + fixed[:, channel, 1:]
+        assert np.ptp(flat, axis=0).max() < 3.0
+    alone = levels(rows([[0], [1]], [[1.0], [1.0]]), 2)
+    np.testing.assert_array_equal(alone[..., 0], 1.0)
+
+
+def test_a_car_in_one_of_five_views_is_left_out() -> None:
+    found = rows([[0, 1, 2, 3, 4]], [[5.0, 4.0, 3.0, 2.0, 1.0]])
+    found.bgr[0, :5] = 100.0
+    found.bgr[0, 0] = 220.0
+    assert consistent(found).view[0].tolist() == [1, 2, 3, 4, -1, -1]
+
+
+def test_weights_fade_across_a_seam() -> None:
+    mesh = sheet(cells=30)
+    middle = mesh.vertices_m[mesh.faces].mean(axis=1)
+    label = np.where(middle[:, 0] < 0, 0, 1).astype(np.int32)
+    view, share = fading(mesh.faces, label, len(mesh.vertices_m), 2)
+    np.testing.assert_allclose(share.sum(axis=1), 1.0, atol=1e-5)
+    of_one = np.where(view == 1, share, 0).sum(axis=1)
+    x = mesh.vertices_m[:, 0]
+    means = [of_one[np.abs(x - at) < 0.01].mean() for at in np.unique(np.round(x, 3))]
+    assert means[0] == 0.0 and means[-1] == 1.0
+    assert (np.diff(means) >= -1e-6).all() and np.diff(means).max() < 0.35
+
+
+def test_charts_do_not_overlap_and_fit() -> None:
+    rng = np.random.default_rng(4)
+    size = rng.integers(3, 60, (300, 2))
+    place, (w, h) = pack(size)
+    used = np.zeros((h, w), int)
+    for (x, y), (dx, dy) in zip(place.astype(int), size, strict=True):
+        used[y : y + dy, x : x + dx] += 1
+    assert used.max() == 1
+    assert used.mean() > 0.7
+    mesh = sheet()
+    view = picture(np.array([0.0, 0.0, 14.0]))
+    label = np.where(np.arange(len(mesh.faces)) % 7 == 0, -1, 0).astype(np.int32)
+    layout = lay_out(mesh, [view], label, face_neighbours(mesh.faces), 128)
+    assert max(layout.size_px) <= 128 and layout.scale < 1.0
+    assert layout.uv_px.min() >= 0 and (layout.uv_px.max(axis=(0, 1)) <= layout.size_px).all()
+    assert BORDER_PX >= 1
+
+
+def test_what_no_view_sees_keeps_the_colours_of_the_vertices() -> None:
+    pytest.importorskip("open3d")
+    done = texture(sheet(cells=6), [])
+    assert done.seen_share == 0.0
+    assert (shown(done.mesh, done.picture)[1] == 9).all()
+    with pytest.raises(ValueError, match="colours at its vertices"):
+        texture(Mesh(sheet().vertices_m, sheet().faces), [])
+
+
+def test_cutting_divides_triangles_at_the_border() -> None:
+    mesh = sheet(step_m=3.0)
+    west = cut(mesh, (-np.inf, -np.inf, 1.3, np.inf))
+    east = cut(mesh, (1.3, -np.inf, np.inf, np.inf))
+    total = sum(0.5 * np.linalg.norm(np.cross(*edges(m)), axis=1).sum() for m in (west, east))
+    assert total == pytest.approx(0.5 * np.linalg.norm(np.cross(*edges(mesh)), axis=1).sum())
+    assert west.vertices_m[:, 0].max() == pytest.approx(1.3)
+    assert east.vertices_m[:, 0].min() == pytest.approx(1.3)
+    border = [m.vertices_m[np.abs(m.vertices_m[:, 0] - 1.3) < 1e-9] for m in (west, east)]
+    one, two = (b[np.argsort(b[:, 1])] for b in border)
+    np.testing.assert_allclose(one, two)
+    for part in (west, east):
+        assert (np.cross(*edges(part))[:, 2] > -1e-9).all() and part.rgb is not None
+    assert len(cut(mesh, (50.0, 50.0, 60.0, 60.0)).faces) == 0
