@@ -16,8 +16,10 @@ from service.cameras.source import CameraFrame
 class Recording:
     """Counts what was taken from it; breaks at ``fault_at``."""
 
-    description, size_px, epoch_unix_ns, start_monotonic_ns = "test", (4, 4), None, None
-    fps, is_live = 30.0, False
+    description, size_px, is_live = "test", (4, 4), False
+    epoch_unix_ns: int | None = None
+    start_monotonic_ns: int | None = None
+    fps: float | None = 30.0
 
     def __init__(self, count: int, fault_at: int | None = None) -> None:
         self.count, self.fault_at, self.taken = count, fault_at, 0
