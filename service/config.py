@@ -165,7 +165,9 @@ class DatalinkConfig:
     tls_ca: str = key("", "fleet's certificate authority (PEM), from 'skyrelief keys'")
     tls_certificate: str = key("", "this aircraft's certificate (PEM)")
     tls_key: str = key("", "this aircraft's private key (PEM)")
-    radio: str = key("", "MAVLink endpoint for the narrow fallback: udpout:127.0.0.1:14551")
+    radio: str = key(
+        "", "narrow fallback: 'mavlink' for our own links, or an endpoint: udpout:127.0.0.1:14551"
+    )
     radio_baud: int = key(57600, "speed of that telemetry radio")
     radio_share: float = key(0.3, "how much of it we may use")
     drain_s: float = key(20.0, "after a replay, wait so long for the ground to fetch the rest")

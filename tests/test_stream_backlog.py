@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import socket
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from mavlink.rehearsal import RehearsalControl
+from mavlink.vehicle import VehicleConfig, VehicleLink
 from service.config import Config
-from service.datalink import open_backlog
+from service.datalink import DaemonLink, open_backlog
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream.backlog import delivered, open_undelivered
+from service.stream.link import DatalinkSender
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.session import SessionConfig
 from service.stream.store import ScanStore
@@ -79,3 +83,58 @@ def test_the_backlog_reaches_the_ground_and_is_then_empty(
     assert open_backlog(config) is None
     with ScanStore.open(tmp_path / "ground" / "red" / "two" / "scan.db") as two:
         assert two.summary == {"interrupted": True} and len(list(two.poses())) == 5
+
+
+def test_the_daemon_offers_earlier_scans_between_flights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(receiver_module, "_deliver", lambda *_: None)
+    scans = tmp_path / "scans"
+    make_scan(scans, "one")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    base = Config()
+    config = dataclasses.replace(
+        base,
+        scan=dataclasses.replace(base.scan, folder=str(scans), drone="red"),
+        datalink=dataclasses.replace(base.datalink, connect=(endpoint,)),
+    )
+    session = SessionConfig(mode="router", listen=(endpoint,))
+    ground = Receiver(ReceiverConfig(tmp_path / "ground", session))
+    ground.start()
+    vehicle = VehicleLink(VehicleConfig(), RehearsalControl())
+    link = DaemonLink()
+
+    def complete(scan_id: str) -> bool:
+        deadline = time.monotonic() + 15
+        while time.monotonic() < deadline:
+            done = {e["scan"] for e in ground.progress() if e["complete"]}
+            if scan_id in done:
+                return True
+            time.sleep(0.05)
+        return False
+
+    try:
+        link.offer_backlog(config, lambda: False)
+        link.offer_backlog(config)
+        assert complete("one")
+        flown = ScanStore.create(scans / "two" / "scan.db", ScanHeader("two", "red", 1))
+        link.take_off(flown, config, vehicle)
+        assert link.flying is not None and link._backlog is None
+        changed = dataclasses.replace(config.datalink, budget_kbit_s=123.0, share=0.5)
+        link.follow(dataclasses.replace(config, datalink=changed))
+        assert isinstance(link.flying, DatalinkSender)
+        deadline = time.monotonic() + 10
+        while link.flying.progress.rate_kbit_s != 61.5 and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert link.flying.progress.rate_kbit_s == 61.5
+        flown.add_pose(PoseRecord(1, np.eye(4), np.eye(6)))
+        flown.finish({})
+        link.land(config)  # at once: the ground cannot have everything yet
+        flown.close()
+        link.offer_backlog(config)
+        assert complete("two")
+    finally:
+        link.rest()
+        ground.close()

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+import os
+import select
 import socket
 import time
+import tty
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +15,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mavlink.framing import Framer
+from mavlink.presence import Health
+from mavlink.rehearsal import RehearsalControl
+from mavlink.vehicle import VehicleConfig, VehicleLink
+from mavlink.wire import dialect
 from recon import se3
 from recon.types import DepthMap, Keyframe, Pose
+from service.config import Config, DatalinkConfig
+from service.datalink import OWN_LINKS, DaemonLink
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream import codec
-from service.stream.radio_link import GROUND, RadioLink, RadioSender
+from service.stream.link import DatalinkSender
+from service.stream.radio_link import GROUND, TUNNEL, EndpointCarrier, RadioLink, RadioSender
 from service.stream.radio_messages import (
     MAX_BYTES,
     Tile,
@@ -259,7 +271,8 @@ def test_over_a_real_link_into_the_ground_station(
     radio = RadioLink(f"udpin:127.0.0.1:{udp}", GROUND, ground.add_radio)
     radio.start()
     store = ScanStore.create(tmp_path / "a.db", HEADER)
-    sender = RadioSender(store, TunnelConfig(radio_bytes_s=50_000), f"udpout:127.0.0.1:{udp}")
+    carrier = EndpointCarrier(f"udpout:127.0.0.1:{udp}")
+    sender = RadioSender(store, TunnelConfig(radio_bytes_s=50_000), carrier)
     try:
         store.add_keyframe(0, codec.encode(keyframe(0, 0.0), 0))
         deadline = time.monotonic() + 15
@@ -278,6 +291,52 @@ def test_over_a_real_link_into_the_ground_station(
         (frame,) = kept.keyframes()
         assert np.isfinite(frame.depth.depth_m).mean() > 0.95
         assert kept.header.origin_lat_deg == 47.5
+
+
+def test_through_the_vehicles_own_serial_port_heeding_its_radio(tmp_path: Path) -> None:
+    """One serial port: our heartbeats, the tunnel and RADIO_STATUS share the vehicle's link."""
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    control = RehearsalControl()
+    vehicle = VehicleLink(VehicleConfig(links=(f"serial:{os.ttyname(theirs)}:57600",)), control)
+    store = ScanStore.create(tmp_path / "a.db", HEADER)
+    framer, intake, heartbeats = Framer(), TunnelIntake(), 0
+    found: list[tuple[ScanHeader, str, int, int, bytes]] = []
+    listener = dialect.MAVLink(None)
+    vehicle.start()
+    vehicle.set_health(Health.ACTIVE)
+    config = DatalinkConfig(radio=OWN_LINKS, radio_share=1.0)
+    link = DaemonLink()
+    try:
+        link.take_off(store, Config(datalink=config), vehicle)
+        store.add_keyframe(0, codec.encode(keyframe(0, 0.0), 0))
+        full = dialect.MAVLink_radio_status_message(200, 200, 3, 50, 50, 0, 0)
+        radio = dialect.MAVLink(None, 51, 68)
+        os.write(ours, bytes(full.pack(radio)))
+        deadline = time.monotonic() + 15
+        while len(found) < 16 and time.monotonic() < deadline:
+            if not select.select([ours], [], [], 0.2)[0]:
+                continue
+            for packet in framer.feed(os.read(ours, 4096)):
+                heartbeats += packet.message_id == 0
+                if packet.message_id == TUNNEL:
+                    message = listener.decode(bytearray(packet.data))
+                    payload = bytes(message.payload[: message.payload_length])
+                    found += [item for item in intake.receive(payload) if item[1] != "pose"]
+        sender = link.flying
+        assert isinstance(sender, DatalinkSender) and sender._radio is not None
+        assert sender._radio._tunnel._factor < 1.0  # the full buffer was heard
+    finally:
+        link.land(Config(datalink=dataclasses.replace(config, drain_s=0.0)))
+        vehicle.stop()
+        store.close()
+        os.close(ours)
+        os.close(theirs)
+    assert heartbeats >= 1
+    assert {kind for _, kind, *_ in found} == {"header", "tile"}
+    tiles = [unpack_tile(item[4]) for item in found if item[1] == "tile"]
+    again = keyframe_of([tile[1] for tile in tiles if tile is not None])
+    assert again is not None and np.isfinite(again.depth.depth_m).mean() > 0.9
 
 
 def test_tags_tell_scans_apart() -> None:

@@ -17,7 +17,7 @@ from service.errors import OutsideError, SkyreliefError
 from service.stream.lanes import Outgoing
 from service.stream.messages import Held, missing, unpack_ask, unpack_held
 from service.stream.outbox import Outbox
-from service.stream.radio_link import RadioSender
+from service.stream.radio_link import Carrier, EndpointCarrier, RadioSender
 from service.stream.ranges import ranges_from_text
 from service.stream.session import ROOT, SessionConfig, check_endpoints, check_name, open_session
 from service.stream.store import ScanStore
@@ -39,8 +39,8 @@ PATIENCE = 3.0
 """An attempt to open a session may take so many times what the last one took: a fresh call finds
 a link that is back sooner than one whose waits have grown."""
 PATIENT_ATTEMPT = 20
-CLOSING_S = 15.0
-"""Closing a session over a dead link takes Zenoh 10 s and more."""
+CLOSING_S, PROMPT_CLOSING_S = 15.0, 1.0
+"""Closing a session over a dead link takes Zenoh 10 s and more; only the process's end waits."""
 KEEP_HELD_S = 10.0
 """How often a ground station's report is written to the store while it lacks something."""
 
@@ -72,10 +72,16 @@ class DatalinkSender:
     All puts happen on a thread of its own. Without endpoints in ``config`` nothing is opened.
     Raises InputError when an endpoint or a name cannot be used; a ground station that is not
     there yet is waited for. Between flights ``store`` is None and ``drone`` says whose scans
-    :meth:`add` will bring.
+    :meth:`add` will bring. ``radio`` carries the narrow fallback in place of ``config.radio``.
     """
 
-    def __init__(self, store: ScanStore | None, config: DatalinkConfig, drone: str = "") -> None:
+    def __init__(
+        self,
+        store: ScanStore | None,
+        config: DatalinkConfig,
+        drone: str = "",
+        radio: Carrier | None = None,
+    ) -> None:
         self._config = config
         self._drone = check_name(drone if store is None else store.header.drone, "drone")
         self._session_config = SessionConfig(
@@ -97,7 +103,6 @@ class DatalinkSender:
         self._connected = False
         self._heard_at: float | None = None  # on the session that is open
         self._opening_s = FIRST_PATIENCE_S / PATIENCE  # what the last session took to open
-        self._closing: list[threading.Thread] = []
         self._queries: dict[int, Any] = {}
         self._thread: threading.Thread | None = None
         self._kept_at: dict[str, float] = {}
@@ -109,9 +114,11 @@ class DatalinkSender:
             self._thread.start()
         atexit.register(self.close)  # Zenoh aborts a process that ends around an open session
         self._radio = None
-        if config.radio and store is not None:
+        if store is not None and radio is None and config.radio:
+            radio = EndpointCarrier(config.radio)
+        if store is not None and radio is not None:
             tunnel = TunnelConfig(config.radio_baud / 10, config.radio_share)
-            self._radio = RadioSender(store, tunnel, config.radio, lambda: not self._listened())
+            self._radio = RadioSender(store, tunnel, radio, lambda: not self._listened())
 
     def _listened(self) -> bool:
         with self._lock:
@@ -197,8 +204,6 @@ class DatalinkSender:
         if self._thread is not None:
             self._thread.join(timeout=CLOSING_S)
             self._thread = None
-        for closing in self._closing:
-            closing.join(timeout=CLOSING_S)
         if self._radio is not None:
             self._radio.close()
             self._radio = None
@@ -243,17 +248,13 @@ class DatalinkSender:
 
     def _close_session(self, session: zenoh.Session) -> None:
         """Close it on a thread of its own: over a dead link that takes long."""
-
-        def close() -> None:
-            import zenoh
-
-            with contextlib.suppress(zenoh.ZError):
-                session.close()
-
         self._queries.clear()
-        self._closing = [thread for thread in self._closing if thread.is_alive()]
-        self._closing.append(threading.Thread(target=close, name="datalink closing", daemon=True))
-        self._closing[-1].start()
+        closing = threading.Thread(
+            target=_close, args=(session,), name="datalink closing", daemon=True
+        )
+        closing.start()
+        closing.join(PROMPT_CLOSING_S if self._stop.is_set() else 0.0)
+        atexit.register(closing.join, CLOSING_S)
 
     def _serve(self, session: zenoh.Session) -> None:
         """Send and answer until the stop, or until those who listened fall silent."""
@@ -353,6 +354,13 @@ class DatalinkSender:
                 self._end(int(str(ended)))
 
         self._post(asked)
+
+
+def _close(session: zenoh.Session) -> None:
+    import zenoh
+
+    with contextlib.suppress(zenoh.ZError):
+        session.close()
 
 
 def _rate(budget_kbit_s: float, share: float) -> float:

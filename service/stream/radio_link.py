@@ -7,7 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 from mavlink.framing import Decoder, Framer
 from mavlink.link import Link, parse_link
@@ -23,6 +23,22 @@ HEARTBEAT_S = 1.0
 TUNNEL, RADIO_STATUS = 385, 109
 DRONE = (1, 191)  # system and component: the onboard computer
 GROUND = (254, 190)
+
+
+class Carrier(Protocol):
+    """What takes tunnelled payloads to the ground."""
+
+    def open(self, on_status: Callable[[int], None]) -> None:
+        """Begin; ``on_status`` gets the free share of the radio's buffer in percent."""
+
+    def beat(self) -> None:
+        """Say that we are there; asked every second."""
+
+    def send(self, payload: bytes) -> None:
+        """Send a payload to everybody."""
+
+    def close(self) -> None:
+        """End."""
 
 
 class RadioLink:
@@ -85,6 +101,31 @@ class RadioLink:
                 self._on_payload(bytes(message.payload[: message.payload_length]))
 
 
+class EndpointCarrier:
+    """A radio on a MAVLink endpoint of our own; InputError for one that cannot be."""
+
+    def __init__(self, endpoint: str) -> None:
+        self._on_status: Callable[[int], None] = lambda _: None
+        self._link = RadioLink(endpoint, DRONE, lambda _: None, lambda free: self._on_status(free))
+
+    def open(self, on_status: Callable[[int], None]) -> None:
+        """Open the endpoint."""
+        self._on_status = on_status
+        self._link.start()
+
+    def beat(self) -> None:
+        """Send a heartbeat, so that routers on the way know the path."""
+        self._link.beat(dialect.MAV_TYPE_ONBOARD_CONTROLLER)
+
+    def send(self, payload: bytes) -> None:
+        """Send a payload to everybody."""
+        self._link.send(payload)
+
+    def close(self) -> None:
+        """Close the endpoint."""
+        self._link.close()
+
+
 class RadioSender:
     """Sends a scan's coarse tiles and poses over the radio while ``needed`` says so."""
 
@@ -92,7 +133,7 @@ class RadioSender:
         self,
         store: ScanStore,
         config: TunnelConfig,
-        endpoint: str,
+        carrier: Carrier,
         needed: Callable[[], bool] = lambda: True,
     ) -> None:
         try:
@@ -103,10 +144,10 @@ class RadioSender:
         self._store = store
         self._needed = needed
         self._stop = threading.Event()
-        self._link = RadioLink(endpoint, DRONE, lambda _: None, self._status)
+        self._carrier = carrier
         self._thread = threading.Thread(target=self._run, name="radio", daemon=True)
         store.listen(self._news)
-        self._link.start()
+        carrier.open(self._status)
         self._thread.start()
 
     @property
@@ -124,7 +165,7 @@ class RadioSender:
         self._stop.set()
         self._thread.join(5.0)
         self._store.unlisten(self._news)
-        self._link.close()
+        self._carrier.close()
 
     def _news(self, kind: str, number: int) -> None:
         self._events.append(lambda _: self._tunnel.news(kind, number))
@@ -139,10 +180,10 @@ class RadioSender:
             while self._events:
                 self._events.popleft()(now)
             if now >= beat_at:
-                self._link.beat(dialect.MAV_TYPE_ONBOARD_CONTROLLER)
+                self._carrier.beat()
                 beat_at = now + HEARTBEAT_S
             todo = self._tunnel.next(now) if self._needed() else 0.5
             if isinstance(todo, bytes):
-                self._link.send(todo)
+                self._carrier.send(todo)
             else:
                 self._stop.wait(min(todo, 0.1))
