@@ -14,12 +14,16 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from recon import se3
+from recon.camera_model import rays
 from recon.types import F32, F64, Bool, DepthMap
 
 I64 = npt.NDArray[np.int64]
 I32 = npt.NDArray[np.int32]
 
 EMPTY = np.int64(-1)
+TILE_BITS = 7
+"""Pages hold square columns of 2**7 voxels on a side."""
 _OFFSET = 1 << 20
 LARGEST_INDEX = _OFFSET - 1
 """Voxel indices reach this far from the origin on each axis; points beyond are left out."""
@@ -85,6 +89,44 @@ def rehash(old: I64, ids: I32, size: int) -> tuple[I64, I32]:
             keys[t] = old[s]
             out[t] = ids[s]
     return keys, out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Voxels:
+    """Voxels outside a map, as they are paged."""
+
+    keys: I64  # (N,)
+    sigma_m: F32  # (N,)
+    seen: I32  # (N,) turn of the last keyframe that saw it
+
+    def where(self, mask: Bool) -> Voxels:
+        """Those under ``mask`` (N,)."""
+        return Voxels(self.keys[mask], self.sigma_m[mask], self.seen[mask])
+
+
+def tile_of(keys: I64) -> I64:
+    """(N,) number of the square column of TILE x TILE voxels that each key (N,) lies in."""
+    i, j = keys >> 42, (keys >> 21) & ((1 << 21) - 1)
+    return np.asarray(((i >> TILE_BITS) << 21) | (j >> TILE_BITS))
+
+
+def tiles_under(depth: DepthMap, voxel_m: float, margin_m: float) -> I64:
+    """(T,) tiles that the surface of ``depth`` lies in, and those ``margin_m`` around it."""
+    h, w = depth.depth_m.shape
+    step = max(1, h // 24)
+    v, u = np.mgrid[0:h:step, 0:w:step]
+    z = depth.depth_m[::step, ::step].ravel().astype(np.float64)
+    known = np.isfinite(z)
+    if not known.any():
+        return np.zeros(0, np.int64)
+    uv = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)[known]
+    points = se3.transform(depth.T_world_camera, rays(depth.K, uv) * z[known, None])
+    low, high = points[:, :2].min(axis=0) - margin_m, points[:, :2].max(axis=0) + margin_m
+    reach = LARGEST_INDEX - 1
+    first = (np.floor(low / voxel_m).clip(-reach, reach).astype(np.int64) + _OFFSET) >> TILE_BITS
+    last = (np.floor(high / voxel_m).clip(-reach, reach).astype(np.int64) + _OFFSET) >> TILE_BITS
+    x, y = np.meshgrid(np.arange(first[0], last[0] + 1), np.arange(first[1], last[1] + 1))
+    return np.asarray(((x << 21) | y).ravel())
 
 
 class VoxelMap:
@@ -155,9 +197,9 @@ class VoxelMap:
         self._seen: I32 = np.zeros(slots // 2, np.int32)
         self._count = 0
 
-    def _make_room(self, more: int) -> None:
+    def _make_room(self, more: int, forget: bool = True) -> None:
         """Room for ``more`` voxels at a load of one half; forgets the oldest at the limit."""
-        if self._count > self.config.largest_voxels:
+        if forget and self._count > self.config.largest_voxels:
             self._forget_half()
         need = self._count + more
         slots = len(self._keys)
@@ -169,19 +211,51 @@ class VoxelMap:
         self._sigma = np.resize(self._sigma, slots // 2)
         self._seen = np.resize(self._seen, slots // 2)
 
+    def take(self, tiles: I64) -> Voxels:
+        """Remove all voxels of some tiles (:func:`tile_of`) and return them."""
+        held = self._held()
+        gone = np.isin(tile_of(held.keys), tiles)
+        self._refill(held.where(~gone))
+        return held.where(gone)
+
+    def put(self, voxels: Voxels) -> None:
+        """Add voxels taken before; where one is held already the smaller sigma stays."""
+        self._make_room(len(voxels.keys), forget=False)
+        self._count = int(
+            _put(
+                self._keys, self._ids, self._sigma, self._seen, self._count, voxels.keys,
+                voxels.sigma_m, voxels.seen,
+            )
+        )  # fmt: skip
+
+    def oldest_tiles(self) -> tuple[I64, I64]:
+        """(T,) tiles that hold voxels, those seen longest ago first, and (T,) how many."""
+        held = self._held()
+        tiles, index, counts = np.unique(
+            tile_of(held.keys), return_inverse=True, return_counts=True
+        )
+        newest = np.zeros(len(tiles), np.int32)
+        np.maximum.at(newest, index, held.seen)
+        order = np.argsort(newest, kind="stable")
+        return np.asarray(tiles[order]), np.asarray(counts[order], np.int64)
+
     def _forget_half(self) -> None:
-        turn = int(np.median(self._seen[: self._count]))
+        held = self._held()
+        self._refill(held.where(held.seen > int(np.median(held.seen))))
+
+    def _held(self) -> Voxels:
         at = np.flatnonzero(self._keys != EMPTY)
         ids = self._ids[at]
-        kept = self._seen[ids] > turn
-        keys, sigma, seen = self._keys[at][kept], self._sigma[ids][kept], self._seen[ids][kept]
-        slots = 1 << 16
-        while slots < 4 * len(keys):
+        return Voxels(self._keys[at], self._sigma[ids], self._seen[ids])
+
+    def _refill(self, voxels: Voxels) -> None:
+        count, slots = len(voxels.keys), 1 << 16
+        while slots < 4 * count:
             slots *= 2
         self._clear(slots)
-        self._count = len(keys)
-        self._sigma[: len(keys)], self._seen[: len(keys)] = sigma, seen
-        _place(self._keys, self._ids, keys)
+        self._count = count
+        self._sigma[:count], self._seen[:count] = voxels.sigma_m, voxels.seen
+        _place(self._keys, self._ids, voxels.keys)
 
 
 def _arrays(depth: DepthMap) -> tuple[F32, F32, F64, F64]:
@@ -201,6 +275,25 @@ def _place(keys: I64, ids: I32, new: I64) -> None:
         s = find_slot(keys, new[n])
         keys[s] = new[n]
         ids[s] = n
+
+
+@njit(cache=True, nogil=True)
+def _put(
+    keys: I64, ids: I32, held: F32, seen: I32, count: int, new: I64, sigma: F32, turn: I32
+) -> int:
+    """See VoxelMap.put; the new number of voxels."""
+    for n in range(new.shape[0]):
+        t = find_slot(keys, new[n])
+        if keys[t] == -1:
+            keys[t] = new[n]
+            ids[t] = count
+            held[count] = sigma[n]
+            seen[count] = turn[n]
+            count += 1
+            continue
+        held[ids[t]] = min(held[ids[t]], sigma[n])
+        seen[ids[t]] = max(seen[ids[t]], turn[n])
+    return count
 
 
 @njit(cache=True, nogil=True, fastmath=False)

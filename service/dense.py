@@ -6,6 +6,7 @@ import threading
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -41,6 +42,7 @@ from recon.virtual_stereo import (
 )
 from recon.voxel_map import VoxelMap, VoxelMapConfig
 from service.config import ComputeConfig, Config
+from service.map_pages import PagedMap
 from service.stopwatch import Stopwatch
 
 
@@ -64,7 +66,14 @@ class Dense:
     One thread at a time may reconstruct; others may read the trajectory under :attr:`lock`.
     """
 
-    def __init__(self, config: Config, backend: Backend, least_base_to_height: float) -> None:
+    def __init__(
+        self,
+        config: Config,
+        backend: Backend,
+        least_base_to_height: float,
+        pages: Path | None = None,
+    ) -> None:
+        """``pages`` is a folder for the parts of the map flown long ago; None: forget them."""
         compute = config.compute
         self.trajectory = Trajectory()
         self.lock = threading.Lock()
@@ -85,13 +94,16 @@ class Dense:
         self._keep_debug = config.scan.keep_debug
         self._bp = BeliefPropagationConfig(iterations=compute.iterations)
         self._jbu, self._icp, self._fusion = UpsamplingConfig(), IcpConfig(), FusionConfig()
-        self._map: VoxelMap | None = None
+        self._map: VoxelMap | PagedMap | None = None
+        self._pages = pages
         self._resolution_m = config.scan.resolution_m
         self._before: tuple[int, DepthMap | None, F64] | None = None  # seq, depth, T_map_camera
         self._relief = (0.0, 0.0)
 
     def forget_map(self) -> None:
         """Count every surface as new again."""
+        if isinstance(self._map, PagedMap):
+            self._map.close()
         self._map = None
 
     def set_least_base_to_height(self, least: float) -> None:
@@ -183,7 +195,9 @@ class Dense:
             if self._map is None:
                 ground_m = float(np.nanmedian(depth.depth_m)) / depth.K[0, 0]
                 voxel_m = max(2.0 * ground_m, self._resolution_m, 1e-3)
-                self._map = VoxelMap(VoxelMapConfig(voxel_m=voxel_m))
+                fine = VoxelMapConfig(voxel_m=voxel_m)
+                pages = self._pages
+                self._map = PagedMap(fine, pages) if pages is not None else VoxelMap(fine)
             fresh = self._map.fresh(in_map)
             self._map.insert(in_map, fresh)
         with self.lock:

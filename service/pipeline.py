@@ -9,6 +9,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import Counter, deque
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -62,9 +63,17 @@ class Pipeline:
     """
 
     def __init__(
-        self, camera: Camera, config: Config, backend: Backend, live: bool = False
+        self,
+        camera: Camera,
+        config: Config,
+        backend: Backend,
+        live: bool = False,
+        pages: Path | None = None,
     ) -> None:
-        """Raises ValueError for an unusable camera model."""
+        """Raises ValueError for an unusable camera model.
+
+        ``pages`` is a folder that the parts of the map flown long ago may go to.
+        """
         self.config = config
         self.rig = Rig(config.camera, config.scan, config.fusion)
         self.undistorter = Undistorter(_within_width(camera, int(1.3 * config.compute.guide_width)))
@@ -74,7 +83,7 @@ class Pipeline:
         )
         self._blur = BlurWatch()
         self.viewpoints = Viewpoints(config.scan, config.compute.pairs)
-        self.dense = Dense(config, backend, self.viewpoints.least_base_to_height)
+        self.dense = Dense(config, backend, self.viewpoints.least_base_to_height, pages)
         self.stopwatch = self.dense.stopwatch
         self.refusals: Counter[str] = Counter()
         self._jobs: SideBySide[Job, Keyframe | None] = SideBySide(
@@ -149,6 +158,7 @@ class Pipeline:
         self._ask_for_ready(everything=True)
         keyframes = self._collect(everything=True)
         self._jobs.close()
+        self.dense.forget_map()
         tracked = Tracked("lost", self.odometry.segment, reason="end of the recording")
         return Step(tracked, PosePrior(), keyframes=keyframes, moved=self._moved(final=True))
 

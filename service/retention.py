@@ -13,6 +13,9 @@ log = logging.getLogger(__name__)
 
 MIB = 2**20
 
+PAGES = "map-pages"
+"""Folder of the map inside a scan's folder; gone when the scan is closed."""
+
 
 def close_open_scans(folder: Path, before_unix_s: float) -> list[str]:
     """Finish the scans in ``folder`` that a crash or a power cut left open; their names.
@@ -32,6 +35,7 @@ def close_open_scans(folder: Path, before_unix_s: float) -> list[str]:
             with ScanStore.open(path) as store:
                 if store.finished:
                     continue
+                shutil.rmtree(path.parent / PAGES, ignore_errors=True)
                 store.finish({"interrupted": True})
                 write_deliverables(path.parent, store, {})
         except (SkyreliefError, ValueError, OSError, sqlite3.Error) as error:

@@ -20,6 +20,7 @@ from service.config import Config
 from service.errors import InputError
 from service.pipeline import Pipeline, Step
 from service.recorder import Recorder
+from service.retention import PAGES
 from service.rig import ASSUMED_AGL_M
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
@@ -99,7 +100,11 @@ class Scan:
         self.inputs, self.store, self.source = inputs, store, inputs.source
         self.epoch_ns = inputs.epoch_ns
         self.pipeline = Pipeline(
-            inputs.camera, inputs.config, inputs.backend, live=inputs.source.is_live
+            inputs.camera,
+            inputs.config,
+            inputs.backend,
+            live=inputs.source.is_live,
+            pages=inputs.folder / PAGES,
         )
         self.recorder = Recorder(store, self.pipeline, inputs.unix_offset_ns)
         self.check = TelemetryCheck(

@@ -53,5 +53,5 @@ def test_no_more_than_a_few_are_decoded_ahead_and_a_stop_ends_the_thread() -> No
     assert next(frames).seq == 0
     time.sleep(0.2)
     assert recording.taken <= 1 + 3 + 1
-    frames.close()  # type: ignore[attr-defined]
+    frames.close()
     assert not any(t.name == "decoder" for t in threading.enumerate())

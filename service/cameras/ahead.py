@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from queue import Full, Queue
 from threading import Event, Thread
 
@@ -12,7 +12,7 @@ _LOOK_S = 0.1
 """How often a full reader looks whether it is still wanted."""
 
 
-def ahead(source: CameraSource, kept: int = 4) -> Iterator[CameraFrame]:
+def ahead(source: CameraSource, kept: int = 4) -> Generator[CameraFrame, None, None]:
     """Every picture of ``source`` in order, at most ``kept`` of them decoded in advance.
 
     Raises what the source raises. A reader whose pictures are no longer fetched ends soon;

@@ -1,0 +1,88 @@
+"""A map whose old parts are on disk answers like one that has all of it in memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.types import F64, DepthMap
+from recon.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
+from service.map_pages import PagedMap
+
+K: F64 = np.array([[60.0, 0.0, 39.5], [0.0, 60.0, 29.5], [0.0, 0.0, 1.0]])
+NADIR: F64 = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
+CONFIG = VoxelMapConfig(voxel_m=0.5)
+
+
+def view(east_m: float, north_m: float = 0.0, sigma_m: float = 0.2) -> DepthMap:
+    """A nadir camera 30 m over hilly ground."""
+    h, w = 60, 80
+    u = np.meshgrid(np.arange(w), np.arange(h))[0]
+    east = east_m + (u - K[0, 2]) / K[0, 0] * 30.0
+    depth = (30.0 - 2.0 * np.sin(east / 7.0)).astype(np.float32)
+    T = se3.compose(NADIR, np.array([east_m, north_m, 30.0]))
+    sigma = np.full((h, w), sigma_m, np.float32)
+    return DepthMap(depth, sigma, np.ones((h, w), np.uint8), K, T)
+
+
+def survey() -> list[DepthMap]:
+    """Out along one line, back along the next, then over the start with better sigma."""
+    out = [view(12.0 * i) for i in range(40)]
+    back = [view(12.0 * i, 20.0) for i in reversed(range(40))]
+    return [*out, *back, view(0.0, sigma_m=0.05), view(24.0, 5.0)]
+
+
+def test_pages_change_no_answer(tmp_path: Path) -> None:
+    whole, paged = VoxelMap(CONFIG), PagedMap(CONFIG, tmp_path / "pages", most_voxels=20_000)
+    most_on_disk = largest = 0
+    for depth in survey():
+        expected = whole.fresh(depth)
+        np.testing.assert_array_equal(paged.fresh(depth), expected)
+        assert paged.insert(depth, expected) == whole.insert(depth, expected)
+        most_on_disk = max(most_on_disk, paged.tiles_on_disk)
+        largest = max(largest, len(paged))
+    assert len(whole) > 60_000 and most_on_disk > 5
+    assert largest < 20_000 + 2 * depth.depth_m.size
+    paged.close()
+    assert not (tmp_path / "pages").exists()
+
+
+def test_a_damaged_page_makes_its_ground_new_and_nothing_else(tmp_path: Path) -> None:
+    paged = PagedMap(CONFIG, tmp_path, most_voxels=20_000)
+    for depth in survey()[:40]:
+        paged.insert(depth)
+    assert paged.tiles_on_disk > 0
+    for page in tmp_path.glob("*.npz"):
+        page.write_bytes(b"\x00garbage")
+    assert paged.fresh(view(0.0)).mean() > 0.95
+    assert paged.fresh(view(12.0 * 39)).mean() < 0.05
+
+
+def test_a_disk_that_takes_no_pages_keeps_the_map_in_memory(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    paged = PagedMap(CONFIG, blocked / "pages", most_voxels=20_000)
+    for depth in survey()[:40]:
+        paged.insert(depth)
+    assert paged.tiles_on_disk == 0 and not paged.fresh(view(0.0)).any()
+
+
+def test_tiles_under_a_view_hold_all_of_its_voxels() -> None:
+    depth = view(-40.0, 13.0)
+    voxel_map = VoxelMap(CONFIG)
+    voxel_map.insert(depth)
+    tiles, counts = voxel_map.oldest_tiles()
+    assert set(tiles.tolist()) <= set(tiles_under(depth, 0.5, 1.0).tolist())
+    assert counts.sum() == len(voxel_map)
+    blind = DepthMap(
+        np.full((4, 4), np.nan, np.float32), depth.sigma_m, depth.views, K, depth.T_world_camera
+    )
+    assert len(tiles_under(blind, 0.5, 1.0)) == 0
+
+
+def test_nonsense_limits_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="most_voxels"):
+        PagedMap(CONFIG, tmp_path, most_voxels=10)
