@@ -14,7 +14,8 @@ from service.config import DatalinkConfig
 from service.errors import InputError, OutsideError
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
-from service.stream.keys import access_control, load_fleet, make_keys, tls_files
+from service.stream.fleet import access_control, load_fleet
+from service.stream.keys import make_keys, tls_files
 from service.stream.link import DatalinkSender
 from service.stream.records import ScanHeader
 from service.stream.session import SessionConfig, open_session

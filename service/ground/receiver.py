@@ -24,9 +24,10 @@ from typing import TYPE_CHECKING, Any
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.ground.intake import FINE, SILENCE_S, SMALL, ScanIntake
 from service.stream.messages import count, pack_ask, pack_held, unpack_head
+from service.stream.naming import NAME, ROOT
 from service.stream.radio_messages import RADIO_NOTE
 from service.stream.records import ScanHeader
-from service.stream.session import NAME, ROOT, SessionConfig, check_endpoints, open_session
+from service.stream.session import SessionConfig, check_endpoints, open_session
 from service.stream.store import ScanStore
 from service.stream.tunnel import TunnelIntake
 

@@ -2,7 +2,7 @@
 
 A certificate's common name is ``<role>.<name>``. Only ground stations may be called (server
 use), so a drone's stolen key cannot pose as a ground station. ``fleet.json`` in a ground
-station's folder names the members; from it come the rights that its router enforces.
+station's folder names the members (:mod:`service.stream.fleet`).
 """
 
 from __future__ import annotations
@@ -11,32 +11,19 @@ import datetime
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from service.errors import InputError, OutsideError
-from service.stream.session import ROOT, check_name
+from service.stream.fleet import FLEET, Fleet, load_fleet
+from service.stream.naming import check_name
 
 if TYPE_CHECKING:
     from cryptography import x509
     from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 
-CA, CERTIFICATE, KEY, FLEET = "ca.pem", "certificate.pem", "key.pem", "fleet.json"
-ROLES = ("drone", "ground", "viewer")
+CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
 CA_DAYS = 3650
-
-
-@dataclass(frozen=True, slots=True)
-class Fleet:
-    """The members of a fleet by role."""
-
-    members: dict[str, tuple[str, ...]] = field(default_factory=dict)
-
-    def with_members(self, role: str, names: Sequence[str]) -> Fleet:
-        """The fleet with more members of a role."""
-        merged = tuple(sorted({*self.members.get(role, ()), *names}))
-        return Fleet({**self.members, role: merged})
 
 
 def tls_files(folder: Path) -> tuple[str, str, str]:
@@ -46,74 +33,6 @@ def tls_files(folder: Path) -> tuple[str, str, str]:
         if not path.is_file():
             raise InputError(f"{path} does not exist; make it with 'skyrelief keys'")
     return str(paths[0]), str(paths[1]), str(paths[2])
-
-
-def load_fleet(path: Path) -> Fleet:
-    """The fleet that a ``fleet.json`` names; raises InputError when there is none."""
-    try:
-        raw = json.loads(path.read_text(encoding="utf-8"))
-        members = {role: tuple(map(str, raw[role])) for role in ROLES if role in raw}
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise InputError(f"{path} names no fleet; make it with 'skyrelief keys'") from error
-    for names in members.values():
-        for name in names:
-            check_name(name, "fleet member")
-    return Fleet(members)
-
-
-def access_control(fleet: Fleet) -> dict[str, Any]:
-    """Zenoh's access control for a ground station's router.
-
-    A drone reaches only what lies under its own key. A viewer only reads. A ground station
-    reads, asks and reports. Whoever is not of the fleet may do nothing.
-    """
-    rules: list[dict[str, Any]] = []
-    subjects: list[dict[str, Any]] = []
-    policies: list[dict[str, Any]] = []
-
-    def grant(role: str, name: str, *rights: tuple[str, Sequence[str], str]) -> None:
-        subject = f"{role}.{name}"
-        subjects.append({"id": subject, "cert_common_names": [subject]})
-        ids = []
-        for k, (flow, messages, key) in enumerate(rights):
-            ids.append(f"{subject}.{k}")
-            rules.append(
-                {
-                    "id": ids[-1],
-                    "permission": "allow",
-                    "flows": [flow],
-                    "messages": list(messages),
-                    "key_exprs": [key],
-                }
-            )
-        policies.append({"rules": ids, "subjects": [subject]})
-
-    everything = ("put", "query", "reply", "declare_subscriber", "declare_queryable")
-    for name in fleet.members.get("drone", ()):
-        own = f"{ROOT}/{name}/**"
-        grant("drone", name, ("ingress", everything, own), ("egress", everything, own))
-    for name in fleet.members.get("viewer", ()):
-        grant(
-            "viewer",
-            name,
-            ("ingress", ("declare_subscriber",), f"{ROOT}/**"),
-            ("egress", ("put",), f"{ROOT}/**"),
-        )
-    for name in fleet.members.get("ground", ()):
-        grant(
-            "ground",
-            name,
-            ("ingress", ("put",), f"{ROOT}/*/*/held/*"),
-            ("ingress", ("declare_subscriber", "query"), f"{ROOT}/**"),
-            ("egress", everything, f"{ROOT}/**"),
-        )
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
-    }
 
 
 def make_keys(

@@ -16,10 +16,11 @@ from service.config import DatalinkConfig
 from service.errors import OutsideError, SkyreliefError
 from service.stream.lanes import Outgoing
 from service.stream.messages import Held, missing, unpack_ask, unpack_held
+from service.stream.naming import ROOT, check_name
 from service.stream.outbox import Outbox
 from service.stream.radio_link import Carrier, EndpointCarrier, RadioSender
 from service.stream.ranges import ranges_from_text
-from service.stream.session import ROOT, SessionConfig, check_endpoints, check_name, open_session
+from service.stream.session import SessionConfig, check_endpoints, open_session
 from service.stream.store import ScanStore
 from service.stream.tunnel import TunnelConfig
 

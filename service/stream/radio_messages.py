@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from recon import se3
 from recon.types import F32, F64, U8, Bool
+from service.stream.naming import NAME
 from service.stream.records import PoseRecord, ScanHeader, source_bits, sources_of
-from service.stream.session import NAME
 
 U16 = npt.NDArray[np.uint16]
 

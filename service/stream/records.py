@@ -11,14 +11,14 @@ import math
 import struct
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import msgspec
 import numpy as np
 
 from recon import se3
-from recon.types import F64
+from recon.types import F64, DepthMap, Keyframe, Pose
 
 MAX_HEADER_BYTES = 262_144
 """A scan header larger than this is refused."""
@@ -91,10 +91,17 @@ class Repose:
     scale: float  # the keyframe's depth and sigma are multiplied by this
     covariance: F64  # (6, 6) left perturbation in the world frame: rotation rad, translation m
 
+    def applied_to(self, keyframe: Keyframe) -> Keyframe:
+        """The keyframe at this pose, its depth and sigma scaled."""
+        depth, scale = keyframe.depth, np.float32(self.scale)
+        T = self.T_world_camera
+        return replace(
+            keyframe,
+            depth=DepthMap(depth.depth_m * scale, depth.sigma_m * scale, depth.views, depth.K, T),
+            pose=Pose(T, self.covariance, keyframe.pose.sources),
+        )
 
-_POSE = struct.Struct("<2sBBqi3d4d21f3d8f")
-_REPOSE = struct.Struct("<2sBBII3d4d21ff")
-_CRC = struct.Struct("<I")
+
 _UPPER = np.triu_indices(6)
 
 
@@ -137,16 +144,42 @@ def unpack_motion(seven: Sequence[float] | F64) -> F64 | None:
     return se3.compose(se3.rotation_from_quaternion(v[3:]), v[:3])
 
 
-def _seal(body: bytes) -> bytes:
-    return body + _CRC.pack(zlib.crc32(body))
+class _Placed:
+    """A record that begins with fields of its own, places a camera, and ends with more fields.
+
+    Magic, version 1, the first fields, position and quaternion (7 f64), covariance (21 f32),
+    the last fields, CRC-32.
+    """
+
+    def __init__(self, magic: bytes, first: str, last: str) -> None:
+        self._start = magic + b"\x01"
+        self._layout = struct.Struct(f"<3s{first}7d21f{last}")
+        self._at = 1 + len(first)  # each is one letter
+
+    def pack(self, first: Sequence[Any], T: F64, covariance: F64, last: Sequence[Any]) -> bytes:
+        """The record."""
+        placed = (*pack_motion(T), *pack_covariance(covariance))
+        body = self._layout.pack(self._start, *first, *placed, *last)
+        return body + _CRC.pack(zlib.crc32(body))
+
+    def unpack(self, data: bytes) -> tuple[tuple[Any, ...], F64, F64, tuple[Any, ...]] | None:
+        """First fields, motion, covariance, last fields; None for anything else."""
+        size = self._layout.size
+        if len(data) != size + _CRC.size or data[:3] != self._start:
+            return None
+        if zlib.crc32(data[:size]) != _CRC.unpack_from(data, size)[0]:
+            return None
+        fields, at = self._layout.unpack_from(data), self._at
+        motion = unpack_motion(fields[at : at + 7])
+        if motion is None:
+            return None
+        covariance = unpack_covariance(fields[at + 7 : at + 28])
+        return fields[1:at], motion, covariance, fields[at + 28 :]
 
 
-def _unseal(data: bytes, layout: struct.Struct, magic: bytes) -> tuple[Any, ...] | None:
-    if len(data) != layout.size + _CRC.size or data[:3] != magic + b"\x01":
-        return None
-    if zlib.crc32(data[: layout.size]) != _CRC.unpack_from(data, layout.size)[0]:
-        return None
-    return layout.unpack_from(data)
+_CRC = struct.Struct("<I")
+_POSE = _Placed(b"SP", first="Bqi", last="3d8f")
+_REPOSE = _Placed(b"SR", first="BII", last="f")
 
 
 def _or_nan(value: float | None) -> float:
@@ -160,42 +193,35 @@ def _or_none(value: float) -> float | None:
 def pack_pose(pose: PoseRecord) -> bytes:
     """``pose`` as it travels and as it is stored."""
     seq = -1 if pose.keyframe_seq is None else pose.keyframe_seq
-    body = _POSE.pack(
-        b"SP",
-        1,
-        source_bits(pose.sources),
-        pose.time_unix_ns,
-        seq,
-        *pack_motion(pose.T_world_camera),
-        *pack_covariance(pose.covariance),
-        _or_nan(pose.lat_deg),
-        _or_nan(pose.lon_deg),
-        _or_nan(pose.alt_amsl_m),
-        _or_nan(pose.agl_m),
-        pose.roll_rad,
-        pose.pitch_rad,
-        pose.yaw_rad,
-        pose.speed_m_s,
-        pose.distance_m,
-        pose.turn_rate_rad_s,
-        pose.sigma_m,
+    place = (pose.lat_deg, pose.lon_deg, pose.alt_amsl_m, pose.agl_m)
+    return _POSE.pack(
+        (source_bits(pose.sources), pose.time_unix_ns, seq),
+        pose.T_world_camera,
+        pose.covariance,
+        (
+            *map(_or_nan, place),
+            pose.roll_rad,
+            pose.pitch_rad,
+            pose.yaw_rad,
+            pose.speed_m_s,
+            pose.distance_m,
+            pose.turn_rate_rad_s,
+            pose.sigma_m,
+        ),
     )
-    return _seal(body)
 
 
 def unpack_pose(data: bytes) -> PoseRecord | None:
     """The pose in ``data``, or None when it is not a valid pose record."""
-    fields = _unseal(data, _POSE, b"SP")
-    if fields is None:
+    found = _POSE.unpack(data)
+    if found is None:
         return None
-    motion = unpack_motion(fields[5:12])
-    if motion is None:
-        return None
-    lat, lon, alt, agl, roll, pitch, yaw, speed, distance, turn, sigma = fields[33:44]
+    (bits, time_unix_ns, seq), motion, covariance, last = found
+    lat, lon, alt, agl, roll, pitch, yaw, speed, distance, turn, sigma = last
     return PoseRecord(
-        time_unix_ns=fields[3],
+        time_unix_ns=time_unix_ns,
         T_world_camera=motion,
-        covariance=unpack_covariance(fields[12:33]),
+        covariance=covariance,
         lat_deg=_or_none(lat),
         lon_deg=_or_none(lon),
         alt_amsl_m=_or_none(alt),
@@ -206,34 +232,23 @@ def unpack_pose(data: bytes) -> PoseRecord | None:
         speed_m_s=speed,
         distance_m=distance,
         turn_rate_rad_s=turn,
-        sources=sources_of(fields[2]),
+        sources=sources_of(bits),
         sigma_m=sigma,
-        keyframe_seq=None if fields[4] < 0 else fields[4],
+        keyframe_seq=None if seq < 0 else seq,
     )
 
 
 def pack_repose(repose: Repose) -> bytes:
     """``repose`` as it travels and as it is stored."""
-    body = _REPOSE.pack(
-        b"SR",
-        1,
-        0,
-        repose.seq,
-        repose.revision,
-        *pack_motion(repose.T_world_camera),
-        *pack_covariance(repose.covariance),
-        repose.scale,
+    return _REPOSE.pack(
+        (0, repose.seq, repose.revision), repose.T_world_camera, repose.covariance, (repose.scale,)
     )
-    return _seal(body)
 
 
 def unpack_repose(data: bytes) -> Repose | None:
     """The re-pose in ``data``, or None when it is not a valid record."""
-    fields = _unseal(data, _REPOSE, b"SR")
-    if fields is None:
+    found = _REPOSE.unpack(data)
+    if found is None:
         return None
-    motion = unpack_motion(fields[5:12])
-    scale = fields[33]
-    if motion is None or not 1e-6 < scale < 1e6:
-        return None
-    return Repose(fields[3], fields[4], motion, scale, unpack_covariance(fields[12:33]))
+    (_, seq, revision), motion, covariance, (scale,) = found
+    return Repose(seq, revision, motion, scale, covariance) if 1e-6 < scale < 1e6 else None

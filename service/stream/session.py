@@ -9,15 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.errors import InputError, OutsideError
+from service.stream.fleet import FLEET, access_control, load_fleet
 
 if TYPE_CHECKING:
     import zenoh
-
-ROOT = "skyrelief"
-"""Keys are ``skyrelief/<drone>/<scan>/<topic>``."""
-
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-"""What a drone, scan or station may be called."""
 
 ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws)/(\[[0-9A-Fa-f:.%]+\]|[^/:#?\s]+):(\d{1,5})([#?].*)?")
 _ENCRYPTED = ("tls", "quic")
@@ -41,16 +36,6 @@ class SessionConfig:
     tls_key: str = ""
     fleet_rights: bool = False  # enforce, as a router, what fleet.json beside tls_key allows
     open_timeout_s: float = 10.0  # of one attempt to reach the other end
-
-
-def check_name(name: str, what: str) -> str:
-    """``name`` if it may be part of a key; raises InputError when not."""
-    if not NAME.fullmatch(name):
-        raise InputError(
-            f"{what} {name!r} cannot travel on the datalink; "
-            "use at most 64 letters, digits, dots, dashes and underscores"
-        )
-    return name
 
 
 def check_endpoints(config: SessionConfig) -> None:
@@ -134,8 +119,6 @@ def zenoh_config(config: SessionConfig) -> zenoh.Config:
             "transport/link/tls/verify_name_on_connect": False,
         }
     if config.fleet_rights:
-        from service.stream.keys import FLEET, access_control, load_fleet
-
         settings["access_control"] = access_control(load_fleet(Path(config.tls_key).parent / FLEET))
     out: zenoh.Config = zenoh.Config()
     for key, value in settings.items():

@@ -16,16 +16,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from recon.types import DepthMap, Keyframe, Pose
+from recon.types import Keyframe
 from service.errors import InputError
 from service.stream import codec, layer
 from service.stream.database import SCHEMA, SCHEMA_VERSION, Database
 from service.stream.inventory import Inventory, Listener
-from service.stream.radio_messages import unpack_pose as unpack_radio_pose
-from service.stream.radio_messages import unpack_tile
-from service.stream.radio_tiles import keyframe_of
+from service.stream.radio_store import RadioStore
 from service.stream.ranges import RangeSet
 from service.stream.records import (
     PoseRecord,
@@ -60,6 +56,7 @@ class ScanStore:
         total = self._db.one("SELECT TOTAL(LENGTH(data)) FROM chunks")
         self.chunk_bytes = int(total[0]) if total else 0
         self._inventory = Inventory(self._db)
+        self._radio = RadioStore(self._db)
 
     @classmethod
     def create(
@@ -188,11 +185,11 @@ class ScanStore:
         for (data,) in self._db.all(sql, (seq,)):
             decoded = codec.decode([bytes(data)])
             if decoded is not None:
-                return _reposed(decoded, self.repose(seq))
-        sql = "SELECT data FROM radio WHERE kind = 'tile' AND number = ? ORDER BY part"
-        tiles = [unpack_tile(bytes(row[0])) for row in self._db.all(sql, (seq,))]
-        decoded = keyframe_of([tile[1] for tile in tiles if tile is not None])
-        return None if decoded is None else _reposed(decoded, self.repose(seq))
+                break
+        else:
+            decoded = self._radio.keyframe(seq)
+        repose = self.repose(seq)
+        return decoded if decoded is None or repose is None else repose.applied_to(decoded)
 
     def keyframes(self) -> Iterator[Keyframe]:
         """All keyframes in order of their number, as :meth:`keyframe` gives them."""
@@ -203,8 +200,8 @@ class ScanStore:
 
     def seqs(self) -> list[int]:
         """Numbers of the keyframes of which any layer is stored."""
-        sql = "SELECT seq FROM chunks UNION SELECT number FROM radio WHERE kind = 'tile' ORDER BY 1"
-        return [row[0] for row in self._db.all(sql)]
+        stored = {row[0] for row in self._db.all("SELECT DISTINCT seq FROM chunks")}
+        return sorted(stored | self._radio.seqs())
 
     @property
     def next_seq(self) -> int:
@@ -244,11 +241,7 @@ class ScanStore:
             if pose is not None:
                 yield pose
         if not self._inventory.of("pose"):
-            sql = "SELECT data FROM radio WHERE kind = 'pose' ORDER BY number"
-            for (data,) in self._db.all(sql):
-                found = unpack_radio_pose(bytes(data))
-                if found is not None:
-                    yield found[2]
+            yield from self._radio.poses()
 
     def add_repose(self, repose: Repose) -> int:
         """Store a re-pose under the next number, which is returned."""
@@ -289,13 +282,7 @@ class ScanStore:
     def add_radio(self, kind: str, number: int, part: int, data: bytes) -> bool:
         """Store a message of the narrow radio ("tile" or "pose"), the newest of its number;
         False if it is no news."""
-        with self._lock:
-            sql = "SELECT 1 FROM radio WHERE kind = ? AND number = ? AND part = ? AND data = ?"
-            if self._db.one(sql, (kind, number, part, data)) is not None:
-                return False
-            row = (kind, number, part, data)
-            self._db.write([("INSERT OR REPLACE INTO radio VALUES (?, ?, ?, ?)", row)])
-            return True
+        return self._radio.add(kind, number, part, data)
 
     # What the link asks
 
@@ -407,22 +394,3 @@ def _is_object(data: bytes) -> bool:
         return isinstance(json.loads(data), dict)
     except (ValueError, RecursionError):
         return False
-
-
-def _reposed(keyframe: Keyframe, repose: Repose | None) -> Keyframe:
-    """``keyframe`` at the pose, scale and covariance of ``repose``."""
-    if repose is None:
-        return keyframe
-    scale = np.float32(repose.scale)
-    depth = keyframe.depth
-    return replace(
-        keyframe,
-        depth=DepthMap(
-            depth.depth_m * scale,
-            depth.sigma_m * scale,
-            depth.views,
-            depth.K,
-            repose.T_world_camera,
-        ),
-        pose=Pose(repose.T_world_camera, repose.covariance, keyframe.pose.sources),
-    )
