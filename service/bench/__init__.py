@@ -27,6 +27,7 @@ BENCHMARKS: dict[str, str] = {
     "icp": "service.bench.icp:run",
     "map": "service.bench.map:run",
     "pipeline": "service.bench.pipeline:run",
+    "memory": "service.bench.memory:run",
     "mavlink": "service.bench.mavlink:run",
     "codec": "service.bench.codec:run",
     "link": "service.bench.link:run",

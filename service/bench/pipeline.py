@@ -116,11 +116,11 @@ def _path(video: Path, folder: Path, upsample: bool, sgbm: bool) -> dict[str, fl
     return {
         "clouds": summary["clouds"] / elapsed,
         "fps": summary["frames"] / elapsed,
-        "rss_mib": _resident_mib(),
+        "rss_mib": resident_mib(),
     }
 
 
-def _resident_mib() -> float:
+def resident_mib() -> float:
     """Resident memory of this process now; NaN where the system does not tell."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])

@@ -1,0 +1,77 @@
+"""Memory and speed over a long flight: the last tenth beside the first.
+
+The flight of :mod:`service.bench.pipeline`, ten times as long. What grows with the flight and
+should not (queues, windows, maps) shows as a ratio above one.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+
+from recon.types import Camera
+from service.bench import BenchOptions, BenchResult
+from service.bench.pipeline import FPS, SIZE, K, make_video, resident_mib
+from service.scan import Scan
+
+
+def run(options: BenchOptions) -> list[BenchResult]:
+    """Resident memory and milliseconds a frame at the end, against the first tenth."""
+    frames = max(200, int(options.rounds / 3.0 * FPS) * 10)
+    with tempfile.TemporaryDirectory() as folder:
+        video = Path(folder) / "flight.mp4"
+        make_video(video, frames)
+        watch = _Watch(frames)
+        summary = _fly(video, Path(folder) / "scan", watch)
+    note = f"{summary['frames']} frames, {summary['keyframes']} keyframes"
+    early, late = watch.tenth(0), watch.tenth(9)
+    return [
+        BenchResult(
+            "memory", "resident at the end of the flight", late[0], "MiB",
+            peer="after a tenth of it", peer_value=early[0], note=note,
+        ),
+        BenchResult(
+            "memory", "a frame in the last tenth", late[1], "ms",
+            peer="in the second tenth", peer_value=watch.tenth(1)[1],
+        ),
+    ]  # fmt: skip
+
+
+class _Watch:
+    """Resident memory and time after every frame."""
+
+    def __init__(self, frames: int) -> None:
+        self._frames = frames
+        self._seen: list[tuple[float, float]] = []  # s, MiB
+
+    def __call__(self, scan: Scan) -> None:
+        self._seen.append((time.perf_counter(), resident_mib()))
+
+    def tenth(self, index: int) -> tuple[float, float]:
+        """Memory in MiB at the end of a tenth of the flight, and its ms a frame."""
+        first, last = (int(n * len(self._seen) / 10) for n in (index, index + 1))
+        part = self._seen[first:last]
+        return part[-1][1], 1e3 * (part[-1][0] - part[0][0]) / (len(part) - 1)
+
+
+def _fly(video: Path, folder: Path, watch: _Watch) -> dict[str, int]:
+    from recon.backends import load_backend
+    from service.cameras import open_camera
+    from service.config import load_config
+    from service.scan import ScanInputs, create_store
+
+    config = load_config(None, ["scan.assumed_agl_m=60"])
+    source = open_camera(str(video))
+    camera = Camera(K, np.zeros(5), SIZE)
+    inputs = ScanInputs(source, camera, config, load_backend("cpu"), folder, "bench", 0)
+    store = create_store(inputs)
+    scan = Scan(inputs, store)
+    scan.run(Event(), watch)
+    summary = scan.close()
+    source.close()
+    store.close()
+    return summary
