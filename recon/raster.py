@@ -19,6 +19,14 @@ from recon.types import F32, F64, U8, Bool, PointCloud
 TOP_SIGMAS = 4.0
 """Points this many of its sigmas below the highest point of a cell are its surface too."""
 
+STEP_M = 0.8
+"""Heights within a few cells that differ by more are two surfaces."""
+
+SMEAR_SLOPE = 1.2
+SMEAR_CELLS = (1, 2, 4, 6)
+EDGE_CELLS = 3
+EDGE_PRECISION = 1.25
+
 LARGEST_CELLS = 200_000_000
 
 
@@ -145,11 +153,60 @@ def _top_surface(
     return height, spread, colour
 
 
-def fill_holes(raster: Raster, largest_cells: int = 4) -> Raster:
+def surface_model(xyz_m: F64 | F32, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:
+    """The surface model that is delivered: the upper surface where it is certain.
+
+    Cells beside a step that may as well be roof as ground stay unknown (:func:`reliable`);
+    holes are filled on level ground only.
+    """
+    certain = reliable(rasterise_points(xyz_m, rgb, sigma_m, grid))
+    return fill_holes(certain, level_m=STEP_M / 2.0)
+
+
+def reliable(raster: Raster) -> Raster:
+    """``raster`` without the cells that stereo cannot place at a step of STEP_M or more.
+
+    Two kinds are left out. Cells on a slope steeper than SMEAR_SLOPE both up and down are what
+    matching draws across the ground hidden behind a wall. Cells above a step, within the
+    width that matching windows make a roof too wide, are kept only where they are known
+    clearly better than their neighbourhood: a true roof edge is seen by all views, a spill
+    beside it by few.
+    """
+    height = raster.height_m.copy()
+    sigma = np.nan_to_num(raster.sigma_m, nan=1.0)
+    for reach in SMEAR_CELLS:
+        high, low = _highest_lowest(height, reach)
+        limit = SMEAR_SLOPE * reach * raster.grid.cell_m + sigma
+        height[(high - height > limit) & (height - low > limit)] = np.nan
+    known = np.isfinite(height)
+    precision = np.where(known, 1.0 / np.maximum(sigma, 1e-3), 0.0).astype(np.float32)
+    window = (9, 9)
+    count = cv2.boxFilter(known.astype(np.float32), -1, window, normalize=False)
+    mean = cv2.boxFilter(precision, -1, window, normalize=False) / np.maximum(count, 1.0)
+    above = height - _highest_lowest(height, EDGE_CELLS)[1] > STEP_M
+    height[above & (precision < EDGE_PRECISION * mean)] = np.nan
+    known = np.isfinite(height)
+    rgb = np.where(known[..., None], raster.rgb, 0).astype(np.uint8)
+    spread = np.where(known, raster.sigma_m, np.float32(np.nan)).astype(np.float32)
+    return Raster(raster.grid, height, spread, rgb)
+
+
+def _highest_lowest(height_m: F32, reach_cells: int) -> tuple[F32, F32]:
+    """Highest and lowest known height within ``reach_cells`` of each cell, in both axes."""
+    known = np.isfinite(height_m)
+    square = np.ones((2 * reach_cells + 1, 2 * reach_cells + 1), np.uint8)
+    far = np.float32(1e6)
+    high = cv2.dilate(np.where(known, height_m, -far).astype(np.float32), square)
+    low = cv2.erode(np.where(known, height_m, far).astype(np.float32), square)
+    return np.asarray(high, np.float32), np.asarray(low, np.float32)
+
+
+def fill_holes(raster: Raster, largest_cells: int = 4, level_m: float | None = None) -> Raster:
     """``raster`` with its holes up to ``largest_cells`` wide filled from their surroundings.
 
     Only holes are closed: the outline of the surveyed area does not grow into the unknown.
-    Filled cells carry the sigma of their surroundings, doubled.
+    With ``level_m`` a hole stays where the heights around it differ by more. Filled cells
+    carry the sigma of their surroundings, doubled.
     """
     known = raster.known
     if largest_cells < 1 or known.all() or not known.any():
@@ -165,6 +222,9 @@ def fill_holes(raster: Raster, largest_cells: int = 4) -> Raster:
     ).astype(np.float32)
     smooth, reached = _normalised_blur(layers, known, largest_cells)
     fill = holes & reached
+    if level_m is not None:
+        high, low = _highest_lowest(raster.height_m, largest_cells)
+        fill &= high - low <= level_m
     height, sigma, rgb = raster.height_m.copy(), raster.sigma_m.copy(), raster.rgb.copy()
     height[fill] = smooth[fill, 0]
     sigma[fill] = 2.0 * smooth[fill, 1]

@@ -12,6 +12,7 @@ import numpy as np
 
 from recon import metrics, se3, triangle_grid
 from recon.metrics import Fit
+from recon.raster import Grid, grid_over, rasterise_points, surface_model
 from recon.triangle_grid import TriangleGrid
 from recon.types import F32, F64
 from service.errors import InputError
@@ -23,6 +24,7 @@ log = logging.getLogger(__name__)
 REACH_M = 5.0
 COMPLETE_WITHIN_M = 0.5
 SAMPLE_SPACING_M = 0.4
+DSM_CELL_M = 0.25
 FRAMES_FOR_VISIBILITY = 60
 VIEWS_TO_COUNT = 3
 MOST_POINTS = 300_000
@@ -81,6 +83,11 @@ def score(scan_folder: Path, truth_folder: Path) -> dict[str, Any]:
     }
     best = "rigid" if scan.placed else "similarity"
     report["judged_after"] = best
+    report["dsm"] = {
+        name: _dsm(scan, truth, fit)
+        for name, fit in fits["surface"].items()
+        if name in ("raw", best)
+    }
     report["completeness"] = _completeness(scan, truth, fits["surface"][best])
     for name, fit in fits["surface"].items():
         report["surface"][name]["fit"] = _fit_size(fit, scan.points)
@@ -119,6 +126,51 @@ def _surface_part(scan: ScanResult, truth: Truth, fit: Fit) -> dict[str, Any]:
         claim = metrics.honesty(distance, scan.sigma_m[::step] * np.float32(fit.scale))
         out["honesty"] = None if claim is None else asdict(claim)
     return out
+
+
+def _dsm(scan: ScanResult, truth: Truth, fit: Fit) -> dict[str, float]:
+    """The surface model of the cloud against the truth's height at each cell's middle.
+
+    ``known_share`` is that of the cells with any point; a step is a metre within a cell.
+    """
+    points = fit.points(scan.points)
+    sigma = np.full(len(points), 0.1, np.float32) if scan.sigma_m is None else scan.sigma_m
+    grid = grid_over(points[:, :2], DSM_CELL_M, margin_cells=1)
+    model = surface_model(points, np.zeros((len(points), 3), np.uint8), sigma, grid)
+    hit = rasterise_points(points, np.zeros((len(points), 3), np.uint8), sigma, grid).known
+    height = _truth_heights(truth, grid)
+    error = (model.height_m - height)[model.known & np.isfinite(height)]
+    if not len(error):
+        return {"cell_m": DSM_CELL_M, "cells": 0}
+    level = _range_of_three(height) < 1.0
+    away = (model.height_m - height)[model.known & level]
+    return {
+        "cell_m": DSM_CELL_M,
+        "cells": len(error),
+        "known_share": float((model.known & hit).sum() / hit.sum()),
+        "rms_m": float(np.sqrt(np.mean(error**2))),
+        "median_m": float(np.median(error)),
+        "nmad_m": float(1.4826 * np.median(np.abs(error - np.median(error)))),
+        "within_30cm": float(np.mean(np.abs(error) < 0.3)),
+        "rms_away_from_steps_m": float(np.sqrt(np.mean(away**2))) if len(away) else float("nan"),
+    }
+
+
+def _truth_heights(truth: Truth, grid: Grid) -> F64:
+    """(rows, cols) height of the truth straight below the middle of each cell; NaN outside."""
+    rows, cols = np.indices(grid.shape)
+    x = grid.west_m + (cols.ravel() + 0.5) * grid.cell_m
+    y = grid.north_m - (rows.ravel() + 0.5) * grid.cell_m
+    above = np.column_stack([x, y, np.full(len(x), truth.surface.bounds[5] + 10.0)])
+    t, _ = truth.surface.cast(above, np.tile([0.0, 0.0, -1.0], (len(x), 1)))
+    return np.asarray((above[:, 2] - t).reshape(grid.shape))
+
+
+def _range_of_three(height: F64) -> F64:
+    """(rows, cols) highest less lowest of the 3x3 cells about each; NaN beside unknown ones."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    return np.asarray(maximum_filter(height, 3) - minimum_filter(height, 3))
 
 
 def _fit_size(fit: Fit, points: F64) -> dict[str, float]:

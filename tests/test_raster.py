@@ -7,7 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from recon.raster import Grid, Raster, fill_holes, grid_over, hillshade, rasterise
+from recon.raster import (
+    Grid,
+    Raster,
+    fill_holes,
+    grid_over,
+    hillshade,
+    rasterise,
+    reliable,
+    surface_model,
+)
 from recon.types import F32, F64, PointCloud
 
 
@@ -124,3 +133,53 @@ def test_grids_are_checked() -> None:
         Grid(0.0, 0.0, 0.0, (1, 1))
     with pytest.raises(ValueError, match=r"\(N, 2\)"):
         grid_over(np.zeros((0, 2)), 1.0)
+
+
+def step_raster(sigma: F32) -> Raster:
+    """A roof 5 m high east of column 20."""
+    height = np.zeros((40, 40), np.float32)
+    height[:, 20:] = 5.0
+    return Raster(Grid(0.0, 0.0, 0.25, (40, 40)), height, sigma, np.full((40, 40, 3), 50, np.uint8))
+
+
+def test_a_smear_down_a_wall_is_no_surface_but_a_steep_roof_is() -> None:
+    raster = step_raster(np.full((40, 40), 0.05, np.float32))
+    for n, column in enumerate(range(16, 20)):
+        raster.height_m[:, column] = 1.0 + n
+    left = reliable(raster)
+    assert not left.known[:, 16:20].any()
+    assert left.known[:, :16].all()
+    x = 0.25 * np.arange(40, dtype=np.float32)
+    roof = np.tile(np.minimum(x, x[::-1]), (40, 1))  # 45 degrees up and down
+    one = Raster(raster.grid, roof, np.full((40, 40), 0.05, np.float32), raster.rgb)
+    assert reliable(one).known.all()
+
+
+def test_of_cells_above_a_step_the_uncertain_are_left_out() -> None:
+    sigma = np.full((40, 40), 0.08, np.float32)
+    sigma[:, 20:22] = 0.3  # the spill beside the roof: few views
+    left = reliable(step_raster(sigma))
+    assert not left.known[:, 20:22].any()
+    assert left.known[:, 23:].all() and left.known[:, :20].all()
+    sigma[:, 20:22] = 0.02  # an edge that is well seen
+    assert reliable(step_raster(sigma)).known[:, 20:22].all()
+
+
+def test_holes_beside_a_step_stay_holes() -> None:
+    raster = step_raster(np.full((40, 40), 0.05, np.float32))
+    raster.height_m[10:12, 19:21] = np.nan
+    raster.height_m[10:12, 5:7] = np.nan
+    assert fill_holes(raster).known.all()
+    filled = fill_holes(raster, level_m=0.4)
+    assert not filled.known[10:12, 19:21].any()
+    assert filled.known[10:12, 5:7].all()
+
+
+def test_the_surface_model_of_a_plain_cloud_is_its_upper_surface() -> None:
+    rng = np.random.default_rng(5)
+    xyz = np.column_stack([rng.uniform(0, 10, (20_000, 2)), rng.normal(2.0, 0.02, 20_000)])
+    points = cloud(xyz, 0.02)
+    grid = grid_over(xyz[:, :2], 0.25)
+    model = surface_model(points.xyz_m, points.rgb, points.sigma_m, grid)
+    assert model.known.mean() > 0.99
+    assert np.nanmax(np.abs(model.height_m - 2.0)) < 0.06

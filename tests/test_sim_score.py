@@ -98,6 +98,9 @@ def test_perfect_scan_scores_perfectly(flight: Path, tmp_path: Path) -> None:
     assert report["trajectory"]["raw"]["max_m"] < 0.001
     assert report["trajectory"]["raw"]["median_deg"] < 0.01
     assert report["altitude_m"] == pytest.approx(40.0, abs=3.0)
+    dsm = report["dsm"]["raw"]
+    assert dsm["cells"] > 1000 and dsm["within_30cm"] > 0.9
+    assert dsm["rms_away_from_steps_m"] < 0.15 and abs(dsm["median_m"]) < 0.02
 
 
 def test_known_displacement_and_noise_are_told_apart(flight: Path, tmp_path: Path) -> None:
@@ -118,6 +121,8 @@ def test_known_displacement_and_noise_are_told_apart(flight: Path, tmp_path: Pat
     assert rigid["median_percent_of_altitude"] == pytest.approx(
         100 * rigid["median_m"] / report["altitude_m"]
     )
+    assert report["dsm"]["raw"]["median_m"] == pytest.approx(raw["bias_m"], abs=0.35)
+    assert abs(report["dsm"]["rigid"]["median_m"]) < 0.1
     assert report["trajectory"]["raw"]["rms_m"] > 0.5
     assert report["trajectory"]["rigid"]["rms_m"] < 0.01
     assert report["trajectory"]["raw"]["drift_percent"] == pytest.approx(1.4, abs=0.4)

@@ -43,6 +43,14 @@ def _text(report: dict[str, Any]) -> str:
                 f"  sigma: {h['within_1_sigma']:.0%} within 1, {h['within_2_sigma']:.0%} within 2 "
                 f"(a Gaussian has 68 % and 95 %), median {h['median_sigma_m']:.3f} m"
             )
+    for name, d in report["dsm"].items():
+        if d["cells"]:
+            lines.append(
+                f"  DSM {_label(name)}, {d['cell_m']:g} m cells: rms {d['rms_m']:.3f} m, "
+                f"{d['rms_away_from_steps_m']:.3f} m away from steps, median "
+                f"{d['median_m']:+.3f} m, {d['within_30cm']:.1%} within 0.3 m, "
+                f"{d['known_share']:.1%} of the cells seen are known"
+            )
     c = report["completeness"]
     lines += [
         "",

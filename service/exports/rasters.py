@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.raster import Grid, Raster, fill_holes
+from recon.raster import Grid, Raster, fill_holes, surface_model
 from recon.types import F64, Array
 from service.exports.view import ExportOptions, ScanView
 from service.scan_folder import writing
@@ -21,8 +21,12 @@ SHORTEST_CONTOUR_CELLS = 12
 
 
 def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """Heights in AMSL metres (float32, -9999 where unknown); band 2 holds their sigma."""
-    raster = fill_holes(scan.raster(options.cell_m))
+    """Heights in AMSL metres (float32, -9999 where unknown); band 2 holds their sigma.
+
+    Unknown is also what cannot be placed beside a step (:func:`recon.raster.surface_model`).
+    """
+    cloud = scan.fused.cloud
+    raster = surface_model(scan.xyz_m, cloud.rgb, cloud.sigma_m, scan.grid(options.cell_m))
     known = raster.known
     bands = np.stack(
         [np.where(known, raster.height_m, NODATA_M), np.where(known, raster.sigma_m, NODATA_M)]

@@ -11,7 +11,7 @@ from types import TracebackType
 
 import numpy as np
 
-from recon.raster import Raster, grid_over, rasterise_points
+from recon.raster import Grid, Raster, grid_over, rasterise_points
 from recon.types import F64
 from service.errors import InputError, OutsideError
 from service.exports import EXPORTERS
@@ -87,14 +87,18 @@ class ScanView:
         """(N, 3) of the fused cloud in UTM with AMSL heights; ENU without georeference."""
         return placed(self.fused.cloud, self.frame)
 
-    def raster(self, cell_m: float | None) -> Raster:
-        """The upper surface on a grid in the coordinates of ``xyz_m``."""
+    def grid(self, cell_m: float | None) -> Grid:
+        """A grid over ``xyz_m``, by default of cells as large as the voxels."""
         cell = cell_m or self.fused.voxel_m
         try:
-            grid = grid_over(self.xyz_m[:, :2], cell, margin_cells=1)
+            return grid_over(self.xyz_m[:, :2], cell, margin_cells=1)
         except ValueError as error:
             raise InputError(f"{self.folder}: {error} with --cell-m") from error
-        return rasterise_points(self.xyz_m, self.fused.cloud.rgb, self.fused.cloud.sigma_m, grid)
+
+    def raster(self, cell_m: float | None) -> Raster:
+        """The upper surface on :meth:`grid`, also where it is doubtful."""
+        cloud = self.fused.cloud
+        return rasterise_points(self.xyz_m, cloud.rgb, cloud.sigma_m, self.grid(cell_m))
 
     def needs_place(self, what: str) -> LocalFrame:
         """The frame; InputError when the scan has no georeference."""
