@@ -1,8 +1,8 @@
 """What telemetry says of a keyframe, as factors of the pose graph.
 
 Errors of one sensor wander: readings closer in time than the wander's time constant err
-together. A first-order Gauss-Markov error of sigma s and time constant tau weighs on what is
-slower than tau like white noise of sigma s sqrt(2 tau / dt), which is the sigma given here.
+together. All readings of a first-order Gauss-Markov error with time constant tau over a time
+T count as 1 + T / (2 tau) of them; each gets the sigma that makes it so.
 """
 
 from __future__ import annotations
@@ -33,27 +33,31 @@ class Readings:
         config: PoseGraphConfig,
         smoother: Smoother,
         counts: Counter[str],
+        keyframes: int = 1,
+        span_s: float = 0.0,
         altitude_offset_m: float | None = None,
     ) -> None:
-        """``altitude_offset_m``: altitude less world z; by default that of the first reading."""
+        """``keyframes`` are known so far over ``span_s``; ``altitude_offset_m`` is altitude less
+        world z, by default that of the first reading."""
         import gtsam
 
         self._gtsam = gtsam
         self._config, self._smoother, self._counts = config, smoother, counts
+        self._keyframes, self._span_s = max(keyframes, 1), max(span_s, 1.0)
         self._offset_m = altitude_offset_m
 
-    def add(self, node: Node, gap_s: float, T: F64, spread: F64, is_placed: bool) -> set[str]:
+    def add(self, node: Node, T: F64, spread: F64, is_placed: bool) -> set[str]:
         """The sensors that took part; the keyframe is predicted at ``T`` +- ``spread``.
 
-        ``gap_s`` is the time since the keyframe before; ``is_placed`` tells that the world's
-        frame is known, without which only the attitude says something.
+        ``is_placed`` tells that the world's frame is known, without which only the attitude
+        says something.
         """
-        used = {"attitude"} if self._attitude(node, gap_s, T, spread) else set()
+        used = {"attitude"} if self._attitude(node, T, spread) else set()
         if is_placed:
             lever = np.hstack([-se3.hat(T[:3, 3]), np.eye(3)])
             place = lever @ spread @ lever.T
-            used |= {"gnss"} if self._position(node, gap_s, T, place) else set()
-            used |= {"altitude"} if self._altitude(node, gap_s, T) else set()
+            used |= {"gnss"} if self._position(node, T, place) else set()
+            used |= {"altitude"} if self._altitude(node, T) else set()
         return used
 
     def height(self, node: Node, scale_key: int, scale: float) -> bool:
@@ -67,7 +71,7 @@ class Readings:
         self._smoother.add(self._gtsam.PriorFactorVector(scale_key, measured, noise), "height")
         return True
 
-    def _attitude(self, node: Node, gap_s: float, T: F64, spread: F64) -> bool:
+    def _attitude(self, node: Node, T: F64, spread: F64) -> bool:
         prior = node.prior
         if prior.R_world_camera is None:
             return False
@@ -81,14 +85,14 @@ class Readings:
             self._counts["tilt off"] += 1
             return False
         R = se3.so3_exp(turn) @ T[:3, :3]
-        sigma = sigma * _inflated(self._config.attitude_s, gap_s)
+        sigma = sigma * self._inflated(self._config.attitude_s)
         covariance = R.T @ np.diag(sigma**2) @ R
         noise = self._robust(self._gtsam.noiseModel.Gaussian.Covariance(covariance))
         factor = self._gtsam.PoseRotationPrior3D(node.key, self._gtsam.Rot3(R), noise)
         self._smoother.add(factor, "attitude")
         return True
 
-    def _position(self, node: Node, gap_s: float, T: F64, place: F64) -> bool:
+    def _position(self, node: Node, T: F64, place: F64) -> bool:
         prior = node.prior
         if prior.position_m is None or prior.sigma_position_m is None:
             return False
@@ -99,13 +103,13 @@ class Readings:
             return False
         precise = float(sigma[0]) < PRECISE_M
         seconds = self._config.precise_fix_s if precise else self._config.fix_s
-        sigma = sigma * _inflated(seconds, gap_s)
+        sigma = sigma * self._inflated(seconds)
         noise = self._robust(self._gtsam.noiseModel.Diagonal.Sigmas(sigma))
         factor = self._gtsam.GPSFactor(node.key, prior.position_m, noise)
         self._smoother.add(factor, "position")
         return True
 
-    def _altitude(self, node: Node, gap_s: float, T: F64) -> bool:
+    def _altitude(self, node: Node, T: F64) -> bool:
         """The altitude less its offset; after a step it goes on from where the track is."""
         prior = node.prior
         if prior.altitude_m is None:
@@ -118,11 +122,18 @@ class Readings:
             self._offset_m = prior.altitude_m - T[2, 3]
             return False
         loose = 1e4  # m: says nothing of east and north
-        sigma = np.array([loose, loose, one * _inflated(self._config.altitude_s, gap_s)])
+        sigma = np.array([loose, loose, one * self._inflated(self._config.altitude_s)])
         noise = self._robust(self._gtsam.noiseModel.Diagonal.Sigmas(sigma))
         place = np.array([T[0, 3], T[1, 3], z])
         self._smoother.add(self._gtsam.GPSFactor(node.key, place, noise), "altitude")
         return True
+
+    def _inflated(self, seconds: float) -> float:
+        """Factor on a sigma whose error wanders with the time constant ``seconds``."""
+        if seconds <= 0:
+            return 1.0
+        independent = 1.0 + self._span_s / (2.0 * seconds)
+        return float(np.sqrt(max(1.0, self._keyframes / independent)))
 
     def _robust(self, noise: Any) -> Any:
         model = self._gtsam.noiseModel
@@ -135,8 +146,3 @@ def _turn(R: F64, R_measured: F64, heading: bool) -> F64:
         return se3.so3_log(R_measured @ R.T)
     up = R @ R_measured[2]  # where the reading's up points now
     return np.array([up[1], -up[0], 0.0])
-
-
-def _inflated(seconds: float, gap_s: float) -> float:
-    """Factor on a sigma whose error wanders with the time constant ``seconds``."""
-    return float(np.sqrt(max(1.0, 2.0 * seconds / gap_s)))

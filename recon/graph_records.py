@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -59,18 +59,28 @@ class Node:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loop:
-    """A motion seen between two keyframes that are far apart in time."""
+    """A motion seen between two keyframes that are far apart in time.
+
+    Lengths are in units of the odometry at ``a``, so that a better scale moves them too.
+    """
 
     a: int  # number of the earlier keyframe
     b: int
-    T_a_b: F64  # (4, 4) m
+    T_a_b: F64  # (4, 4)
     covariance: F64  # (6, 6) left perturbation in a's frame
-    growth: float = 1.0  # of b's depth, to fit a's
+    ratio: float  # units of a's odometry in one of b's
 
     @property
     def ends(self) -> tuple[int, int]:
         """Both keyframes, the earlier first."""
         return self.a, self.b
+
+    def scaled(self, factor: float) -> Loop:
+        """The same with lengths multiplied by ``factor``."""
+        units = np.array([1.0] * 3 + [factor] * 3)
+        T = self.T_a_b.copy()
+        T[:3, 3] *= factor
+        return replace(self, T_a_b=T, covariance=self.covariance * np.outer(units, units))
 
 
 def loops_agree(one: Loop, other: Loop, T_a_a: F64, T_b_b: F64, limit: float) -> bool:

@@ -21,6 +21,7 @@ from recon.alignment import Anchor, Scale, Similarity
 from recon.graph_factors import pose3
 from recon.graph_readings import BLOCK, Readings
 from recon.graph_records import Loop, Node, PoseGraphConfig, loops_agree
+from recon.sensor_offsets import Offsets, offsets
 from recon.smoother import ROUNDS, Smoother, moved_covariance
 from recon.types import F64, Pose, PosePrior
 
@@ -34,6 +35,9 @@ MOST_PENDING = 50
 
 REFIT_GROWTH = 1.3
 """A segment's similarity is fitted again when its keyframes have grown by so much."""
+
+SETTLED = 60
+"""Keyframes after which the frame of a segment must change notably to be taken over."""
 
 SOURCES = ("vision", "attitude", "altitude", "gnss", "loop", "dead reckoning")
 
@@ -60,6 +64,7 @@ class PoseGraph:
         self._nodes: dict[int, Node] = {}  # by keyframe number, in order of time
         self._segments: dict[int, list[Node]] = {}
         self._frames: dict[int, Similarity] = {}  # by segment, once telemetry or a loop tells
+        self._offsets: dict[int, Offsets] = {}  # by segment that telemetry has placed
         self._fitted: dict[int, int] = {}  # keyframes that the segment's frame was fitted to
         self._tied: set[int] = set()  # segments that a loop has placed
         self._loops: list[Loop] = []
@@ -76,7 +81,7 @@ class PoseGraph:
         """The graph of all keyframes and accepted loops at once, solved."""
         graph = cls(config)
         for node in nodes:
-            graph._keep(node)
+            graph._keep(replace(node, key=len(graph)))
         graph._loops = list(loops)
         graph.solve()
         return graph
@@ -137,7 +142,9 @@ class PoseGraph:
         if a > b:
             a, b, growth = b, a, 1.0 / growth
             T_a_b, covariance = graph_factors.reversed_motion(T_a_b, covariance)
-        loop = Loop(a, b, T_a_b, covariance, growth)
+        scale = self.scale(a)
+        ratio = growth * self.scale(b) / scale
+        loop = Loop(a, b, T_a_b, covariance, ratio).scaled(1.0 / scale)
         support = [other for other in self._pending + self._loops if self._agree(loop, other)]
         if not support:
             self._pending.append(loop)
@@ -158,9 +165,15 @@ class PoseGraph:
     def solve(self) -> None:
         """Fit every segment's frame once more to all its telemetry, and build all anew."""
         for segment, nodes in self._segments.items():
-            if len(nodes) >= self.config.least_anchors:
-                self._fitted.pop(segment, None)
-                self._refit(segment)
+            self._frames.pop(segment, None)
+            self._offsets.pop(segment, None)
+            self._fitted.pop(segment, None)
+            self._tied.discard(segment)
+            if nodes[0].key > 0 and all(n.prior.sigma_position_m is None for n in nodes):
+                self.rebuild()  # so that the segment's start is known
+                if any(self._tie(loop) for loop in self._loops if self._enters(loop, segment)):
+                    continue
+            self._refit(segment)
         self.rebuild()
 
     # ---- what comes out ------------------------------------------------------------------------
@@ -204,8 +217,7 @@ class PoseGraph:
         """The pose of keyframe ``seq`` with its covariance and sources."""
         node = self._nodes[seq]
         T, covariance = self._smoother.state(node.key)
-        used = self._sources[node.key]
-        return Pose(T, covariance, tuple(name for name in SOURCES if name in used))
+        return Pose(T, covariance, self.sources(seq))
 
     def scale(self, seq: int) -> float:
         """Metres per unit of the odometry at keyframe ``seq``."""
@@ -216,6 +228,15 @@ class PoseGraph:
     def poses(self) -> dict[int, F64]:
         """(4, 4) T_world_camera of every keyframe."""
         return dict(zip(self._nodes, self._smoother.poses(), strict=True))
+
+    def pose_array(self) -> F64:
+        """(N, 4, 4) T_world_camera in the order of the keyframes."""
+        return self._smoother.poses()
+
+    def sources(self, seq: int) -> tuple[str, ...]:
+        """What keyframe ``seq`` rests on."""
+        used = self._sources[self._nodes[seq].key]
+        return tuple(name for name in SOURCES if name in used)
 
     def scales(self) -> F64:
         """(N,) metres per unit of the odometry, in the order of the keyframes."""
@@ -245,8 +266,12 @@ class PoseGraph:
         self._gtsam = gtsam
         self._smoother = Smoother()
         self._left_out: Counter[str] = Counter()
-        offset_m = self._altitude_offset()
-        self._readings = Readings(self.config, self._smoother, self._left_out, offset_m)
+        times = [n.time_ns for n in self._nodes.values()]
+        span_s = (times[-1] - times[0]) * 1e-9 if times else 0.0
+        self._readings = Readings(
+            self.config, self._smoother, self._left_out, len(times), span_s,
+            self._altitude_offset(),
+        )  # fmt: skip
         self._sources: list[set[str]] = []
         self._scale_of: list[int] = []  # key of each keyframe's scale; 0 while it has none
         self._blocks: dict[int, tuple[list[int], int]] = {}  # keys of scales, keyframe of the last
@@ -290,9 +315,10 @@ class PoseGraph:
             spread = moved_covariance(spread_last, T_last, covariance)
             self._connect(node, last, motion, covariance)
         self._smoother.add_pose(node.key, T, spread)
-        gap_s = 1e9 if last is None else max((node.time_ns - last.time_ns) * 1e-9, 1e-3)
         is_placed = node.segment in self._frames
-        used = self._readings.add(node, gap_s, T, spread, is_placed)
+        if node.segment in self._offsets:
+            node = replace(node, prior=self._offsets[node.segment].applied(node.prior))
+        used = self._readings.add(node, T, spread, is_placed)
         if is_placed and self._readings.height(
             node, self._scale_key(node), self._frame(node).scale
         ):
@@ -430,8 +456,17 @@ class PoseGraph:
             return False
         if "gnss" not in found.sources and nodes[0].key > 0:
             found = self._kept_in_place(found, nodes[0])
-        self._frames[segment] = found
-        return True
+        self._offsets[segment] = offsets(self._anchors(segment), found)
+        before, self._frames[segment] = self._frames.get(segment), found
+        if before is None or len(nodes) < SETTLED:
+            return True
+        ends = (nodes[0], nodes[len(nodes) // 2], nodes[-1])
+        shift = [before.pose(n.T_odom_camera) - found.pose(n.T_odom_camera) for n in ends]
+        sigma = float(np.sqrt(np.trace(found.covariance[3:6, 3:6])))
+        if max(float(np.linalg.norm(s[:3, 3])) for s in shift) > 0.5 * sigma:
+            return True
+        self._frames[segment] = before  # the graph itself follows such small changes
+        return False
 
     def _kept_in_place(self, found: Similarity, first: Node) -> Similarity:
         """A frame without fixes, moved so that its first keyframe stays where it is, and turned
@@ -451,17 +486,21 @@ class PoseGraph:
         a, b = self._nodes[loop.a], self._nodes[loop.b]
         frame = self._frames.get(b.segment)
         placed = frame is not None and "gnss" in frame.sources
-        if a.segment == b.segment or placed or b.segment in self._tied:
+        if not self._enters(loop, b.segment) or placed or b.segment in self._tied:
             return False
-        T = self._smoother.pose(a.key) @ loop.T_a_b
-        scale = self.scale(loop.b) * loop.growth
+        scale = self.scale(loop.a)
+        T = self._smoother.pose(a.key) @ loop.scaled(scale).T_a_b
         R = T[:3, :3] @ b.T_odom_camera[:3, :3].T
-        t = T[:3, 3] - scale * R @ b.T_odom_camera[:3, 3]
+        t = T[:3, 3] - scale * loop.ratio * R @ b.T_odom_camera[:3, 3]
         covariance = np.eye(7) if frame is None else frame.covariance
         sources = () if frame is None else frame.sources
-        self._frames[b.segment] = Similarity(scale, R, t, covariance, sources)
+        self._frames[b.segment] = Similarity(scale * loop.ratio, R, t, covariance, sources)
         self._tied.add(b.segment)
         return True
+
+    def _enters(self, loop: Loop, segment: int) -> bool:
+        """True when the loop leads from an earlier segment into this one."""
+        return self._nodes[loop.b].segment == segment != self._nodes[loop.a].segment
 
     def _agree(self, one: Loop, other: Loop) -> bool:
         """True when two loops, joined by the track between their ends, close on themselves."""
@@ -472,6 +511,7 @@ class PoseGraph:
         ends = (one.a, other.a, other.b, one.b)
         a, a_other, b_other, b = (self._smoother.pose(self._nodes[i].key) for i in ends)
         T_a_a, T_b_b = se3.inverse(a) @ a_other, se3.inverse(b_other) @ b
+        one, other = one.scaled(self.scale(one.a)), other.scaled(self.scale(other.a))
         return loops_agree(one, other, T_a_a, T_b_b, CHI2_LIMIT)
 
     def _apart(self, seq: int, other: int) -> int:
@@ -481,6 +521,7 @@ class PoseGraph:
 
     def _add_loop_factor(self, loop: Loop) -> None:
         a, b = self._nodes[loop.a].key, self._nodes[loop.b].key
+        loop = loop.scaled(self.scale(loop.a))
         noise = self._gtsam.noiseModel.Gaussian.Covariance(
             graph_factors.right_covariance(loop.T_a_b, loop.covariance)
         )

@@ -47,7 +47,7 @@ class Smoother:
         self._kinds: list[str] = []
         self._waiting: dict[int, tuple[F64, F64]] = {}  # pose and its left covariance
         self._held = 0
-        self._newest: tuple[int, F64, F64] | None = None  # asked for most often
+        self._states: dict[int, tuple[F64, F64]] = {}  # asked for since the last update
 
     def __len__(self) -> int:
         return self._held + len(self._waiting)
@@ -81,7 +81,7 @@ class Smoother:
         self._values.clear()
         self._held += len(self._waiting)
         self._waiting.clear()
-        self._newest = None
+        self._states.clear()
         return True
 
     # ---- what comes out ------------------------------------------------------------------------
@@ -96,14 +96,11 @@ class Smoother:
         """A pose and its (6, 6) left covariance."""
         if key in self._waiting:
             return self._waiting[key]
-        if self._newest is not None and self._newest[0] == key:
-            return self._newest[1], self._newest[2]
-        T = self.pose(key)
-        right = np.asarray(self._isam.marginalCovariance(key), np.float64)
-        covariance = graph_factors.left_covariance(T, right)
-        if key == self._held - 1:
-            self._newest = (key, T, covariance)
-        return T, covariance
+        if key not in self._states:
+            T = self.pose(key)
+            right = np.asarray(self._isam.marginalCovariance(key), np.float64)
+            self._states[key] = (T, graph_factors.left_covariance(T, right))
+        return self._states[key]
 
     def scalar(self, key: int) -> float:
         """Best estimate of a scalar."""

@@ -1,7 +1,7 @@
-"""The keyframes' poses: chained from vision and ICP, brought to the world by alignment.
+"""The keyframes' poses: chained from vision and ICP, placed in the world by the pose graph.
 
 A scan may break into segments (the camera lost its way and found it again elsewhere). Each
-segment has a chain of its own and is placed in the world by its own similarity.
+segment has a chain of its own; the graph (:mod:`recon.pose_graph`) holds them all in one frame.
 """
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon import alignment, se3
-from recon.alignment import Anchor, Similarity
+from recon import se3
+from recon.alignment import Similarity
+from recon.pose_graph import PoseGraph, PoseGraphConfig
 from recon.types import F64, PosePrior
 
 
@@ -21,18 +22,6 @@ class TrajectoryConfig:
 
     repose_m: float = 0.05  # a keyframe that moved or would move its ground by more
     repose_sigmas: float = 0.1  # and by more than this share of the sigma, in flight
-    least_anchors: int = 3  # keyframes before the alignment replaces the first guess
-
-
-@dataclass(slots=True, eq=False)
-class _Node:
-    seq: int
-    segment: int
-    T_map_camera: F64  # (4, 4) in the segment's chain
-    prior: PosePrior
-    height: float | None
-    lean: float
-    told: tuple[F64, float] | None = None  # world pose and scale last published
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,11 +38,12 @@ class Placed:
 class Trajectory:
     """Keyframe poses of one scan, segment by segment."""
 
-    def __init__(self, config: TrajectoryConfig | None = None) -> None:
+    def __init__(
+        self, config: TrajectoryConfig | None = None, graph: PoseGraphConfig | None = None
+    ) -> None:
         self.config = config or TrajectoryConfig()
-        self._nodes: dict[int, _Node] = {}
-        self._segments: dict[int, list[_Node]] = {}
-        self._similarity: dict[int, Similarity | None] = {}
+        self.graph = PoseGraph(graph)
+        self._told: dict[int, Placed] = {}  # as last published
 
     def add(
         self,
@@ -62,45 +52,34 @@ class Trajectory:
         T_map_camera: F64,
         prior: PosePrior,
         height: tuple[float, float] | None,
+        time_ns: int,
+        covariance: F64,
     ) -> None:
-        """Append a keyframe to its segment and fit the segment's place in the world anew.
+        """Append a keyframe to its segment.
 
-        ``height`` comes from :func:`recon.alignment.height_above`, in odometry units.
+        ``height`` comes from :func:`recon.alignment.height_above`, in odometry units, and
+        ``covariance`` is of the step from the keyframe before, as in
+        :meth:`recon.pose_graph.PoseGraph.add_keyframe`.
         """
-        above, lean = height if height is not None else (None, 0.0)
-        node = _Node(seq, segment, T_map_camera, prior, above, lean)
-        self._nodes[seq] = node
-        nodes = self._segments.setdefault(segment, [])
-        nodes.append(node)
-        if len(nodes) >= self.config.least_anchors:
-            self._similarity[segment] = alignment.fit(
-                [Anchor(n.T_map_camera, n.prior, n.height, n.lean) for n in nodes]
-            )
+        self.graph.add_keyframe(seq, time_ns, segment, T_map_camera, covariance, prior, height)
 
     def __contains__(self, seq: int) -> bool:
-        return seq in self._nodes
+        return seq in self.graph
 
     def similarity(self, segment: int) -> Similarity | None:
         """The segment's way to the world; None while it stands where telemetry first put it."""
-        return self._similarity.get(segment)
+        return self.graph.similarity(segment)
 
     def map_pose(self, seq: int) -> F64:
         """(4, 4) T_map_camera of a keyframe in its segment's chain."""
-        return self._nodes[seq].T_map_camera
+        return self.graph.node(seq).T_odom_camera
 
     def place(self, seq: int) -> Placed:
         """The keyframe in the world, as known now. Raises KeyError for an unknown keyframe."""
-        node = self._nodes[seq]
-        similarity = self._similarity.get(node.segment)
-        if similarity is None:
-            return Placed(seq, node.T_map_camera, 1.0, np.eye(6), ("vision",))
-        return Placed(
-            seq,
-            similarity.pose(node.T_map_camera),
-            similarity.scale,
-            self._covariance(node, similarity),
-            ("vision", *similarity.sources),
-        )
+        pose = self.graph.pose(seq)
+        known = self.graph.similarity(self.graph.node(seq).segment) is not None
+        covariance = pose.covariance if known else np.eye(6)
+        return Placed(seq, pose.T_world_camera, self.graph.scale(seq), covariance, pose.sources)
 
     def ride(self, seq: int, T_key_camera: F64) -> Placed:
         """A frame's world pose from its pose relative to keyframe ``seq`` (odometry units)."""
@@ -113,35 +92,48 @@ class Trajectory:
         """Keyframes whose world pose changed since it was told by more than is worth it.
 
         In flight a change must exceed ``repose_m`` and a tenth of the pose's own sigma, or
-        each fix of a poor receiver would move the whole scan. At the end (``final``) every
-        change is told, so that the result does not hang on when corrections were asked for.
+        each fix of a poor receiver would move the whole scan. At the end (``final``) the graph
+        is solved once more and every change is told, so that the result does not hang on when
+        corrections were asked for.
         """
-        out = []
-        for node in self._nodes.values():
-            if node.told is None:
-                continue
-            now = self.place(node.seq)
-            T_old, scale_old = node.told
-            reach = now.scale * (node.height or 1.0)
-            change = se3.log(now.T_world_camera @ se3.inverse(T_old))
-            shift = float(np.linalg.norm(now.T_world_camera[:3, 3] - T_old[:3, 3]))
-            turn = float(np.linalg.norm(change[:3])) * reach
-            growth = abs(now.scale / scale_old - 1.0) * reach
-            sigma = float(np.sqrt(np.trace(now.covariance[3:, 3:])))
-            least = max(self.config.repose_m, self.config.repose_sigmas * sigma)
-            least = 1e-6 if final else least
-            if shift + turn + growth > least:
-                out.append(now)
-        return out
+        if final:
+            self.graph.solve()
+        if not self._told:
+            return []
+        keys = np.array([self.graph.node(seq).key for seq in self._told])
+        T, scales = self.graph.pose_array()[keys], self.graph.scales()[keys]
+        change = self._change(T, scales)
+        sigma = np.array([np.sqrt(np.trace(p.covariance[3:, 3:])) for p in self._told.values()])
+        least = np.maximum(self.config.repose_m, self.config.repose_sigmas * sigma)
+        seqs = list(self._told)
+        rows = np.flatnonzero(change > (1e-6 if final else least))
+        if final:
+            return [self.place(seqs[i]) for i in rows]
+        # In flight with the sigmas told before: newer readings have only made them smaller.
+        before = [self._told[seqs[i]] for i in rows]
+        return [
+            Placed(p.seq, T[i], float(scales[i]), p.covariance, self.graph.sources(p.seq))
+            for i, p in zip(rows, before, strict=True)
+        ]
+
+    def _change(self, T: F64, scales: F64) -> F64:
+        """(N,) metres by which the told keyframes or their ground are off now."""
+        old = np.array([p.T_world_camera for p in self._told.values()])
+        old_scales = np.array([p.scale for p in self._told.values()])
+        heights = np.array([self.graph.node(seq).height or 1.0 for seq in self._told])
+        reach = scales * heights
+        shift = np.linalg.norm(T[:, :3, 3] - old[:, :3, 3], axis=1)
+        # Of a rotation by an angle a, the Frobenius norm of its difference is sqrt(8) sin(a/2).
+        apart = np.linalg.norm(T[:, :3, :3] - old[:, :3, :3], axis=(1, 2))
+        turn = 2.0 * np.arcsin(np.clip(apart / np.sqrt(8.0), 0.0, 1.0)) * reach
+        growth = np.abs(scales / old_scales - 1.0) * reach
+        return np.asarray(shift + turn + growth)
 
     def tell(self, placed: Placed) -> None:
         """Remember that this pose of the keyframe was published."""
-        self._nodes[placed.seq].told = (placed.T_world_camera, placed.scale)
+        self._told[placed.seq] = placed
 
-    def _covariance(self, node: _Node, similarity: Similarity) -> F64:
-        """(6, 6) of the world pose: that of the alignment, moved to the camera's place."""
-        x = similarity.scale * similarity.R @ node.T_map_camera[:3, 3]
-        J = np.zeros((6, 7))
-        J[:3, :3] = J[3:, 3:6] = np.eye(3)
-        J[3:, 6] = x
-        return np.asarray(J @ similarity.covariance @ J.T)
+    def step_between(self, a: int, b: int) -> F64:
+        """(4, 4) T_a_b in metres by what the graph holds now."""
+        T_a, T_b = self.graph.pose(a).T_world_camera, self.graph.pose(b).T_world_camera
+        return np.asarray(se3.inverse(T_a) @ T_b)

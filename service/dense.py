@@ -169,12 +169,16 @@ class Dense:
             covariance = A @ covariance @ A.T
             found = self._icp_step(depth, self._before[1], step)
             if found is not None and found.converged:
-                step, _ = se3.average(step, covariance, found.T_target_source, found.covariance)
+                step, covariance = se3.average(
+                    step, covariance, found.T_target_source, found.covariance
+                )
             T_map = self._before[2] @ step
         self._before = (job.view.seq, depth, T_map)
         height = height_above(job.points, job.view.T_odom_camera[2, :3])
         with self.lock:
-            self.trajectory.add(job.view.seq, job.segment, T_map, job.prior, height)
+            self.trajectory.add(
+                job.view.seq, job.segment, T_map, job.prior, height, job.view.time_ns, covariance
+            )
 
     def _icp_step(
         self, depth: DepthMap | None, before: DepthMap | None, step: F64
