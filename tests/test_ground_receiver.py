@@ -192,6 +192,56 @@ def test_a_session_on_which_stations_fell_silent_is_opened_anew(
     onboard.close()
 
 
+def test_a_router_between_them_may_restart(tmp_path: Path) -> None:
+    """Drone and ground are both clients of a fleet's router, which dies in mid-flight."""
+    endpoint = free_endpoint()
+    router_config = SessionConfig(mode="router", listen=(endpoint,))
+    router = open_session(router_config)
+    onboard = new_store(tmp_path / "air")
+    ground = Receiver(ReceiverConfig(tmp_path / "ground", SessionConfig(connect=(endpoint,))))
+    ground.start()
+    link = DatalinkSender(onboard, fast(endpoint))
+    try:
+        fly(onboard, 0, 2)
+        assert wait_for(lambda: any(e["held"].get("k1") == 2 for e in ground.progress()))
+        router.close()
+        fly(onboard, 2, 4)
+        time.sleep(0.3)
+        router = open_session(router_config)
+        fly(onboard, 4, 6)
+        onboard.finish({})
+        assert link.drain(30.0)
+    finally:
+        link.close()
+        ground.close()
+        router.close()
+    assert_equal(onboard, ground.folder("drone-a", "scan-1") / "scan.db")
+    onboard.close()
+
+
+def test_clocks_hours_apart_change_nothing(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    ahead_ns = time.time_ns() + 7 * 3_600_000_000_000
+    header = ScanHeader("scan-1", "drone-a", ahead_ns)
+    onboard = ScanStore.create(tmp_path / "air" / "scan.db", header)
+    ground = start_ground(tmp_path / "ground", endpoint)
+    link = DatalinkSender(onboard, fast(endpoint))
+    try:
+        for seq in range(3):
+            at_ns = ahead_ns + seq if seq else 1  # and it is set right, or wrong, on the way
+            onboard.add_keyframe(seq, codec.encode(keyframe(seq), at_ns))
+            onboard.add_pose(PoseRecord(at_ns, np.eye(4), np.eye(6), keyframe_seq=seq))
+        onboard.finish({})
+        assert link.drain(20.0)
+        (entry,) = ground.progress()
+        assert all(0 <= lag_s < 20 for lag_s in entry["lag_s"].values())
+    finally:
+        link.close()
+        ground.close()
+    assert_equal(onboard, ground.folder("drone-a", "scan-1") / "scan.db")
+    onboard.close()
+
+
 def test_two_drones_with_the_same_scan_id_and_a_late_second_ground(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     stores = [new_store(tmp_path / name, name) for name in ("red", "blue")]

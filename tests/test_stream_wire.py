@@ -15,9 +15,18 @@ import pytest
 from PIL import Image
 
 from service.stream import codec
-from service.stream.messages import pack_head, unpack_head
+from service.stream.messages import (
+    pack_ask,
+    pack_head,
+    pack_held,
+    unpack_ask,
+    unpack_head,
+    unpack_held,
+)
 from service.stream.parts import Assembler, parse, split
-from service.stream.radio_messages import pack_tile, unpack_tile
+from service.stream.radio_messages import pack_announce, pack_tile, unpack_announce, unpack_tile
+from service.stream.radio_messages import pack_pose as pack_radio_pose
+from service.stream.radio_messages import unpack_pose as unpack_radio_pose
 from service.stream.records import pack_pose, pack_repose, unpack_pose, unpack_repose
 
 VECTORS = json.loads((Path(__file__).parent / "data" / "wire_v1.json").read_text())
@@ -155,6 +164,80 @@ def test_our_decoder_reads_the_same(vector: dict[str, Any]) -> None:
         assert float(frame.depth.depth_m[at]) == pytest.approx(pixel["depth_m"], rel=1e-6)
         assert float(frame.depth.sigma_m[at]) == pytest.approx(pixel["sigma_m"], rel=1e-6)
         np.testing.assert_allclose(frame.bgr[at].astype(int), pixel["bgr"], atol=4)
+
+
+@pytest.mark.parametrize("vector", LAYERS, ids=["coarse-1", "fine-1", "coarse-2", "fine-2"])
+def test_both_decoders_agree_in_every_pixel(vector: dict[str, Any]) -> None:
+    data = bytes.fromhex(vector["hex"])
+    frame, layer = codec.decode([data]), read_layer(data)
+    assert frame is not None
+    known = {(int(u), int(v)) for v, u in np.argwhere(frame.fresh)}
+    assert known == set(layer["pixels"])
+    for (u, v), (depth, sigma, views, _) in layer["pixels"].items():
+        assert frame.depth.depth_m[v, u] == np.float32(depth)
+        assert frame.depth.sigma_m[v, u] == pytest.approx(sigma, rel=1e-6)
+        assert frame.depth.views[v, u] == views
+
+
+def resealed(data: bytes, at: int, value: int, crc_at: int) -> bytes:
+    """The record with one byte changed and its CRC-32 made right again."""
+    changed = bytearray(data)
+    changed[at] = value
+    rest = changed[crc_at + 4 :]
+    crc = zlib.crc32(bytes(rest), zlib.crc32(bytes(changed[:crc_at])))
+    changed[crc_at : crc_at + 4] = struct.pack("<I", crc)
+    return bytes(changed)
+
+
+def test_other_versions_are_refused_although_the_checksum_holds() -> None:
+    layer = bytes.fromhex(LAYERS[1]["hex"])
+    pose, repose = (bytes.fromhex(VECTORS[kind]["hex"]) for kind in ("pose", "repose"))
+    assert codec.decode([resealed(layer, 4, 1, 218)]) is not None
+    assert unpack_pose(resealed(pose, 2, 1, 212)) is not None
+    for version in (0, 2, 255):
+        assert codec.decode([resealed(layer, 4, version, 218)]) is None
+        assert unpack_pose(resealed(pose, 2, version, 212)) is None
+        assert unpack_repose(resealed(repose, 2, version, 156)) is None
+        message = bytearray.fromhex(VECTORS["parts"]["hex"])
+        message[2] = version
+        assert list(parse(bytes(message))) == []
+        assert (
+            unpack_head(VECTORS["head"]["json"].replace('"v":1', f'"v":{version}').encode()) is None
+        )
+
+
+def test_what_stations_say() -> None:
+    text = VECTORS["held"]["json"].encode()
+    said = unpack_held(text)
+    assert said is not None and pack_held(said) == text
+    text = VECTORS["ask"]["json"].encode()
+    wish = unpack_ask(text)
+    assert wish is not None and pack_ask(wish) == text
+    held = json.loads(VECTORS["held"]["json"])
+    assert set(held) == {"v", "numbers", "received_bytes"}
+    ask = json.loads(VECTORS["ask"]["json"])
+    assert ask == {"v": 1, "peer": "base-1", "parts": [[2, 3], [7, 7]], "parts_of": 9}
+
+
+def test_announcement_and_pose_of_the_narrow_radio() -> None:
+    expected = VECTORS["announcement"]
+    data = bytes.fromhex(expected["hex"])
+    tag = zlib.crc32(f"{expected['drone']}/{expected['scan']}".encode())
+    fields = struct.unpack_from("<BIqddfHB", data)
+    assert fields[:3] == (0x11, tag, expected["started_unix_ns"])
+    assert fields[3:5] == (expected["lat_deg"], expected["lon_deg"])
+    assert fields[6:] == (expected["epsg"], len(expected["drone"]))
+    assert data[36:].decode() == expected["drone"] + expected["scan"]
+    header = unpack_announce(data)
+    assert header is not None and pack_announce(header) == data
+    expected = VECTORS["radio_pose"]
+    data = bytes.fromhex(expected["hex"])
+    fields = struct.unpack("<BIIq3i4h2ifHBH", data)
+    assert fields[:4] == (0x12, tag, expected["number"], expected["time_unix_ns"])
+    assert list(fields[4:7]) == expected["position_cm"]
+    assert fields[11:13] == (474_300_000, -85_500_000)
+    found = unpack_radio_pose(data)
+    assert found is not None and pack_radio_pose(*found) == data
 
 
 def test_the_two_methods_carry_the_same_depth() -> None:

@@ -10,10 +10,8 @@ from __future__ import annotations
 import contextlib
 import logging
 import queue
-import socket
 import threading
 import time
-import uuid
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -24,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.ground.intake import FINE, SILENCE_S, SMALL, ScanIntake
 from service.stream.messages import count, pack_ask, pack_held, unpack_head
-from service.stream.naming import NAME, ROOT
+from service.stream.naming import ROOT, place_of, station_name
 from service.stream.radio_messages import RADIO_NOTE
 from service.stream.records import ScanHeader
 from service.stream.session import SessionConfig, check_endpoints, open_session
@@ -87,7 +85,7 @@ class Receiver:
         self._config = config
         try:
             config.store.mkdir(parents=True, exist_ok=True)
-            self._name = config.name or _station_name(config.store)
+            self._name = config.name or station_name(config.store)
         except OSError as error:
             raise InputError(f"cannot write the store {config.store}: {error.strerror}") from error
         self._scans: dict[tuple[str, str], _Scan] = {}
@@ -282,7 +280,7 @@ class Receiver:
 
     def _on_head(self, sample: zenoh.Sample) -> None:
         head = unpack_head(sample.payload.to_bytes())
-        place = _place(str(sample.key_expr))
+        place = place_of(str(sample.key_expr))
         if head is None or place is None:
             self.dropped += 1
             return
@@ -300,7 +298,7 @@ class Receiver:
 
     def _on_item(self, sample: zenoh.Sample) -> None:
         payload = sample.payload.to_bytes()
-        place = _place(str(sample.key_expr))
+        place = place_of(str(sample.key_expr))
         if place is None:
             self.dropped += 1
             return
@@ -380,24 +378,3 @@ def _deliver(folder: Path, store: ScanStore) -> None:
         write_deliverables(folder, store, {})
     except (SkyreliefError, OSError) as error:
         log.error("deliverables of %s not written: %s", folder, error)
-
-
-def _place(key: str) -> tuple[str, str] | None:
-    """(drone, scan) of a key; None when either name could not be a folder."""
-    parts = key.split("/")
-    if len(parts) < 4 or not (NAME.fullmatch(parts[1]) and NAME.fullmatch(parts[2])):
-        return None
-    return parts[1], parts[2]
-
-
-def _station_name(store: Path) -> str:
-    """This station's name, made once and kept in its store."""
-    path = store / "station.txt"
-    if path.exists():
-        name = path.read_text(encoding="utf-8").strip()
-        if NAME.fullmatch(name):
-            return name
-    host = "".join(c if c.isalnum() else "-" for c in socket.gethostname())[:40].strip("-")
-    name = f"{host or 'ground'}-{uuid.uuid4().hex[:8]}"
-    path.write_text(name + "\n", encoding="utf-8")
-    return name

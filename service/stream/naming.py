@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+import socket
+import uuid
+from pathlib import Path
 
 from service.errors import InputError
 
@@ -20,4 +23,25 @@ def check_name(name: str, what: str) -> str:
             f"{what} {name!r} cannot travel on the datalink; "
             "use at most 64 letters, digits, dots, dashes and underscores"
         )
+    return name
+
+
+def place_of(key: str) -> tuple[str, str] | None:
+    """(drone, scan) of a key; None when either name could not be a folder."""
+    parts = key.split("/")
+    if len(parts) < 4 or not (NAME.fullmatch(parts[1]) and NAME.fullmatch(parts[2])):
+        return None
+    return parts[1], parts[2]
+
+
+def station_name(store: Path) -> str:
+    """The name of the ground station with this store, made once and kept in it."""
+    path = store / "station.txt"
+    if path.exists():
+        name = path.read_text(encoding="utf-8").strip()
+        if NAME.fullmatch(name):
+            return name
+    host = "".join(c if c.isalnum() else "-" for c in socket.gethostname())[:40].strip("-")
+    name = f"{host or 'ground'}-{uuid.uuid4().hex[:8]}"
+    path.write_text(name + "\n", encoding="utf-8")
     return name
