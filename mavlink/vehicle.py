@@ -221,6 +221,11 @@ class VehicleLink:
         offset = None if clock is None else clock.offset_ns
         return None if offset is None else (time_ns - offset) // 1000
 
+    @property
+    def is_serving(self) -> bool:
+        """True while the protocol's thread makes progress."""
+        return time.monotonic_ns() - self._alive_ns < STUCK_NS
+
     def report(self) -> VehicleReport:
         """A snapshot for health pages and ``doctor``."""
         seen = self.presence.autopilot_seen_ns

@@ -47,6 +47,7 @@ class FrameGate:
         self.level = Level.FULL
         self.frames = self.kept = self.lost = 0
         self.age_s = 0.0  # of the newest frame when it came out of the camera's queue
+        self._taken_s: float | None = None  # when the frame at work was handed on
         self._kept_ns = -KEEP_EVERY_NS
         self._faulty = False
         self.description, self.size_px = source.description, source.size_px
@@ -73,9 +74,17 @@ class FrameGate:
             if level is Level.RECORD_ONLY:
                 self._keep(frame)
             elif level is Level.FULL or self.frames % STRIDE == 0:
+                self._taken_s = time.monotonic()
                 yield frame
+                self._taken_s = None
                 continue
             self._alive()
+
+    @property
+    def busy_s(self) -> float:
+        """Seconds for which one frame has been worked on; 0 while the camera is waited for."""
+        taken_s = self._taken_s
+        return 0.0 if taken_s is None else time.monotonic() - taken_s
 
     @property
     def late(self) -> int:

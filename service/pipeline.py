@@ -148,6 +148,11 @@ class Pipeline:
         """Views that were not reconstructed because newer ones came faster."""
         return self._jobs.dropped
 
+    @property
+    def busy_s(self) -> float:
+        """Seconds for which one view has been under reconstruction; 0 when none is."""
+        return self._jobs.busy_s
+
     def all_refusals(self) -> Counter[str]:
         """Frames and pairs not used, by reason."""
         return self.refusals + self.dense.refusals

@@ -33,9 +33,11 @@ log = logging.getLogger(__name__)
 STUCK_S = 10.0
 """A scan without a processed frame for so long is reported as critical."""
 
-HUNG_S = 180.0
-"""A scan without a processed frame for so long is restarted by the watchdog; the compilers
-of the first frames may take minutes on a small board."""
+HUNG_S = 20.0
+"""Work on one frame or view for so long is a hang: the watchdog is no longer fed."""
+
+COMPILING_S = 180.0
+"""The same before anything was compiled, where nobody ran ``skyrelief warm-up``."""
 
 
 class Daemon:
@@ -84,9 +86,14 @@ class Daemon:
             self.vehicle.set_health(self._health())
             was_armed = self._follow_arming(was_armed)
             scanning.retry()
-            silent_s = time.monotonic() - scanning.progress_s
-            if silent_s < HUNG_S or scanning.phase is not Phase.SCANNING:
+            if self.is_progressing:
                 notifier.alive(scanning.phase.value)
+
+    @property
+    def is_progressing(self) -> bool:
+        """False for a hang that only a restart ends; a camera that gives nothing is none."""
+        most_s = HUNG_S if self.scanning.is_warm else COMPILING_S
+        return self.scanning.busy_s < most_s and self.vehicle.is_serving
 
     def quit(self) -> None:
         """Close a running scan, then let :meth:`run` return."""

@@ -19,6 +19,7 @@ from service.config import Config
 from service.datalink import DaemonLink
 from service.degradation import Level, lowered
 from service.errors import InputError, OutsideError, SkyreliefError
+from service.warm_up import is_warm
 
 if TYPE_CHECKING:
     from recon.backends import Backend
@@ -52,6 +53,7 @@ class Scanning:
         self.scan: Scan | None = None
         self.gate: FrameGate | None = None
         self.level = Level.FULL
+        self.is_warm = is_warm()  # nothing is left to compile
         self.started_s = self.progress_s = time.monotonic()
         self._backend: Backend | None = None
         self._camera: Camera | None = None
@@ -140,6 +142,14 @@ class Scanning:
             scan.pipeline.set_baseline(config.scan)
             scan.check.set_camera(config.camera)
         self.link.follow(config)
+
+    @property
+    def busy_s(self) -> float:
+        """Seconds for which one frame or view has been worked on; 0 while the camera is awaited."""
+        scan, gate = self.scan, self.gate
+        if scan is None or gate is None or self.phase is not Phase.SCANNING:
+            return 0.0
+        return max(gate.busy_s, scan.pipeline.busy_s)
 
     def set_level(self, level: Level) -> None:
         """Do less with the pictures, or more again, in this scan and in the next."""
@@ -290,6 +300,7 @@ class Scanning:
 
     def _on_frame(self, scan: Scan) -> None:
         self._alive()
+        self.is_warm = self.is_warm or scan.recorder.keyframes > 1
         if scan.recorder.keyframes > self._reported and scan.recorder.last is not None:
             self._reported = scan.recorder.keyframes
             self._retry_s = FIRST_RETRY_S

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -40,15 +41,29 @@ class SideBySide(Generic[In, Out]):
             self._worker = ThreadPoolExecutor(1, "dense", numba.set_num_threads, (half,))
         self._queue: deque[tuple[In, Future[Out]]] = deque()
         self.dropped = 0
+        self._began_s: float | None = None
+
+    @property
+    def busy_s(self) -> float:
+        """Seconds for which the work at hand has been going on; 0 when there is none."""
+        began_s = self._began_s
+        return 0.0 if began_s is None else time.monotonic() - began_s
+
+    def _do(self, item: In) -> Out:
+        self._began_s = time.monotonic()
+        try:
+            return self._work(item)
+        finally:
+            self._began_s = None
 
     def offer(self, item: In) -> None:
         """Hand over one piece of work."""
         if self._worker is None:
             done: Future[Out] = Future()
-            done.set_result(self._work(item))
+            done.set_result(self._do(item))
             self._queue.append((item, done))
             return
-        self._queue.append((item, self._worker.submit(self._work, item)))
+        self._queue.append((item, self._worker.submit(self._do, item)))
         waiting = [f for _, f in self._queue if not f.done()]
         if len(waiting) <= self._most + 1:  # one is being worked on
             return

@@ -1,0 +1,102 @@
+"""Compiled before the flight, and a watchdog that is tight once that is so."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+
+from mavlink.control import Phase
+from service.cameras import CameraFrame
+from service.config import load_config
+from service.frame_gate import FrameGate
+from service.runtime import COMPILING_S, HUNG_S, Daemon
+from service.side_by_side import SideBySide
+from service.warm_up import MadeUpGround, is_warm, warm_up
+
+
+def test_made_up_ground_is_scanned_and_marked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    assert not is_warm()
+    seconds, keyframes = warm_up(load_config(None, ["compute.backend=cpu"]))
+    assert seconds > 0
+    assert keyframes >= 5
+    assert is_warm()
+    monkeypatch.setattr("service.warm_up.software", lambda: "another version")
+    assert not is_warm()
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    assert not is_warm()
+
+
+def test_made_up_ground_is_the_same_each_time() -> None:
+    first, again = ([f.image for f in MadeUpGround(5)] for _ in range(2))
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not np.array_equal(first[0], first[1])
+
+
+def test_work_at_hand_is_timed() -> None:
+    release, begun = Event(), Event()
+
+    def work(x: int) -> int:
+        begun.set()
+        assert release.wait(20.0)
+        return x
+
+    jobs: SideBySide[int, int] = SideBySide(work, 3, live=True)
+    assert jobs.busy_s == 0.0
+    jobs.offer(1)
+    assert begun.wait(20.0)
+    time.sleep(0.02)
+    assert jobs.busy_s >= 0.02
+    release.set()
+    assert jobs.finished(everything=True) == [(1, 1)]
+    assert jobs.busy_s == 0.0
+    jobs.close()
+
+
+def test_a_frame_at_work_is_timed_and_a_silent_camera_is_not(tmp_path: Path) -> None:
+    asked = Event()
+    gate: FrameGate
+
+    class Silent(MadeUpGround):
+        """Gives one picture, then nothing for a while."""
+
+        def __iter__(self) -> Iterator[CameraFrame]:
+            for frame in super().__iter__():
+                yield frame
+                assert gate.busy_s == 0.0
+                asked.set()
+
+    gate = FrameGate(Silent(1), tmp_path, 0, lambda: None, Event())
+    for _ in gate:
+        time.sleep(0.02)
+        assert gate.busy_s >= 0.02
+    assert asked.is_set()
+
+
+def test_the_watchdog_starves_on_a_hang_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
+    busy_s = 0.0
+    monkeypatch.setattr(type(daemon.scanning), "busy_s", property(lambda _: busy_s))
+    daemon.scanning.phase = Phase.SCANNING
+    daemon.scanning.progress_s -= 1000.0  # no frame for long: the camera's fault, not ours
+    assert daemon.is_progressing
+    daemon.scanning.is_warm = False
+    busy_s = HUNG_S + 1.0
+    assert daemon.is_progressing
+    busy_s = COMPILING_S + 1.0
+    assert not daemon.is_progressing
+    busy_s, daemon.scanning.is_warm = HUNG_S + 1.0, True
+    assert not daemon.is_progressing
+    busy_s = 0.0
+    assert daemon.is_progressing
+    daemon.vehicle._alive_ns -= 60_000_000_000  # the protocol's thread stands still
+    assert not daemon.is_progressing
