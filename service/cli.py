@@ -31,6 +31,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "export-model": ("service.commands.export_model:export_model", "The dense stage as ONNX."),
     "config": ("service.commands.config:config", "Check, show or print the configuration."),
     "doctor": ("service.commands.doctor:doctor", "What works here, what does not."),
+    "warm-up": ("service.commands.warm_up:warm_up", "Compile before the first flight."),
     "bench": ("service.commands.bench:bench", "Benchmarks, each against a peer."),
 }
 """Name to (``module:function``, one line of help). The next command is one file, one line."""
