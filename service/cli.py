@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "score": ("service.commands.score:score", "Compare a scan folder with the truth."),
     "export": ("service.commands.export:export", "Deliverables of a scan folder."),
     "mesh": ("service.commands.mesh:mesh", "Offline mesh and texture of a scan folder."),
+    "refine": ("service.commands.refine:refine", "A finished scan adjusted as a whole."),
     "refly": ("service.commands.refly:refly", "A mission over what was seen too little of."),
     "inspect": ("service.commands.inspect:inspect", "Every stage of a keyframe as one picture."),
     "calibrate": ("service.commands.calibrate:calibrate", "Camera model from a chessboard."),

@@ -88,6 +88,7 @@ def write_deliverables(
         part.write_text(_csv(poses), encoding="utf-8")
     coverage = write_coverage_files(folder, store)
     summary["coverage"] = None if coverage is None else coverage.figures()
+    summary["refinement"] = store.refinement
     preview = _preview(raster, poses, summary)
     with writing(folder / PREVIEW) as part:
         part.write_bytes(preview)

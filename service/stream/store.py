@@ -118,6 +118,12 @@ class ScanStore:
         return None if text is None else dict(json.loads(text))
 
     @property
+    def refinement(self) -> dict[str, Any] | None:
+        """The figures of the refinement in force (:mod:`service.revisions`); None without one."""
+        figures = json.loads(self._db.get("refinement") or "{}").get("figures", {})
+        return dict(figures) if figures and not figures.get("undone") else None
+
+    @property
     def finished(self) -> bool:
         """True once the drone closed the scan."""
         return self._db.get("summary") is not None

@@ -1,0 +1,82 @@
+"""``skyrelief refine``: a finished scan adjusted as a whole."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+
+def refine(
+    scan_dir: Annotated[Path, typer.Argument(help="scan folder (holds scan.db)")],
+    gcp: Annotated[
+        Path | None, typer.Option(help="CSV of ground control and check points (docs/refine.md)")
+    ] = None,
+    telemetry: Annotated[
+        Path | None, typer.Option(help="flight log; default: link.tlog beside the scan, if any")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="folder for the refined scan; default: in place")
+    ] = None,
+    loops: Annotated[bool, typer.Option(help="search for places seen twice")] = True,
+    intrinsics: Annotated[
+        bool, typer.Option("--intrinsics", help="refused: see docs/refine.md")
+    ] = False,
+    undo: Annotated[
+        bool, typer.Option("--undo", help="bring back the scan as it was flown")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
+) -> None:
+    """All keyframes adjusted at once with loops, telemetry and ground control points.
+
+    Chunks keep their numbers and the state before is kept in the store. Deliverables are
+    written again.
+    """
+    from service.errors import InputError
+    from service.refinement import RefineOptions
+    from service.refinement import refine as run
+    from service.refinement import undo as run_undo
+
+    if intrinsics:
+        raise InputError(
+            "--intrinsics: the stored depth images were made with the scan's camera model and "
+            "cannot be bent to another; calibrate anew and replay the flight"
+        )
+    if undo:
+        if gcp or telemetry or out:
+            raise InputError("--undo takes nothing else")
+        figures = run_undo(scan_dir)
+    else:
+        figures = run(scan_dir, RefineOptions(gcp, telemetry, out, loops))
+    print(json.dumps(figures) if as_json else "\n".join(_lines(figures)))
+
+
+def _lines(figures: dict[str, Any]) -> list[str]:
+    where, count = figures["scan_folder"], figures["keyframes"]
+    if figures.get("undone"):
+        return [f"{where}: {count} keyframes are back where the flight left them"]
+    moved, found = figures["moved_m"], figures["loops"]
+    out = [
+        f"{where}: {count} keyframes moved by {moved['median']:.2f} m "
+        f"(most {moved['most']:.2f} m), scale {figures['scale']:.4f}; "
+        f"loops: {found['used']} used of {found['verified']} verified"
+    ]
+    if not figures["changed"]:
+        out[0] += "; nothing new since the last refinement"
+    for p in figures["points"]:
+        line = f"  {p['role']:<8}{p['name']:<12}{p['marks']:>3} marks"
+        for name in ("before_m", "after_m"):
+            if p[name] is not None:
+                line += "  " + name[:-2] + " " + " ".join(f"{v:+.2f}" for v in p[name])
+        out.append(line + (f"  REFUSED: {p['refused']}" if p["refused"] else ""))
+    for role in ("control", "check"):
+        s = figures[role]
+        if s:
+            out.append(
+                f"{role} points ({s['count']}), rms: horizontal {s['rms_h_before_m']:.2f} -> "
+                f"{s['rms_h_after_m']:.2f} m, vertical {s['rms_v_before_m']:.2f} -> "
+                f"{s['rms_v_after_m']:.2f} m"
+            )
+    return out + [f"note: {note}" for note in figures["notes"]]

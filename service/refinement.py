@@ -1,0 +1,391 @@
+"""A finished scan adjusted as a whole: telemetry, every loop, ground control, all at once.
+
+The unrefined state is the input, however often a scan was refined, so the same input gives
+the same result. What comes out are new poses of the same chunks, appended to the store, and
+the deliverables written again.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from recon import loop_closure, se3
+from recon.ground_control import (
+    Adjusted,
+    BatchConfig,
+    Closure,
+    Point,
+    Track,
+    adjust,
+    map_position,
+    supported,
+)
+from recon.loop_closure import LoopConfig, LoopView
+from recon.types import F64, Keyframe, PosePrior
+from service.config import CameraConfig, FusionConfig, ScanConfig
+from service.control_points import Candidate, Pictures, candidates_of, place_by_survey, screen
+from service.errors import InputError
+from service.georeference import LocalFrame
+from service.refinement_figures import in_words, told
+from service.revisions import KeyframeState, Revisions, copy_store
+from service.rig import Rig, attitude_of
+from service.scan_folder import local_frame, write_deliverables
+from service.stream.records import PoseRecord, Repose, ScanHeader
+from service.stream.store import ScanStore
+from service.survey_file import read_survey
+
+log = logging.getLogger(__name__)
+
+LINK_LOG = "link.tlog"
+"""What the daemon keeps of the flight's telemetry beside a scan."""
+
+LOOPS_PER_KEYFRAME = 2
+MOST_REFUSALS = 0.4
+"""Of the control points; when more contradict the rest, nobody knows which half is right."""
+
+
+@dataclass(frozen=True, slots=True)
+class RefineOptions:
+    """What the operator chose."""
+
+    gcp: Path | None = None
+    telemetry: Path | None = None
+    out: Path | None = None
+    loops: bool = True
+
+
+def refine(folder: Path, options: RefineOptions) -> dict[str, Any]:
+    """Adjust the scan in ``folder`` and write its deliverables again; the figures of it.
+
+    Raises InputError, in one line, for a scan that is not finished or holds fewer than two
+    keyframes, and for bad control points.
+    """
+    target = _open_target(folder, options.out)
+    with ScanStore.open(target / "scan.db") as store, Revisions(store) as revisions:
+        job = _Refinement(folder, store, revisions, options)
+        figures = job.run()
+    return _deliver(target, figures)
+
+
+def undo(folder: Path) -> dict[str, Any]:
+    """Bring back the unrefined state, as a further revision, and write the deliverables again."""
+    target = _open_target(folder, None)
+    with ScanStore.open(target / "scan.db") as store, Revisions(store) as revisions:
+        states = [s for seq in store.seqs() if (s := revisions.keyframe_state(seq)) is not None]
+        back = [Repose(s.seq, 0, s.T_world_camera, s.scale, s.covariance) for s in states]
+        revisions.append(back, revisions.frames(), revisions.header, {"undone": True})
+    return _deliver(target, {"undone": True, "keyframes": len(states)})
+
+
+def _deliver(target: Path, figures: dict[str, Any]) -> dict[str, Any]:
+    with ScanStore.open(target / "scan.db") as store:
+        write_deliverables(target, store, {})
+    return figures | {"scan_folder": str(target)}
+
+
+def _open_target(folder: Path, out: Path | None) -> Path:
+    """The folder to work in: the scan's own, or a copy of its store in ``out``."""
+    path = folder / "scan.db"
+    if not path.is_file():
+        raise InputError(f"{folder} holds no scan.db; give a scan folder")
+    with ScanStore.open(path) as store:
+        if not store.finished:
+            raise InputError(f"{folder} is not finished; refine it when the flight is over")
+        count = len(store.seqs())
+    if count < 2:
+        raise InputError(f"{folder} holds {count} keyframe(s); refining takes two or more")
+    if out is None or out.resolve() == folder.resolve():
+        return folder
+    copy_store(path, out / "scan.db")
+    return out
+
+
+class _Refinement:
+    """One adjustment of one scan."""
+
+    def __init__(
+        self, folder: Path, store: ScanStore, revisions: Revisions, options: RefineOptions
+    ) -> None:
+        self.folder, self.store, self.options = folder, store, options
+        self.revisions = revisions
+        self.header = revisions.header
+        self.frame = local_frame(self.header)
+        states = (revisions.keyframe_state(seq) for seq in store.seqs())
+        self.states = sorted((s for s in states if s is not None), key=lambda s: s.time_ns)
+        self.frames = revisions.frames()
+        self.keyframe = lru_cache(maxsize=64)(revisions.keyframe)
+        self.notes: list[str] = []
+
+    def run(self) -> dict[str, Any]:
+        """Adjust and append; the figures."""
+        survey = read_survey(self.options.gcp) if self.options.gcp is not None else []
+        pictures = Pictures(self.states, self.frames, self.header.camera, self.keyframe, self.frame)
+        candidates = candidates_of(survey, pictures, str(self.options.gcp))
+        if self.frame is None and candidates:
+            self._place(candidates)
+        if self.frame is not None:
+            screen(candidates, self.frame)
+            self._enough(candidates)
+        elif self.options.telemetry is not None:
+            raise InputError(f"{self.folder} has no georeference; replay it with its telemetry")
+        track = self._track()
+        closures = self._closures(track) if self.options.loops else []
+        track = replace(track, loops=supported(closures, track.poses))
+        found = self._adjusted(track, candidates)
+        seqs = [s.seq for s in self.states]
+        figures = told(seqs, track, found, candidates, len(closures)) | {"notes": self.notes}
+        header = replace(self.header, notes=(*self.header.notes, in_words(figures)))
+        frames = moved_frames(self.frames, self.states, found, self.frame)
+        changed = self.revisions.append(self._reposes(found), frames, header, figures)
+        return figures | {"changed": changed}
+
+    # ---- what goes in ------------------------------------------------------------------------
+
+    def _place(self, candidates: Sequence[Candidate]) -> None:
+        """Give a scan without a place, and without a sure scale, those of the survey."""
+        self.frame, scale, R, t = place_by_survey(candidates)
+        moved = []
+        for s in self.states:
+            T = s.T_world_camera
+            placed = se3.compose(R @ T[:3, :3], scale * R @ T[:3, 3] + t)
+            spread = np.diag([0.03**2] * 3 + [1.0] * 3)
+            moved.append(
+                replace(s, T_world_camera=placed, covariance=spread, scale=s.scale * scale)
+            )
+        self.states = moved
+        for one in candidates:
+            if one.before_m is not None:
+                one.before_m = np.asarray(scale * R @ one.before_m + t)
+                one.sigma_before_m *= scale
+            one.marks = [
+                replace(
+                    m,
+                    depth_m=None if m.depth_m is None else scale * m.depth_m,
+                    sigma_depth_m=scale * m.sigma_depth_m,
+                    T_key_camera=_grown(m.T_key_camera, scale),
+                )
+                for m in one.marks
+            ]
+        self.frames = [
+            replace(f, T_world_camera=se3.compose(
+                R @ f.T_world_camera[:3, :3], scale * R @ f.T_world_camera[:3, 3] + t))
+            for f in self.frames
+        ]  # fmt: skip
+        f = self.frame
+        self.header = replace(
+            self.header, origin_lat_deg=f.lat_deg, origin_lon_deg=f.lon_deg,
+            origin_alt_amsl_m=f.alt_amsl_m, epsg=f.epsg, georeference="control points",
+        )  # fmt: skip
+
+    def _enough(self, candidates: Sequence[Candidate]) -> None:
+        """Raise InputError when control points were given and none, or too few, hold."""
+        control = [c for c in candidates if not c.point.is_check]
+        refused = [c for c in control if not c.usable]
+        if control and len(refused) > MOST_REFUSALS * len(control):
+            told = "; ".join(f"{c.point.name}: {c.why_not}" for c in refused[:4])
+            raise InputError(
+                f"{self.options.gcp}: {len(refused)} of {len(control)} control points do not "
+                f"fit ({told}); nothing was changed"
+            )
+
+    def _track(self) -> Track:
+        times = np.array([s.time_ns * 1e-9 for s in self.states])
+        poses = np.array([s.T_world_camera for s in self.states])
+        spread = np.array([s.covariance for s in self.states])
+        return Track(poses, times - times[0], spread, self._priors())
+
+    def _priors(self) -> list[PosePrior]:
+        """What the flight's telemetry says of each keyframe; empty without a log."""
+        path = self.options.telemetry or self.folder / LINK_LOG
+        if self.frame is None or (self.options.telemetry is None and not path.is_file()):
+            return []
+        from mavlink.logs import load_telemetry
+
+        try:
+            history = load_telemetry(path).history
+        except ValueError as error:
+            if self.options.telemetry is None:
+                self.notes.append(f"{LINK_LOG} beside the scan was not used: {error}")
+                return []
+            raise InputError(str(error)) from error
+        rig = _rig(self.header, self.frame)
+        states = [history.state_at(s.time_ns) for s in self.states]
+        if not any(s is not None and s.lat_deg is not None for s in states):
+            self.notes.append(f"{path.name} tells no position of any keyframe: not used")
+            return []
+        return [PosePrior() if s is None else rig.prior(s, None) for s in states]
+
+    # ---- loops -------------------------------------------------------------------------------
+
+    def _closures(self, track: Track) -> list[Closure]:
+        """All pairs of keyframes far apart in time that see the same place, verified."""
+        config = LoopConfig()
+        views = [self._size(s) for s in self.states]
+        depth_m = float(np.median([v[2] for v in views if v is not None] or [1.0]))
+        tree = cKDTree(track.poses[:, :2, 3])
+        out = []
+        for b, view in enumerate(views):
+            if view is None:
+                continue
+            near = tree.query_ball_point(track.poses[b, :2, 3], 2.0 * depth_m)
+            earlier = sorted(a for a in near if a <= b - config.least_gap and views[a] is not None)
+            subset = {a: track.poses[a] for a in (*earlier, b)}
+            options = replace(config, least_gap=1)
+            found = loop_closure.candidates(subset, b, view[0], view[1], depth_m, options)
+            for a, _ in found[:LOOPS_PER_KEYFRAME]:
+                closure = self._verified(a, b, track)
+                if closure is not None:
+                    out.append(closure)
+        return out
+
+    def _size(self, state: KeyframeState) -> tuple[F64, tuple[int, int], float] | None:
+        """Optics, size and usual depth of a keyframe; None without surface."""
+        keyframe = self.keyframe(state)
+        if keyframe is None or not np.isfinite(keyframe.depth.depth_m).any():
+            return None
+        h, w = keyframe.depth.depth_m.shape
+        return keyframe.depth.K, (w, h), float(np.nanmedian(keyframe.depth.depth_m))
+
+    def _verified(self, a: int, b: int, track: Track) -> Closure | None:
+        one, two = self.keyframe(self.states[a]), self.keyframe(self.states[b])
+        if one is None or two is None:
+            return None
+        guess = se3.inverse(track.poses[a]) @ track.poses[b]
+        found = loop_closure.verify(_loop_view(one), _loop_view(two), guess)
+        return None if found is None else Closure(a, b, found.T_a_b, found.covariance)
+
+    def _config(self) -> BatchConfig:
+        """How sure the scan's scale is, by its own word."""
+        scale = (self.store.summary or {}).get("scale")
+        sigma = scale.get("sigma") if isinstance(scale, dict) else None
+        usual = BatchConfig()
+        return replace(usual, sigma_scale=max(usual.sigma_scale, float(sigma or 0.0)))
+
+    # ---- adjustment --------------------------------------------------------------------------
+
+    def _adjusted(self, track: Track, candidates: Sequence[Candidate]) -> Adjusted:
+        """The adjustment; control points that stay off are left out one by one, and named."""
+        points = [
+            Point(np.zeros(3) if c.surveyed_m is None else c.surveyed_m, c.sigma_m)
+            for c in candidates
+        ]
+        most = int(MOST_REFUSALS * sum(not c.point.is_check for c in candidates))
+        while True:
+            used = [c for c in candidates if c.usable and not c.point.is_check]
+            marks = [m for c in used for m in c.marks]
+            found = adjust(track, points, marks, self._config())
+            worst, by = None, 1.0
+            for one in used:
+                after = map_position(found.poses, found.scales, one.marks)
+                if after is None or one.surveyed_m is None:
+                    continue
+                off = float(np.linalg.norm(after[0] - one.surveyed_m))
+                ratio = off / (5.0 * float(np.hypot(one.sigma_m.max(), after[1])) + 0.3)
+                if ratio > by:
+                    worst, by, far = one, ratio, off
+            refused = sum(not c.usable and not c.point.is_check for c in candidates)
+            if worst is None or refused >= most:
+                return found
+            worst.why_not = f"stays {far:.2f} m off after the adjustment"
+
+    def _reposes(self, found: Adjusted) -> list[Repose]:
+        return [
+            Repose(s.seq, 0, T, s.scale * float(scale), spread)
+            for s, T, scale, spread in zip(
+                self.states, found.poses, found.scales, found.covariances, strict=True
+            )
+        ]
+
+
+def _loop_view(keyframe: Keyframe) -> LoopView:
+    return LoopView(
+        np.asarray(cv2.cvtColor(keyframe.bgr, cv2.COLOR_BGR2GRAY), np.uint8),
+        keyframe.depth.K,
+        keyframe.depth,
+    )
+
+
+def _grown(T: F64, scale: float) -> F64:
+    return se3.compose(T[:3, :3], scale * T[:3, 3])
+
+
+Section = TypeVar("Section")
+
+
+def _section(kind: type[Section], kept: Any) -> Section:
+    """A part of the configuration as it was kept, with defaults for what was not."""
+    known = {f.name for f in fields(kind)} if is_dataclass(kind) else set()
+    return kind(**{k: v for k, v in dict(kept or {}).items() if k in known})
+
+
+def _rig(header: ScanHeader, frame: LocalFrame) -> Rig:
+    """The rig that the scan was flown with, about the scan's own origin."""
+    kept = header.configuration
+    rig = Rig(
+        _section(CameraConfig, kept.get("camera")),
+        _section(ScanConfig, kept.get("scan")),
+        _section(FusionConfig, kept.get("fusion")),
+    )
+    rig.frame = frame
+    return rig
+
+
+def moved_frames(
+    frames: Sequence[PoseRecord],
+    states: Sequence[KeyframeState],
+    found: Adjusted,
+    place: LocalFrame | None,
+) -> list[PoseRecord]:
+    """Every frame's pose, carried by the keyframes before and after it."""
+    keys = np.array([s.time_ns for s in states])
+    out: list[PoseRecord] = []
+    before: PoseRecord | None = None
+    distance = 0.0
+    for frame in frames:
+        b = int(np.clip(np.searchsorted(keys, frame.time_unix_ns), 1, len(keys) - 1))
+        one, two = (_carried(frame, states[k], found, k) for k in (b - 1, b))
+        share = (frame.time_unix_ns - keys[b - 1]) / max(int(keys[b] - keys[b - 1]), 1)
+        share = float(np.clip(share, 0.0, 1.0))
+        T = one @ se3.exp(share * se3.log(se3.inverse(one) @ two))
+        near = b - 1 if share < 0.5 else b
+        step = 0.0
+        if before is not None:
+            step = float(np.linalg.norm(T[:3, 3] - before.T_world_camera[:3, 3]))
+        distance += step
+        moved = _record(frame, T, found.covariances[near], place, distance)
+        if before is not None and frame.time_unix_ns > before.time_unix_ns:
+            seconds = (frame.time_unix_ns - before.time_unix_ns) * 1e-9
+            moved = replace(moved, speed_m_s=step / seconds)
+        out.append(moved)
+        before = moved
+    return out
+
+
+def _carried(frame: PoseRecord, state: KeyframeState, found: Adjusted, k: int) -> F64:
+    """A frame's pose as one keyframe carries it along."""
+    relative = se3.inverse(state.T_world_camera) @ frame.T_world_camera
+    return np.asarray(found.poses[k] @ _grown(relative, float(found.scales[k])))
+
+
+def _record(
+    frame: PoseRecord, T: F64, spread: F64, place: LocalFrame | None, distance_m: float
+) -> PoseRecord:
+    roll, pitch, yaw = attitude_of(T)
+    lat = lon = alt = None
+    if place is not None:
+        lat, lon, alt = (float(v) for v in place.to_geodetic(T[None, :3, 3])[0])
+    lever = np.hstack([-se3.hat(T[:3, 3]), np.eye(3)])
+    sigma = float(np.sqrt(np.trace(lever @ spread @ lever.T)))
+    return replace(
+        frame, T_world_camera=T, covariance=spread, lat_deg=lat, lon_deg=lon, alt_amsl_m=alt,
+        roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw, distance_m=distance_m, sigma_m=sigma,
+    )  # fmt: skip

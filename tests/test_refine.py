@@ -1,0 +1,434 @@
+"""Refinement of finished scans: control points, revisions, and everything wrong with a CSV."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from recon import se3
+from recon.types import F64, DepthMap, Keyframe, Pose
+from service.cli import app
+from service.errors import InputError
+from service.georeference import LocalFrame
+from service.refinement import RefineOptions, refine, undo
+from service.revisions import REFINED, Revisions
+from service.stream.codec import encode
+from service.stream.records import PoseRecord, Repose, ScanHeader
+from service.stream.store import ScanStore
+from service.survey_file import read_survey
+
+FRAME = LocalFrame(47.39, 8.54, 408.0)
+DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
+K = np.array([[140.0, 0.0, 79.5], [0.0, 140.0, 44.5], [0.0, 0.0, 1.0]])
+SIZE = (160, 90)
+START_NS = 1_700_000_000_000_000_000
+SHIFT = np.array([1.4, -0.9, 2.1])
+TURN = np.array([0.003, -0.004, 0.008])
+
+
+def ground(x: Any, y: Any) -> Any:
+    """True height of gentle country."""
+    return 1.5 * np.sin(np.asarray(x) / 17.0) + 1.0 * np.cos(np.asarray(y) / 13.0)
+
+
+def ground_depth(T: F64) -> F64:
+    """(h, w) exact depth of the country, by fixed-point iteration along the rays."""
+    w, h = SIZE
+    u, v = np.meshgrid(np.arange(w), np.arange(h))
+    ways = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones((h, w))], -1)
+    ways = ways @ T[:3, :3].T
+    d = np.full((h, w), T[2, 3])
+    for _ in range(30):
+        p = T[:3, 3] + d[..., None] * ways
+        d = (ground(p[..., 0], p[..., 1]) - T[2, 3]) / ways[..., 2]
+    return np.asarray(d)
+
+
+@dataclass(eq=False)
+class Flight:
+    """A scan whose poses are off by one motion, and its truth."""
+
+    folder: Path
+    truth: F64  # (N, 4, 4)
+    placed: bool = True
+
+    @property
+    def scan(self) -> Path:
+        return self.folder / "scan"
+
+    def pixel(self, k: int, spot: F64) -> tuple[float, float] | None:
+        p = se3.transform(se3.inverse(self.truth[k]), spot[None])[0]
+        u, v = K[0, 0] * p[0] / p[2] + K[0, 2], K[1, 1] * p[1] / p[2] + K[1, 2]
+        return (float(u), float(v)) if 3 < u < SIZE[0] - 4 and 3 < v < SIZE[1] - 4 else None
+
+    def survey(self, spots: dict[str, tuple[float, float]], **changes: Any) -> list[dict[str, Any]]:
+        """Rows of a CSV: each spot (east, north) marked in up to three keyframes."""
+        rows = []
+        for name, (x, y) in spots.items():
+            spot = np.array([x, y, float(ground(x, y))])
+            lat, lon, alt = FRAME.to_geodetic(spot[None])[0]
+            seen = [k for k in range(len(self.truth)) if self.pixel(k, spot)]
+            for k in seen[:: max(1, len(seen) // 3)][:3]:
+                uv = self.pixel(k, spot)
+                assert uv is not None
+                rows.append(
+                    {
+                        "name": name, "keyframe_seq": 10 * k, "u_px": uv[0], "v_px": uv[1],
+                        "lat": lat, "lon": lon, "alt_amsl_m": alt, "sigma_h_m": 0.02,
+                        "sigma_v_m": 0.03, "role": "check" if name.startswith("C") else "control",
+                    }
+                    | changes
+                )  # fmt: skip
+        return rows
+
+
+SPOTS = {"A": (4.0, -6.0), "B": (46.0, -4.0), "D": (44.0, 26.0), "E": (5.0, 25.0), "F": (25.0, 9.0),
+         "C1": (15.0, 3.0), "C2": (36.0, 18.0)}  # fmt: skip
+
+
+def wrong(T: F64) -> F64:
+    """The pose as the scan has it."""
+    return se3.compose(se3.so3_exp(TURN), SHIFT) @ T
+
+
+def fly(folder: Path, placed: bool = True, finished: bool = True, keyframes: int = 16) -> Flight:
+    """Two legs over the country, stored with poses that are off."""
+    half = keyframes // 2
+    truth = np.array(
+        [
+            se3.compose(
+                DOWN,
+                np.array([6.0 * min(k, keyframes - 1 - k), 0.0 if k < half else 20.0, 40.0]),
+            )
+            for k in range(keyframes)
+        ]
+    )
+    camera = {"width": SIZE[0], "height": SIZE[1], "K": K.ravel().tolist(), "distortion": [0.0] * 5}
+    header = ScanHeader("test-1", "drone-1", START_NS, camera=camera)
+    if placed:
+        header = replace(
+            header, origin_lat_deg=FRAME.lat_deg, origin_lon_deg=FRAME.lon_deg,
+            origin_alt_amsl_m=FRAME.alt_amsl_m, epsg=FRAME.epsg, georeference="gnss",
+        )  # fmt: skip
+    flight = Flight(folder, truth, placed)
+    spread = np.diag([0.01**2] * 3 + [1.5**2] * 3)
+    with ScanStore.create(flight.scan / "scan.db", header) as store:
+        for k, T in enumerate(truth):
+            time_ns = START_NS + k * 10**9
+            depth = ground_depth(T).astype(np.float32)
+            sigma = np.full(depth.shape, 0.05, np.float32)
+            views = np.full(depth.shape, 3, np.uint8)
+            bgr = np.full((*depth.shape, 3), 120, np.uint8)
+            here = wrong(T)
+            one = Keyframe(
+                10 * k, time_ns, DepthMap(depth, sigma, views, K, here), bgr,
+                Pose(here, spread, ("vision",)), np.ones(depth.shape, np.bool_),
+            )  # fmt: skip
+            store.add_keyframe(10 * k, encode(one, time_ns))
+            for part in (0.0, 0.5):  # a keyframe and a frame after it
+                if part and k + 1 >= len(truth):
+                    continue
+                ahead = se3.compose(
+                    np.eye(3), part * (truth[min(k + 1, len(truth) - 1)] - T)[:3, 3]
+                )
+                store.add_pose(
+                    PoseRecord(
+                        time_ns + int(part * 1e9),
+                        wrong(ahead @ T),
+                        spread,
+                        sources=("vision",),
+                        keyframe_seq=10 * k if part == 0 else None,
+                    )
+                )
+        if finished:
+            store.finish({"frames": 2 * keyframes - 1})
+    return flight
+
+
+def write_csv(path: Path, rows: list[dict[str, Any]]) -> Path:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.DictWriter(file, list(rows[0]))
+        table.writeheader()
+        table.writerows(rows)
+    return path
+
+
+def errors(flight: Flight, folder: Path | None = None) -> F64:
+    """(N,) metres by which the keyframes' positions are off, in the frame of the truth."""
+    with ScanStore.open((folder or flight.scan) / "scan.db") as store:
+        own = LocalFrame(*(getattr(store.header, f"origin_{n}") or 0.0
+                           for n in ("lat_deg", "lon_deg", "alt_amsl_m")))  # fmt: skip
+        out = []
+        for k, T in enumerate(flight.truth):
+            found = store.keyframe(10 * k)
+            assert found is not None
+            enu = found.depth.T_world_camera[None, :3, 3]
+            if own != FRAME:
+                enu = FRAME.to_enu(own.to_geodetic(enu))
+            out.append(float(np.linalg.norm(enu[0] - T[:3, 3])))
+    return np.array(out)
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Flight:
+    return fly(tmp_path)
+
+
+def test_control_points_bring_map_and_track_to_their_place(flight: Flight) -> None:
+    gcp = write_csv(flight.folder / "points.csv", flight.survey(SPOTS))
+    before = errors(flight)
+    figures = refine(flight.scan, RefineOptions(gcp))
+    assert before.min() > 2.0 and errors(flight).max() < 0.12
+    assert figures["control"]["count"] == 5 and figures["check"]["count"] == 2
+    assert figures["check"]["rms_h_before_m"] > 1.0 and figures["check"]["rms_v_before_m"] > 1.5
+    assert figures["check"]["rms_h_after_m"] < 0.08 and figures["check"]["rms_v_after_m"] < 0.08
+    with ScanStore.open(flight.scan / "scan.db") as store:
+        poses = list(store.poses())
+        assert len(poses) == 31
+        for k in range(15):  # the frame half way between two keyframes
+            half = (flight.truth[k] + flight.truth[k + 1])[:3, 3] / 2
+            assert np.linalg.norm(poses[2 * k + 1].T_world_camera[:3, 3] - half) < 0.15
+        assert poses[3].lat_deg is not None and poses[3].speed_m_s == pytest.approx(6.0, rel=0.05)
+    summary = json.loads((flight.scan / "scan.json").read_text())
+    assert summary["refinement"]["check"] == figures["check"]
+    assert any("control points" in note for note in summary["notes"])
+
+
+def test_marks_by_time_and_points_of_the_cloud_count_too(flight: Flight) -> None:
+    rows = []
+    for name, (x, y) in SPOTS.items():
+        spot = np.array([x, y, float(ground(x, y))])
+        lat, lon, alt = FRAME.to_geodetic(spot[None])[0]
+        row: dict[str, Any] = dict.fromkeys(("time", "u_px", "v_px", "x", "y", "z"), "")
+        row |= {"name": name, "lat": lat, "lon": lon, "alt_amsl_m": alt}
+        if name in "ABD":  # two pictures between keyframes
+            for k in [k for k in range(15) if flight.pixel(k, spot)]:
+                half = np.array(flight.truth[k])
+                half[:3, 3] = (flight.truth[k] + flight.truth[k + 1])[:3, 3] / 2
+                p = se3.transform(se3.inverse(half), spot[None])[0]
+                seen = {"u_px": K[0, 0] * p[0] / p[2] + K[0, 2],
+                        "v_px": K[1, 1] * p[1] / p[2] + K[1, 2]}  # fmt: skip
+                if 0 < seen["u_px"] < 159 and 0 < seen["v_px"] < 89:
+                    rows.append(row | seen | {"time": START_NS * 1e-9 + k + 0.5})
+        else:
+            utm = FRAME.to_utm(se3.transform(wrong(np.eye(4)), spot[None]))
+            rows.append(row | dict(zip("xyz", utm[0], strict=True)))
+    gcp = write_csv(flight.folder / "points.csv", rows)
+    figures = refine(flight.scan, RefineOptions(gcp))
+    assert [p["refused"] for p in figures["points"]] == [None] * len(SPOTS)
+    assert errors(flight).max() < 0.2
+
+
+def test_the_same_input_twice_changes_nothing_and_undo_brings_all_back(flight: Flight) -> None:
+    gcp = write_csv(flight.folder / "points.csv", flight.survey(SPOTS))
+    with ScanStore.open(flight.scan / "scan.db") as store:
+        store.add_repose(Repose(0, 1, wrong(flight.truth[0]), 1.0, np.eye(6) * 0.01))
+        held = [(k.seq, k.depth.T_world_camera, k.depth.depth_m) for k in store.keyframes()]
+        track = [p.T_world_camera for p in store.poses()]
+    first = refine(flight.scan, RefineOptions(gcp))
+    with ScanStore.open(flight.scan / "scan.db") as store:
+        rows = store.numbers()["pose"], store.repose(0)
+    again = refine(flight.scan, RefineOptions(gcp))
+    assert first["changed"] and not again["changed"]
+    assert {k: v for k, v in first.items() if k != "changed"} == {
+        k: v for k, v in again.items() if k != "changed"
+    }
+    with ScanStore.open(flight.scan / "scan.db") as store:
+        assert store.numbers()["pose"] == rows[0]
+        repose = store.repose(0)
+        assert repose is not None and rows[1] is not None
+        assert repose.revision == rows[1].revision == REFINED
+    undo(flight.scan)
+    with ScanStore.open(flight.scan / "scan.db") as store:
+        for seq, T, depth in held:
+            found = store.keyframe(seq)
+            assert found is not None
+            assert np.abs(found.depth.T_world_camera - T).max() < 1e-9
+            assert np.array_equal(found.depth.depth_m, depth, equal_nan=True)
+        for pose, T in zip(store.poses(), track, strict=True):
+            assert np.abs(pose.T_world_camera - T).max() < 1e-9
+        assert store.refinement is None
+    assert json.loads((flight.scan / "scan.json").read_text())["refinement"] is None
+    assert refine(flight.scan, RefineOptions(gcp))["changed"]
+
+
+def test_out_leaves_the_scan_alone(flight: Flight, tmp_path: Path) -> None:
+    gcp = write_csv(flight.folder / "points.csv", flight.survey(SPOTS))
+    before = (flight.scan / "scan.db").read_bytes()
+    refine(flight.scan, RefineOptions(gcp, out=tmp_path / "refined"))
+    assert errors(flight, tmp_path / "refined").max() < 0.12
+    assert errors(flight).min() > 2.0
+    assert len((flight.scan / "scan.db").read_bytes()) == len(before)
+    assert (tmp_path / "refined" / "cloud.laz").is_file()
+    with pytest.raises(InputError, match="exists"):
+        refine(flight.scan, RefineOptions(gcp, out=tmp_path / "refined"))
+
+
+def test_a_scan_without_a_place_gets_it_from_three_points(tmp_path: Path) -> None:
+    flight = fly(tmp_path, placed=False)
+    rows = flight.survey(SPOTS)
+    few = write_csv(flight.folder / "few.csv", [r for r in rows if r["name"] in "AB"])
+    with pytest.raises(InputError, match="only 2 usable control points"):
+        refine(flight.scan, RefineOptions(few))
+    figures = refine(flight.scan, RefineOptions(write_csv(flight.folder / "points.csv", rows)))
+    assert errors(flight).max() < 0.15
+    assert figures["check"]["rms_v_after_m"] < 0.1
+    summary = json.loads((flight.scan / "scan.json").read_text())
+    assert summary["georeference"] == "control points" and summary["epsg"] == FRAME.epsg
+    undo(flight.scan)
+    assert json.loads((flight.scan / "scan.json").read_text())["origin"] is None
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"lon": -8.54}, "lon has the wrong sign"),
+        ({"lat": -47.39}, "lat has the wrong sign"),
+        ({"lat": 8.54, "lon": 47.39}, "swapped"),
+        ({"lat": 47.41}, "wrong point, zone or sign"),
+        ({"alt_amsl_m": 456.0}, "not above the ellipsoid"),
+    ],
+)
+def test_an_outlier_is_refused_and_named(
+    flight: Flight, change: dict[str, float], why: str
+) -> None:
+    rows = [r | change if r["name"] == "D" else r for r in flight.survey(SPOTS)]
+    figures = refine(flight.scan, RefineOptions(write_csv(flight.folder / "p.csv", rows)))
+    refused = {p["name"]: p["refused"] for p in figures["points"] if p["refused"]}
+    assert list(refused) == ["D"] and why in refused["D"]
+    assert errors(flight).max() < 0.2
+
+
+def test_a_point_two_metres_off_is_told_from_the_others(flight: Flight) -> None:
+    rows = flight.survey(SPOTS)
+    for row in rows:
+        if row["name"] == "B":
+            row["lat"] += 2.0 / 111_200
+    figures = refine(flight.scan, RefineOptions(write_csv(flight.folder / "p.csv", rows)))
+    refused = {p["name"]: p["refused"] for p in figures["points"] if p["refused"]}
+    assert list(refused) == ["B"] and "north" in refused["B"]
+    assert errors(flight).max() < 0.2
+
+
+def test_check_points_never_take_part(flight: Flight) -> None:
+    rows = flight.survey(SPOTS)
+    one = refine(
+        flight.scan,
+        RefineOptions(write_csv(flight.folder / "a.csv", rows), out=flight.folder / "a"),
+    )
+    alone = [r for r in rows if r["role"] == "control"]
+    moved = alone + [r | {"alt_amsl_m": r["alt_amsl_m"] + 0.5} for r in rows if r not in alone]
+    two = refine(
+        flight.scan,
+        RefineOptions(write_csv(flight.folder / "b.csv", moved), out=flight.folder / "b"),
+    )
+    assert one["moved_m"] == two["moved_m"] and one["control"] == two["control"]
+    assert two["check"]["rms_v_after_m"] == pytest.approx(0.5, abs=0.1)
+
+
+def test_when_half_contradict_the_rest_nothing_is_changed(flight: Flight) -> None:
+    rows = flight.survey({k: SPOTS[k] for k in "AB"})
+    for row in rows:
+        if row["name"] == "B":
+            row["lat"] += 10.0 / 111_200
+    with pytest.raises(InputError, match="contradicts"):
+        refine(flight.scan, RefineOptions(write_csv(flight.folder / "p.csv", rows)))
+    with Revisions(ScanStore.open(flight.scan / "scan.db")) as revisions:
+        assert revisions._note == {}
+
+
+def test_scans_that_cannot_be_refined_say_why(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="not finished"):
+        refine(fly(tmp_path / "a", finished=False, keyframes=2).scan, RefineOptions())
+    with pytest.raises(InputError, match="1 keyframe"):
+        refine(fly(tmp_path / "b", keyframes=1).scan, RefineOptions())
+    with pytest.raises(InputError, match=r"no scan\.db"):
+        refine(tmp_path, RefineOptions())
+    local = fly(tmp_path / "c", placed=False, keyframes=3)
+    log = tmp_path / "x.tlog"
+    log.write_bytes(b"nothing")
+    with pytest.raises(InputError, match="no georeference"):
+        refine(local.scan, RefineOptions(telemetry=log))
+    assert refine(local.scan, RefineOptions())["moved_m"]["most"] < 1e-3
+
+
+GOOD = "name,keyframe_seq,u_px,v_px,lat,lon,alt_amsl_m\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "line 1: column name is missing"),
+        ("name;lat;lon\n", "separated by commas"),
+        ("name,lat,lon,alt_amsl_m,height\n", "unknown column 'height'"),
+        ("name,lat,lon,alt_amsl_m\n", "neither u_px,v_px nor x,y,z"),
+        (GOOD, "no points"),
+        (GOOD + "A,0,10,10,47.39,8.54\n", "line 2: alt_amsl_m is empty"),
+        (GOOD + "A,0,10,10,47,39,8.54,408\n", "decimals take a point"),
+        (GOOD + "A,0,10,ten,47.39,8.54,408\n", "v_px is 'ten', not a number"),
+        (GOOD + "A,0,10,10,97.39,8.54,408\n", "not on the globe"),
+        (GOOD + "A,0,10,10,47.39,8.54,nan\n", "not a finite number"),
+        (GOOD + "A,0,10,10,47.39,8.54,40800\n", "not metres above sea level"),
+        (GOOD + ",0,10,10,47.39,8.54,408\n", "no name"),
+        (GOOD + "A,,10,10,47.39,8.54,408\n", "either keyframe_seq or time"),
+        (GOOD + "A,1.5,10,10,47.39,8.54,408\n", "not a whole number"),
+        (GOOD + "A,0,1,1,47.39,8.54,408\nA,1,1,1,47.38,8.54,408\n", "differs from line 2"),
+        (GOOD + "A,3,10,10,47.39,8.54,408\n", "no keyframe 3; the nearest is 0"),
+        (GOOD + "A,0,999,10,47.39,8.54,408\n", "outside the camera's picture of 160x90"),
+        ("name,x,y,z,lat,lon,alt_amsl_m\nA,1,2,3,47.39,8.54,408\n", "no surface at x,y,z"),
+        (
+            "name,time,u_px,v_px,lat,lon,alt_amsl_m\nA,5,10,10,47.39,8.54,408\n",
+            "no picture within 20 ms",
+        ),
+        (
+            "name,x,y,z,u_px,v_px,lat,lon,alt_amsl_m\nA,1,2,3,4,5,47.39,8.54,408\n",
+            "not both in one row",
+        ),
+        (GOOD.replace("u_px", "u_px,role") + "A,0,10,both,10,47.39,8.54,408\n", "neither control"),
+        (GOOD.replace("u_px", "u_px,sigma_h_m") + "A,0,1,-1,10,47.39,8.54,408\n", "sigma"),
+    ],
+)
+def test_a_bad_file_is_said_in_one_line(
+    tmp_path_factory: pytest.TempPathFactory, small: Path, text: str, said: str
+) -> None:
+    path = tmp_path_factory.mktemp("csv") / "points.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError) as raised:
+        refine(small, RefineOptions(path))
+    assert said in str(raised.value) and str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fly(tmp_path_factory.mktemp("small"), keyframes=2).scan
+
+
+def test_files_that_are_no_tables(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_survey(tmp_path / "none.csv")
+    (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe\x00name")
+    with pytest.raises(InputError, match="UTF-8"):
+        read_survey(tmp_path / "bytes.csv")
+
+
+def test_the_command_reports_and_refuses_intrinsics(flight: Flight) -> None:
+    gcp = write_csv(flight.folder / "points.csv", flight.survey(SPOTS))
+    run = CliRunner().invoke
+    answer = run(app, ["refine", str(flight.scan), "--gcp", str(gcp)])
+    assert answer.exit_code == 0, answer.output
+    assert "check points (2), rms" in answer.stdout
+    answer = run(app, ["refine", str(flight.scan), "--gcp", str(gcp), "--json"])
+    assert json.loads(answer.stdout.splitlines()[-1])["changed"] is False
+    refused = run(app, ["refine", str(flight.scan), "--intrinsics"])
+    assert isinstance(refused.exception, InputError)
+    assert "calibrate" in str(refused.exception)
+    assert run(app, ["refine", str(flight.scan), "--undo"]).exit_code == 0
+    assert errors(flight).min() > 2.0
