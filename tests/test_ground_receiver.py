@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import time
 from collections.abc import Callable
@@ -20,7 +21,7 @@ from service.stream import codec
 from service.stream import link as link_module
 from service.stream.link import DatalinkSender
 from service.stream.records import PoseRecord, Repose, ScanHeader
-from service.stream.session import SessionConfig, open_session
+from service.stream.session import SessionConfig, open_session, zenoh_config
 from service.stream.store import ScanStore
 
 pytest.importorskip("zenoh")
@@ -286,6 +287,13 @@ def test_over_the_quota_the_ground_keeps_coarse_layers_and_says_so(tmp_path: Pat
         link.close()
         ground.close()
         onboard.close()
+
+
+@pytest.mark.parametrize(("rate", "size"), [(0.0, 16_384), (81_250.0, 16_384), (1e6, 200_000)])
+def test_the_send_buffer_is_small_and_covers_a_round_trip(rate: float, size: int) -> None:
+    config = SessionConfig(connect=("tls/10.0.0.1:7447",), rate_bytes_s=rate)
+    endpoints = json.loads(zenoh_config(config).get_json("connect/endpoints"))
+    assert endpoints == [f"tls/10.0.0.1:7447#so_sndbuf={size}"]
 
 
 def test_no_endpoint_opens_nothing(tmp_path: Path) -> None:

@@ -6,8 +6,9 @@ correlated). Ours carries mask, sigma, views and a coarse layer besides; the pee
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -79,6 +80,8 @@ def run(options: BenchOptions) -> list[BenchResult]:
         BenchResult("codec", "colour", ours.psnr_db, "dB PSNR"),
         BenchResult("codec", "sent of a keyframe at 80 % overlap", 100 * (1 - saved), "%"),
         BenchResult("codec", "size of such keyframes", bits, "bits per point"),
+        BenchResult("codec", "encode one of them", strip_ms(), "ms"),
+        BenchResult("codec", "decode a whole keyframe", decode_ms(), "ms"),
         BenchResult("codec", "coarse layer of their bytes", 100 * coarse_share(), "%"),
         BenchResult("codec", "coarse layer of a whole keyframe", 100 * coarse_share(False), "%"),
     ]
@@ -93,6 +96,20 @@ def masking() -> tuple[float, float]:
     fresh = [strip(SIZE_PX, 20 + k) for k in frames]
     part = sum(_size(make_keyframe(k, SIZE_PX, fresh[k], seed=1 + k)) for k in frames)
     return 1 - part / whole, part * 8 / sum(int(f.sum()) for f in fresh)
+
+
+def strip_ms() -> float:
+    """Milliseconds to encode a keyframe at 80 % overlap, both layers, on one core."""
+    frame = make_keyframe(0, SIZE_PX, strip(SIZE_PX, 20), seed=1)
+    with _one_core():
+        return _median_ms(lambda: codec.encode(frame, 0))
+
+
+def decode_ms() -> float:
+    """Milliseconds to decode the fine layer of a whole keyframe, on one core."""
+    layers = codec.encode(make_keyframe(0, SIZE_PX, seed=1), 0)
+    with _one_core():
+        return _median_ms(lambda: codec.decode(layers[-1:]))
 
 
 def coarse_share(masked: bool = True) -> float:
@@ -129,6 +146,17 @@ def _median_ms(work: Callable[[], object]) -> float:
     return float(np.median(times)) * 1e3
 
 
+@contextlib.contextmanager
+def _one_core() -> Iterator[None]:
+    """OpenCV without threads of its own."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)
+
+
 def _rms_at_60(frame: Keyframe, depth_m: F32) -> float:
     truth = frame.depth.depth_m.astype(np.float64)
     error = (depth_m - truth) * (60.0 / truth) ** 2
@@ -140,12 +168,8 @@ def _psnr(a: U8, frame: Keyframe) -> float:
 
 
 def _ours(frame: Keyframe) -> CodecFigures:
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
+    with _one_core():
         encode_ms = _median_ms(lambda: codec.encode(frame, 0))
-    finally:
-        cv2.setNumThreads(threads)
     layers = codec.encode(frame, 0)
     back = codec.decode(layers)
     assert back is not None

@@ -287,3 +287,10 @@ class _UdpBack(asyncio.DatagramProtocol):
         if at is not None and self._near.transport is not None:
             delay = max(0.0, at - time.monotonic())
             self._emulator._loop.call_later(delay, self._near.transport.sendto, data, self._caller)
+
+
+def free_port() -> int:
+    """A TCP port of this machine that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

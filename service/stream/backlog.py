@@ -35,17 +35,25 @@ def open_undelivered(scans: Path, but: Path | None = None) -> list[ScanStore]:
         if but is not None and path.resolve() == but.resolve():
             continue
         try:
+            if _was_delivered(path):
+                continue
             store = ScanStore.open(path)
             if not store.finished:
                 store.finish({"interrupted": True})
         except SkyreliefError as error:
             log.warning("%s", error)
             continue
-        if delivered(store):
-            store.close()
-        else:
-            out.append(store)
+        out.append(store)
     return out
+
+
+def _was_delivered(path: Path) -> bool:
+    """Whether the scan is finished and delivered, without reading the whole file for damage."""
+    try:
+        with ScanStore(path, None, None) as store:
+            return store.finished and delivered(store)
+    except SkyreliefError:
+        return False  # it is opened with more care
 
 
 def _changed(path: Path) -> float:

@@ -93,6 +93,7 @@ class DatalinkSender:
             tls_ca=config.tls_ca,
             tls_certificate=config.tls_certificate,
             tls_key=config.tls_key,
+            rate_bytes_s=_rate(config.budget_kbit_s, config.share),
         )
         check_endpoints(self._session_config)
         self._lock = threading.Lock()  # of the outbox

@@ -18,7 +18,9 @@ ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws)/(\[[0-9A-Fa-f:.%]+\]|[^/:#?\s]+):(
 _ENCRYPTED = ("tls", "quic")
 _LOOPBACK = ("localhost", "[::1]")
 
-SEND_BUFFER_BYTES = 16_384
+SEND_BUFFER_BYTES, SEND_BUFFER_S = 16_384, 0.2
+"""Least send buffer, and how long the budget takes to empty a larger one: what the system holds
+must cover a round trip, and nothing urgent may wait behind more."""
 BATCH_BYTES = 8_192
 LEASE_MS = 8_000
 
@@ -36,6 +38,7 @@ class SessionConfig:
     tls_key: str = ""
     fleet_rights: bool = False  # enforce, as a router, what fleet.json beside tls_key allows
     open_timeout_s: float = 10.0  # of one attempt to reach the other end
+    rate_bytes_s: float = 0.0  # that we shall send; sizes the send buffer
 
 
 def check_endpoints(config: SessionConfig) -> None:
@@ -88,7 +91,7 @@ def zenoh_config(config: SessionConfig) -> zenoh.Config:
 
     settings: dict[str, Any] = {
         "mode": config.mode,
-        "connect/endpoints": [_small_buffer(e) for e in config.connect],
+        "connect/endpoints": [_small_buffer(e, config.rate_bytes_s) for e in config.connect],
         "connect/timeout_ms": 0,
         "transport/unicast/open_timeout": round(1000 * config.open_timeout_s),
         "connect/exit_on_failure": config.mode == "client",
@@ -126,8 +129,8 @@ def zenoh_config(config: SessionConfig) -> zenoh.Config:
     return out
 
 
-def _small_buffer(endpoint: str) -> str:
+def _small_buffer(endpoint: str, rate_bytes_s: float) -> str:
     """A small send buffer keeps control from waiting behind bulk in the kernel."""
     if "#" in endpoint or not endpoint.startswith(("tcp/", "tls/")):
         return endpoint
-    return f"{endpoint}#so_sndbuf={SEND_BUFFER_BYTES}"
+    return f"{endpoint}#so_sndbuf={max(SEND_BUFFER_BYTES, round(rate_bytes_s * SEND_BUFFER_S))}"

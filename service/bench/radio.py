@@ -1,0 +1,246 @@
+"""The coarse map over a telemetry radio: part of ``skyrelief bench link``.
+
+A flight of 100 m in 20 s. The drone's MAVLink link and the ground station's are two
+pseudo-terminals; between them a radio of 57,600 baud that loses packets and says in
+RADIO_STATUS how full its buffer is. There is no IP link.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import select
+import tempfile
+import threading
+import time
+import tty
+from collections import deque
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from mavlink.framing import Framer
+from mavlink.presence import Health
+from mavlink.rehearsal import RehearsalControl
+from mavlink.vehicle import VehicleConfig, VehicleLink
+from mavlink.wire import dialect
+from recon import se3
+from recon.types import F64, DepthMap, Keyframe, Pose
+from service.bench.link_emulator import free_port
+from service.config import DatalinkConfig
+from service.ground.receiver import Receiver, ReceiverConfig
+from service.stream import codec
+from service.stream.link import DatalinkSender
+from service.stream.radio_link import GROUND, TUNNEL, RadioLink
+from service.stream.radio_messages import unpack_tile
+from service.stream.records import PoseRecord, ScanHeader
+from service.stream.session import SessionConfig
+from service.stream.store import ScanStore
+from service.stream.vehicle_radio import VehicleRadio
+
+BAUD = 57_600
+BYTES_S = BAUD / 10
+SHARE = 0.3
+LOSS = 0.05
+BUFFER_BYTES = 4096
+FLIGHT_S, FLIGHT_M, KEYFRAMES = 20.0, 100.0, 13
+HEIGHT_M = 60.0
+FOCAL_PX, SIZE_PX = 260.0, (320, 180)
+CELL_M = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class RadioOutcome:
+    """What was at the ground when the flight ended."""
+
+    share: float  # of the radio, by our tunnel
+    all_share: float  # of the radio, by everything that our component sent
+    covered: float  # of the 4 m cells that the drone saw
+    height_rms_m: float  # of the points against the true ground
+    first_s: float  # from the first keyframe to the first of its tiles
+    latency_s: float  # median, from a keyframe to its last tile
+    poses: int
+
+
+class _Radio:
+    """Two serial lines and the air between them; ``sent`` counts bytes by message number."""
+
+    def __init__(self) -> None:
+        self._lines = [os.openpty() for _ in range(2)]
+        for _, slave in self._lines:
+            tty.setraw(slave)
+        self.names = [f"serial:{os.ttyname(slave)}:{BAUD}" for _, slave in self._lines]
+        self.sent: dict[int, int] = {}
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="radio emulator", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Switch it off."""
+        self._stop.set()
+        self._thread.join(5.0)
+        for line in self._lines:
+            for end in line:
+                os.close(end)
+
+    def _run(self) -> None:
+        """Carry packets up from line 0 to line 1 at the radio's rate, and the status back."""
+        drone, ground = (master for master, _ in self._lines)
+        framer, encoder, rng = Framer(), dialect.MAVLink(None, 51, 68), random.Random(1)
+        waiting: deque[bytes] = deque()
+        free_at = status_at = time.monotonic()
+        while not self._stop.is_set():
+            for end in select.select([drone, ground], [], [], 0.005)[0]:
+                data = os.read(end, 4096)
+                if end == ground:
+                    continue
+                for packet in framer.feed(data):
+                    size = len(packet.data)
+                    self.sent[packet.message_id] = self.sent.get(packet.message_id, 0) + size
+                    if sum(map(len, waiting)) + size <= BUFFER_BYTES:
+                        waiting.append(bytes(packet.data))
+            now = time.monotonic()
+            while waiting and free_at <= now:
+                data = waiting.popleft()
+                free_at = max(free_at, now - 0.02) + len(data) / BYTES_S
+                if rng.random() >= LOSS:
+                    os.write(ground, data)
+            if now >= status_at:
+                status_at = now + 1.0
+                free = round(100 * (1 - sum(map(len, waiting)) / BUFFER_BYTES))
+                status = dialect.MAVLink_radio_status_message(180, 180, free, 40, 40, 0, 0)
+                os.write(drone, bytes(status.pack(encoder)))
+
+
+@dataclass(slots=True, eq=False)
+class _Flight:
+    """When keyframes were made, and when the first and the last of their tiles came."""
+
+    made: dict[int, float] = field(default_factory=dict)
+    first: dict[int, float] = field(default_factory=dict)
+    last: dict[int, float] = field(default_factory=dict)
+    tiles: set[tuple[int, int]] = field(default_factory=set)
+
+    def heard(self, payload: bytes) -> None:
+        """Take note of a payload at the ground."""
+        tile = unpack_tile(payload)
+        if tile is not None and (tile[1].seq, tile[1].index) not in self.tiles:
+            self.tiles.add((tile[1].seq, tile[1].index))
+            self.first.setdefault(tile[1].seq, time.monotonic())
+            self.last[tile[1].seq] = time.monotonic()
+
+
+def fly() -> RadioOutcome:
+    """Fly over the radio alone."""
+    with tempfile.TemporaryDirectory() as folder:
+        return _fly(Path(folder))
+
+
+def _fly(folder: Path) -> RadioOutcome:
+    radio, flight = _Radio(), _Flight()
+    vehicle = VehicleLink(VehicleConfig(links=(radio.names[0],)), RehearsalControl())
+    vehicle.start()
+    session = SessionConfig(mode="router", listen=(f"tcp/127.0.0.1:{free_port()}",))
+    receiver = _Receiver(ReceiverConfig(folder / "ground", session))
+    receiver.start()
+
+    def heard(payload: bytes) -> None:
+        flight.heard(payload)
+        receiver.add_radio(payload)
+
+    ear = RadioLink(radio.names[1], GROUND, heard)
+    ear.start()
+    onboard = ScanStore.create(folder / "scan.db", ScanHeader("scan", "drone", 1))
+    config = DatalinkConfig(radio_baud=BAUD, radio_share=SHARE)
+    sender = DatalinkSender(onboard, config, radio=VehicleRadio(vehicle))
+    try:
+        began = time.monotonic()
+        while time.monotonic() - began < FLIGHT_S:
+            vehicle.set_health(Health.ACTIVE)
+            _produce(onboard, flight, time.monotonic() - began)
+            time.sleep(0.1)
+        sent = dict(radio.sent)
+    finally:
+        sender.close()
+        ear.close()
+        receiver.close()
+        vehicle.stop()
+        radio.close()
+    with onboard, ScanStore.open(folder / "ground" / "drone" / "scan" / "scan.db") as ground:
+        return _outcome(onboard, ground, flight, sent)
+
+
+class _Receiver(Receiver):
+    """A receiver that writes no deliverables."""
+
+    def _write(self, scan) -> None:  # type: ignore[no-untyped-def]
+        scan.unwritten = False
+
+
+def _produce(store: ScanStore, flight: _Flight, at_s: float) -> None:
+    """The keyframes that are due, of the surface that each adds."""
+    while len(flight.made) < min(KEYFRAMES, 1 + int(at_s / FLIGHT_S * KEYFRAMES)):
+        seq = len(flight.made)
+        frame = _keyframe(seq)
+        flight.made[seq] = time.monotonic()
+        store.add_keyframe(seq, codec.encode(frame, time.time_ns()))
+        store.add_pose(PoseRecord(time.time_ns(), frame.pose.T_world_camera, np.eye(6)))
+
+
+def _ground_m(x: F64, y: F64) -> F64:
+    """The true surface: hills of 7 m."""
+    return np.asarray(4 * np.sin(x / 15) + 3 * np.cos(y / 12))
+
+
+def _keyframe(seq: int) -> Keyframe:
+    """What a camera looking down sees; all but the first show a strip of new surface."""
+    w, h = SIZE_PX
+    x0, step_m = seq * FLIGHT_M / (KEYFRAMES - 1), FLIGHT_M / (KEYFRAMES - 1)
+    T = se3.compose(np.diag([1.0, -1.0, -1.0]), np.array([x0, 0.0, HEIGHT_M]))
+    K = np.array([[FOCAL_PX, 0, (w - 1) / 2], [0, FOCAL_PX, (h - 1) / 2], [0, 0, 1]])
+    v, u = np.mgrid[:h, :w].astype(np.float64)
+    rays_x, rays_y = (u - K[0, 2]) / FOCAL_PX, (v - K[1, 2]) / FOCAL_PX
+    z = np.full((h, w), HEIGHT_M)
+    for _ in range(12):  # to where each ray meets the surface
+        z = HEIGHT_M - _ground_m(x0 + rays_x * z, -rays_y * z)
+    grey = np.clip(128 + 60 * np.sin((x0 + rays_x * z) / 3), 0, 255).astype(np.uint8)
+    depth = DepthMap(
+        z.astype(np.float32), np.full((h, w), 0.2, np.float32), np.full((h, w), 3, np.uint8), K, T
+    )
+    fresh = u >= (0 if seq == 0 else w - 1.2 * step_m * FOCAL_PX / HEIGHT_M)
+    bgr = np.stack([grey, grey, grey // 2], axis=-1)
+    return Keyframe(seq, 0, depth, bgr, Pose(T, np.eye(6) * 1e-4), fresh)
+
+
+def _points(frame: Keyframe) -> F64:
+    """(n, 3) points in the world."""
+    depth = frame.depth
+    v, u = np.nonzero(np.isfinite(depth.depth_m))
+    z = depth.depth_m[v, u].astype(np.float64)
+    K = depth.K
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(len(u))], axis=1)
+    return se3.transform(depth.T_world_camera, rays * z[:, None])
+
+
+def _cells(frames: list[F64]) -> set[tuple[int, int]]:
+    return {(int(x // CELL_M), int(y // CELL_M)) for points in frames for x, y in points[:, :2]}
+
+
+def _outcome(
+    onboard: ScanStore, ground: ScanStore, flight: _Flight, sent: dict[int, int]
+) -> RadioOutcome:
+    there = [_points(frame) for frame in ground.keyframes()]
+    seen = _cells([_points(frame) for frame in onboard.keyframes()])
+    points = np.concatenate(there)
+    error = points[:, 2] - _ground_m(points[:, 0], points[:, 1])
+    whole = BYTES_S * FLIGHT_S
+    return RadioOutcome(
+        share=sent.get(TUNNEL, 0) / whole,
+        all_share=sum(sent.values()) / whole,
+        covered=len(_cells(there) & seen) / len(seen),
+        height_rms_m=float(np.sqrt(np.mean(error**2))),
+        first_s=min(flight.first.values()) - flight.made[0],
+        latency_s=float(np.median([at - flight.made[seq] for seq, at in flight.last.items()])),
+        poses=len(list(ground.poses())),
+    )
