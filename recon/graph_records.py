@@ -28,6 +28,9 @@ class PoseGraphConfig:
     huber_sigmas: float = 1.5
     sigma_link_m: float = 3.0  # per second without vision
     sigma_link_rad: float = 0.3
+    loop_drift: float = 0.05  # of the path between its ends; a loop off by more is impossible
+    loop_slack_m: float = 2.0  # and this
+    loop_turn_rad: float = 0.5
     loop_window: int = 15  # keyframes within which two loops support each other
 
     def __post_init__(self) -> None:

@@ -9,7 +9,7 @@ agree by ICP. Whether a loop that passes may bend the map is for
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,6 +18,10 @@ from recon.camera_model import project, rays
 from recon.registration import IcpConfig, register_projective
 from recon.types import F32, F64, U8, Bool, DepthMap
 
+LEAST_RAD, LEAST_SHARE = 2e-4, 0.1
+"""A loop's sigmas are no less than this, and than this share of its depths' sigma: what the
+points of one depth map have in common does not average out."""
+
 __all__ = ["LoopClosure", "LoopConfig", "LoopView", "candidates", "verify"]
 
 
@@ -25,7 +29,7 @@ __all__ = ["LoopClosure", "LoopConfig", "LoopView", "candidates", "verify"]
 class LoopConfig:
     """Parameters of the search for loops."""
 
-    least_gap: int = 15  # keyframes between the two ends of a loop
+    least_gap: int = 10  # keyframes between the two ends of a loop
     least_overlap: float = 0.35  # of the later view in the earlier one
     search_share: float = 0.12  # of the picture's width, about the predicted places
     least_confidence: float = 1.4  # of the global shift, tried when the prediction fails
@@ -34,6 +38,10 @@ class LoopConfig:
     matching: matching.MatchingConfig = field(default_factory=matching.MatchingConfig)
     pnp: pnp.PnpConfig = field(default_factory=lambda: pnp.PnpConfig(min_inliers=30))
     icp: IcpConfig = field(default_factory=IcpConfig)
+
+    def without_gap(self) -> LoopConfig:
+        """The same for keyframes that are known not to be neighbours."""
+        return replace(self, least_gap=1)
 
     def __post_init__(self) -> None:
         """Raise ValueError when a parameter makes no sense."""
@@ -60,6 +68,7 @@ class LoopClosure:
     covariance: F64  # (6, 6) left perturbation in a's camera frame
     matches: int
     sources: tuple[str, ...]  # of "epnp", "icp"
+    growth: float = 1.0  # of b's depths, to fit a's
 
 
 def candidates(
@@ -172,6 +181,10 @@ def _with_icp(
     config: LoopConfig,
 ) -> LoopClosure | None:  # fmt: skip
     """The loop after the depth maps had their say; None when they contradict."""
+    growth = _growth(a, b, T_a_b)
+    if growth is None:
+        return None
+    b = replace(b, depth=_grown(b.depth, growth))
     count = int(np.count_nonzero(solved.inliers))
     # Depths of one keyframe err together, which the pixels do not show.
     depth = float(np.nanmedian(a.depth.depth_m))
@@ -185,4 +198,27 @@ def _with_icp(
     if float(difference @ np.linalg.solve(spread, difference)) / 6.0 > config.max_disagreement:
         return None
     T, covariance = se3.average(T_a_b, covariance, aligned.T_target_source, aligned.covariance)
-    return LoopClosure(T, covariance, count, ("epnp", "icp"))
+    covariance = covariance + np.diag([LEAST_RAD**2] * 3 + [(LEAST_SHARE * sigma) ** 2] * 3)
+    return LoopClosure(T, covariance, count, ("epnp", "icp"), growth)
+
+
+def _growth(a: LoopView, b: LoopView, T_a_b: F64) -> float | None:
+    """Median ratio of a's depths to b's where both see the same; None with too few."""
+    h, w = a.depth.depth_m.shape
+    v, u = np.mgrid[0:h:4, 0:w:4].reshape(2, -1)
+    depth = a.depth.depth_m[v, u].astype(np.float64)
+    known = np.isfinite(depth)
+    points = rays(a.depth.K, np.column_stack([u, v])[known].astype(np.float64))
+    there = se3.transform(se3.inverse(T_a_b), points * depth[known, None])
+    pixel = project(b.depth.K, there)
+    h, w = b.depth.depth_m.shape
+    inside = (pixel >= 0).all(axis=1) & (pixel <= [w - 1, h - 1]).all(axis=1) & (there[:, 2] > 0)
+    at = np.rint(pixel[inside]).astype(np.int64)
+    ratio = there[inside, 2] / b.depth.depth_m[at[:, 1], at[:, 0]]
+    ratio = ratio[np.isfinite(ratio)]
+    return float(np.median(ratio)) if len(ratio) >= 50 else None
+
+
+def _grown(depth: DepthMap, growth: float) -> DepthMap:
+    factor = np.float32(growth)
+    return replace(depth, depth_m=depth.depth_m * factor, sigma_m=depth.sigma_m * factor)

@@ -145,6 +145,9 @@ class PoseGraph:
         scale = self.scale(a)
         ratio = growth * self.scale(b) / scale
         loop = Loop(a, b, T_a_b, covariance, ratio).scaled(1.0 / scale)
+        if not self._is_possible(loop):
+            self._kept_counts["loop impossible"] += 1
+            return False
         support = [other for other in self._pending + self._loops if self._agree(loop, other)]
         if not support:
             self._pending.append(loop)
@@ -202,6 +205,11 @@ class PoseGraph:
     def similarity(self, segment: int) -> Similarity | None:
         """What brings a segment's odometry to the world; None before telemetry or a loop does."""
         return self._frames.get(segment)
+
+    def is_tied(self, segment: int) -> bool:
+        """True when fixes or a loop tell where the segment lies."""
+        frame = self._frames.get(segment)
+        return segment in self._tied or (frame is not None and "gnss" in frame.sources)
 
     def node(self, seq: int) -> Node:
         """What is known of keyframe ``seq``. Raises KeyError for an unknown one."""
@@ -274,6 +282,7 @@ class PoseGraph:
         )  # fmt: skip
         self._sources: list[set[str]] = []
         self._scale_of: list[int] = []  # key of each keyframe's scale; 0 while it has none
+        self._path: list[float] = []  # m flown up to each keyframe
         self._blocks: dict[int, tuple[list[int], int]] = {}  # keys of scales, keyframe of the last
 
     def rebuild(self) -> None:
@@ -306,12 +315,14 @@ class PoseGraph:
     def _insert(self, node: Node, last: Node | None) -> None:
         self._sources.append(set())
         self._scale_of.append(0)
+        self._path.append(self._path[-1] if self._path else 0.0)
         if last is None:
             T, spread = self._first(node)
         else:
             T_last, spread_last = self._smoother.state(last.key)
             motion, covariance = self._motion(node, last, T_last)
             T = T_last @ motion
+            self._path[-1] += float(np.linalg.norm(motion[:3, 3]))
             spread = moved_covariance(spread_last, T_last, covariance)
             self._connect(node, last, motion, covariance)
         self._smoother.add_pose(node.key, T, spread)
@@ -498,6 +509,18 @@ class PoseGraph:
         self._tied.add(b.segment)
         return True
 
+    def _is_possible(self, loop: Loop) -> bool:
+        """False when a loop within a segment is off by more than vision can drift."""
+        a, b = self._nodes[loop.a], self._nodes[loop.b]
+        if a.segment != b.segment:
+            return True
+        T = se3.inverse(self._smoother.pose(a.key)) @ self._smoother.pose(b.key)
+        apart = se3.log(se3.inverse(loop.scaled(self.scale(loop.a)).T_a_b) @ T)
+        path = self._path[b.key] - self._path[a.key]
+        allowed_m = self.config.loop_slack_m + self.config.loop_drift * path
+        turned, moved = float(np.linalg.norm(apart[:3])), float(np.linalg.norm(apart[3:]))
+        return moved < allowed_m and turned < self.config.loop_turn_rad
+
     def _enters(self, loop: Loop, segment: int) -> bool:
         """True when the loop leads from an earlier segment into this one."""
         return self._nodes[loop.b].segment == segment != self._nodes[loop.a].segment
@@ -511,6 +534,7 @@ class PoseGraph:
         ends = (one.a, other.a, other.b, one.b)
         a, a_other, b_other, b = (self._smoother.pose(self._nodes[i].key) for i in ends)
         T_a_a, T_b_b = se3.inverse(a) @ a_other, se3.inverse(b_other) @ b
+        T_b_b[:3, 3] *= one.ratio * self.scale(one.a) / self.scale(one.b)
         one, other = one.scaled(self.scale(one.a)), other.scaled(self.scale(other.a))
         return loops_agree(one, other, T_a_a, T_b_b, CHI2_LIMIT)
 

@@ -191,6 +191,7 @@ class FusionConfig:
     gnss: bool = key(True, "use positions")
     attitude: bool = key(True, "use roll, pitch and yaw")
     altitude: bool = key(True, "use the height above ground")
+    loops: bool = key(True, "look for places seen before and close the loop")
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,6 +42,7 @@ from recon.virtual_stereo import (
 )
 from recon.voxel_map import VoxelMap, VoxelMapConfig
 from service.config import ComputeConfig, Config
+from service.loops import LoopSearch
 from service.map_pages import PagedMap
 from service.stopwatch import Stopwatch
 
@@ -99,6 +100,7 @@ class Dense:
         self._resolution_m = config.scan.resolution_m
         self._before: tuple[int, DepthMap | None, F64] | None = None  # seq, depth, T_map_camera
         self._relief = (0.0, 0.0)
+        self.loops = LoopSearch(self.trajectory, self.lock) if config.fusion.loops else None
 
     def forget_map(self) -> None:
         """Count every surface as new again."""
@@ -179,6 +181,9 @@ class Dense:
             self.trajectory.add(
                 job.view.seq, job.segment, T_map, job.prior, height, job.view.time_ns, covariance
             )
+        if self.loops is not None and depth is not None:
+            with self.stopwatch("loops"):
+                self.loops.look(job.view.seq, job.segment, job.view.grey, job.view.K, depth)
 
     def _icp_step(
         self, depth: DepthMap | None, before: DepthMap | None, step: F64

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from mavlink.control import Phase
+from mavlink.first_beat import FirstBeats
 from mavlink.presence import Health
 from mavlink.vehicle import VehicleLink
 from service.config import Config, reload
@@ -43,14 +44,16 @@ COMPILING_S = 180.0
 class Daemon:
     """The service on the aircraft."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, first: FirstBeats | None = None) -> None:
+        """``first`` speaks on the MAVLink links already."""
         self._started_s = time.time()
         self._wanted = config  # as it was asked for last; operators may have tuned it since
         self._quit = threading.Event()
         self.scanning = Scanning(config)
         self.load_control = LoadControl(self.scanning)
         self.actions = ControlActions(self.scanning, self.quit)
-        self.vehicle = self.scanning.vehicle = VehicleLink(vehicle_config(config), self.actions)
+        self.vehicle = VehicleLink(vehicle_config(config), self.actions, first)
+        self.scanning.vehicle = self.vehicle
 
     @property
     def config(self) -> Config:

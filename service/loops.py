@@ -1,0 +1,177 @@
+"""Places seen before, looked for after each keyframe, on the thread that reconstructs."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from recon.camera_model import scaled_K
+from recon.loop_closure import LoopClosure, LoopConfig, LoopView, candidates, verify
+from recon.trajectory import Trajectory
+from recon.types import F64, U8, DepthMap
+
+WIDTH_PX = 640
+"""Of the pictures kept; loops need no finer ones."""
+
+MOST_VIEWS = 600
+"""Kept at once, about 0.2 MB each; on longer flights every second of the older half goes."""
+
+TRIES = 2
+"""Verifications per keyframe, at most."""
+
+LATEST_S = 0.4
+"""No further verification begins later than this after the first one."""
+
+PAUSE = 3
+"""Keyframes without a search after a loop was taken; neighbours would only repeat it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Kept:
+    """A keyframe packed for later."""
+
+    seq: int
+    segment: int
+    picture: U8  # JPEG, grey
+    K: F64  # (3, 3) px of that picture
+    depth: npt.NDArray[np.uint16]  # (h, w) share of ``far``, 0 unknown
+    far: float  # odometry units
+    sigma: npt.NDArray[np.float16]  # (h, w) odometry units
+    depth_K: F64
+    size_px: tuple[int, int]
+
+    def unpacked(self, scale: float) -> LoopView:
+        """The view with its depth in metres."""
+        grey = cv2.imdecode(self.picture, cv2.IMREAD_GRAYSCALE)
+        depth = self.depth.astype(np.float32) * np.float32(scale * self.far / 65535.0)
+        depth[self.depth == 0] = np.nan
+        sigma = self.sigma.astype(np.float32) * np.float32(scale)
+        views = np.where(self.depth > 0, 2, 0).astype(np.uint8)
+        return LoopView(
+            np.asarray(grey, np.uint8), self.K,
+            DepthMap(depth, sigma, views, self.depth_K, np.eye(4)),
+        )  # fmt: skip
+
+
+def _packed(seq: int, segment: int, grey: U8, K: F64, depth: DepthMap) -> _Kept:
+    H, W = grey.shape
+    size = (min(WIDTH_PX, W), round(min(WIDTH_PX, W) * H / W))
+    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    _, picture = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 92])
+    known = np.isfinite(depth.depth_m)
+    far = float(depth.depth_m[known].max()) if known.any() else 1.0
+    share = np.where(known, np.maximum(np.rint(depth.depth_m * (65535.0 / far)), 1), 0)
+    return _Kept(
+        seq, segment, np.asarray(picture, np.uint8), scaled_K(K, size[0] / W, size[1] / H),
+        share.astype(np.uint16), far, depth.sigma_m.astype(np.float16), depth.K, size,
+    )  # fmt: skip
+
+
+class LoopSearch:
+    """Remembers keyframes, finds earlier ones that see the same, and tells the trajectory."""
+
+    def __init__(
+        self, trajectory: Trajectory, lock: threading.Lock, config: LoopConfig | None = None
+    ) -> None:
+        """``lock`` guards the trajectory."""
+        self.counts: Counter[str] = Counter()  # "tried", "verified", "taken"
+        self._trajectory, self._lock = trajectory, lock
+        self._config = config or LoopConfig()
+        self._kept: dict[int, _Kept] = {}
+        self._rest = 0
+        self._turn = 0
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def look(self, seq: int, segment: int, grey: U8, K: F64, depth: DepthMap) -> None:
+        """Search for loops that end in this keyframe, and remember it.
+
+        Args:
+            grey: (H, W) picture without distortion, ``K`` (3, 3) px of it.
+            depth: of the same camera, in units of its segment's odometry.
+        """
+        new = _packed(seq, segment, grey, K, depth)
+        self._kept[seq] = new
+        if self._rest > 0:
+            self._rest -= 1
+        else:
+            self._search(new)
+        if len(self._kept) > MOST_VIEWS:
+            self._thin()
+
+    def _search(self, new: _Kept) -> None:
+        began = time.monotonic()
+        with self._lock:
+            view = new.unpacked(self._trajectory.graph.scale(new.seq))
+            likely = self._likely(new, view)
+        for seq in likely:
+            if self.counts["tried"] and time.monotonic() - began > LATEST_S:
+                return
+            self.counts["tried"] += 1
+            with self._lock:
+                guess = self._trajectory.step_between(seq, new.seq)
+                scale = self._trajectory.graph.scale(seq)
+            found = verify(self._kept[seq].unpacked(scale), view, guess, self._config)
+            if found is not None and self._tell(seq, new, found):
+                self._rest = PAUSE
+                return
+
+    def _tell(self, seq: int, new: _Kept, found: LoopClosure) -> bool:
+        """True when the graph believes the loop."""
+        self.counts["verified"] += 1
+        with self._lock:
+            taken = self._trajectory.graph.add_loop(
+                seq, new.seq, found.T_a_b, found.covariance, found.growth
+            )
+        self.counts["taken"] += taken
+        return taken
+
+    def _likely(self, new: _Kept, view: LoopView) -> list[int]:
+        """Earlier keyframes worth a verification, the best first."""
+        depth_m = float(np.nanmedian(view.depth.depth_m))
+        if not depth_m > 0:
+            return []
+        graph = self._trajectory.graph
+        seqs = [seq for seq in self._kept if self._is_apart(seq, new.seq)]
+        if not seqs:
+            return []
+        W, H = new.size_px
+        reach = depth_m * float(np.hypot(W, H)) / new.K[0, 0]
+        poses = graph.pose_array()
+        here = poses[graph.node(new.seq).key]
+        there = poses[[graph.node(seq).key for seq in seqs]]
+        ahead = there[:, :3, 3] + depth_m * there[:, :3, 2]
+        apart = np.linalg.norm(ahead - (here[:3, 3] + depth_m * here[:3, 2]), axis=1)
+        near = [seqs[i] for i in np.argsort(apart)[:8] if apart[i] < reach]
+        some = {seq: poses[graph.node(seq).key] for seq in near}
+        some[new.seq] = here
+        config = self._config.without_gap()
+        found = [s for s, _ in candidates(some, new.seq, new.K, new.size_px, depth_m, config)]
+        return (found[: TRIES - 1] + self._by_turns(new, seqs) + found[TRIES - 1 :])[:TRIES]
+
+    def _by_turns(self, new: _Kept, seqs: list[int]) -> list[int]:
+        """One more to try when the segment's place is not known: its predecessor's by turns."""
+        if new.segment == 0 or self._trajectory.graph.is_tied(new.segment):
+            return []
+        earlier = [seq for seq in seqs if self._kept[seq].segment != new.segment]
+        if not earlier:
+            return []
+        self._turn += 1
+        return [earlier[-1 - (self._turn - 1) % len(earlier)]]
+
+    def _is_apart(self, seq: int, new: int) -> bool:
+        """True when two keyframes are not neighbours on one chain."""
+        one, two = self._trajectory.graph.node(seq), self._trajectory.graph.node(new)
+        return two.key - one.key >= self._config.least_gap or one.segment != two.segment
+
+    def _thin(self) -> None:
+        """Forget every second keyframe of the older half."""
+        for seq in list(self._kept)[: len(self._kept) // 2 : 2]:
+            del self._kept[seq]
