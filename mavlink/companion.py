@@ -32,7 +32,7 @@ from mavlink.samples import OF_AUTOPILOT
 from mavlink.status import ComputerLoad, StatusTexts, computer_status, motion_values
 from mavlink.streams import Streams
 from mavlink.timesync import TimesyncFilter
-from mavlink.wire import COMMAND_CANCEL, dialect
+from mavlink.wire import COMMAND_CANCEL, dialect, numbers_of
 
 S = 1_000_000_000
 MS = 1_000_000
@@ -40,6 +40,21 @@ COMPONENTS = (ONBOARD, CAMERA)
 HEARTBEAT, FILE_TRANSFER, TIMESYNC = 0, 110, 111
 LOAD_STATUS, MOTION = 390, 251
 LOST_NS = 5 * S
+SERVED = (
+    "HEARTBEAT",
+    "COMMAND_LONG",
+    "COMMAND_INT",
+    "FILE_TRANSFER_PROTOCOL",
+    "TIMESYNC",
+    "PARAM_REQUEST_READ",
+    "PARAM_REQUEST_LIST",
+    "PARAM_SET",
+    "PARAM_EXT_REQUEST_READ",
+    "PARAM_EXT_REQUEST_LIST",
+    "PARAM_EXT_SET",
+)
+HEARD = numbers_of((*READERS, *SERVED)) | {COMMAND_CANCEL}
+"""Numbers of the messages with which :meth:`Companion.receive` does something."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,7 @@ goes on one byte further, so that a packet inside the damage is found.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from mavlink.wire import CRC_EXTRA, dialect, x25crc
 
@@ -21,8 +20,7 @@ Message = Any
 """A message object of a pymavlink dialect."""
 
 
-@dataclass(frozen=True, slots=True)
-class Packet:
+class Packet(NamedTuple):
     """One packet with a right checksum, or of a kind whose checksum nobody here can know."""
 
     data: bytes
@@ -103,6 +101,11 @@ class Framer:
     def feed(self, data: bytes) -> list[Packet]:
         """The packets completed by ``data``, in order."""
         buffer = self._buffer
+        if not buffer and packet_length(data, 0) == len(data):  # a datagram, most of the time
+            whole = check_packet(data)
+            if whole is not None:
+                self.packets += 1
+                return [whole]
         buffer += data
         found: list[Packet] = []
         at = 0

@@ -9,42 +9,46 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
+from typing import Generic, TypeVar
 
-GATHER_S = 0.02
+GATHER_S = 0.04
 
 Job = Callable[[], object]
+T = TypeVar("T")
 
 
-class Inbox:
-    """A bounded queue from many threads to one."""
+class Inbox(Generic[T]):
+    """A bounded queue from many threads to one, of jobs and of telemetry."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
         self._jobs: deque[Job] = deque()
+        self._telemetry: deque[T] = deque()
         self._wake = threading.Condition()
-        self._urgent = False
         self.dropped = 0
 
-    def put(self, job: Job, urgent: bool = True) -> None:
-        """Add a job; dropped, and counted, when too many wait."""
+    def put(self, job: Job) -> None:
+        """Add a job and wake who takes it; dropped, and counted, when too many wait."""
         with self._wake:
             if len(self._jobs) >= self._limit:
                 self.dropped += 1
                 return
             self._jobs.append(job)
-            first = len(self._jobs) == 1
-            if urgent or first:
-                self._urgent = self._urgent or urgent
-                self._wake.notify()
+            self._wake.notify()
 
-    def take(self, timeout_s: float) -> list[Job]:
-        """Every job that waits, after waiting for one at most ``timeout_s``."""
+    def gather(self, telemetry: T) -> None:
+        """Add telemetry, to be taken within a moment; dropped when too much waits."""
+        if len(self._telemetry) >= self._limit:
+            self.dropped += 1
+            return
+        self._telemetry.append(telemetry)
+
+    def take(self, timeout_s: float) -> tuple[list[T], list[Job]]:
+        """The telemetry and the jobs that wait, after waiting for a job for a moment at most."""
         with self._wake:
             if not self._jobs:
-                self._wake.wait(timeout_s)
-            if self._jobs and not self._urgent:
-                self._wake.wait(min(GATHER_S, max(timeout_s, 0.001)))
+                self._wake.wait(min(GATHER_S, timeout_s))
             jobs = list(self._jobs)
             self._jobs.clear()
-            self._urgent = False
-            return jobs
+        telemetry = [self._telemetry.popleft() for _ in range(len(self._telemetry))]
+        return telemetry, jobs

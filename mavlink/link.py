@@ -44,8 +44,14 @@ class Link:
         """True while the port is open."""
         return self._port is not None
 
+    def hand_to(self, on_data: Callable[[bytes, int], None]) -> None:
+        """Let another one take what comes from now on."""
+        self._on_data = on_data
+
     def start(self) -> None:
-        """Start both threads."""
+        """Start both threads, unless they run."""
+        if self._threads:
+            return
         for target in (self._read, self._write):
             thread = threading.Thread(
                 target=target, name=f"mavlink {self.spec.name} {target.__name__}", daemon=True

@@ -24,12 +24,14 @@ class LiveHistory(VehicleHistory):
         super().__init__(config)
         self.patience_s = patience_s
         self._news = threading.Condition()
+        self._waiting = 0  # readers
 
     def add(self, sample: Sample, time_ns: int) -> None:
         """Put a sample in at its time and wake whoever waits for it."""
         super().add(sample, time_ns)
-        with self._news:
-            self._news.notify_all()
+        if self._waiting:
+            with self._news:
+                self._news.notify_all()
 
     def state_at(self, time_ns: int) -> VehicleState | None:
         """The state at ``time_ns``, as soon as every stream that flows has come past it."""
@@ -37,7 +39,9 @@ class LiveHistory(VehicleHistory):
         end_s = now_s + self.patience_s
         if time_ns * 1e-9 < end_s:  # what lies further ahead cannot come in time
             with self._news:
+                self._waiting += 1  # before looking, so that nothing new goes unnoticed
                 while not self.covers(time_ns) and now_s < end_s:
                     self._news.wait(end_s - now_s)
                     now_s = time.monotonic()
+                self._waiting -= 1
         return super().state_at(time_ns)

@@ -20,8 +20,9 @@ HEADER = 10
 class Packer:
     """Packs for one link; safe between threads. Each component counts its own packets."""
 
-    def __init__(self, link: int, signing: Signing | None = None) -> None:
+    def __init__(self, link: int, signing: Signing | None = None, sequence: int = 0) -> None:
         self._link = link
+        self._sequence = sequence  # of the first packet of each component
         self._signing = signing
         self._lock = threading.Lock()
         self._encoders: dict[tuple[int, int], Any] = {}
@@ -34,6 +35,7 @@ class Packer:
             encoder = self._encoders.get(key)
             if encoder is None:
                 encoder = self._encoders[key] = dialect.MAVLink(None, *key)
+                encoder.seq = self._sequence
             try:
                 data = bytes(outgoing.message.pack(encoder))
             except (struct.error, ValueError, TypeError, OverflowError) as error:

@@ -130,10 +130,12 @@ class UdpPort:
     def read(self) -> bytes:
         """The next datagram."""
         try:
+            if self._fixed is not None:
+                return self._socket.recv(LONGEST)
             length, peer = self._socket.recvfrom_into(self._buffer)
         except (TimeoutError, ConnectionRefusedError):
             return b""
-        if self._fixed is None and (peer in self._peers or len(self._peers) < MAX_PEERS):
+        if peer in self._peers or len(self._peers) < MAX_PEERS:
             self._peers[peer] = time.monotonic_ns()
         return bytes(self._buffer[:length])
 

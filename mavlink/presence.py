@@ -11,15 +11,14 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
+from mavlink.first_beat import NO_AUTOPILOT, TYPES
 from mavlink.messages import CAMERA, ONBOARD, Outgoing
 from mavlink.wire import dialect
 
 S = 1_000_000_000
 PERIOD_NS = S
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
-NO_AUTOPILOT = 8
 TYPE_GCS = 6
-TYPES = {ONBOARD: 18, CAMERA: 30}  # MAV_TYPE_ONBOARD_CONTROLLER, MAV_TYPE_CAMERA
 
 
 class Health(IntEnum):
@@ -51,13 +50,16 @@ class PresenceConfig:
 class Presence:
     """What we say of ourselves every second, and what others say of themselves."""
 
-    def __init__(self, config: PresenceConfig, token: int, now_ns: int) -> None:
+    def __init__(
+        self, config: PresenceConfig, token: int, now_ns: int, first_ns: int | None = None
+    ) -> None:
+        """The first heartbeat is due at ``first_ns``, or now."""
         self.config = config
         self._token = token  # in custom_mode: tells our echo from another companion
         self._lock = threading.Lock()
         self._health = Health.BOOT
         self._confirmed_ns = now_ns
-        self._next_ns = now_ns
+        self._next_ns = now_ns if first_ns is None else first_ns
         self._system = config.system or 1
         self._candidates: set[int] = set()
         self._first_autopilot_ns: int | None = None

@@ -23,13 +23,14 @@ from typing import Any
 
 from mavlink import status as texts
 from mavlink.camera import KeyframeReport
-from mavlink.companion import Companion, CompanionConfig
+from mavlink.companion import HEARD, Companion, CompanionConfig
 from mavlink.control import ScanControl
 from mavlink.decode import READERS
+from mavlink.first_beat import FirstBeats
 from mavlink.framing import Framer, Packet
 from mavlink.history import HistoryConfig
 from mavlink.inbox import Inbox, Job
-from mavlink.link import Link, LinkSpec, parse_link
+from mavlink.link import Link, parse_link
 from mavlink.live_history import LiveHistory
 from mavlink.messages import Outgoing
 from mavlink.odometry import Odometry, odometry_message
@@ -99,14 +100,23 @@ class VehicleReport:
 class VehicleLink:
     """Start it, feed it with health, and read ``history``."""
 
-    def __init__(self, config: VehicleConfig, control: ScanControl) -> None:
+    def __init__(
+        self, config: VehicleConfig, control: ScanControl, first: FirstBeats | None = None
+    ) -> None:
+        """``first`` has opened the links of ``config`` already and speaks on them."""
         self.config = config
+        links = None if first is None else first.hand_over()
         now_ns = time.monotonic_ns()
         self.history = LiveHistory(config.history)
         self.recorder = Recorder()
         self._memory = _Memory(config.state_dir)
         self._signing = self._make_signing()
-        self.presence = Presence(config.presence, secrets.randbits(32) or 1, now_ns)
+        self.presence = Presence(
+            config.presence,
+            new_token() if first is None else first.token,
+            now_ns,
+            None if first is None else round(first.next_s * S),
+        )
         self._companion = Companion(
             config.companion,
             control,
@@ -116,23 +126,24 @@ class VehicleLink:
             self._memory.parameters,
             lambda: time.time_ns() // 1000,
         )
-        self._inbox = Inbox(BACKLOG)
+        self._inbox: Inbox[tuple[int, Packet, int]] = Inbox(BACKLOG)
+        self._heard = set(HEARD)  # numbers of messages; nothing is done with others
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self._alive_ns = now_ns
         self._is_served = True  # something was done that may have set a timer
         specs = [parse_link(text) for text in config.links]
         self._framers = [Framer() for _ in specs]
-        self._packers = [Packer(i, self._signing) for i in range(len(specs))]
-        self._links = [self._make_link(i, spec) for i, spec in enumerate(specs)]
+        sequence = 0 if first is None else first.sequence
+        self._packers = [Packer(i, self._signing, sequence) for i in range(len(specs))]
+        self._links = links or [Link(spec, _nobody) for spec in specs]
+        for i, link in enumerate(self._links):
+            link.hand_to(partial(self._on_data, i))
 
     def _make_signing(self) -> Signing | None:
         if self.config.signing_key is None:
             return None
         return Signing(read_key(self.config.signing_key), self._memory.signing_timestamp)
-
-    def _make_link(self, index: int, spec: LinkSpec) -> Link:
-        return Link(spec, lambda data, now_ns: self._on_data(index, data, now_ns))
 
     # The service's side.
 
@@ -183,6 +194,7 @@ class VehicleLink:
 
     def listen(self, name: str, listener: Callable[[Any], None]) -> None:
         """Call back, in the protocol's thread, with every message of a name such as TUNNEL."""
+        self._heard |= numbers_of([name])
         self._do(lambda: self._companion.listen(name, listener))
 
     def report_odometry(self, odometry: Odometry, time_ns: int) -> bool:
@@ -258,8 +270,10 @@ class VehicleLink:
     def _on_data(self, index: int, data: bytes, now_ns: int) -> None:
         for packet in self._framers[index].feed(data):
             self.recorder.write(packet.data, now_ns)
-            urgent = packet.message_id not in TELEMETRY
-            self._inbox.put(partial(self._hear, index, packet, now_ns), urgent)
+            if packet.message_id in TELEMETRY:
+                self._inbox.gather((index, packet, now_ns))
+            elif packet.message_id in self._heard:
+                self._inbox.put(partial(self._hear, index, packet, now_ns))
 
     def _hear(self, index: int, packet: Packet, now_ns: int) -> None:
         if self._signing is not None and not self._signing.accepts(packet):
@@ -284,9 +298,7 @@ class VehicleLink:
         timer_ns = 0
         while not self._stop.is_set():
             wait_s = (timer_ns - time.monotonic_ns()) / S
-            jobs = self._inbox.take(max(1e-4, min(1.0, wait_s)))
-            for job in jobs:
-                self._guard(job)
+            self._serve(max(1e-4, wait_s))
             now_ns = self._alive_ns = time.monotonic_ns()
             if now_ns >= timer_ns or self._is_served:
                 self._is_served = False
@@ -296,9 +308,16 @@ class VehicleLink:
             if now_ns >= save_ns or self._memory.is_stale(self._companion.parameters.revision):
                 save_ns = now_ns + SAVE_EVERY_NS
                 self._save()
-        for job in self._inbox.take(0.0):
-            self._guard(job)
+        self._serve(0.0)
         self._send(self._companion.take())
+
+    def _serve(self, wait_s: float) -> None:
+        """Take in the telemetry and do the jobs that wait."""
+        telemetry, jobs = self._inbox.take(wait_s)
+        for index, packet, now_ns in telemetry:
+            self._guard(partial(self._hear, index, packet, now_ns))
+        for job in jobs:
+            self._guard(job)
 
     def _guard(self, job: Job) -> None:
         """Do a job; a fault in what the service does on a command must not cost the link."""
@@ -337,6 +356,15 @@ class VehicleLink:
         parameters = self._companion.parameters
         timestamp = 0 if self._signing is None else self._signing.timestamp
         self._memory.save(parameters.kept(), parameters.revision, timestamp)
+
+
+def new_token() -> int:
+    """What tells our own heartbeats, heard back, from those of another companion."""
+    return secrets.randbits(32) or 1
+
+
+def _nobody(data: bytes, now_ns: int) -> None:
+    """Takes what comes before anyone listens."""
 
 
 class _Memory:

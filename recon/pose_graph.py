@@ -67,6 +67,7 @@ class PoseGraph:
         self._offsets: dict[int, Offsets] = {}  # by segment that telemetry has placed
         self._fitted: dict[int, int] = {}  # keyframes that the segment's frame was fitted to
         self._tied: set[int] = set()  # segments that a loop has placed
+        self._built = 0
         self._loops: list[Loop] = []
         self._pending: list[Loop] = []
         self._start()
@@ -237,6 +238,11 @@ class PoseGraph:
         """(4, 4) T_world_camera of every keyframe."""
         return dict(zip(self._nodes, self._smoother.poses(), strict=True))
 
+    @property
+    def version(self) -> int:
+        """Changes whenever poses told before may be others now."""
+        return self._built * 1_000_000 + self._smoother.updates
+
     def pose_array(self) -> F64:
         """(N, 4, 4) T_world_camera in the order of the keyframes."""
         return self._smoother.poses()
@@ -248,10 +254,10 @@ class PoseGraph:
 
     def scales(self) -> F64:
         """(N,) metres per unit of the odometry, in the order of the keyframes."""
-        known = {key: self._smoother.scalar(key) for key in set(self._scale_of) if key}
-        frames = [self._frame(node).scale for node in self._nodes.values()]
-        drift = [known.get(key, 0.0) for key in self._scale_of]
-        return np.asarray(np.array(frames, np.float64) * np.exp(np.array(drift, np.float64)))
+        blocks, block = np.unique(np.array(self._scale_of, np.int64), return_inverse=True)
+        drift = np.array([self._smoother.scalar(int(key)) if key else 0.0 for key in blocks])
+        frames = [np.full(len(n), self._frame(n[0]).scale) for n in self._segments.values()]
+        return np.asarray(np.concatenate(frames) * np.exp(drift[block]))
 
     def residuals(self) -> dict[str, F64]:
         """Whitened residuals by kind of factor: "vision", "attitude", "position", "altitude",
@@ -272,6 +278,7 @@ class PoseGraph:
         import gtsam
 
         self._gtsam = gtsam
+        self._built += 1
         self._smoother = Smoother()
         self._left_out: Counter[str] = Counter()
         times = [n.time_ns for n in self._nodes.values()]

@@ -15,17 +15,17 @@ from recon import graph_factors, se3
 from recon.graph_factors import matrix, pose3
 from recon.types import F64
 
-POSES_PER_WAIT = 400
-"""One more pose waits between two updates for each so many that are held."""
+LEAST_WAIT, POSES_PER_WAIT = 2, 400
+"""So many poses wait between two updates, and one more for each so many that are held."""
 
 WILDFIRE = 1e-3
 """rad and m; corrections smaller than this are not passed on."""
 
-RELINEARISE = 0.3
+RELINEARISE = 0.1
 """rad and m; what moved further is linearised again, at every tenth update."""
 
-ROUNDS = 20
-"""Updates after a change that moves many poses; two of them linearise again."""
+ROUNDS = 3
+"""Updates after a change that moves many poses; each linearises again what moved."""
 
 
 class Smoother:
@@ -47,6 +47,7 @@ class Smoother:
         self._kinds: list[str] = []
         self._waiting: dict[int, tuple[F64, F64]] = {}  # pose and its left covariance
         self._held = 0
+        self.updates = 0
         self._states: dict[int, tuple[F64, F64]] = {}  # asked for since the last update
 
     def __len__(self) -> int:
@@ -72,16 +73,20 @@ class Smoother:
 
     def update(self, now: bool = False, rounds: int = 0) -> bool:
         """True when what waits went into the smoother: enough of it waits, or ``now``."""
-        if not now and len(self._waiting) <= self._held // POSES_PER_WAIT:
+        if not now and len(self._waiting) <= LEAST_WAIT + self._held // POSES_PER_WAIT:
             return False
         self._isam.update(self._graph, self._values)
+        again = self._gtsam.ISAM2UpdateParams()
+        again.force_relinearize = True
+        empty = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
         for _ in range(rounds):
-            self._isam.update()
+            self._isam.update(*empty, again)
         self._graph.resize(0)
         self._values.clear()
         self._held += len(self._waiting)
         self._waiting.clear()
         self._states.clear()
+        self.updates += 1
         return True
 
     # ---- what comes out ------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from recon import se3
 from recon.alignment import Similarity
@@ -35,6 +36,53 @@ class Placed:
     sources: tuple[str, ...]
 
 
+class _Told:
+    """Keyframes as they were last published, as columns that grow."""
+
+    def __init__(self) -> None:
+        self.placed: list[Placed] = []
+        self.checked = -1  # version of the graph that they were compared with
+        self._row: dict[int, int] = {}
+        self._columns = np.zeros((64, 20))  # pose, scale, sigma, height, key
+
+    def __len__(self) -> int:
+        return len(self.placed)
+
+    def put(self, placed: Placed, key: int, height: float) -> None:
+        """Take a keyframe's newest published pose; ``height`` in odometry units."""
+        row = self._row.setdefault(placed.seq, len(self.placed))
+        if row == len(self.placed):
+            self.placed.append(placed)
+        if row == len(self._columns):
+            self._columns = np.concatenate([self._columns, np.zeros_like(self._columns)])
+        self.placed[row] = placed
+        sigma = float(np.sqrt(np.trace(placed.covariance[3:, 3:])))
+        self._columns[row, :16] = placed.T_world_camera.ravel()
+        self._columns[row, 16:] = placed.scale, sigma, height, key
+
+    @property
+    def keys(self) -> npt.NDArray[np.int64]:
+        """(N,) keys in the graph."""
+        return self._columns[: len(self), 19].astype(np.int64)
+
+    @property
+    def sigma(self) -> F64:
+        """(N,) m of the place."""
+        return self._columns[: len(self), 17]
+
+    def change(self, T: F64, scales: F64) -> F64:
+        """(N,) metres by which the keyframes or their ground are off, given where they are now."""
+        rows = self._columns[: len(self)]
+        old = rows[:, :16].reshape(-1, 4, 4)
+        reach = scales * rows[:, 18]
+        shift = np.linalg.norm(T[:, :3, 3] - old[:, :3, 3], axis=1)
+        # Of a rotation by an angle a, the Frobenius norm of its difference is sqrt(8) sin(a/2).
+        apart = np.linalg.norm(T[:, :3, :3] - old[:, :3, :3], axis=(1, 2))
+        turn = 2.0 * np.arcsin(np.clip(apart / np.sqrt(8.0), 0.0, 1.0)) * reach
+        growth = np.abs(scales / rows[:, 16] - 1.0) * reach
+        return np.asarray(shift + turn + growth)
+
+
 class Trajectory:
     """Keyframe poses of one scan, segment by segment."""
 
@@ -43,7 +91,7 @@ class Trajectory:
     ) -> None:
         self.config = config or TrajectoryConfig()
         self.graph = PoseGraph(graph)
-        self._told: dict[int, Placed] = {}  # as last published
+        self._told = _Told()
 
     def add(
         self,
@@ -98,40 +146,28 @@ class Trajectory:
         """
         if final:
             self.graph.solve()
-        if not self._told:
+        told = self._told
+        if not len(told) or (told.checked == self.graph.version and not final):
             return []
-        keys = np.array([self.graph.node(seq).key for seq in self._told])
+        told.checked = self.graph.version
+        keys = told.keys
         T, scales = self.graph.pose_array()[keys], self.graph.scales()[keys]
-        change = self._change(T, scales)
-        sigma = np.array([np.sqrt(np.trace(p.covariance[3:, 3:])) for p in self._told.values()])
-        least = np.maximum(self.config.repose_m, self.config.repose_sigmas * sigma)
-        seqs = list(self._told)
+        least = np.maximum(self.config.repose_m, self.config.repose_sigmas * told.sigma)
+        change = told.change(T, scales)
         rows = np.flatnonzero(change > (1e-6 if final else least))
         if final:
-            return [self.place(seqs[i]) for i in rows]
+            return [self.place(told.placed[i].seq) for i in rows]
         # In flight with the sigmas told before: newer readings have only made them smaller.
-        before = [self._told[seqs[i]] for i in rows]
+        before = [told.placed[i] for i in rows]
         return [
             Placed(p.seq, T[i], float(scales[i]), p.covariance, self.graph.sources(p.seq))
             for i, p in zip(rows, before, strict=True)
         ]
 
-    def _change(self, T: F64, scales: F64) -> F64:
-        """(N,) metres by which the told keyframes or their ground are off now."""
-        old = np.array([p.T_world_camera for p in self._told.values()])
-        old_scales = np.array([p.scale for p in self._told.values()])
-        heights = np.array([self.graph.node(seq).height or 1.0 for seq in self._told])
-        reach = scales * heights
-        shift = np.linalg.norm(T[:, :3, 3] - old[:, :3, 3], axis=1)
-        # Of a rotation by an angle a, the Frobenius norm of its difference is sqrt(8) sin(a/2).
-        apart = np.linalg.norm(T[:, :3, :3] - old[:, :3, :3], axis=(1, 2))
-        turn = 2.0 * np.arcsin(np.clip(apart / np.sqrt(8.0), 0.0, 1.0)) * reach
-        growth = np.abs(scales / old_scales - 1.0) * reach
-        return np.asarray(shift + turn + growth)
-
     def tell(self, placed: Placed) -> None:
         """Remember that this pose of the keyframe was published."""
-        self._told[placed.seq] = placed
+        node = self.graph.node(placed.seq)
+        self._told.put(placed, node.key, node.height or 1.0)
 
     def step_between(self, a: int, b: int) -> F64:
         """(4, 4) T_a_b in metres by what the graph holds now."""

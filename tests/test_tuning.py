@@ -189,7 +189,7 @@ def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> N
         assert store.header.configuration["scan"]["resolution_m"] == 0.5
         scan = Scan(inputs, store)
         scanning, link = operator.daemon.scanning, Budget()
-        scanning.scan, scanning._link = scan, link
+        scanning.scan, scanning.link.flying = scan, link
         operator.set("SR_LINK_KBIT_S", 64.0)
         assert link.budgets[-1] == (64.0, operator.config.datalink.share)
         operator.set("SR_BASELINE_M", 2.5)
@@ -199,5 +199,5 @@ def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> N
         assert scan.check.exposed_ns(3 * 10**9) == 3 * 10**9 - 70_000_000
         operator.set("SR_YAW_FRAME", 2.0)
         assert operator.daemon.vehicle.history.config.gimbal.yaw_frame == "earth"
-        scanning.scan = None
+        scanning.scan = scanning.link.flying = None
         scan.pipeline.finish()

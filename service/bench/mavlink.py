@@ -48,7 +48,10 @@ def run(options: BenchOptions) -> list[BenchResult]:
         BenchResult(
             "mavlink", "receive to stamp", delay, "ms", slow - delay, peer, peer_delay, 0.0, "aim 1"
         ),
-        BenchResult("mavlink", "first heartbeat", first_heartbeat(), "s", note="aim 1"),
+        BenchResult("mavlink", "first heartbeat", first_heartbeat(False), "s", note="aim 1"),
+        BenchResult(
+            "mavlink", "first heartbeat, all cores busy", first_heartbeat(True), "s", note="aim 1"
+        ),
         BenchResult(
             "mavlink", "heartbeat jitter, all cores busy", worst, "ms",
             note=f"worst; median {usual:.0f}; aim 200",
@@ -166,18 +169,36 @@ def _drain(ear: socket.socket) -> None:
             ear.recv(65536)
 
 
-def first_heartbeat() -> float:
-    """Seconds from the start of a fresh process to its first heartbeat; median of five."""
-    times = []
-    for _ in range(5):
-        ear, port = _socket()
-        with contextlib.closing(ear):
-            start = time.monotonic()
-            with vehicle_process("beat", 0.3, port):
-                while not any(p.message_id == 0 for p in Framer().feed(ear.recv(65536))):
-                    pass
-                times.append(time.monotonic() - start)
-    return statistics.median(times)
+def first_heartbeat(busy: bool) -> float:
+    """Seconds from the start of ``skyrelief run`` to its first heartbeat; median of five.
+
+    ``busy`` keeps every core occupied by other processes meanwhile.
+    """
+    others = [
+        subprocess.Popen([sys.executable, "-c", "while True: pass"])
+        for _ in range((os.cpu_count() or 1) if busy else 0)
+    ]
+    try:
+        return statistics.median(_first_heartbeat() for _ in range(5))
+    finally:
+        for other in others:
+            other.kill()
+            other.wait()
+
+
+def _first_heartbeat() -> float:
+    ear, port = _socket()
+    link = f"mavlink.links=udpout:127.0.0.1:{port}"
+    command = [sys.executable, "-m", "service.cli", "run", "--set", link, "--set", "health.http="]
+    with contextlib.closing(ear):
+        start = time.monotonic()
+        # Without a camera's name the service says so and ends, long after its first heartbeat.
+        with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+            while not any(p.message_id == 0 for p in Framer().feed(ear.recv(65536))):
+                pass
+            seconds = time.monotonic() - start
+            process.wait(timeout=60.0)
+    return seconds
 
 
 def heartbeat_jitter(seconds: float = 15.0) -> tuple[float, float]:

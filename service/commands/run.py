@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from mavlink.first_beat import FirstBeats
+    from service.config import Config
     from service.runtime import Daemon
 
 log = logging.getLogger(__name__)
@@ -26,13 +28,34 @@ def run(
     A HUP signal reads the configuration again; a broken one changes nothing.
     """
     from service.config import load_config
+
+    chosen = load_config(config, set_ or [])
+    first = _first_beats(chosen)
     from service.runtime import Daemon
 
-    daemon = Daemon(load_config(config, set_ or []))
+    daemon = Daemon(chosen, first)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: daemon.quit())
     signal.signal(signal.SIGHUP, lambda *_: _reload(daemon, config, set_ or []))
     daemon.run()
+
+
+def _first_beats(config: Config) -> FirstBeats | None:
+    """Heartbeats before everything else; None where they must be signed, or there is no link."""
+    import random
+
+    from mavlink.first_beat import FirstBeats
+
+    mavlink = config.mavlink
+    if mavlink.signing_key or not mavlink.links:
+        return None
+    try:
+        token = random.getrandbits(32) or 1
+        first = FirstBeats(mavlink.links, mavlink.system_id or 1, token)
+    except ValueError:
+        return None  # said by the check of the whole configuration
+    first.start()
+    return first
 
 
 def _reload(daemon: Daemon, path: Path | None, overrides: list[str]) -> None:

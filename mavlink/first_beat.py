@@ -1,0 +1,77 @@
+"""Heartbeats before the heavy imports: the links are opened and spoken to at once.
+
+An autopilot may not talk on a serial line until it hears MAVLink, and ArduPilot stops looking
+for a camera a minute after boot. Dialect and arrays take a while to import on a busy machine,
+so these first packets are made by hand. :class:`~mavlink.vehicle.VehicleLink` takes over.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections.abc import Sequence
+
+from mavlink.link import Link, parse_link
+from mavlink.messages import CAMERA, ONBOARD
+
+TYPES = {ONBOARD: 18, CAMERA: 30}  # MAV_TYPE_ONBOARD_CONTROLLER, MAV_TYPE_CAMERA
+NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
+BOOT = 1  # MAV_STATE
+HEARTBEAT, CRC_EXTRA, VERSION = 0, 50, 3
+PERIOD_S = 1.0
+
+
+def heartbeat_packet(
+    sequence: int, system: int, component: int, token: int, state: int = BOOT
+) -> bytes:
+    """The MAVLink 2 packet of a HEARTBEAT of one of our components."""
+    payload = struct.pack("<IBBBBB", token, TYPES[component], NO_AUTOPILOT, 0, state, VERSION)
+    head = struct.pack("<BBBBBB", len(payload), 0, 0, sequence & 0xFF, system, component)
+    body = head + HEARTBEAT.to_bytes(3, "little") + payload
+    return b"\xfd" + body + _crc(body + bytes((CRC_EXTRA,))).to_bytes(2, "little")
+
+
+def _crc(data: bytes) -> int:
+    """CRC-16/MCRF4XX."""
+    crc = 0xFFFF
+    for byte in data:
+        step = (byte ^ crc) & 0xFF
+        step = (step ^ step << 4) & 0xFF
+        crc = crc >> 8 ^ step << 8 ^ step << 3 ^ step >> 4
+    return crc
+
+
+class FirstBeats:
+    """Opens links and says once a second that we are booting, until someone takes over."""
+
+    def __init__(self, links: Sequence[str], system: int, token: int) -> None:
+        """Raises ValueError for a link that cannot be."""
+        self.system, self.token = system, token
+        self.sequence = 0  # of the next packet of either component
+        self.next_s = time.monotonic()
+        self.links = [Link(parse_link(text), lambda data, now_ns: None) for text in links]
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="first beats", daemon=True)
+
+    def start(self) -> None:
+        """Open the links and speak."""
+        for link in self.links:
+            link.start()
+        self._thread.start()
+
+    def hand_over(self) -> list[Link]:
+        """The open links; from now on it is the caller who speaks."""
+        self._stop.set()
+        self._thread.join()
+        return self.links
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            for component in TYPES:
+                packet = heartbeat_packet(self.sequence, self.system, component, self.token)
+                for link in self.links:
+                    link.write(packet)
+            self.sequence = (self.sequence + 1) & 0xFF
+            self.next_s += PERIOD_S
+            self._stop.wait(max(0.0, self.next_s - time.monotonic()))

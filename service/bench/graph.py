@@ -1,0 +1,124 @@
+"""The pose graph over a long flight: what each keyframe costs, first and last, with loops."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon import se3
+from recon.trajectory import Trajectory
+from recon.types import F64, PosePrior
+from service.bench import BenchOptions, BenchResult
+
+KEYFRAMES = 5000
+STEP_M = 6.0
+LEG = 100
+"""Keyframes of one leg; neighbouring legs see each other."""
+
+LOOP_EVERY = 25
+PART = 1000
+HEIGHT_M = 60.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Flight:
+    truth: list[F64]  # T_world_camera
+    odometry: list[F64]
+    covariance: F64
+    priors: list[PosePrior]
+
+
+def run(options: BenchOptions) -> list[BenchResult]:
+    """Median milliseconds per keyframe of the first and of the last thousand, and the mean."""
+    del options  # one flight is one round
+    flight = _flight()
+    taken, worst_m = _fly(flight)
+    first, last = taken[:PART], taken[-PART:]
+    note = f"all sensors, a loop every {LOOP_EVERY}; goal 2 ms"
+    return [
+        _result(f"keyframes 1 to {PART}, median", statistics.median(first), note),
+        _result(
+            f"keyframes {KEYFRAMES - PART + 1} to {KEYFRAMES}, median",
+            statistics.median(last), f"{statistics.median(last) / statistics.median(first):.2f} "
+            "of the first; goal: flat",
+        ),
+        _result(f"keyframes 1 to {PART}, mean", statistics.fmean(first), ""),
+        _result(
+            f"keyframes {KEYFRAMES - PART + 1} to {KEYFRAMES}, mean", statistics.fmean(last),
+            f"longest {max(taken):.0f} ms",
+        ),
+        BenchResult("graph", "rms place of all keyframes", worst_m, "m", note="GNSS of 1 m"),
+    ]  # fmt: skip
+
+
+def _result(what: str, value: float, note: str) -> BenchResult:
+    return BenchResult("graph", what, value, "ms", note=note)
+
+
+def _fly(flight: _Flight) -> tuple[list[float], float]:
+    """Milliseconds of each keyframe: entered, placed, loops, corrections; and rms in metres."""
+    trajectory, taken = Trajectory(), []
+    spread = np.diag([5e-4**2] * 3 + [0.03**2] * 3)
+    for i, (T, prior) in enumerate(zip(flight.odometry, flight.priors, strict=True)):
+        begun = time.perf_counter()
+        trajectory.add(i, 0, T, prior, (HEIGHT_M / 1.3, 0.0), i * 1_000_000_000, flight.covariance)
+        partner = _opposite(i)
+        if i % LOOP_EVERY == 0 and partner is not None:
+            T_a_b = se3.inverse(flight.truth[partner]) @ flight.truth[i]
+            trajectory.graph.add_loop(partner, i, T_a_b, spread)
+        trajectory.tell(trajectory.place(i))
+        for placed in trajectory.moved():
+            trajectory.tell(placed)
+        taken.append(1e3 * (time.perf_counter() - begun))
+    apart = trajectory.graph.pose_array()[:, :3, 3] - np.array(flight.truth)[:, :3, 3]
+    return taken, float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+
+
+def _opposite(i: int) -> int | None:
+    """The keyframe beside ``i`` on the leg before; None on the first leg and near the turns."""
+    leg, along = divmod(i, LEG)
+    if leg == 0 or not 15 < along < LEG - 15:
+        return None
+    return (leg - 1) * LEG + LEG - 1 - along
+
+
+def _flight() -> _Flight:
+    """Legs to and fro with wandering sensors and an odometry of another scale that drifts."""
+    rng = np.random.default_rng(1)
+    truth = []
+    for i in range(KEYFRAMES):
+        leg, along = divmod(i, LEG)
+        x = STEP_M * (along if leg % 2 == 0 else LEG - 1 - along)
+        turn = se3.so3_exp(np.array([0.0, 0.0, np.pi * (leg % 2)]))
+        wobble = se3.so3_exp(rng.normal(size=3) * 0.02)
+        place = np.array([x, 20.0 * leg, HEIGHT_M]) + rng.normal(size=3) * 0.2
+        truth.append(se3.compose(turn @ np.diag([1.0, -1.0, -1.0]) @ wobble, place))
+    covariance = np.diag([1e-4**2] * 3 + [0.01**2] * 3)
+    noise = rng.multivariate_normal(np.zeros(6), covariance, KEYFRAMES)
+    odometry = [np.eye(4)]
+    for a, b, error in zip(truth[:-1], truth[1:], noise[1:], strict=True):
+        motion = se3.exp(error) @ se3.inverse(a) @ b
+        motion[:3, 3] /= 1.3
+        odometry.append(odometry[-1] @ motion)
+    wander = _wander(rng, np.array([1.0, 1.0, 1.5, 0.005, 0.005, 0.02]))
+    priors = [
+        PosePrior(
+            se3.so3_exp(w[3:]) @ T[:3, :3], 0.02, 0.05, T[:3, 3] + w[:3], np.array([1, 1, 1.5]),
+            HEIGHT_M, 3.0, T[2, 3] + 4.0, 0.5,
+        )
+        for T, w in zip(truth, wander, strict=True)
+    ]  # fmt: skip
+    units = np.array([1.0] * 3 + [1.3] * 3)
+    return _Flight(truth, odometry, covariance / np.outer(units, units), priors)
+
+
+def _wander(rng: np.random.Generator, sigma: F64) -> F64:
+    """(KEYFRAMES, 6) first-order Gauss-Markov errors with a time constant of 60 s."""
+    keep = np.exp(-1.0 / 60.0)
+    out = rng.normal(size=(KEYFRAMES, 6))
+    for k in range(1, KEYFRAMES):
+        out[k] = keep * out[k - 1] + np.sqrt(1 - keep**2) * out[k]
+    return np.asarray(out * sigma)
