@@ -265,12 +265,11 @@ class PoseGraph:
         self._smoother.update(now=True)
         return self._smoother.residuals()
 
-    def scale_readings(self, segment: int) -> tuple[Scale | None, Scale | None]:
-        """A segment's scale by fixes alone and by heights alone."""
+    def newest_scales(self) -> tuple[Scale | None, Scale | None]:
+        """The newest segment's scale by fixes alone and by heights alone."""
+        segment = self._newest().segment if self._nodes else -1
         frame = self._frames.get(segment)
-        if frame is None:
-            return None, None
-        return alignment.scales(self._anchors(segment), frame)
+        return (None, None) if frame is None else alignment.scales(self._anchors(segment), frame)
 
     # ---- building ------------------------------------------------------------------------------
 

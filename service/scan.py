@@ -18,6 +18,7 @@ from service.cameras.ahead import ahead
 from service.cameras.source import CameraFrame, CameraSource
 from service.config import Config
 from service.errors import InputError
+from service.graph_watch import GraphWatch
 from service.pipeline import Pipeline, Step
 from service.recorder import Recorder
 from service.retention import PAGES
@@ -110,6 +111,8 @@ class Scan:
         self.check = TelemetryCheck(
             inputs.config.camera, inputs.history, inputs.tell, inputs.latency_ms
         )
+        dense = self.pipeline.dense
+        self.watch = GraphWatch(dense.trajectory.graph, dense.lock, inputs.tell)
         self.tagged = self.odd_sized = self.heights = 0
         self._started = time.monotonic()
 
@@ -131,6 +134,8 @@ class Scan:
             Frame(frame.image, exposed_ns, frame.seq, inputs.camera), state, frame.geotag
         )
         self.check.add(time_ns, step.tracked)
+        if step.keyframes:
+            self.watch.look()
         self.recorder.write(step, exposed_ns, state.alt_agl_m if state is not None else None)
         return step
 
@@ -173,7 +178,7 @@ class Scan:
 
     def _doubts(self) -> list[str]:
         """What the reader of this scan must know."""
-        out = list(self.check.told.values())
+        out = [*self.check.told.values(), *self.watch.sentences()]
         if self.odd_sized:
             W, H = self.inputs.camera.size_px
             out.append(f"{self.odd_sized} frames were not {W}x{H} like the camera model: left out")

@@ -1,0 +1,72 @@
+"""Tells the operator, once each, what the pose graph finds wrong with the telemetry."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+
+from recon.pose_graph import PoseGraph
+
+LEAST = 5
+"""Readings of one kind left out before it is said."""
+
+SIGMAS, LEAST_SHARE = 3.0, 0.03
+"""Two scales disagree when they are further apart than both of these."""
+
+LOOK_GROWTH = 1.2
+"""The track is looked at again when its keyframes have grown by so much."""
+
+LEFT_OUT = {
+    "position off": "positions far from the track were left out: does GNSS jump?",
+    "position frozen": "positions only repeated the one before: is GNSS frozen?",
+    "heading off": "headings contradict the track and were left out: check the compass",
+    "tilt off": "attitudes contradict the pictures and were left out: check the gimbal's frame",
+    "altitude off": "altitudes stepped and were left out: check the barometer",
+}
+
+
+class GraphWatch:
+    """Looks at a pose graph now and then; what it finds goes to ``tell`` when it is new."""
+
+    def __init__(self, graph: PoseGraph, lock: threading.Lock, tell: Callable[[str], None]) -> None:
+        """``lock`` guards the graph."""
+        self._graph, self._lock, self._tell = graph, lock, tell
+        self._seen = 0
+        self._told: set[str] = set()
+
+    def look(self) -> None:
+        """Look again when enough keyframes have come since the last time."""
+        if len(self._graph) < max(LEAST, LOOK_GROWTH * self._seen):
+            return
+        self._seen = len(self._graph)
+        for kind, sentence in self._findings().items():
+            if kind not in self._told:
+                self._told.add(kind)
+                self._tell(sentence)
+
+    def sentences(self) -> list[str]:
+        """Everything that is wrong, as known now."""
+        return list(self._findings().values())
+
+    def _findings(self) -> dict[str, str]:
+        """Sentences by kind."""
+        with self._lock:
+            counts = self._graph.counts
+            scales = self._graph.newest_scales()
+        out = {
+            kind: f"{counts[kind]} {text}" for kind, text in LEFT_OUT.items()
+            if counts[kind] >= LEAST
+        }  # fmt: skip
+        by_fixes, by_heights = scales
+        if by_fixes is not None and by_heights is not None:
+            apart = math.log(by_fixes.metres / by_heights.metres)
+            limit = max(SIGMAS * math.hypot(by_fixes.sigma, by_heights.sigma), LEAST_SHARE)
+            if abs(apart) > limit:
+                percent = 100.0 * (math.exp(abs(apart)) - 1.0)
+                which = "larger" if apart > 0 else "smaller"
+                out["scale"] = (
+                    f"scale: GNSS makes the map {percent:.0f} % {which} than the height above "
+                    "ground does; check both"
+                )
+        return out
