@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -65,7 +65,11 @@ class Rig:
         fix = self._fix(state, tag)
         position, sigma = self._position(fix)
         agl, sigma_agl = self._agl(state, tag)
-        return PosePrior(R, tilt, yaw, position, sigma, agl, sigma_agl)
+        prior = PosePrior(R, tilt, yaw, position, sigma, agl, sigma_agl)
+        # With a position the altitude is part of it.
+        if position is None and state is not None and self._fusion.altitude:
+            prior = replace(prior, altitude_m=state.alt_amsl_m)
+        return prior
 
     def _rotation(self, state: VehicleState | None, tag: GeoTag | None) -> tuple[F64, float, float]:
         if state is not None and self._fusion.attitude:
