@@ -203,6 +203,10 @@ class PoseGraph:
         """Keyframes and accepted loops, from which :meth:`batch` makes the same graph."""
         return list(self._nodes.values()), list(self._loops)
 
+    def metric_loops(self) -> list[Loop]:
+        """Accepted loops with lengths in metres, by the scale known now."""
+        return [loop.scaled(self.scale(loop.a)) for loop in self._loops]
+
     def similarity(self, segment: int) -> Similarity | None:
         """What brings a segment's odometry to the world; None before telemetry or a loop does."""
         return self._frames.get(segment)
