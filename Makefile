@@ -10,13 +10,14 @@ ARGS ?=
 
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
+PEERS := $(VENV)/peers/installed
 
 .PHONY: demo test lint types check bench trials format bundle clean
 
 demo: $(STAMP)
 	$(BIN)/skyrelief demo --out demo-output $(ARGS)
 
-test: $(STAMP)
+test: $(STAMP) $(PEERS)
 	$(BIN)/python -m pytest $(ARGS)
 
 lint: $(STAMP)
@@ -54,3 +55,12 @@ $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt $(PIP_FLAGS) -e '.[$(EXTRAS)]'
 	@touch $(STAMP)
+
+# MAVProxy, a ground station for the tests, in an environment of its own without its graphical
+# parts, which clash with ours. Without a network its tests are skipped by name.
+$(PEERS): constraints.txt | $(STAMP)
+	@test -x $(VENV)/peers/bin/python || $(BIN)/python -m venv $(VENV)/peers
+	@PIP="$(VENV)/peers/bin/python -m pip --disable-pip-version-check --retries 1 --timeout 15"; \
+	  { $$PIP install -q -c constraints.txt pymavlink pyserial && \
+	    $$PIP install -q --no-deps MAVProxy==1.8.75 && touch $@; } || \
+	  echo "could not install MAVProxy; its tests are skipped" >&2

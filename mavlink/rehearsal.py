@@ -1,13 +1,18 @@
-"""A ScanControl that keeps the state of a scan but scans nothing.
+"""A vehicle link over a ScanControl that keeps the state of a scan but scans nothing.
 
 For benches and for trying a ground station on the table without camera or pipeline.
 """
 
 from __future__ import annotations
 
+import threading
+import time
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from mavlink.control import ACCEPTED, Answer, Handled, Phase, Power, Result, ScanStatus, Work
+from mavlink.presence import Health
+from mavlink.vehicle import VehicleConfig, VehicleLink
 
 
 @dataclass
@@ -76,3 +81,38 @@ class RehearsalControl:
         """Take it, unless ``answers`` holds a refusal by this name."""
         self.asked.append(f"{name}={value:g}")
         return self.answers.get(name, ACCEPTED)
+
+
+class RehearsalVehicle:
+    """A context: a VehicleLink whose health is confirmed, over a :class:`RehearsalControl`."""
+
+    def __init__(self, *links: str, **settings: Any) -> None:
+        """``settings`` are fields of :class:`~mavlink.vehicle.VehicleConfig`."""
+        self.control = RehearsalControl()
+        self.link = VehicleLink(VehicleConfig(links=links, **settings), self.control)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._confirm, name="rehearsal", daemon=True)
+
+    def __enter__(self) -> RehearsalVehicle:
+        """Open the links; those that listen are open when this returns, if they can be."""
+        self.link.start()
+        self._thread.start()
+        deadline = time.monotonic() + 5.0
+        while not self._is_listening() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        return self
+
+    def _is_listening(self) -> bool:
+        ears = [r for r in self.link.report().links if r.name.startswith(("udpin", "tcpin"))]
+        return all(report.is_up for report in ears)
+
+    def __exit__(self, *_: object) -> None:
+        """Close everything."""
+        self._stop.set()
+        self._thread.join()
+        self.link.stop()
+
+    def _confirm(self) -> None:
+        while not self._stop.wait(0.2):
+            recording = self.control.state.is_recording
+            self.link.set_health(Health.ACTIVE if recording else Health.STANDBY)

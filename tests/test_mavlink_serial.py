@@ -1,0 +1,71 @@
+"""A pseudo-terminal as the serial line, which is unplugged."""
+
+from __future__ import annotations
+
+import os
+import pty
+import time
+import tty
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mavlink.framing import Framer
+from mavlink.rehearsal import RehearsalVehicle
+from mavlink.wire import dialect
+
+S = 1_000_000_000
+
+
+def until(done: Callable[[], Any], limit_s: float = 15.0) -> Any:
+    """What ``done`` gives once it is true; the test fails when that takes too long."""
+    deadline = time.monotonic() + limit_s
+    while time.monotonic() < deadline:
+        value = done()
+        if value:
+            return value
+        time.sleep(0.02)
+    pytest.fail(f"nothing came in {limit_s} s")
+
+
+def plug(path: Path) -> int:
+    """A pseudo-terminal whose far end is reachable at ``path``; our end comes back."""
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    path.symlink_to(os.ttyname(theirs))
+    os.close(theirs)
+    os.set_blocking(ours, False)
+    return ours
+
+
+def heard(line: int, framer: Framer) -> list[int]:
+    try:
+        return [packet.message_id for packet in framer.feed(os.read(line, 4096))]
+    except OSError:
+        return []
+
+
+def test_a_serial_line_is_spoken_to_first_and_survives_the_plug(tmp_path: Path) -> None:
+    path = tmp_path / "autopilot"
+    line = plug(path)
+    with RehearsalVehicle(f"serial:{path}:57600") as daemon:
+        first = until(lambda: heard(line, Framer()))
+        assert first[0] == 0  # a heartbeat before anything else
+        mouth = dialect.MAVLink(None, 1, 1)
+        beat = dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)
+        os.write(line, bytes(beat.pack(mouth)))
+        until(lambda: daemon.link.presence.autopilot == (1, 1))
+        path.unlink()
+        os.close(line)
+        until(lambda: not daemon.link.report().links[0].is_up)
+        assert daemon.link.report().links[0].last_error
+        line = plug(path)
+        until(lambda: daemon.link.report().links[0].opened >= 2)
+        start = dialect.MAVLink_command_long_message(1, 100, 2500, 0, 0, 0, 0, 0, 0, 0, 0)
+        os.write(line, b"\x00\xfd noise" + bytes(start.pack(mouth)) + bytes(300))
+        until(lambda: daemon.control.asked == ["start_scan"])
+        framer = Framer()
+        until(lambda: 77 in heard(line, framer))
+    os.close(line)
