@@ -7,6 +7,8 @@
 #   sudo deploy/install.sh                      from this clone, with pip's package index
 #   sudo deploy/install.sh --bundle DIR         offline, from what 'make bundle' prepared
 #   sudo deploy/install.sh --ground             the ground receiver instead of the onboard service
+#   sudo deploy/install.sh --profile NAME       settings of deploy/profiles/NAME.toml for a fresh
+#                                               configuration; without it the board is recognised
 #   sudo deploy/install.sh --rollback           back to the version before
 #   sudo deploy/install.sh --uninstall          remove it; scans and configuration stay
 set -euo pipefail
@@ -20,6 +22,7 @@ unit=skyrelief
 start=1
 action=install
 keep=3
+profile=""
 health_s=${SKYRELIEF_HEALTH_S:-45}
 
 say() { printf '%s\n' "$*"; }
@@ -30,11 +33,12 @@ while (($#)); do
     --bundle) bundle=${2:?--bundle needs a folder}; shift ;;
     --python) python=${2:?--python needs a command}; shift ;;
     --extras) extras=${2:?--extras needs a list such as gpu,logs}; shift ;;
+    --profile) profile=${2:?--profile needs a name such as orin-nano}; shift ;;
     --ground) unit=skyrelief-ground; extras="ground,logs" ;;
     --no-start) start=0 ;;
     --rollback) action=rollback ;;
     --uninstall) action=uninstall ;;
-    -h | --help) sed -n '2,11s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"; exit 0 ;;
+    -h | --help) sed -n '2,13s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"; exit 0 ;;
     *) die "no option $1; see --help" ;;
   esac
   shift
@@ -99,6 +103,19 @@ switch_to() {
   mv -T "$home/current.new" "$current"
 }
 
+# The profile of this board: by its device tree, else by its processor.
+board() {
+  local model=""
+  [[ -r $root/proc/device-tree/model ]] && model=$(tr -d '\0' <"$root/proc/device-tree/model")
+  case $model in
+    *Orin*Nano*) printf 'orin-nano' ;;
+    *Orin*NX*) printf 'orin-nx' ;;
+    *AGX*Orin*) printf 'orin-agx' ;;
+    *"Raspberry Pi 5"* | *"Compute Module 5"*) printf 'raspberry-pi-5' ;;
+    *) [[ $(uname -m) != x86_64 ]] || printf 'x86-bench' ;;
+  esac
+}
+
 version_now() { [[ -L $current ]] && basename "$(readlink "$current")" || true; }
 
 install_files() {
@@ -111,11 +128,14 @@ install_files() {
   install -D -m 0644 "$from/deploy/50-skyrelief.polkit.rules" \
     "$root/etc/polkit-1/rules.d/50-skyrelief.rules"
   install -d -m 0755 "$etc"
-  if [[ $unit == skyrelief && ! -e $etc/skyrelief.toml ]]; then
-    "$current/bin/python" -m service.cli config default >"$etc/skyrelief.toml.new"
-    mv "$etc/skyrelief.toml.new" "$etc/skyrelief.toml"
-    say "wrote $etc/skyrelief.toml: set camera.source, camera.model, mavlink.links, datalink.connect"
-  fi
+  [[ $unit == skyrelief && ! -e $etc/skyrelief.toml ]] || return 0
+  local settings=()
+  [[ -n $profile ]] || profile=$(board)
+  [[ -z $profile ]] || settings=("$from/deploy/profiles/$profile.toml")
+  "$current/bin/python" -m service.cli config default "${settings[@]}" >"$etc/skyrelief.toml.new"
+  mv "$etc/skyrelief.toml.new" "$etc/skyrelief.toml"
+  say "wrote $etc/skyrelief.toml${profile:+ with the settings of $profile}:" \
+    "set camera.source, camera.model, mavlink.links, datalink.connect"
 }
 
 prepare_machine() {
@@ -129,6 +149,15 @@ prepare_machine() {
   udevadm control --reload 2>/dev/null || true
   systemctl daemon-reload
   systemctl enable "$unit.service" >/dev/null
+}
+
+# Compiles the kernels as the service's user, so that no flight waits for that.
+warm_up() {
+  live && [[ $unit == skyrelief ]] || return 0
+  say "warming up: the kernels are compiled, some minutes on a small board"
+  runuser -u skyrelief -- env NUMBA_CACHE_DIR=/var/cache/skyrelief HOME=/var/lib/skyrelief \
+    "$current/bin/skyrelief" warm-up --config "$etc/skyrelief.toml" ||
+    say "it did not warm up; the first scan will take longer to begin"
 }
 
 # True when the service is up and stays up without a restart.
@@ -185,6 +214,8 @@ version_to_install() {
 do_install() {
   [[ -z $bundle || -d $bundle/wheels ]] || die "$bundle holds no wheels/; make one with 'make bundle'"
   [[ -z $bundle ]] || bundle=$(cd "$bundle" && pwd)
+  [[ -z $profile || -r ${bundle:-$here}/deploy/profiles/$profile.toml ]] ||
+    die "no profile $profile; there are $(cd "${bundle:-$here}/deploy/profiles" && echo ./*.toml)"
   check_python
   local new old
   new=$(version_to_install)
@@ -198,6 +229,7 @@ do_install() {
   switch_to "$new"
   install_files
   prepare_machine
+  warm_up
   start_or_roll_back "$old" "$new"
   prune
 }

@@ -28,7 +28,7 @@ case "$*" in
     chmod +x "${@: -1}/bin/skyrelief"
     printf 'command = %s\\n' "${@: -1}" > "${@: -1}/pyvenv.cfg" ;;
   "-m pip install"*) exit "${PIP_EXIT:-0}" ;;
-  "-m service.cli config default") printf '[camera]\\n' ;;
+  "-m service.cli config default"*) printf '[camera]\\n# %s\\n' "${@:5}" ;;
   "-c import service.cli"*) exit 0 ;;
   *) exec REAL "$@" ;;
 esac
@@ -104,6 +104,45 @@ def test_everything_lands_in_its_place(machine: Machine) -> None:
         assert (machine.root / name).is_file(), name
     script = (machine.home / "current" / "bin" / "skyrelief").read_text()
     assert script == f"#!/opt/skyrelief/versions/{machine.current}/bin/python\n"
+
+
+@pytest.mark.parametrize(
+    ("model", "profile"),
+    [
+        ("NVIDIA Jetson Orin Nano Developer Kit", "orin-nano"),
+        ("NVIDIA Jetson Orin NX Engineering Reference Developer Kit", "orin-nx"),
+        ("NVIDIA Jetson AGX Orin Developer Kit", "orin-agx"),
+        ("Raspberry Pi 5 Model B Rev 1.0", "raspberry-pi-5"),
+    ],
+)
+def test_the_board_is_recognised(machine: Machine, model: str, profile: str) -> None:
+    tree = machine.root / "proc" / "device-tree" / "model"
+    tree.parent.mkdir(parents=True)
+    tree.write_bytes(model.encode() + b"\0")
+    done = machine.install()
+    assert done.returncode == 0, done.stderr
+    assert f"with the settings of {profile}" in done.stdout
+    configuration = machine.root / "etc" / "skyrelief" / "skyrelief.toml"
+    assert configuration.read_text().endswith(f"/deploy/profiles/{profile}.toml\n")
+
+
+def test_a_named_profile_must_exist(machine: Machine) -> None:
+    done = machine.install("--profile", "orin-mini")
+    assert done.returncode != 0
+    assert "orin-nano" in done.stderr
+    assert not machine.home.exists()
+    assert "x86-bench" in machine.install("--profile", "x86-bench").stdout
+
+
+@pytest.mark.parametrize("profile", sorted((ROOT / "deploy" / "profiles").glob("*.toml")))
+def test_profiles_are_configurations(profile: Path) -> None:
+    from service.commands.config import to_toml
+    from service.config import load_config
+
+    chosen = load_config(profile)
+    assert chosen != load_config(None)
+    assert "# " in profile.read_text()
+    assert f"least_memory_mib = {chosen.compute.least_memory_mib}" in to_toml(chosen, True)
 
 
 def test_running_it_again_changes_nothing(machine: Machine) -> None:

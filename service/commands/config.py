@@ -22,11 +22,12 @@ def config(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
-    """Check a configuration file, show what is in force, or print the documented default."""
+    """Check a configuration file, show what is in force, or print the documented default.
+
+    ``default FILE`` prints the documented default with what FILE sets, such as a board's profile.
+    """
     if action not in ACTIONS:
         raise InputError(f"config {action}: there are {', '.join(ACTIONS)}")
-    if action == "default" and (file is not None or set_):
-        raise InputError("config default takes no file; 'config show FILE' shows what is in force")
     if action == "check" and file is None:
         raise InputError("config check: name the file to check")
     chosen = load_config(file, set_ or [])
