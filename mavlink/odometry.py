@@ -10,7 +10,7 @@ from typing import Any
 from mavlink.quaternion import Quaternion
 from mavlink.wire import dialect
 
-LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
+LOCAL_FRD = 20  # MAV_FRAME_LOCAL_FRD: an origin of our own; ArduPilot and PX4 both take it
 BODY_FRD = 12  # MAV_FRAME_BODY_FRD
 VISION = 2  # MAV_ESTIMATOR_TYPE_VISION
 CELLS = 21  # upper triangle of 6 x 6
@@ -40,7 +40,7 @@ def odometry_message(odometry: Odometry, boot_time_us: int) -> Any:
     nan = math.nan
     return dialect.MAVLink_odometry_message(
         max(0, boot_time_us),
-        LOCAL_NED,
+        LOCAL_FRD,
         BODY_FRD,
         *odometry.position_ned_m,
         list(odometry.q_ned_body),

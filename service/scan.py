@@ -12,6 +12,7 @@ from threading import Event
 from typing import Any, Protocol
 
 from mavlink.history import VehicleHistory
+from mavlink.state import VehicleState
 from recon.backends import Backend
 from recon.types import Camera, Frame
 from service.cameras.ahead import ahead
@@ -67,6 +68,7 @@ class ScanInputs:
     extra: dict[str, Any] = field(default_factory=dict)  # goes into scan.json
     latency_ms: float | None = None  # the camera's as an earlier scan found it
     tell: Callable[[str], None] = log.warning  # the operator
+    on_step: Callable[[Step, VehicleState | None, int], None] | None = None  # and its exposure
 
 
 def create_store(inputs: ScanInputs) -> ScanStore:
@@ -137,6 +139,8 @@ class Scan:
         if step.keyframes:
             self.watch.look()
         self.recorder.write(step, exposed_ns, state.alt_agl_m if state is not None else None)
+        if inputs.on_step is not None:
+            inputs.on_step(step, state, exposed_ns)
         return step
 
     def run(

@@ -22,10 +22,14 @@ from service.errors import InputError, OutsideError, SkyreliefError
 from service.warm_up import is_warm
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from mavlink.state import VehicleState
     from recon.backends import Backend
     from recon.types import Camera
     from service.cameras.source import CameraSource
     from service.frame_gate import FrameGate
+    from service.pipeline import Step
     from service.scan import Scan
     from service.stream.records import PoseRecord
     from service.stream.store import ScanStore
@@ -245,6 +249,7 @@ class Scanning:
             extra={"backend": self._backend.name, "source": source.description},
             latency_ms=self._latency_ms,
             tell=lambda text: self.vehicle.statustext(text, WARNING),
+            on_step=self._odometry_report(),
         )
         store = create_store(inputs)
         self.vehicle.record(folder / "link.tlog")
@@ -264,6 +269,14 @@ class Scanning:
                 write_deliverables(folder, store, {})
                 self.link.land(self.config)
                 store.close()
+
+    def _odometry_report(self) -> Callable[[Step, VehicleState | None, int], None] | None:
+        """What tells the autopilot how it moves, where that is wanted."""
+        if not self.config.mavlink.odometry:
+            return None
+        from service.odometry_report import OdometryReport
+
+        return OdometryReport(self.config.camera, self.vehicle.report_odometry).tell
 
     def _close_scan(self, scan: Scan, store: ScanStore) -> None:
         """Finish the scan; when the pipeline cannot, what is stored is kept as interrupted."""

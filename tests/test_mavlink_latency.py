@@ -171,7 +171,7 @@ def test_odometry_goes_out_as_meant() -> None:
     (packet,) = Framer().feed(data)
     message = Decoder().message(packet)
     assert message is not None and message.get_type() == "ODOMETRY"
-    assert (message.time_usec, message.frame_id, message.child_frame_id) == (5_000_000, 1, 12)
+    assert (message.time_usec, message.frame_id, message.child_frame_id) == (5_000_000, 20, 12)
     assert (message.x, message.y, message.z) == (1.0, 2.0, -3.0)
     w, x, y, z = message.q
     assert Rotation.from_quat([x, y, z, w]).as_euler("ZYX") == pytest.approx([0.3, 0.2, 0.1])

@@ -1,0 +1,127 @@
+"""The estimate that goes to the autopilot: from steps of the pipeline to ODOMETRY on the wire."""
+
+from __future__ import annotations
+
+import math
+import socket
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mavlink.framing import Framer
+from mavlink.odometry import Odometry
+from mavlink.rehearsal import RehearsalVehicle
+from mavlink.state import VehicleState
+from mavlink.wire import dialect
+from recon import se3
+from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
+from recon.keyframe_window import OdometryKeyframe
+from recon.odometry import Tracked
+from recon.trajectory import Placed
+from recon.types import F64, PosePrior
+from service.config import CameraConfig
+from service.odometry_report import OdometryReport
+from service.pipeline import Anchorage, Step
+
+S = 1_000_000_000
+BODY = Rotation.from_euler("ZYX", [0.7, 0.05, -0.1])  # q_ned_body
+HEAD = Rotation.from_euler("ZYX", [0.7, -math.pi / 3, 0.0])  # q_ned_gimbal
+COVARIANCE = np.diag([1e-4, 2e-4, 3e-4, 0.04, 0.09, 0.16])  # about and along east, north, up
+
+
+def wxyz(R: Rotation) -> F64:
+    return np.asarray(R.as_quat()[[3, 0, 1, 2]], np.float64)
+
+
+def step_at(enu: tuple[float, float, float], head: Rotation = HEAD, segment: int = 0) -> Step:
+    R = R_ENU_NED @ head.as_matrix() @ R_GIMBAL_CAMERA
+    T = se3.compose(R, np.array(enu))
+    tracked = Tracked("tracked", segment, T, np.eye(6), tracks=150)
+    anchor = Anchorage(0, object.__new__(OdometryKeyframe), np.eye(4))
+    return Step(tracked, PosePrior(), Placed(0, T, 1.0, COVARIANCE, ("vision",)), False, anchor)
+
+
+def state() -> VehicleState:
+    return VehicleState(0, q_ned_body_wxyz=wxyz(BODY), q_ned_gimbal_wxyz=wxyz(HEAD))
+
+
+def test_pose_velocity_and_covariance_are_the_bodys_in_ned() -> None:
+    sent: list[tuple[Odometry, int]] = []
+    report = OdometryReport(CameraConfig(), lambda o, t: sent.append((o, t)))
+    for k in range(3):
+        report.tell(step_at((4.0 * k / 10, 1.0, 30.0)), state(), k * S // 10)
+    odometry, time_ns = sent[-1]
+    assert time_ns == 2 * S // 10
+    assert odometry.position_ned_m == pytest.approx((1.0, 0.8, -30.0))
+    assert abs(float(np.dot(odometry.q_ned_body, wxyz(BODY)))) == pytest.approx(1.0, abs=1e-9)
+    assert odometry.velocity_frd_m_s == pytest.approx(BODY.inv().apply([0.0, 4.0, 0.0]))
+    assert np.diag(odometry.pose_covariance) == pytest.approx([0.09, 0.04, 0.16, 2e-4, 1e-4, 3e-4])
+    assert (odometry.reset_counter, odometry.quality_percent) == (0, 75)
+    assert all(math.isnan(v) for v in sent[0][0].velocity_frd_m_s)
+
+
+def test_a_fixed_mount_needs_no_gimbal() -> None:
+    sent: list[Odometry] = []
+    camera = CameraConfig(mount="fixed", mount_pitch_deg=-60.0, mount_yaw_deg=20.0)
+    mount = Rotation.from_euler("ZYX", [20.0, -60.0, 0.0], degrees=True)
+    report = OdometryReport(camera, lambda o, t: sent.append(o))
+    report.tell(step_at((0.0, 0.0, 30.0), BODY * mount), None, 0)
+    assert abs(float(np.dot(sent[0].q_ned_body, wxyz(BODY)))) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_resets_are_counted_and_lost_frames_left_out() -> None:
+    sent: list[Odometry] = []
+    report = OdometryReport(CameraConfig(), lambda o, t: sent.append(o))
+    way = [(k * 1.0, 0.0, 30.0) for k in range(6)]
+    for k, place in enumerate(way):  # a fast vehicle: no step of it is a jump
+        report.tell(step_at(place), state(), k * S // 10)
+    assert report.resets == 0
+    report.tell(step_at((9.0, 0.0, 30.0)), state(), 6 * S // 10)  # a loop was closed
+    assert sent[-1].reset_counter == 1
+    assert sent[-1].velocity_frd_m_s == pytest.approx(BODY.inv().apply([0.0, 10.0, 0.0]))
+    report.tell(step_at((10.0, 0.0, 30.0)), state(), 7 * S // 10)
+    assert report.resets == 1
+    lost = Step(Tracked("lost", 0), PosePrior())
+    report.tell(lost, state(), 8 * S // 10)
+    assert len(sent) == 8
+    report.tell(step_at((11.0, 0.0, 30.0), segment=1), state(), 9 * S // 10)
+    assert sent[-1].reset_counter == 2
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_it_reaches_the_autopilot_stamped_with_its_clock_only_when_wanted(wanted: bool) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
+        autopilot.bind(("127.0.0.1", 0))
+        autopilot.settimeout(0.1)
+        address = f"udpout:127.0.0.1:{autopilot.getsockname()[1]}"
+        with RehearsalVehicle(address, odometry=wanted) as vehicle:
+            _, peer = autopilot.recvfrom(65536)
+            mouth, boot = dialect.MAVLink(None, 1, 1), time.monotonic_ns() - 50 * S
+            for message in (
+                dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3),
+                dialect.MAVLink_attitude_message(50_000, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+            ):
+                autopilot.sendto(bytes(message.pack(mouth)), peer)
+            deadline = time.monotonic() + 10.0
+            while vehicle.link.boot_time_us(0) is None and time.monotonic() < deadline:
+                time.sleep(0.01)
+            now_ns = time.monotonic_ns()
+            report = OdometryReport(CameraConfig(), vehicle.link.report_odometry)
+            report.tell(step_at((1.0, 2.0, 30.0)), state(), now_ns)
+            ear, framer = dialect.MAVLink(None), Framer()
+            heard: list[Any] = []
+            end = time.monotonic() + (5.0 if wanted else 0.5)
+            while not heard and time.monotonic() < end:
+                try:
+                    packets = framer.feed(autopilot.recv(65536))
+                except TimeoutError:
+                    continue
+                heard = [ear.decode(bytearray(p.data)) for p in packets if p.message_id == 331]
+    assert bool(heard) is wanted
+    if wanted:
+        assert heard[0].time_usec == pytest.approx((now_ns - boot) / 1000, abs=50_000)
+        assert (heard[0].x, heard[0].y, heard[0].z) == (2.0, 1.0, -30.0)
+        assert heard[0].pose_covariance[0] == pytest.approx(0.09)
