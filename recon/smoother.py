@@ -41,6 +41,7 @@ class Smoother:
         parameters.setOptimizationParams(solver)
         parameters.setRelinearizeThreshold(RELINEARISE)
         parameters.relinearizeSkip = 10
+        parameters.setFactorization("QR")  # loose starts beside tight motions are ill-conditioned
         self._isam: Any = gtsam.ISAM2(parameters)
         self._graph: Any = gtsam.NonlinearFactorGraph()
         self._values: Any = gtsam.Values()
