@@ -118,6 +118,11 @@ class ComputeConfig:
     """[compute]: where and how finely it is computed."""
 
     backend: str = key("auto", "auto, cpu, torch or onnx; one that is named must run")
+    model: str = key(
+        "",
+        "a learned stereo model by ONNX Runtime in place of belief propagation: the TOML that "
+        "declares it",
+    )
     threads: int = key(0, "threads of the CPU backend; 0: one per core")
     stereo_width: int = key(320, "width of the stereo pair in pixels; the paper's is 320")
     labels: int = key(16, "least number of disparity labels; the paper's is 16")

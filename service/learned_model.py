@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from service.backend_choice import engine_folder
 from service.errors import InputError, OutsideError
 
 if TYPE_CHECKING:
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 def load_learned_model(declaration: Path) -> LearnedStereoBackend:
     """The model declared in a TOML file, checked and ready to run.
+
+    TensorRT's engine of it, where there is TensorRT, is kept between starts.
 
     Raises InputError, with what was expected and what was found, when declaration and model
     do not fit, and OutsideError when ONNX Runtime is missing.
@@ -41,7 +44,8 @@ def load_learned_model(declaration: Path) -> LearnedStereoBackend:
                    else f"{', '.join(missing)} must be given" if missing
                    else f"model = {model.name!r} is no file beside it")
             )  # fmt: skip
-        return LearnedStereoBackend(model.read_bytes(), LearnedStereoConfig(**given))
+        config = LearnedStereoConfig(**given)
+        return LearnedStereoBackend(model.read_bytes(), config, engine_folder())
     except OSError as error:
         raise InputError(f"{declaration}: cannot be read: {error.strerror}") from error
     except (msgspec.DecodeError, ValueError, TypeError) as error:

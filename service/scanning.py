@@ -83,7 +83,7 @@ class Scanning:
                 "camera.model is not set; make one with 'skyrelief calibrate' and name it"
             )
         self._camera = load_camera(Path(self.config.camera.model))
-        self._backend = open_backend(self.config.compute)
+        self._backend = open_backend(self.config.compute, self._camera.size_px)
         log.info("ready: backend %s", self._backend.name)
 
     # ---- what may be asked of it -----------------------------------------------------------

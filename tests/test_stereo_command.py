@@ -155,7 +155,7 @@ def test_auto_takes_the_fastest_that_works(monkeypatch: pytest.MonkeyPatch) -> N
     class Named(Broken):
         """A backend of any name."""
 
-        def __init__(self, name: str) -> None:
+        def __init__(self, name: str, engines: Path) -> None:
             self.name = name
 
     monkeypatch.setattr(backend_choice, "load_backend", Named)
@@ -165,7 +165,7 @@ def test_auto_takes_the_fastest_that_works(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_named_backend_that_cannot_run_stops(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(name: str) -> None:
+    def refuse(name: str, engines: Path) -> None:
         raise ImportError("No module named 'torch'")
 
     monkeypatch.setattr(backend_choice, "load_backend", refuse)

@@ -7,6 +7,7 @@ operation has a short NumPy reference that the tests compare every backend again
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from recon.belief_propagation import BeliefPropagationConfig
@@ -55,14 +56,17 @@ BACKENDS: dict[str, str] = {
 """Name to ``module:class``; imported on first use."""
 
 
-def load_backend(name: str) -> Backend:
+def load_backend(name: str, engines: Path | None = None) -> Backend:
     """The backend called ``name``, ready to run.
 
-    Raises ValueError for a name that is not in the table, and whatever the backend raises
-    when it cannot run here (ImportError, RuntimeError), with the reason.
+    ``engines`` is a folder for what takes minutes to build and is the same at the next start:
+    TensorRT's engines, of the onnx backend. Raises ValueError for a name that is not in the
+    table, and whatever the backend raises when it cannot run here (ImportError, RuntimeError),
+    with the reason.
     """
     if name not in BACKENDS:
         raise ValueError(f"no backend {name!r}; there are {', '.join(sorted(BACKENDS))}")
     module, _, cls = BACKENDS[name].partition(":")
-    backend: Backend = getattr(import_module(module), cls)()
+    made = getattr(import_module(module), cls)
+    backend: Backend = made(engines) if name == "onnx" else made()
     return backend

@@ -7,8 +7,10 @@ and checked when it is loaded, before anything flies.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from recon.backends.onnx_backend import OnnxBackend, open_session
@@ -59,10 +61,12 @@ class LearnedStereoBackend(OnnxBackend):
 
     name = "learned"
 
-    def __init__(self, model: bytes, config: LearnedStereoConfig) -> None:
-        super().__init__()
+    def __init__(
+        self, model: bytes, config: LearnedStereoConfig, engines: Path | None = None
+    ) -> None:
+        super().__init__(engines)
         self.config = config
-        self._model = open_session(model, self.providers)
+        self._model = open_session(model, self.providers, engines)
         found = {i.name: (tuple(i.shape), i.type) for i in self._model.get_inputs()}
         for name in (config.left, config.right):
             _check(name, found, config.image_shape)
@@ -75,26 +79,44 @@ class LearnedStereoBackend(OnnxBackend):
     def belief_propagation(
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
     ) -> DisparityMap:
-        """The model's disparity less ``config.min_disparity``, NaN outside the labels."""
+        """The model's disparity less ``config.min_disparity``, NaN outside the labels.
+
+        A pair larger than the model's images is averaged down to fit (rectified pairs of a
+        turning camera are larger than its pictures); its disparities grow back with it.
+        """
         check_pair(left, right, labels)
         h, w = left.shape
-        if h > self.config.height or w > self.config.width:
-            most = f"{self.config.width}x{self.config.height}"
-            raise ValueError(f"the model takes images up to {most}, not {w}x{h}")
+        share = min(1.0, self.config.height / h, self.config.width / w)
+        size = (max(1, int(w * share)), max(1, int(h * share)))
+        if share < 1:
+            images = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (left, right)]
+        else:
+            images = [left, right]
+        px = self._disparity(*(np.asarray(i, np.uint8) for i in images))
+        if share < 1:
+            grown = cv2.resize(px, (w, h), interpolation=cv2.INTER_NEAREST)
+            px = np.asarray(grown, np.float32) * np.float32(w / size[0])
+        px = px - np.float32(config.min_disparity)
+        partner = np.arange(w)[None, :] - px - config.min_disparity
+        sound = (px >= 0) & (px <= labels - 1) & (partner > -0.5) & (partner < w - 0.5)
+        confidence = np.where(sound, self.config.confidence, 0).astype(np.float32)
+        return believe(left, np.where(sound, px, np.nan).astype(np.float32), confidence, config)
+
+    def _disparity(self, left: U8, right: U8) -> F32:
+        """(h, w) pixels, of images that fit the model."""
+        h, w = left.shape
         given = {self.config.left: self._image(left), self.config.right: self._image(right)}
-        (raw,) = self._model.run([self.config.disparity], given)
+        try:
+            (raw,) = self._model.run([self.config.disparity], given)
+        except Exception as error:  # ONNX Runtime's own exceptions share no base class
+            raise RuntimeError(str(error)) from error
         plane = np.asarray(raw, np.float32).squeeze()
         if plane.shape != (self.config.height, self.config.width):
             raise ValueError(
                 f"the model gave {np.shape(raw)}; one plane of "
                 f"{self.config.height}x{self.config.width} was expected"
             )
-        px: F32 = plane[:h, :w] * np.float32(self.config.disparity_scale)
-        px = px - np.float32(config.min_disparity)
-        partner = np.arange(w)[None, :] - px - config.min_disparity
-        sound = (px >= 0) & (px <= labels - 1) & (partner > -0.5) & (partner < w - 0.5)
-        confidence = np.where(sound, self.config.confidence, 0).astype(np.float32)
-        return believe(left, np.where(sound, px, np.nan).astype(np.float32), confidence, config)
+        return np.asarray(plane[:h, :w] * np.float32(self.config.disparity_scale))
 
     def _image(self, grey: U8) -> Any:
         """The image as the model takes it; a smaller one is continued by its border."""

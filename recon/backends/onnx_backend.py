@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import onnxruntime  # type: ignore[import-untyped]
@@ -20,16 +22,21 @@ PROVIDERS = ("TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecution
 
 KEPT_SESSIONS = 8
 
+ENGINE_NAME_DIGITS = 16
+
 
 class OnnxBackend:
     """Builds one model per shape and keeps its session; needs no torch.
 
-    ICP is the compiled one: it is not part of the dense stage.
+    TensorRT builds an engine of each model, which takes minutes; ``engines`` is the folder that
+    keeps them between starts (None: nothing is kept). ICP is the compiled one: it is not part
+    of the dense stage.
     """
 
     name = "onnx"
 
-    def __init__(self) -> None:
+    def __init__(self, engines: Path | None = None) -> None:
+        self.engines = engines
         found = onnxruntime.get_available_providers()
         self.providers = [p for p in PROVIDERS if p in found]
         if not self.providers:
@@ -80,7 +87,7 @@ class OnnxBackend:
         while len(self._sessions) >= KEPT_SESSIONS:
             self._sessions.pop(next(iter(self._sessions)))
         try:
-            self._sessions[key] = open_session(model, self.providers)
+            self._sessions[key] = open_session(model, self.providers, self.engines)
         except ValueError as error:  # our own model: it is the device that cannot
             raise RuntimeError(str(error)) from error
 
@@ -92,12 +99,36 @@ class OnnxBackend:
         return first.copy(), second.copy()
 
 
-def open_session(model: bytes, providers: list[str]) -> Any:
+def provider_options(
+    providers: list[str], model: bytes, engines: Path | None
+) -> list[tuple[str, dict[str, Any]]]:
+    """The providers with their options: TensorRT keeps its engines, the others need none.
+
+    Each model has a folder of its own, named by its digest: TensorRT tells engines apart by the
+    names in a model, which ours share whatever numbers they hold.
+    """
+    kept: dict[str, Any] = {}
+    if engines is not None and "TensorrtExecutionProvider" in providers:
+        folder = engines / hashlib.sha256(model).hexdigest()[:ENGINE_NAME_DIGITS]
+        kept = {
+            "trt_engine_cache_enable": True,
+            "trt_engine_cache_path": str(folder),
+            "trt_timing_cache_enable": True,
+            "trt_timing_cache_path": str(engines),
+        }
+    return [(p, kept if p == "TensorrtExecutionProvider" else {}) for p in providers]
+
+
+def open_session(model: bytes, providers: list[str], engines: Path | None = None) -> Any:
     """A session for an ONNX file; ValueError, with the reason, when it cannot be used."""
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
+    chosen = provider_options(providers, model, engines)
     try:
-        return onnxruntime.InferenceSession(model, options, providers=providers)
+        for _, kept in chosen:
+            if "trt_engine_cache_path" in kept:
+                Path(kept["trt_engine_cache_path"]).mkdir(parents=True, exist_ok=True)
+        return onnxruntime.InferenceSession(model, options, providers=chosen)
     except Exception as error:  # ONNX Runtime's own exceptions share no base class
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(f"ONNX Runtime cannot use the model: {first}") from error

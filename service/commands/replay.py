@@ -111,7 +111,7 @@ def _replay(
     epoch_ns = _epoch(source, log, video_epoch, notes)
     scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(epoch_ns / 1e9))
     folder = out or Path(f"scan-{scan_id}")
-    chosen = open_backend(config.compute)
+    chosen = open_backend(config.compute, source.size_px)
     notes += log.warnings if log is not None else ()
     inputs = ScanInputs(
         paced(source) if realtime else source,
