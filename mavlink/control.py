@@ -109,6 +109,8 @@ class ScanStatus:
     speed_m_s: float = float("nan")
     distance_m: float = float("nan")
     turn_rate_rad_s: float = float("nan")
+    camera_latency_ms: float = float("nan")  # as the pictures say, whether applied or not
+    camera_latency_sigma_ms: float = float("nan")
 
     @property
     def is_recording(self) -> bool:

@@ -123,11 +123,13 @@ def computer_status(load: ComputerLoad, unix_us: int, uptime_ms: int) -> Any:
 
 
 def motion_values(status: ScanStatus, boot_ms: int) -> list[Any]:
-    """NAMED_VALUE_FLOAT of speed (m/s), distance (m) and turn rate (rad/s) by vision."""
+    """NAMED_VALUE_FLOAT by vision: speed (m/s), distance (m), turn rate (rad/s), latency (ms)."""
     named = (
         (b"SR_SPEED", status.speed_m_s),
         (b"SR_DIST", status.distance_m),
         (b"SR_TURN", status.turn_rate_rad_s),
+        (b"SR_CAM_LAT", status.camera_latency_ms),
+        (b"SR_LAT_SIG", status.camera_latency_sigma_ms),
     )
     return [
         dialect.MAVLink_named_value_float_message(boot_ms, name, value)

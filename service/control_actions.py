@@ -33,6 +33,7 @@ class ControlActions:
         disk = shutil.disk_usage(_existing(Path(scanning.config.scan.folder)))
         scan = scanning.scan
         recorder = scan.recorder if scan is not None else None
+        latency = scan.check.latency if scan is not None else None
         recording = scanning.phase in (Phase.SCANNING, Phase.PAUSED)
         return ScanStatus(
             phase=scanning.phase,
@@ -43,6 +44,8 @@ class ControlActions:
             speed_m_s=recorder.speed_m_s if recorder is not None else math.nan,
             distance_m=recorder.distance_m if recorder is not None else math.nan,
             turn_rate_rad_s=recorder.turn_rate_rad_s if recorder is not None else math.nan,
+            camera_latency_ms=latency.latency_ms if latency is not None else math.nan,
+            camera_latency_sigma_ms=latency.sigma_ms if latency is not None else math.nan,
         )
 
     def start_scan(self) -> Handled:

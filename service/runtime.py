@@ -122,6 +122,8 @@ class Daemon:
                 "frames": scan.recorder.frames,
                 "clouds": scan.recorder.keyframes,
                 "points": scan.recorder.points,
+                "camera_latency_ms": status.camera_latency_ms,
+                "camera_latency_sigma_ms": status.camera_latency_sigma_ms,
             }
         return {
             "ok": health is not Health.CRITICAL,

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -44,7 +45,14 @@ def test_ctl_steers_a_scan() -> None:
         assert answer == {"action": "start", "result": "accepted", "system": 1, "component": 100}
         assert run_ctl(port, "baseline", "2.5").returncode == 0
         assert daemon.link.parameter("SR_BASELINE_M") == 2.5
+        state = daemon.control.state
+        daemon.control.state = replace(
+            state, distance_m=112.5, camera_latency_ms=70.8, camera_latency_sigma_ms=2.1
+        )
         status = json.loads(run_ctl(port, "status", "--json").stdout.splitlines()[-1])
+        assert status["distance_m"] == 112.5 and status["speed_m_s"] is None
+        assert status["camera_latency_ms"] == pytest.approx(70.8, abs=1e-4)
+        assert status["camera_latency_sigma_ms"] == pytest.approx(2.1, abs=1e-4)
         assert status["recording"] is True and status["state"] == "scanning"
         assert status["storage_free_mib"] == 750.0
         refused = run_ctl(port, "selftest")

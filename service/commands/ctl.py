@@ -21,6 +21,13 @@ ACTIONS = (
 )  # fmt: skip
 STATES = {1: "starting", 3: "ready", 4: "scanning", 5: "in trouble"}
 ANSWER_S = 2.0
+FIGURES = {
+    "SR_SPEED": "speed_m_s",
+    "SR_DIST": "distance_m",
+    "SR_CAM_LAT": "camera_latency_ms",
+    "SR_LAT_SIG": "camera_latency_sigma_ms",
+}
+"""Named values that come while scanning, and what the status calls them."""
 
 
 def ctl(
@@ -91,20 +98,34 @@ def status(operator: Operator) -> dict[str, Any]:
     from service.ground.operator import CAMERA, ONBOARD
 
     beats: dict[int, dict[str, Any]] = {}
+    values: dict[str, float] = {}
     operator.subscribe("HEARTBEAT", lambda sender, fields: beats.update({sender: fields}))
+    operator.subscribe("NAMED_VALUE_FLOAT", lambda sender, fields: _keep(values, sender, fields))
     capture = operator.request(262, "CAMERA_CAPTURE_STATUS", CAMERA, ANSWER_S)
     storage = operator.request(261, "STORAGE_INFORMATION", CAMERA, ANSWER_S)
     _wait(lambda: ONBOARD in beats, ANSWER_S)
     state = beats.get(ONBOARD, {}).get("system_status")
+    if capture and capture.get("video_status"):
+        _wait(lambda: "SR_DIST" in values, ANSWER_S)
+        _wait(lambda: "SR_LAT_SIG" in values, 0.1)  # comes right behind, where it is known
     return {
         "system": operator.system,
         "state": STATES.get(state, "unknown") if isinstance(state, int) else "unknown",
         "recording": bool(capture.get("video_status")) if capture else None,
         "recording_s": capture.get("recording_time_ms", 0) / 1000.0,
         "keyframes": capture.get("image_count"),
+        **{field: values.get(name) for name, field in FIGURES.items()},
         "storage_free_mib": storage.get("available_capacity"),
         "storage_total_mib": storage.get("total_capacity"),
     }
+
+
+def _keep(values: dict[str, float], sender: int, fields: dict[str, Any]) -> None:
+    """Take in a figure of the companion's."""
+    from service.ground.operator import ONBOARD
+
+    if sender == ONBOARD:
+        values[str(fields.get("name", ""))] = float(fields.get("value", math.nan))
 
 
 def _watch(operator: Operator, seconds: float, as_json: bool) -> None:
