@@ -135,8 +135,24 @@ class Daemon:
             "backend": self.scanning.backend_name,
             "backend_failure": self.scanning.backend_failure,
             "load": self.load_control.to_dict(),
+            "mavlink": self._mavlink(),
             "machine": read_machine(Path(self.config.scan.folder)).to_dict(),
         } | {key: value for key, value in figures.items() if math.isfinite(value)}
+
+    def _mavlink(self) -> dict[str, Any]:
+        """How the links to the vehicle do, as far as it is known."""
+        report = self.vehicle.report()
+        figures = {
+            "links_up": sum(link.is_up for link in report.links),
+            "packets": sum(link.packets for link in report.links),
+            "skipped_bytes": sum(link.skipped_bytes for link in report.links),
+            "dropped": report.dropped,
+            "unverified": report.unverified,
+            "armed": report.is_armed,
+            "autopilot_age_s": report.autopilot_age_s,
+            "round_trip_ms": report.timesync_round_trip_ms,
+        }
+        return {key: value for key, value in figures.items() if value is not None}
 
     def reload(self, wanted: Config) -> None:
         """Take over what of ``wanted`` may change while running; the rest waits for a restart."""

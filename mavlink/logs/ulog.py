@@ -67,14 +67,14 @@ def _topics(path: Path) -> tuple[dict[str, Columns], Counter[str], list[str]]:
             raise ValueError(f"{path}: not a PX4 .ulg log")
     try:
         from pyulog import ULog  # type: ignore[import-untyped]
-        from pyulog.core import ULogIncompatibleFlagException  # type: ignore[import-untyped]
+        from pyulog.core import ULogException  # type: ignore[import-untyped]
     except ImportError as error:
         raise ValueError(
             f"{path}: reading .ulg needs pyulog; pip install 'skyrelief[logs]'"
         ) from error
     try:
         log = ULog(str(path), list(TABLE))
-    except (*BROKEN, ULogIncompatibleFlagException) as error:
+    except (*BROKEN, ULogException) as error:
         raise ValueError(f"{path}: the .ulg log cannot be read ({error})") from error
     counts = Counter({d.name: len(d.data["timestamp"]) for d in log.data_list if not d.multi_id})
     topics = {d.name: d.data for d in log.data_list if d.multi_id == 0}

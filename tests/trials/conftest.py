@@ -1,0 +1,25 @@
+"""The table of the trials: every trial adds its row, ``make trials`` keeps it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from trial_rig import Row, Table
+
+
+@pytest.fixture(scope="session")
+def table() -> Iterator[Table]:
+    """Collects rows; written where SKYRELIEF_TRIALS_TABLE says, rows of before kept."""
+    target = os.environ.get("SKYRELIEF_TRIALS_TABLE", "")
+    collected = Table(Path(target) if target else None)
+    yield collected
+    collected.write()
+
+
+@pytest.fixture
+def record(table: Table) -> Row:
+    """A row to fill in: ``record(fault, times, outcome, lost, back_s)``."""
+    return table.add

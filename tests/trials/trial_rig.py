@@ -1,0 +1,246 @@
+"""What the trials share: the service as a process, its faults, and the table of outcomes."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import resource
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+DEMO = Path(__file__).resolve().parents[2] / "demo" / "caliterra"
+WHOLE = os.environ.get("SKYRELIEF_TRIALS") == "whole"
+PATIENCE_S = 120.0
+BACK_S = 10.0
+"""After a fault's cause is gone the service has to be scanning again within this."""
+
+
+class Row(Protocol):
+    """Adds one line to the table."""
+
+    def __call__(
+        self, fault: str, times: int, outcome: str, lost: str = "-", back_s: float | None = None
+    ) -> None:
+        """``lost``: acknowledged data lost; ``back_s``: the longest until scanning again."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One fault that was tried."""
+
+    fault: str
+    times: int
+    outcome: str
+    lost: str
+    back_s: float | None
+
+
+class Table:
+    """The outcomes, kept as JSON and as a page; lines of earlier runs stay until tried again."""
+
+    def __init__(self, target: Path | None) -> None:
+        self._target = target
+        self._lines: dict[str, Line] = {}
+        kept = target.with_suffix(".json") if target is not None else None
+        if kept is not None and kept.is_file():
+            for line in json.loads(kept.read_text(encoding="utf-8"))["trials"]:
+                self._lines[line["fault"]] = Line(**line)
+
+    def add(
+        self, fault: str, times: int, outcome: str, lost: str = "-", back_s: float | None = None
+    ) -> None:
+        """See :class:`Row`."""
+        rounded = None if back_s is None else round(back_s, 1)
+        self._lines[fault] = Line(fault, times, outcome, lost, rounded)
+
+    def write(self) -> None:
+        """Keep what there is, where a place was named."""
+        if self._target is None or not self._lines:
+            return
+        machine = (
+            f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
+        )
+        lines = sorted(self._lines.values(), key=lambda line: line.fault)
+        kept = {"machine": machine, "trials": [asdict(line) for line in lines]}
+        self._target.with_suffix(".json").write_text(json.dumps(kept, indent=1) + "\n", "utf-8")
+        rows = [
+            f"| {x.fault} | {x.times} | {x.outcome} | {x.lost} | "
+            f"{'-' if x.back_s is None else f'{x.back_s:.1f} s'} |"
+            for x in lines
+        ]
+        self._target.write_text(
+            "# What was tried to break it\n\n"
+            f"Written by `make trials` ({machine}). *Lost*: of what the store had acknowledged;\n"
+            "*scanning again* is the longest time from the end of the cause to the next frame.\n\n"
+            "| fault | times | outcome | lost | scanning again |\n|---|---|---|---|---|\n"
+            + "\n".join(rows)
+            + "\n",
+            encoding="utf-8",
+        )
+
+
+def free_port() -> int:
+    """A port of this machine that nobody uses."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Service:
+    """The daemon as a process of its own, looking at the demo flight as its camera."""
+
+    def __init__(
+        self,
+        folder: Path,
+        start: str = "on-boot",
+        environment: dict[str, str] | None = None,
+        camera: str = f"images:{DEMO / 'frames'}?interval_s=1.0",
+        model: Path = DEMO / "camera.yaml",
+        largest_file_bytes: int | None = None,
+        scans: Path | None = None,
+        more: str = "",
+    ) -> None:
+        self.port = free_port()
+        self.configuration = folder / "skyrelief.toml"
+        self.scans = scans or folder / "scans"
+        self.configuration.write_text(
+            f'[camera]\nsource = "{camera}"\nmodel = "{model}"\n'
+            f'[scan]\nfolder = "{self.scans}"\nstart = "{start}"\n'
+            '[compute]\nbackend = "cpu"\nguide_width = 320\n'
+            f'[health]\nhttp = "127.0.0.1:{self.port}"\n{more}'
+        )
+        self.log = folder / "log.txt"
+        self.began_s = time.monotonic()
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "service.cli", "run", "--config", str(self.configuration)],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env={**os.environ, **(environment or {})},
+                preexec_fn=lambda: _limit_files(largest_file_bytes),
+            )
+
+    def __enter__(self) -> Service:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    def get(self, path: str = "/status") -> dict[str, Any]:
+        """The JSON answer of the health page; empty while nobody answers."""
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{self.port}{path}", timeout=5) as page:
+                return dict(json.loads(page.read()))
+        except urllib.error.HTTPError as error:
+            with error:
+                return dict(json.loads(error.read()))
+        except (OSError, ValueError):
+            return {}
+
+    @property
+    def frames(self) -> int:
+        """Of the scan that runs; 0 when none does."""
+        return int(self.get().get("frames", 0))
+
+    def until(self, reached: Callable[[], Any], what: str) -> float:
+        """Seconds until ``reached``; fails with the log when the process ends or time runs out."""
+        start = time.monotonic()
+        while not reached():
+            alive = self.process.poll() is None
+            late = time.monotonic() > start + PATIENCE_S
+            assert alive and not late, f"{what}:\n{self.log.read_text()[-3000:]}"
+            time.sleep(0.05)
+        return time.monotonic() - start
+
+    def until_up(self) -> None:
+        """Wait for the end of the start."""
+        self.until(lambda: self.get().get("state") not in (None, "starting"), "up")
+
+    def until_more_frames(self, what: str) -> float:
+        """Seconds until a frame is processed that was not before."""
+        before = (self.get().get("scan"), self.frames)
+        return self.until(
+            lambda: self.frames > 0 and (self.get().get("scan"), self.frames) != before, what
+        )
+
+    def said(self, text: str) -> int:
+        """How often the log says ``text``."""
+        return self.log.read_text(errors="replace").count(text)
+
+    def reload(self, *changes: tuple[str, str]) -> None:
+        """Replace texts in the configuration and have it read again."""
+        text = self.configuration.read_text()
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new)
+        self.configuration.write_text(text)
+        self.process.send_signal(signal.SIGHUP)
+
+    def stop(self) -> int:
+        """The exit code after a TERM signal."""
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(timeout=PATIENCE_S)
+
+
+def _limit_files(largest_bytes: int | None) -> None:
+    """In the child: writing beyond ``largest_bytes`` of any file fails, as on a full disk."""
+    if largest_bytes is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (largest_bytes, largest_bytes))
+
+
+Chunk = tuple[str, int, int, int]
+
+
+def stored(scans: Path) -> set[Chunk]:
+    """(scan, keyframe, layer, checksum) of every chunk that a store has acknowledged."""
+    found: set[Chunk] = set()
+    for path in scans.rglob("scan.db"):
+        try:
+            with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as db:
+                rows = db.execute("SELECT seq, layer, crc FROM chunks").fetchall()
+        except sqlite3.Error:
+            continue  # being made
+        found |= {(path.parent.name, *row) for row in rows}
+    return found
+
+
+def burn(processes: int) -> list[subprocess.Popen[bytes]]:
+    """So many processes that only take time."""
+    return [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(processes)]
+
+
+def small_model(folder: Path, width: int = 320) -> Path:
+    """The demo's camera model for pictures of ``width`` pixels."""
+    scale = width / 1600
+    text = (DEMO / "camera.yaml").read_text()
+    for value in ("1600", "1200"):
+        text = text.replace(value, str(round(int(value) * scale)))
+    for value in ("1161.8", "799.5", "599.5"):
+        text = text.replace(value, f"{float(value) * scale:.2f}")
+    path = folder / "camera.yaml"
+    path.write_text(text)
+    return path
+
+
+def stream_to(port: int, size: str = "320:240", source: str = "") -> subprocess.Popen[bytes]:
+    """FFmpeg sending the demo's pictures, or a video, in a loop by UDP."""
+    given = source or f"-framerate 2 -pattern_type glob -i {DEMO}/frames/*.jpg"
+    command = (
+        f"ffmpeg -v error -re -stream_loop -1 {given} -vf scale={size} -c:v libx264 "
+        f"-preset ultrafast -tune zerolatency -g 2 -f mpegts udp://127.0.0.1:{port}?pkt_size=1316"
+    )
+    return subprocess.Popen(command.split(), stdin=subprocess.DEVNULL)
