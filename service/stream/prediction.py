@@ -53,15 +53,15 @@ MARGIN = 2
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _base(c: I64, k: I64, i: int, row: int, last: int) -> Any:
+def _base(c: Any, k: Any, i: int, row: int, last: Any) -> Any:
     """The first known of W, N, NE, NW; else the pixel coded last."""
-    if k[i - 1]:
+    if k[i - 1] != 0:
         return c[i - 1]
-    if k[i - row]:
+    if k[i - row] != 0:
         return c[i - row]
-    if k[i - row + 1]:
+    if k[i - row + 1] != 0:
         return c[i - row + 1]
-    if k[i - row - 1]:
+    if k[i - row - 1] != 0:
         return c[i - row - 1]
     return last
 
@@ -84,7 +84,7 @@ def _guess(c: I64, k: I64, i: int, row: int, base: int, w: I64) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _normal_equations(c: I64, k: I64, size: tuple[int, int], step: int) -> tuple[F64, F64]:
+def _normal_equations(c: F64, k: F64, size: tuple[int, int], step: int) -> tuple[F64, F64]:
     """Weighted sums of the fit over every ``step``-th pixel; calm surroundings weigh more."""
     h, w = size
     row = w + 2 * MARGIN
@@ -94,7 +94,7 @@ def _normal_equations(c: I64, k: I64, size: tuple[int, int], step: int) -> tuple
     for v in range(h):
         for u in range((v * 7) % step, w, step):
             i = (v + MARGIN) * row + u + MARGIN
-            if not (k[i] and k[i - 1]):
+            if k[i] == 0.0 or k[i - 1] == 0.0:
                 continue
             base = c[i - 1]
             for j in range(9):
@@ -110,18 +110,18 @@ def _normal_equations(c: I64, k: I64, size: tuple[int, int], step: int) -> tuple
 
 
 @numba.njit(cache=True, nogil=True)
-def _residuals(c: I64, k: I64, size: tuple[int, int], weights: I64) -> U16:
+def _residuals(c: F64, k: F64, size: tuple[int, int], weights: I64) -> U16:
     """Zigzag residuals of the known pixels in scan order.
 
     A row's predictions are made at once in float64, where these integers are exact.
     """
     h, w = size
     row = w + 2 * MARGIN
-    real, there, f = c.astype(np.float64), k.astype(np.float64), weights.astype(np.float64)
+    f = weights.astype(np.float64)
     base = np.zeros(w)
     guess = np.zeros(w)
     out = np.empty(h * w, np.uint16)
-    last = 0
+    last = 0.0
     at = 0
     for v in range(h):
         start = (v + MARGIN) * row + MARGIN
@@ -134,10 +134,10 @@ def _residuals(c: I64, k: I64, size: tuple[int, int], weights: I64) -> U16:
             if known[u]:
                 base[u] = west[u] if west_known[u] else _base(c, k, start + u, row, last)
                 last = code[u]
-        _guess_row(real, there, start, row, base, f, guess)
+        _guess_row(c, k, start, row, base, f, guess)
         for u in range(w):
             if known[u]:
-                r = ((code[u] - np.int64(guess[u]) + 32768) & 0xFFFF) - 32768
+                r = ((np.int64(code[u] - guess[u]) + 32768) & 0xFFFF) - 32768
                 out[at] = (r << 1) ^ (r >> 63)
                 at += 1
     return out[:at]
@@ -177,15 +177,15 @@ def _restore(residuals: U16, c: I64, k: I64, size: tuple[int, int], weights: I64
                 at += 1
 
 
-def _padded(plane: npt.NDArray[np.generic]) -> I64:
+def _padded(plane: npt.NDArray[np.generic], kind: type[np.generic]) -> npt.NDArray[Any]:
     """The plane in a margin of zeros, flat."""
     h, w = plane.shape
-    out = np.zeros((h + 2 * MARGIN, w + 2 * MARGIN), np.int64)
+    out = np.zeros((h + 2 * MARGIN, w + 2 * MARGIN), kind)
     out[MARGIN:-MARGIN, MARGIN:-MARGIN] = plane
     return out.reshape(-1)
 
 
-def fit(c: I64, k: I64, size: tuple[int, int]) -> I64:
+def fit(c: F64, k: F64, size: tuple[int, int]) -> I64:
     """(9,) weights, 4096 is one, that predict the padded codes best; least squares about a
     plane."""
     step = max(1, size[0] * size[1] // FIT_PIXELS)
@@ -199,7 +199,7 @@ def fit(c: I64, k: I64, size: tuple[int, int]) -> I64:
 def encode(codes: U16, known: Bool) -> bytes:
     """The section for ``codes`` (h, w) at the ``known`` pixels."""
     size = known.shape[0], known.shape[1]
-    c, k = _padded(codes), _padded(known)
+    c, k = _padded(codes, np.float64), _padded(known, np.float64)
     weights = fit(c, k, size)
     residuals = _residuals(c, k, size, weights)
     symbols = np.minimum(residuals, ESCAPE).astype(np.uint8)
@@ -227,6 +227,6 @@ def decode(data: bytes, known: Bool) -> U16 | None:
     weights = np.frombuffer(data[: 2 * WEIGHTS], "<i2").astype(np.int64)
     h, w = known.shape
     codes = np.zeros((h + 2 * MARGIN) * (w + 2 * MARGIN), np.int64)
-    _restore(residuals, codes, _padded(known), (h, w), weights)
+    _restore(residuals, codes, _padded(known, np.int64), (h, w), weights)
     plane = codes.reshape(h + 2 * MARGIN, w + 2 * MARGIN)[MARGIN:-MARGIN, MARGIN:-MARGIN]
     return plane.astype(np.uint16)
