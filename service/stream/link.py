@@ -254,9 +254,9 @@ class DatalinkSender:
         closing = threading.Thread(
             target=_close, args=(session,), name="datalink closing", daemon=True
         )
+        atexit.register(closing.join, CLOSING_S)
         closing.start()
         closing.join(PROMPT_CLOSING_S if self._stop.is_set() else 0.0)
-        atexit.register(closing.join, CLOSING_S)
 
     def _serve(self, session: zenoh.Session) -> None:
         """Send and answer until the stop, or until those who listened fall silent."""
@@ -280,7 +280,8 @@ class DatalinkSender:
             else:
                 self._wake.wait(todo)
             heard = self._heard_at
-            if heard is not None and time.monotonic() - heard > SILENCE_S:
+            is_caller = not self._config.listen  # who is called waits for the others to call
+            if is_caller and heard is not None and time.monotonic() - heard > SILENCE_S:
                 log.info("datalink silent; opening it anew")
                 return
 
@@ -363,6 +364,7 @@ def _close(session: zenoh.Session) -> None:
 
     with contextlib.suppress(zenoh.ZError):
         session.close()
+    atexit.unregister(threading.current_thread().join)
 
 
 def _rate(budget_kbit_s: float, share: float) -> float:
