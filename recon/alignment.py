@@ -32,7 +32,7 @@ HUBER = 2.5
 """Whitened residuals beyond this lose weight."""
 
 WILD = 12.5
-"""Fixes beyond this are left out once the fit stands, unless they are more than half."""
+"""Fixes and attitudes beyond this are left out once the fit stands, if fewer than half are."""
 
 I64 = npt.NDArray[np.int64]
 
@@ -169,11 +169,6 @@ class _Readings:
         J[:, :, :3] = np.eye(3) * info[:, :, None]
         return np.where(self.heading_known[:, None], turn, tilt) * info, J
 
-    @property
-    def fix_groups(self) -> tuple[int, int]:
-        """Numbers of the first group of a fix, and after the last."""
-        return len(self.R_odom), len(self.R_odom) + len(self.fix)
-
 
 def fit(anchors: Sequence[Anchor], iterations: int = 30) -> Similarity | None:
     """The similarity that brings the anchors onto their priors, or None without any prior.
@@ -230,7 +225,6 @@ def _solve(
     readings: _Readings, R: F64, t: F64, log_scale: float, iterations: int
 ) -> tuple[F64, F64, float, F64, float]:
     """Gauss-Newton with Huber's weights: R, t, log scale, information (7, 7) and cost."""
-    first, last = readings.fix_groups
     kept = np.ones(0)
     H, cost = np.eye(7), np.inf
     for i in range(iterations + 10):
@@ -247,13 +241,20 @@ def _solve(
         R = se3.so3_exp(step[:3]) @ R
         t = t + step[3:6]
         log_scale += float(step[6])
-        if np.abs(step).max() < 1e-7 or i >= iterations - 1:
-            wild = norms[first:last] > WILD
-            if kept.all() and wild.any() and 2 * wild.sum() < len(wild):
-                kept[first:last][wild] = 0.0
-            else:
-                break
+        stands = np.abs(step).max() < 1e-7 or i >= iterations - 1
+        if stands and not (kept.all() and _leave_out(readings, norms, kept)):
+            break
     return R, t, log_scale, H, cost
+
+
+def _leave_out(readings: _Readings, norms: F64, kept: F64) -> bool:
+    """True when attitudes or fixes are wild and now out of ``kept``: fewer than half of them."""
+    n, m = len(readings.R_odom), len(readings.fix)
+    for kind in (slice(0, n), slice(n, n + m)):
+        wild = norms[kind] > WILD
+        if 2 * wild.sum() < len(wild):
+            kept[kind][wild] = 0.0
+    return not kept.all()
 
 
 def _starts(anchors: Sequence[Anchor], readings: _Readings) -> list[tuple[F64, F64, float]]:

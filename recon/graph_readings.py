@@ -21,6 +21,9 @@ from recon.types import F64
 PRECISE_M = 0.3
 """Fixes of a smaller sigma are RTK's or PPK's."""
 
+FRAME_SIGMA_RAD = (0.05, 0.05, 0.15)
+"""What a placed segment's tilt and heading are known to, at least."""
+
 BLOCK = 20
 """Keyframes that share one scale and one altitude bias."""
 
@@ -52,7 +55,7 @@ class Readings:
         ``is_placed`` tells that the world's frame is known, without which only the attitude
         says something.
         """
-        used = {"attitude"} if self._attitude(node, T, spread) else set()
+        used = {"attitude"} if self._attitude(node, T, spread, is_placed) else set()
         if is_placed:
             lever = np.hstack([-se3.hat(T[:3, 3]), np.eye(3)])
             place = lever @ spread @ lever.T
@@ -71,13 +74,16 @@ class Readings:
         self._smoother.add(self._gtsam.PriorFactorVector(scale_key, measured, noise), "height")
         return True
 
-    def _attitude(self, node: Node, T: F64, spread: F64) -> bool:
+    def _attitude(self, node: Node, T: F64, spread: F64, is_placed: bool) -> bool:
         prior = node.prior
         if prior.R_world_camera is None:
             return False
         sigma = np.array([prior.sigma_tilt_rad, prior.sigma_tilt_rad, prior.sigma_yaw_rad])
         turn = _turn(T[:3, :3], prior.R_world_camera, prior.sigma_yaw_rad < 1.0)
-        allowed = self._config.gate_sigmas * np.sqrt(np.diag(spread)[:3] + sigma**2)
+        sure = np.diag(spread)[:3]
+        if is_placed:  # the frame rests on all attitudes: it is no worse than this
+            sure = np.minimum(sure, np.square(FRAME_SIGMA_RAD))
+        allowed = self._config.gate_sigmas * np.sqrt(sure + sigma**2)
         if abs(turn[2]) > allowed[2]:
             self._counts["heading off"] += 1
             turn, sigma[2] = _turn(T[:3, :3], prior.R_world_camera, False), np.pi

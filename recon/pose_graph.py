@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from recon.graph_factors import pose3
 from recon.graph_readings import BLOCK, Readings
 from recon.graph_records import Loop, Node, PoseGraphConfig, loops_agree
 from recon.sensor_offsets import Offsets, offsets
-from recon.smoother import ROUNDS, Smoother, moved_covariance
+from recon.smoother import ROUNDS, SCALAR, Smoother, moved_covariance
 from recon.types import F64, Pose, PosePrior
 
 __all__ = ["Edge", "PoseGraph", "PoseGraphConfig"]
@@ -30,14 +29,18 @@ __all__ = ["Edge", "PoseGraph", "PoseGraphConfig"]
 CHI2_LIMIT = 22.5
 """99.9 % of chi-square with six degrees of freedom."""
 
+BATCH = 100
+"""Keyframes that enter the smoother together when the graph is made anew."""
+
 MOST_PENDING = 50
 """Loops that wait for one that agrees; older ones are forgotten."""
 
-REFIT_GROWTH = 1.3
-"""A segment's similarity is fitted again when its keyframes have grown by so much."""
+REFIT_GROWTH, SETTLED_GROWTH = 1.3, 2.0
+"""A segment's similarity is fitted again when its keyframes have grown by so much: at first,
+and once it has settled."""
 
 SETTLED = 60
-"""Keyframes after which the frame of a segment must change notably to be taken over."""
+"""Keyframes after which a segment's frame is taken over only when it has changed notably."""
 
 SOURCES = ("vision", "attitude", "altitude", "gnss", "loop", "dead reckoning")
 
@@ -301,7 +304,7 @@ class PoseGraph:
         last: Node | None = None
         for i, node in enumerate(self._nodes.values()):
             self._insert(node, last)
-            if i % 50 == 49:
+            if i % BATCH == BATCH - 1 or i in (3, 10, 30):  # gates need the spread early
                 self._smoother.update(now=True)
             last = node
         self._smoother.update(now=True)
@@ -386,7 +389,7 @@ class PoseGraph:
         if keys and node.key - since < BLOCK:
             self._scale_of[node.key] = keys[-1]
             return keys[-1]
-        key = int(gtsam.symbol("s", len(keys) + 1_000_000 * node.segment))
+        key = int(gtsam.symbol(SCALAR, len(keys) + 1_000_000 * node.segment))
         one = gtsam.noiseModel.Isotropic
         if keys:
             value, walk = self._smoother.scalar(keys[-1]), self.config.sigma_scale_walk
@@ -468,7 +471,9 @@ class PoseGraph:
     def _refit(self, segment: int) -> bool:
         """True when the segment's frame was fitted anew, which is due as the segment grows."""
         nodes = self._segments[segment]
-        due = max(self.config.least_anchors, int(REFIT_GROWTH * self._fitted.get(segment, 0)))
+        fitted = self._fitted.get(segment, 0)
+        growth = REFIT_GROWTH if fitted < SETTLED else SETTLED_GROWTH
+        due = max(self.config.least_anchors, int(growth * fitted))
         if len(nodes) < due or segment in self._tied:
             return False
         self._fitted[segment] = len(nodes)
@@ -477,17 +482,19 @@ class PoseGraph:
             return False
         if "gnss" not in found.sources and nodes[0].key > 0:
             found = self._kept_in_place(found, nodes[0])
-        self._offsets[segment] = offsets(self._anchors(segment), found)
-        before, self._frames[segment] = self._frames.get(segment), found
-        if before is None or len(nodes) < SETTLED:
+        before = self._frames.get(segment)
+        if before is None or len(nodes) < SETTLED or self._differ(before, found, nodes):
+            self._frames[segment] = found
+            self._offsets[segment] = offsets(self._anchors(segment), found)
             return True
+        return False  # the graph itself follows such small changes
+
+    def _differ(self, before: Similarity, found: Similarity, nodes: list[Node]) -> bool:
+        """True when two frames place a segment apart by more than half their sigma."""
         ends = (nodes[0], nodes[len(nodes) // 2], nodes[-1])
         shift = [before.pose(n.T_odom_camera) - found.pose(n.T_odom_camera) for n in ends]
         sigma = float(np.sqrt(np.trace(found.covariance[3:6, 3:6])))
-        if max(float(np.linalg.norm(s[:3, 3])) for s in shift) > 0.5 * sigma:
-            return True
-        self._frames[segment] = before  # the graph itself follows such small changes
-        return False
+        return max(float(np.linalg.norm(s[:3, 3])) for s in shift) > 0.5 * sigma
 
     def _kept_in_place(self, found: Similarity, first: Node) -> Similarity:
         """A frame without fixes, moved so that its first keyframe stays where it is, and turned
@@ -560,12 +567,9 @@ class PoseGraph:
             graph_factors.right_covariance(loop.T_a_b, loop.covariance)
         )
         self._sources[b].add("loop")
-        factor: Any = self._gtsam.BetweenFactorPose3(a, b, pose3(loop.T_a_b), self._robust(noise))
+        # Not robust: two loops agreed, and what closes late would lose its weight by its size.
+        factor = self._gtsam.BetweenFactorPose3(a, b, pose3(loop.T_a_b), noise)
         self._smoother.add(factor, "loop")
-
-    def _robust(self, noise: Any) -> Any:
-        model = self._gtsam.noiseModel
-        return model.Robust.Create(model.mEstimator.Huber.Create(self.config.huber_sigmas), noise)
 
     def _newest(self) -> Node:
         return next(reversed(self._nodes.values()))

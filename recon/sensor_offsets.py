@@ -32,6 +32,7 @@ class Offsets:
     centre_m: F64 = field(default_factory=lambda: np.zeros(3))  # of the fixes
     shift_m: F64 = field(default_factory=lambda: np.zeros(3))  # takes fixes to the frame
     warp: F64 = field(default_factory=lambda: np.zeros((3, 3)))  # likewise, per metre off centre
+    reach_m: float = 0.0  # off centre to which the warp is known; it grows no further
 
     def applied(self, prior: PosePrior) -> PosePrior:
         """The prior's attitude, position and height without their constants."""
@@ -39,7 +40,9 @@ class Offsets:
         if R is not None:
             R = se3.so3_exp(self.turn) @ R
         if position is not None:
-            position = position + self.shift_m + self.warp @ (position - self.centre_m)
+            off = position - self.centre_m
+            off = off * min(1.0, self.reach_m / max(float(np.linalg.norm(off)), 1e-9))
+            position = position + self.shift_m + self.warp @ off
         if agl is not None:
             agl = agl * float(np.exp(self.log_height))
         return replace(prior, R_world_camera=R, position_m=position, agl_m=agl)
@@ -80,9 +83,9 @@ def _turn(anchors: Sequence[Anchor], frame: Similarity) -> F64:
     return turn if np.linalg.norm(turn) < 2.0 * PRIOR_SIGMA else np.zeros(3)
 
 
-def _fixes(anchors: Sequence[Anchor], frame: Similarity) -> tuple[F64, F64, F64]:
-    """Centre, shift and warp (3, 3) of the fixes: turned and stretched about their centre."""
-    nothing = np.zeros(3), np.zeros(3), np.zeros((3, 3))
+def _fixes(anchors: Sequence[Anchor], frame: Similarity) -> tuple[F64, F64, F64, float]:
+    """Centre, shift, warp (3, 3) and reach of the fixes, turned and stretched about the centre."""
+    nothing = np.zeros(3), np.zeros(3), np.zeros((3, 3)), 0.0
     rows = [
         (frame.pose(a.T_odom_camera)[:3, 3], a.prior.position_m, a.prior.sigma_position_m)
         for a in anchors
@@ -106,4 +109,5 @@ def _fixes(anchors: Sequence[Anchor], frame: Similarity) -> tuple[F64, F64, F64]
     rows_A = (A * weight[:, :, None]).reshape(-1, 7)
     H = rows_A.T @ rows_A + np.diag([0.0] * 3 + [PRIOR_SIGMA**-2] * 4)
     x = np.linalg.solve(H, rows_A.T @ (apart * weight).ravel())
-    return centre, x[:3], se3.hat(x[3:6]) + x[6] * np.eye(3)
+    reach_m = float(np.linalg.norm(p, axis=1).max())
+    return centre, x[:3], se3.hat(x[3:6]) + x[6] * np.eye(3), reach_m

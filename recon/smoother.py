@@ -21,15 +21,19 @@ LEAST_WAIT, POSES_PER_WAIT = 2, 400
 WILDFIRE = 1e-3
 """rad and m; corrections smaller than this are not passed on."""
 
-RELINEARISE = 0.1
-"""rad and m; what moved further is linearised again, at every tenth update."""
+RELINEARISE_POSE, RELINEARISE_SCALAR = (0.02, 0.02, 0.02, 1.0, 1.0, 1.0), 0.02
+"""rad and m; what moved further is linearised again, at every tenth update. Motions between
+poses bend with the angle and hardly with the place."""
+
+SCALAR = "s"
+"""First letter of a scalar's key (``gtsam.symbol``); poses have plain numbers."""
 
 ROUNDS = 3
 """Updates after a change that moves many poses; each linearises again what moved."""
 
 
 class Smoother:
-    """Poses by key 0, 1, 2 …; scalars by other keys."""
+    """Poses by key 0, 1, 2 …; scalars by symbols of the letter :data:`SCALAR`."""
 
     def __init__(self) -> None:
         import gtsam
@@ -39,7 +43,10 @@ class Smoother:
         solver = gtsam.ISAM2GaussNewtonParams()
         solver.setWildfireThreshold(WILDFIRE)
         parameters.setOptimizationParams(solver)
-        parameters.setRelinearizeThreshold(RELINEARISE)
+        thresholds = gtsam.ISAM2ThresholdMap()
+        thresholds.insert((chr(0), np.array(RELINEARISE_POSE)))
+        thresholds.insert((SCALAR, np.array([RELINEARISE_SCALAR])))
+        parameters.setRelinearizeThreshold(thresholds)
         parameters.relinearizeSkip = 10
         parameters.setFactorization("QR")  # loose starts beside tight motions are ill-conditioned
         self._isam: Any = gtsam.ISAM2(parameters)

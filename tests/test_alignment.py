@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from recon import se3
-from recon.alignment import Anchor, fit, height_above
+from recon.alignment import Anchor, fit, height_above, scales
 from recon.types import F64, PosePrior
 
 
@@ -129,3 +130,51 @@ def test_height_is_that_of_the_ground_most_nearly_below() -> None:
     assert found[0] == pytest.approx(60.0 - 0.2 * 12.0, abs=1.5)
     assert 0.0 < found[1] < 0.1
     assert height_above(points[:5], T[2, :3]) is None
+
+
+def test_a_compass_wrong_by_half_a_turn_yields_to_the_fixes() -> None:
+    half = se3.so3_exp(np.array([0.0, 0.0, math.pi]))
+    wrong = []
+    for a in anchors(np.eye(3), 1.5, np.zeros(3), seed=5):
+        p = a.prior
+        assert p.R_world_camera is not None
+        prior = replace(p, R_world_camera=half @ p.R_world_camera)
+        wrong.append(replace(a, prior=prior))
+    found = fit(wrong)
+    assert found is not None
+    assert np.linalg.norm(se3.so3_log(found.R)) < 0.1
+    assert found.scale == pytest.approx(1.5, rel=0.05)
+
+
+def test_fixes_that_jump_for_a_third_of_the_flight_do_not_shift_it() -> None:
+    good = anchors(np.eye(3), 1.0, np.zeros(3), seed=6)
+    bad = list(good)
+    for i in range(10, 20):
+        p = bad[i].prior
+        assert p.position_m is not None
+        jumped = p.position_m + np.array([30.0, -20.0, 8.0])
+        bad[i] = replace(bad[i], prior=replace(p, position_m=jumped))
+    a, b = fit(good), fit(bad)
+    assert a is not None and b is not None
+    for i in (0, 15, 29):
+        apart = a.pose(good[i].T_odom_camera) - b.pose(good[i].T_odom_camera)
+        assert np.linalg.norm(apart[:3, 3]) < 1.0
+
+
+@pytest.mark.parametrize("wrong", [1.0, 1.2])
+def test_scales_by_fixes_and_by_heights_are_told_apart(wrong: float) -> None:
+    """Ten runs each: agreeing readings are within three sigmas, a fifth more height is not."""
+    for seed in range(10):
+        some = []
+        for a in anchors(np.eye(3), 1.4, np.zeros(3), seed=seed, gnss_m=0.5):
+            p = a.prior
+            assert p.agl_m is not None
+            some.append(replace(a, prior=replace(p, agl_m=wrong * p.agl_m, sigma_agl_m=2.0)))
+        found = fit(some)
+        assert found is not None
+        by_fixes, by_heights = scales(some, found)
+        assert by_fixes is not None and by_heights is not None
+        assert by_fixes.metres == pytest.approx(1.4, rel=0.05)
+        apart = abs(math.log(by_fixes.metres / by_heights.metres))
+        spread = math.hypot(by_fixes.sigma, by_heights.sigma)
+        assert (apart < 3 * spread) == (wrong == 1.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import threading
 from functools import lru_cache
 
 import cv2
@@ -13,7 +15,9 @@ from recon import se3
 from recon.camera_model import rays, scaled_K
 from recon.loop_closure import LoopConfig, LoopView, candidates, verify
 from recon.pose_graph import PoseGraph
+from recon.trajectory import Trajectory
 from recon.types import F64, DepthMap, PosePrior
+from service.loops import LoopSearch
 
 SIZE = (640, 360)
 K = np.array([[450.0, 0, 319.5], [0, 450.0, 179.5], [0, 0, 1.0]])
@@ -137,7 +141,7 @@ def lawnmower() -> dict[int, F64]:
 def test_candidates_are_the_earlier_views_of_the_same_ground() -> None:
     poses = lawnmower()
     found = candidates(poses, 55, K, SIZE, 40.0)
-    assert found and all(seq <= 55 - 15 for seq, _ in found)
+    assert found and all(seq <= 55 - 10 for seq, _ in found)
     shares = [share for _, share in found]
     assert shares == sorted(shares, reverse=True) and shares[-1] >= 0.35
     # Keyframe 55 is over x = 16 m: the first leg passed there at keyframe 4.
@@ -175,6 +179,65 @@ def test_two_verified_loops_close_the_map() -> None:
         (se3.inverse(closed[4]) @ closed[55] - se3.inverse(poses[4]) @ poses[55])[:3, 3]
     )
     assert after < 0.15 < before
+
+
+def search_along(poses: list[F64], chain: list[F64], segment: list[int]) -> LoopSearch:
+    """The search fed as the reconstruction feeds it, without telemetry."""
+    trajectory, lock = Trajectory(), threading.Lock()
+    search = LoopSearch(trajectory, lock, LoopConfig(least_gap=5))
+    covariance = np.diag([4e-3**2] * 3 + [0.1**2] * 3)
+    for i, (T, odom) in enumerate(zip(poses, chain, strict=True)):
+        trajectory.add(i, segment[i], odom, PosePrior(), None, i * 10**9, covariance)
+        seen = view(T, i)
+        search.look(i, segment[i], seen.gray, K, seen.depth)
+    return search
+
+
+def apart_m(search: LoopSearch, poses: list[F64], a: int, b: int) -> float:
+    moved = search.trajectory.step_between(a, b)
+    return float(np.linalg.norm((moved - se3.inverse(poses[a]) @ poses[b])[:3, 3]))
+
+
+def test_the_search_closes_two_legs_of_a_drifting_chain() -> None:
+    there = [camera(8.0 * i, 0.0, 40.0, 0.0) for i in range(5)]
+    poses = [*there, *(camera(8.0 * (4 - i), 9.0, 40.0, np.pi) for i in range(5))]
+    chain = [poses[0]]
+    for a, b in itertools.pairwise(poses):
+        drift = se3.exp(np.array([0.0, 0.0, 0.004, 0.05, -0.03, 0.12]))
+        chain.append(chain[-1] @ drift @ se3.inverse(a) @ b)
+    before = np.linalg.norm(
+        (se3.inverse(chain[1]) @ chain[8] - se3.inverse(poses[1]) @ poses[8])[:3, 3]
+    )
+    search = search_along(poses, chain, [0] * 10)
+    assert search.counts["taken"] >= 1
+    ends = [edge for edge in search.trajectory.graph.loops if edge.accepted]
+    assert before > 0.6
+    assert all(apart_m(search, poses, e.a, e.b) < 0.15 for e in ends)
+    assert apart_m(search, poses, 1, 8) < 0.5 * before
+
+
+def test_a_lost_stretch_is_found_again_from_the_pictures() -> None:
+    """Over the same ground after a gap, in a frame of another origin, heading and scale."""
+    poses = [camera(6.0 * i, 0.0, 40.0, 0.0) for i in range(4)]
+    poses += [camera(6.0 * i + 3.0, 4.0, 40.0, 0.3) for i in range(4)]
+    other = se3.exp(np.array([0.0, 0.0, 0.1, 15.0, 4.0, 0.0]))
+    chain = [*poses[:4], *(other @ T for T in poses[4:])]
+    search = search_along(poses, chain, [0] * 4 + [1] * 4)
+    assert search.trajectory.graph.is_tied(1)
+    assert apart_m(search, poses, 1, 6) < 0.2
+
+
+def test_the_search_keeps_a_bounded_number_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.loops.MOST_VIEWS", 6)
+    seen = view(A, 1)
+    trajectory = Trajectory()
+    search = LoopSearch(trajectory, threading.Lock())
+    for i in range(20):
+        T = camera(300.0 * i, 0.0, 40.0, 0.0)
+        trajectory.add(i, 0, T, PosePrior(), None, i * 10**9, np.eye(6) * 1e-4)
+        search.look(i, 0, seen.gray, K, seen.depth)
+        assert len(search) <= 6
+    assert search.counts["tried"] == 0
 
 
 def test_wrong_parameters_are_named() -> None:

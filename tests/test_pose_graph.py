@@ -278,7 +278,10 @@ def test_the_attitude_of_a_wrong_frame_is_left_out() -> None:
         )
     graph, _ = fly(f)
     assert graph.counts["tilt off"] + graph.counts["heading off"] >= 40
-    assert rms_m(graph, f) < 0.6
+    assert rms_m(graph, f) < 0.8
+    graph.solve()
+    assert graph.counts["tilt off"] + graph.counts["heading off"] >= 40
+    assert rms_m(graph, f) < 0.5
 
 
 def test_a_hover_of_an_hour_bends_nothing() -> None:
@@ -362,6 +365,101 @@ def test_false_loops_never_bend_the_map() -> None:
     after = graph.poses()
     for i in before:
         np.testing.assert_array_equal(after[i], before[i])
+
+
+def test_a_step_of_the_barometer_does_not_bend_the_track() -> None:
+    f = flight(120)
+    f.priors = [
+        replace(
+            blind(p, True), altitude_m=T[2, 3] + (30.0 if i < 60 else 45.0), sigma_altitude_m=0.3
+        )
+        for i, (p, T) in enumerate(zip(f.priors, f.truth, strict=True))
+    ]
+    graph, _ = fly(f)
+    poses = graph.poses()
+    climb = (poses[119] - poses[0])[2, 3]
+    true = (f.truth[119] - f.truth[0])[2, 3]
+    assert abs(climb - true) < 4.0  # of 15 m that it stepped
+    assert graph.counts["altitude off"] >= 1
+
+
+def test_wandering_fixes_do_not_bend_what_vision_sees_straight() -> None:
+    """With a metre of slow wander, the track is no worse in shape than the odometry itself."""
+    rng = np.random.default_rng(4)
+    f = flight(60, drift=0.0003)
+    error = np.zeros(3)
+    for i, p in enumerate(f.priors):
+        error = np.exp(-1 / 60) * error + np.sqrt(1 - np.exp(-2 / 60)) * rng.normal(size=3)
+        f.priors[i] = replace(p, position_m=f.truth[i][:3, 3] + error)
+    covariance = f.covariance
+    graph = PoseGraph()
+    for i, (T, p) in enumerate(zip(f.odom, f.priors, strict=True)):
+        graph.add_keyframe(i, i * 10**9, 0, T, covariance, p)
+    graph.solve()
+
+    def shape_m(track: F64) -> float:
+        truth = np.array([T[:3, 3] for T in f.truth])
+        scale, R, t = umeyama(track, truth, np.ones(len(track)), False)
+        return float(np.sqrt(np.mean(np.sum((scale * track @ R.T + t - truth) ** 2, axis=1))))
+
+    alone = shape_m(np.array([T[:3, 3] for T in f.odom]))
+    assert shape_m(graph.pose_array()[:, :3, 3]) < 1.3 * alone + 0.01
+
+
+def test_a_lost_stretch_is_tied_by_two_loops_in_scale_and_heading() -> None:
+    """No fixes, no compass: what was found again elsewhere lies right once loops tell."""
+    f, later = flight(24, scale=1.0, seed=5), flight(24, scale=0.5, seed=5)
+    turned = se3.compose(se3.so3_exp(np.array([0.0, 0.0, 2.0])), np.array([40.0, -70.0, 5.0]))
+    graph = PoseGraph()
+    for i in range(12):
+        graph.add_keyframe(i, i * 10**9, 0, f.odom[i], f.covariance, PosePrior())
+    for i in range(12, 24):
+        graph.add_keyframe(
+            i, (i + 20) * 10**9, 1, turned @ later.odom[i], later.covariance, PosePrior()
+        )
+    assert not graph.is_tied(1)
+    shrunk = 1.0 / graph.scale(20) * 0.5  # depths of the second stretch, as the first has them
+    for a, b in ((3, 15), (5, 18)):
+        T_a_b = se3.inverse(f.truth[a]) @ f.truth[b]
+        graph.add_loop(a, b, T_a_b, LOOP_COVARIANCE, shrunk)
+    assert graph.is_tied(1)
+    poses = graph.poses()
+    for i in (12, 18, 23):
+        moved, true = se3.inverse(poses[4]) @ poses[i], se3.inverse(f.truth[4]) @ f.truth[i]
+        assert np.linalg.norm((moved - true)[:3, 3]) < 0.6
+        assert np.linalg.norm(se3.so3_log(moved[:3, :3].T @ true[:3, :3])) < 0.02
+    assert graph.scale(20) == pytest.approx(0.5 * graph.scale(4), rel=0.03)
+
+
+def test_a_loop_that_vision_cannot_have_drifted_is_refused() -> None:
+    f = circle()
+    graph, _ = fly(f)
+    before = graph.poses()
+    row = np.eye(4)
+    row[0, 3] = 30.0  # the next but one row of a field looks the same
+    for a, b in ((3, 43), (5, 45), (7, 47)):
+        assert not graph.add_loop(a, b, true_loop(f, a, b) @ row, LOOP_COVARIANCE)
+    assert graph.counts["loop impossible"] == 3
+    np.testing.assert_array_equal(graph.poses()[44], before[44])
+
+
+def test_the_whole_graph_at_once_is_the_same_and_tells_its_residuals() -> None:
+    f = flight(80)
+    graph, _ = fly(f)
+    graph.add_loop(3, 60, true_loop(f, 3, 60), LOOP_COVARIANCE)
+    graph.add_loop(5, 58, true_loop(f, 5, 58), LOOP_COVARIANCE)
+    graph.solve()
+    nodes, loops = graph.records()
+    batch = PoseGraph.batch(nodes, loops, WHITE)
+    for i in (0, 40, 79):
+        np.testing.assert_allclose(batch.poses()[i], graph.poses()[i], atol=0.01)
+    residuals = batch.residuals()
+    assert residuals["vision"].shape == (79, 6)
+    assert residuals["position"].shape == (80, 3)
+    assert residuals["loop"].shape == (2, 6)
+    assert 0.6 < np.sqrt(np.mean(residuals["position"] ** 2)) < 1.4
+    edges = sorted((e.a, e.b, e.accepted) for e in batch.loops)
+    assert edges == [(3, 60, True), (5, 58, True)]
 
 
 def test_wrong_calls_are_named() -> None:
