@@ -8,7 +8,7 @@ import numpy as np
 
 from recon import bundle, matching, se3, two_view
 from recon.landmarks import I64, Landmarks
-from recon.types import F64, Bool, PosePrior
+from recon.types import F64, U8, Bool, PosePrior
 
 
 @dataclass(slots=True, eq=False)
@@ -29,6 +29,19 @@ class OdometryKeyframe:
     @property
     def T_odom_camera(self) -> F64:
         return se3.inverse(self.T_camera_odom)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Incoming:
+    """A new frame on its way in."""
+
+    grey: U8  # (H, W) undistorted
+    pyramid: matching.Pyramid
+    seq: int
+    time_ns: int
+    prior: PosePrior
+    mask: U8 | None  # (H, W) non-zero where the picture is valid
+    blurred: bool
 
 
 def landmarks(key: OdometryKeyframe) -> tuple[F64, F64]:

@@ -11,14 +11,20 @@ heading and position are corrected afterwards by :mod:`recon.alignment`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
 from recon import matching, pnp, prediction, se3, two_view
-from recon.keyframe_window import OdometryKeyframe, adjust_window, landmarks, triangulate
+from recon.first_views import FirstViews
+from recon.keyframe_window import (
+    Incoming,
+    OdometryKeyframe,
+    adjust_window,
+    landmarks,
+    triangulate,
+)
 from recon.landmarks import I64, Landmarks
 from recon.types import F64, U8, Bool, Camera, PosePrior
 
@@ -67,19 +73,6 @@ class Tracked:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Incoming:
-    """A new frame on its way in."""
-
-    grey: U8  # (H, W) undistorted
-    pyramid: matching.Pyramid
-    seq: int
-    time_ns: int
-    prior: PosePrior
-    mask: U8 | None  # (H, W) non-zero where the picture is valid
-    blurred: bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Located:
     """A frame's pose and the keyframe's corners found in it."""
 
@@ -103,7 +96,12 @@ class Odometry:
         self._lost = 0
         self._last: tuple[int, F64, PosePrior] | None = None  # time, T_odom_camera, prior
         self._velocity = np.zeros(3)
-        self._drift = np.eye(3)  # from the first frame's pixels to the last one's
+        self._first_views = FirstViews(
+            camera,
+            self.config.matching,
+            self.config.wide_search_share * camera.size_px[0],
+            self.config.least_shift_confidence,
+        )
         self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
 
     # ---- one frame -------------------------------------------------------------------
@@ -126,7 +124,7 @@ class Odometry:
             blurred: a later frame makes a better keyframe, if it comes soon.
         """
         pyramid = matching.Pyramid.build(grey, self.config.matching.search_levels)
-        new = _Incoming(grey, pyramid, seq, time_ns, prior, mask, blurred)
+        new = Incoming(grey, pyramid, seq, time_ns, prior, mask, blurred)
         self._gap_ns, self._frame_ns = time_ns - self._frame_ns, time_ns
         if not self.keyframes:
             return self._start(new)
@@ -139,7 +137,7 @@ class Odometry:
 
     def _missed(
         self,
-        new: _Incoming,
+        new: Incoming,
         reason: str,
     ) -> Tracked:
         """Count a frame without a pose; after too many, or at a still, begin a new segment."""
@@ -151,7 +149,7 @@ class Odometry:
 
     def _start(
         self,
-        new: _Incoming,
+        new: Incoming,
     ) -> Tracked:
         """Begin a segment at this frame."""
         corners = matching.harris_grid(new.grey, self.config.matching, new.mask)
@@ -159,7 +157,8 @@ class Odometry:
             return Tracked("lost", self.segment, reason="too little texture")
         self.segment += 1
         self._metric, self._lost = False, 0
-        self._velocity, self._drift = np.zeros(3), np.eye(3)
+        self._velocity = np.zeros(3)
+        self._first_views.begin()
         R = (
             new.prior.R_world_camera
             if new.prior.R_world_camera is not None
@@ -189,12 +188,13 @@ class Odometry:
 
     def _second_view(
         self,
-        new: _Incoming,
+        new: Incoming,
     ) -> Tracked:
         """Wait until the camera has moved enough, then make the first landmarks."""
         first = self.keyframes[0]
         R_b_a = prediction.relative_rotation(first.prior, new.prior)
-        uv, ok = self._match_without_map(new, first, R_b_a)
+        still = self._gap_ns > 1e9 * self.config.still_gap_s
+        uv, ok = self._first_views.match(new, first, R_b_a, still)
         if ok.sum() < 2 * self.config.min_tracks:
             return self._missed(new, "too few matches with the first frame")
         self._lost = 0
@@ -236,58 +236,7 @@ class Odometry:
         first.landmark[rows] = first.map.add(points)
         return scale
 
-    def _match_without_map(
-        self,
-        new: _Incoming,
-        first: OdometryKeyframe,
-        R_b_a: F64 | None,
-    ) -> tuple[F64, Bool]:
-        """(N, 2) pixels and (N,) success of the first frame's corners in a new frame."""
-        best: tuple[F64, Bool] | None = None
-        for guess in self._predictions_2d(new, first, R_b_a):
-            found = matching.match(
-                first.pyramid,
-                first.uv.astype(np.float32),
-                new.pyramid,
-                guess.uv.astype(np.float32),
-                guess.radius_px,
-                guess.warp.astype(np.float32),
-                self.config.matching,
-            )
-            if best is None or found.ok.sum() > best[1].sum():
-                best = (found.uv_px.astype(np.float64), found.ok)
-            if best[1].sum() > 0.5 * len(first.uv):
-                self._drift = prediction.common_affine(first.uv[best[1]], best[0][best[1]])
-                break
-        assert best is not None
-        return best
-
-    def _predictions_2d(
-        self, new: _Incoming, key: OdometryKeyframe, R_b_a: F64 | None
-    ) -> Iterator[prediction.Prediction]:
-        """Guesses of where a keyframe's corners went, best first, without landmarks."""
-        radius_px = self.config.wide_search_share * self.camera.size_px[0]
-        if self._gap_ns <= 1e9 * self.config.still_gap_s:
-            yield prediction.by_homography(self._drift, key.uv, radius_px)
-        if R_b_a is not None:
-            height = new.prior.agl_m or 0.0
-            t = np.zeros(3)
-            if new.prior.position_m is not None and key.prior.position_m is not None and height > 0:
-                R_a = key.prior.R_world_camera
-                assert R_a is not None
-                t = R_b_a @ R_a.T @ (key.prior.position_m - new.prior.position_m) / height
-            n = key.T_camera_odom[:3, 2]  # up, seen from the camera
-            H = self.K @ (R_b_a - np.outer(t, n)) @ np.linalg.inv(self.K)
-            yield prediction.by_homography(H, key.uv, radius_px)
-        shift = matching.global_shift(key.pyramid.levels[0], new.grey)
-        if shift is not None and shift.confidence > self.config.least_shift_confidence:
-            H = np.eye(3)
-            H[:2, :2], H[:2, 2] = shift.A, shift.shift_px
-            yield prediction.by_homography(H, key.uv, radius_px)
-        elif R_b_a is None:
-            yield prediction.by_homography(np.eye(3), key.uv, radius_px)
-
-    def _locate(self, new: _Incoming) -> _Located | str:
+    def _locate(self, new: Incoming) -> _Located | str:
         """The frame against the last keyframe, averaged with the one before; or why not."""
         right = self.keyframes[-1]
         reason = "no match"
@@ -306,7 +255,7 @@ class Odometry:
             return self._with_left(new, found)
         return reason
 
-    def _with_left(self, new: _Incoming, found: _Located) -> _Located:
+    def _with_left(self, new: Incoming, found: _Located) -> _Located:
         """The pose averaged with the one that the keyframe before gives, as the paper does."""
         if len(self.keyframes) < 2:
             return found
@@ -317,7 +266,7 @@ class Odometry:
             return found
         return replace(found, pose=_averaged(left.pose, found.pose))
 
-    def _predicted_poses(self, new: _Incoming, key: OdometryKeyframe) -> list[tuple[F64, float]]:
+    def _predicted_poses(self, new: Incoming, key: OdometryKeyframe) -> list[tuple[F64, float]]:
         """Start poses T_camera_odom with their search radius share, most trusted first."""
         assert self._last is not None
         last_ns, T_last, last_prior = self._last
@@ -432,7 +381,7 @@ class Odometry:
 
     def _accept(
         self,
-        new: _Incoming,
+        new: Incoming,
         found: _Located,
     ) -> Tracked:
         """Keep the pose; make the frame a keyframe when it has moved enough."""
@@ -467,7 +416,7 @@ class Odometry:
 
     def _add_keyframe(
         self,
-        new: _Incoming,
+        new: Incoming,
         T_camera_odom: F64,
         uv: F64,
         ok: Bool,

@@ -88,7 +88,7 @@ def clean() -> list[U8]:
 
 
 def half_green(picture: U8) -> U8:
-    out = picture.copy()
+    out: U8 = picture.copy()
     out[picture.shape[0] // 2 :] = (0, 255, 0)
     return out
 
