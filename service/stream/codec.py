@@ -16,6 +16,7 @@ import numpy as np
 from recon.types import DepthMap, Keyframe, Pose
 from service.stream import planes
 from service.stream.layer import MAX_PIXELS, MAX_SIDE_PX, LayerHead, pack, unpack
+from service.stream.records import pack_place
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +75,10 @@ def encode(
     fine = planes.planes_of(depth, keyframe.bgr, known)
     factor = -(-w // config.coarse_width_px)
     fine_place = (0, 1, 1) if factor == 1 else (1, 2, 1)
+    pose = pack_place(depth.T_world_camera, keyframe.pose.covariance)
+    quality = config.colour_quality
     fine_layer = _layer(
-        keyframe, time_unix_ns, fine_place, fine, config.fine_step, config.colour_quality, config
+        keyframe, time_unix_ns, fine_place, pose, fine, config.fine_step, quality, config
     )
     if factor == 1:
         return (fine_layer,)
@@ -83,7 +86,7 @@ def encode(
     quality = config.coarse_colour_quality
     place = (0, 2, factor)
     return (
-        _layer(keyframe, time_unix_ns, place, coarse, config.coarse_step, quality, config),
+        _layer(keyframe, time_unix_ns, place, pose, coarse, config.coarse_step, quality, config),
         fine_layer,
     )
 
@@ -106,12 +109,14 @@ def _layer(
     keyframe: Keyframe,
     time_unix_ns: int,
     place: tuple[int, int, int],
+    pose: bytes,
     full: planes.Planes,
     step: float,
     quality: int,
     config: CodecConfig,
 ) -> bytes:
-    """One coded layer; ``place`` is its number, how many there are, and its factor."""
+    """One coded layer; ``place`` is its number, how many there are, and its factor; ``pose``
+    is that of the keyframe, packed."""
     layer, layers, factor = place
     box = planes.bounding_box(full.known)
     low = 0.0
@@ -143,7 +148,7 @@ def _layer(
         covariance=keyframe.pose.covariance,
         sources=keyframe.pose.sources,
     )
-    return pack(head, sections)
+    return pack(head, sections, pose)
 
 
 def decode(layers: Sequence[bytes]) -> Keyframe | None:

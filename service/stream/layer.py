@@ -15,14 +15,7 @@ import numpy as np
 
 from recon.camera_model import scaled_K
 from recon.types import F64
-from service.stream.records import (
-    pack_covariance,
-    pack_motion,
-    source_bits,
-    sources_of,
-    unpack_covariance,
-    unpack_motion,
-)
+from service.stream.records import PLACE_BYTES, pack_place, source_bits, sources_of, unpack_place
 
 MAX_SIDE_PX = 4096
 MAX_PIXELS = 1 << 22
@@ -33,11 +26,10 @@ MAX_LAYERS = 8
 _ID = struct.Struct("<4sBBBBIq")  # magic, version, layer, layers, sources, seq, time
 _GRID = struct.Struct("<HHBB4H")  # full w, full h, factor, depth method, box x y w h
 _OPTICS = struct.Struct("<6f")  # inverse min, inverse step, fx, fy, cx, cy
-_MOTION = struct.Struct("<3d4d")  # x y z, qw qx qy qz
-_COVARIANCE = struct.Struct("<21f")
+_PLACE = struct.Struct(f"<{PLACE_BYTES}s")  # pose and covariance, as records have them
 _SIZES = struct.Struct("<5I")
 _CRC = struct.Struct("<I")
-_PARTS = (_ID, _GRID, _OPTICS, _MOTION, _COVARIANCE, _SIZES)
+_PARTS = (_ID, _GRID, _OPTICS, _PLACE, _SIZES)
 _SEALED_BYTES = sum(part.size for part in _PARTS)
 
 MAGIC = b"SRKF"
@@ -75,8 +67,11 @@ class LayerHead:
         return scaled_K(self.K, 1.0 / self.factor, 1.0 / self.factor)
 
 
-def pack(head: LayerHead, sections: Sequence[bytes]) -> bytes:
-    """The layer: ``head``, checksum, then mask, depth, sigma, views and colour sections."""
+def pack(head: LayerHead, sections: Sequence[bytes], place: bytes = b"") -> bytes:
+    """The layer: ``head``, checksum, then mask, depth, sigma, views and colour sections.
+
+    ``place`` is what pack_place makes of the head's pose and covariance, if known already.
+    """
     K = head.K
     sealed = b"".join(
         (
@@ -91,8 +86,7 @@ def pack(head: LayerHead, sections: Sequence[bytes]) -> bytes:
             ),
             _GRID.pack(*head.full_px, head.factor, head.method, *head.box),
             _OPTICS.pack(head.inverse_min, head.inverse_step, K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
-            _MOTION.pack(*pack_motion(head.T_world_camera)),
-            _COVARIANCE.pack(*pack_covariance(head.covariance)),
+            place or pack_place(head.T_world_camera, head.covariance),
             _SIZES.pack(*(len(s) for s in sections)),
         )
     )
@@ -123,7 +117,7 @@ def unpack(data: bytes) -> tuple[LayerHead, tuple[bytes, ...]] | None:
         return None
     sections = []
     offset = HEADER_BYTES
-    for size in fields[5]:
+    for size in fields[4]:
         sections.append(data[offset : offset + size])
         offset += size
     return (head, tuple(sections)) if offset == len(data) else None
@@ -133,9 +127,8 @@ def _head(fields: list[tuple[object, ...]]) -> LayerHead | None:
     _, _, layer, layers, bits, seq, time_unix_ns = _ints(fields[0])
     w, h, factor, method, x, y, box_w, box_h = _ints(fields[1])
     optics = np.array(fields[2], np.float64)
-    covariance = np.array(fields[4], np.float64)
-    motion = unpack_motion(np.array(fields[3], np.float64))
-    if motion is None or not np.isfinite(optics).all() or not np.isfinite(covariance).all():
+    place = unpack_place(fields[3][0]) if isinstance(fields[3][0], bytes) else None
+    if place is None or not np.isfinite(optics).all() or not np.isfinite(place[1]).all():
         return None
     fx, fy, cx, cy = optics[2:]
     return LayerHead(
@@ -150,8 +143,8 @@ def _head(fields: list[tuple[object, ...]]) -> LayerHead | None:
         inverse_min=float(optics[0]),
         inverse_step=float(optics[1]),
         K=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
-        T_world_camera=motion,
-        covariance=unpack_covariance(covariance),
+        T_world_camera=place[0],
+        covariance=place[1],
         sources=sources_of(bits),
     )
 

@@ -144,6 +144,24 @@ def unpack_motion(seven: Sequence[float] | F64) -> F64 | None:
     return se3.compose(se3.rotation_from_quaternion(v[3:]), v[:3])
 
 
+_PLACE = struct.Struct("<7d21f")
+
+
+def pack_place(T: F64, covariance: F64) -> bytes:
+    """Position, quaternion and covariance as they travel: 7 f64, 21 f32."""
+    return _PLACE.pack(*pack_motion(T), *pack_covariance(covariance))
+
+
+def unpack_place(data: bytes) -> tuple[F64, F64] | None:
+    """Motion and covariance of what :func:`pack_place` gave; None for what cannot be."""
+    fields = _PLACE.unpack(data)
+    motion = unpack_motion(fields[:7])
+    return None if motion is None else (motion, unpack_covariance(fields[7:]))
+
+
+PLACE_BYTES = _PLACE.size
+
+
 class _Placed:
     """A record that begins with fields of its own, places a camera, and ends with more fields.
 
@@ -153,28 +171,31 @@ class _Placed:
 
     def __init__(self, magic: bytes, first: str, last: str) -> None:
         self._start = magic + b"\x01"
-        self._layout = struct.Struct(f"<3s{first}7d21f{last}")
-        self._at = 1 + len(first)  # each is one letter
+        self._first, self._last = struct.Struct(f"<3s{first}"), struct.Struct(f"<{last}")
+        self._size = self._first.size + PLACE_BYTES + self._last.size
 
     def pack(self, first: Sequence[Any], T: F64, covariance: F64, last: Sequence[Any]) -> bytes:
         """The record."""
-        placed = (*pack_motion(T), *pack_covariance(covariance))
-        body = self._layout.pack(self._start, *first, *placed, *last)
+        body = self._first.pack(self._start, *first)
+        body += pack_place(T, covariance) + self._last.pack(*last)
         return body + _CRC.pack(zlib.crc32(body))
 
     def unpack(self, data: bytes) -> tuple[tuple[Any, ...], F64, F64, tuple[Any, ...]] | None:
         """First fields, motion, covariance, last fields; None for anything else."""
-        size = self._layout.size
+        size = self._size
         if len(data) != size + _CRC.size or data[:3] != self._start:
             return None
         if zlib.crc32(data[:size]) != _CRC.unpack_from(data, size)[0]:
             return None
-        fields, at = self._layout.unpack_from(data), self._at
-        motion = unpack_motion(fields[at : at + 7])
-        if motion is None:
+        at = self._first.size
+        place = unpack_place(data[at : at + PLACE_BYTES])
+        if place is None:
             return None
-        covariance = unpack_covariance(fields[at + 7 : at + 28])
-        return fields[1:at], motion, covariance, fields[at + 28 :]
+        return (
+            self._first.unpack_from(data)[1:],
+            *place,
+            self._last.unpack(data[at + PLACE_BYTES : size]),
+        )
 
 
 _CRC = struct.Struct("<I")
