@@ -130,7 +130,8 @@ class DaemonLink:
             self._is_wanted = False
             sender, self._backlog = self._backlog, None
         if sender is not None:
-            threading.Thread(target=sender.close, name="backlog closing", daemon=True).start()
+            # The process does not end before it has: Zenoh would abort it.
+            threading.Thread(target=sender.close, name="backlog closing").start()
 
     def follow(self, config: Config) -> None:
         """Keep to another budget, also in flight."""
