@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from recon.backends.torch_dense import DenseStereo, JointBilateral
+from recon.backends.torch_dense import DenseStereo, pyramid_levels, room
+from recon.backends.torch_plan import Part, Plan, part, read
+from recon.backends.torch_upsampling import JointBilateral
 from recon.belief_propagation import BeliefPropagationConfig, believe
 from recon.matching_cost import check_pair
 from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration
@@ -19,34 +20,27 @@ from recon.upsampling import UpsamplingConfig, check_guide, guide_at_taps, upsam
 if TYPE_CHECKING:
     from recon.registration import IcpConfig
 
-log = logging.getLogger(__name__)
-
 KEPT_PLANS = 8
 """Shapes whose buffers (and CUDA graph) are kept."""
-
-
-@dataclass(slots=True, eq=False)
-class _Plan:
-    """One operation at fixed shapes: static inputs on the device, and how to run it."""
-
-    inputs: tuple[torch.Tensor, ...]
-    outputs: tuple[torch.Tensor, ...]
-    replay: Callable[[], object] | None  # None: call ``module`` anew
-    module: Any
 
 
 class TorchBackend:
     """``device`` is "cuda" when torch has one, else "cpu"; RuntimeError when it cannot compute.
 
     On CUDA an operation is captured once per shape as a graph; a call then uploads, replays
-    and waits once, for its result. One backend serves one thread at a time.
+    and waits once, for its result. ``messages`` is the type of belief propagation's costs and
+    messages, "int16" or "float32"; the results are the same. One backend serves one thread at
+    a time.
     """
 
     name = "torch"
 
-    def __init__(self, device: str | None = None) -> None:
+    def __init__(self, device: str | None = None, messages: str = "int16") -> None:
+        if messages not in ("int16", "float32"):
+            raise ValueError(f"messages are 'int16' or 'float32', not {messages!r}")
         self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
-        self._plans: dict[Any, _Plan] = {}
+        self.messages: torch.dtype = getattr(torch, messages)
+        self._plans: dict[Any, Plan] = {}
         torch.zeros(8, device=self.device).add_(1).cpu()  # fails here rather than in flight
 
     def belief_propagation(
@@ -54,11 +48,17 @@ class TorchBackend:
     ) -> DisparityMap:
         """Labels of the left view, (h, w); Eq. 1."""
         check_pair(left, right, labels)
+        h, w = left.shape
+        *space, label_room = room(h, w, labels)
+        levels = pyramid_levels(h, w, config)
+        true = np.array([h, w, labels])
         px, confidence = self._run(
-            ("stereo", left.shape, labels, config),
-            lambda: DenseStereo(labels, config),
-            (left, right),
+            ("stereo", *space, label_room, levels, config),
+            lambda: DenseStereo(label_room, levels, config, self.messages),
+            [part(left, (space[0], space[1])), part(right, (space[0], space[1])), part(true)],
+            (left, right, true),
         )
+        px, confidence = px[:h, :w].copy(), confidence[:h, :w].copy()
         return believe(left, px, confidence, config)
 
     def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
@@ -66,14 +66,22 @@ class TorchBackend:
         check_guide(coarse, guide)
         if config.method != "bilateral":
             return upsample(coarse, guide, config)
-        shape = (coarse.px.shape[0], coarse.px.shape[1])
-        size = (guide.shape[0], guide.shape[1])
+        (h, w), (H, W) = coarse.px.shape, guide.shape[:2]
+        small, large = room(h, w, 1)[:2], room(H, W, 1)[:2]
+        given = (
+            coarse.px, coarse.confidence, guide_at_taps(guide, (h, w)), guide,
+            np.array([h, w, H, W]),
+        )  # fmt: skip
         px, confidence = self._run(
-            ("upsample", shape, size, config),
-            lambda: JointBilateral(shape, size, config),
-            (coarse.px, coarse.confidence, guide_at_taps(guide, shape), guide),
-        )
-        return DisparityMap(px, confidence)
+            ("upsample", *small, *large, config),
+            lambda: JointBilateral(config),
+            [
+                part(given[0], small), part(given[1], small), part(given[2], (*small, 3)),
+                part(guide, (*large, 3)), part(given[4]),
+            ],
+            given,
+        )  # fmt: skip
+        return DisparityMap(px[:H, :W].copy(), confidence[:H, :W].copy())
 
     def register(
         self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
@@ -84,37 +92,18 @@ class TorchBackend:
         return register_projective(source, target, T_target_source, config, self.device)
 
     def _run(
-        self, key: Any, build: Callable[[], torch.nn.Module], arrays: tuple[Array, ...]
-    ) -> tuple[Array, Array]:
-        """Two float32 results of the operation called ``key`` on ``arrays``."""
+        self,
+        key: Any,
+        build: Callable[[], Callable[..., tuple[Tensor, ...]]],
+        parts: Sequence[Part],
+        arrays: Sequence[Array],
+    ) -> list[Array]:
+        """The float32 results of the operation called ``key`` on ``arrays``."""
         with torch.inference_mode():
             if key not in self._plans:
                 while len(self._plans) >= KEPT_PLANS:
                     self._plans.pop(next(iter(self._plans)))
-                self._plans[key] = self._plan(build().to(self.device), arrays)
+                self._plans[key] = Plan(self.device, build(), parts)
             plan = self._plans[key]
-            for tensor, array in zip(plan.inputs, arrays, strict=True):
-                tensor.copy_(torch.from_numpy(np.ascontiguousarray(array)), non_blocking=True)
-            if plan.replay is not None:
-                plan.replay()
-                outputs = plan.outputs
-            else:
-                outputs = plan.module(*plan.inputs)
-            first, second = (tensor.cpu().numpy() for tensor in outputs)
-            return first.copy(), second.copy()
-
-    def _plan(self, module: torch.nn.Module, arrays: tuple[Array, ...]) -> _Plan:
-        inputs = tuple(torch.zeros(a.shape, device=self.device) for a in arrays)
-        if self.device != "cuda":
-            return _Plan(inputs, (), None, module)
-        stream: Any = torch.cuda.Stream()  # type: ignore[no-untyped-call]
-        stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):  # capture needs kernels that are loaded already
-            for _ in range(2):
-                module(*inputs)
-        torch.cuda.current_stream().wait_stream(stream)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            outputs = module(*inputs)
-        log.debug("captured a CUDA graph for shapes %s", [a.shape for a in arrays])
-        return _Plan(inputs, tuple(outputs), graph.replay, module)
+            plan.upload(arrays)
+            return read(plan.run())

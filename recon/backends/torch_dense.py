@@ -1,15 +1,16 @@
-"""The dense stage in torch: matching cost, belief propagation, winner, bilateral upsampling.
+"""The dense stage in torch: matching cost, belief propagation, winner.
 
-Written in plain operations on fixed shapes, so that it runs on any device, is captured as one
-CUDA graph, and exports to ONNX. All integers of the compiled backend are held exactly in
-float32 (they stay below 2**24), so the beliefs are the same to the last bit. Axes are
-(labels, h, w).
+Written in plain operations on fixed shapes, so that it runs on any device and is captured as
+one CUDA graph. The pairs of a flight differ by a few pixels and labels from each other: arrays
+are a little larger than the pair (see :func:`room`), and its true height, width and number of
+labels come as a tensor. What lies beyond them says nothing, so the results are those of the
+pair alone, to the last bit. All integers of the compiled backend are held exactly, in float32
+(they stay below 2**24) or in int16 (half the bytes). Axes are (labels, h, w).
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -19,24 +20,69 @@ from recon.belief_propagation import BeliefPropagationConfig
 from recon.disparity_selection import NOISE, RADIUS, SURE_EVIDENCE
 from recon.matching_cost import CENSUS_RADIUS, COST_UNIT
 from recon.message_passing import FULL_WEIGHT
-from recon.upsampling import MIN_CONFIDENCE, RANGE_FLOOR, UpsamplingConfig
 
 FAR = 1.0e6
+BEYOND = 28000
+"""In place of ``FAR`` in 16 bits: more than any sum, and room for the longest slope on top."""
+
+MAX_SHORT_TRUNCATION = 1024
+"""The largest truncation for which no sum of four costs leaves 16 bits."""
+
+ROOM_PX, ROOM_LABELS = 32, 8
+
+
+def room(height: int, width: int, labels: int) -> tuple[int, int, int]:
+    """Height, width and labels of arrays that hold such a pair, so that few shapes occur."""
+    h, w = (-(-n // ROOM_PX) * ROOM_PX for n in (height, width))
+    return h, w, -(-labels // ROOM_LABELS) * ROOM_LABELS
+
+
+def pyramid_levels(height: int, width: int, config: BeliefPropagationConfig) -> int:
+    """How many levels belief propagation takes on a pair of this size."""
+    levels, least = 1, min(height, width)
+    while levels < config.levels and least >= 8:
+        levels, least = levels + 1, (least + 1) // 2
+    return levels
 
 
 class DenseStereo(torch.nn.Module):
-    """Grey images (h, w) in 0 to 255 to labels and their confidence, two (h, w)."""
+    """Grey images (h, w) in 0 to 255 to labels and their confidence, two (h, w).
 
-    def __init__(self, labels: int, config: BeliefPropagationConfig) -> None:
+    ``labels`` is the room for them, ``levels`` counts those of the pyramid; ``messages`` is the
+    type of costs and messages, torch.int16 (where they fit) or torch.float32.
+    """
+
+    def __init__(
+        self,
+        labels: int,
+        levels: int,
+        config: BeliefPropagationConfig,
+        messages: torch.dtype = torch.float32,
+    ) -> None:
         super().__init__()
         self.labels = labels
+        self.levels = levels
         self.config = config
+        short = messages == torch.int16 and config.truncation <= MAX_SHORT_TRUNCATION
+        self.messages = torch.int16 if short else torch.float32
 
-    def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
-        """Labels, NaN where the partner is outside the right image; confidence, 0: not believed."""
-        cost = matching_cost(left, right, self.labels, self.config)
-        belief = propagate(cost, edge_weights(left, self.config), self.config)
-        return select(belief, cost, self.config)
+    def forward(self, left: Tensor, right: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
+        """Labels, NaN where the partner is outside the right image; confidence, 0: not believed.
+
+        ``true`` (3,) is height, width and labels of the pair; beyond them the images repeat
+        their last row and column, and the results mean nothing.
+        """
+        left, right = left.float(), right.float()
+        cost = matching_cost(left, right, self.labels, true, self.config)
+        edges = edge_weights(left, true, self.config)
+        belief = propagate(cost, edges, true, self.levels, self.config, self.messages)
+        return select(belief, cost, true, self.config)
+
+
+def inside(shape: torch.Size | tuple[int, ...], true: Tensor) -> Tensor:
+    """(h, w) boolean: rows and columns of the pair itself; ``true`` begins with its size."""
+    rows = torch.arange(shape[-2], device=true.device)[:, None]
+    return (rows < true[0]) & (torch.arange(shape[-1], device=true.device)[None, :] < true[1])
 
 
 def census(image: Tensor) -> Tensor:
@@ -49,12 +95,13 @@ def census(image: Tensor) -> Tensor:
 
 
 def matching_cost(
-    left: Tensor, right: Tensor, labels: int, config: BeliefPropagationConfig
+    left: Tensor, right: Tensor, labels: int, true: Tensor, config: BeliefPropagationConfig
 ) -> Tensor:
-    """(L, h, w) cost of each label, as :func:`recon.matching_cost.matching_cost`."""
+    """(L, h, w) cost of each label, as :func:`recon.matching_cost.matching_cost`; 0 beyond."""
     c = config.cost
     width = left.shape[1]
     bits_left, bits_right = census(left), census(right)
+    column = torch.arange(width, device=left.device)
     layers = []
     for label in range(labels):
         shift = label + config.min_disparity
@@ -69,54 +116,85 @@ def matching_cost(
         seen = seen + grey.clamp(max=c.difference_truncation) * round(
             c.difference_weight * COST_UNIT
         )
+        partner = column[first:last] - shift
+        seen = torch.where((partner < true[1]) & (label < true[2]), seen, FAR)
         layers.append(F.pad(seen, (first, width - last), value=FAR))
     cost = torch.stack(layers)
     best = cost.amin(0, keepdim=True)
     unseen = torch.where(best < FAR, best + round(c.unseen * COST_UNIT), torch.zeros_like(best))
-    return torch.where(cost < FAR, cost, unseen)
+    return torch.where(cost < FAR, cost, unseen) * inside(cost.shape, true)
 
 
-def edge_weights(image: Tensor, config: BeliefPropagationConfig) -> Tensor:
+def edge_weights(image: Tensor, true: Tensor, config: BeliefPropagationConfig) -> Tensor:
     """(2, h, w) weight of the edge above and to the left, in whole 1 / FULL_WEIGHT."""
     above = F.pad((image[1:] - image[:-1]).abs(), (0, 0, 1, 0))
     before = F.pad((image[:, 1:] - image[:, :-1]).abs(), (1, 0))
     fall = (1 - config.edge_floor) / config.edge_contrast
     share = (1 - torch.stack([above, before]) * fall).clamp(min=config.edge_floor)
-    return torch.round(share * FULL_WEIGHT)
+    return _bounded(torch.round(share * FULL_WEIGHT), true)
 
 
-def propagate(cost: Tensor, weights: Tensor, config: BeliefPropagationConfig) -> Tensor:
+def _bounded(edges: Tensor, true: Tensor) -> Tensor:
+    """The last edges along the border of the pair repeated, and no edge across it."""
+    rows = torch.arange(edges.shape[1], device=edges.device)
+    columns = torch.arange(edges.shape[2], device=edges.device)
+    edges = edges.index_select(1, torch.minimum(rows, true[0] - 1))
+    edges = edges.index_select(2, torch.minimum(columns, true[1] - 1))
+    return torch.stack([edges[0] * (rows < true[0])[:, None], edges[1] * (columns < true[1])])
+
+
+def propagate(
+    cost: Tensor,
+    weights: Tensor,
+    true: Tensor,
+    levels: int,
+    config: BeliefPropagationConfig,
+    kind: torch.dtype,
+) -> Tensor:
     """(L, h, w) beliefs, as :func:`recon.message_passing.propagate` (Eq. 1)."""
-    top = 4.0 * config.truncation
-    pyramid = [_cut(cost, top)]
-    edges = [weights]
-    while len(pyramid) < config.levels and min(pyramid[-1].shape[1:]) >= 8:
-        pyramid.append(_cut(_pooled(pyramid[-1]) * 4, top))
-        edges.append(_coarser_weights(edges[-1]))
+    labels = true[2]
+    pyramid = [_cut(cost.to(kind), labels, config.truncation)]
+    edges, sizes = [weights], [true[:2]]
+    while len(pyramid) < levels:
+        pyramid.append(_cut(_pooled(pyramid[-1]), labels, config.truncation))
+        sizes.append((sizes[-1] + 1) // 2)
+        edges.append(_bounded(_coarser_weights(edges[-1]), sizes[-1]))
     messages = torch.zeros_like(pyramid[-1]).expand(4, *pyramid[-1].shape)
-    for data, weight in zip(reversed(pyramid), reversed(edges), strict=True):
+    for data, weight, size in zip(pyramid[::-1], edges[::-1], sizes[::-1], strict=True):
         _, h, w = data.shape
         if messages.shape[2:] != data.shape[1:]:
             messages = messages.repeat_interleave(2, 2).repeat_interleave(2, 3)[:, :, :h, :w]
+            messages = messages * inside(data.shape, size)
         rows = torch.arange(h, device=data.device)[:, None]
         colour = (rows + torch.arange(w, device=data.device)[None, :]) % 2
-        slope = torch.floor(weight * (COST_UNIT / FULL_WEIGHT))
-        cut = torch.floor(weight * (config.truncation / FULL_WEIGHT))
+        slope = torch.floor(weight * (COST_UNIT / FULL_WEIGHT)).to(kind)
+        cut = torch.floor(weight * (config.truncation / FULL_WEIGHT)).to(kind)
         smooth = (_per_direction(slope), _per_direction(cut))
         for t in range(config.iterations):
             fresh = _outgoing(data, messages, *smooth, config)
             messages = torch.where(colour == t % 2, fresh, messages)
-    return pyramid[0] + _arriving(messages).sum(0)
+    return pyramid[0] + _total(_arriving(messages))
 
 
-def _cut(data: Tensor, top: float) -> Tensor:
-    return (data - data.amin(0, keepdim=True)).clamp(max=top)
+def _beyond(values: Tensor) -> float:
+    """A number of their type above all of them."""
+    return BEYOND if values.dtype == torch.int16 else FAR
+
+
+def _cut(data: Tensor, labels: Tensor, truncation: int) -> Tensor:
+    """Above the pixel's best, at most what can win; a label that is not of the pair cannot."""
+    top = 4 * truncation
+    ours = torch.arange(data.shape[0], device=data.device)[:, None, None] < labels
+    least = torch.where(ours, data, _beyond(data)).amin(0, keepdim=True)
+    return torch.where(ours, (data - least).clamp(max=top), top).to(data.dtype)
 
 
 def _pooled(data: Tensor) -> Tensor:
-    """Mean over 2x2, missing pixels of an odd border counting as zero."""
+    """Sum over 2x2, missing pixels of an odd border counting as zero."""
     _, h, w = data.shape
-    return F.avg_pool2d(F.pad(data, (0, w % 2, 0, h % 2))[None], 2)[0]
+    even = F.pad(data, (0, w % 2, 0, h % 2))
+    rows = even[:, ::2] + even[:, 1::2]
+    return rows[:, :, ::2] + rows[:, :, 1::2]
 
 
 def _coarser_weights(fine: Tensor) -> Tensor:
@@ -147,16 +225,21 @@ def _arriving(messages: Tensor) -> Tensor:
     )
 
 
+def _total(arriving: Tensor) -> Tensor:
+    """Sum of the four, in their own type."""
+    return (arriving[0] + arriving[1]) + (arriving[2] + arriving[3])
+
+
 def _outgoing(
     data: Tensor, messages: Tensor, slope: Tensor, cut: Tensor, config: BeliefPropagationConfig
 ) -> Tensor:
     """Lower envelope of all other news; a label further than ``steps`` costs the cut anyway."""
     arriving = _arriving(messages)
-    total = data + arriving.sum(0)
+    total = data + _total(arriving)
     rest = total - torch.stack([arriving[1], arriving[0], arriving[3], arriving[2]])
     labels = data.shape[0]
     steps = min(math.ceil(config.truncation / COST_UNIT) + 1, labels - 1)
-    wide = F.pad(rest, (0, 0, 0, 0, steps, steps), value=FAR)
+    wide = F.pad(rest, (0, 0, 0, 0, steps, steps), value=_beyond(rest))
     best = rest
     for k in range(1, steps + 1):
         ahead, behind = wide[:, steps + k : steps + k + labels], wide[:, steps - k :][:, :labels]
@@ -164,24 +247,29 @@ def _outgoing(
     return torch.minimum(best - rest.amin(1, keepdim=True), cut)
 
 
-def select(belief: Tensor, cost: Tensor, config: BeliefPropagationConfig) -> tuple[Tensor, Tensor]:
+def select(
+    belief: Tensor, cost: Tensor, true: Tensor, config: BeliefPropagationConfig
+) -> tuple[Tensor, Tensor]:
     """Labels and confidence, as :func:`recon.disparity_selection.select`."""
-    labels, _, w = belief.shape
-    index = torch.arange(labels, device=belief.device)[:, None, None]
+    room_for, _, w = belief.shape
+    index = torch.arange(room_for, device=belief.device)[:, None, None]
     column = torch.arange(w, device=belief.device)[None, None, :]
+    ours = index < true[2]
+    belief = torch.where(ours, belief, _beyond(belief))
     low, best = belief.min(0)
-    second = torch.where((index - best).abs() <= 1, FAR, belief).amin(0)
+    beside = (index - best).abs() <= 1
+    second = torch.where(beside | ~ours, FAR, belief.float()).amin(0)
     area = (2 * RADIUS + 1) ** 2
     box = torch.round(F.avg_pool2d(cost[None], 2 * RADIUS + 1, 1, RADIUS)[0] * area)
     partner = column - index - config.min_disparity
-    seen = ((partner >= 0) & (partner < w)).float()
+    seen = ((partner >= 0) & (partner < true[1]) & ours).float()
     mean = (box * seen).sum(0) / seen.sum(0).clamp(min=1)
     here = box.gather(0, best[None])[0]
     a = box.gather(0, (best - 1).clamp(min=0)[None])[0] - here
-    b = box.gather(0, (best + 1).clamp(max=labels - 1)[None])[0] - here
+    b = box.gather(0, torch.minimum(best + 1, true[2] - 1)[None])[0] - here
     steep = torch.maximum(a, b)
     offset = ((a - b) / (2 * steep.clamp(min=1))).clamp(-0.5, 0.5)
-    inner = (best > 0) & (best < labels - 1) & (steep > 0)
+    inner = (best > 0) & (best < true[2] - 1) & (steep > 0)
     px = best.float() + torch.where(inner, offset, torch.zeros_like(offset))
     evidence = (mean - here) / (mean + area * NOISE)
     margin = (second - low) / (2.0 * config.truncation)
@@ -190,59 +278,6 @@ def select(belief: Tensor, cost: Tensor, config: BeliefPropagationConfig) -> tup
         believed = believed & (evidence >= config.min_evidence)
     sure = (evidence.clamp(min=0.01) / SURE_EVIDENCE).clamp(max=1)
     there = column[0] - best - config.min_disparity
-    inside = (there >= 0) & (there < w)
-    confidence = torch.where(believed & inside, margin.clamp(max=1) * sure, 0.0)
-    return torch.where(inside, px, math.nan), confidence
-
-
-class JointBilateral(torch.nn.Module):
-    """Eq. 2 with every tap, from (h, w) to the size of the guide (H, W, 3)."""
-
-    def __init__(
-        self, coarse: tuple[int, int], fine: tuple[int, int], config: UpsamplingConfig
-    ) -> None:
-        super().__init__()
-        self.config = config
-        self.window = [self._axis(n, m) for n, m in zip(coarse, fine, strict=True)]
-        for k, (index, log) in enumerate(self.window):
-            self.register_buffer(f"index{k}", index)
-            self.register_buffer(f"log{k}", log)
-
-    def _axis(self, taps: int, fine: int) -> tuple[Tensor, Tensor]:
-        """Coarse index (D, fine), clamped, and log of s, very low outside, of each tap."""
-        q = (torch.arange(fine, dtype=torch.float64) + 0.5) * (taps / fine) - 0.5
-        index = torch.ceil(q - self.config.diameter_px / 2)[None, :] + torch.arange(
-            self.config.diameter_px, dtype=torch.float64
-        ).unsqueeze(1)
-        log = -0.5 * ((index - q) / self.config.spatial_sigma) ** 2
-        log = torch.where((index >= 0) & (index < taps), log, -1e4)
-        return index.clamp(0, taps - 1).long(), log.float()
-
-    def forward(
-        self, px: Tensor, confidence: Tensor, taps: Tensor, guide: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """``taps`` (h, w, 3) and ``guide`` (H, W, 3) in grey levels, float32."""
-        known = px == px
-        trust = torch.where(known, confidence.clamp(min=MIN_CONFIDENCE), 0.0)
-        value = torch.where(known, px, 0.0) * trust
-        layers = torch.cat([taps.permute(2, 0, 1), torch.stack([trust, value, known.float()])])
-        image = guide.permute(2, 0, 1)
-        everything = torch.zeros_like(image[0])
-        sums = torch.zeros_like(image)
-        for j in range(self.config.diameter_px):
-            rows = layers[:, self.index0[j]]
-            for i in range(self.config.diameter_px):
-                tap = rows[:, :, self.index1[i]]
-                tonal = -((image - tap[:3]) ** 2).sum(0) / (2 * self.config.range_sigma**2)
-                near = self.log0[j][:, None] + self.log1[i][None, :]
-                weight = torch.exp(tonal.clamp(min=RANGE_FLOOR * math.log(2)) + near)
-                everything = everything + weight
-                sums = sums + weight * tap[3:]
-        good = sums[2] > self.config.min_support * everything
-        out = torch.where(good, sums[1] / sums[0], math.nan)
-        return out, torch.where(good, sums[0] / everything, 0.0)
-
-    index0: Any
-    index1: Any
-    log0: Any
-    log1: Any
+    sees = (there >= 0) & (there < true[1]) & inside(best.shape, true)
+    confidence = torch.where(believed & sees, margin.clamp(max=1) * sure, 0.0)
+    return torch.where(sees, px, math.nan), confidence

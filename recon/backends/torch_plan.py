@@ -1,0 +1,122 @@
+"""One operation at fixed shapes on a device: staging, one upload, and its CUDA graph."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon.types import Array
+
+log = logging.getLogger(__name__)
+
+ALIGNMENT = 64  # bytes
+
+Part = tuple[tuple[int, ...], torch.dtype]
+"""Shape and type of an input."""
+
+_NUMPY = {torch.uint8: np.uint8, torch.float32: np.float32, torch.float64: np.float64,
+          torch.int64: np.int64}  # fmt: skip
+
+
+class Plan:
+    """A module with its inputs in one buffer of the device; on CUDA captured as a graph.
+
+    Inputs are written to pinned memory and go to the device in one copy that the host does not
+    wait for; each ``slot`` is a staging buffer of its own, free again once the results that
+    came of it were read. Elsewhere the same module runs without capture.
+    """
+
+    def __init__(
+        self, device: str, module: Callable[..., tuple[Tensor, ...]], parts: Sequence[Part]
+    ) -> None:
+        self.device = device
+        self._module = module
+        self._parts = list(parts)
+        self._places = []
+        at = 0
+        for shape, kind in self._parts:
+            size = math.prod(shape) * torch.empty(0, dtype=kind).element_size()
+            self._places.append((at, at + size))
+            at += -(-size // ALIGNMENT) * ALIGNMENT
+        self.upload_bytes = at
+        self._buffer = torch.zeros(at, dtype=torch.uint8, device=device)
+        self._inputs = self._views(self._buffer)
+        self._staging: dict[int, tuple[Tensor, list[Array]]] = {}
+        self._replay: Callable[[], object] | None = None
+        self._outputs: tuple[Tensor, ...] = ()
+
+    def upload(self, arrays: Sequence[Array], slot: int = 0) -> None:
+        """Write the inputs; a smaller picture is continued by its last row and column."""
+        if slot not in self._staging:
+            host = torch.zeros(self.upload_bytes, dtype=torch.uint8, pin_memory=self._on_cuda)
+            self._staging[slot] = host, [view.numpy() for view in self._views(host)]
+        host, views = self._staging[slot]
+        for view, array in zip(views, arrays, strict=True):
+            _place(view, array)
+        self.send(slot)
+
+    def send(self, slot: int = 0) -> None:
+        """Copy what was staged in the slot to the device again."""
+        self._buffer.copy_(self._staging[slot][0], non_blocking=True)
+
+    def run(self) -> tuple[Tensor, ...]:
+        """The results, on the device; on CUDA overwritten by the next run."""
+        if not self._on_cuda:
+            return self._module(*self._inputs)
+        if self._replay is None:
+            self._capture()
+        assert self._replay is not None
+        self._replay()
+        return self._outputs
+
+    @property
+    def _on_cuda(self) -> bool:
+        return self.device.startswith("cuda")
+
+    def _views(self, buffer: Tensor) -> list[Tensor]:
+        return [
+            buffer[first:last].view(kind).view(shape)
+            for (shape, kind), (first, last) in zip(self._parts, self._places, strict=True)
+        ]
+
+    def _capture(self) -> None:
+        """Record the kernels once; capture needs them loaded, hence the rounds before."""
+        stream: Any = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            for _ in range(2):
+                self._module(*self._inputs)
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            self._outputs = self._module(*self._inputs)
+        self._replay = graph.replay
+        log.debug("captured a CUDA graph for %s", [shape for shape, _ in self._parts])
+
+
+def part(array: Array, shape: tuple[int, ...] | None = None) -> Part:
+    """The input that holds such an array, in room for ``shape``."""
+    kinds = {np.dtype(n): k for k, n in _NUMPY.items()}
+    return shape or array.shape, kinds[array.dtype]
+
+
+def read(tensors: Sequence[Tensor]) -> list[Array]:
+    """Float32 results of one shape as arrays of the host: one copy, one wait."""
+    together = torch.stack(list(tensors)).cpu().numpy()
+    return [np.array(layer) for layer in together]
+
+
+def _place(view: Array, array: Array) -> None:
+    if view.shape == array.shape:
+        view[...] = array
+        return
+    h, w = array.shape[:2]
+    view[:h, :w] = array
+    view[:h, w:] = view[:h, w - 1 : w]
+    view[h:] = view[h - 1 : h]
