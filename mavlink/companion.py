@@ -31,6 +31,7 @@ from mavlink.rates import WANTED_HZ, RateKeeper
 from mavlink.samples import OF_AUTOPILOT
 from mavlink.status import ComputerLoad, StatusTexts, computer_status, motion_values
 from mavlink.streams import Streams
+from mavlink.telemetry import TelemetryDecoder
 from mavlink.timesync import TimesyncFilter
 from mavlink.wire import COMMAND_CANCEL, dialect, numbers_of
 
@@ -91,7 +92,7 @@ class Companion:
         self._listeners: dict[str, list[Callable[[Any], None]]] = {}
         self._start_ns = self._now_ns = now_ns
         self._outbox = Outbox()
-        self._decoder = Decoder()
+        self._decoder, self._telemetry = Decoder(), TelemetryDecoder(READERS)
         self._clocks: dict[int, BootClock] = {}  # component of our system to its boot clock
         self.timesync = TimesyncFilter()
         self.rates = RateKeeper(config.wanted_hz)
@@ -129,7 +130,7 @@ class Companion:
         if packet.message_id == COMMAND_CANCEL:
             self._cancel(packet, now_ns)
             return
-        message = self._decoder.message(packet)
+        message = self._telemetry.message(packet) or self._decoder.message(packet)
         if message is None:
             self.counts["not understood"] += 1
             return

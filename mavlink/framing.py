@@ -71,6 +71,15 @@ def check_packet(data: bytes) -> Packet | None:
     return Packet(data, message_id, system, component, True)
 
 
+def _starts_whole(data: bytes) -> bool:
+    """True when a whole packet with a right checksum stands at the start."""
+    length = packet_length(data, 0)
+    if not length or length > len(data):
+        return False
+    packet = check_packet(data[:length])
+    return packet is not None and packet.known
+
+
 class Decoder:
     """Packets into message objects; never raises."""
 
@@ -90,7 +99,11 @@ class Decoder:
 
 
 class Framer:
-    """Splits a byte stream into packets; keeps at most one unfinished packet."""
+    """Splits a byte stream into packets; keeps at most one unfinished packet.
+
+    Noise may look like the start of a long packet. It is not waited for when what comes next
+    begins with a whole one, or an order sent once would wait for the next hundred bytes.
+    """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -106,6 +119,9 @@ class Framer:
             if whole is not None:
                 self.packets += 1
                 return [whole]
+        if buffer and _starts_whole(data):  # then what waits is no packet, or lost its end
+            self.skipped_bytes += len(buffer)
+            buffer.clear()
         buffer += data
         found: list[Packet] = []
         at = 0

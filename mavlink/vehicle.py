@@ -312,12 +312,15 @@ class VehicleLink:
         self._send(self._companion.take())
 
     def _serve(self, wait_s: float) -> None:
-        """Take in the telemetry and do the jobs that wait."""
+        """Do the jobs that wait and take in the telemetry."""
         telemetry, jobs = self._inbox.take(wait_s)
-        for index, packet, now_ns in telemetry:
-            self._guard(partial(self._hear, index, packet, now_ns))
-        for job in jobs:
+        for job in jobs:  # first: a heartbeat says whose telemetry follows
             self._guard(job)
+        for index, packet, now_ns in telemetry:
+            try:
+                self._hear(index, packet, now_ns)
+            except Exception:
+                log.exception("a fault while hearing telemetry")
 
     def _guard(self, job: Job) -> None:
         """Do a job; a fault in what the service does on a command must not cost the link."""

@@ -27,8 +27,9 @@ from mavlink.rates import LOOK_NS, RateKeeper
 from mavlink.rehearsal import RehearsalControl
 from mavlink.samples import PositionSample, RangeSample, TerrainSample
 from mavlink.signing import Signing, read_key, timestamp_of
+from mavlink.telemetry import TelemetryDecoder
 from mavlink.timesync import TimesyncFilter
-from mavlink.wire import CRC_EXTRA, dialect, x25crc
+from mavlink.wire import CRC_EXTRA, dialect, numbers_of, x25crc
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -122,6 +123,16 @@ def test_a_damaged_packet_does_not_take_the_next_one_along() -> None:
     assert len(found) == 30 and framer.bad_checksums >= 1
 
 
+def test_an_order_does_not_wait_behind_noise_that_looks_like_a_start() -> None:
+    beat = bytes(dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(dialect.MAVLink(None)))
+    for noise in (b"\xfd\xff\x00\x00\x01", b"\xfe\xff", beat[:12]):
+        framer = Framer()
+        assert framer.feed(noise) == []
+        assert [p.data for p in framer.feed(beat)] == [beat]
+        assert framer.skipped_bytes == len(noise)
+        assert [p.data for p in framer.feed(beat[:9]) + framer.feed(beat[9:])] == [beat]
+
+
 def test_every_single_bit_error_is_noticed() -> None:
     packet = packed(attitude(12345, 0.5))
     for i in range(len(packet)):
@@ -173,6 +184,36 @@ def test_right_checksums_around_any_payload_of_any_message(seed: int) -> None:
         state = station.history.state_at(station.now_ns)
         assert state is None or state.sources
     assert station.framer.skipped_bytes == 0
+
+
+@pytest.mark.parametrize("version", ["v1", "v2"])
+def test_telemetry_reads_as_pymavlink_does(version: str) -> None:
+    rng = random.Random(5)
+    ours, theirs = TelemetryDecoder(READERS), Decoder()
+    for number in sorted(numbers_of(READERS)):
+        kind = dialect.mavlink_map[number]
+        if version == "v1" and number > 255:
+            continue
+        for cut in (0, 1, 7):
+            payload = bytes(rng.randrange(256) for _ in range(kind.unpacker.size))
+            payload = payload[: len(payload) - cut]
+            if version == "v1":
+                head = bytes((0xFE, len(payload), 3, 1, 154, number))
+            else:
+                head = bytes((0xFD, len(payload), 0, 0, 3, 1, 154)) + number.to_bytes(3, "little")
+            crc = x25crc(head[1:] + payload + bytes((kind.crc_extra,))).crc
+            (packet,) = Framer().feed(head + payload + crc.to_bytes(2, "little"))
+            mine, other = ours.message(packet), theirs.message(packet)
+            assert mine is not None and other is not None
+            assert mine.get_type() == other.get_type()
+            assert mine.get_srcSystem() == 1 and mine.get_srcComponent() == 154
+            for field in kind.ordered_fieldnames:
+                a, b = np.array(getattr(mine, field)), np.array(getattr(other, field))
+                np.testing.assert_array_equal(a, b)
+            with pytest.raises(AttributeError, match="no field"):
+                _ = mine.not_there
+    beat = bytes(dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(dialect.MAVLink(None)))
+    assert ours.message(Framer().feed(beat)[0]) is None
 
 
 def test_unknown_messages_are_counted_and_left() -> None:
