@@ -61,6 +61,17 @@ check_python() {
   "$python" -c 'import ensurepip' 2>/dev/null || die "no venv module; apt install python3-venv"
 }
 
+# Without OpenMP numba cannot let tracking and stereo run side by side.
+check_openmp() {
+  [[ -z $root ]] || return 0
+  "$python" -c 'import ctypes; ctypes.CDLL("libgomp.so.1")' 2>/dev/null && return 0
+  if [[ -z $bundle ]] && command -v apt-get >/dev/null; then
+    say "installing libgomp1 (OpenMP)"
+    apt-get install -y -q libgomp1 >/dev/null && return 0
+  fi
+  say "libgomp1 (OpenMP) is missing: it will run at half the speed; apt install libgomp1"
+}
+
 # NVIDIA's own builds of torch and onnxruntime live in the system's Python on a Jetson; a
 # virtual environment that sees them keeps them, PyPI's would lack the GPU.
 site_packages() {
@@ -217,6 +228,7 @@ do_install() {
   [[ -z $profile || -r ${bundle:-$here}/deploy/profiles/$profile.toml ]] ||
     die "no profile $profile; there are $(cd "${bundle:-$here}/deploy/profiles" && echo ./*.toml)"
   check_python
+  check_openmp
   local new old
   new=$(version_to_install)
   old=$(version_now)

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 
 from service.config import Config
 from service.errors import InputError, SkyreliefError
+from service.threading_layer import REMEDY, kernels_may_overlap
+from service.warm_up import is_warm
 
 if TYPE_CHECKING:
     from recon.types import Camera
@@ -23,6 +25,10 @@ GOOD, NOTE, BAD = "good", "note", "bad"
 CORE = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "pymavlink", "eclipse-zenoh")
 NEEDED_MIB = {"disk": 1000.0, "memory": 700.0}
 HOT_C = 85.0
+WARM_UP = (
+    "sudo -u skyrelief env NUMBA_CACHE_DIR=/var/cache/skyrelief "
+    "/opt/skyrelief/current/bin/skyrelief warm-up"
+)
 EARLIEST_UNIX_S = 1_735_689_600  # 2025-01-01: a clock before this was never set
 
 
@@ -127,6 +133,14 @@ def _compute(config: Config) -> Iterator[Finding]:
         return
     seconds = time.monotonic() - start
     yield Finding("compute", GOOD, f"{backend.name} on {backend.device}, up in {seconds:.1f} s")
+    if kernels_may_overlap():
+        yield Finding("threads", GOOD, "OpenMP or TBB: tracking and stereo run side by side")
+    else:
+        yield Finding("threads", BAD, f"no OpenMP: half as fast, one core idle; {REMEDY}")
+    if is_warm():
+        yield Finding("kernels", GOOD, "compiled for this version")
+    else:
+        yield Finding("kernels", NOTE, f"the first scan may have to compile; {WARM_UP}")
 
 
 def _camera(config: Config) -> Iterator[Finding]:

@@ -10,6 +10,7 @@ import logging
 import math
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from service.load_control import LoadControl
 from service.machine import CoreLoad, computer_load, read_machine
 from service.retention import close_open_scans, make_room
 from service.scanning import Scanning
+from service.threading_layer import kernels_may_overlap
 from service.tuning import TUNABLES, parameters_of
 from service.vehicle_config import vehicle_config
 from service.version import software
@@ -70,8 +72,11 @@ class Daemon:
             self.scanning.load()
             self.actions.is_ready = True
             notifier.ready()
-            for work in (self._recover, self._tidy):
-                threading.Thread(target=work, name=work.__name__[1:], daemon=True).start()
+            self._begin(self._tidy)
+            if kernels_may_overlap():
+                self._begin(self._recover)
+            else:
+                self._recover()
             if self.config.scan.start == "on-boot":
                 self.actions.start_scan()
             self._watch(notifier)
@@ -81,6 +86,9 @@ class Daemon:
             self.vehicle.stop()
             if http is not None:
                 http.close()
+
+    def _begin(self, work: Callable[[], None]) -> None:
+        threading.Thread(target=work, name=work.__name__[1:], daemon=True).start()
 
     def _watch(self, notifier: Notifier) -> None:
         """Keep the operator and the init system told until :meth:`quit`."""

@@ -10,6 +10,8 @@ from typing import Generic, TypeVar
 
 import numba
 
+from service.threading_layer import kernels_may_overlap
+
 In = TypeVar("In")
 Out = TypeVar("Out")
 
@@ -18,10 +20,10 @@ class SideBySide(Generic[In, Out]):
     """Runs ``work`` on what is offered, in a thread of its own and in order.
 
     A recording drops nothing: a full queue makes :meth:`offer` wait. Live, the oldest work that
-    has not begun gives way and :attr:`dropped` counts it. Without a thread (``beside`` False)
-    the work is done within :meth:`offer`. Compiled kernels share the cores between the two:
-    two that each want all of them only wait for one another. ``threads`` are what both use
-    together; 0 is one per core.
+    has not begun gives way and :attr:`dropped` counts it. Without a thread (``beside`` False, or
+    kernels that may not overlap here) the work is done within :meth:`offer`. Compiled kernels
+    share the cores between the two: two that each want all of them only wait for one another.
+    ``threads`` are what both use together; 0 is one per core.
     """
 
     def __init__(
@@ -34,7 +36,7 @@ class SideBySide(Generic[In, Out]):
     ) -> None:
         self._work, self._most, self._live = work, most_waiting, live
         self._worker: ThreadPoolExecutor | None = None
-        if beside:
+        if beside and kernels_may_overlap():
             most = numba.config.NUMBA_NUM_THREADS
             half = max(1, min(threads or most, most) // 2)
             numba.set_num_threads(half)  # of the calling thread: the other half is the worker's

@@ -1,0 +1,39 @@
+"""Whether compiled kernels may run on two threads of ours at once.
+
+Numba shares its loops among cores by TBB, OpenMP or a work queue of its own. The work queue ends
+the process when two threads call it at once, and it is what is left on a bare system without
+``libgomp.so.1`` (numba's documentation, "The Threading Layers").
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import logging
+import sys
+
+log = logging.getLogger(__name__)
+
+LIBRARIES = ("libtbb.so.12", "libgomp.so.1")
+REMEDY = "apt install libgomp1"
+
+
+@functools.cache
+def kernels_may_overlap() -> bool:
+    """True when TBB or OpenMP is there; said once in the log when neither is."""
+    import numba
+
+    if numba.config.THREADING_LAYER != "workqueue" and (
+        not sys.platform.startswith("linux") or any(map(_loads, LIBRARIES))
+    ):
+        return True
+    log.warning("no OpenMP on this system: tracking and stereo take turns; %s", REMEDY)
+    return False
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
