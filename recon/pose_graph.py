@@ -11,47 +11,26 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from recon import alignment, graph_factors, se3
-from recon.alignment import Anchor, Scale, Similarity
+from recon import graph_factors, se3
+from recon.alignment import Scale, Similarity
 from recon.graph_factors import pose3
 from recon.graph_readings import BLOCK, Readings
-from recon.graph_records import Loop, Node, PoseGraphConfig, loops_agree
-from recon.sensor_offsets import Offsets, offsets
+from recon.graph_records import Loop, Node, PoseGraphConfig
+from recon.loop_book import Edge, LoopBook
+from recon.segment_frames import SegmentFrames
 from recon.smoother import ROUNDS, SCALAR, Smoother, moved_covariance
 from recon.types import F64, Pose, PosePrior
 
 __all__ = ["Edge", "PoseGraph", "PoseGraphConfig"]
 
-CHI2_LIMIT = 22.5
-"""99.9 % of chi-square with six degrees of freedom."""
-
 BATCH = 100
 """Keyframes that enter the smoother together when the graph is made anew."""
 
-MOST_PENDING = 50
-"""Loops that wait for one that agrees; older ones are forgotten."""
-
-REFIT_GROWTH, SETTLED_GROWTH = 1.3, 2.0
-"""A segment's similarity is fitted again when its keyframes have grown by so much: at first,
-and once it has settled."""
-
-SETTLED = 60
-"""Keyframes after which a segment's frame is taken over only when it has changed notably."""
-
 SOURCES = ("vision", "attitude", "altitude", "gnss", "loop", "dead reckoning")
-
-
-@dataclass(frozen=True, slots=True)
-class Edge:
-    """A loop as reports show it."""
-
-    a: int  # number of the earlier keyframe
-    b: int
-    accepted: bool  # False: none that agrees was found
 
 
 class PoseGraph:
@@ -65,14 +44,9 @@ class PoseGraph:
         self.config = config or PoseGraphConfig()
         self._kept_counts: Counter[str] = Counter()  # of what happens once, whatever is rebuilt
         self._nodes: dict[int, Node] = {}  # by keyframe number, in order of time
-        self._segments: dict[int, list[Node]] = {}
-        self._frames: dict[int, Similarity] = {}  # by segment, once telemetry or a loop tells
-        self._offsets: dict[int, Offsets] = {}  # by segment that telemetry has placed
-        self._fitted: dict[int, int] = {}  # keyframes that the segment's frame was fitted to
-        self._tied: set[int] = set()  # segments that a loop has placed
+        self._segments = SegmentFrames(self.config.least_anchors)
+        self._book = LoopBook(self.config, self)
         self._built = 0
-        self._loops: list[Loop] = []
-        self._pending: list[Loop] = []
         self._start()
 
     @classmethod
@@ -86,7 +60,7 @@ class PoseGraph:
         graph = cls(config)
         for node in nodes:
             graph._keep(replace(node, key=len(graph)))
-        graph._loops = list(loops)
+        graph._book.taken = list(loops)
         graph.solve()
         return graph
 
@@ -124,7 +98,7 @@ class PoseGraph:
         )  # fmt: skip
         last = self._newest() if self._nodes else None
         self._keep(node)
-        if self._refit(segment):
+        if self._segments.refit(segment, self._smoother.pose):
             self.rebuild()
         else:
             self._insert(node, last)
@@ -149,18 +123,9 @@ class PoseGraph:
         scale = self.scale(a)
         ratio = growth * self.scale(b) / scale
         loop = Loop(a, b, T_a_b, covariance, ratio).scaled(1.0 / scale)
-        if not self._is_possible(loop):
-            self._kept_counts["loop impossible"] += 1
+        fresh = self._book.offer(loop)
+        if not fresh:
             return False
-        support = [other for other in self._pending + self._loops if self._agree(loop, other)]
-        if not support:
-            self._pending.append(loop)
-            self._pending = self._pending[-MOST_PENDING:]
-            self._kept_counts["loop waits"] += 1
-            return False
-        fresh = [loop, *(other for other in support if other in self._pending)]
-        self._pending = [other for other in self._pending if other not in support]
-        self._loops += fresh
         if self._tie(loop):
             self.rebuild()
             return True
@@ -171,16 +136,12 @@ class PoseGraph:
 
     def solve(self) -> None:
         """Fit every segment's frame once more to all its telemetry, and build all anew."""
-        for segment, nodes in self._segments.items():
-            self._frames.pop(segment, None)
-            self._offsets.pop(segment, None)
-            self._fitted.pop(segment, None)
-            self._tied.discard(segment)
-            if nodes[0].key > 0 and all(n.prior.sigma_position_m is None for n in nodes):
+        for segment, nodes in self._segments.nodes.items():
+            if self._segments.forget(segment) and nodes[0].key > 0:
                 self.rebuild()  # so that the segment's start is known
-                if any(self._tie(loop) for loop in self._loops if self._enters(loop, segment)):
+                if any(self._tie(loop) for loop in self._book.into(segment)):
                     continue
-            self._refit(segment)
+            self._segments.refit(segment, self._smoother.pose)
         self.rebuild()
 
     # ---- what comes out ------------------------------------------------------------------------
@@ -188,36 +149,33 @@ class PoseGraph:
     @property
     def aligned(self) -> bool:
         """True when the newest segment's frame is the world's, by fixes."""
-        frame = self._frames.get(self._newest().segment) if self._nodes else None
-        return frame is not None and "gnss" in frame.sources
+        return bool(self._nodes) and self._segments.rests_on_fixes(self._newest().segment)
 
     @property
     def counts(self) -> Counter[str]:
         """Readings and loops left out, by reason."""
-        return self._kept_counts + self._left_out
+        return self._kept_counts + self._book.counts + self._left_out
 
     @property
     def loops(self) -> list[Edge]:
         """All loops that were offered."""
-        found = [Edge(loop.a, loop.b, True) for loop in self._loops]
-        return found + [Edge(loop.a, loop.b, False) for loop in self._pending]
+        return self._book.edges()
 
     def records(self) -> tuple[list[Node], list[Loop]]:
         """Keyframes and accepted loops, from which :meth:`batch` makes the same graph."""
-        return list(self._nodes.values()), list(self._loops)
+        return list(self._nodes.values()), list(self._book.taken)
 
     def metric_loops(self) -> list[Loop]:
         """Accepted loops with lengths in metres, by the scale known now."""
-        return [loop.scaled(self.scale(loop.a)) for loop in self._loops]
+        return [loop.scaled(self.scale(loop.a)) for loop in self._book.taken]
 
     def similarity(self, segment: int) -> Similarity | None:
         """What brings a segment's odometry to the world; None before telemetry or a loop does."""
-        return self._frames.get(segment)
+        return self._segments.known(segment)
 
     def is_tied(self, segment: int) -> bool:
         """True when fixes or a loop tell where the segment lies."""
-        frame = self._frames.get(segment)
-        return segment in self._tied or (frame is not None and "gnss" in frame.sources)
+        return self._segments.is_tied(segment)
 
     def node(self, seq: int) -> Node:
         """What is known of keyframe ``seq``. Raises KeyError for an unknown one."""
@@ -228,6 +186,14 @@ class PoseGraph:
 
     def __len__(self) -> int:
         return len(self._nodes)
+
+    def place(self, seq: int) -> F64:
+        """(4, 4) T_world_camera of keyframe ``seq``."""
+        return self._smoother.pose(self._nodes[seq].key)
+
+    def path_m(self, a: int, b: int) -> float:
+        """Metres flown from keyframe ``a`` to the later ``b``."""
+        return self._path[self._nodes[b].key] - self._path[self._nodes[a].key]
 
     def pose(self, seq: int) -> Pose:
         """The pose of keyframe ``seq`` with its covariance and sources."""
@@ -263,7 +229,7 @@ class PoseGraph:
         """(N,) metres per unit of the odometry, in the order of the keyframes."""
         blocks, block = np.unique(np.array(self._scale_of, np.int64), return_inverse=True)
         drift = np.array([self._smoother.scalar(int(key)) if key else 0.0 for key in blocks])
-        frames = [np.full(len(n), self._frame(n[0]).scale) for n in self._segments.values()]
+        frames = [np.full(len(n), self._frame(n[0]).scale) for n in self._segments.nodes.values()]
         return np.asarray(np.concatenate(frames) * np.exp(drift[block]))
 
     def residuals(self) -> dict[str, F64]:
@@ -274,9 +240,7 @@ class PoseGraph:
 
     def newest_scales(self) -> tuple[Scale | None, Scale | None]:
         """The newest segment's scale by fixes alone and by heights alone."""
-        segment = self._newest().segment if self._nodes else -1
-        frame = self._frames.get(segment)
-        return (None, None) if frame is None else alignment.scales(self._anchors(segment), frame)
+        return self._segments.scales(self._newest().segment) if self._nodes else (None, None)
 
     # ---- building ------------------------------------------------------------------------------
 
@@ -291,7 +255,7 @@ class PoseGraph:
         span_s = (times[-1] - times[0]) * 1e-9 if times else 0.0
         self._readings = Readings(
             self.config, self._smoother, self._left_out, len(times), span_s,
-            self._altitude_offset(),
+            self._segments.altitude_offset(),
         )  # fmt: skip
         self._sources: list[set[str]] = []
         self._scale_of: list[int] = []  # key of each keyframe's scale; 0 while it has none
@@ -308,22 +272,13 @@ class PoseGraph:
                 self._smoother.update(now=True)
             last = node
         self._smoother.update(now=True)
-        for loop in self._loops:
+        for loop in self._book.taken:
             self._add_loop_factor(loop)
         self._smoother.update(now=True, rounds=ROUNDS)
 
-    def _altitude_offset(self) -> float | None:
-        """Altitude less world z over all placed keyframes; None without any."""
-        apart = [
-            n.prior.altitude_m - self._frames[n.segment].pose(n.T_odom_camera)[2, 3]
-            for n in self._nodes.values()
-            if n.prior.altitude_m is not None and n.segment in self._frames
-        ]
-        return float(np.median(apart)) if apart else None
-
     def _keep(self, node: Node) -> None:
         self._nodes[node.seq] = node
-        self._segments.setdefault(node.segment, []).append(node)
+        self._segments.keep(node)
 
     def _insert(self, node: Node, last: Node | None) -> None:
         self._sources.append(set())
@@ -339,9 +294,8 @@ class PoseGraph:
             spread = moved_covariance(spread_last, T_last, covariance)
             self._connect(node, last, motion, covariance)
         self._smoother.add_pose(node.key, T, spread)
-        is_placed = node.segment in self._frames
-        if node.segment in self._offsets:
-            node = replace(node, prior=self._offsets[node.segment].applied(node.prior))
+        is_placed = self._segments.known(node.segment) is not None
+        node = self._segments.freed(node)
         used = self._readings.add(node, T, spread, is_placed)
         if is_placed and self._readings.height(
             node, self._scale_key(node), self._frame(node).scale
@@ -369,7 +323,7 @@ class PoseGraph:
         noise = gtsam.noiseModel.Gaussian.Covariance(
             graph_factors.right_covariance(motion, covariance)
         )
-        if node.segment != last.segment or node.segment not in self._frames:
+        if node.segment != last.segment or self._segments.known(node.segment) is None:
             kind = "vision" if node.segment == last.segment else "link"
             factor = gtsam.BetweenFactorPose3(last.key, node.key, pose3(motion), noise)
             self._smoother.add(factor, kind)
@@ -404,13 +358,7 @@ class PoseGraph:
         return key
 
     def _frame(self, node: Node) -> Similarity:
-        """The segment's frame; until there is one, its own turned to the attitude."""
-        if node.segment in self._frames:
-            return self._frames[node.segment]
-        first = self._segments[node.segment][0]
-        R = first.prior.R_world_camera
-        turn = np.eye(3) if R is None else R @ first.T_odom_camera[:3, :3].T
-        return Similarity(1.0, turn, np.zeros(3), np.eye(7))
+        return self._segments.frame(node.segment)
 
     def _motion(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
         """T_last_node in metres and its (6, 6) covariance, left, in last's frame."""
@@ -428,7 +376,7 @@ class PoseGraph:
         """Dead reckoning where vision was lost: telemetry's motion, else the last one's, wide."""
         self._left_out["stretch without vision"] += 1
         seconds = max((node.time_ns - last.time_ns) * 1e-9, 1.0)
-        frame = self._frames.get(node.segment)
+        frame = self._segments.known(node.segment)
         if frame is not None:  # already placed, by telemetry or by a loop
             T = frame.pose(node.T_odom_camera)
         else:
@@ -447,7 +395,7 @@ class PoseGraph:
         if a.position_m is not None and b.position_m is not None:
             T[:3, 3] = T_last[:3, 3] + b.position_m - a.position_m
             return T
-        before = self._segments[last.segment][-2:]
+        before = [n for n in self._segments.nodes[last.segment] if n.key <= last.key][-2:]
         if len(before) == 2 and before[1].time_ns > before[0].time_ns:
             step = T_last[:3, 3] - self._smoother.pose(before[0].key)[:3, 3]
             T[:3, 3] += step * seconds / ((before[1].time_ns - before[0].time_ns) * 1e-9)
@@ -463,102 +411,19 @@ class PoseGraph:
         self._kept_counts["position frozen"] += 1
         return replace(prior, sigma_position_m=None)
 
-    # ---- frames and loops ----------------------------------------------------------------------
-
-    def _anchors(self, segment: int) -> list[Anchor]:
-        return [Anchor(n.T_odom_camera, n.prior, n.height, n.lean) for n in self._segments[segment]]
-
-    def _refit(self, segment: int) -> bool:
-        """True when the segment's frame was fitted anew, which is due as the segment grows."""
-        nodes = self._segments[segment]
-        fitted = self._fitted.get(segment, 0)
-        growth = REFIT_GROWTH if fitted < SETTLED else SETTLED_GROWTH
-        due = max(self.config.least_anchors, int(growth * fitted))
-        if len(nodes) < due or segment in self._tied:
-            return False
-        self._fitted[segment] = len(nodes)
-        found = alignment.fit(self._anchors(segment))
-        if found is None:
-            return False
-        if "gnss" not in found.sources and nodes[0].key > 0:
-            found = self._kept_in_place(found, nodes[0])
-        before = self._frames.get(segment)
-        if before is None or len(nodes) < SETTLED or self._differ(before, found, nodes):
-            self._frames[segment] = found
-            self._offsets[segment] = offsets(self._anchors(segment), found)
-            return True
-        return False  # the graph itself follows such small changes
-
-    def _differ(self, before: Similarity, found: Similarity, nodes: list[Node]) -> bool:
-        """True when two frames place a segment apart by more than half their sigma."""
-        ends = (nodes[0], nodes[len(nodes) // 2], nodes[-1])
-        shift = [before.pose(n.T_odom_camera) - found.pose(n.T_odom_camera) for n in ends]
-        sigma = float(np.sqrt(np.trace(found.covariance[3:6, 3:6])))
-        return max(float(np.linalg.norm(s[:3, 3])) for s in shift) > 0.5 * sigma
-
-    def _kept_in_place(self, found: Similarity, first: Node) -> Similarity:
-        """A frame without fixes, moved so that its first keyframe stays where it is, and turned
-        to its heading there when no compass tells one."""
-        T = self._smoother.pose(first.key)
-        R = found.R
-        if "attitude" not in found.sources:
-            ahead, now = T[:3, :3], R @ first.T_odom_camera[:3, :3]
-            turn = ahead @ now.T
-            yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
-            R = se3.so3_exp(np.array([0.0, 0.0, float(yaw)])) @ R
-        t = T[:3, 3] - found.scale * R @ first.T_odom_camera[:3, 3]
-        return replace(found, R=R, t=t)
+    # ---- loops ---------------------------------------------------------------------------------
 
     def _tie(self, loop: Loop) -> bool:
         """True when a loop between segments now places the later one, which no fix does."""
         a, b = self._nodes[loop.a], self._nodes[loop.b]
-        frame = self._frames.get(b.segment)
-        placed = frame is not None and "gnss" in frame.sources
-        if not self._enters(loop, b.segment) or placed or b.segment in self._tied:
+        if not self._book.enters(loop, b.segment) or self._segments.is_tied(b.segment):
             return False
         scale = self.scale(loop.a)
         T = self._smoother.pose(a.key) @ loop.scaled(scale).T_a_b
         R = T[:3, :3] @ b.T_odom_camera[:3, :3].T
-        t = T[:3, 3] - scale * loop.ratio * R @ b.T_odom_camera[:3, 3]
-        covariance = np.eye(7) if frame is None else frame.covariance
-        sources = () if frame is None else frame.sources
-        self._frames[b.segment] = Similarity(scale * loop.ratio, R, t, covariance, sources)
-        self._tied.add(b.segment)
+        scale *= loop.ratio
+        self._segments.tie(b.segment, scale, R, T[:3, 3] - scale * R @ b.T_odom_camera[:3, 3])
         return True
-
-    def _is_possible(self, loop: Loop) -> bool:
-        """False when a loop within a segment is off by more than vision can drift."""
-        a, b = self._nodes[loop.a], self._nodes[loop.b]
-        if a.segment != b.segment:
-            return True
-        T = se3.inverse(self._smoother.pose(a.key)) @ self._smoother.pose(b.key)
-        apart = se3.log(se3.inverse(loop.scaled(self.scale(loop.a)).T_a_b) @ T)
-        path = self._path[b.key] - self._path[a.key]
-        allowed_m = self.config.loop_slack_m + self.config.loop_drift * path
-        turned, moved = float(np.linalg.norm(apart[:3])), float(np.linalg.norm(apart[3:]))
-        return moved < allowed_m and turned < self.config.loop_turn_rad
-
-    def _enters(self, loop: Loop, segment: int) -> bool:
-        """True when the loop leads from an earlier segment into this one."""
-        return self._nodes[loop.b].segment == segment != self._nodes[loop.a].segment
-
-    def _agree(self, one: Loop, other: Loop) -> bool:
-        """True when two loops, joined by the track between their ends, close on themselves."""
-        window = self.config.loop_window
-        near = all(self._apart(*pair) <= window for pair in zip(one.ends, other.ends, strict=True))
-        if not near or one.ends == other.ends:
-            return False
-        ends = (one.a, other.a, other.b, one.b)
-        a, a_other, b_other, b = (self._smoother.pose(self._nodes[i].key) for i in ends)
-        T_a_a, T_b_b = se3.inverse(a) @ a_other, se3.inverse(b_other) @ b
-        T_b_b[:3, 3] *= one.ratio * self.scale(one.a) / self.scale(one.b)
-        one, other = one.scaled(self.scale(one.a)), other.scaled(self.scale(other.a))
-        return loops_agree(one, other, T_a_a, T_b_b, CHI2_LIMIT)
-
-    def _apart(self, seq: int, other: int) -> int:
-        """Keyframes from one to the other; many between segments."""
-        one, two = self._nodes[seq], self._nodes[other]
-        return abs(one.key - two.key) if one.segment == two.segment else 1_000_000
 
     def _add_loop_factor(self, loop: Loop) -> None:
         a, b = self._nodes[loop.a].key, self._nodes[loop.b].key

@@ -1,0 +1,141 @@
+"""Stretches of unbroken vision, and what brings each one's odometry to the world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from recon import alignment, se3
+from recon.alignment import Anchor, Scale, Similarity
+from recon.graph_records import Node
+from recon.sensor_offsets import Offsets, offsets
+from recon.types import F64
+
+REFIT_GROWTH, SETTLED_GROWTH = 1.3, 2.0
+"""A segment's similarity is fitted again when its keyframes have grown by so much: at first,
+and once it has settled."""
+
+SETTLED = 60
+"""Keyframes after which a segment's frame is taken over only when it has changed notably."""
+
+
+class SegmentFrames:
+    """Keyframes by segment, and each segment's similarity once telemetry or a loop tells it."""
+
+    def __init__(self, least_anchors: int) -> None:
+        """``least_anchors`` keyframes must be there before telemetry places a segment."""
+        self.nodes: dict[int, list[Node]] = {}
+        self._least = least_anchors
+        self._frames: dict[int, Similarity] = {}
+        self._offsets: dict[int, Offsets] = {}
+        self._fitted: dict[int, int] = {}  # keyframes that the frame was fitted to
+        self._tied: set[int] = set()  # placed by a loop
+
+    def keep(self, node: Node) -> None:
+        """Take a keyframe."""
+        self.nodes.setdefault(node.segment, []).append(node)
+
+    def known(self, segment: int) -> Similarity | None:
+        """The segment's similarity; None before telemetry or a loop tells it."""
+        return self._frames.get(segment)
+
+    def frame(self, segment: int) -> Similarity:
+        """The segment's similarity; until there is one, its own frame turned to the attitude."""
+        if segment in self._frames:
+            return self._frames[segment]
+        first = self.nodes[segment][0]
+        R = first.prior.R_world_camera
+        turn = np.eye(3) if R is None else R @ first.T_odom_camera[:3, :3].T
+        return Similarity(1.0, turn, np.zeros(3), np.eye(7))
+
+    def freed(self, node: Node) -> Node:
+        """The node without its sensors' constants."""
+        if node.segment not in self._offsets:
+            return node
+        return replace(node, prior=self._offsets[node.segment].applied(node.prior))
+
+    def rests_on_fixes(self, segment: int) -> bool:
+        """True when positions place the segment."""
+        frame = self._frames.get(segment)
+        return frame is not None and "gnss" in frame.sources
+
+    def is_tied(self, segment: int) -> bool:
+        """True when fixes or a loop tell where the segment lies."""
+        return segment in self._tied or self.rests_on_fixes(segment)
+
+    def tie(self, segment: int, scale: float, R: F64, t: F64) -> None:
+        """Place a segment by a loop, for good."""
+        frame = self._frames.get(segment)
+        covariance = np.eye(7) if frame is None else frame.covariance
+        sources = () if frame is None else frame.sources
+        self._frames[segment] = Similarity(scale, R, t, covariance, sources)
+        self._tied.add(segment)
+
+    def forget(self, segment: int) -> bool:
+        """Count the segment as not placed; True when no fix can place it again."""
+        for known in (self._frames, self._offsets, self._fitted):
+            known.pop(segment, None)
+        self._tied.discard(segment)
+        return all(n.prior.sigma_position_m is None for n in self.nodes[segment])
+
+    def refit(self, segment: int, pose: Callable[[int], F64]) -> bool:
+        """True when the segment's frame was fitted anew, which is due as the segment grows.
+
+        ``pose`` gives the present pose of a key in the graph.
+        """
+        nodes, fitted = self.nodes[segment], self._fitted.get(segment, 0)
+        growth = REFIT_GROWTH if fitted < SETTLED else SETTLED_GROWTH
+        if len(nodes) < max(self._least, int(growth * fitted)) or segment in self._tied:
+            return False
+        self._fitted[segment] = len(nodes)
+        found = alignment.fit(self._anchors(segment))
+        if found is None:
+            return False
+        if "gnss" not in found.sources and nodes[0].key > 0:
+            found = _kept_in_place(found, nodes[0], pose(nodes[0].key))
+        before = self._frames.get(segment)
+        if before is not None and len(nodes) >= SETTLED and not _differ(before, found, nodes):
+            return False  # the graph itself follows such small changes
+        self._frames[segment] = found
+        self._offsets[segment] = offsets(self._anchors(segment), found)
+        return True
+
+    def altitude_offset(self) -> float | None:
+        """Altitude less world z over all placed keyframes; None without any."""
+        apart = [
+            n.prior.altitude_m - frame.pose(n.T_odom_camera)[2, 3]
+            for segment, frame in self._frames.items()
+            for n in self.nodes[segment]
+            if n.prior.altitude_m is not None
+        ]
+        return float(np.median(apart)) if apart else None
+
+    def scales(self, segment: int) -> tuple[Scale | None, Scale | None]:
+        """The segment's scale by fixes alone and by heights alone."""
+        frame = self._frames.get(segment)
+        return (None, None) if frame is None else alignment.scales(self._anchors(segment), frame)
+
+    def _anchors(self, segment: int) -> list[Anchor]:
+        return [Anchor(n.T_odom_camera, n.prior, n.height, n.lean) for n in self.nodes[segment]]
+
+
+def _differ(before: Similarity, found: Similarity, nodes: list[Node]) -> bool:
+    """True when two frames place a segment apart by more than half their sigma."""
+    ends = (nodes[0], nodes[len(nodes) // 2], nodes[-1])
+    shift = [before.pose(n.T_odom_camera) - found.pose(n.T_odom_camera) for n in ends]
+    sigma = float(np.sqrt(np.trace(found.covariance[3:6, 3:6])))
+    return max(float(np.linalg.norm(s[:3, 3])) for s in shift) > 0.5 * sigma
+
+
+def _kept_in_place(found: Similarity, first: Node, T: F64) -> Similarity:
+    """A frame without fixes, moved so that its first keyframe stays at ``T``, and turned to the
+    heading there when no compass tells one."""
+    R = found.R
+    if "attitude" not in found.sources:
+        turn = T[:3, :3] @ (R @ first.T_odom_camera[:3, :3]).T
+        yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+        R = se3.so3_exp(np.array([0.0, 0.0, float(yaw)])) @ R
+    t = T[:3, 3] - found.scale * R @ first.T_odom_camera[:3, 3]
+    return replace(found, R=R, t=t)
