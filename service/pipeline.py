@@ -270,7 +270,8 @@ def _by_telemetry(seq: int, prior: PosePrior) -> Placed | None:
         return None
     tilt, yaw = prior.sigma_tilt_rad, prior.sigma_yaw_rad
     covariance = np.diag(np.square([tilt, tilt, yaw, *sigma]))
-    return Placed(seq, se3.compose(R, position), 1.0, covariance, ("attitude", "gnss"))
+    told = ("attitude", "gnss", "dead reckoning")
+    return Placed(seq, se3.compose(R, position), 1.0, covariance, told)
 
 
 def _within_width(camera: Camera, width_px: int) -> Camera:

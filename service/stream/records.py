@@ -23,7 +23,7 @@ from recon.types import F64, DepthMap, Keyframe, Pose
 MAX_HEADER_BYTES = 262_144
 """A scan header larger than this is refused."""
 
-SOURCES = ("vision", "attitude", "altitude", "gnss", "exif")
+SOURCES = ("vision", "attitude", "altitude", "gnss", "exif", "loop", "dead reckoning")
 """Bit k of a ``sources`` byte on the wire stands for name k."""
 
 
