@@ -23,7 +23,6 @@ from recon.coverage import CoverageGrid, CoverageMap, Footprint, usual_cell_m
 from recon.raster import Grid
 from recon.types import U8, Array, DepthMap
 from service.georeference import LocalFrame
-from service.scan_folder import local_frame, writing
 from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
@@ -148,6 +147,8 @@ class LiveCoverage:
 
     def refresh(self) -> Coverage | None:
         """The layer as the store has it now; None while it holds no surface."""
+        from service.scan_folder import local_frame  # which itself writes this layer
+
         fine = self._store.numbers_of("k1")
         for seq in self._store.seqs():
             repose = self._store.repose(seq)
@@ -194,6 +195,8 @@ def coverage_of(store: ScanStore, cell_m: float | None = None) -> Coverage | Non
 
 def write_coverage_files(folder: Path, store: ScanStore) -> Coverage | None:
     """Write coverage.png and coverage.json beside the scan; the layer, None without surface."""
+    from service.scan_folder import writing
+
     found = coverage_of(store)
     if found is not None:
         with writing(folder / PICTURE) as part:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from recon.trajectory import Placed
-from recon.types import F64
+from recon.types import F64, Keyframe
+from service.graph_figures import graph_figures
 from service.inspection import save_debug
 from service.pipeline import Anchorage, Pipeline, Step
 from service.rig import attitude_of
@@ -36,8 +38,15 @@ class _Told:
 class Recorder:
     """Writes one scan: poses as they come, keyframes as chunks, corrections as re-poses."""
 
-    def __init__(self, store: ScanStore, pipeline: Pipeline, clock_offset_ns: int = 0) -> None:
+    def __init__(
+        self,
+        store: ScanStore,
+        pipeline: Pipeline,
+        clock_offset_ns: int = 0,
+        on_keyframe: Callable[[Keyframe], None] | None = None,
+    ) -> None:
         """``clock_offset_ns`` takes the frames' clock to unix time."""
+        self._on_keyframe = on_keyframe
         self.store, self.pipeline = store, pipeline
         self.points = self.keyframes = self.frames = self.chunk_bytes = 0
         self.states: Counter[str] = Counter()
@@ -68,7 +77,8 @@ class Recorder:
         """Write what is left, correct the trajectory, close the scan; return its summary."""
         self._write_keyframes(self.pipeline.finish())
         self._correct_trajectory()
-        summary = self.summary() | extra
+        summary = self.summary() | {"graph": graph_figures(self.pipeline.dense.trajectory.graph)}
+        summary |= extra
         self.store.finish(summary)
         return summary
 
@@ -142,6 +152,8 @@ class Recorder:
             self.keyframes += 1
             self.points += int((keyframe.fresh & np.isfinite(keyframe.depth.depth_m)).sum())
             self.chunk_bytes += sum(map(len, layers))
+            if self._on_keyframe is not None:
+                self._on_keyframe(keyframe)
         if self.pipeline.dense.debug and step.keyframes:
             save_debug(self.store.path.parent, step.keyframes[-1].seq, self.pipeline.dense.debug)
         moved = [self._repose(p) for p in step.moved if p.seq in self.pipeline.dense.encoded_scale]

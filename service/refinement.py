@@ -31,15 +31,21 @@ from recon.ground_control import (
 )
 from recon.loop_closure import LoopConfig, LoopView
 from recon.types import F64, Keyframe, PosePrior
+from service.carried_frames import grown, moved_frames
 from service.config import CameraConfig, FusionConfig, ScanConfig
 from service.control_points import Candidate, Pictures, candidates_of, place_by_survey, screen
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.refinement_figures import in_words, told
 from service.revisions import KeyframeState, Revisions, copy_store
-from service.rig import Rig, attitude_of
+from service.rig import Rig
 from service.scan_folder import local_frame, write_deliverables
-from service.stream.records import PoseRecord, Repose, ScanHeader
+from service.stream.records import (
+    Repose,
+    ScanHeader,
+    unpack_covariance,
+    unpack_motion,
+)
 from service.stream.store import ScanStore
 from service.survey_file import read_survey
 
@@ -49,6 +55,11 @@ LINK_LOG = "link.tlog"
 """What the daemon keeps of the flight's telemetry beside a scan."""
 
 LOOPS_PER_KEYFRAME = 2
+LOOP_SCALE = 0.005
+"""Sigma of a loop's length, as a share of it, from the scale of the depths that gave it."""
+
+LEAST_SIGMA_SCALE = 0.003
+BY_SURVEY = "control points"
 MOST_REFUSALS = 0.4
 """Of the control points; when more contradict the rest, nobody knows which half is right."""
 
@@ -124,6 +135,7 @@ class _Refinement:
         self.frames = revisions.frames()
         self.keyframe = lru_cache(maxsize=64)(revisions.keyframe)
         self.notes: list[str] = []
+        self.grown = 1.0  # metres of the survey per metre of the flight's own scale
 
     def run(self) -> dict[str, Any]:
         """Adjust and append; the figures."""
@@ -138,11 +150,15 @@ class _Refinement:
         elif self.options.telemetry is not None:
             raise InputError(f"{self.folder} has no georeference; replay it with its telemetry")
         track = self._track()
+        flown = self._flown_loops() if self.options.loops else []
         closures = self._closures(track) if self.options.loops else []
-        track = replace(track, loops=supported(closures, track.poses))
+        kept = [c for c in supported([*flown, *closures], track.poses) if c not in flown]
+        track = replace(track, loops=[*flown, *kept])
         found = self._adjusted(track, candidates)
         seqs = [s.seq for s in self.states]
-        figures = told(seqs, track, found, candidates, len(closures)) | {"notes": self.notes}
+        figures = told(seqs, track, found, candidates, len(flown) + len(closures)) | {
+            "notes": self.notes
+        }
         header = replace(self.header, notes=(*self.header.notes, in_words(figures)))
         frames = moved_frames(self.frames, self.states, found, self.frame)
         changed = self.revisions.append(self._reposes(found), frames, header, figures)
@@ -153,6 +169,7 @@ class _Refinement:
     def _place(self, candidates: Sequence[Candidate]) -> None:
         """Give a scan without a place, and without a sure scale, those of the survey."""
         self.frame, scale, R, t = place_by_survey(candidates)
+        self.grown = scale
         moved = []
         for s in self.states:
             T = s.T_world_camera
@@ -171,7 +188,7 @@ class _Refinement:
                     m,
                     depth_m=None if m.depth_m is None else scale * m.depth_m,
                     sigma_depth_m=scale * m.sigma_depth_m,
-                    T_key_camera=_grown(m.T_key_camera, scale),
+                    T_key_camera=grown(m.T_key_camera, scale),
                 )
                 for m in one.marks
             ]
@@ -183,7 +200,7 @@ class _Refinement:
         f = self.frame
         self.header = replace(
             self.header, origin_lat_deg=f.lat_deg, origin_lon_deg=f.lon_deg,
-            origin_alt_amsl_m=f.alt_amsl_m, epsg=f.epsg, georeference="control points",
+            origin_alt_amsl_m=f.alt_amsl_m, epsg=f.epsg, georeference=BY_SURVEY,
         )  # fmt: skip
 
     def _enough(self, candidates: Sequence[Candidate]) -> None:
@@ -225,6 +242,22 @@ class _Refinement:
         return [PosePrior() if s is None else rig.prior(s, None) for s in states]
 
     # ---- loops -------------------------------------------------------------------------------
+
+    def _flown_loops(self) -> list[Closure]:
+        """The loops that the flight accepted, with whole pictures at hand."""
+        graph = (self.store.summary or {}).get("graph") or {}
+        at = {s.seq: k for k, s in enumerate(self.states)}
+        out = []
+        for a, b, motion, upper in (graph.get("loops") or {}).get("motions", []):
+            T = unpack_motion(motion)
+            if a in at and b in at and T is not None and len(upper) == 21:
+                T = grown(T, self.grown)
+                units = np.array([1.0] * 3 + [self.grown] * 3)
+                spread = unpack_covariance(upper) * np.outer(units, units)
+                # Its length is that of depths, which err together.
+                spread[3:, 3:] += LOOP_SCALE**2 * np.outer(T[:3, 3], T[:3, 3])
+                out.append(Closure(at[a], at[b], T, spread))
+        return out
 
     def _closures(self, track: Track) -> list[Closure]:
         """All pairs of keyframes far apart in time that see the same place, verified."""
@@ -268,7 +301,9 @@ class _Refinement:
         scale = (self.store.summary or {}).get("scale")
         sigma = scale.get("sigma") if isinstance(scale, dict) else None
         usual = BatchConfig()
-        return replace(usual, sigma_scale=max(usual.sigma_scale, float(sigma or 0.0)))
+        if not sigma or self.header.georeference == BY_SURVEY:
+            return usual
+        return replace(usual, sigma_scale=max(float(sigma), LEAST_SIGMA_SCALE))
 
     # ---- adjustment --------------------------------------------------------------------------
 
@@ -314,10 +349,6 @@ def _loop_view(keyframe: Keyframe) -> LoopView:
     )
 
 
-def _grown(T: F64, scale: float) -> F64:
-    return se3.compose(T[:3, :3], scale * T[:3, 3])
-
-
 Section = TypeVar("Section")
 
 
@@ -337,55 +368,3 @@ def _rig(header: ScanHeader, frame: LocalFrame) -> Rig:
     )
     rig.frame = frame
     return rig
-
-
-def moved_frames(
-    frames: Sequence[PoseRecord],
-    states: Sequence[KeyframeState],
-    found: Adjusted,
-    place: LocalFrame | None,
-) -> list[PoseRecord]:
-    """Every frame's pose, carried by the keyframes before and after it."""
-    keys = np.array([s.time_ns for s in states])
-    out: list[PoseRecord] = []
-    before: PoseRecord | None = None
-    distance = 0.0
-    for frame in frames:
-        b = int(np.clip(np.searchsorted(keys, frame.time_unix_ns), 1, len(keys) - 1))
-        one, two = (_carried(frame, states[k], found, k) for k in (b - 1, b))
-        share = (frame.time_unix_ns - keys[b - 1]) / max(int(keys[b] - keys[b - 1]), 1)
-        share = float(np.clip(share, 0.0, 1.0))
-        T = one @ se3.exp(share * se3.log(se3.inverse(one) @ two))
-        near = b - 1 if share < 0.5 else b
-        step = 0.0
-        if before is not None:
-            step = float(np.linalg.norm(T[:3, 3] - before.T_world_camera[:3, 3]))
-        distance += step
-        moved = _record(frame, T, found.covariances[near], place, distance)
-        if before is not None and frame.time_unix_ns > before.time_unix_ns:
-            seconds = (frame.time_unix_ns - before.time_unix_ns) * 1e-9
-            moved = replace(moved, speed_m_s=step / seconds)
-        out.append(moved)
-        before = moved
-    return out
-
-
-def _carried(frame: PoseRecord, state: KeyframeState, found: Adjusted, k: int) -> F64:
-    """A frame's pose as one keyframe carries it along."""
-    relative = se3.inverse(state.T_world_camera) @ frame.T_world_camera
-    return np.asarray(found.poses[k] @ _grown(relative, float(found.scales[k])))
-
-
-def _record(
-    frame: PoseRecord, T: F64, spread: F64, place: LocalFrame | None, distance_m: float
-) -> PoseRecord:
-    roll, pitch, yaw = attitude_of(T)
-    lat = lon = alt = None
-    if place is not None:
-        lat, lon, alt = (float(v) for v in place.to_geodetic(T[None, :3, 3])[0])
-    lever = np.hstack([-se3.hat(T[:3, 3]), np.eye(3)])
-    sigma = float(np.sqrt(np.trace(lever @ spread @ lever.T)))
-    return replace(
-        frame, T_world_camera=T, covariance=spread, lat_deg=lat, lon_deg=lon, alt_amsl_m=alt,
-        roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw, distance_m=distance_m, sigma_m=sigma,
-    )  # fmt: skip

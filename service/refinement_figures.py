@@ -21,7 +21,8 @@ def told(
 ) -> dict[str, Any]:
     """What the adjustment of the keyframes ``seqs`` did, fit for JSON.
 
-    ``verified``: loops that matching confirmed, of which the track has those with support.
+    ``verified``: loops of the flight and loops that matching confirmed; of these the track
+    has those with support.
     """
     shift = np.linalg.norm((found.poses - track.poses)[:, :3, 3], axis=1)
     points = [_told_point(c, found) for c in candidates]
@@ -63,6 +64,7 @@ def _told_point(one: Candidate, found: Adjusted) -> dict[str, Any]:
         "role": "check" if one.point.is_check else "control",
         "marks": len(one.marks),
         "refused": one.why_not or None,
+        "place_m": None if one.surveyed_m is None else [_round(v) for v in one.surveyed_m],
         "before_m": off(one.before_m),
         "after_m": off(None if after is None else after[0]),
     }

@@ -17,10 +17,17 @@ import numpy as np
 
 from recon.raster import Raster, grid_over
 from recon.types import F32, U8, PointCloud
+from service.coverage import Coverage
 from service.inspection import coloured
+from service.report_consistency import consistency, rows_table
+from service.report_map import map_figure
 from service.stream.records import PoseRecord
 
 LARGEST_MAP_PX = 900
+SPEEDS = (
+    "frames", "frames_tracked", "frames_lost", "segments", "pairs", "clouds",
+    "clouds_per_second", "seconds", "backend",
+)  # fmt: skip
 CURVE_PX = (820, 150)
 STYLE = (
     "body{font:15px/1.5 system-ui,sans-serif;color:#20252b;max-width:960px;margin:24px auto;"
@@ -37,6 +44,7 @@ def report_html(
     cloud: PointCloud,
     raster: Raster | None,
     preview_jpg: bytes,
+    coverage: Coverage | None = None,
 ) -> str:
     """The report of a scan whose scan.json holds ``summary``."""
     run = summary["run"]
@@ -45,13 +53,16 @@ def report_html(
         _table(_flown(summary, poses)),
         _picture(preview_jpg, "image/jpeg", "Colour and height from above, with the track."),
         "<h2>Coverage and accuracy</h2>",
-        _table(_accuracy(summary, raster)),
+        map_figure(summary, poses, coverage),
+        _table([*_covered(coverage), *_accuracy(summary, raster)]),
         *_maps(cloud, raster),
+        *consistency(summary, poses),
         "<h2>The flight</h2>",
         *_curves(poses),
         "<h2>Speeds and faults</h2>",
-        _table(_rows(run, ("frames", "frames_tracked", "frames_lost", "segments", "pairs"))),
+        _table(_rows(run, SPEEDS)),
         _counted("Not used for stereo", run.get("refusals")),
+        _counted("Readings left out of the pose graph", (run.get("graph") or {}).get("left_out")),
         _counted("Clouds registered", run.get("registrations")),
         _counted("Milliseconds per call of each stage", run.get("stage_ms")),
         *(f"<p>Note: {escape(str(note))}</p>" for note in summary["notes"]),
@@ -102,6 +113,18 @@ def _accuracy(summary: dict[str, Any], raster: Raster | None) -> list[tuple[str,
     if raster is not None and quality["area_m2"]:
         rows.append(("points per m2", f"{counts['points'] / quality['area_m2']:.1f}"))
     return rows
+
+
+def _covered(coverage: Coverage | None) -> list[tuple[str, str]]:
+    if coverage is None:
+        return []
+    f = coverage.figures()
+    return [
+        ("flown over", f"{f['flown_m2']:.0f} m2"),
+        ("of that without a surface", f"{f['gaps_m2']:.0f} m2"),
+        ("of that weak (skyrelief refly plans a flight over it)", f"{f['weak_m2']:.0f} m2"),
+        ("pictures of a place, median", f"{f['views_median']:.0f}"),
+    ]
 
 
 def _maps(cloud: PointCloud, raster: Raster | None) -> list[str]:
@@ -183,8 +206,7 @@ def _counted(title: str, values: Any) -> str:
 
 
 def _table(rows: Sequence[tuple[str, str]]) -> str:
-    cells = "".join(f"<tr><td>{escape(k)}</td><td>{escape(v)}</td></tr>" for k, v in rows)
-    return f"<table>{cells}</table>" if rows else ""
+    return rows_table((), rows)
 
 
 def _picture(data: bytes, kind: str, caption: str) -> str:

@@ -20,7 +20,13 @@ from service.georeference import LocalFrame
 from service.refinement import RefineOptions, refine, undo
 from service.revisions import REFINED, Revisions
 from service.stream.codec import encode
-from service.stream.records import PoseRecord, Repose, ScanHeader
+from service.stream.records import (
+    PoseRecord,
+    Repose,
+    ScanHeader,
+    pack_covariance,
+    pack_motion,
+)
 from service.stream.store import ScanStore
 from service.survey_file import read_survey
 
@@ -257,6 +263,36 @@ def test_the_same_input_twice_changes_nothing_and_undo_brings_all_back(flight: F
         assert store.refinement is None
     assert json.loads((flight.scan / "scan.json").read_text())["refinement"] is None
     assert refine(flight.scan, RefineOptions(gcp))["changed"]
+
+
+def test_loops_of_the_flight_hold_both_legs_together(tmp_path: Path) -> None:
+    flight = fly(tmp_path)
+    pairs = [(1, 14), (4, 11), (6, 9)]
+    slip = np.array([0.4, 0.5, -0.3])  # the second leg has slipped against the first
+    spread = np.diag([1e-3**2] * 3 + [0.02**2] * 3)
+    motions = [
+        [10 * a, 10 * b, pack_motion(se3.inverse(flight.truth[a]) @ flight.truth[b]),
+         pack_covariance(spread)]
+        for a, b in pairs
+    ]  # fmt: skip
+    with ScanStore.open(flight.scan / "scan.db") as store:
+        for k in range(8, 16):
+            T = se3.compose(np.eye(3), slip) @ wrong(flight.truth[k])
+            store.add_repose(Repose(10 * k, 1, T, 1.0, np.eye(6) * 0.01))
+        store.finish({"graph": {"loops": {"motions": motions}}})
+    figures = refine(flight.scan, RefineOptions())
+    assert figures["loops"]["used"] == 3
+
+    def step() -> F64:
+        with ScanStore.open(flight.scan / "scan.db") as store:
+            one, two = (store.keyframe(10 * k) for k in (2, 13))
+            assert one is not None and two is not None
+            found = se3.inverse(one.depth.T_world_camera) @ two.depth.T_world_camera
+        return np.asarray(found - se3.inverse(flight.truth[2]) @ flight.truth[13])[:3, 3]
+
+    after = float(np.linalg.norm(step()))
+    undo(flight.scan)
+    assert float(np.linalg.norm(step())) > 0.6 and after < 0.35
 
 
 def test_out_leaves_the_scan_alone(flight: Flight, tmp_path: Path) -> None:

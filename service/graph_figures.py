@@ -1,0 +1,51 @@
+"""What the pose graph of a flight says of itself, for the scan's summary."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from recon.pose_graph import PoseGraph
+from service.stream.records import pack_covariance, pack_motion
+
+MOST_LOOPS = 300
+"""Loops that a summary carries with their motions; of more, an even sample."""
+
+
+def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:
+    """Residuals by kind of factor, loops and readings left out, fit for JSON; None when empty.
+
+    ``loops.motions`` are the accepted loops as refinement takes them: two keyframes, seven
+    numbers of the motion and 21 of its covariance.
+    """
+    if len(graph) < 2:
+        return None
+    accepted = graph.metric_loops()
+    step = max(1, -(-len(accepted) // MOST_LOOPS))
+    edges = graph.loops
+    return {
+        "residuals": {
+            kind: {
+                "count": len(rows),
+                "rms": round(float(np.sqrt(np.mean(np.square(rows)))), 4),
+            }
+            for kind, rows in graph.residuals().items()
+            if rows.size
+        },
+        "loops": {
+            "used": sum(edge.accepted for edge in edges),
+            "waiting": sum(not edge.accepted for edge in edges),
+            "pairs": [[edge.a, edge.b, edge.accepted] for edge in edges][-2 * MOST_LOOPS :],
+            "motions": [
+                [
+                    loop.a,
+                    loop.b,
+                    [float(f"{v:.9g}") for v in pack_motion(loop.T_a_b)],
+                    [float(f"{v:.6g}") for v in pack_covariance(loop.covariance)],
+                ]
+                for loop in accepted[::step]
+            ],
+        },
+        "left_out": {str(k): int(v) for k, v in graph.counts.items()},
+    }
