@@ -12,6 +12,7 @@ import typer.core
 import typer.main
 
 from service.errors import SkyreliefError
+from service.journal import log_handler
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("service.commands.demo:demo", "A real flight through both ends, here."),
@@ -81,11 +82,7 @@ def _root(
     verbose: bool = typer.Option(False, "--verbose", "-v", help="Log what every stage does."),
 ) -> None:
     """Terrain and buildings in 3D, in real time, from the camera of a drone."""
-    logging.basicConfig(
-        level=logging.DEBUG if verbose else logging.INFO,
-        format="%(levelname)s %(name)s: %(message)s",
-        stream=sys.stderr,
-    )
+    logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, handlers=[log_handler()])
 
 
 def main() -> None:

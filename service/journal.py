@@ -1,0 +1,88 @@
+"""Log records as journald keeps them: priority, logger and thread as fields of their own.
+
+Speaks the journal's native protocol (systemd, "Native Journal Protocol"): one datagram of
+``NAME=value`` lines, values of several lines with their length before them.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import struct
+import sys
+
+SOCKET = "/run/systemd/journal/socket"
+PRIORITIES = (
+    (logging.CRITICAL, 2),
+    (logging.ERROR, 3),
+    (logging.WARNING, 4),
+    (logging.INFO, 6),
+    (logging.DEBUG, 7),
+)
+MOST_BYTES = 100_000
+
+
+class JournalHandler(logging.Handler):
+    """Sends every record to the journal; what it does not take goes to standard error."""
+
+    def __init__(self, address: str = SOCKET) -> None:
+        super().__init__()
+        self._address = address
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send one record."""
+        try:
+            text = self.format(record)
+            self._socket.sendto(packed(record, text), self._address)
+        except OSError:
+            print(f"{record.levelname} {record.name}: {record.getMessage()}", file=sys.stderr)
+
+    def close(self) -> None:
+        """Let go of the socket."""
+        self._socket.close()
+        super().close()
+
+
+def packed(record: logging.LogRecord, text: str) -> bytes:
+    """The record as a datagram of the journal."""
+    fields = {
+        "MESSAGE": text[:MOST_BYTES],
+        "PRIORITY": str(next((p for level, p in PRIORITIES if record.levelno >= level), 7)),
+        "SYSLOG_IDENTIFIER": "skyrelief",
+        "LOGGER": record.name,
+        "THREAD_NAME": record.threadName or "",
+        "CODE_FILE": record.pathname,
+        "CODE_LINE": str(record.lineno),
+        "CODE_FUNC": record.funcName or "",
+    }
+    return b"".join(_field(name, value) for name, value in fields.items())
+
+
+def _field(name: str, value: str) -> bytes:
+    data = value.encode(errors="replace")
+    if b"\n" in data:
+        return name.encode() + b"\n" + struct.pack("<Q", len(data)) + data + b"\n"
+    return name.encode() + b"=" + data + b"\n"
+
+
+def log_handler() -> logging.Handler:
+    """The journal where it reads our standard error, else standard error itself."""
+    if _journal_reads_us() and os.path.exists(SOCKET):
+        handler: logging.Handler = JournalHandler()
+        handler.setFormatter(logging.Formatter("%(message)s"))
+        return handler
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
+    return handler
+
+
+def _journal_reads_us() -> bool:
+    """True when standard error is the stream that JOURNAL_STREAM names (device:inode)."""
+    device, _, inode = os.environ.get("JOURNAL_STREAM", "").partition(":")
+    try:
+        found = os.fstat(sys.stderr.fileno())
+    except (OSError, ValueError):
+        return False
+    return (str(found.st_dev), str(found.st_ino)) == (device, inode)
