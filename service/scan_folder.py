@@ -24,6 +24,7 @@ import numpy as np
 
 from recon import se3
 from recon.raster import Raster, grid_over, rasterise
+from service.coverage import write_coverage_files
 from service.errors import OutsideError
 from service.fused_cloud import FusedCloud, fused_cloud
 from service.georeference import LocalFrame
@@ -71,8 +72,6 @@ def write_deliverables(
 
     Raises OutsideError when the folder cannot be written.
     """
-    from service.coverage import write_coverage_files
-
     header = store.header
     frame = local_frame(header)
     poses = latest(store.poses())
@@ -93,7 +92,7 @@ def write_deliverables(
     with writing(folder / PREVIEW) as part:
         part.write_bytes(preview)
     with writing(folder / REPORT) as part:
-        page = report_html(summary, poses, fused.cloud, raster, preview)
+        page = report_html(summary, poses, fused.cloud, raster, preview, coverage)
         part.write_text(page, encoding="utf-8")
     with writing(folder / SUMMARY) as part:
         part.write_text(json.dumps(summary, indent=2, sort_keys=True) + "\n", encoding="utf-8")
