@@ -14,11 +14,13 @@ from typing import Any, Protocol
 from mavlink.history import VehicleHistory
 from mavlink.state import VehicleState
 from recon.backends import Backend
-from recon.types import Camera, Frame
+from recon.types import Camera, Frame, Keyframe
 from service.cameras.ahead import ahead
 from service.cameras.source import CameraFrame, CameraSource
 from service.config import Config
 from service.errors import InputError
+from service.frame_tags import FILE as TAGS
+from service.frame_tags import FrameTags
 from service.graph_watch import GraphWatch
 from service.pipeline import Pipeline, Step
 from service.recorder import Recorder
@@ -69,6 +71,7 @@ class ScanInputs:
     latency_ms: float | None = None  # the camera's as an earlier scan found it
     tell: Callable[[str], None] = log.warning  # the operator
     on_step: Callable[[Step, VehicleState | None, int], None] | None = None  # and its exposure
+    on_keyframe: Callable[[Keyframe], None] | None = None
 
 
 def create_store(inputs: ScanInputs) -> ScanStore:
@@ -109,12 +112,15 @@ class Scan:
             live=inputs.source.is_live,
             pages=inputs.folder / PAGES,
         )
-        self.recorder = Recorder(store, self.pipeline, inputs.unix_offset_ns)
+        self.recorder = Recorder(
+            store, self.pipeline, inputs.unix_offset_ns, on_keyframe=inputs.on_keyframe
+        )
         self.check = TelemetryCheck(
             inputs.config.camera, inputs.history, inputs.tell, inputs.latency_ms
         )
         dense = self.pipeline.dense
         self.watch = GraphWatch(dense.trajectory.graph, dense.lock, inputs.tell)
+        self.tags = FrameTags(inputs.folder / TAGS) if inputs.history is not None else None
         self.tagged = self.odd_sized = self.heights = 0
         self._started = time.monotonic()
 
@@ -131,6 +137,8 @@ class Scan:
         exposed_ns = round(exposed_ns / TIME_STEP_NS) * TIME_STEP_NS
         state = inputs.history.state_at(exposed_ns) if inputs.history is not None else None
         self.tagged += state is not None
+        if self.tags is not None:
+            self.tags.write(exposed_ns + inputs.unix_offset_ns, state)
         self.heights += self.pipeline.rig.height_known(state, frame.geotag)
         step = self.pipeline.step(
             Frame(frame.image, exposed_ns, frame.seq, inputs.camera), state, frame.geotag
@@ -169,6 +177,8 @@ class Scan:
         """Write what is left and close the scan in the store; return its figures."""
         elapsed = max(time.monotonic() - self._started, 1e-9)
         self.check.finish()
+        if self.tags is not None:
+            self.tags.close()
         extra = self.check.summary() | {
             "frames_tagged": self.tagged,
             "frames_of_another_size": self.odd_sized,

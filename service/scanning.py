@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mavlink.camera import KeyframeReport
 from mavlink.control import ACCEPTED, Answer, Phase, Result, Work
 from mavlink.status import CRITICAL, WARNING
 from mavlink.vehicle import VehicleLink
@@ -26,12 +25,11 @@ if TYPE_CHECKING:
 
     from mavlink.state import VehicleState
     from recon.backends import Backend
-    from recon.types import Camera
+    from recon.types import Camera, Keyframe
     from service.cameras.source import CameraSource
     from service.frame_gate import FrameGate
     from service.pipeline import Step
     from service.scan import Scan
-    from service.stream.records import PoseRecord
     from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
@@ -65,7 +63,6 @@ class Scanning:
         self._paused = threading.Event()
         self._worker: threading.Thread | None = None
         self._closing: Work | None = None
-        self._reported = 0
         self._retry_at_s: float | None = None
         self._retry_s = FIRST_RETRY_S
         self._latency_ms: float | None = None  # of the camera, as the last scan found it
@@ -250,11 +247,12 @@ class Scanning:
             latency_ms=self._latency_ms,
             tell=lambda text: self.vehicle.statustext(text, WARNING),
             on_step=self._odometry_report(),
+            on_keyframe=self._on_keyframe,
         )
         store = create_store(inputs)
         self.vehicle.record(folder / "link.tlog")
         self.link.take_off(store, self.config, self.vehicle)
-        self.scan, self.gate, self._reported = Scan(inputs, store), gate, 0
+        self.scan, self.gate = Scan(inputs, store), gate
         self.set_level(self.level)
         self.vehicle.statustext(f"Scan {scan_id} started")
         try:
@@ -314,26 +312,21 @@ class Scanning:
     def _on_frame(self, scan: Scan) -> None:
         self._alive()
         self.is_warm = self.is_warm or scan.recorder.keyframes > 1
-        if scan.recorder.keyframes > self._reported and scan.recorder.last is not None:
-            self._reported = scan.recorder.keyframes
+        if scan.recorder.keyframes:
             self._retry_s = FIRST_RETRY_S
-            self.vehicle.report_keyframe(_keyframe_report(scan.recorder.last))
 
+    def _on_keyframe(self, keyframe: Keyframe) -> None:
+        """Tell ground stations of a keyframe, at the pose that it has now."""
+        from service.keyframe_report import keyframe_report
 
-def _keyframe_report(pose: PoseRecord) -> KeyframeReport:
-    """What ground stations are told of a keyframe, from the newest pose."""
-    from recon.frames import rotation_from_rpy
-    from recon.se3 import quaternion_from_rotation
-
-    q = quaternion_from_rotation(rotation_from_rpy(pose.roll_rad, pose.pitch_rad, pose.yaw_rad))
-    return KeyframeReport(
-        unix_us=pose.time_unix_ns // 1000,
-        lat_deg=pose.lat_deg,
-        lon_deg=pose.lon_deg,
-        alt_amsl_m=pose.alt_amsl_m,
-        alt_agl_m=pose.agl_m,
-        q_ned_camera_wxyz=(float(q[0]), float(q[1]), float(q[2]), float(q[3])),
-    )
+        scan = self.scan
+        if scan is not None:
+            frame, inputs = scan.pipeline.rig.frame, scan.inputs
+            state = self.vehicle.history.state_at(keyframe.time_ns)
+            agl_m = None if state is None else state.alt_agl_m
+            time_ns = keyframe.time_ns + inputs.unix_offset_ns
+            T = keyframe.pose.T_world_camera
+            self.vehicle.report_keyframe(keyframe_report(time_ns, T, frame, agl_m))
 
 
 def _zero_ns(source: CameraSource) -> int:

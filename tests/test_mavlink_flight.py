@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import csv
+import json
 import math
 import socket
 import threading
@@ -15,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mavlink.framing import Framer
 from mavlink.logs.tlog import packets
@@ -147,7 +150,8 @@ def test_a_flight_by_mavlink(tmp_path: Path, autopilot: Autopilot) -> None:
     assert {(a.command, a.result) for a in autopilot.of("COMMAND_ACK")} == {(2500, 0), (2000, 0)}
     (folder,) = (path.parent for path in (tmp_path / "scans").glob("*/" + SUMMARY))
     _check_odometry(autopilot.of("ODOMETRY"))
-    assert autopilot.of("CAMERA_IMAGE_CAPTURED")
+    _check_keyframes(autopilot.of("CAMERA_IMAGE_CAPTURED"), folder)
+    _check_tags((folder / "telemetry.csv").read_text().splitlines())
     assert {v.name for v in autopilot.of("NAMED_VALUE_FLOAT")} >= {"SR_SPEED", "SR_DIST", "SR_TURN"}
     counts: Counter[str] = Counter()
     with (folder / "link.tlog").open("rb") as file:
@@ -155,6 +159,31 @@ def test_a_flight_by_mavlink(tmp_path: Path, autopilot: Autopilot) -> None:
     assert counts["skipped_bytes"] == 0
     assert kinds[(1, 1, 30)] > 50 and kinds[(1, 1, 33)] > 50  # what came
     assert kinds[(1, 191, 0)] and kinds[(1, 191, 331)] >= 20 and kinds[(255, 190, 76)] >= 1
+
+
+def _check_keyframes(told: list[Any], folder: Path) -> None:
+    """Every keyframe is told once, at its own place."""
+    assert len(told) == json.loads((folder / SUMMARY).read_text())["counts"]["keyframes"] >= 3
+    assert [m.image_index for m in told] == list(range(len(told)))
+    assert all(m.capture_result == 1 for m in told)
+    lons = [m.lon for m in told]
+    assert lons == sorted(lons) and abs(told[0].lat * 1e-7 - LAT) < 5e-5
+    assert told[0].relative_alt == pytest.approx(AGL_M * 1e3, rel=0.05)
+    down = Rotation.from_quat([*told[0].q[1:], told[0].q[0]]).apply([1.0, 0.0, 0.0])
+    assert down == pytest.approx([0.0, 0.0, 1.0], abs=0.05)  # the optical axis in NED
+
+
+def _check_tags(lines: list[str]) -> None:
+    """Every frame's telemetry has its age and sigma."""
+    rows = list(csv.DictReader(lines))
+    assert len(rows) >= 20
+    tagged = [row for row in rows if "attitude" in row["sources"].split()]
+    assert len(tagged) > 0.9 * len(rows)
+    for row in tagged:
+        assert 0.0 <= float(row["age_attitude_ms"]) <= 500.0
+        assert float(row["sigma_attitude_deg"]) > 0.0 and float(row["sigma_yaw_deg"]) > 0.0
+    times = [float(row["time_unix_s"]) for row in rows]
+    assert times == sorted(times) and abs(times[0] - time.time()) < 300.0
 
 
 def _check_odometry(told: list[Any]) -> None:
