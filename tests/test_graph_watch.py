@@ -1,0 +1,68 @@
+"""What the operator is told of telemetry that contradicts itself."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.pose_graph import PoseGraph
+from recon.types import F64, PosePrior
+from service.graph_watch import GraphWatch
+
+NADIR = np.diag([1.0, -1.0, -1.0])
+COVARIANCE = np.diag([2e-4**2] * 3 + [0.02**2] * 3)
+
+
+def track(count: int = 30) -> list[F64]:
+    """A bent flight at 60 m."""
+    turns = [se3.so3_exp(np.array([0.0, 0.0, 0.05 * i])) for i in range(count)]
+    places = [np.array([6.0 * i, 0.15 * i * i, 60.0]) for i in range(count)]
+    return [se3.compose(R @ NADIR, p) for R, p in zip(turns, places, strict=True)]
+
+
+def prior(T: F64, agl_m: float = 60.0) -> PosePrior:
+    return PosePrior(T[:3, :3], 0.01, 0.05, T[:3, 3].copy(), np.full(3, 0.5), agl_m, 2.0)
+
+
+def told(priors: list[PosePrior]) -> tuple[list[str], GraphWatch]:
+    graph, heard = PoseGraph(), list[str]()
+    watch = GraphWatch(graph, threading.Lock(), heard.append)
+    for i, (T, p) in enumerate(zip(track(len(priors)), priors, strict=True)):
+        graph.add_keyframe(i, i * 10**9, 0, T, COVARIANCE, p, (60.0, 0.0))
+        watch.look()
+    return heard, watch
+
+
+def test_agreeing_sensors_are_no_news() -> None:
+    heard, watch = told([prior(T) for T in track()])
+    assert heard == [] and watch.sentences() == []
+
+
+@pytest.mark.parametrize(("agl_m", "word"), [(75.0, "smaller"), (48.0, "larger")])
+def test_scales_that_disagree_are_told_once(agl_m: float, word: str) -> None:
+    heard, watch = told([prior(T, agl_m) for T in track()])
+    assert len(heard) == 1
+    assert heard[0].startswith("scale: GNSS makes the map 25 % " + word)
+    assert watch.sentences() == heard
+
+
+def test_a_jump_of_the_receiver_is_told() -> None:
+    priors = [prior(T) for T in track(40)]
+    for i in range(20, 28):
+        place = priors[i].position_m
+        assert place is not None
+        priors[i] = replace(priors[i], position_m=place + np.array([30.0, 0.0, 0.0]))
+    heard, watch = told(priors)
+    assert any("does GNSS jump" in text for text in heard)
+    assert any(text.startswith("8 positions") for text in watch.sentences())
+
+
+def test_a_frozen_receiver_is_told() -> None:
+    priors = [prior(T) for T in track(40)]
+    priors[20:] = [replace(p, position_m=priors[19].position_m) for p in priors[20:]]
+    heard, _ = told(priors)
+    assert any("is GNSS frozen" in text for text in heard)
