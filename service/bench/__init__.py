@@ -26,6 +26,7 @@ BENCHMARKS: dict[str, str] = {
     "pose": "service.bench.pose:run",
     "icp": "service.bench.icp:run",
     "map": "service.bench.map:run",
+    "graph": "service.bench.graph:run",
     "pipeline": "service.bench.pipeline:run",
     "memory": "service.bench.memory:run",
     "mavlink": "service.bench.mavlink:run",
