@@ -111,6 +111,33 @@ def test_disparity_equals_the_compiled_backend(backend: Backend, fill: bool) -> 
     np.testing.assert_array_equal(got.px, backend.belief_propagation(left, right, 16, config).px)
 
 
+def test_a_pair_as_in_flight_within_a_quarter_of_a_pixel(backend: Backend) -> None:
+    """Size and labels that do not fill their arrays: 99 % of the valid pixels."""
+    left, right = pair(89, 155, 18)
+    config = BeliefPropagationConfig()
+    want = load_backend("cpu").belief_propagation(left, right, 18, config)
+    got = backend.belief_propagation(left, right, 18, config)
+    valid = np.isfinite(want.px)
+    assert valid.mean() > 0.8
+    assert (np.abs(got.px - want.px)[valid] < 0.25).mean() >= 0.99
+    assert (np.isfinite(got.px) == valid).mean() >= 0.99
+
+
+def test_pairs_of_nearly_one_size_share_what_is_built(backend: Backend) -> None:
+    """A graph or a session for each of a flight's pairs would take longer than the flight."""
+    built: dict[object, object] = next(
+        (v for n, v in vars(backend).items() if n in ("_plans", "_sessions")), {}
+    )
+    rng = np.random.default_rng(0)
+    for height, width, labels in ((60, 100, 17), (57, 97, 20), (64, 127, 24), (58, 110, 18)):
+        image = rng.integers(0, 256, (height, width), np.uint8)
+        guide = rng.integers(0, 256, (round(1.5 * height), round(1.5 * width), 3), np.uint8)
+        found = backend.belief_propagation(image, image, labels, BELIEVE_ALL)
+        assert found.px.shape == (height, width)
+        assert backend.upsample(found, guide, UpsamplingConfig()).px.shape == guide.shape[:2]
+    assert len(built) <= 3  # the guide of the widest has a larger array
+
+
 def test_blank_images_stay_unknown(backend: Backend) -> None:
     blank = np.full((40, 60), 128, np.uint8)
     found = backend.belief_propagation(blank, blank, 8, BeliefPropagationConfig())

@@ -109,19 +109,6 @@ def test_room_around_a_pair_changes_nothing(
         np.testing.assert_allclose(got.confidence, want.confidence, atol=1e-4)
 
 
-def test_few_shapes_serve_many_pairs(device: str) -> None:
-    """Pairs of a flight differ by a few pixels and labels: they must not each build anew."""
-    from recon.backends.torch_backend import TorchBackend
-
-    backend = TorchBackend(device)
-    rng = np.random.default_rng(0)
-    for height, width, labels in ((60, 100, 17), (57, 97, 20), (64, 127, 24), (58, 110, 18)):
-        image = rng.integers(0, 256, (height, width), np.uint8)
-        found = backend.belief_propagation(image, image, labels, BeliefPropagationConfig())
-        assert found.px.shape == (height, width)
-    assert len(backend._plans) == 1
-
-
 @pytest.mark.parametrize("tolerance", [1.0, -1.0])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_belief_on_the_device_equals_the_compiled_one(

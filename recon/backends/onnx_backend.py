@@ -6,9 +6,11 @@ import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import onnxruntime  # type: ignore[import-untyped]
 
-from recon.backends.onnx_dense import stereo_model, upsampling_model
+from recon.backends.onnx_dense import stereo_model, tap_windows, upsampling_model
+from recon.backends.room import place, pyramid_levels, room
 from recon.belief_propagation import BeliefPropagationConfig, believe
 from recon.matching_cost import check_pair
 from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration
@@ -27,6 +29,8 @@ ENGINE_NAME_DIGITS = 16
 
 class OnnxBackend:
     """Builds one model per shape and keeps its session; needs no torch.
+
+    Shapes are few, see :mod:`recon.backends.room`.
 
     TensorRT builds an engine of each model, which takes minutes; ``engines`` is the folder that
     keeps them between starts (None: nothing is kept). ICP is the compiled one: it is not part
@@ -49,31 +53,39 @@ class OnnxBackend:
     ) -> DisparityMap:
         """Labels of the left view, (h, w); Eq. 1."""
         check_pair(left, right, labels)
-        size = (left.shape[0], left.shape[1])
-        key = ("stereo", size, labels, config)
+        h, w = left.shape
+        *size, label_room = room(h, w, labels)
+        levels = pyramid_levels(h, w, config)
+        key = ("stereo", *size, label_room, levels, config)
         if key not in self._sessions:
-            self._open(key, stereo_model(size, labels, config))
-        px, confidence = self._run(key, {"left": left, "right": right})
-        return believe(left, px, confidence, config)
+            self._open(key, stereo_model((size[0], size[1]), label_room, config, levels))
+        given = {name: np.empty(size, np.uint8) for name in ("left", "right")}
+        place(given["left"], left)
+        place(given["right"], right)
+        px, confidence = self._run(key, {**given, "true": np.array([h, w, labels])})
+        return believe(left, px[:h, :w].copy(), confidence[:h, :w].copy(), config)
 
     def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
         """``coarse`` (h, w) at the size of ``guide`` (H, W, 3), values unscaled; Eq. 2."""
         check_guide(coarse, guide)
         if config.method != "bilateral":
             return upsample(coarse, guide, config)
-        shape = (coarse.px.shape[0], coarse.px.shape[1])
-        size = (guide.shape[0], guide.shape[1])
-        key = ("upsample", shape, size, config)
+        (h, w), (H, W) = coarse.px.shape, guide.shape[:2]
+        small, large = room(h, w, 1)[:2], room(H, W, 1)[:2]
+        key = ("upsample", small, large, config)
         if key not in self._sessions:
-            self._open(key, upsampling_model(shape, size, config))
-        taps = guide_at_taps(guide, shape)
+            self._open(key, upsampling_model(small, large, config, fixed=False))
         given: dict[str, Array] = {
-            "px": coarse.px,
-            "confidence": coarse.confidence,
-            "taps": taps,
-            "guide": guide,
+            "px": np.empty(small, np.float32),
+            "confidence": np.empty(small, np.float32),
+            "taps": np.empty((*small, 3), np.uint8),
+            "guide": np.empty((*large, 3), np.uint8),
         }
-        return DisparityMap(*self._run(key, given))
+        arrays: list[Array] = [coarse.px, coarse.confidence, guide_at_taps(guide, (h, w)), guide]
+        for name, array in zip(given, arrays, strict=True):
+            place(given[name], array)
+        px, sure = self._run(key, given | tap_windows((h, w), (H, W), small, large, config))
+        return DisparityMap(px[:H, :W].copy(), sure[:H, :W].copy())
 
     def register(
         self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
@@ -96,7 +108,7 @@ class OnnxBackend:
             first, second = self._sessions[key].run(None, given)
         except Exception as error:  # ONNX Runtime's own exceptions share no base class
             raise RuntimeError(str(error)) from error
-        return first.copy(), second.copy()
+        return first, second
 
 
 def provider_options(

@@ -1,38 +1,75 @@
 """The dense stage as ONNX models of fixed shapes: the same numbers as the compiled backend.
 
-Integers are held exactly in float32, as in :mod:`recon.backends.torch_dense`; tensors are
-(labels, h, w), messages (4, labels, h, w).
+Integers are held exactly in float32, as in :mod:`recon.backends.torch_dense`, and as there a
+model may be larger than the pair that it is fed: its true size is then one more input. Tensors
+are (labels, h, w), messages (4, labels, h, w).
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from onnx import TensorProto
 
 from recon.backends.onnx_graph import Graph, Value
+from recon.backends.room import pyramid_levels
 from recon.belief_propagation import BeliefPropagationConfig
 from recon.disparity_selection import NOISE, RADIUS, SURE_EVIDENCE
 from recon.matching_cost import CENSUS_RADIUS, COST_UNIT
 from recon.message_passing import FULL_WEIGHT
+from recon.types import Array
 from recon.upsampling import MIN_CONFIDENCE, RANGE_FLOOR, UpsamplingConfig, window
 
 FAR = 1.0e6
 
 
-def stereo_model(size: tuple[int, int], labels: int, config: BeliefPropagationConfig) -> bytes:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """Height, width and labels of the pair itself, each (1,) float32."""
+
+    h: Value
+    w: Value
+    labels: Value
+
+    def half(self) -> _Pair:
+        """Of the next coarser level."""
+        h, w = (((n + 1.0) * 0.5).floor() for n in (self.h, self.w))
+        return _Pair(h, w, self.labels)
+
+    def inside(self, size: tuple[int, int]) -> Value:
+        """(h, w) 1 on the pair, else 0."""
+        rows = self.h.above(np.arange(size[0], dtype=np.float32)[:, None]).numbers()
+        return rows * self.w.above(np.arange(size[1], dtype=np.float32)[None, :]).numbers()
+
+    def ours(self, labels: int) -> Value:
+        """(L, 1, 1) True for labels of the pair."""
+        return self.labels.above(np.arange(labels, dtype=np.float32)[:, None, None])
+
+
+def stereo_model(
+    size: tuple[int, int], labels: int, config: BeliefPropagationConfig, levels: int | None = None
+) -> bytes:
     """An ONNX file: ``left`` and ``right`` (h, w) uint8 to ``px`` and ``confidence`` (h, w).
 
-    Iterations and levels are written out. The results are those before
+    Iterations and levels are written out. With ``levels`` of the pyramid given the model serves
+    every pair up to its size: ``true`` (3,) int64 is height, width and labels of the pair,
+    whose last row and column are repeated beyond. The results are those before
     :func:`recon.belief_propagation.believe`.
     """
     graph = Graph()
     left = graph.input("left", TensorProto.UINT8, size).numbers()
     right = graph.input("right", TensorProto.UINT8, size).numbers()
-    cost = _matching_cost(graph, left, right, size, labels, config)
-    belief = _propagate(graph, cost, left, size, labels, config)
-    px, confidence = _select(graph, belief, cost, size, labels, config)
+    if levels is None:
+        pair = _Pair(*(graph.constant(np.array([n], np.float32)) for n in (*size, labels)))
+        levels = pyramid_levels(*size, config)
+    else:
+        true = graph.input("true", TensorProto.INT64, (3,)).numbers()
+        pair = _Pair(*(true.part(0, k, k + 1) for k in range(3)))
+    cost = _matching_cost(graph, left, right, size, labels, pair, config)
+    belief = _propagate(graph, cost, left, size, labels, levels, pair, config)
+    px, confidence = _select(graph, belief, cost, size, labels, pair, config)
     graph.output(px, "px", size)
     graph.output(confidence, "confidence", size)
     return graph.model(f"belief propagation, {labels} labels, {config}")
@@ -53,10 +90,10 @@ def _census(graph: Graph, image: Value, size: tuple[int, int]) -> Value:
 
 
 def _matching_cost(
-    graph: Graph, left: Value, right: Value, size: tuple[int, int], labels: int,
+    graph: Graph, left: Value, right: Value, size: tuple[int, int], labels: int, pair: _Pair,
     config: BeliefPropagationConfig,
 ) -> Value:  # fmt: skip
-    """(L, h, w), as :func:`recon.matching_cost.matching_cost`."""
+    """(L, h, w), 0 beyond the pair, as :func:`recon.matching_cost.matching_cost`."""
     c = config.cost
     h, w = size
     bits_left, bits_right = _census(graph, left, size), _census(graph, right, size)
@@ -76,15 +113,18 @@ def _matching_cost(
         seen = seen + grey.at_most(float(c.difference_truncation)) * float(
             round(c.difference_weight * COST_UNIT)
         )
+        partner = np.arange(first - shift, last - shift, dtype=np.float32)
+        known = graph.op("And", pair.w.above(partner), pair.labels.above(float(label)))
+        seen = graph.where(known, seen, FAR)
         layers.append(seen.pad([0, 0, first], [0, 0, w - last], FAR))
     cost = graph.join(layers, 0)
     best = cost.min(0)
     unseen = graph.where(best.less(FAR), best + float(round(c.unseen * COST_UNIT)), 0.0)
-    return graph.where(cost.less(FAR), cost, unseen)
+    return graph.where(cost.less(FAR), cost, unseen) * pair.inside(size)
 
 
 def _edge_weights(
-    graph: Graph, image: Value, size: tuple[int, int], config: BeliefPropagationConfig
+    image: Value, size: tuple[int, int], pair: _Pair, config: BeliefPropagationConfig
 ) -> list[Value]:
     """Weight of the edge above and to the left, two (h, w)."""
     fall = (1 - config.edge_floor) / config.edge_contrast
@@ -94,28 +134,41 @@ def _edge_weights(
         step = step.pad([1 - axis, axis], [0, 0])
         share = (step * -fall + 1.0).at_least(config.edge_floor)
         weights.append((share * float(FULL_WEIGHT)).round())
-    return weights
+    return _bounded(weights, size, pair)
+
+
+def _bounded(edges: list[Value], size: tuple[int, int], pair: _Pair) -> list[Value]:
+    """The last edges along the border of the pair repeated, and no edge across it."""
+    rows, columns = (np.arange(n, dtype=np.float32) for n in size)
+    last_row = (pair.h - 1.0).at_most(rows).cast(TensorProto.INT64)
+    last_column = (pair.w - 1.0).at_most(columns).cast(TensorProto.INT64)
+    above, before = (e.gather(last_row, 0).gather(last_column, 1) for e in edges)
+    below = pair.h.above(rows[:, None]).numbers()
+    return [above * below, before * pair.w.above(columns).numbers()]
 
 
 def _propagate(
-    graph: Graph, cost: Value, image: Value, size: tuple[int, int], labels: int,
-    config: BeliefPropagationConfig,
+    graph: Graph, cost: Value, image: Value, size: tuple[int, int], labels: int, levels: int,
+    pair: _Pair, config: BeliefPropagationConfig,
 ) -> Value:  # fmt: skip
     """(L, h, w) beliefs (Eq. 1)."""
-    pyramid, sizes = [_cut(cost, config)], [size]
-    edges = [_edge_weights(graph, image, size, config)]
-    while len(pyramid) < config.levels and min(sizes[-1]) >= 8:
+    ours = pair.ours(labels)
+    pyramid, sizes, pairs = [_cut(graph, cost, ours, config)], [size], [pair]
+    edges = [_edge_weights(image, size, pair, config)]
+    while len(pyramid) < levels:
         h, w = sizes[-1]
         lift = graph.op("Unsqueeze", pyramid[-1].pad([0] * 3, [0, h % 2, w % 2]), _AXIS_0)
         pooled = graph.op("AveragePool", lift, kernel_shape=[2, 2], strides=[2, 2]) * 4.0
-        pyramid.append(_cut(graph.op("Squeeze", pooled, _AXIS_0), config))
-        edges.append(_coarser_weights(edges[-1], h, w))
+        pyramid.append(_cut(graph, graph.op("Squeeze", pooled, _AXIS_0), ours, config))
+        pairs.append(pairs[-1].half())
         sizes.append(((h + 1) // 2, (w + 1) // 2))
+        edges.append(_bounded(_coarser_weights(edges[-1], h, w), sizes[-1], pairs[-1]))
     messages = graph.constant(np.zeros((4, labels, *sizes[-1]), np.float32))
     for level in range(len(pyramid) - 1, -1, -1):
         h, w = sizes[level]
         if level < len(pyramid) - 1:
             messages = messages.take(np.arange(h) // 2, 2).take(np.arange(w) // 2, 3)
+            messages = messages * pairs[level].inside((h, w))
         slope = _per_direction(graph, edges[level], (h, w), COST_UNIT)
         cut = _per_direction(graph, edges[level], (h, w), config.truncation)
         colour = np.add.outer(np.arange(h), np.arange(w)) % 2
@@ -129,8 +182,11 @@ def _propagate(
 _AXIS_0 = np.array([0], np.int64)
 
 
-def _cut(data: Value, config: BeliefPropagationConfig) -> Value:
-    return (data - data.min(0)).at_most(4.0 * config.truncation)
+def _cut(graph: Graph, data: Value, ours: Value, config: BeliefPropagationConfig) -> Value:
+    """Above the pixel's best, at most what can win; a label that is not of the pair cannot."""
+    top = 4.0 * config.truncation
+    least = graph.where(ours, data, FAR).min(0)
+    return graph.where(ours, (data - least).at_most(top), top)
 
 
 def _coarser_weights(fine: list[Value], h: int, w: int) -> list[Value]:
@@ -185,14 +241,17 @@ def _outgoing(
 
 
 def _select(
-    graph: Graph, belief: Value, cost: Value, size: tuple[int, int], labels: int,
+    graph: Graph, belief: Value, cost: Value, size: tuple[int, int], labels: int, pair: _Pair,
     config: BeliefPropagationConfig,
 ) -> tuple[Value, Value]:  # fmt: skip
     """Labels and confidence (h, w), as :func:`recon.disparity_selection.select`."""
     w = size[1]
     index = np.arange(labels, dtype=np.float32)[:, None, None]
     partner = np.arange(w, dtype=np.float32)[None, None, :] - index - config.min_disparity
-    seen = ((partner >= 0) & (partner < w)).astype(np.float32)
+    left_of = pair.w.above(np.where(partner >= 0, partner, np.inf).astype(np.float32))
+    seen = graph.op("And", left_of, pair.ours(labels)).numbers()
+    belief = graph.where(pair.ours(labels), belief, FAR)
+    last = pair.labels - 1.0
     winner = graph.op("ArgMin", belief, axis=0, keepdims=1)
     best = winner.numbers()
     beside = (best * -1.0 + graph.constant(index)).abs().less(1.5)
@@ -203,12 +262,12 @@ def _select(
         pads=[RADIUS] * 4, count_include_pad=1,
     )  # fmt: skip
     box = (graph.op("Squeeze", pooled, _AXIS_0) * float(area)).round()
-    mean = (box * seen).sum(0) / np.maximum(seen.sum(axis=0, keepdims=True), 1)
+    mean = (box * seen).sum(0) / seen.sum(0).at_least(1.0)
     here, a, b = (
         graph.op(
             "GatherElements",
             box,
-            (best + float(step)).at_least(0.0).at_most(labels - 1.0).cast(TensorProto.INT64),
+            (best + float(step)).at_least(0.0).at_most(last).cast(TensorProto.INT64),
             axis=0,
         )
         for step in (0, -1, 1)
@@ -216,7 +275,7 @@ def _select(
     a, b = a - here, b - here
     steep = a.at_least(b)
     offset = ((a - b) / (steep.at_least(1.0) * 2.0)).at_least(-0.5).at_most(0.5)
-    edge = graph.op("Or", best.less(0.5), best.above(labels - 1.5))
+    edge = graph.op("Or", best.less(0.5), best.above(last - 0.5))
     px = best + graph.where(graph.op("Or", edge, steep.less(0.5)), 0.0, offset)
     evidence = (mean - here) / (mean + area * NOISE)
     margin = (second - belief.min(0)) / (2.0 * config.truncation)
@@ -227,7 +286,8 @@ def _select(
     sure = (evidence.at_least(0.01) / SURE_EVIDENCE).at_most(1.0)
     column = np.arange(w, dtype=np.float32)[None, None, :] - config.min_disparity
     there = best * -1.0 + column
-    outside = graph.op("Or", there.less(-0.5), there.above(w - 0.5))
+    outside = graph.op("Or", there.less(-0.5), there.above(pair.w - 0.5))
+    outside = graph.op("Or", outside, pair.inside(size).less(0.5))
     believed = graph.op("And", believed, graph.op("Not", outside))
     confidence = graph.where(believed, margin.at_most(1.0) * sure, 0.0)
     px = graph.where(outside, math.nan, px)
@@ -235,18 +295,25 @@ def _select(
 
 
 def upsampling_model(
-    coarse: tuple[int, int], fine: tuple[int, int], config: UpsamplingConfig
+    coarse: tuple[int, int], fine: tuple[int, int], config: UpsamplingConfig, fixed: bool = True
 ) -> bytes:
     """An ONNX file of Eq. 2 with every tap.
 
     Inputs ``px`` and ``confidence`` (h, w) float32, ``taps`` (h, w, 3) and ``guide`` (H, W, 3)
-    uint8; results ``fine_px`` and ``fine_confidence`` (H, W).
+    uint8; results ``fine_px`` and ``fine_confidence`` (H, W). Unless ``fixed`` the taps of each
+    row and column are inputs as well, see :func:`tap_windows`, and pictures may be smaller.
     """
     graph = Graph()
     px = graph.input("px", TensorProto.FLOAT, coarse)
     confidence = graph.input("confidence", TensorProto.FLOAT, coarse)
     taps = graph.input("taps", TensorProto.UINT8, (*coarse, 3)).numbers()
     guide = graph.input("guide", TensorProto.UINT8, (*fine, 3)).numbers()
+    windows = {
+        name: graph.constant(array)
+        if fixed
+        else graph.input(name, _KINDS[array.dtype.kind], array.shape)
+        for name, array in tap_windows(coarse, fine, coarse, fine, config).items()
+    }
     unknown = graph.op("IsNaN", px)
     trust = graph.where(unknown, 0.0, confidence.at_least(MIN_CONFIDENCE))
     value = graph.where(unknown, 0.0, px) * trust
@@ -256,20 +323,15 @@ def upsampling_model(
     image = graph.op("Transpose", guide, perm=[2, 0, 1])
     everything = graph.constant(np.zeros((1, *fine), np.float32))
     sums = graph.constant(np.zeros((3, *fine), np.float32))
-    (first_y, log_y), (first_x, log_x) = (
-        window(n, m, config) for n, m in zip(coarse, fine, strict=True)
-    )
     for j in range(config.diameter_px):
-        rows = layers.take(np.clip(first_y + j, 0, coarse[0] - 1), 1)
+        rows = layers.gather(_row(graph, windows["rows"], j), 1)
+        near_y = graph.op("Unsqueeze", windows["near_rows"].part(0, j, j + 1), np.array([2]))
         for i in range(config.diameter_px):
-            tap = rows.take(np.clip(first_x + i, 0, coarse[1] - 1), 2)
+            tap = rows.gather(_row(graph, windows["columns"], i), 2)
             step = image - tap.part(0, 0, 3)
             tonal = (step * step).sum(0) * (-0.5 / config.range_sigma**2)
             alike = graph.op("Exp", tonal.at_least(RANGE_FLOOR * math.log(2)))
-            inside_y = (first_y + j >= 0) & (first_y + j < coarse[0])
-            inside_x = (first_x + i >= 0) & (first_x + i < coarse[1])
-            near_y = (np.exp2(log_y[:, j]) * inside_y).astype(np.float32)[None, :, None]
-            near_x = (np.exp2(log_x[:, i]) * inside_x).astype(np.float32)[None, None, :]
+            near_x = graph.op("Unsqueeze", windows["near_columns"].part(0, i, i + 1), np.array([1]))
             weight = alike * near_y * near_x
             everything = everything + weight
             sums = sums + weight * tap.part(0, 3, 6)
@@ -279,3 +341,33 @@ def upsampling_model(
     graph.output(graph.op("Squeeze", fine_px, _AXIS_0), "fine_px", fine)
     graph.output(graph.op("Squeeze", sure, _AXIS_0), "fine_confidence", fine)
     return graph.model(f"joint bilateral upsampling, {config}")
+
+
+_KINDS = {"i": TensorProto.INT64, "f": TensorProto.FLOAT}
+
+
+def _row(graph: Graph, table: Value, k: int) -> Value:
+    """Row ``k`` of a table, (N,)."""
+    return graph.op("Squeeze", table.part(0, k, k + 1), _AXIS_0)
+
+
+def tap_windows(
+    coarse: tuple[int, int],
+    fine: tuple[int, int],
+    coarse_room: tuple[int, int],
+    fine_room: tuple[int, int],
+    config: UpsamplingConfig,
+) -> dict[str, Array]:
+    """Taps of each fine row and column: ``rows`` (D, H) int64, ``near_rows`` (D, H) float32,
+    and the same of columns; weights are zero outside and beyond ``fine`` in its room.
+    """
+    tables: dict[str, Array] = {}
+    for name, axis in (("rows", 0), ("columns", 1)):
+        n = coarse[axis]
+        first, log = window(n, fine[axis], config)
+        index = first[:, None] + np.arange(config.diameter_px)
+        near = np.where((index >= 0) & (index < n), np.exp2(log), 0)
+        beyond = ((0, 0), (0, fine_room[axis] - fine[axis]))
+        tables[name] = np.pad(np.clip(index, 0, n - 1).T, beyond).astype(np.int64)
+        tables[f"near_{name}"] = np.pad(near.T, beyond).astype(np.float32)
+    return tables

@@ -89,6 +89,10 @@ class Value:
         """The entries of a constant ``index`` along an axis."""
         return self.graph.op("Gather", self, np.asarray(index, np.int64), axis=axis)
 
+    def gather(self, index: Value, axis: int) -> Value:
+        """The entries of an int64 ``index`` (N,) along an axis."""
+        return self.graph.op("Gather", self, index, axis=axis)
+
     def pad(self, before: list[int], after: list[int], value: float | None = 0.0) -> Value:
         """Wider at each axis: by a constant, or by the border when ``value`` is None."""
         widths = np.array([*before, *after], np.int64)

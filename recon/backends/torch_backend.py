@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.backends.torch_dense import DenseStereo, pyramid_levels, room
+from recon.backends.room import pyramid_levels, room
+from recon.backends.torch_dense import DenseStereo
 from recon.backends.torch_plan import Part, Plan, part, read
 from recon.backends.torch_upsampling import JointBilateral
 from recon.belief_propagation import BeliefPropagationConfig, believe

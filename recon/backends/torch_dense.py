@@ -2,10 +2,10 @@
 
 Written in plain operations on fixed shapes, so that it runs on any device and is captured as
 one CUDA graph. The pairs of a flight differ by a few pixels and labels from each other: arrays
-are a little larger than the pair (see :func:`room`), and its true height, width and number of
-labels come as a tensor. What lies beyond them says nothing, so the results are those of the
-pair alone, to the last bit. All integers of the compiled backend are held exactly, in float32
-(they stay below 2**24) or in int16 (half the bytes). Axes are (labels, h, w).
+are a little larger than the pair (see :mod:`recon.backends.room`), and its true height, width
+and number of labels come as a tensor. What lies beyond them says nothing, so the results are
+those of the pair alone, to the last bit. All integers of the compiled backend are held exactly,
+in float32 (they stay below 2**24) or in int16 (half the bytes). Axes are (labels, h, w).
 """
 
 from __future__ import annotations
@@ -27,22 +27,6 @@ BEYOND = 28000
 
 MAX_SHORT_TRUNCATION = 1024
 """The largest truncation for which no sum of four costs leaves 16 bits."""
-
-ROOM_PX, ROOM_LABELS = 32, 8
-
-
-def room(height: int, width: int, labels: int) -> tuple[int, int, int]:
-    """Height, width and labels of arrays that hold such a pair, so that few shapes occur."""
-    h, w = (-(-n // ROOM_PX) * ROOM_PX for n in (height, width))
-    return h, w, -(-labels // ROOM_LABELS) * ROOM_LABELS
-
-
-def pyramid_levels(height: int, width: int, config: BeliefPropagationConfig) -> int:
-    """How many levels belief propagation takes on a pair of this size."""
-    levels, least = 1, min(height, width)
-    while levels < config.levels and least >= 8:
-        levels, least = levels + 1, (least + 1) // 2
-    return levels
 
 
 class DenseStereo(torch.nn.Module):

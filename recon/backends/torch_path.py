@@ -14,8 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.backends.room import pyramid_levels, room
 from recon.backends.torch_believe import believe, drop_unseen
-from recon.backends.torch_dense import DenseStereo, pyramid_levels, room
+from recon.backends.torch_dense import DenseStereo
 from recon.backends.torch_depth import fuse, reproject
 from recon.backends.torch_plan import Plan, part, read
 from recon.backends.torch_upsampling import JointBilateral, averaged

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.backends.room import place
 from recon.types import Array
 
 log = logging.getLogger(__name__)
@@ -58,7 +59,7 @@ class Plan:
             self._staging[slot] = host, [view.numpy() for view in self._views(host)]
         host, views = self._staging[slot]
         for view, array in zip(views, arrays, strict=True):
-            _place(view, array)
+            place(view, array)
         self.send(slot)
 
     def send(self, slot: int = 0) -> None:
@@ -110,13 +111,3 @@ def read(tensors: Sequence[Tensor]) -> list[Array]:
     """Float32 results of one shape as arrays of the host: one copy, one wait."""
     together = torch.stack(list(tensors)).cpu().numpy()
     return [np.array(layer) for layer in together]
-
-
-def _place(view: Array, array: Array) -> None:
-    if view.shape == array.shape:
-        view[...] = array
-        return
-    h, w = array.shape[:2]
-    view[:h, :w] = array
-    view[:h, w:] = view[:h, w - 1 : w]
-    view[h:] = view[h - 1 : h]
