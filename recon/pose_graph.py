@@ -17,6 +17,7 @@ import numpy as np
 
 from recon import graph_factors, se3
 from recon.alignment import Scale, Similarity
+from recon.dead_reckoning import dead_reckoned
 from recon.graph_factors import pose3
 from recon.graph_readings import BLOCK, Readings
 from recon.graph_records import Loop, Node, PoseGraphConfig
@@ -105,9 +106,7 @@ class PoseGraph:
             self._smoother.update()
         return self.pose(seq)
 
-    def add_loop(
-        self, a: int, b: int, T_a_b: F64, covariance: F64, growth: float = 1.0
-    ) -> bool:  # fmt: skip
+    def add_loop(self, a: int, b: int, T_a_b: F64, covariance: F64, growth: float = 1.0) -> bool:
         """True when the loop bent the graph; False while it waits for another that agrees.
 
         ``T_a_b`` (4, 4) in metres between the cameras of keyframes ``a`` and ``b``, with a
@@ -380,26 +379,19 @@ class PoseGraph:
         if frame is not None:  # already placed, by telemetry or by a loop
             T = frame.pose(node.T_odom_camera)
         else:
-            T = self._dead_reckoned(node, last, T_last, seconds)
+            T = dead_reckoned(last, node, T_last, self._velocity(last, T_last))
         sigma_r = self.config.sigma_link_rad if node.prior.sigma_yaw_rad < 1.0 else 1.5
         sigma = np.array([sigma_r] * 3 + [self.config.sigma_link_m * seconds + 5.0] * 3)
         self._sources[node.key].add("dead reckoning")
         return se3.inverse(T_last) @ T, np.diag(sigma**2)
 
-    def _dead_reckoned(self, node: Node, last: Node, T_last: F64, seconds: float) -> F64:
-        """(4, 4) where a new segment's first keyframe should be."""
-        T: F64 = T_last.copy()
-        a, b = last.prior, node.prior
-        if b.R_world_camera is not None and b.sigma_yaw_rad < 1.0:
-            T[:3, :3] = b.R_world_camera
-        if a.position_m is not None and b.position_m is not None:
-            T[:3, 3] = T_last[:3, 3] + b.position_m - a.position_m
-            return T
-        before = [n for n in self._segments.nodes[last.segment] if n.key <= last.key][-2:]
-        if len(before) == 2 and before[1].time_ns > before[0].time_ns:
-            step = T_last[:3, 3] - self._smoother.pose(before[0].key)[:3, 3]
-            T[:3, 3] += step * seconds / ((before[1].time_ns - before[0].time_ns) * 1e-9)
-        return T
+    def _velocity(self, last: Node, T_last: F64) -> F64 | None:
+        """(3,) m/s between a segment's keyframe and the one before it; None at its start."""
+        before = [n for n in self._segments.nodes[last.segment] if n.key == last.key - 1]
+        if not before or last.time_ns <= before[0].time_ns:
+            return None
+        step = T_last[:3, 3] - self._smoother.pose(before[0].key)[:3, 3]
+        return np.asarray(step / ((last.time_ns - before[0].time_ns) * 1e-9))
 
     def _fresh(self, prior: PosePrior) -> PosePrior:
         """The prior without its position when the receiver repeats its last one."""

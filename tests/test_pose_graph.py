@@ -320,6 +320,22 @@ def test_a_stretch_without_vision_is_bridged_and_said() -> None:
         assert np.linalg.norm(poses[i][:3, 3] - f.truth[i][:3, 3]) < 1.2
 
 
+def test_without_fixes_a_gap_is_bridged_at_the_last_velocity() -> None:
+    f = flight(40, scale=1.0, turn_every=100)
+    graph = PoseGraph()
+    for i in range(20):
+        graph.add_keyframe(i, i * 10**9, 0, f.odom[i], f.covariance, blind(f.priors[i], True))
+    pose = graph.add_keyframe(
+        24, 24 * 10**9, 1, f.odom[24], f.covariance, blind(f.priors[24], True)
+    )
+    moved = pose.T_world_camera[:3, 3] - graph.pose(19).T_world_camera[:3, 3]
+    true = f.truth[24][:3, 3] - f.truth[19][:3, 3]
+    turn = graph.pose(19).T_world_camera[:3, :3] @ f.truth[19][:3, :3].T
+    assert "dead reckoning" in pose.sources
+    assert np.linalg.norm(moved - turn @ true) < 0.35 * np.linalg.norm(true)
+    assert np.sqrt(np.trace(pose.covariance[3:, 3:])) > 5.0
+
+
 def circle(drift_sigma: float = 0.01) -> Flight:
     """A closed square flown one and a half times, without fixes."""
     f = flight(61, scale=1.0, drift=drift_sigma, turn_every=10, seed=3)
