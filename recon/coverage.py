@@ -275,8 +275,13 @@ class CoverageMap:
 
     @staticmethod
     def _tiles_of(cells: Array) -> set[Tile]:
-        keys = np.unique(cells // TILE, axis=0)
-        return {(int(i), int(j)) for i, j in keys}
+        tile = cells // TILE
+        low, high = tile.min(axis=0), tile.max(axis=0)
+        if np.prod(high - low + 1) > 1 << 20:  # a stray point far away
+            return {(int(i), int(j)) for i, j in np.unique(tile, axis=0)}
+        rows = int(high[1] - low[1]) + 1
+        there = np.flatnonzero(np.bincount((tile[:, 0] - low[0]) * rows + tile[:, 1] - low[1]))
+        return {(int(low[0]) + int(k) // rows, int(low[1]) + int(k) % rows) for k in there}
 
     def _add_surface(self, seq: int, depth: DepthMap, only: set[Tile] | None) -> set[Tile]:
         """Merge a keyframe's points into its tiles (``only`` these); the tiles touched."""
