@@ -52,6 +52,7 @@ def examine(config: Config, listen_s: float) -> Iterator[Finding]:
         lambda: _camera(config),
         lambda: _mavlink(config, listen_s),
         lambda: _datalink(config),
+        lambda: _to_fly(config),
     )
     for check in checks:
         yield from check()
@@ -88,6 +89,7 @@ def _machine(config: Config) -> Iterator[Finding]:
 
     m = read_machine(Path(config.scan.folder))
     yield Finding("machine", GOOD, f"{m.model}, {os.cpu_count()} cores")
+    yield from _board(config, m.model)
     if m.memory_free_mib is not None:
         short = m.memory_free_mib < NEEDED_MIB["memory"]
         text = f"{m.memory_free_mib:.0f} MiB free"
@@ -98,6 +100,33 @@ def _machine(config: Config) -> Iterator[Finding]:
         yield Finding("heat", NOTE if hot else GOOD, text)
     if m.throttled:
         yield Finding("heat", NOTE, "throttled right now, by heat or a weak supply")
+
+
+def _board(config: Config, model: str) -> Iterator[Finding]:
+    from service.boards import board_of, other_than_profile, profile_path
+
+    name = board_of(model)
+    path = profile_path(name)
+    if path is None:
+        yield Finding("board", NOTE, f"no settings are delivered for {model}: the defaults hold")
+        return
+    others = other_than_profile(config, path)
+    if others:
+        yield Finding("board", NOTE, f"other than {path}: {'; '.join(others)}")
+    else:
+        yield Finding("board", GOOD, f"the settings of {name} are in force")
+
+
+def _to_fly(config: Config) -> Iterator[Finding]:
+    """What the service does not start without, or a flight is poor without."""
+    needed = [n for n in ("source", "model") if not getattr(config.camera, n)]
+    if needed:
+        names = " and ".join(f"camera.{n}" for n in needed)
+        yield Finding("to fly", BAD, f"set {names}; the service does not start without")
+    elif not config.mavlink.links:
+        yield Finding("to fly", NOTE, "set mavlink.links: without it no commands, scale or place")
+    else:
+        yield Finding("to fly", GOOD, "all that is needed is set")
 
 
 def _clock() -> Iterator[Finding]:

@@ -121,3 +121,39 @@ def test_command_line(tmp_path: Path) -> None:
     report = json.loads(done.stdout.splitlines()[-1])
     assert report["ok"] is False
     assert "not ready to fly: camera" in done.stderr.splitlines()[-1]
+
+
+def test_what_is_missing_to_fly_is_told(tmp_path: Path) -> None:
+    given = [f"scan.folder={tmp_path}", f"camera.source={DEMO / 'frames'}"]
+    assert findings(given[0])["to fly"] == (
+        BAD,
+        "set camera.source and camera.model; the service does not start without",
+    )
+    assert findings(*given)["to fly"][1].startswith("set camera.model;")
+    assert findings(*given, f"camera.model={DEMO / 'camera.yaml'}")["to fly"][0] == NOTE
+
+
+def test_the_boards_settings_are_compared() -> None:
+    from service.boards import BOARDS, board_of, other_than_profile, profile_path
+
+    assert board_of("NVIDIA Jetson Orin Nano Developer Kit") == "orin-nano"
+    assert board_of("NVIDIA Jetson AGX Orin Developer Kit") == "orin-agx"
+    assert board_of("Raspberry Pi 5 Model B Rev 1.0") == "raspberry-pi-5"
+    for name in (*BOARDS, "x86-bench"):
+        path = profile_path(name)
+        assert path is not None
+        assert other_than_profile(load_config(path), path) == []
+    path = profile_path("raspberry-pi-5")
+    assert path is not None
+    changed = load_config(path, ["compute.threads=1"])
+    assert other_than_profile(changed, path) == ["compute.threads = 1, not 3"]
+    told = findings("compute.threads=1")["board"]
+    assert told[0] == NOTE
+
+
+def test_threads_and_kernels_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.diagnosis.kernels_may_overlap", lambda: False)
+    monkeypatch.setattr("service.diagnosis.is_warm", lambda: True)
+    found = findings()
+    assert found["threads"] == (BAD, "no OpenMP: half as fast, one core idle; apt install libgomp1")
+    assert found["kernels"][0] == GOOD
