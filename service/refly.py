@@ -138,7 +138,9 @@ def _usual_heading(ways: F64) -> float:
 def weak_patches(weak: Bool, grid: Grid, swath: Swath) -> list[F64]:
     """(N, 2) cell centres of each group of weak patches that one set of lines can serve."""
     cell = grid.cell_m
-    tidy = cv2.morphologyEx(weak.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    tidy = weak.astype(np.uint8)
+    for step in (cv2.MORPH_CLOSE, cv2.MORPH_OPEN):  # heal single cells, then drop thin strips
+        tidy = np.asarray(cv2.morphologyEx(tidy, step, np.ones((3, 3), np.uint8)), np.uint8)
     count, label, stats, _ = cv2.connectedComponentsWithStats(tidy, connectivity=8)
     least = max(4.0, SMALLEST_SHARE * swath.across_m * swath.along_m / cell**2)
     large = np.array([n > 0 and stats[n, cv2.CC_STAT_AREA] >= least for n in range(count)])

@@ -250,14 +250,14 @@ def test_the_command_writes_both_kinds_and_refuses_in_one_line(
     with house.flown(tmp_path / "scan"):
         pass
     run = CliRunner().invoke
-    answer = run(app, ["refly", str(tmp_path / "scan"), "--views", "6", "--json"])
+    answer = run(app, ["refly", str(tmp_path / "scan"), "--sigma-m", "0.01", "--json"])
     assert answer.exit_code == 0, answer.output
     figures = json.loads(answer.stdout.splitlines()[-1])
     assert figures["lines"] >= 1
     plan = json.loads((tmp_path / "scan" / "refly.plan").read_text())
     assert plan["fileType"] == "Plan" and len(plan["mission"]["items"]) > 5
     out = tmp_path / "again.waypoints"
-    assert run(app, ["refly", str(tmp_path / "scan"), "--views", "6", "--out", str(out)])
+    assert run(app, ["refly", str(tmp_path / "scan"), "--sigma-m", "0.01", "--out", str(out)])
     assert out.read_text().startswith("QGC WPL 110\n")
     for arguments, match in (
         (["--out", str(tmp_path / "x.kml")], "name it .plan"),
@@ -267,5 +267,5 @@ def test_the_command_writes_both_kinds_and_refuses_in_one_line(
         assert isinstance(refused.exception, InputError) and match in str(refused.exception)
     with house.flown(tmp_path / "local", georeferenced=False):
         pass
-    refused = run(app, ["refly", str(tmp_path / "local"), "--views", "6"])
+    refused = run(app, ["refly", str(tmp_path / "local"), "--sigma-m", "0.01"])
     assert isinstance(refused.exception, InputError) and "georeference" in str(refused.exception)
