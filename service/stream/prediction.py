@@ -143,6 +143,7 @@ def _residuals(c: F64, k: F64, size: tuple[int, int], weights: I64) -> U16:
     f = weights.astype(np.float64)
     base = np.zeros(w)
     guess = np.zeros(w)
+    zigzag = np.zeros(w, np.uint16)
     out = np.empty(h * w, np.uint16)
     last = 0.0
     at = 0
@@ -159,9 +160,11 @@ def _residuals(c: F64, k: F64, size: tuple[int, int], weights: I64) -> U16:
                 last = code[u]
         _guess_row(c, k, start, row, base, f, guess)
         for u in range(w):
+            r = ((np.int32(code[u] - guess[u]) + 32768) & 0xFFFF) - 32768
+            zigzag[u] = (r << 1) ^ (r >> 31)
+        for u in range(w):
             if known[u]:
-                r = ((np.int64(code[u] - guess[u]) + 32768) & 0xFFFF) - 32768
-                out[at] = (r << 1) ^ (r >> 63)
+                out[at] = zigzag[u]
                 at += 1
     return out[:at]
 
@@ -211,7 +214,7 @@ def _padded(plane: npt.NDArray[np.generic], kind: type[np.generic]) -> npt.NDArr
 def fit(c: F64, k: F64, size: tuple[int, int]) -> I64:
     """(9,) weights, 4096 is one, that predict the padded codes best; least squares about a
     plane."""
-    step = max(1, size[0] * size[1] // FIT_PIXELS)
+    step = max(1, -(-size[0] * size[1] // FIT_PIXELS))
     A, b = _normal_equations(c, k, size, step)
     weights = _solve(A + _PRIOR * np.eye(WEIGHTS), b + _PRIOR * _PLANE)
     return np.asarray(np.rint(np.clip(weights, -7.9, 7.9) * (1 << SHIFT)), np.int64)
