@@ -20,6 +20,7 @@ NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 BOOT = 1  # MAV_STATE
 HEARTBEAT, CRC_EXTRA, VERSION = 0, 50, 3
 PERIOD_S = 1.0
+LONGEST_S = 120.0  # who has not taken over by then is dead, and says so by silence
 
 
 def heartbeat_packet(
@@ -67,7 +68,8 @@ class FirstBeats:
         return self.links
 
     def _run(self) -> None:
-        while not self._stop.is_set():
+        end_s = self.next_s + LONGEST_S
+        while not self._stop.is_set() and time.monotonic() < end_s:
             for component in TYPES:
                 packet = heartbeat_packet(self.sequence, self.system, component, self.token)
                 for link in self.links:

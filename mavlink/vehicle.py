@@ -8,7 +8,6 @@ protocol's thread.
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import os
 import secrets
@@ -32,6 +31,7 @@ from mavlink.history import HistoryConfig
 from mavlink.inbox import Inbox, Job
 from mavlink.link import Link, parse_link
 from mavlink.live_history import LiveHistory
+from mavlink.memory import Memory
 from mavlink.messages import Outgoing
 from mavlink.odometry import Odometry, odometry_message
 from mavlink.packer import Packer
@@ -109,7 +109,7 @@ class VehicleLink:
         now_ns = time.monotonic_ns()
         self.history = LiveHistory(config.history)
         self.recorder = Recorder()
-        self._memory = _Memory(config.state_dir)
+        self._memory = Memory(config.state_dir)
         self._signing = self._make_signing()
         self.presence = Presence(
             config.presence,
@@ -368,38 +368,3 @@ def new_token() -> int:
 
 def _nobody(data: bytes, now_ns: int) -> None:
     """Takes what comes before anyone listens."""
-
-
-class _Memory:
-    """Parameters and signing time, kept in a file over restarts."""
-
-    def __init__(self, folder: Path | None) -> None:
-        self._path = None if folder is None else folder / "mavlink.json"
-        self._revision = 0
-        self.parameters: dict[str, float] = {}
-        self.signing_timestamp = 0
-        if self._path is None or not self._path.is_file():
-            return
-        try:
-            kept = json.loads(self._path.read_text())
-            self.parameters = {str(k): float(v) for k, v in kept["parameters"].items()}
-            self.signing_timestamp = int(kept["signing_timestamp"])
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            log.warning("%s is not used: %s", self._path, error)
-
-    def is_stale(self, revision: int) -> bool:
-        """True when parameters have changed since the last save."""
-        return self._path is not None and revision != self._revision
-
-    def save(self, values: dict[str, float], revision: int, timestamp: int) -> None:
-        """Keep them; a full disk is logged, not raised."""
-        self._revision = revision
-        if self._path is None:
-            return
-        fresh = self._path.with_suffix(".new")
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            fresh.write_text(json.dumps({"parameters": values, "signing_timestamp": timestamp}))
-            os.replace(fresh, self._path)
-        except OSError as error:
-            log.error("parameters could not be kept: %s", error)
