@@ -91,6 +91,8 @@ def undo(folder: Path) -> dict[str, Any]:
     """Bring back the unrefined state, as a further revision, and write the deliverables again."""
     target = _open_target(folder, None)
     with ScanStore.open(target / "scan.db") as store, Revisions(store) as revisions:
+        if not revisions.refined:
+            raise InputError(f"{folder} was never refined; there is nothing to undo")
         states = [s for seq in store.seqs() if (s := revisions.keyframe_state(seq)) is not None]
         back = [Repose(s.seq, 0, s.T_world_camera, s.scale, s.covariance) for s in states]
         revisions.append(back, revisions.frames(), revisions.header, {"undone": True})

@@ -68,6 +68,11 @@ class Revisions:
         self.close()
 
     @property
+    def refined(self) -> bool:
+        """True once a refinement was written, also when it was undone."""
+        return bool(self._note)
+
+    @property
     def header(self) -> ScanHeader:
         """The scan's header before any refinement."""
         text = self._db.get(META_HEADER)

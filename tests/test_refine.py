@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import common as mavlink  # type: ignore[import-untyped]
 from typer.testing import CliRunner
 
 from recon import se3
@@ -380,6 +382,50 @@ def test_when_half_contradict_the_rest_nothing_is_changed(flight: Flight) -> Non
         assert revisions._note == {}
 
 
+def write_log(flight: Flight, path: Path) -> Path:
+    """A .tlog of a level vehicle heading north: attitude, position and its accuracy at 10 Hz."""
+    link = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    with path.open("wb") as file:
+        for n in range(-20, 10 * len(flight.truth) + 10):
+            s = n / 10
+            k = int(np.clip(np.floor(s), 0, len(flight.truth) - 2))
+            spot = flight.truth[k][:3, 3] + (s - k) * (flight.truth[k + 1] - flight.truth[k])[:3, 3]
+            lat, lon, alt = FRAME.to_geodetic(spot[None])[0]
+            stamp_us = START_NS // 1000 + n * 100_000
+            boot_ms = 60_000 + n * 100
+            place = (round(lat * 1e7), round(lon * 1e7), round(alt * 1e3))
+            for message in (
+                mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3),
+                mavlink.MAVLink_attitude_message(boot_ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+                mavlink.MAVLink_global_position_int_message(
+                    boot_ms, *place, round(1e3 * spot[2]), 0, 0, 0, 0
+                ),
+                mavlink.MAVLink_gps_raw_int_message(
+                    stamp_us, 6, *place, 60, 90, 0, 0, 14, 0, 100, 150, 0, 0, 0
+                ),
+            ):
+                file.write(struct.pack(">Q", stamp_us) + message.pack(link))
+    return path
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_the_flights_telemetry_places_the_track(flight: Flight, beside: bool) -> None:
+    log = flight.scan / "link.tlog" if beside else flight.folder / "flight.tlog"
+    write_log(flight, log)
+    figures = refine(flight.scan, RefineOptions(telemetry=None if beside else log))
+    assert figures["telemetry"] and {"position", "attitude"} <= set(figures["residuals"])
+    assert errors(flight).max() < 0.6
+
+
+def test_a_broken_log_beside_the_scan_is_noted_and_a_given_one_refused(flight: Flight) -> None:
+    log = flight.scan / "link.tlog"
+    log.write_bytes(b"no telemetry at all" * 40)
+    figures = refine(flight.scan, RefineOptions())
+    assert not figures["telemetry"] and "link.tlog" in figures["notes"][0]
+    with pytest.raises(InputError, match=r"link\.tlog"):
+        refine(flight.scan, RefineOptions(telemetry=log))
+
+
 def test_scans_that_cannot_be_refined_say_why(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not finished"):
         refine(fly(tmp_path / "a", finished=False, keyframes=2).scan, RefineOptions())
@@ -387,6 +433,8 @@ def test_scans_that_cannot_be_refined_say_why(tmp_path: Path) -> None:
         refine(fly(tmp_path / "b", keyframes=1).scan, RefineOptions())
     with pytest.raises(InputError, match=r"no scan\.db"):
         refine(tmp_path, RefineOptions())
+    with pytest.raises(InputError, match="never refined"):
+        undo(fly(tmp_path / "d", keyframes=2).scan)
     local = fly(tmp_path / "c", placed=False, keyframes=3)
     log = tmp_path / "x.tlog"
     log.write_bytes(b"nothing")
