@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from recon import se3
 from recon.track_alignment import umeyama
-from recon.types import F64, PosePrior
+from recon.types import F64, DepthMap, PosePrior
 
 WANDER_SHARE = 0.4
 """Of a fix's sigma, what differs between fixes of one flight; the rest is common to all."""
@@ -25,8 +25,17 @@ WANDER_SHARE = 0.4
 INDEPENDENT_HEIGHTS = 4.0
 """Heights of one flight count as so many: they share the ground's relief or an assumption."""
 
+EXACT_HEIGHTS = 16.0
+"""The same where the ground exactly below was measured: relief has no part in it."""
+
 LEANING_SHARE = 2.0
 """Sigma of a height, as a share of it, per unit of (1 - cosine) off the vertical."""
+
+LEAST_EXACT = 4
+"""Heights exactly below from which on no others count."""
+
+EDGE_SHARE = 0.03
+"""Depths about the point below that differ by more than this share belong to an edge."""
 
 HUBER = 2.5
 """Whitened residuals beyond this lose weight."""
@@ -73,7 +82,7 @@ class Anchor:
     T_odom_camera: F64  # (4, 4)
     prior: PosePrior
     height: float | None  # of the camera above ground that it sees, in odometry units
-    lean: float = 0.0  # 1 - cosine of how far off the vertical that ground is seen
+    lean: float = 0.0  # 1 - cosine of how far off the vertical that ground is; 0 is below
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +112,26 @@ def height_above(points: F64, up: F64) -> tuple[float, float] | None:
     return (height, 1.0 - float(np.median(cosine[below]))) if height > 0 else None
 
 
+def height_below(depth: DepthMap, up: F64) -> float | None:
+    """Height above the ground exactly below, in the depth map's unit; None where it is not seen.
+
+    ``up`` (3,) is the unit vector upwards in the camera's frame. Edges and holes do not count.
+    """
+    down = -up
+    if down[2] < 0.2:
+        return None
+    h, w = depth.depth_m.shape
+    u = round(float(depth.K[0, 0] * down[0] / down[2] + depth.K[0, 2]))
+    v = round(float(depth.K[1, 1] * down[1] / down[2] + depth.K[1, 2]))
+    if not (2 <= u < w - 2 and 2 <= v < h - 2):
+        return None
+    window = depth.depth_m[v - 2 : v + 3, u - 2 : u + 3]
+    known = window[np.isfinite(window)]
+    if len(known) < 15 or float(np.ptp(known)) > EDGE_SHARE * float(np.median(known)):
+        return None
+    return float(np.median(known)) / float(down[2])
+
+
 def height_ratio(anchor: Anchor) -> tuple[float, float] | None:
     """Log of height by telemetry over height by vision, and its sigma; None without both."""
     agl, height = anchor.prior.agl_m, anchor.height
@@ -113,13 +142,23 @@ def height_ratio(anchor: Anchor) -> tuple[float, float] | None:
     return float(np.log(agl / height)), sigma
 
 
+def height_ratios(anchors: Sequence[Anchor]) -> tuple[list[tuple[float, float]], bool]:
+    """:func:`height_ratio` of the anchors that have one; True when only those count that see
+    the ground exactly below."""
+    told = [(h, a.lean) for a in anchors if (h := height_ratio(a)) is not None]
+    exact = [h for h, lean in told if lean == 0.0]
+    is_exact = len(exact) >= LEAST_EXACT
+    return (exact if is_exact else [h for h, _ in told]), is_exact
+
+
 class _Readings:
     """The anchors' readings as arrays, by kind; rows of one reading form a group."""
 
     def __init__(self, anchors: Sequence[Anchor]) -> None:
         turned = [a for a in anchors if a.prior.R_world_camera is not None]
         fixed = [a for a in anchors if _has_fix(a.prior)]
-        heights = [h for a in anchors if (h := height_ratio(a)) is not None]
+        heights, is_exact = height_ratios(anchors)
+        independent = EXACT_HEIGHTS if is_exact else INDEPENDENT_HEIGHTS
         self.R_odom = _stack([a.T_odom_camera[:3, :3] for a in turned], (3, 3))
         self.R_prior = _stack([a.prior.R_world_camera for a in turned], (3, 3))
         self.sigma_turn = _stack(
@@ -130,7 +169,7 @@ class _Readings:
         self.fix = _stack([a.prior.position_m for a in fixed], (3,))
         self.sigma_fix = _stack([a.prior.sigma_position_m for a in fixed], (3,))
         self.log_ratio = _stack([h[0] for h in heights], ())
-        thinned = min(1.0, (INDEPENDENT_HEIGHTS / max(len(heights), 1)) ** 0.5)
+        thinned = min(1.0, (independent / max(len(heights), 1)) ** 0.5)
         self.sigma_log = _stack([h[1] for h in heights], ()) / thinned
 
     def linearised(self, R: F64, t: F64, log_scale: float) -> tuple[F64, F64, I64]:

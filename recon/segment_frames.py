@@ -54,7 +54,8 @@ class SegmentFrames:
         """The node without its sensors' constants."""
         if node.segment not in self._offsets:
             return node
-        return replace(node, prior=self._offsets[node.segment].applied(node.prior))
+        prior = self._offsets[node.segment].applied(node.prior, node.lean)
+        return replace(node, prior=prior)
 
     def rests_on_fixes(self, segment: int) -> bool:
         """True when positions place the segment."""

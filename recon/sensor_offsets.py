@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from recon import se3
-from recon.alignment import Anchor, Similarity, height_ratio
+from recon.alignment import Anchor, Similarity, height_ratios
 from recon.types import F64, PosePrior
 
 PRIOR_SIGMA = 0.1
@@ -33,9 +33,13 @@ class Offsets:
     shift_m: F64 = field(default_factory=lambda: np.zeros(3))  # takes fixes to the frame
     warp: F64 = field(default_factory=lambda: np.zeros((3, 3)))  # likewise, per metre off centre
     reach_m: float = 0.0  # off centre to which the warp is known; it grows no further
+    is_exact: bool = False  # only heights of the ground exactly below count
 
-    def applied(self, prior: PosePrior) -> PosePrior:
-        """The prior's attitude, position and height without their constants."""
+    def applied(self, prior: PosePrior, lean: float) -> PosePrior:
+        """The prior's attitude, position and height without their constants.
+
+        ``lean`` is that of the ground whose height vision tells.
+        """
         R, position, agl = prior.R_world_camera, prior.position_m, prior.agl_m
         if R is not None:
             R = se3.so3_exp(self.turn) @ R
@@ -43,19 +47,21 @@ class Offsets:
             off = position - self.centre_m
             off = off * min(1.0, self.reach_m / max(float(np.linalg.norm(off)), 1e-9))
             position = position + self.shift_m + self.warp @ off
-        if agl is not None:
+        if agl is not None and self.is_exact and lean > 0.0:
+            agl = None
+        elif agl is not None:
             agl = agl * float(np.exp(self.log_height))
         return replace(prior, R_world_camera=R, position_m=position, agl_m=agl)
 
 
 def offsets(anchors: Sequence[Anchor], frame: Similarity) -> Offsets:
     """The constants of all sensors over the anchors of one segment, robustly."""
-    ratios = [r for a in anchors if (r := height_ratio(a)) is not None]
+    ratios, is_exact = height_ratios(anchors)
     log_height = 0.0
     if ratios:
         mean = np.average([r[0] for r in ratios], weights=[r[1] ** -2 for r in ratios])
         log_height = float(np.log(frame.scale) - mean)
-    return Offsets(_turn(anchors, frame), log_height, *_fixes(anchors, frame))
+    return Offsets(_turn(anchors, frame), log_height, *_fixes(anchors, frame), is_exact)
 
 
 def _turn(anchors: Sequence[Anchor], frame: Similarity) -> F64:

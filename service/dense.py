@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from recon import se3
-from recon.alignment import height_above
+from recon.alignment import height_above, height_below
 from recon.backends import Backend
 from recon.belief_propagation import BeliefPropagationConfig
 from recon.camera_model import scaled_K
@@ -176,7 +176,9 @@ class Dense:
                 )
             T_map = self._before[2] @ step
         self._before = (job.view.seq, depth, T_map)
-        height = height_above(job.points, job.view.T_odom_camera[2, :3])
+        up = job.view.T_odom_camera[2, :3]
+        below = height_below(depth, up) if depth is not None else None
+        height = (below, 0.0) if below is not None else height_above(job.points, up)
         with self.lock:
             self.trajectory.add(
                 job.view.seq, job.segment, T_map, job.prior, height, job.view.time_ns, covariance

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.alignment import Anchor, fit, height_above, scales
-from recon.types import F64, PosePrior
+from recon.alignment import Anchor, fit, height_above, height_below, scales
+from recon.camera_model import rays
+from recon.types import F32, F64, DepthMap, PosePrior
 
 
 def track(n: int = 30) -> list[F64]:
@@ -178,3 +179,40 @@ def test_scales_by_fixes_and_by_heights_are_told_apart(wrong: float) -> None:
         apart = abs(math.log(by_fixes.metres / by_heights.metres))
         spread = math.hypot(by_fixes.sigma, by_heights.sigma)
         assert (apart < 3 * spread) == (wrong == 1.0)
+
+
+def test_the_height_exactly_below_is_read_from_the_depth_map() -> None:
+    """A camera leaning over a slope: only the point below tells the height, and edges do not."""
+    K = np.array([[300.0, 0, 159.5], [0, 300.0, 89.5], [0, 0, 1]])
+    lean = se3.so3_exp(np.array([math.pi + 0.15, 0.0, 0.0]))
+    T = se3.compose(lean, np.array([0.0, 0.0, 50.0]))
+    v, u = np.mgrid[0:180, 0:320].astype(np.float64)
+    directions = rays(K, np.column_stack([u.ravel(), v.ravel()])) @ T[:3, :3].T
+    slope = 0.2  # ground z = slope * y, which is 0 straight below
+    depth = 50.0 / (slope * directions[:, 1] - directions[:, 2])
+    image = depth.reshape(180, 320).astype(np.float32)
+    ones = np.ones_like(image)
+
+    def below(picture: F32) -> float | None:
+        seen = DepthMap(picture, 0.1 * ones, 3 * ones.astype(np.uint8), K, T)
+        return height_below(seen, T[2, :3])
+
+    assert below(image) == pytest.approx(50.0, abs=0.3)
+    stepped = image.copy()
+    stepped[: int(89.5 + 300 * math.tan(0.15)), :] -= 6.0
+    stepped[:, :160] -= 6.0
+    assert below(stepped) is None
+    assert below(np.full_like(image, np.nan)) is None
+    assert height_below(DepthMap(image, ones, ones.astype(np.uint8), K, T), np.eye(3)[0]) is None
+
+
+def test_heights_exactly_below_count_alone() -> None:
+    some = []
+    for i, a in enumerate(anchors(np.eye(3), 3.0, np.zeros(3), seed=4)):
+        p = a.prior
+        prior = PosePrior(p.R_world_camera, 0.01, 0.05, None, None, 60.0, 2.0)
+        lean, error = (0.0, 1.0) if i % 3 == 0 else (0.02, 1.1)
+        some.append(Anchor(a.T_odom_camera, prior, 20.0 * error, lean))
+    found = fit(some)
+    assert found is not None
+    assert found.scale == pytest.approx(3.0, rel=0.001)
