@@ -34,7 +34,7 @@ SETTLED_MS = 5.0  # sigma of an estimate that may be believed
 LARGEST_SIGMA_MS = 25.0  # one that is not worth telling
 RIVAL = 1.3  # a second answer, further away than RIVAL_APART_S, must fit worse by so much
 RIVAL_APART_S = 0.15
-KEPT = 3000
+KEPT = 2000
 COARSE_S, FINE_S, FINE_STEPS = 0.02, 0.004, 8
 OUTLIER = 4.0  # times the median misfit
 

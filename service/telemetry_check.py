@@ -25,7 +25,7 @@ from service.config import CameraConfig
 log = logging.getLogger(__name__)
 
 LOOK_NS = 10_000_000_000
-REACH_NS = 100_000_000_000  # how far back frames and telemetry are compared
+REACH_NS = 60_000_000_000  # how far back telemetry is compared with frames
 SLEW = 0.1  # of the time that passes, so that frames stay in order when the latency changes
 WORTH_TELLING_MS = 10.0
 
