@@ -62,6 +62,10 @@ def ground(
         str | None,
         typer.Option(help="MAVLink of the vehicle for the portal: udpin://0.0.0.0:14550"),
     ] = None,
+    take: Annotated[
+        list[Path] | None,
+        typer.Option(help="scans from an aircraft's storage, taken in first; may be repeated"),
+    ] = None,
     once: Annotated[bool, typer.Option("--once", help="end when a scan is complete")] = False,
     idle_exit_s: Annotated[
         float | None, typer.Option(help="end when nothing new came for so many seconds")
@@ -90,6 +94,8 @@ def ground(
     )
     quota = None if quota_mb is None else int(quota_mb * 1e6)
     refresh = refresh_s if refresh_s is not None else RADIO_REFRESH_S if mavlink else 0.0
+    for folder in take or ():
+        _take_in(store, folder)
     receiver = Receiver(ReceiverConfig(store, session, quota, refresh_s=refresh))
     radios = [RadioLink(endpoint, GROUND, receiver.add_radio) for endpoint in mavlink or ()]
     receiver.start()
@@ -110,6 +116,14 @@ def ground(
             radio.close()
         receiver.close()
     _report(entries, receiver.dropped, as_json)
+
+
+def _take_in(store: Path, folder: Path) -> None:
+    """Take a folder's scans into the store."""
+    from service.ground.storage import take_in
+
+    for taken in take_in(store, folder):
+        print(f"taken in: {taken}", file=sys.stderr, flush=True)
 
 
 def _open_portal(

@@ -1,0 +1,68 @@
+"""Scans from an aircraft's storage, taken into a ground station's after landing."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import tempfile
+from pathlib import Path
+
+from service.errors import InputError
+from service.stream.naming import check_name
+from service.stream.records import ScanHeader
+from service.stream.store import ScanStore
+
+log = logging.getLogger(__name__)
+
+FILES = ("scan.db", "scan.db-wal")
+
+
+def take_in(store: Path, folder: Path) -> list[Path]:
+    """The scan folders under ``store`` that now hold what those in ``folder`` hold.
+
+    ``folder`` is a scan folder or a folder of them, such as a card's; nothing is written there.
+    What came by radio or network before is kept and completed. Raises InputError when there is
+    no scan, OutsideError when the disk is full.
+    """
+    paths = [folder / FILES[0]] if (folder / FILES[0]).is_file() else []
+    paths += sorted(folder.glob(f"*/{FILES[0]}"))
+    if not paths:
+        raise InputError(f"{folder} holds no scan; it should hold scan.db, or folders that do")
+    return [_take(store, path.parent) for path in paths]
+
+
+def _take(store: Path, folder: Path) -> Path:
+    store.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".taking-", dir=store) as place:
+        for name in FILES:
+            if (folder / name).is_file():
+                shutil.copyfile(folder / name, Path(place) / name)
+        with ScanStore.open(Path(place) / FILES[0]) as source:
+            header = source.header
+            drone, scan = check_name(header.drone, "drone"), check_name(header.scan_id, "scan")
+            path = store / drone / scan / FILES[0]
+            with _open(path, header) as target:
+                news = merge(source, target)
+                _deliver(path.parent, target)
+    log.info("%s/%s: %d records from %s", drone, scan, news, folder)
+    return path.parent
+
+
+def _open(path: Path, header: ScanHeader) -> ScanStore:
+    return ScanStore.open(path) if path.exists() else ScanStore.create(path, header)
+
+
+def merge(source: ScanStore, target: ScanStore) -> int:
+    """Put every record of ``source`` that ``target`` lacks into it; how many there were."""
+    news = 0
+    for kind, numbers in source.numbers().items():
+        for number in numbers - target.numbers_of(kind):
+            record = source.record(kind, number)
+            news += record is not None and target.put_record(kind, number, record)
+    return news
+
+
+def _deliver(folder: Path, store: ScanStore) -> None:
+    from service.scan_folder import write_deliverables
+
+    write_deliverables(folder, store, {})

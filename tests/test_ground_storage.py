@@ -1,0 +1,81 @@
+"""What came by radio alone is completed from the aircraft's card after landing."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.types import DepthMap, Keyframe, Pose
+from service.errors import InputError
+from service.ground import storage
+from service.ground.storage import take_in
+from service.stream import codec
+from service.stream.radio_messages import pack_announce, pack_tile, tag_of, unpack_announce
+from service.stream.radio_tiles import tiles_of
+from service.stream.records import PoseRecord, Repose, ScanHeader
+from service.stream.store import ScanStore
+
+HEADER = ScanHeader("scan-1", "red", 1_767_268_800_000_000_000, 47.5, 8.25, 431.5)
+
+
+def keyframe(seq: int) -> Keyframe:
+    rng = np.random.default_rng(seq)
+    depth = DepthMap(
+        rng.uniform(40, 60, (90, 160)).astype(np.float32),
+        np.full((90, 160), 0.1, np.float32),
+        np.full((90, 160), 3, np.uint8),
+        np.array([[130.0, 0, 79.5], [0, 130.0, 44.5], [0, 0, 1]]),
+        np.eye(4),
+    )
+    bgr = rng.integers(0, 255, (90, 160, 3), np.uint8)
+    return Keyframe(seq, 5, depth, bgr, Pose(np.eye(4), np.eye(6)), np.ones((90, 160), bool))
+
+
+@pytest.fixture
+def card(tmp_path: Path) -> Path:
+    """The aircraft's storage, as a power cut left it: the write-ahead log is not folded in."""
+    folder = tmp_path / "aircraft" / "scan-1"
+    store = ScanStore.create(folder / "scan.db", HEADER)
+    for seq in range(3):
+        store.add_keyframe(seq, codec.encode(keyframe(seq), seq))
+        store.add_pose(PoseRecord(seq, np.eye(4), np.eye(6)))
+    store.add_repose(Repose(1, 1, np.eye(4), 1.0, np.eye(6)))
+    store.finish({"points": 1})
+    (tmp_path / "card" / "scan-1").mkdir(parents=True)
+    for name in ("scan.db", "scan.db-wal"):
+        shutil.copyfile(folder / name, tmp_path / "card" / "scan-1" / name)
+    assert (tmp_path / "card" / "scan-1" / "scan.db-wal").stat().st_size > 10_000
+    store.close()
+    return tmp_path / "card"
+
+
+def test_the_card_completes_what_the_radio_brought(
+    tmp_path: Path, card: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(storage, "_deliver", lambda *_: None)
+    announced = unpack_announce(pack_announce(HEADER))
+    assert announced is not None
+    path = tmp_path / "ground" / "red" / "scan-1" / "scan.db"
+    with ScanStore.create(path, announced) as ground:
+        coarse = codec.decode(codec.encode(keyframe(0), 0)[:1])
+        assert coarse is not None
+        for tile in tiles_of(coarse):
+            ground.add_radio("tile", 0, tile.index, pack_tile(tag_of("red", "scan-1"), tile))
+    before = {p.name: p.read_bytes() for p in (card / "scan-1").iterdir()}
+    assert take_in(tmp_path / "ground", card) == [path.parent]
+    assert take_in(tmp_path / "ground", card / "scan-1") == [path.parent]  # once more: no harm
+    assert {p.name: p.read_bytes() for p in (card / "scan-1").iterdir()} == before
+    assert [p.name for p in (tmp_path / "ground").iterdir()] == ["red"]
+    with ScanStore.open(path) as ground, ScanStore.open(card / "scan-1" / "scan.db") as aircraft:
+        assert ground.numbers() == aircraft.numbers()
+        assert ground.header == HEADER and ground.summary == {"points": 1}
+        for a, b in zip(aircraft.keyframes(), ground.keyframes(), strict=True):
+            np.testing.assert_array_equal(a.depth.depth_m, b.depth.depth_m)
+
+
+def test_a_folder_without_scans_is_said(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no scan"):
+        take_in(tmp_path / "ground", tmp_path)
