@@ -12,11 +12,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 
 REACH = 2  # the window is (2 REACH + 1) squared
 MIN_PIXELS = 12  # of the 25, next to holes
 UNMATCHED = np.float32(1e9)
+CHUNK = 8  # rows per parallel work item
 
 
 @njit(cache=True, nogil=True)
@@ -83,7 +84,7 @@ def _full_fits(inverse: Any, v: int, column: Any, fits: Any) -> None:
         rest[u] = (s2 - s0 * s0 * (1 / 25) - (sx * sx + s1 * s1) * (1 / 50)) * (1 / 22)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, parallel=True)
 def surface_elements(
     depth: Any, sigma: Any, fx: float, fy: float, cx: float, cy: float, edge: float, elements: Any
 ) -> None:
@@ -94,31 +95,32 @@ def surface_elements(
     """
     h, w = depth.shape
     inverse = np.empty((h, w), np.float64)
-    for v in range(h):
+    for v in prange(h):
         for u in range(w):
             inverse[v, u] = 1.0 / depth[v, u] if depth[v, u] > 0 else np.nan
-    column, fits, fit = np.empty((3, w)), np.empty((4, w)), np.empty(4)
-    for v in range(h):
-        _full_fits(inverse, v, column, fits)
-        for u in range(w):
-            element = elements[v, u]
-            element[4] = 0.0
-            z = depth[v, u]
-            if not (z > 0 and sigma[v, u] > 0):
-                continue
-            if np.isnan(fits[0, u]):
-                if not _gappy_fit(inverse, v, u, fit):
+    for chunk in prange((h + CHUNK - 1) // CHUNK):
+        column, fits, fit = np.empty((3, w)), np.empty((4, w)), np.empty(4)
+        for v in range(chunk * CHUNK, min((chunk + 1) * CHUNK, h)):
+            _full_fits(inverse, v, column, fits)
+            for u in range(w):
+                element = elements[v, u]
+                element[4] = 0.0
+                z = depth[v, u]
+                if not (z > 0 and sigma[v, u] > 0):
                     continue
-                fits[0, u], fits[1, u], fits[2, u], fits[3, u] = fit[0], fit[1], fit[2], fit[3]
-            rms = np.sqrt(max(fits[3, u], 0.0)) * z * z
-            if rms > edge * z and rms > 3 * sigma[v, u]:
-                continue
-            # A plane's inverse depth at (u, v) is normal . ray / distance.
-            a, b = fits[1, u] * fx, fits[2, u] * fy
-            c = fits[0, u] - fits[1, u] * (u - cx) - fits[2, u] * (v - cy)
-            length = 1.0 / np.sqrt(a * a + b * b + c * c)
-            element[0], element[1], element[2] = a * length, b * length, c * length
-            element[3], element[4], element[5] = length, sigma[v, u], rms
+                if np.isnan(fits[0, u]):
+                    if not _gappy_fit(inverse, v, u, fit):
+                        continue
+                    fits[0, u], fits[1, u], fits[2, u], fits[3, u] = fit[0], fit[1], fit[2], fit[3]
+                rms = np.sqrt(max(fits[3, u], 0.0)) * z * z
+                if rms > edge * z and rms > 3 * sigma[v, u]:
+                    continue
+                # A plane's inverse depth at (u, v) is normal . ray / distance.
+                a, b = fits[1, u] * fx, fits[2, u] * fy
+                c = fits[0, u] - fits[1, u] * (u - cx) - fits[2, u] * (v - cy)
+                length = 1.0 / np.sqrt(a * a + b * b + c * c)
+                element[0], element[1], element[2] = a * length, b * length, c * length
+                element[3], element[4], element[5] = length, sigma[v, u], rms
 
 
 @njit(cache=True, nogil=True, fastmath=True)
