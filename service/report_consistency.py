@@ -70,7 +70,10 @@ def _residuals(flown: dict[str, Any], refined: dict[str, Any]) -> str:
     if not rows:
         return ""
     header = ["residuals over their sigmas, rms (number)", "in flight", "refined"]
-    note = "<p>1 is as large as the sigmas claim; much less means that they are too careful.</p>"
+    note = (
+        "<p>1 is as large as the sigmas claim. Telemetry's are smaller: its sigmas are widened, "
+        "because its errors wander slowly and many readings are no better than a few.</p>"
+    )
     return rows_table(header if refined else header[:2], rows) + note
 
 
@@ -129,4 +132,6 @@ def _survey(refined: dict[str, Any]) -> str:
 
 
 def _offset(values: Sequence[float] | None) -> str:
-    return "" if values is None else "  ".join(f"{v:+.3f}" for v in values)
+    if values is None or max(map(abs, values)) > 1e4:
+        return ""
+    return "  ".join(f"{v:+.3f}" for v in values)

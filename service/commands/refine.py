@@ -68,7 +68,7 @@ def _lines(figures: dict[str, Any]) -> list[str]:
     for p in figures["points"]:
         line = f"  {p['role']:<8}{p['name']:<12}{p['marks']:>3} marks"
         for name in ("before_m", "after_m"):
-            if p[name] is not None:
+            if p[name] is not None and not p["refused"]:
                 line += "  " + name[:-2] + " " + " ".join(f"{v:+.2f}" for v in p[name])
         out.append(line + (f"  REFUSED: {p['refused']}" if p["refused"] else ""))
     for role in ("control", "check"):
