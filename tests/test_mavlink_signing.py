@@ -1,0 +1,103 @@
+"""Signed packets, against pymavlink's own signatures."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mavlink.framing import Framer
+from mavlink.messages import Outgoing
+from mavlink.packer import Packer
+from mavlink.signing import Signing, read_key
+from mavlink.wire import dialect
+
+S = 1_000_000_000
+KEY = bytes(range(32))
+AUTOPILOT = (1, 1)
+NOW = timestamp_of(1_760_000_000 * S)
+
+
+def packed(message: Any, source: tuple[int, int] = AUTOPILOT, seq: int = 0) -> bytes:
+    mouth = dialect.MAVLink(None, *source)
+    mouth.seq = seq
+    return bytes(message.pack(mouth))
+
+
+def beat(system: int = 1, token: int = 0, autopilot: int = 3, armed: bool = False) -> Any:
+    return dialect.MAVLink_heartbeat_message(2, autopilot, 128 if armed else 0, token, 4, 3)
+
+
+def signed(message: Any, timestamp: int, key: bytes = KEY, link: int = 3) -> bytes:
+    mouth = dialect.MAVLink(None, 255, 190)
+    mouth.signing.secret_key = key
+    mouth.signing.link_id = link
+    mouth.signing.timestamp = timestamp
+    mouth.signing.sign_outgoing = True
+    return bytes(message.pack(mouth))
+
+
+def accepts(signing: Signing, data: bytes) -> bool:
+    (packet,) = Framer().feed(data)
+    return signing.accepts(packet)
+
+
+def test_signatures_of_pymavlink_are_verified_and_replays_refused() -> None:
+    signing = Signing(KEY, NOW)
+    first = signed(beat(), NOW + 10)
+    assert accepts(signing, first)
+    assert not accepts(signing, first)  # replayed
+    assert not accepts(signing, signed(beat(), NOW + 5))  # older
+    assert accepts(signing, signed(beat(), NOW + 11))
+    assert not accepts(signing, signed(beat(), NOW + 20, bytes(32)))  # another key
+    assert accepts(signing, signed(beat(), NOW + 12))  # the forgery moved nothing
+    assert not accepts(signing, signed(beat(), NOW - 61 * 100_000, link=4))  # a stale stream
+    assert not accepts(signing, packed(beat()))  # unsigned
+    radio = dialect.MAVLink_radio_status_message(1, 1, 90, 1, 1, 0, 0)
+    assert accepts(signing, packed(radio, (51, 68)))  # radios cannot sign
+    assert signing.refused == 5
+
+
+def test_a_flipped_bit_breaks_the_signature() -> None:
+    data = signed(beat(), NOW + 10)
+    for i in range(len(data) - 13, len(data)):
+        signing = Signing(KEY, NOW)
+        damaged = bytearray(data)
+        damaged[i] ^= 1
+        assert not accepts(signing, bytes(damaged))
+
+
+def test_our_signatures_satisfy_pymavlink_and_times_only_grow() -> None:
+    signing = Signing(KEY)
+    packer = Packer(2, signing)
+    ear = dialect.MAVLink(None)
+    ear.signing.secret_key = KEY
+    stamps = []
+    for unix_ns in (1_760_000_000 * S, 1_760_000_000 * S, 1_500_000_000 * S):  # steps back
+        data = packer.pack(1, Outgoing(191, beat()), unix_ns)
+        assert data is not None
+        (message,) = ear.parse_buffer(data)
+        assert message.get_signed() and message.get_srcComponent() == 191
+        stamps.append(signing.timestamp)
+    assert stamps == sorted(set(stamps))
+
+
+def test_keys_must_be_private_and_whole(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    with pytest.raises(ValueError, match="no such"):
+        read_key(path)
+    path.write_bytes(KEY)
+    os.chmod(path, 0o644)
+    with pytest.raises(ValueError, match="chmod 600"):
+        read_key(path)
+    os.chmod(path, 0o600)
+    assert read_key(path) == KEY
+    path.write_text(KEY.hex() + "\n")
+    assert read_key(path) == KEY
+    path.write_bytes(b"short")
+    with pytest.raises(ValueError, match="32 bytes"):
+        read_key(path)
+    with pytest.raises(ValueError, match="32 bytes"):
+        Signing(b"short")
