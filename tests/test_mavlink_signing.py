@@ -11,7 +11,7 @@ import pytest
 from mavlink.framing import Framer
 from mavlink.messages import Outgoing
 from mavlink.packer import Packer
-from mavlink.signing import Signing, read_key
+from mavlink.signing import Signing, read_key, timestamp_of
 from mavlink.wire import dialect
 
 S = 1_000_000_000
