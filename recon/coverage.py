@@ -30,8 +30,8 @@ CELL_SAMPLES = 4.0
 FARTHEST = 3.0
 """Pictures count as seeing the ground out to this many times their median depth."""
 
-MOST_TILES = 12_000
-"""Tiles at most (49 million cells, some 700 MB); what lies beyond them is counted."""
+MOST_TILES = 5_000
+"""Tiles at most (20 million cells, 400 MB); what lies beyond them is counted."""
 
 Tile = tuple[int, int]
 
