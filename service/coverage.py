@@ -7,6 +7,7 @@ Drone and ground make the same layer, because both read the same store. In fligh
 from __future__ import annotations
 
 import json
+import logging
 import threading
 import time
 from collections import OrderedDict
@@ -22,11 +23,14 @@ import numpy as np
 from recon.coverage import CoverageGrid, CoverageMap, Footprint, usual_cell_m
 from recon.raster import Grid
 from recon.types import U8, Array, DepthMap
+from service.errors import OutsideError
 from service.georeference import LocalFrame
 from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
     from service.exports.view import ExportOptions, ScanView
+
+log = logging.getLogger(__name__)
 
 PICTURE, FIGURES = "coverage.png", "coverage.json"
 LEAST_VIEWS = 3
@@ -45,6 +49,8 @@ LEGEND = {
     "good": "measured; the darker, the surer",
 }
 LARGEST_PX = 1600
+WRITE_EVERY_S = 15.0
+"""In flight the layer is written beside the scan this often."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,15 +201,49 @@ def coverage_of(store: ScanStore, cell_m: float | None = None) -> Coverage | Non
 
 def write_coverage_files(folder: Path, store: ScanStore) -> Coverage | None:
     """Write coverage.png and coverage.json beside the scan; the layer, None without surface."""
-    from service.scan_folder import writing
-
     found = coverage_of(store)
     if found is not None:
-        with writing(folder / PICTURE) as part:
-            part.write_bytes(found.png_bytes())
-        with writing(folder / FIGURES) as part:
-            part.write_bytes(found.json_bytes())
+        _write(folder, found)
     return found
+
+
+def _write(folder: Path, found: Coverage) -> None:
+    from service.scan_folder import writing
+
+    with writing(folder / PICTURE) as part:
+        part.write_bytes(found.png_bytes())
+    with writing(folder / FIGURES) as part:
+        part.write_bytes(found.json_bytes())
+
+
+class CoverageWriter:
+    """Writes coverage.png and coverage.json beside a growing scan, on a thread of its own.
+
+    For a ``with`` about the flight; failures of the disk are logged and tried again.
+    """
+
+    def __init__(self, store: ScanStore, every_s: float = WRITE_EVERY_S) -> None:
+        self._live, self._folder = LiveCoverage(store), store.path.parent
+        self._every_s = every_s
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="coverage", daemon=True)
+
+    def __enter__(self) -> CoverageWriter:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _work(self) -> None:
+        while not self._stop.wait(self._every_s):
+            try:
+                found = self._live.refresh()
+                if found is not None:
+                    _write(self._folder, found)
+            except OutsideError as error:
+                log.warning("coverage not written: %s", error)
 
 
 class LiveCoverages:

@@ -18,6 +18,7 @@ from recon.types import Camera, Frame, Keyframe
 from service.cameras.ahead import ahead
 from service.cameras.source import CameraFrame, CameraSource
 from service.config import Config
+from service.coverage import CoverageWriter
 from service.errors import InputError
 from service.frame_tags import FILE as TAGS
 from service.frame_tags import FrameTags
@@ -162,7 +163,9 @@ class Scan:
         Frames that come while ``paused`` is set are passed over. A recording is decoded ahead.
         """
         live = self.source.is_live
-        with nullcontext(self.source) if live else closing(ahead(self.source)) as frames:
+        coverage = CoverageWriter(self.store) if live else nullcontext()
+        source = nullcontext(self.source) if live else closing(ahead(self.source))
+        with coverage, source as frames:
             for frame in frames:
                 if stop.is_set():
                     log.info("stopped; closing the scan")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import time
 import urllib.error
 import urllib.request
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -15,7 +16,14 @@ import pytest
 from recon import coverage, se3
 from recon.coverage import CoverageMap
 from recon.types import F64, DepthMap
-from service.coverage import FIGURES, PICTURE, LiveCoverage, LiveCoverages, coverage_of
+from service.coverage import (
+    FIGURES,
+    PICTURE,
+    CoverageWriter,
+    LiveCoverage,
+    LiveCoverages,
+    coverage_of,
+)
 from service.errors import InputError
 from service.exports.view import ExportOptions, ScanView, export
 from service.georeference import LocalFrame
@@ -284,6 +292,26 @@ def test_the_portal_shows_the_layer(tmp_path: Path, house: HouseFlight) -> None:
             urllib.request.urlopen(base + "none/coverage.png", timeout=10)
     finally:
         portal.close()
+
+
+def test_a_growing_scan_has_its_layer_written_beside_it(tmp_path: Path, house: HouseFlight) -> None:
+    def figures() -> dict[str, Any]:
+        path = tmp_path / FIGURES
+        return dict(json.loads(path.read_text())) if path.exists() else {}
+
+    def wait(keyframes: int) -> None:
+        for _ in range(200):
+            if figures().get("keyframes") == keyframes:
+                return
+            time.sleep(0.05)
+        raise AssertionError(f"never {keyframes} keyframes: {figures()}")
+
+    with house.flown(tmp_path) as store, CoverageWriter(store, every_s=0.05):
+        wait(5)
+        one = house.keyframe(5, 30.0)
+        store.add_keyframe(5, encode(one, one.time_ns))
+        wait(6)
+    assert cv2.imread(str(tmp_path / PICTURE)) is not None
 
 
 def test_few_layers_are_kept_and_rarely_made_anew(tmp_path: Path, house: HouseFlight) -> None:
