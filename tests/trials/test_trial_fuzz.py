@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import subprocess
 import sys
 import urllib.error
@@ -21,8 +22,8 @@ from service.health import HealthServer
 
 pytestmark = [pytest.mark.trial, pytest.mark.timeout(3600 if WHOLE else 280)]
 
-EXAMPLES = 20_000 if WHOLE else 60
-ATHERIS_S = 60 if WHOLE else 0
+EXAMPLES = int(os.environ.get("SKYRELIEF_FUZZ_EXAMPLES", "20000" if WHOLE else "60"))
+ATHERIS_S = int(os.environ.get("SKYRELIEF_FUZZ_S", "60" if WHOLE else "0"))
 
 
 def mutated(seed: bytes) -> st.SearchStrategy[bytes]:

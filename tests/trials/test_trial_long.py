@@ -24,11 +24,15 @@ FLAT_MIB_PER_H = 1.0
 
 
 def there_and_back(folder: Path) -> tuple[Path, Path]:
-    """(video, camera model) of a made-up flight to and fro, which can be shown in a loop."""
-    flight = folder / "flight"
-    simulate = [sys.executable, "-m", "service.cli", "simulate", "--out", str(flight)]
-    size = ["--size", "480x270", "--duration-s", "15", "--fps", "10"]
-    subprocess.run([*simulate, *size], check=True, capture_output=True, timeout=280)
+    """(video, camera model) of a flight to and fro, which can be shown in a loop.
+
+    SKYRELIEF_SOAK_FLIGHT names a folder that ``skyrelief simulate`` made; else one is made.
+    """
+    flight = Path(os.environ.get("SKYRELIEF_SOAK_FLIGHT", folder / "flight"))
+    if not flight.is_dir():
+        simulate = [sys.executable, "-m", "service.cli", "simulate", "--out", str(flight)]
+        size = ["--size", "480x270", "--duration-s", "15", "--fps", "10"]
+        subprocess.run([*simulate, *size], check=True, capture_output=True, timeout=600)
     loop = folder / "loop.mp4"
     command = f"ffmpeg -v error -y -i {flight}/flight.mp4 -filter_complex"
     chain = "[0]split[a][b];[b]reverse[r];[a][r]concat"
