@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -24,6 +25,8 @@ from service.errors import InputError, OutsideError
 from service.ground.http import Portal, PortalConfig, open_portal, parse_address
 from service.ground.library import Library
 from service.ground.live import SIGMA_STEP_M, LiveFeed, StoreIndex
+from service.ground.scan_files import DARK
+from service.ground.scan_files import _closed as closed_picture
 from service.ground.vehicle import Vehicle
 from service.scan_folder import write_deliverables
 from service.stream.codec import encode
@@ -116,6 +119,12 @@ def test_downloads_and_their_ranges(client: Client, store: Path) -> None:
         "/api/scans/.bin/test-1",
         "/api/scans/drone-1/test-1%00",
         "/api/scans/drone-1/none",
+        "/api/scans/drone-1/test-1/tiles/tileset.json",
+        "/api/scans/drone-1/test-1/tiles/../scan.db",
+        "/api/scans/drone-1/test-1/tiles/..%2fscan.db",
+        "/api/scans/drone-1/test-1/tiles/..%2fscan.json",
+        "/api/scans/drone-1/test-1/keyframes/99.jpg",
+        "/api/scans/drone-1/test-1/keyframes/-1.jpg",
         "/assets/../../http.py",
         "/nothing",
     ],
@@ -214,6 +223,82 @@ def test_import_copies_a_scan_folder(client: Client, tmp_path: Path, house: Hous
     assert again[0] == 400 and "already" in again[1]["error"]
     for bad in ({}, {"folder": 3}, {"folder": str(tmp_path)}, {"folder": "a\0b"}):
         assert client.ask("/api/import", "POST", bad)[0] == 400
+
+
+def test_the_tiles_of_a_scan_are_served(client: Client, store: Path) -> None:
+    assert client.ask("/api/scans/drone-1/test-1")[1]["tiles"] is False
+    folder = store / "drone-1/test-1/3dtiles"
+    (folder / "points").mkdir(parents=True)
+    (folder / "tileset.json").write_text('{"asset": {}}')
+    (folder / "points/r0.pnts").write_bytes(b"pnts")
+    (folder / "secret.txt").write_text("no")
+    assert client.ask("/api/scans/drone-1/test-1")[1]["tiles"] is True
+    one = "/api/scans/drone-1/test-1/tiles"
+    assert client.ask(f"{one}/tileset.json")[1] == {"asset": {}}
+    assert client.ask(f"{one}/points/r0.pnts")[1] == b"pnts"
+    for bad in ("secret.txt", "points", "points/../../scan.json", "points//r0.pnts"):
+        assert client.ask(f"{one}/{bad}")[0] == 404
+
+
+def test_a_keyframes_picture_is_shown(client: Client, house: HouseFlight) -> None:
+    status, data, headers = client.ask("/api/scans/drone-1/test-1/keyframes/2.jpg")
+    assert status == 200 and headers["content-type"] == "image/jpeg"
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    error = np.abs(image.astype(float) - house.keyframe(2, 10.0).bgr)
+    assert np.median(error) < 6.0
+
+
+def test_a_picture_closes_gaps_and_leaves_the_rest_dark() -> None:
+    known = np.ones((90, 160), np.bool_)
+    known[40:44, 50:54] = False
+    known[:, 100:] = False
+    bgr = np.where(known[..., None], 200, 0).repeat(3, axis=2).astype(np.uint8)
+    closed = closed_picture(bgr, known)
+    assert (closed[40:44, 50:54] == 200).all()
+    assert (closed[:, 120:] == DARK).all()
+
+
+def test_an_mcap_from_the_aircraft_becomes_a_scan(
+    client: Client, store: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("foxglove")
+    pytest.importorskip("mcap")
+    from service.stream.mcap_export import export_mcap
+
+    recording = tmp_path / "flight.mcap"
+    with ScanStore.open(store / "drone-1/test-1/scan.db") as scan:
+        export_mcap(scan, recording)
+        before = list(scan.keyframes())
+        track = [pose.T_world_camera for pose in scan.poses()]
+    body = {"folder": str(recording)}
+    assert client.ask("/api/import", "POST", body)[0] == 400  # the library has it already
+    client.ask("/api/scans/drone-1/test-1", "DELETE")
+    status, answer, _ = client.ask("/api/import", "POST", body)
+    assert (status, answer) == (201, {"drone": "drone-1", "scan": "test-1"})
+    entry = client.ask("/api/scans/drone-1/test-1")[1]
+    assert entry["finished"] and entry["preview"] and entry["trouble"] is None
+    assert entry["origin"]["lat_deg"] == pytest.approx(47.39)
+    with ScanStore.open(store / "drone-1/test-1/scan.db") as scan:
+        after = list(scan.keyframes())
+        np.testing.assert_allclose([p.T_world_camera for p in scan.poses()], track, atol=1e-5)
+    assert [k.seq for k in after] == [k.seq for k in before]
+    for one, other in zip(before, after, strict=True):
+        known = np.isfinite(one.depth.depth_m)
+        assert (known == np.isfinite(other.depth.depth_m)).mean() > 0.999
+        both = known & np.isfinite(other.depth.depth_m)
+        assert np.abs(one.depth.depth_m - other.depth.depth_m)[both].max() < 0.02
+        np.testing.assert_allclose(one.depth.T_world_camera, other.depth.T_world_camera, atol=1e-5)
+
+
+def test_unfit_mcaps_are_refused_in_one_line(client: Client, tmp_path: Path) -> None:
+    pytest.importorskip("mcap")
+    whole = b"\x89MCAP0\r\n" + bytes(200)
+    for name, content in (("a.mcap", b""), ("b.mcap", b"not one"), ("c.mcap", whole)):
+        (tmp_path / name).write_bytes(content)
+        status, answer, _ = client.ask("/api/import", "POST", {"folder": str(tmp_path / name)})
+        assert status == 400 and "\n" not in answer["error"] and name in answer["error"]
+    assert client.ask("/api/import", "POST", {"folder": str(tmp_path / "no.mcap")})[0] == 400
 
 
 def test_deliverables_are_made_on_request(client: Client) -> None:

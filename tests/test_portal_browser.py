@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import base64
 import json
-import shutil
-import subprocess
-import time
-import urllib.request
+import socket
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -19,7 +15,11 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 pytest.importorskip("websockets")
 
+from mavlink.rehearsal import RehearsalVehicle
+from service.bench.browser import Browser, chromium
+from service.exports.view import ExportOptions, ScanView, export
 from service.ground.http import PAGE, Portal, PortalConfig
+from service.ground.vehicle import Vehicle
 from service.scan_folder import write_deliverables
 from service.stream.codec import encode
 from service.stream.records import Repose
@@ -28,100 +28,11 @@ from service.stream.store import ScanStore
 if TYPE_CHECKING:
     from conftest import HouseFlight
 
-CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
-)
 pytestmark = [
-    pytest.mark.skipif(not CHROMIUM, reason="needs Chromium"),
+    pytest.mark.skipif(not chromium(), reason="needs Chromium"),
     pytest.mark.skipif(not (PAGE / "index.html").is_file(), reason="needs the built page"),
 ]
 TOKEN = "a-token-of-enough-letters"
-
-
-class Browser:
-    """One page of a headless Chromium."""
-
-    def __init__(self, profile: Path) -> None:
-        from websockets.sync.client import connect
-
-        flags = "--headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader"
-        flags += " --remote-debugging-port=0 --window-size=1280,800 --disable-extensions"
-        flags += " --no-first-run --disable-background-networking --disable-dev-shm-usage"
-        self.process = subprocess.Popen(
-            [CHROMIUM, *flags.split(), f"--user-data-dir={profile}", "about:blank"],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        port_file = profile / "DevToolsActivePort"
-        self._until(lambda: port_file.is_file() and port_file.read_text().count("\n") > 0)
-        port = port_file.read_text().split()[0]
-        pages = json.load(urllib.request.urlopen(f"http://127.0.0.1:{port}/json"))
-        page = next(p for p in pages if p["type"] == "page")
-        self._socket = connect(page["webSocketDebuggerUrl"], max_size=None)
-        self._number = 0
-        self.requests: list[str] = []
-        self.dialog = ""  # what the next prompt is answered with
-        for domain in ("Page", "Runtime", "Network"):
-            self.call(f"{domain}.enable")
-
-    def close(self) -> None:
-        self._socket.close()
-        self.process.terminate()
-        self.process.wait(timeout=10)
-
-    def call(self, method: str, **params: Any) -> Any:
-        self._number += 1
-        self._socket.send(json.dumps({"id": self._number, "method": method, "params": params}))
-        wanted = self._number
-        while True:
-            message = json.loads(self._socket.recv(timeout=30))
-            if message.get("id") == wanted:
-                assert "error" not in message, message
-                return message["result"]
-            self._note(message)
-
-    def _note(self, message: dict[str, Any]) -> None:
-        if message.get("method") == "Network.requestWillBeSent":
-            self.requests.append(message["params"]["request"]["url"])
-        if message.get("method") == "Page.javascriptDialogOpening":
-            self._number += 1
-            params = {"accept": True, "promptText": self.dialog}
-            answer = {"method": "Page.handleJavaScriptDialog", "params": params}
-            self._socket.send(json.dumps({"id": self._number, **answer}))
-
-    def run(self, script: str) -> Any:
-        found = self.call(
-            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
-        )
-        assert "exceptionDetails" not in found, found["exceptionDetails"]
-        return found["result"].get("value")
-
-    def open(self, url: str) -> None:
-        self.call("Page.navigate", url=url)
-
-    def wait(self, script: str, timeout_s: float = 20.0) -> Any:
-        """The first true value of ``script``; a page that is still loading has none."""
-        quiet = f"(() => {{ try {{ return {script} }} catch {{ return null }} }})()"
-        return self._until(lambda: self.run(quiet), timeout_s)
-
-    def click(self, text: str) -> None:
-        """Click the button with this text, as an event of its own."""
-        find = f"[...document.querySelectorAll('button')].find(b => b.textContent === '{text}')"
-        self.wait(f"!!{find}")
-        self.run(f"setTimeout(() => {find}.click(), 0)")
-        self.run("new Promise(r => setTimeout(r, 50))")
-
-    def picture(self, path: Path) -> None:
-        data = self.call("Page.captureScreenshot", format="png")["data"]
-        path.write_bytes(base64.b64decode(data))
-
-    def _until(self, true: Any, timeout_s: float = 20.0) -> Any:
-        deadline = time.monotonic() + timeout_s
-        while not (value := true()):
-            assert time.monotonic() < deadline, "the page did not get there"
-            assert self.process.poll() is None, "the browser ended"
-            time.sleep(0.05)
-        return value
 
 
 @pytest.fixture(scope="module")
@@ -201,3 +112,78 @@ def test_the_mesh_is_made_and_shown(browser: Browser, portal: Portal) -> None:
     browser.wait("Number(document.body.dataset.points) || 0")
     browser.click("Mesh")
     browser.wait("document.body.dataset.mesh === 'shown'", 60)
+
+
+def test_the_tiles_are_loaded_where_the_cloud_was(
+    browser: Browser, portal: Portal, scans: Path
+) -> None:
+    pytest.importorskip("py3dtiles")
+    with ScanView(scans / "drone-1/test-1") as scan:
+        export(scan, "3dtiles", None, ExportOptions())
+    browser.open(portal.url)
+    browser.wait("document.querySelectorAll('article').length === 1")
+    browser.open(f"{base(portal)}/#/view/drone-1/test-1")
+    browser.wait("Number(document.body.dataset.points) || 0")
+    browser.click("Tiles")
+    browser.wait("Number(document.body.dataset.tiles) > 0", 60)
+    off = json.loads(browser.wait("document.body.dataset.tilesMiddle"))
+    assert np.abs(off[:2]).max() < 15.0 and abs(off[2]) < 5.0  # about the scan's own origin
+
+
+def test_the_latest_picture_is_shown(browser: Browser, portal: Portal) -> None:
+    browser.open(portal.url)
+    browser.wait("document.querySelectorAll('article').length === 1")
+    browser.open(f"{base(portal)}/#/view/drone-1/test-1")
+    browser.wait("document.body.dataset.picture === '4'")
+    assert browser.run("document.querySelector('.latest img').naturalWidth") == 160
+
+
+def test_the_buttons_reach_the_vehicle_and_show_its_answer(browser: Browser, scans: Path) -> None:
+    pytest.importorskip("mavsdk")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    vehicle = Vehicle(f"udpin://127.0.0.1:{port}")
+    one = Portal(PortalConfig(scans, port=0, token=TOKEN), vehicle=vehicle)
+    one.start()
+    try:
+        with RehearsalVehicle(f"udpout:127.0.0.1:{port}") as daemon:
+            vehicle.start()
+            browser.open(one.url)
+            browser.wait("!document.querySelector('.vehicle').hidden", 30)
+            browser.wait("document.querySelector('.vehicle').textContent.includes('connected')", 30)
+            browser.click("Start scan")
+            browser.wait("document.querySelector('.note').textContent === 'start: accepted'", 30)
+            browser.dialog = "2.5"
+            browser.click("Baseline")
+            browser.wait(
+                "[...document.querySelectorAll('.note')].some(n => n.textContent ==="
+                " 'baseline 2.5 m: accepted')",
+                30,
+            )
+            assert daemon.link.parameter("SR_BASELINE_M") == 2.5
+    finally:
+        one.close()
+
+
+def test_without_webgl_the_view_says_so_and_the_list_works(tmp_path: Path, portal: Portal) -> None:
+    blind = Browser(tmp_path / "blind", "--disable-3d-apis")
+    try:
+        blind.open(portal.url)
+        blind.wait("document.querySelectorAll('article').length === 1")
+        blind.open(f"{base(portal)}/#/view/drone-1/test-1")
+        blind.wait("document.querySelector('.stage').textContent.includes('cannot draw in 3D')")
+        blind.open(f"{base(portal)}/#/")
+        blind.wait("document.querySelectorAll('article').length === 1")
+    finally:
+        blind.close()
+
+
+def test_an_empty_library_says_how_scans_get_there(browser: Browser, tmp_path: Path) -> None:
+    one = Portal(PortalConfig(tmp_path / "none", port=0, token=TOKEN))
+    one.start()
+    try:
+        browser.open(one.url)
+        browser.wait("document.querySelector('.empty h2').textContent === 'No scans yet'")
+    finally:
+        one.close()

@@ -32,6 +32,7 @@ BENCHMARKS: dict[str, str] = {
     "mavlink": "service.bench.mavlink:run",
     "codec": "service.bench.codec:run",
     "link": "service.bench.link:run",
+    "portal": "service.bench.portal:run",
 }
 """Name to ``module:function``; imported when it runs."""
 
@@ -43,6 +44,7 @@ class BenchOptions:
     rounds: int = 30
     warm_up: int = 3
     backend: str = "cpu"
+    device: str = ""  # of the benchmark gpu: "cuda", "cpu", or empty for what is there
     data: Path | None = None  # folder with ground truth, for the benchmarks that score
 
 

@@ -13,7 +13,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +33,14 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
-from service.coverage import LiveCoverages
 from service.errors import InputError, OutsideError
 from service.ground.guard import LARGEST_BODY_BYTES, Guard, is_loopback
 from service.ground.jobs import Jobs
 from service.ground.library import Library
 from service.ground.live_socket import serve_live
 from service.ground.openapi import DOCUMENT
+from service.ground.scan_files import file_routes
+from service.ground.state import PortalState, names_of, state_of
 from service.ground.vehicle import Vehicle
 
 log = logging.getLogger(__name__)
@@ -53,10 +54,6 @@ NO_PAGE = (
     " the npm registry in reach. The interface works: <a href=/api/scans>scans</a>,"
     " <a href=/api/openapi.json>description</a>.</p>"
 )
-SANDBOX = {
-    "content-security-policy": "sandbox; default-src 'none'; style-src 'unsafe-inline';"
-    " img-src data:"
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,19 +162,6 @@ class Portal:
             self._vehicle.close()
 
 
-@dataclass(slots=True, eq=False)
-class _State:
-    """What the endpoints share."""
-
-    library: Library
-    jobs: Jobs
-    progress: Callable[[], list[dict[str, Any]]]
-    vehicle: Vehicle | None
-    coverages: LiveCoverages = field(default_factory=LiveCoverages)
-    live_views: int = 0
-    started: float = field(default_factory=time.monotonic)
-
-
 def portal_app(
     store: Path,
     token: str,
@@ -186,7 +170,7 @@ def portal_app(
     vehicle: Vehicle | None = None,
 ) -> ASGIApp:
     """The portal as an ASGI application; ``local`` when only this machine can reach it."""
-    state = _State(Library(store), Jobs(), progress or list, vehicle)
+    state = PortalState(Library(store), Jobs(), progress or list, vehicle)
     one = "/api/scans/{drone}/{scan}"
     routes: list[Any] = [
         Route("/", _page),
@@ -194,10 +178,8 @@ def portal_app(
         Route(one, _scan, methods=["GET"]),
         Route(one, _label, methods=["PATCH"]),
         Route(one, _delete, methods=["DELETE"]),
-        Route(one + "/files/{name}", _file),
+        *file_routes(one),
         Route(one + "/exports", _export, methods=["POST"]),
-        Route(one + "/coverage.png", _coverage),
-        Route(one + "/coverage.json", _coverage),
         WebSocketRoute(one + "/live", _live),
         Route("/api/bin", _bin),
         Route("/api/bin/{name}/restore", _restore, methods=["POST"]),
@@ -216,15 +198,6 @@ def portal_app(
     )
     app.state.portal = state
     return Guard(app, token, local)
-
-
-def _portal(connection: HTTPConnection) -> _State:
-    state: _State = connection.app.state.portal
-    return state
-
-
-def _names(connection: HTTPConnection) -> tuple[str, str]:
-    return connection.path_params["drone"], connection.path_params["scan"]
 
 
 def _said(request: HTTPConnection, error: Exception) -> Response:
@@ -257,35 +230,14 @@ def _page(request: Request) -> Response:
 
 
 def _scans(request: Request) -> Response:
-    return JSONResponse(_portal(request).library.scans())
+    return JSONResponse(state_of(request).library.scans())
 
 
 def _scan(request: Request) -> Response:
-    state, names = _portal(request), _names(request)
+    state, names = state_of(request), names_of(request)
     entry = state.library.entry(*names)
     entry["jobs"] = state.jobs.of(state.library.folder(*names))
     return JSONResponse(entry)
-
-
-def _file(request: Request) -> Response:
-    """A deliverable; byte ranges are honoured."""
-    path = _portal(request).library.file(*_names(request), request.path_params["name"])
-    if path.name in ("preview.jpg", "mesh.glb"):
-        return FileResponse(path)
-    if path.name == "report.html":
-        return FileResponse(path, headers=SANDBOX)
-    return FileResponse(path, filename=f"{request.path_params['scan']}-{path.name}")
-
-
-def _coverage(request: Request) -> Response:
-    """The coverage layer as it is now, also of a scan that still grows."""
-    state = _portal(request)
-    found = state.coverages.of(state.library.folder(*_names(request)))
-    if found is None:
-        raise InputError("no surface yet")
-    if request.url.path.endswith(".png"):
-        return Response(found.png_bytes(), media_type="image/png")
-    return Response(found.json_bytes(), media_type="application/json")
 
 
 async def _label(request: Request) -> Response:
@@ -293,15 +245,15 @@ async def _label(request: Request) -> Response:
     unknown = set(body) - {"title", "tags"}
     if unknown:
         raise InputError(f"unknown: {', '.join(sorted(unknown))[:100]}")
-    library = _portal(request).library
+    library = state_of(request).library
     labels = await run_in_threadpool(
-        library.label, *_names(request), body.get("title"), body.get("tags")
+        library.label, *names_of(request), body.get("title"), body.get("tags")
     )
     return JSONResponse({"title": labels.title, "tags": list(labels.tags)})
 
 
 def _delete(request: Request) -> Response:
-    state, (drone, scan) = _portal(request), _names(request)
+    state, (drone, scan) = state_of(request), names_of(request)
     for entry in state.progress():
         if (entry["drone"], entry["scan"]) == (drone, scan):
             raise HTTPException(409, "this scan is open at the receiver; delete it after a restart")
@@ -313,18 +265,18 @@ def _delete(request: Request) -> Response:
 
 async def _export(request: Request) -> Response:
     body = await _body(request)
-    state = _portal(request)
-    folder = state.library.folder(*_names(request))
+    state = state_of(request)
+    folder = state.library.folder(*names_of(request))
     job = state.jobs.start(folder, str(body.get("kind", "")))
     return JSONResponse(job, 202)
 
 
 def _bin(request: Request) -> Response:
-    return JSONResponse(_portal(request).library.bin())
+    return JSONResponse(state_of(request).library.bin())
 
 
 def _restore(request: Request) -> Response:
-    drone, scan = _portal(request).library.restore(request.path_params["name"])
+    drone, scan = state_of(request).library.restore(request.path_params["name"])
     return JSONResponse({"drone": drone, "scan": scan})
 
 
@@ -332,13 +284,13 @@ async def _import(request: Request) -> Response:
     body = await _body(request)
     folder = body.get("folder")
     if not isinstance(folder, str) or not folder or "\0" in folder:
-        raise InputError("give the folder to import")
-    drone, scan = await run_in_threadpool(_portal(request).library.import_folder, Path(folder))
+        raise InputError("give the folder or the .mcap to import")
+    drone, scan = await run_in_threadpool(state_of(request).library.bring_in, Path(folder))
     return JSONResponse({"drone": drone, "scan": scan}, 201)
 
 
 def _status(request: Request) -> Response:
-    state = _portal(request)
+    state = state_of(request)
     return JSONResponse(
         {
             "up_s": round(time.monotonic() - state.started, 1),
@@ -349,14 +301,14 @@ def _status(request: Request) -> Response:
 
 
 def _figures(request: Request) -> Response:
-    vehicle = _portal(request).vehicle
+    vehicle = state_of(request).vehicle
     return JSONResponse({"connected": None} if vehicle is None else vehicle.figures())
 
 
 async def _order(request: Request) -> Response:
     """An order to the vehicle; the answer is the companion's own."""
     body = await _body(request)
-    vehicle = _portal(request).vehicle
+    vehicle = state_of(request).vehicle
     if vehicle is None:
         raise InputError("no vehicle: start with 'skyrelief ground --vehicle ENDPOINT'")
     metres = body.get("metres")
@@ -369,7 +321,7 @@ async def _order(request: Request) -> Response:
 def _metrics(request: Request) -> Response:
     """The receiver's figures in the text form of Prometheus."""
     lines = ["# TYPE skyrelief_received_bytes counter", "# TYPE skyrelief_keyframes gauge"]
-    for entry in _portal(request).progress():
+    for entry in state_of(request).progress():
         labels = f'{{drone="{_quoted(entry["drone"])}",scan="{_quoted(entry["scan"])}"}}'
         lines.append(f"skyrelief_received_bytes{labels} {entry['received_bytes']}")
         lines.append(f"skyrelief_keyframes{labels} {entry['held'].get('k0', 0)}")
@@ -382,9 +334,9 @@ def _quoted(text: str) -> str:
 
 async def _live(socket: WebSocket) -> None:
     """Messages of :mod:`service.ground.live` until the browser goes away."""
-    state = _portal(socket)
+    state = state_of(socket)
     try:
-        folder = state.library.folder(*_names(socket))
+        folder = state.library.folder(*names_of(socket))
     except InputError as error:
         await socket.close(1008, str(error)[:100])
         return

@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import InputError, OutsideError, SkyreliefError
-from service.scan_folder import SUMMARY, writing
+from service.ground.mcap_import import header_in, store_from_mcap
+from service.scan_folder import SUMMARY, write_deliverables, writing
 from service.stream.store import ScanStore
 
 BIN = ".bin"
@@ -93,6 +94,7 @@ class Library:
             "tags": list(labels.tags),
             "files": _files(folder),
             "preview": (folder / "preview.jpg").is_file(),
+            "tiles": (folder / "3dtiles" / "tileset.json").is_file(),
             "started_unix_s": None,
             "origin": None,
             "finished": False,
@@ -150,6 +152,35 @@ class Library:
                 raise InputError(f"there is a scan {parts[0]}/{parts[1]}; rename its folder first")
             _move(self.store / BIN / name, target)
         return parts[0], parts[1]
+
+    def bring_in(self, source: Path) -> tuple[str, str]:
+        """Import a scan folder or an MCAP; its drone and scan."""
+        if source.suffix.lower() == ".mcap":
+            return self.import_mcap(source)
+        return self.import_folder(source)
+
+    def import_mcap(self, source: Path) -> tuple[str, str]:
+        """Make a scan folder of an aircraft's MCAP, with its usual files.
+
+        Raises InputError when it is no scan's recording or the library has that scan already.
+        """
+        header = header_in(source)
+        drone, scan = _safe(header.drone, "drone"), _safe(header.scan_id, "scan")
+        target = self.store / drone / scan
+        part = target.with_name(f".{scan}.part")
+        try:
+            with self._lock:
+                if target.exists():
+                    raise InputError(f"the library holds {drone}/{scan} already")
+                shutil.rmtree(part, ignore_errors=True)
+                with store_from_mcap(source, part / "scan.db") as store:
+                    write_deliverables(part, store, {})
+                os.replace(part, target)
+        except OSError as error:
+            raise OutsideError(f"cannot write {target} ({error})") from error
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+        return drone, scan
 
     def import_folder(self, source: Path) -> tuple[str, str]:
         """Copy a scan folder, as it lay on the aircraft's disk, into the library.

@@ -53,6 +53,12 @@ DOCUMENT: dict[str, Any] = {
         "/api/scans/{drone}/{scan}/files/{name}": _path(
             "drone", "scan", "name", get=_operation("A deliverable; ranges work.", "the file")
         ),
+        "/api/scans/{drone}/{scan}/tiles/{name}": _path(
+            "drone", "scan", "name", get=_operation("A file of the 3D Tiles.", "the file")
+        ),
+        "/api/scans/{drone}/{scan}/keyframes/{seq}.jpg": _path(
+            "drone", "scan", "seq", get=_operation("The colours of a keyframe.", "a picture")
+        ),
         "/api/scans/{drone}/{scan}/exports": _path(
             "drone",
             "scan",
@@ -80,7 +86,7 @@ DOCUMENT: dict[str, Any] = {
         ),
         "/api/import": _path(
             post=_operation(
-                "Copy a scan folder of this machine into the library.",
+                "Bring a scan folder or an MCAP of this machine into the library.",
                 "its drone and scan",
                 True,
                 {"folder": _TEXT},

@@ -20,6 +20,7 @@ export interface Scan {
   tags: string[];
   files: { name: string; what: string; bytes: number }[];
   preview: boolean;
+  tiles: boolean;
   started_unix_s: number | null;
   origin: Origin | null;
   finished: boolean;
@@ -46,6 +47,9 @@ async function ask<T>(path: string, method = "GET", body?: unknown): Promise<T> 
 const place = (s: { drone: string; scan: string }): string =>
   `/api/scans/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`;
 
+/** Where everything of a scan lies. */
+export const scanAddress = place;
+
 export const scans = (): Promise<Scan[]> => ask("/api/scans");
 export const scan = (drone: string, name: string): Promise<Scan> =>
   ask(place({ drone, scan: name }));
@@ -54,6 +58,17 @@ export const label = (s: Scan, body: { title?: string; tags?: string[] }): Promi
 export const remove = (s: Scan): Promise<unknown> => ask(place(s), "DELETE");
 export const make = (s: Scan, kind: string): Promise<Job> =>
   ask(`${place(s)}/exports`, "POST", { kind });
+/** The scan, when its newest job of a kind has ended; throws the job's error. */
+export async function finished(s: Scan, kind: string): Promise<Scan> {
+  for (;;) {
+    const now = await scan(s.drone, s.scan);
+    const job = (now.jobs ?? []).filter((j) => j.kind === kind).at(-1);
+    if (job?.state === "failed") throw new Error(job.error ?? "failed");
+    if (!job || job.state === "done") return now;
+    await new Promise((resolve) => setTimeout(resolve, 500));
+  }
+}
+
 export const bin = (): Promise<string[]> => ask("/api/bin");
 export const restore = (name: string): Promise<unknown> =>
   ask(`/api/bin/${encodeURIComponent(name)}/restore`, "POST", {});

@@ -5,7 +5,7 @@ import { count, date, el, size, tell } from "./dom";
 import { vehicleStrip } from "./vehicle";
 
 const KINDS = [
-  "laz", "copc", "ply", "dsm", "ortho", "contours", "glb", "geojson", "kml", "mcap",
+  "laz", "copc", "ply", "dsm", "ortho", "contours", "glb", "3dtiles", "geojson", "kml", "mcap",
 ];
 
 export async function showLibrary(root: HTMLElement): Promise<void> {
@@ -26,7 +26,7 @@ export async function showLibrary(root: HTMLElement): Promise<void> {
       [s.title, s.scan, s.drone, ...s.tags].join(" ").toLowerCase().includes(wanted),
     );
     list.replaceChildren(...shown.map((s) => card(s, again)));
-    if (!shown.length) list.append(el("p", { textContent: "No scans here yet." }));
+    if (!shown.length) list.append(empty(scans.length > 0));
   };
   search.oninput = draw;
   async function load(): Promise<void> {
@@ -38,8 +38,19 @@ export async function showLibrary(root: HTMLElement): Promise<void> {
   await load();
 }
 
+/** What an empty list says: how scans get here. */
+function empty(filtered: boolean): HTMLElement {
+  if (filtered) return el("p", { className: "empty", textContent: "No scan has that name, tag or drone." });
+  return el(
+    "div",
+    { className: "empty" },
+    el("h2", { textContent: "No scans yet" }),
+    el("p", { textContent: "They appear here as soon as a drone calls. A scan folder or an MCAP from an aircraft's storage can be imported above." }),
+  );
+}
+
 function importForm(again: () => void): HTMLElement {
-  const folder = el("input", { placeholder: "scan folder on this machine" });
+  const folder = el("input", { placeholder: "folder or .mcap on this machine", size: 30 });
   folder.setAttribute("aria-label", "folder to import");
   const act = el("button", {
     textContent: "Import",
@@ -57,8 +68,13 @@ function card(s: api.Scan, again: () => void): HTMLElement {
     "article",
     {},
     el("a", { href: open, className: "picture" }, picture),
-    el("h2", {}, el("a", { href: open, textContent: s.title })),
-    el("p", { className: "facts", textContent: facts(s) }),
+    el(
+      "h2",
+      {},
+      el("a", { href: open, textContent: s.title }),
+      s.finished || s.trouble ? null : el("span", { className: "badge", textContent: "growing" }),
+    ),
+    facts(s),
     s.trouble ? el("p", { className: "trouble", textContent: s.trouble }) : null,
     el("p", { className: "tags" }, ...s.tags.map((t) => el("span", { textContent: t }))),
     downloads(s),
@@ -73,16 +89,21 @@ function card(s: api.Scan, again: () => void): HTMLElement {
   );
 }
 
-function facts(s: api.Scan): string {
-  const parts = [s.drone, date(s.started_unix_s)];
-  if (s.origin) parts.push(`${s.origin.lat_deg.toFixed(5)}, ${s.origin.lon_deg.toFixed(5)}`);
-  if (s.counts?.points !== undefined) parts.push(`${count(s.counts.points)} points`);
-  else if (s.counts?.keyframes !== undefined) parts.push(`${s.counts.keyframes} keyframes`);
+function facts(s: api.Scan): HTMLElement {
+  const rows: [string, string][] = [["Drone", s.drone], ["Flown", date(s.started_unix_s)]];
+  if (s.origin) rows.push(["Place", `${s.origin.lat_deg.toFixed(5)}, ${s.origin.lon_deg.toFixed(5)}`]);
   const { area_m2, sigma_median_m } = s.quality ?? {};
-  if (area_m2) parts.push(`${count(area_m2)} m²`);
-  if (sigma_median_m) parts.push(`σ ${sigma_median_m.toFixed(2)} m`);
-  if (!s.finished) parts.push("not finished");
-  return parts.join(" · ");
+  const size: string[] = [];
+  if (s.counts?.points !== undefined) size.push(`${count(s.counts.points)} points`);
+  else if (s.counts?.keyframes !== undefined) size.push(`${s.counts.keyframes} keyframes`);
+  if (area_m2) size.push(`${count(area_m2)} m²`);
+  if (size.length) rows.push(["Size", size.join(", ")]);
+  if (sigma_median_m) rows.push(["Sigma", `${sigma_median_m.toFixed(2)} m (median)`]);
+  return el(
+    "dl",
+    { className: "facts" },
+    ...rows.flatMap(([k, v]) => [el("dt", { textContent: k }), el("dd", { textContent: v })]),
+  );
 }
 
 function downloads(s: api.Scan): HTMLElement {
@@ -111,24 +132,14 @@ function makeMenu(s: api.Scan, again: () => void): HTMLElement {
     menu.value = "";
     try {
       await api.make(s, kind);
-      await done(s, kind);
+      tell(`making ${kind} of “${s.title}” …`);
+      await api.finished(s, kind);
       again();
     } catch (error) {
       tell(error);
     }
   };
   return menu;
-}
-
-/** Waits until the newest job of a kind has ended; throws its error. */
-async function done(s: api.Scan, kind: string): Promise<void> {
-  for (;;) {
-    const jobs = (await api.scan(s.drone, s.scan)).jobs ?? [];
-    const job = jobs.filter((j) => j.kind === kind).at(-1);
-    if (job?.state === "failed") throw new Error(job.error ?? "failed");
-    if (!job || job.state === "done") return;
-    await new Promise((resolve) => setTimeout(resolve, 500));
-  }
 }
 
 function rename(s: api.Scan, again: () => void): void {

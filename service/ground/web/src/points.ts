@@ -58,6 +58,8 @@ interface Held {
 export class Cloud {
   readonly group = new THREE.Group();
   budget = 3_000_000;
+  drawn = 0;
+  private detail = 1;
   private readonly chunks = new Map<number, Held>();
   private readonly shared = {
     size: { value: 300 },
@@ -109,16 +111,39 @@ export class Cloud {
     if (mode === "age") this.ages();
   }
 
+  /** The words at both ends of the colour scale; null for the camera's colours. */
+  scale(): [string, string] | null {
+    const { x, y } = this.shared.range.value;
+    const words: Record<Colour, [string, string] | null> = {
+      colour: null,
+      height: [`${x.toFixed(1)} m`, `${y.toFixed(1)} m`],
+      sigma: ["0 m", "σ 1 m"],
+      views: ["1 view", "8 views"],
+      age: ["first", "last"],
+    };
+    return words[COLOURS[this.shared.mode.value]!];
+  }
+
   pointSize(pixelsAtOneMetre: number): void {
     this.shared.size.value = pixelsAtOneMetre;
   }
 
   /** Draws at most the budget: of each chunk, whose points are shuffled, the first part. */
   thin(): void {
-    const share = Math.min(1, this.budget / Math.max(1, this.total));
+    const share = Math.min(1, this.budget / Math.max(1, this.total)) * this.detail;
+    this.drawn = 0;
     for (const { object, points } of this.chunks.values()) {
-      object.geometry.setDrawRange(0, Math.ceil(points * share));
+      const count = Math.ceil(points * share);
+      object.geometry.setDrawRange(0, count);
+      this.drawn += count;
     }
+  }
+
+  /** Draws this share of what the budget allows. */
+  setDetail(share: number): void {
+    if (share === this.detail) return;
+    this.detail = share;
+    this.thin();
   }
 
   /** Heights of the middle 96 % of a sample of the points, for the colour scale. */

@@ -1,9 +1,17 @@
-// The scene around the cloud: renderer, camera, track, aircraft, mesh, VR.
+// The scene around the cloud: renderer, camera, track, cameras flown, mesh, tiles, VR.
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 import { VRButton } from "three/addons/webxr/VRButton.js";
+import type { Look } from "./look";
+
+export const BACKGROUND = 0x171b20;
+const INPUTS = ["pointerdown", "click", "input", "change", "keydown", "wheel"];
+const MOVING_MS = 250;
+const LIVELY_MS = 500;
+const MOVING_FRAME_MS = 70;
+const LEAST_SHARE = 0.02;
 
 /** False when this browser cannot draw in 3D. */
 export function canDraw(): boolean {
@@ -21,32 +29,36 @@ export class Stage {
   readonly controls: OrbitControls;
   readonly model = new THREE.Group();
   follow = true;
+  frames_per_s = 0;
+  look: Look | null = null;
+  /** Draw all points also while the view moves, however long it takes. */
+  fullDetail = false;
+  /** Told what share of the points to draw: less while the view moves, to keep up. */
+  onDetail: (share: number) => void = () => undefined;
+  /** Called before each picture. */
+  readonly before: (() => void)[] = [];
   private readonly world = new THREE.Group(); // what VR shrinks and lays at one's feet
   private readonly track = new THREE.Line(
     new THREE.BufferGeometry(),
-    new THREE.LineBasicMaterial({ color: 0xeb3c28 }),
-  );
-  private readonly frustum = new THREE.LineSegments(
-    new THREE.BufferGeometry(),
-    new THREE.LineBasicMaterial({ color: 0x2a6df4 }),
+    new THREE.LineBasicMaterial({ color: 0xff6b4a }),
   );
   private readonly watcher: ResizeObserver;
-  private frames = 0;
-  private since = performance.now();
-  frames_per_s = 0;
+  private touched = performance.now();
+  private moved = -1e9;
+  private drawn = 0; // when the last picture was drawn; 0 when the one before was left out
+  private settled = false;
+  private share = 1; // of the points, while moving
+  private readonly keys = new Set<string>();
+  private last = performance.now();
 
   constructor(private readonly host: HTMLElement) {
-    this.scene.background = new THREE.Color(0xeef1f4);
+    this.scene.background = new THREE.Color(BACKGROUND);
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(0, -120, 90);
     this.controls = new OrbitControls(this.camera, this.renderer.domElement);
     this.controls.addEventListener("start", () => (this.follow = false));
     this.track.frustumCulled = false;
-    this.frustum.frustumCulled = false;
-    this.frustum.matrixAutoUpdate = false;
-    this.frustum.geometry.setFromPoints(frustumLines());
-    this.frustum.visible = false;
-    this.world.add(this.track, this.frustum, this.model);
+    this.world.add(this.track, this.model);
     this.scene.add(this.world, new THREE.AmbientLight(0xffffff, 2));
     host.append(this.renderer.domElement);
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
@@ -54,6 +66,9 @@ export class Stage {
     this.watcher = new ResizeObserver(() => this.resize());
     this.watcher.observe(host);
     this.resize();
+    addEventListener("keydown", this.press);
+    addEventListener("keyup", this.release);
+    for (const name of INPUTS) addEventListener(name, this.touch);
     this.renderer.setAnimationLoop(() => this.draw());
   }
 
@@ -62,6 +77,9 @@ export class Stage {
   }
 
   close(): void {
+    removeEventListener("keydown", this.press);
+    removeEventListener("keyup", this.release);
+    for (const name of INPUTS) removeEventListener(name, this.touch);
     this.renderer.setAnimationLoop(null);
     this.watcher.disconnect();
     this.controls.dispose();
@@ -75,12 +93,8 @@ export class Stage {
     );
   }
 
-  /** Puts the aircraft's camera at its pose; in follow mode the view goes along. */
-  setCamera(T: number[], reach: number): void {
-    const s = reach / 4;
-    this.frustum.matrix.fromArray(T).scale(new THREE.Vector3(s, s, s));
-    this.frustum.matrixWorldNeedsUpdate = true;
-    this.frustum.visible = true;
+  /** In follow mode the view goes along with the camera at T, which looks `reach` metres far. */
+  goAlong(T: number[], reach: number): void {
     if (!this.follow) return;
     const eye = new THREE.Vector3().setFromMatrixPosition(new THREE.Matrix4().fromArray(T));
     const axis = new THREE.Vector3(T[8], T[9], T[10]);
@@ -104,12 +118,18 @@ export class Stage {
     this.camera.updateProjectionMatrix();
   }
 
-  /** Shows a mesh made by skyrelief: glTF with y up, turned back to z up. */
-  async load(address: string): Promise<void> {
+  fieldOfView(degrees: number): void {
+    this.camera.fov = degrees;
+    this.camera.updateProjectionMatrix();
+  }
+
+  /** Shows a mesh made by skyrelief: glTF with y up, turned back to z up. Returns what removes it. */
+  async load(address: string): Promise<() => void> {
     const { scene } = await new GLTFLoader().loadAsync(address);
     scene.rotation.x = Math.PI / 2;
-    this.model.clear();
     this.model.add(scene);
+    this.touch();
+    return () => void this.model.remove(scene);
   }
 
   /** The button that enters VR, or null where the browser has no WebXR. */
@@ -135,17 +155,69 @@ export class Stage {
     this.world.matrixWorldNeedsUpdate = true;
   }
 
+  /** Something changed that is to be seen: pictures are drawn again for a moment. */
+  readonly touch = (): void => {
+    this.touched = performance.now();
+  };
+
+  /** One tick. Nothing is drawn while nothing changes; the last picture has full detail. */
   private draw(): void {
-    if (!this.renderer.xr.isPresenting) this.controls.update();
-    this.renderer.render(this.scene, this.camera);
-    this.frames += 1;
     const now = performance.now();
-    if (now - this.since > 1000) {
-      this.frames_per_s = (1000 * this.frames) / (now - this.since);
-      this.frames = 0;
-      this.since = now;
+    const presenting = this.renderer.xr.isPresenting;
+    if (!presenting) {
+      const flying = this.fly((now - this.last) / 1000);
+      if (this.controls.update() || flying) this.moved = now;
     }
+    this.last = now;
+    const moving = presenting || now - this.moved < MOVING_MS;
+    const lively = moving || now - this.touched < LIVELY_MS;
+    if (!lively && this.settled) {
+      this.drawn = 0;
+      return;
+    }
+    this.settled = !lively;
+    if (this.drawn) this.pace(now - this.drawn, moving);
+    this.drawn = now;
+    this.onDetail(moving && !this.fullDetail ? this.share : 1);
+    for (const call of this.before) call();
+    if (this.look && !presenting) this.look.render();
+    else this.renderer.render(this.scene, this.camera);
   }
+
+  /** Keeps the frame rate's figure, and the share of points that holds MOVING_FRAME_MS. */
+  private pace(ms: number, moving: boolean): void {
+    this.frames_per_s = 1000 / Math.max(ms, 1);
+    if (!moving) return;
+    const change = Math.min(Math.max(MOVING_FRAME_MS / Math.max(ms, 1), 0.5), 1.2);
+    this.share = Math.min(Math.max(this.share * change, LEAST_SHARE), 1);
+  }
+
+  /** W A S D fly over the ground, R and F up and down; faster the farther one looks. */
+  private fly(seconds: number): boolean {
+    if (!this.keys.size) return false;
+    const has = (key: string): number => (this.keys.has(key) ? 1 : 0);
+    const gaze = this.controls.target.clone().sub(this.camera.position);
+    const step = gaze.length() * Math.min(seconds, 0.1);
+    const ahead = gaze.setZ(0).normalize();
+    const right = new THREE.Vector3().crossVectors(ahead, this.camera.up);
+    const move = ahead.multiplyScalar(has("w") - has("s")).addScaledVector(right, has("d") - has("a"));
+    move.z += has("r") - has("f");
+    move.multiplyScalar(step);
+    this.camera.position.add(move);
+    this.controls.target.add(move);
+    this.follow = false;
+    return true;
+  }
+
+  private readonly press = (event: KeyboardEvent): void => {
+    const typing = event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement;
+    const key = event.key.toLowerCase();
+    if (!typing && !event.ctrlKey && !event.metaKey && "wasdrf".includes(key)) this.keys.add(key);
+  };
+
+  private readonly release = (event: KeyboardEvent): void => {
+    this.keys.delete(event.key.toLowerCase());
+  };
 
   private resize(): void {
     const { clientWidth: w, clientHeight: h } = this.host;
@@ -153,19 +225,7 @@ export class Stage {
     this.camera.aspect = w / h;
     this.camera.updateProjectionMatrix();
     this.renderer.setSize(w, h);
+    this.look?.resize(w, h);
+    this.touch();
   }
-}
-
-/** A pyramid along z with a mark at its upper (minus y) side. */
-function frustumLines(): THREE.Vector3[] {
-  const corners = [
-    [-0.6, -0.4], [0.6, -0.4], [0.6, 0.4], [-0.6, 0.4],
-  ].map(([x, y]) => new THREE.Vector3(x, y, 1));
-  const out: THREE.Vector3[] = [];
-  corners.forEach((corner, i) => {
-    out.push(new THREE.Vector3(), corner, corner, corners[(i + 1) % 4]!);
-  });
-  const mark = [new THREE.Vector3(-0.2, -0.42, 1), new THREE.Vector3(0, -0.62, 1)];
-  out.push(mark[0]!, mark[1]!, mark[1]!, new THREE.Vector3(0.2, -0.42, 1));
-  return out;
 }

@@ -1,0 +1,147 @@
+"""``skyrelief bench portal``: the page in a headless Chromium, drawn in software.
+
+Page load on loopback, from a keyframe in the receiver's store to its points in the browser,
+and frame times of ten million points. SwiftShader draws on the processor: a graphics card is
+one to two orders of magnitude faster.
+"""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from service.bench import BenchOptions, BenchResult
+from service.bench.browser import Browser, chromium
+from service.bench.keyframes import make_keyframe
+from service.errors import OutsideError
+from service.ground.http import PAGE, Portal, PortalConfig
+from service.stream.codec import encode
+from service.stream.records import ScanHeader
+from service.stream.store import ScanStore
+
+NOTE = "software rendering (SwiftShader), 1280x800"
+LARGE_PX = (640, 360)
+KEYFRAMES = 44  # of 230,400 points: ten million
+ARRIVALS = 15
+SETTLING, FRAMES, FULL_FRAMES = 25, 40, 6
+TOKEN = "a-token-for-the-benchmark"
+FRAME_TIMES = """new Promise(done => {
+  dispatchEvent(new KeyboardEvent('keydown', { key: 'd' }));
+  const times = []; let last = performance.now();
+  const tick = now => {
+    times.push(now - last); last = now;
+    if (times.length <= %d) requestAnimationFrame(tick);
+    else { dispatchEvent(new KeyboardEvent('keyup', { key: 'd' })); done(times.slice(1)); }
+  };
+  requestAnimationFrame(tick);
+})"""
+BUDGET = """(() => {
+  const label = [...document.querySelectorAll('.settings label')]
+    .find(l => l.textContent.startsWith('Points drawn'));
+  const input = label.querySelector('input'); input.value = '7.1'; input.oninput();
+})()"""
+FULL_DETAIL = """[...document.querySelectorAll('.settings label')]
+  .find(l => l.textContent.startsWith('Full detail')).querySelector('input').click()"""
+
+
+def run(options: BenchOptions) -> list[BenchResult]:
+    """The figures; OutsideError without Chromium or without the built page."""
+    if not chromium():
+        raise OutsideError("bench portal needs Chromium; apt install chromium")
+    if not (PAGE / "index.html").is_file():
+        raise OutsideError("bench portal needs the portal's page; see CONTRIBUTING.md")
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        store = _large_scan(root / "scans" / "bench" / "large")
+        growing = ScanStore.create(root / "scans" / "bench" / "live" / "scan.db", _header("live"))
+        with store, growing, _page(root) as (browser, base):
+            load = _page_loads(browser, base, max(3, options.rounds // 5))
+            arrivals = _arrivals(browser, base, growing)
+            flying, still = _frame_times(browser, base)
+    return [
+        _result("page load, cold cache, list drawn", load),
+        _result("keyframe in the store to points in the browser", arrivals),
+        _result("frame while flying over 10.1 M points, thinned to keep up", flying),
+        _result("frame with all 10.1 M points drawn", still),
+    ]
+
+
+def _result(what: str, times_ms: list[float]) -> BenchResult:
+    tenths = statistics.quantiles(times_ms, n=10) if len(times_ms) > 1 else [0.0, 0.0]
+    note = f"{NOTE}; worst {max(times_ms):.0f} ms"
+    middle = statistics.median(times_ms)
+    return BenchResult("portal", what, middle, "ms", tenths[-1] - tenths[0], note=note)
+
+
+def _header(scan: str) -> ScanHeader:
+    return ScanHeader(scan, "bench", 1_700_000_000_000_000_000)
+
+
+def _large_scan(folder: Path) -> ScanStore:
+    """Ten million points in 44 keyframes, finished."""
+    store = ScanStore.create(folder / "scan.db", _header("large"))
+    for seq in range(KEYFRAMES):
+        store.add_keyframe(seq, encode(make_keyframe(seq, LARGE_PX), seq))
+    store.finish({})
+    return store
+
+
+@contextmanager
+def _page(root: Path) -> Iterator[tuple[Browser, str]]:
+    """A browser and the address of a portal on the scans below ``root``."""
+    portal = Portal(PortalConfig(root / "scans", port=0, token=TOKEN))
+    portal.start()
+    browser = Browser(root / "profile")
+    try:
+        yield browser, portal.url.split("/?")[0]
+    finally:
+        browser.close()
+        portal.close()
+
+
+def _page_loads(browser: Browser, base: str, rounds: int) -> list[float]:
+    """Milliseconds from the request to the list of scans, nothing from the cache."""
+    browser.call("Network.setCacheDisabled", cacheDisabled=True)
+    times = []
+    for _ in range(rounds):
+        browser.open("about:blank")
+        browser.wait("location.href === 'about:blank'")
+        started = time.perf_counter()
+        browser.open(base)
+        browser.wait("document.querySelectorAll('article').length === 2")
+        times.append(1e3 * (time.perf_counter() - started))
+    return times
+
+
+def _arrivals(browser: Browser, base: str, store: ScanStore) -> list[float]:
+    """Milliseconds from a keyframe's commit to its points in the scene."""
+    browser.open(f"{base}/#/view/bench/live")
+    browser.wait("document.querySelector('.state').textContent === 'receiving'")
+    times = []
+    for seq in range(ARRIVALS):
+        layers = encode(make_keyframe(seq), seq)
+        committed = 1e3 * time.time()
+        store.add_keyframe(seq, layers)
+        at = browser.wait(
+            f"document.body.dataset.chunk?.startsWith('{seq} ') && document.body.dataset.chunk", 30
+        )
+        times.append(float(at.split()[1]) - committed)
+        time.sleep(0.07 * (seq % 5))  # every phase of the portal's own beat
+    return times
+
+
+def _frame_times(browser: Browser, base: str) -> tuple[list[float], list[float]]:
+    """Milliseconds of frames while flying over the scan: as usual, and with full detail."""
+    points = KEYFRAMES * LARGE_PX[0] * LARGE_PX[1]
+    browser.open(f"{base}/#/view/bench/large")
+    browser.wait(f"Number(document.body.dataset.points) >= {0.99 * points}", 120)
+    browser.run(BUDGET)
+    browser.run(FRAME_TIMES % SETTLING)  # until the page knows what this machine can draw
+    flying = browser.run(FRAME_TIMES % FRAMES)
+    browser.run(FULL_DETAIL)
+    still = browser.run(FRAME_TIMES % FULL_FRAMES)
+    return [float(t) for t in flying], [float(t) for t in still]

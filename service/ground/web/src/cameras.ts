@@ -1,0 +1,113 @@
+// Where pictures were taken: a frustum per keyframe, the aircraft's with its latest picture.
+
+import * as THREE from "three";
+
+const CORNERS: [number, number][] = [
+  [-0.66, -0.37], [0.66, -0.37], [0.66, 0.37], [-0.66, 0.37],
+];
+
+export class Cameras {
+  readonly group = new THREE.Group();
+  private readonly taken = new Map<number, THREE.Matrix4>();
+  private readonly all = new THREE.LineSegments(
+    new THREE.BufferGeometry(),
+    new THREE.LineBasicMaterial({ color: 0x6f8296, transparent: true, opacity: 0.55 }),
+  );
+  private readonly now = new THREE.LineSegments(
+    new THREE.BufferGeometry().setFromPoints(frustum()),
+    new THREE.LineBasicMaterial({ color: 0x59b4ff }),
+  );
+  private readonly picture = new THREE.Mesh(
+    pane(),
+    new THREE.MeshBasicMaterial({ side: THREE.DoubleSide, toneMapped: false }),
+  );
+  private reach = 10;
+  private stale = false;
+
+  constructor() {
+    for (const object of [this.all, this.now, this.picture]) object.frustumCulled = false;
+    for (const object of [this.now, this.picture]) {
+      object.matrixAutoUpdate = false;
+      object.visible = false;
+    }
+    this.group.add(this.all, this.now, this.picture);
+  }
+
+  get shown(): boolean {
+    return this.all.visible;
+  }
+
+  /** Shows or hides the frusta of the keyframes; the aircraft's stays. */
+  toggle(): void {
+    this.all.visible = !this.all.visible;
+  }
+
+  /** A keyframe taken, or moved, at T (16 numbers, column by column). */
+  put(seq: number, T: number[]): void {
+    this.taken.set(seq, new THREE.Matrix4().fromArray(T));
+    this.stale = true;
+  }
+
+  /** The aircraft's camera is at T and looks `reach` metres far. */
+  aircraft(T: number[], reach: number): void {
+    if (Math.abs(reach - this.reach) > 0.2 * this.reach) {
+      this.reach = reach;
+      this.stale = true;
+    }
+    const s = this.reach / 4;
+    this.now.matrix.fromArray(T).scale(new THREE.Vector3(s, s, s));
+    this.now.matrixWorldNeedsUpdate = true;
+    this.now.visible = true;
+  }
+
+  /** Hangs the picture of keyframe `seq` into its frustum. */
+  show(seq: number, image: HTMLImageElement): void {
+    const T = this.taken.get(seq);
+    if (!T) return;
+    const texture = new THREE.Texture(image);
+    texture.colorSpace = THREE.SRGBColorSpace;
+    texture.needsUpdate = true;
+    this.picture.material.map?.dispose();
+    this.picture.material.map = texture;
+    this.picture.material.needsUpdate = true;
+    const s = this.reach / 4;
+    this.picture.matrix.copy(T).scale(new THREE.Vector3(s, s, s));
+    this.picture.matrixWorldNeedsUpdate = true;
+    this.picture.visible = true;
+  }
+
+  /** Draws the frusta anew when keyframes came; call now and then. True when it did. */
+  refresh(): boolean {
+    if (!this.stale) return false;
+    this.stale = false;
+    const s = this.reach / 12;
+    const lines = frustum().map((p) => p.multiplyScalar(s));
+    const points: THREE.Vector3[] = [];
+    for (const T of this.taken.values()) for (const p of lines) points.push(p.clone().applyMatrix4(T));
+    this.all.geometry.dispose();
+    this.all.geometry = new THREE.BufferGeometry().setFromPoints(points);
+    return true;
+  }
+}
+
+/** A pyramid along z with a mark at its upper (minus y) side. */
+function frustum(): THREE.Vector3[] {
+  const corners = CORNERS.map(([x, y]) => new THREE.Vector3(x, y, 1));
+  const out: THREE.Vector3[] = [];
+  corners.forEach((corner, i) => {
+    out.push(new THREE.Vector3(), corner, corner, corners[(i + 1) % 4]!);
+  });
+  const mark = [new THREE.Vector3(-0.15, -0.39, 1), new THREE.Vector3(0, -0.54, 1)];
+  out.push(mark[0]!, mark[1]!, mark[1]!, new THREE.Vector3(0.15, -0.39, 1));
+  return out.map((p) => p.clone());
+}
+
+/** The pyramid's base, with the picture the right way up. */
+function pane(): THREE.BufferGeometry {
+  const geometry = new THREE.BufferGeometry().setFromPoints(
+    CORNERS.map(([x, y]) => new THREE.Vector3(x, y, 1)),
+  );
+  geometry.setAttribute("uv", new THREE.Float32BufferAttribute([0, 1, 1, 1, 1, 0, 0, 0], 2));
+  geometry.setIndex([0, 1, 2, 0, 2, 3]);
+  return geometry;
+}

@@ -1,0 +1,40 @@
+// Bloom and depth of field over the plain picture, for those whose graphics card has the time.
+
+import * as THREE from "three";
+import { BokehPass } from "three/addons/postprocessing/BokehPass.js";
+import { EffectComposer } from "three/addons/postprocessing/EffectComposer.js";
+import { OutputPass } from "three/addons/postprocessing/OutputPass.js";
+import { RenderPass } from "three/addons/postprocessing/RenderPass.js";
+import { UnrealBloomPass } from "three/addons/postprocessing/UnrealBloomPass.js";
+import type { Stage } from "./stage";
+
+export class Look {
+  private readonly composer: EffectComposer;
+  private readonly focus: BokehPass;
+
+  constructor(private readonly stage: Stage, bloom: boolean, depthOfField: boolean) {
+    const size = stage.renderer.getSize(new THREE.Vector2());
+    this.composer = new EffectComposer(stage.renderer);
+    this.composer.addPass(new RenderPass(stage.scene, stage.camera));
+    this.focus = new BokehPass(stage.scene, stage.camera, { focus: 100, aperture: 2e-5, maxblur: 0.008 });
+    this.focus.enabled = depthOfField;
+    this.composer.addPass(this.focus);
+    if (bloom) this.composer.addPass(new UnrealBloomPass(size, 0.25, 0.4, 0.7));
+    this.composer.addPass(new OutputPass());
+  }
+
+  render(): void {
+    const { camera, controls } = this.stage;
+    const uniforms = this.focus.uniforms as Record<string, THREE.IUniform>;
+    uniforms["focus"]!.value = camera.position.distanceTo(controls.target);
+    this.composer.render();
+  }
+
+  resize(w: number, h: number): void {
+    this.composer.setSize(w, h);
+  }
+
+  close(): void {
+    this.composer.dispose();
+  }
+}

@@ -1,0 +1,214 @@
+// The view's controls: colour, navigation, measuring, what is shown, and settings.
+
+import * as THREE from "three";
+import * as api from "./api";
+import type { Cameras } from "./cameras";
+import { el, tell } from "./dom";
+import type { Ruler } from "./measure";
+import { COLOURS, type Cloud, type Colour } from "./points";
+import type { Stage } from "./stage";
+
+export interface Parts {
+  stage: Stage;
+  cloud: Cloud;
+  cameras: Cameras;
+  ruler: Ruler;
+  legend: HTMLElement;
+  coverage: HTMLElement;
+  id: { drone: string; scan: string };
+}
+
+/** Everything right of the title. */
+export function toolbar(parts: Parts): HTMLElement {
+  const { stage, ruler } = parts;
+  const bar = el("span", { className: "tools" });
+  const follow = el("button", {
+    textContent: "Follow",
+    title: "go along with the aircraft",
+    onclick: () => void (stage.follow = true),
+  });
+  const whole = el("button", {
+    textContent: "Whole site",
+    title: "see all of it; W A S D R F fly",
+    onclick: () => ((stage.follow = false), stage.frame()),
+  });
+  bar.append(
+    group(colours(parts)),
+    group(follow, whole),
+    group(measure(stage, ruler, parts.cloud), cameraButton(parts.cameras), coverageButton(parts)),
+    showGroup(parts),
+    settings(parts),
+  );
+  void stage.vr().then((button) => button && bar.append(button));
+  return bar;
+}
+
+const group = (...children: HTMLElement[]): HTMLElement => el("span", { className: "group" }, ...children);
+
+function colours({ cloud, legend }: Parts): HTMLElement {
+  const select = el(
+    "select",
+    {},
+    ...COLOURS.map((c) => el("option", { value: c, textContent: c })),
+  );
+  select.setAttribute("aria-label", "colour by");
+  select.onchange = () => {
+    cloud.colour(select.value as Colour);
+    const words = cloud.scale();
+    legend.hidden = words === null;
+    if (words)
+      legend.replaceChildren(
+        el("span", { textContent: words[0] }),
+        el("i", {}),
+        el("span", { textContent: words[1] }),
+      );
+  };
+  return select;
+}
+
+function measure(stage: Stage, ruler: Ruler, cloud: Cloud): HTMLElement {
+  const button = el("button", { textContent: "Measure", title: "click points: distance, height, area" });
+  button.onclick = () => {
+    ruler.active = !ruler.active;
+    ruler.clear();
+    button.classList.toggle("on", ruler.active);
+  };
+  stage.renderer.domElement.addEventListener("click", (event) => {
+    if (!ruler.active) return;
+    const box = stage.renderer.domElement.getBoundingClientRect();
+    const x = (2 * (event.clientX - box.left)) / box.width - 1;
+    const y = 1 - (2 * (event.clientY - box.top)) / box.height;
+    const target = stage.model.children.length ? stage.model : cloud.group;
+    ruler.pick(new THREE.Vector2(x, y), stage.camera, target);
+  });
+  return button;
+}
+
+function cameraButton(cameras: Cameras): HTMLElement {
+  const button = el("button", { textContent: "Cameras", className: "on", title: "where pictures were taken" });
+  button.onclick = () => {
+    cameras.toggle();
+    button.classList.toggle("on", cameras.shown);
+  };
+  return button;
+}
+
+/** The coverage layer beside the scene: gaps and weak places, new every few seconds. */
+function coverageButton({ coverage, id }: Parts): HTMLElement {
+  const button = el("button", { textContent: "Coverage", title: "gaps and weak places so far" });
+  const picture = el("img", { alt: "coverage: gaps red, weak yellow, good green" });
+  const none = el("p", { textContent: "No surface yet." });
+  picture.onerror = () => coverage.replaceChildren(none);
+  picture.onload = () => coverage.replaceChildren(picture);
+  const refresh = (): void => {
+    if (coverage.hidden || !coverage.isConnected) return;
+    picture.src = `${api.scanAddress(id)}/coverage.png?t=${Date.now()}`;
+    setTimeout(refresh, 5000);
+  };
+  button.onclick = () => {
+    coverage.hidden = !coverage.hidden;
+    button.classList.toggle("on", !coverage.hidden);
+    refresh();
+  };
+  return button;
+}
+
+/** Points, tiles or mesh: one at a time. */
+function showGroup(parts: Parts): HTMLElement {
+  const { stage, cloud, id } = parts;
+  let close: () => void = () => undefined;
+  const points = el("button", { textContent: "Points", className: "on" });
+  const tiles = el("button", { textContent: "Tiles", title: "3D Tiles: detail where one looks" });
+  const mesh = el("button", { textContent: "Mesh", title: "the textured mesh" });
+  const buttons = [points, tiles, mesh];
+  const show = async (chosen: HTMLElement, open: () => Promise<() => void>): Promise<void> => {
+    buttons.forEach((b) => (b.disabled = true));
+    try {
+      const next = await open();
+      close();
+      close = next;
+      cloud.group.visible = chosen === points;
+      stage.touch();
+      buttons.forEach((b) => b.classList.toggle("on", b === chosen));
+    } catch (error) {
+      tell(error);
+    }
+    buttons.forEach((b) => (b.disabled = false));
+  };
+  points.onclick = () => void show(points, async () => () => undefined);
+  mesh.onclick = () =>
+    void show(mesh, async () => {
+      await made(id, "glb", "mesh.glb", "There is no mesh yet. Make one now?");
+      const remove = await stage.load(api.file(id, "mesh.glb"));
+      document.body.dataset["mesh"] = "shown";
+      return remove;
+    });
+  tiles.onclick = () =>
+    void show(tiles, async () => {
+      const scan = await made(id, "3dtiles", "3dtiles", "There are no 3D Tiles yet. Make them now?");
+      if (!scan.origin) throw new Error("this scan has no place on the globe, so no tiles");
+      const { showTiles } = await import("./tiles");
+      return showTiles(stage, `${api.scanAddress(id)}/tiles/tileset.json`, scan.origin, () => 2);
+    });
+  return group(...buttons);
+}
+
+/** The scan, once it has a deliverable; makes it when the operator says so. */
+async function made(id: { drone: string; scan: string }, kind: string, name: string, ask: string): Promise<api.Scan> {
+  const has = (s: api.Scan): boolean => (kind === "3dtiles" ? s.tiles : s.files.some((f) => f.name === name));
+  const scan = await api.scan(id.drone, id.scan);
+  if (has(scan)) return scan;
+  if (!confirm(ask)) throw new Error("not made");
+  tell(`making ${kind} …`);
+  await api.make(scan, kind);
+  return api.finished(scan, kind);
+}
+
+function settings({ stage, cloud }: Parts): HTMLElement {
+  const panel = el("div", { className: "settings" });
+  const slide = (text: string, min: number, max: number, step: number, value: number, set: (v: number) => void, words: (v: number) => string): void => {
+    const shown = el("output", { textContent: words(value) });
+    const input = el("input", { type: "range" });
+    Object.assign(input, { min: String(min), max: String(max), step: String(step) });
+    input.value = String(value);
+    input.oninput = () => {
+      set(Number(input.value));
+      shown.textContent = words(Number(input.value));
+    };
+    panel.append(el("label", {}, el("span", { textContent: text }), input, shown));
+  };
+  slide("Point size", 50, 1500, 10, 300, (v) => cloud.pointSize(v), (v) => `${(v / 300).toFixed(1)} x`);
+  slide("Points drawn", 5, 8, 0.1, 6.5, (v) => ((cloud.budget = 10 ** v), cloud.thin()), (v) => `${(10 ** (v - 6)).toFixed(1)} M`);
+  slide("Field of view", 20, 100, 1, 60, (v) => stage.fieldOfView(v), (v) => `${v}°`);
+  slide("Exposure", -2, 2, 0.1, 0, (v) => (stage.renderer.toneMappingExposure = 2 ** v), (v) => `${v > 0 ? "+" : ""}${v.toFixed(1)} EV`);
+  const tone = el("select", {});
+  const tones: [string, THREE.ToneMapping][] = [
+    ["none", THREE.NoToneMapping],
+    ["Reinhard", THREE.ReinhardToneMapping],
+    ["ACES", THREE.ACESFilmicToneMapping],
+    ["neutral", THREE.NeutralToneMapping],
+  ];
+  for (const [name, value] of tones) tone.append(el("option", { textContent: name, value: String(value) }));
+  tone.onchange = () => (stage.renderer.toneMapping = Number(tone.value) as THREE.ToneMapping);
+  panel.append(el("label", {}, el("span", { textContent: "Tone (mesh)" }), tone));
+  const bloom = el("input", { type: "checkbox" });
+  const blur = el("input", { type: "checkbox" });
+  bloom.onchange = blur.onchange = () => void looks(stage, bloom.checked, blur.checked).catch(tell);
+  const full = el("input", { type: "checkbox" });
+  full.onchange = () => (stage.fullDetail = full.checked);
+  panel.append(
+    el("label", { title: "draw all points also while the view moves" }, el("span", { textContent: "Full detail" }), full),
+    el("label", {}, el("span", { textContent: "Bloom" }), bloom),
+    el("label", {}, el("span", { textContent: "Depth of field" }), blur),
+  );
+  const box = el("details", { className: "group" }, el("summary", { textContent: "Settings" }), panel);
+  return box;
+}
+
+async function looks(stage: Stage, bloom: boolean, depthOfField: boolean): Promise<void> {
+  stage.look?.close();
+  stage.look = null;
+  if (!bloom && !depthOfField) return;
+  const { Look } = await import("./look");
+  stage.look = new Look(stage, bloom, depthOfField);
+}
