@@ -68,7 +68,9 @@ class MavlinkConfig:
     )
     signing_key: str = key("", "file with the 32-byte key of signed links, mode 600")
     odometry: bool = key(False, "send our motion estimate to the autopilot (ODOMETRY)")
-    memory: str = key("", "folder that keeps tuned parameters and the signing time over restarts")
+    memory: str = key(
+        "", "folder that keeps tuned parameters and the signing time; empty: scan.folder"
+    )
 
     def __post_init__(self) -> None:
         """Check ranges."""

@@ -34,7 +34,7 @@ def vehicle_config(config: Config) -> VehicleConfig:
             ),
             signing_key=key,
             odometry=mavlink.odometry,
-            state_dir=Path(mavlink.memory) if mavlink.memory else None,
+            state_dir=Path(mavlink.memory or config.scan.folder),
         )
     except ValueError as error:
         raise InputError(f"[mavlink] {error}") from error

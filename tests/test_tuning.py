@@ -45,7 +45,6 @@ class Operator:
         overrides = [
             f"scan.folder={folder}",
             "health.http=",
-            f"mavlink.memory={folder / 'memory'}",
             f"mavlink.links=udpout:127.0.0.1:{port}",
         ]
         self.daemon = Daemon(load_config(None, [*overrides, *settings]))
@@ -126,6 +125,12 @@ def test_a_parameter_is_set_refused_out_of_range_and_kept(tmp_path: Path, name: 
         assert again.daemon.vehicle.parameter(name) == pytest.approx(value)
 
 
+def test_nothing_is_written_where_nothing_was_tuned(tmp_path: Path) -> None:
+    with Operator(tmp_path) as operator:
+        operator.set("SR_BASELINE_M", -1.0)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_the_key_refuses_is_refused_with_the_value_kept(operator: Operator) -> None:
     assert operator.set("SR_RESOLUTION_M", 0.001) == 0.0
     assert operator.config.scan.resolution_m == 0.0
@@ -145,6 +150,7 @@ def test_parameters_begin_as_the_file_says_and_follow_it(tmp_path: Path) -> None
         until(lambda: operator.heard().get("SR_BASELINE_M") == [6.0])
         until(lambda: operator.heard().get("SR_LINK_KBIT_S") == [9.0])
         assert operator.config.camera.latency_ms == 80.0  # tuned, and the file says as before
+    assert "SR_CAM_LATENCY" in (tmp_path / "mavlink.json").read_text()  # beside the scans
     # What was not tuned follows the file.
     with Operator(tmp_path, "scan.resolution_m=0.3", "scan.baseline=2/10") as operator:
         until(lambda: operator.config.camera.latency_ms == 80.0)

@@ -36,7 +36,8 @@ def test_every_key_reaches_the_link(tmp_path: Path) -> None:
 def test_the_default_takes_the_autopilots_system_id() -> None:
     vehicle = vehicle_config(load_config(None, []))
     assert vehicle.presence.system is None and vehicle.links == ()
-    assert vehicle.signing_key is None and vehicle.state_dir is None and not vehicle.odometry
+    assert vehicle.signing_key is None and not vehicle.odometry
+    assert vehicle.state_dir == Path("/var/lib/skyrelief/scans")  # beside the scans
 
 
 @pytest.mark.parametrize(
