@@ -93,9 +93,9 @@ def search(
     H, W = image_b.shape
     S = 2 * reach + 1
     centre = torch.floor(uv_b + 0.5).long()
-    near = (centre >= -reach) & (centre < torch.tensor([W, H], device=uv_b.device) + reach)
+    near = (centre >= -reach).all(1) & (centre[:, 0] < W + reach) & (centre[:, 1] < H + reach)
     patch, within = _sample(image_a, uv_a, inverse_warp, radius)
-    usable = active & near.all(1) & within
+    usable = active & near & within
     patch, contrast = _normalised(patch)
     contrast = torch.where(usable, contrast, 0.0)
     usable = usable & (contrast >= min_contrast)
@@ -128,8 +128,8 @@ def _sample(image: Tensor, uv: Tensor, warp: Tensor, radius: int) -> tuple[Tenso
     u = uv[:, 0, None, None] + w[:, 0] * dx + w[:, 1] * dy
     v = uv[:, 1, None, None] + w[:, 2] * dx + w[:, 3] * dy
     reach = (warp[:, 0::2].abs() + warp[:, 1::2].abs()) * radius  # (N, 2) along u and v
-    size = torch.tensor([W, H], device=image.device)
-    within = ((uv - reach >= 0) & (uv + reach < size - 1)).all(1)
+    low, high = uv - reach, uv + reach
+    within = (low >= 0).all(1) & (high[:, 0] < W - 1) & (high[:, 1] < H - 1)
     u0, v0 = torch.floor(u).clamp(0, W - 2), torch.floor(v).clamp(0, H - 2)
     fu, fv = (u - u0).float(), (v - v0).float()
     flat, first = image.float().view(-1), (v0 * W + u0).long()

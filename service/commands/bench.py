@@ -15,6 +15,7 @@ def bench(
     names: Annotated[list[str] | None, typer.Argument(help="which; all when none is named")] = None,
     rounds: Annotated[int, typer.Option(help="timed rounds of each figure", min=1)] = 30,
     backend: Annotated[str, typer.Option(help="auto, cpu, torch or onnx")] = "cpu",
+    device: Annotated[str, typer.Option(help="of 'gpu': cuda or cpu; default: what is there")] = "",
     data: Annotated[Path | None, typer.Option(help="folder with ground truth to score on")] = None,
     keep: Annotated[Path | None, typer.Option(help="folder for a result file (JSON)")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
@@ -27,7 +28,9 @@ def bench(
             raise InputError(f"bench {name}: there are {', '.join(BENCHMARKS)}")
     if data is not None and not data.is_dir():
         raise InputError(f"{data}: no such folder")
-    options = BenchOptions(rounds=rounds, backend=backend, data=data)
+    if device not in ("", "cuda", "cpu"):
+        raise InputError(f"--device {device}: give cuda or cpu")
+    options = BenchOptions(rounds=rounds, backend=backend, device=device, data=data)
     chosen = names or list(BENCHMARKS)
     results = run_benchmarks(chosen, options)
     print(table(results))

@@ -1,0 +1,69 @@
+"""The benchmark of the device: every stage has a figure, a floor and a device's name."""
+
+from __future__ import annotations
+
+import math
+import sys
+
+import pytest
+
+from recon.belief_propagation import BeliefPropagationConfig
+from service.bench import BenchOptions
+from service.bench import gpu as bench_gpu
+from service.bench.gpu import Floor, propagation_work
+from service.cli import main
+
+pytest.importorskip("torch")
+
+STAGES = (
+    "stereo", "what is believed", "upsampling", "reprojection", "fusion", "corners", "search",
+    "refinement", "cloud",
+)  # fmt: skip
+
+
+def test_every_stage_is_measured_beside_its_floor(
+    monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    """Small pictures here; the figures are those of ``skyrelief bench gpu``."""
+    from service.bench import gpu_stages
+
+    for module in (bench_gpu, gpu_stages):
+        monkeypatch.setattr(module, "SIZE", (96, 54))
+    for guide in ("GUIDE", "GUIDE_ON_DEVICE"):
+        monkeypatch.setattr(bench_gpu, guide, (192, 108))
+    device = str(request.config.getoption("--device"))
+    for table in ("COPY_MB", "PRODUCT"):
+        monkeypatch.setattr(bench_gpu, table, {device: 16})
+    results = bench_gpu.run(BenchOptions(rounds=1, warm_up=0, device=device))
+    on_device = {r.what: r for r in results if r.peer == "floor of the device"}
+    for stage in STAGES:
+        assert any(what.startswith(stage) for what in on_device), stage
+    assert all(r.value > 0 and r.peer_value and r.peer_value > 0 for r in on_device.values())
+    whole = [r for r in results if r.what.startswith("cloud")]
+    assert [r.what.rpartition(", ")[2] for r in whole] == [
+        "on the device", "with uploads", "with uploads",
+    ]  # fmt: skip
+    beside = [r for r in results if r.peer == "cpu backend"]
+    assert all(math.isfinite(r.value) and r.value > 0 for r in beside)
+    assert {r.note.partition(" on ")[0] for r in beside} >= {"torch"}
+    (named,) = [r for r in results if r.what == "bandwidth of the device"]
+    assert named.note and named.value > 0
+
+
+def test_floor_is_the_larger_of_bytes_and_operations() -> None:
+    floor = Floor(1e9, 1e12)
+    assert floor.ms(2e6, 1e6) == pytest.approx(2.0)
+    assert floor.ms(1.0, 5e9) == pytest.approx(5.0)
+    short, long = (propagation_work(BeliefPropagationConfig(), n) for n in (2, 4))
+    assert long[0] == 2 * short[0] > 0
+    assert long[1] == short[1] > 0
+
+
+def test_an_unknown_device_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["skyrelief", "bench", "gpu", "--device", "abacus"])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2
+    assert "give cuda or cpu" in capsys.readouterr().err

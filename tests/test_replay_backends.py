@@ -1,0 +1,84 @@
+"""One recorded flight through the whole path with each backend: clouds that score alike."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("open3d", reason="the simulator needs Open3D (extra 'ground')")
+
+NEEDS = {"torch": "torch", "onnx": "onnxruntime"}
+SMALL = ("compute.stereo_width=160", "compute.guide_width=320", "compute.pairs=1")
+
+
+def skyrelief(*arguments: str | Path) -> dict[str, Any]:
+    """The JSON that the command ends with."""
+    done = subprocess.run(
+        [sys.executable, "-m", "service.cli", *map(str, arguments), "--json"],
+        capture_output=True, text=True, timeout=240, check=False,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    report: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return report
+
+
+def scored(flight: Path, backend: str) -> dict[str, float]:
+    """Points, surface error and completeness of the flight replayed with a backend."""
+    out = flight.parent / backend
+    summary = skyrelief(
+        "replay", flight / "flight.mp4", "--telemetry", flight / "flight.tlog",
+        "--camera-model", flight / "camera.yaml", "--out", out, "--backend", backend,
+        *(word for setting in SMALL for word in ("--set", setting)),
+    )  # fmt: skip
+    assert summary["backend"] == backend
+    report = skyrelief("score", out, flight)
+    surface = report["surface"]["rigid"]
+    return {
+        "clouds": summary["clouds"],
+        "points": report["points"],
+        "median_m": surface["median_m"],
+        "p90_m": surface["p90_m"],
+        "complete": report["completeness"]["share"],
+    }
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated nadir flight of 5 s."""
+    folder = tmp_path_factory.mktemp("sim") / "flight"
+    command = [
+        "simulate", "--out", folder, "--size", "320x180", "--fps", "4", "--duration-s", "5",
+        "--height-m", "40", "--speed-m-s", "6", "--seed", "3",
+    ]  # fmt: skip
+    subprocess.run([sys.executable, "-m", "service.cli", *map(str, command)], check=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def compiled(flight: Path) -> dict[str, float]:
+    """Scores of the compiled backend."""
+    return scored(flight, "cpu")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", sorted(NEEDS))
+def test_each_backend_scores_within_a_tenth(
+    flight: Path, compiled: dict[str, float], backend: str
+) -> None:
+    """Number of clouds and points, surface error and completeness."""
+    if find_spec(NEEDS[backend]) is None:
+        pytest.skip(f"{NEEDS[backend]} is not installed")
+    found = scored(flight, backend)
+    assert compiled["clouds"] >= 8
+    assert compiled["complete"] > 0.3
+    print(f"cpu {compiled}\n{backend} {found}")
+    for name, value in compiled.items():
+        assert found[name] == pytest.approx(value, rel=0.1), name
