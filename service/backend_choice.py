@@ -6,16 +6,16 @@ import ctypes.util
 import logging
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from recon.backends import BACKENDS, Backend, load_backend
+from recon.backends import BACKENDS, Backend, DenseStages, PathBackend, load_backend
 from recon.belief_propagation import BeliefPropagationConfig
-from recon.types import F64, U8, DepthMap, DisparityMap, Registration
+from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 from recon.upsampling import UpsamplingConfig
 from service.errors import InputError, OutsideError
 
@@ -67,6 +67,23 @@ class FallbackBackend:
     ) -> Registration:
         """See :class:`recon.backends.Backend`."""
         return self._run(lambda b: b.register(source, target, T_target_source, config))
+
+    def fused_depth(
+        self,
+        pairs: Sequence[StereoPair],
+        K: F64,
+        size_px: tuple[int, int],
+        T_world_camera: F64,
+        stages: DenseStages,
+    ) -> DepthMap | None:
+        """See :class:`recon.backends.PathBackend`; None also when the CPU goes on."""
+        return self._run(
+            lambda b: (
+                b.fused_depth(pairs, K, size_px, T_world_camera, stages)
+                if isinstance(b, PathBackend)
+                else None
+            )
+        )
 
     def _run(self, operation: Callable[[Backend], Result]) -> Result:
         try:

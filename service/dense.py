@@ -13,7 +13,7 @@ import numpy as np
 
 from recon import se3
 from recon.alignment import height_above, height_below
-from recon.backends import Backend
+from recon.backends import Backend, DenseStages, PathBackend
 from recon.belief_propagation import BeliefPropagationConfig
 from recon.camera_model import scaled_K
 from recon.depth_fusion import FusionConfig, fuse
@@ -95,6 +95,7 @@ class Dense:
         self._keep_debug = config.scan.keep_debug
         self._bp = BeliefPropagationConfig(iterations=compute.iterations)
         self._jbu, self._icp, self._fusion = UpsamplingConfig(), IcpConfig(), FusionConfig()
+        self._stages = DenseStages(self._bp, self._jbu, self._fusion)
         self._map: VoxelMap | PagedMap | None = None
         self._pages = pages
         self._resolution_m = config.scan.resolution_m
@@ -122,27 +123,39 @@ class Dense:
         stereo = self.stereo  # may be set anew meanwhile
         size = (stereo.width_px, round(stereo.width_px * H / W))
         K = scaled_K(job.view.K, size[0] / W, size[1] / H)
-        depths = []
+        pairs = []
         for partner in job.partners:
             with self.stopwatch("rectify"):
                 pair = rectify(job.view, partner, job.points, stereo, self._relief)
             if isinstance(pair, Refusal):
                 self.refusals[pair.reason] += 1
                 continue
-            depths.append(self._pair_depth(pair, K, size))
+            pairs.append(pair)
             if self._keep_debug:
-                self.debug |= {"raw_left": job.bgr, "raw_right": partner.grey}
+                self.debug = {"raw_left": job.bgr, "raw_right": partner.grey}
         depth = None
-        if depths:
-            with self.stopwatch("fuse"):
-                depth = fuse(depths, K, job.view.T_odom_camera, self._fusion)
-                self._relief = plane_relief(depth, self._relief)
+        if pairs:
+            depth = self._depth(pairs, K, size, job.view.T_odom_camera)
+            self._relief = plane_relief(depth, self._relief)
         self._register(job, depth)
         return None if depth is None else self._keyframe(job, depth)
 
+    def _depth(
+        self, pairs: list[StereoPair], K: F64, size: tuple[int, int], T_odom_camera: F64
+    ) -> DepthMap:
+        """The fused depth: at once where the backend has a device for it, else by stages."""
+        self.pairs += len(pairs)
+        if isinstance(self._backend, PathBackend) and not self._keep_debug:
+            with self.stopwatch("dense path"):
+                whole = self._backend.fused_depth(pairs, K, size, T_odom_camera, self._stages)
+            if whole is not None:
+                return whole
+        depths = [self._pair_depth(pair, K, size) for pair in pairs]
+        with self.stopwatch("fuse"):
+            return fuse(depths, K, T_odom_camera, self._fusion)
+
     def _pair_depth(self, pair: StereoPair, K: F64, size: tuple[int, int]) -> PairDepth:
         """Belief propagation, upsampling and reprojection of one pair."""
-        self.pairs += 1
         with self.stopwatch("belief propagation"):  # Eq. 1
             coarse = self._backend.belief_propagation(pair.left, pair.right, pair.labels, self._bp)
             coarse = fine = drop_unseen(coarse, pair)
@@ -152,7 +165,7 @@ class Dense:
         with self.stopwatch("reproject"):  # Eq. 3
             depth = reproject(fine, pair, K, size)
         if self._keep_debug:
-            self.debug = {
+            self.debug |= {
                 "rect_left": pair.left,
                 "rect_right": pair.right,
                 "disparity": coarse.px,

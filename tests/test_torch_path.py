@@ -249,3 +249,30 @@ def test_what_the_path_does_not_do_is_said(device: str) -> None:
     ):
         with pytest.raises(ValueError, match="neither fills"):
             DensePath(device, matching, upsampling, ALL)
+
+
+def test_the_backend_gives_the_path_to_the_service_and_falls_back(device: str) -> None:
+    """The same depth through the fallback; stage by stage once the device failed."""
+    from recon.backends import DenseStages, PathBackend, load_backend
+    from recon.backends.torch_backend import TorchBackend
+    from service.backend_choice import FallbackBackend
+
+    stages = DenseStages(BeliefPropagationConfig(), UpsamplingConfig(), ALL)
+    pair = stereo_pair(54, 96, 16, 1)
+    own = TorchBackend(device)
+    backend = FallbackBackend(own)
+    assert isinstance(backend, PathBackend)
+    found = backend.fused_depth([pair], K, SIZE, np.eye(4), stages)
+    assert found is not None
+    close(found.depth_m, by_stages([pair], stages.matching).depth_m, 1e-3, 0.99)
+    guided = replace(stages, upsampling=UpsamplingConfig(method="guided"))
+    assert backend.fused_depth([pair], K, SIZE, np.eye(4), guided) is None
+
+    def lost(*given: object) -> None:
+        raise RuntimeError("CUDA error: device lost")
+
+    own.fused_depth = lost  # type: ignore[assignment, method-assign]
+    assert backend.fused_depth([pair], K, SIZE, np.eye(4), stages) is None
+    assert backend.failure == "CUDA error: device lost"
+    assert backend.name == "cpu"
+    assert not isinstance(load_backend("cpu"), PathBackend)

@@ -6,12 +6,15 @@ operation has a short NumPy reference that the tests compare every backend again
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from recon.belief_propagation import BeliefPropagationConfig
-from recon.types import F64, U8, DepthMap, DisparityMap, Registration
+from recon.depth_fusion import FusionConfig
+from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 from recon.upsampling import UpsamplingConfig
 
 if TYPE_CHECKING:
@@ -45,6 +48,31 @@ class Backend(Protocol):
         self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
     ) -> Registration:
         """Projective point-to-plane ICP from the given start."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class DenseStages:
+    """The parameters of the stages from a rectified pair to fused depth."""
+
+    matching: BeliefPropagationConfig
+    upsampling: UpsamplingConfig
+    fusion: FusionConfig
+
+
+@runtime_checkable
+class PathBackend(Protocol):
+    """A backend that keeps the stages between pictures and fused depth on its device."""
+
+    def fused_depth(
+        self,
+        pairs: Sequence[StereoPair],
+        K: F64,
+        size_px: tuple[int, int],
+        T_world_camera: F64,
+        stages: DenseStages,
+    ) -> DepthMap | None:
+        """Depth of a keyframe on its grid ``size_px`` (w, h); None: do it stage by stage."""
         ...
 
 

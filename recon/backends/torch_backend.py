@@ -9,13 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.backends import DenseStages
 from recon.backends.room import pyramid_levels, room
 from recon.backends.torch_dense import DenseStereo
+from recon.backends.torch_path import DensePath
 from recon.backends.torch_plan import Part, Plan, part, read
 from recon.backends.torch_upsampling import JointBilateral
 from recon.belief_propagation import BeliefPropagationConfig, believe
 from recon.matching_cost import check_pair
-from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration
+from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration, StereoPair
 from recon.upsampling import UpsamplingConfig, check_guide, guide_at_taps, upsample
 
 if TYPE_CHECKING:
@@ -42,6 +44,7 @@ class TorchBackend:
         self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         self.messages: torch.dtype = getattr(torch, messages)
         self._plans: dict[Any, Plan] = {}
+        self._path: tuple[DenseStages, DensePath] | None = None
         torch.zeros(8, device=self.device).add_(1).cpu()  # fails here rather than in flight
 
     def belief_propagation(
@@ -91,6 +94,24 @@ class TorchBackend:
         from recon.backends.torch_icp import register_projective
 
         return register_projective(source, target, T_target_source, config, self.device)
+
+    def fused_depth(
+        self,
+        pairs: Sequence[StereoPair],
+        K: F64,
+        size_px: tuple[int, int],
+        T_world_camera: F64,
+        stages: DenseStages,
+    ) -> DepthMap | None:
+        """Depth of a keyframe without leaving the device; None for what is not done there."""
+        if stages.matching.fill_occluded or stages.upsampling.method != "bilateral":
+            return None
+        if self._path is None or self._path[0] != stages:
+            path = DensePath(
+                self.device, stages.matching, stages.upsampling, stages.fusion, self.messages
+            )
+            self._path = stages, path
+        return self._path[1].depth(pairs, K, size_px, T_world_camera)
 
     def _run(
         self,
