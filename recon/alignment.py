@@ -67,13 +67,6 @@ class Similarity:
             self.R @ T_odom_camera[:3, :3], self.scale * self.R @ T_odom_camera[:3, 3] + self.t
         )
 
-    def inverse_pose(self, T_world_camera: F64) -> F64:
-        """(4, 4) T_odom_camera of a pose in the world."""
-        return se3.compose(
-            self.R.T @ T_world_camera[:3, :3],
-            self.R.T @ (T_world_camera[:3, 3] - self.t) / self.scale,
-        )
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Anchor:

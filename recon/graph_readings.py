@@ -49,17 +49,18 @@ class Readings:
         self._keyframes, self._span_s = max(keyframes, 1), max(span_s, 1.0)
         self._offset_m = altitude_offset_m
 
-    def add(self, node: Node, T: F64, spread: F64, is_placed: bool) -> set[str]:
+    def add(self, node: Node, T: F64, spread: F64, drift_m: float | None) -> set[str]:
         """The sensors that took part; the keyframe is predicted at ``T`` +- ``spread``.
 
-        ``is_placed`` tells that the world's frame is known, without which only the attitude
-        says something.
+        ``drift_m`` is how far the segment's track may have left its frame. None while there is
+        no such frame, without which only the attitude says something.
         """
+        is_placed = drift_m is not None
         used = {"attitude"} if self._attitude(node, T, spread, is_placed) else set()
-        if is_placed:
+        if drift_m is not None:
             lever = np.hstack([-se3.hat(T[:3, 3]), np.eye(3)])
-            place = lever @ spread @ lever.T
-            used |= {"gnss"} if self._position(node, T, place) else set()
+            place = np.diag(lever @ spread @ lever.T)
+            used |= {"gnss"} if self._position(node, T, place, drift_m) else set()
             used |= {"altitude"} if self._altitude(node, T) else set()
         return used
 
@@ -98,13 +99,15 @@ class Readings:
         self._smoother.add(factor, "attitude")
         return True
 
-    def _position(self, node: Node, T: F64, place: F64) -> bool:
+    def _position(self, node: Node, T: F64, place: F64, drift_m: float) -> bool:
         prior = node.prior
         if prior.position_m is None or prior.sigma_position_m is None:
             return False
         sigma = np.maximum(prior.sigma_position_m, 0.005)
+        # The frame rests on all fixes: it is no worse than one of them.
+        sure = np.minimum(place, sigma**2 + drift_m**2)
         apart = np.abs(prior.position_m - T[:3, 3])
-        if np.any(apart > self._config.gate_sigmas * np.sqrt(np.diag(place) + sigma**2)):
+        if np.any(apart > self._config.gate_sigmas * np.sqrt(sure + sigma**2)):
             self._counts["position off"] += 1
             return False
         precise = float(sigma[0]) < PRECISE_M

@@ -28,9 +28,6 @@ from recon.types import F64, Pose, PosePrior
 
 __all__ = ["Edge", "PoseGraph", "PoseGraphConfig"]
 
-BATCH = 100
-"""Keyframes that enter the smoother together when the graph is made anew."""
-
 SOURCES = ("vision", "attitude", "altitude", "gnss", "loop", "dead reckoning")
 
 
@@ -265,12 +262,9 @@ class PoseGraph:
         """Make the whole graph anew from all readings and the segments' present frames."""
         self._start()
         last: Node | None = None
-        for i, node in enumerate(self._nodes.values()):
+        for node in self._nodes.values():
             self._insert(node, last)
-            if i % BATCH == BATCH - 1 or i in (3, 10, 30):  # gates need the spread early
-                self._smoother.update(now=True)
             last = node
-        self._smoother.update(now=True)
         for loop in self._book.taken:
             self._add_loop_factor(loop)
         self._smoother.update(now=True, rounds=ROUNDS)
@@ -293,12 +287,11 @@ class PoseGraph:
             spread = moved_covariance(spread_last, T_last, covariance)
             self._connect(node, last, motion, covariance)
         self._smoother.add_pose(node.key, T, spread)
-        is_placed = self._segments.known(node.segment) is not None
+        frame = self._segments.known(node.segment)
+        drift_m = None if frame is None else self.config.frame_drift * self._path[node.key]
         node = self._segments.freed(node)
-        used = self._readings.add(node, T, spread, is_placed)
-        if is_placed and self._readings.height(
-            node, self._scale_key(node), self._frame(node).scale
-        ):
+        used = self._readings.add(node, T, spread, drift_m)
+        if frame is not None and self._readings.height(node, self._scale_key(node), frame.scale):
             used.add("altitude")
         self._sources[node.key] |= used
 

@@ -13,11 +13,11 @@ from recon.graph_records import Node
 from recon.sensor_offsets import Offsets, offsets
 from recon.types import F64
 
-REFIT_GROWTH, SETTLED_GROWTH = 1.3, 2.0
+REFIT_GROWTH, SETTLED_GROWTH = 1.3, 1.6
 """A segment's similarity is fitted again when its keyframes have grown by so much: at first,
 and once it has settled."""
 
-SETTLED = 60
+SETTLED = 100
 """Keyframes after which a segment's frame is taken over only when it has changed notably."""
 
 
