@@ -96,7 +96,7 @@ def main() -> None:
     flight, out = Path(sys.argv[1]), Path(sys.argv[2])
     import service.dense
 
-    service.dense.Trajectory = Drifting  # type: ignore[misc]
+    vars(service.dense)["Trajectory"] = Drifting
     rows = []
     for loops, title in ((False, "without loops"), (True, "with loops")):
         replay(flight, out / title.replace(" ", "_"), loops)
