@@ -45,7 +45,7 @@ _PLANE = np.array([1.0, -1.0, 0, 0, 0, 0, 0, 0, 0])
 """Weights of plane prediction, W + N - NW: what the fit starts from."""
 _PRIOR = 20.0
 FIT_PIXELS = 2_500
-"""Pixels that the weights are fitted to, about."""
+"""Known pixels that the weights are fitted to, about."""
 
 
 MARGIN = 2
@@ -214,7 +214,7 @@ def _padded(plane: npt.NDArray[np.generic], kind: type[np.generic]) -> npt.NDArr
 def fit(c: F64, k: F64, size: tuple[int, int]) -> I64:
     """(9,) weights, 4096 is one, that predict the padded codes best; least squares about a
     plane."""
-    step = max(1, -(-size[0] * size[1] // FIT_PIXELS))
+    step = max(1, round(k.sum() / FIT_PIXELS))
     A, b = _normal_equations(c, k, size, step)
     weights = _solve(A + _PRIOR * np.eye(WEIGHTS), b + _PRIOR * _PLANE)
     return np.asarray(np.rint(np.clip(weights, -7.9, 7.9) * (1 << SHIFT)), np.int64)
