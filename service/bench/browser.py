@@ -17,7 +17,7 @@ FLAGS = (
     " --remote-debugging-port=0 --window-size=1280,800 --disable-extensions --no-first-run"
     " --disable-background-networking --disable-dev-shm-usage"
 )
-ANSWER_S = 60.0
+ANSWER_S = 180.0
 
 
 def chromium() -> str:
