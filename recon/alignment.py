@@ -34,6 +34,9 @@ LEANING_SHARE = 2.0
 LEAST_EXACT = 4
 """Heights exactly below from which on no others count."""
 
+LEAST_SPREAD = 0.005
+"""Share of a height by which readings of one flight may always differ."""
+
 EDGE_SHARE = 0.03
 """Depths about the point below that differ by more than this share belong to an edge."""
 
@@ -140,8 +143,13 @@ def height_ratios(anchors: Sequence[Anchor]) -> tuple[list[tuple[float, float]],
     the ground exactly below."""
     told = [(h, a.lean) for a in anchors if (h := height_ratio(a)) is not None]
     exact = [h for h, lean in told if lean == 0.0]
-    is_exact = len(exact) >= LEAST_EXACT
-    return (exact if is_exact else [h for h, _ in told]), is_exact
+    if len(exact) < LEAST_EXACT:
+        return [h for h, _ in told], False
+    # A rangefinder meets a tree where the picture sees through it: single ones are far off.
+    ratio = np.array([h[0] for h in exact])
+    apart = np.abs(ratio - np.median(ratio))
+    limit = max(3.0 * 1.48 * float(np.median(apart)), LEAST_SPREAD)
+    return [h for h, off in zip(exact, apart, strict=True) if off <= limit], True
 
 
 class _Readings:

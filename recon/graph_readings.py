@@ -21,6 +21,9 @@ from recon.types import F64
 PRECISE_M = 0.3
 """Fixes of a smaller sigma are RTK's or PPK's."""
 
+HEIGHT_GATE = 0.05
+"""Share of a height by which one exactly below may be off, once its constant is out."""
+
 FRAME_SIGMA_RAD = (0.05, 0.05, 0.15)
 """What a placed segment's tilt and heading are known to, at least."""
 
@@ -68,6 +71,9 @@ class Readings:
         """True when the height above ground was taken as a reading of the scale."""
         ratio = height_ratio(Anchor(node.T_odom_camera, node.prior, node.height, node.lean))
         if ratio is None:
+            return False
+        if node.lean == 0.0 and abs(ratio[0] - np.log(scale)) > HEIGHT_GATE:
+            self._counts["height off"] += 1  # a tree or a roof under the one sensor alone
             return False
         sigma = ratio[1] * float(np.sqrt(BLOCK * self._config.blocks_per_height))
         noise = self._robust(self._gtsam.noiseModel.Isotropic.Sigma(1, sigma))

@@ -216,3 +216,15 @@ def test_heights_exactly_below_count_alone() -> None:
     found = fit(some)
     assert found is not None
     assert found.scale == pytest.approx(3.0, rel=0.001)
+
+
+def test_a_rangefinder_that_meets_trees_does_not_move_the_scale() -> None:
+    rng = np.random.default_rng(3)
+    some = []
+    for i, a in enumerate(anchors(np.eye(3), 2.0, np.zeros(3), seed=4)):
+        agl_m = 60.0 * (1 + 0.003 * rng.normal()) - (9.0 if i % 4 == 0 else 0.0)
+        prior = PosePrior(a.prior.R_world_camera, 0.01, 0.05, None, None, agl_m, 1.8)
+        some.append(Anchor(a.T_odom_camera, prior, 30.0))
+    found = fit(some)
+    assert found is not None
+    assert found.scale == pytest.approx(2.0, rel=0.004)
