@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,12 +10,10 @@ from trial_rig import Row, Table
 
 
 @pytest.fixture(scope="session")
-def table() -> Iterator[Table]:
+def table() -> Table:
     """Collects rows; written where SKYRELIEF_TRIALS_TABLE says, rows of before kept."""
     target = os.environ.get("SKYRELIEF_TRIALS_TABLE", "")
-    collected = Table(Path(target) if target else None)
-    yield collected
-    collected.write()
+    return Table(Path(target) if target else None)
 
 
 @pytest.fixture

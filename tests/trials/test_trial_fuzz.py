@@ -65,7 +65,9 @@ ATHERIS = """
 import atheris, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-with atheris.instrument_imports(include=["service", "mavlink"]):
+compiled = ["mask_coder", "prediction", "plane_kernels"]  # numba reads their bytecode
+kernels = [f"service.stream.{name}" for name in compiled]
+with atheris.instrument_imports(include=["service", "mavlink"], exclude=kernels):
     from trial_decoders import DECODERS
 decode = DECODERS[sys.argv[1]](Path(sys.argv[3]))
 corpus, seconds = sys.argv[4], sys.argv[5]

@@ -64,6 +64,7 @@ class Table:
         """See :class:`Row`."""
         rounded = None if back_s is None else round(back_s, 1)
         self._lines[fault] = Line(fault, times, outcome, lost, rounded)
+        self.write()  # at once: a run that is broken off keeps what it found
 
     def write(self) -> None:
         """Keep what there is, where a place was named."""
