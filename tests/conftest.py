@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from trial_rig import Row, Table
 
 from recon import se3
 from recon.types import F64, Array, DepthMap, Keyframe, Pose
@@ -98,3 +100,16 @@ def house() -> HouseFlight:
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--device cuda`` runs the tests of the backends on a GPU."""
     parser.addoption("--device", default="cpu", choices=("cpu", "cuda"), help="of the backends")
+
+
+@pytest.fixture(scope="session")
+def table() -> Table:
+    """Collects the rows of trials; written where SKYRELIEF_TRIALS_TABLE says, older ones kept."""
+    target = os.environ.get("SKYRELIEF_TRIALS_TABLE", "")
+    return Table(Path(target) if target else None)
+
+
+@pytest.fixture
+def record(table: Table) -> Row:
+    """A row to fill in: ``record(fault, times, outcome, lost, back_s)``."""
+    return table.add
