@@ -112,11 +112,17 @@ def choose_backend(name: str = "auto") -> Backend:
     return chosen if chosen.name == "cpu" else FallbackBackend(chosen)
 
 
-def engine_folder() -> Path:
-    """Where compiled engines of GPU providers are kept between starts."""
+def engine_folder() -> str | None:
+    """Where compiled engines of GPU providers are kept between starts; None: nowhere."""
     given = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]  # as systemd sets it
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(given or Path(home) / "skyrelief") / "engines"
+    folder = Path(given or Path(home) / "skyrelief") / "engines"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        log.info("compiled engines are not kept: %s", error)
+        return None
+    return str(folder)
 
 
 def fastest_backend() -> Backend:

@@ -112,17 +112,17 @@ def test_tensorrt_keeps_its_engines_and_no_other_provider_is_told(tmp_path: Path
     from recon.backends.onnx_backend import provider_options
 
     both = ["TensorrtExecutionProvider", "CPUExecutionProvider"]
-    (first, kept), (second, none) = provider_options(both, b"one", tmp_path)
+    (first, kept), (second, none) = provider_options(both, b"one", str(tmp_path))
     assert (first, second) == tuple(both)
     assert kept["trt_engine_cache_enable"] is True
     assert Path(kept["trt_engine_cache_path"]).parent == tmp_path
     assert none == {}
-    again, other = (provider_options(both, m, tmp_path)[0][1] for m in (b"one", b"two"))
+    again, other = (provider_options(both, m, str(tmp_path))[0][1] for m in (b"one", b"two"))
     assert again == kept
     assert other["trt_engine_cache_path"] != kept["trt_engine_cache_path"]
     assert provider_options(both, b"one", None)[0][1] == {}
     cpu = ["CPUExecutionProvider"]
-    assert provider_options(cpu, b"one", tmp_path) == [("CPUExecutionProvider", {})]
+    assert provider_options(cpu, b"one", str(tmp_path)) == [("CPUExecutionProvider", {})]
 
 
 def test_engines_are_kept_where_the_service_may_write(
@@ -131,9 +131,9 @@ def test_engines_are_kept_where_the_service_may_write(
     """systemd's cache folder when it gives one, else the user's."""
     monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert engine_folder() == tmp_path / "skyrelief" / "engines"
-    monkeypatch.setenv("CACHE_DIRECTORY", "/var/cache/skyrelief:/var/cache/other")
-    assert engine_folder() == Path("/var/cache/skyrelief/engines")
+    assert engine_folder() == str(tmp_path / "skyrelief" / "engines")
+    monkeypatch.setenv("CACHE_DIRECTORY", f"{tmp_path}/cache:/elsewhere")
+    assert engine_folder() == str(tmp_path / "cache" / "engines")
 
 
 def test_a_learned_model_serves_the_whole_path(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from recon.belief_propagation import BeliefPropagationConfig
@@ -84,7 +83,7 @@ BACKENDS: dict[str, str] = {
 """Name to ``module:class``; imported on first use."""
 
 
-def load_backend(name: str, engines: Path | None = None) -> Backend:
+def load_backend(name: str, engines: str | None = None) -> Backend:
     """The backend called ``name``, ready to run.
 
     ``engines`` is a folder for what takes minutes to build and is the same at the next start:

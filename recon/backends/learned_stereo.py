@@ -7,7 +7,6 @@ and checked when it is loaded, before anything flies.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -62,7 +61,7 @@ class LearnedStereoBackend(OnnxBackend):
     name = "learned"
 
     def __init__(
-        self, model: bytes, config: LearnedStereoConfig, engines: Path | None = None
+        self, model: bytes, config: LearnedStereoConfig, engines: str | None = None
     ) -> None:
         super().__init__(engines)
         self.config = config

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,7 +38,7 @@ class OnnxBackend:
 
     name = "onnx"
 
-    def __init__(self, engines: Path | None = None) -> None:
+    def __init__(self, engines: str | None = None) -> None:
         self.engines = engines
         found = onnxruntime.get_available_providers()
         self.providers = [p for p in PROVIDERS if p in found]
@@ -112,34 +111,32 @@ class OnnxBackend:
 
 
 def provider_options(
-    providers: list[str], model: bytes, engines: Path | None
+    providers: list[str], model: bytes, engines: str | None
 ) -> list[tuple[str, dict[str, Any]]]:
     """The providers with their options: TensorRT keeps its engines, the others need none.
 
     Each model has a folder of its own, named by its digest: TensorRT tells engines apart by the
-    names in a model, which ours share whatever numbers they hold.
+    names in a model, which ours share whatever numbers they hold. ``engines`` must exist;
+    TensorRT makes the folders in it.
     """
     kept: dict[str, Any] = {}
     if engines is not None and "TensorrtExecutionProvider" in providers:
-        folder = engines / hashlib.sha256(model).hexdigest()[:ENGINE_NAME_DIGITS]
+        folder = f"{engines}/{hashlib.sha256(model).hexdigest()[:ENGINE_NAME_DIGITS]}"
         kept = {
             "trt_engine_cache_enable": True,
-            "trt_engine_cache_path": str(folder),
+            "trt_engine_cache_path": folder,
             "trt_timing_cache_enable": True,
-            "trt_timing_cache_path": str(engines),
+            "trt_timing_cache_path": engines,
         }
     return [(p, kept if p == "TensorrtExecutionProvider" else {}) for p in providers]
 
 
-def open_session(model: bytes, providers: list[str], engines: Path | None = None) -> Any:
+def open_session(model: bytes, providers: list[str], engines: str | None = None) -> Any:
     """A session for an ONNX file; ValueError, with the reason, when it cannot be used."""
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     chosen = provider_options(providers, model, engines)
     try:
-        for _, kept in chosen:
-            if "trt_engine_cache_path" in kept:
-                Path(kept["trt_engine_cache_path"]).mkdir(parents=True, exist_ok=True)
         return onnxruntime.InferenceSession(model, options, providers=chosen)
     except Exception as error:  # ONNX Runtime's own exceptions share no base class
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
