@@ -18,8 +18,11 @@ from recon.types import F64, U8, DepthMap
 WIDTH_PX = 640
 """Of the pictures kept; loops need no finer ones."""
 
-MOST_VIEWS = 600
-"""Kept at once, about 0.2 MB each; on longer flights every second of the older half goes."""
+LEAST_DEPTH_PX = 120
+"""A depth image at least twice as wide is kept at half its size."""
+
+MOST_VIEWS = 400
+"""Kept at once, about 0.1 MB each; on longer flights every second of the older half goes."""
 
 TRIES = 2
 """Verifications per keyframe, at most. Each is bounded work: some 30 to 120 ms on one core."""
@@ -60,12 +63,15 @@ def _packed(seq: int, segment: int, grey: U8, K: F64, depth: DepthMap) -> _Kept:
     size = (min(WIDTH_PX, W), round(min(WIDTH_PX, W) * H / W))
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     _, picture = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 92])
-    known = np.isfinite(depth.depth_m)
-    far = float(depth.depth_m[known].max()) if known.any() else 1.0
-    share = np.where(known, np.maximum(np.rint(depth.depth_m * (65535.0 / far)), 1), 0)
+    step = 2 if depth.depth_m.shape[1] >= 2 * LEAST_DEPTH_PX else 1
+    z, sigma = depth.depth_m[::step, ::step], depth.sigma_m[::step, ::step]
+    depth_K = depth.K / np.array([[step], [step], [1.0]])  # every second pixel keeps its place
+    known = np.isfinite(z)
+    far = float(z[known].max()) if known.any() else 1.0
+    share = np.where(known, np.maximum(np.rint(z * (65535.0 / far)), 1), 0)
     return _Kept(
         seq, segment, np.asarray(picture, np.uint8), scaled_K(K, size[0] / W, size[1] / H),
-        share.astype(np.uint16), far, depth.sigma_m.astype(np.float16), depth.K, size,
+        share.astype(np.uint16), far, sigma.astype(np.float16), depth_K, size,
     )  # fmt: skip
 
 
