@@ -80,6 +80,20 @@ def load_debug(path: Path) -> dict[str, Array] | None:
     return arrays
 
 
+def middle_keyframe(folder: Path, seqs: Sequence[int]) -> int | None:
+    """Number of a keyframe in the middle, of those with every stage kept if there are any."""
+    kept = [seq for seq in seqs if debug_path(folder, seq).is_file()]
+    some = kept or list(seqs)
+    return some[len(some) // 2] if some else None
+
+
+def stages(folder: Path, scan_id: str, keyframe: Keyframe) -> tuple[U8, bool]:
+    """One picture of a keyframe's stages (the paper's Figure 2), and whether all were kept."""
+    arrays = load_debug(debug_path(folder, keyframe.seq))
+    panels = keyframe_panels(keyframe) if arrays is None else debug_panels(arrays)
+    return sheet(panels, f"{scan_id}: keyframe {keyframe.seq}"), arrays is not None
+
+
 def debug_panels(arrays: dict[str, Array]) -> list[Panel]:
     """The stages in the order of the paper's figure; a stage that was not kept is left out."""
     out = []

@@ -45,8 +45,12 @@ def report_html(
     raster: Raster | None,
     preview_jpg: bytes,
     coverage: Coverage | None = None,
+    keyframe_jpg: bytes | None = None,
 ) -> str:
-    """The report of a scan whose scan.json holds ``summary``."""
+    """The report of a scan whose scan.json holds ``summary``.
+
+    ``keyframe_jpg`` shows the stages of one keyframe.
+    """
     run = summary["run"]
     parts = [
         f"<h1>{escape(summary['id'])}</h1>",
@@ -59,6 +63,7 @@ def report_html(
         *consistency(summary, poses),
         "<h2>The flight</h2>",
         *_curves(poses),
+        *_stages(keyframe_jpg),
         "<h2>Speeds and faults</h2>",
         _table(_rows(run, SPEEDS)),
         _counted("Not used for stereo", run.get("refusals")),
@@ -70,6 +75,13 @@ def report_html(
     ]
     head = f"<!doctype html><html lang=en><meta charset=utf-8><title>{escape(summary['id'])}"
     return f"{head}</title><style>{STYLE}</style><body>{''.join(parts)}</body></html>\n"
+
+
+def _stages(picture: bytes | None) -> list[str]:
+    if picture is None:
+        return []
+    words = "Stages of a keyframe in the middle; all of them with scan.keep_debug=true."
+    return ["<h2>A keyframe</h2>", _picture(picture, "image/jpeg", words)]
 
 
 def _flown(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[tuple[str, str]]:

@@ -28,6 +28,7 @@ from service.coverage import write_coverage_files
 from service.errors import OutsideError
 from service.fused_cloud import FusedCloud, fused_cloud
 from service.georeference import LocalFrame
+from service.inspection import middle_keyframe, stages
 from service.las import write_laz
 from service.preview import blank_preview, draw_preview
 from service.report import report_html
@@ -92,11 +93,22 @@ def write_deliverables(
     with writing(folder / PREVIEW) as part:
         part.write_bytes(preview)
     with writing(folder / REPORT) as part:
-        page = report_html(summary, poses, fused.cloud, raster, preview, coverage)
+        shown = _stages(folder, store)
+        page = report_html(summary, poses, fused.cloud, raster, preview, coverage, shown)
         part.write_text(page, encoding="utf-8")
     with writing(folder / SUMMARY) as part:
         part.write_text(json.dumps(summary, indent=2, sort_keys=True) + "\n", encoding="utf-8")
     return summary
+
+
+def _stages(folder: Path, store: ScanStore) -> bytes | None:
+    """JPEG of a keyframe's stages for the report; None for a scan without keyframes."""
+    seq = middle_keyframe(folder, store.seqs())
+    keyframe = None if seq is None else store.keyframe(seq)
+    if keyframe is None:
+        return None
+    picture, _ = stages(folder, store.header.scan_id, keyframe)
+    return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
 
 
 def _resolution_m(header: ScanHeader) -> float | None:

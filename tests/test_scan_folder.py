@@ -200,6 +200,7 @@ def test_the_report_says_what_was_flown_and_nothing_runs_in_it(
     assert "too &lt;little&gt; motion" in page
     assert "EPSG:32632" in page and "47.3900000" in page
     assert page.count("data:image/png;base64,") == 3  # two maps and the coverage
+    assert page.count("data:image/jpeg;base64,") == 2  # the preview and a keyframe's stages
     assert page.count("<svg") == 5  # the map; no height above ground was recorded
     assert "http" not in page  # nothing is fetched
     rows = dict(re.findall(r"<tr><td>(.*?)</td><td>(.*?)</td></tr>", page))

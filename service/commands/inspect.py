@@ -30,21 +30,18 @@ def inspect(
     import numpy as np
 
     from service.exports.view import ScanView
-    from service.inspection import debug_panels, debug_path, keyframe_panels, load_debug, sheet
+    from service.inspection import middle_keyframe, stages
     from service.scan_folder import writing
 
     with ScanView(scan_dir) as scan:
         seqs = scan.store.seqs()
-        kept = [s for s in seqs if debug_path(scan_dir, s).is_file()]
-        if not seqs:
+        seq = middle_keyframe(scan_dir, seqs) if keyframe is None else keyframe
+        if not seqs or seq is None:
             raise InputError(f"{scan_dir} holds no keyframes yet; nothing to inspect")
-        seq = (kept or seqs)[len(kept or seqs) // 2] if keyframe is None else keyframe
         found = scan.store.keyframe(seq) if seq in seqs else None
         if found is None:
             raise InputError(f"{scan_dir}: no keyframe {seq}; there are {seqs[0]} to {seqs[-1]}")
-    arrays = load_debug(debug_path(scan_dir, seq))
-    panels = keyframe_panels(found) if arrays is None else debug_panels(arrays)
-    picture = sheet(panels, f"{scan.store.header.scan_id}: keyframe {seq}")
+    picture, complete = stages(scan_dir, scan.store.header.scan_id, found)
     path = out or scan_dir / f"keyframe_{seq:06d}.png"
     ok, data = cv2.imencode(".png", picture)
     if not ok:
@@ -55,7 +52,7 @@ def inspect(
     figures = {
         "keyframe": seq,
         "picture": str(path),
-        "stages": arrays is not None,
+        "stages": complete,
         "points": int(known.sum()),
         "depth_median_m": round(float(np.median(found.depth.depth_m[known])), 3)
         if known.any()
@@ -68,5 +65,5 @@ def inspect(
         print(json.dumps(figures))
         return
     print(f"{path}: keyframe {seq}, {figures['points']} points")
-    if arrays is None:
+    if not complete:
         print("only what the store holds; replay with --set scan.keep_debug=true for every stage")
