@@ -83,9 +83,10 @@ class Table:
         ]
         self._target.write_text(
             "# What was tried to break it\n\n"
-            f"Written by the trials ({machine}); rows of earlier runs stay until tried again. *Lost*:\n"
-            "of what the store had acknowledged; *scanning again* is the longest time from the end of\n"
-            "the cause to the next frame. `make trials` is the whole form, `make test` has a short one.\n\n"
+            f"Written by the trials ({machine}); rows of earlier runs stay until tried again.\n"
+            "*Lost*: of what the store had acknowledged; *scanning again* is the longest time\n"
+            "from the end of the cause to the next frame. `make trials` is the whole form,\n"
+            "`make test` has a short one.\n\n"
             "| fault | times | outcome | lost | scanning again |\n|---|---|---|---|---|\n"
             + "\n".join(rows)
             + "\n",
