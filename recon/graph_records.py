@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -87,7 +88,21 @@ class Loop:
         return replace(self, T_a_b=T, covariance=self.covariance * np.outer(units, units))
 
 
-def loops_agree(one: Loop, other: Loop, T_a_a: F64, T_b_b: F64, limit: float) -> bool:
+class SeenMotion(Protocol):
+    """A motion between two keyframes, whoever found it."""
+
+    @property
+    def T_a_b(self) -> F64:
+        """(4, 4)"""
+        ...
+
+    @property
+    def covariance(self) -> F64:
+        """(6, 6) left perturbation in a's frame."""
+        ...
+
+
+def loops_agree(one: SeenMotion, other: SeenMotion, T_a_a: F64, T_b_b: F64, limit: float) -> bool:
     """True when two loops, joined by the track between their ends, close on themselves.
 
     ``T_a_a`` takes the other's first camera to the one's, ``T_b_b`` the one's second to the

@@ -17,6 +17,7 @@ import numpy as np
 
 from recon import graph_factors, se3
 from recon.graph_factors import matrix, pose3
+from recon.graph_records import loops_agree
 from recon.types import F64, Bool, PosePrior
 
 CHI2_LIMIT = 22.5
@@ -138,13 +139,7 @@ def supported(loops: Sequence[Closure], poses: F64, window: int = 15) -> list[Cl
 def _agree(one: Closure, other: Closure, poses: F64) -> bool:
     T_a_a = se3.inverse(poses[one.a]) @ poses[other.a]
     T_b_b = se3.inverse(poses[other.b]) @ poses[one.b]
-    circle = T_a_a @ other.T_a_b @ T_b_b @ se3.inverse(one.T_a_b)
-    length = float(np.linalg.norm(T_a_a[:3, 3]) + np.linalg.norm(T_b_b[:3, 3]))
-    A = se3.adjoint(T_a_a)
-    slack = np.diag([0.01**2] * 3 + [(0.03 * length + 0.02) ** 2] * 3)
-    covariance = one.covariance + A @ other.covariance @ A.T + slack
-    error = se3.log(circle)
-    return bool(error @ np.linalg.solve(covariance, error) < CHI2_LIMIT)
+    return loops_agree(one, other, T_a_a, T_b_b, CHI2_LIMIT)
 
 
 def map_position(poses: F64, scales: F64, marks: Sequence[Mark]) -> tuple[F64, float] | None:
