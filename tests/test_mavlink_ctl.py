@@ -13,20 +13,12 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from loopback import free_port
 
 from mavlink.camera import KeyframeReport
 from mavlink.framing import Framer
 from mavlink.rehearsal import RehearsalVehicle
 from mavlink.wire import dialect
-
-S = 1_000_000_000
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def run_ctl(port: int, *arguments: str) -> subprocess.CompletedProcess[str]:

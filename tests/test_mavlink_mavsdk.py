@@ -8,11 +8,12 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from loopback import free_port, until
 
 from mavlink import quaternion
 from mavlink.camera import KeyframeReport
@@ -22,26 +23,6 @@ from mavlink.logs.tlog import packets
 from mavlink.rehearsal import RehearsalVehicle
 
 S = 1_000_000_000
-
-S = 1_000_000_000
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
-def until(done: Callable[[], Any], limit_s: float = 15.0) -> Any:
-    """What ``done`` gives once it is true; the test fails when that takes too long."""
-    deadline = time.monotonic() + limit_s
-    while time.monotonic() < deadline:
-        value = done()
-        if value:
-            return value
-        time.sleep(0.02)
-    pytest.fail(f"nothing came in {limit_s} s")
 
 
 class Ground:

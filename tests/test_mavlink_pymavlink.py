@@ -5,38 +5,16 @@ from __future__ import annotations
 import json
 import socket
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from loopback import free_port, until
 
 from mavlink.framing import Framer
 from mavlink.rehearsal import RehearsalVehicle
 from mavlink.signing import Signing
 from mavlink.wire import dialect
-
-S = 1_000_000_000
-
-S = 1_000_000_000
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
-def until(done: Callable[[], Any], limit_s: float = 15.0) -> Any:
-    """What ``done`` gives once it is true; the test fails when that takes too long."""
-    deadline = time.monotonic() + limit_s
-    while time.monotonic() < deadline:
-        value = done()
-        if value:
-            return value
-        time.sleep(0.02)
-    pytest.fail(f"nothing came in {limit_s} s")
 
 
 def test_pymavlink_over_tcp_and_the_link_comes_back() -> None:

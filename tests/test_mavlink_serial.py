@@ -4,30 +4,14 @@ from __future__ import annotations
 
 import os
 import pty
-import time
 import tty
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import pytest
+from loopback import until
 
 from mavlink.framing import Framer
 from mavlink.rehearsal import RehearsalVehicle
 from mavlink.wire import dialect
-
-S = 1_000_000_000
-
-
-def until(done: Callable[[], Any], limit_s: float = 15.0) -> Any:
-    """What ``done`` gives once it is true; the test fails when that takes too long."""
-    deadline = time.monotonic() + limit_s
-    while time.monotonic() < deadline:
-        value = done()
-        if value:
-            return value
-        time.sleep(0.02)
-    pytest.fail(f"nothing came in {limit_s} s")
 
 
 def plug(path: Path) -> int:

@@ -6,11 +6,10 @@ import contextlib
 import math
 import socket
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
+from loopback import free_port, until
 
 from mavlink.control import Answer
 from mavlink.link import LinkSpec, parse_link
@@ -21,26 +20,6 @@ from mavlink.vehicle import VehicleConfig
 from mavlink.wire import dialect
 
 S = 1_000_000_000
-
-S = 1_000_000_000
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
-def until(done: Callable[[], Any], limit_s: float = 15.0) -> Any:
-    """What ``done`` gives once it is true; the test fails when that takes too long."""
-    deadline = time.monotonic() + limit_s
-    while time.monotonic() < deadline:
-        value = done()
-        if value:
-            return value
-        time.sleep(0.02)
-    pytest.fail(f"nothing came in {limit_s} s")
 
 
 def test_parameters_are_kept_over_a_restart(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import threading
 import time
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from loopback import free_port
 from pymavlink import mavutil, mavwp  # type: ignore[import-untyped]
 from typer.testing import CliRunner
 
@@ -196,12 +196,6 @@ class Autopilot:
         self._stop.set()
         self._thread.join()
         self._link.close()
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def imported(path: Path) -> Any:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import socket
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from loopback import until
 
 from mavlink.framing import Framer
 from mavlink.parameters import PARAMETERS
@@ -22,16 +22,6 @@ from service.errors import InputError
 from service.runtime import Daemon
 from service.scan import Scan, ScanInputs, create_store
 from service.tuning import TUNABLES, parameters_of, with_parameter
-
-
-def until(done: Callable[[], Any], limit_s: float = 15.0) -> Any:
-    deadline = time.monotonic() + limit_s
-    while time.monotonic() < deadline:
-        value = done()
-        if value:
-            return value
-        time.sleep(0.01)
-    pytest.fail(f"nothing came in {limit_s} s")
 
 
 class Operator:
