@@ -10,11 +10,11 @@ import pytest
 
 from recon.backends import Backend
 from recon.belief_propagation import BeliefPropagationConfig
-from service import backend_choice
-from service.backend_choice import choose_backend, engine_folder
-from service.compute import open_backend
+from service.compute import backend_choice
+from service.compute.backend_choice import choose_backend, engine_folder
+from service.compute.opening import open_backend
 from service.config import ComputeConfig, load_config
-from service.diagnosis import examine
+from service.daemon.diagnosis import examine
 from service.errors import InputError, OutsideError
 
 GOOD = 'model = "net.onnx"\nheight = 96\nwidth = 192\n'

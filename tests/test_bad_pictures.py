@@ -17,7 +17,7 @@ from recon import se3
 from recon.backends import load_backend
 from recon.types import F64, U8, Camera, Frame, Keyframe
 from service.config import load_config
-from service.pipeline import Pipeline
+from service.onboard.pipeline import Pipeline
 
 K: F64 = np.array([[400.0, 0, 239.5], [0, 400.0, 134.5], [0, 0, 1]])
 CAMERA = Camera(K, np.zeros(5), (480, 270))

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from recon.calibration import Board, BoardView, CalibrationConfig, calibrate, find_board
 from recon.types import F32, F64, U8
-from service.camera_file import load_camera
+from service.cameras.camera_file import load_camera
 from service.cli import app
 from service.errors import InputError
 

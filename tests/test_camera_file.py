@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from recon.types import Camera
-from service.camera_file import load_camera, save_camera
+from service.cameras.camera_file import load_camera, save_camera
 from service.errors import InputError, OutsideError
 
 CAMERA = Camera(

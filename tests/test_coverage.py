@@ -16,7 +16,11 @@ import pytest
 from recon import coverage, se3
 from recon.coverage import CoverageMap
 from recon.types import F64, DepthMap
-from service.coverage import (
+from service.errors import InputError
+from service.exports.view import ExportOptions, ScanView, export
+from service.georeference import LocalFrame
+from service.ground.http import Portal, PortalConfig
+from service.scans.coverage import (
     FIGURES,
     PICTURE,
     CoverageWriter,
@@ -24,11 +28,7 @@ from service.coverage import (
     LiveCoverages,
     coverage_of,
 )
-from service.errors import InputError
-from service.exports.view import ExportOptions, ScanView, export
-from service.georeference import LocalFrame
-from service.ground.http import Portal, PortalConfig
-from service.scan_folder import write_deliverables
+from service.scans.folder import write_deliverables
 from service.stream.codec import encode
 from service.stream.records import Repose
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.config import ComputeConfig
-from service.degradation import Ladder, LadderConfig, Level, Move, Readings, lowered, strain
+from service.daemon.degradation import Ladder, LadderConfig, Level, Move, Readings, lowered, strain
 
 CALM = Readings(10, 0, 60, 0, 0.05, 55.0, False, 4000.0)
 LATE = replace(CALM, late_views=4)
@@ -154,7 +154,7 @@ def test_each_step_costs_less_than_the_one_before() -> None:
 
 
 def test_limit_of_the_control_group_is_read(tmp_path: Path) -> None:
-    from service.machine import Machine, read_machine
+    from service.daemon.machine import Machine, read_machine
 
     def put(name: str, text: str) -> None:
         path = tmp_path / name

@@ -14,7 +14,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 
 from service.config import load_config
-from service.diagnosis import BAD, GOOD, NOTE, examine
+from service.daemon.diagnosis import BAD, GOOD, NOTE, examine
 
 DEMO = Path(__file__).resolve().parents[1] / "demo" / "caliterra"
 
@@ -93,7 +93,7 @@ def test_camera_model_of_another_size_is_told(tmp_path: Path) -> None:
 
 
 def test_foreign_package_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.diagnosis._parent", lambda name: f"/somewhere/{name}")
+    monkeypatch.setattr("service.daemon.diagnosis._parent", lambda name: f"/somewhere/{name}")
     assert "hides one of ours" in findings()["packages"][1]
 
 
@@ -134,7 +134,7 @@ def test_what_is_missing_to_fly_is_told(tmp_path: Path) -> None:
 
 
 def test_the_boards_settings_are_compared() -> None:
-    from service.boards import BOARDS, board_of, other_than_profile, profile_path
+    from service.daemon.boards import BOARDS, board_of, other_than_profile, profile_path
 
     assert board_of("NVIDIA Jetson Orin Nano Developer Kit") == "orin-nano"
     assert board_of("NVIDIA Jetson AGX Orin Developer Kit") == "orin-agx"
@@ -152,8 +152,8 @@ def test_the_boards_settings_are_compared() -> None:
 
 
 def test_threads_and_kernels_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.diagnosis.kernels_may_overlap", lambda: False)
-    monkeypatch.setattr("service.diagnosis.is_warm", lambda: True)
+    monkeypatch.setattr("service.daemon.diagnosis.kernels_may_overlap", lambda: False)
+    monkeypatch.setattr("service.daemon.diagnosis.is_warm", lambda: True)
     found = findings()
     assert found["threads"] == (BAD, "no OpenMP: half as fast, one core idle; apt install libgomp1")
     assert found["kernels"][0] == GOOD

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mavlink.state import VehicleState
-from service.frame_tags import COLUMNS, FILE, FrameTags
+from service.onboard.frame_tags import COLUMNS, FILE, FrameTags
 
 STATE = VehicleState(
     0,

@@ -11,7 +11,7 @@ import pytest
 from recon import se3
 from recon.pose_graph import PoseGraph
 from recon.types import F64, PosePrior
-from service.graph_watch import GraphWatch
+from service.onboard.graph_watch import GraphWatch
 
 NADIR = np.diag([1.0, -1.0, -1.0])
 COVARIANCE = np.diag([2e-4**2] * 3 + [0.02**2] * 3)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.scan_folder import CLOUD, CSV, PREVIEW, TUM, write_deliverables
+from service.scans.folder import CLOUD, CSV, PREVIEW, TUM, write_deliverables
 from service.stream.store import ScanStore
 
 pytest.importorskip("zenoh")

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import pytest
 
 from service.config import Config, load_config, reload
+from service.daemon.health import HealthServer, Notifier, metrics_text
+from service.daemon.machine import CoreLoad, Machine, computer_load, read_machine
 from service.errors import OutsideError
-from service.health import HealthServer, Notifier, metrics_text
-from service.machine import CoreLoad, Machine, computer_load, read_machine
-from service.retention import close_open_scans, make_room
+from service.scans.retention import close_open_scans, make_room
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
@@ -229,7 +229,7 @@ def test_oldest_finished_scans_make_room(tmp_path: Path, monkeypatch: pytest.Mon
         taken = 150 * len(list(tmp_path.iterdir()))
         return Usage(1000 << 20, taken << 20, (1000 - taken) << 20)
 
-    monkeypatch.setattr("service.retention.shutil.disk_usage", usage)
+    monkeypatch.setattr("service.scans.retention.shutil.disk_usage", usage)
     assert make_room(tmp_path, 0.0) == []
     assert make_room(tmp_path, 50.0) == []
     assert make_room(tmp_path, 300.0, keep=names[2]) == [names[0], names[3]]

@@ -15,14 +15,14 @@ from recon.backends import load_backend
 from recon.backends.cpu import CpuBackend
 from recon.belief_propagation import BeliefPropagationConfig
 from recon.types import U8, DisparityMap
-from service.backend_choice import FallbackBackend
 from service.cameras import CameraFrame, open_camera
 from service.cameras.source import CameraSource
+from service.compute.backend_choice import FallbackBackend
 from service.config import load_config
-from service.degradation import Level
-from service.frame_gate import FrameGate, picture_name
-from service.machine import Machine
-from service.runtime import Daemon
+from service.daemon.degradation import Level
+from service.daemon.frame_gate import FrameGate, picture_name
+from service.daemon.machine import Machine
+from service.daemon.runtime import Daemon
 
 START_NS = 1_790_000_000_123_456_000
 

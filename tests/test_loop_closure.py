@@ -17,7 +17,7 @@ from recon.loop_closure import LoopConfig, LoopView, candidates, verify
 from recon.pose_graph import PoseGraph
 from recon.trajectory import Trajectory
 from recon.types import F64, DepthMap, PosePrior
-from service.loops import LoopSearch
+from service.onboard.loops import LoopSearch
 
 SIZE = (640, 360)
 K = np.array([[450.0, 0, 319.5], [0, 450.0, 179.5], [0, 0, 1.0]])
@@ -228,7 +228,7 @@ def test_a_lost_stretch_is_found_again_from_the_pictures() -> None:
 
 
 def test_the_search_keeps_a_bounded_number_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.loops.MOST_VIEWS", 6)
+    monkeypatch.setattr("service.onboard.loops.MOST_VIEWS", 6)
     seen = view(A, 1)
     trajectory = Trajectory()
     search = LoopSearch(trajectory, threading.Lock())

@@ -10,7 +10,7 @@ import pytest
 from recon import se3
 from recon.types import F64, DepthMap
 from recon.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
-from service.map_pages import PagedMap
+from service.onboard.map_pages import PagedMap
 
 K: F64 = np.array([[60.0, 0.0, 39.5], [0.0, 60.0, 29.5], [0.0, 0.0, 1.0]])
 NADIR: F64 = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])

@@ -23,10 +23,10 @@ from mavlink.framing import Framer
 from mavlink.logs.tlog import packets
 from mavlink.wire import dialect
 from recon.types import Camera
-from service.camera_file import save_camera
+from service.cameras.camera_file import save_camera
 from service.config import load_config
-from service.runtime import Daemon
-from service.scan_folder import SUMMARY
+from service.daemon.runtime import Daemon
+from service.scans.folder import SUMMARY
 
 AGL_M, FOCAL_PX, SIZE = 50.0, 300.0, (320, 240)
 SPEED_M_S, INTERVAL_S, PICTURES = 5.0, 0.1, 45

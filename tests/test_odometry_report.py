@@ -23,8 +23,8 @@ from recon.odometry import Tracked
 from recon.trajectory import Placed
 from recon.types import F64, PosePrior
 from service.config import CameraConfig
-from service.odometry_report import OdometryReport
-from service.pipeline import Anchorage, Step
+from service.onboard.odometry_report import OdometryReport
+from service.onboard.pipeline import Anchorage, Step
 
 S = 1_000_000_000
 BODY = Rotation.from_euler("ZYX", [0.7, 0.05, -0.1])  # q_ned_body

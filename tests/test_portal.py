@@ -28,7 +28,7 @@ from service.ground.live import SIGMA_STEP_M, LiveFeed, StoreIndex
 from service.ground.scan_files import DARK
 from service.ground.scan_files import _closed as closed_picture
 from service.ground.vehicle import Vehicle
-from service.scan_folder import write_deliverables
+from service.scans.folder import write_deliverables
 from service.stream.codec import encode
 from service.stream.records import Repose, ScanHeader
 from service.stream.store import ScanStore

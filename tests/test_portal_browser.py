@@ -20,7 +20,7 @@ from service.bench.browser import Browser, chromium
 from service.exports.view import ExportOptions, ScanView, export
 from service.ground.http import PAGE, Portal, PortalConfig
 from service.ground.vehicle import Vehicle
-from service.scan_folder import write_deliverables
+from service.scans.folder import write_deliverables
 from service.stream.codec import encode
 from service.stream.records import Repose
 from service.stream.store import ScanStore

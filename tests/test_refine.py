@@ -19,8 +19,9 @@ from recon.types import F64, DepthMap, Keyframe, Pose
 from service.cli import app
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.refinement import RefineOptions, refine, undo
-from service.revisions import REFINED, Revisions
+from service.refine.refinement import RefineOptions, refine, undo
+from service.refine.revisions import REFINED, Revisions
+from service.refine.survey_file import read_survey
 from service.stream.codec import encode
 from service.stream.records import (
     PoseRecord,
@@ -30,7 +31,6 @@ from service.stream.records import (
     pack_motion,
 )
 from service.stream.store import ScanStore
-from service.survey_file import read_survey
 
 FRAME = LocalFrame(47.39, 8.54, 408.0)
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])

@@ -16,12 +16,12 @@ from typer.testing import CliRunner
 
 from recon.coverage import CoverageMap, Footprint
 from recon.types import F64, DepthMap
-from service import refly
 from service.cli import app
-from service.coverage import Coverage, Limits
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.refly import Refly, plan_json, suggest, waypoints_text
+from service.refine import refly
+from service.refine.refly import Refly, plan_json, suggest, waypoints_text
+from service.scans.coverage import Coverage, Limits
 
 if TYPE_CHECKING:
     from conftest import HouseFlight

@@ -13,11 +13,12 @@ import pytest
 from recon import se3
 from recon.pose_graph import PoseGraph
 from recon.types import PosePrior
-from service.coverage import coverage_of
-from service.graph_figures import graph_figures
-from service.report_consistency import consistency
-from service.report_map import map_figure, position_covariance
-from service.scan_folder import latest, write_deliverables
+from service.onboard.graph_figures import graph_figures
+from service.scans.coverage import coverage_of
+from service.scans.folder import write_deliverables
+from service.scans.report_consistency import consistency
+from service.scans.report_map import map_figure, position_covariance
+from service.scans.track import latest
 from service.stream.records import PoseRecord, unpack_covariance, unpack_motion
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from recon.se3 import quaternion_from_rotation
 from recon.types import F64
 from service.cameras.source import GeoTag
 from service.config import CameraConfig, FusionConfig, ScanConfig
-from service.rig import ASSUMED_AGL_M, Rig, attitude_of
+from service.onboard.rig import ASSUMED_AGL_M, Rig, attitude_of
 
 
 def rig(camera: CameraConfig | None = None, fusion: FusionConfig | None = None) -> Rig:

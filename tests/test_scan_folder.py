@@ -18,18 +18,10 @@ from scipy.spatial.transform import Rotation
 from recon import se3
 from recon.types import F64
 from service.errors import OutsideError
-from service.fused_cloud import _Extent, fused_cloud, strip_edges
 from service.georeference import LocalFrame
-from service.scan_folder import (
-    CLOUD,
-    CSV,
-    PREVIEW,
-    REPORT,
-    SUMMARY,
-    TUM,
-    latest,
-    write_deliverables,
-)
+from service.scans.folder import CLOUD, CSV, PREVIEW, REPORT, SUMMARY, TUM, write_deliverables
+from service.scans.fused_cloud import _Extent, fused_cloud, strip_edges
+from service.scans.track import latest
 from service.stream.records import Repose, ScanHeader
 from service.stream.store import ScanStore
 
@@ -213,9 +205,9 @@ def test_a_large_site_is_fused_strip_by_strip_to_the_same_cloud(
 ) -> None:
     with house.flown(tmp_path) as store:
         whole = fused_cloud(store)
-        monkeypatch.setattr("service.fused_cloud.STRIP_POINTS", 9000)
+        monkeypatch.setattr("service.scans.fused_cloud.STRIP_POINTS", 9000)
         strips = fused_cloud(store)
-        monkeypatch.setattr("service.fused_cloud.LARGEST_POINTS", 18_000)
+        monkeypatch.setattr("service.scans.fused_cloud.LARGEST_POINTS", 18_000)
         coarse = fused_cloud(store)
     for name in ("xyz_m", "rgb", "sigma_m", "views"):
         np.testing.assert_array_equal(getattr(strips.cloud, name), getattr(whole.cloud, name))

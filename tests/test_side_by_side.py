@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from service.side_by_side import SideBySide
+from service.compute.side_by_side import SideBySide
 
 
 def test_results_come_in_order_and_nothing_is_dropped() -> None:

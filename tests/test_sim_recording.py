@@ -18,7 +18,7 @@ from mavlink.logs import load_telemetry
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
 from recon.se3 import rotation_from_quaternion
 from recon.types import F64
-from service.camera_file import load_camera
+from service.cameras.camera_file import load_camera
 from service.cli import app
 from service.errors import InputError
 from service.sim.mosaic import patchwork

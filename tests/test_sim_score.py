@@ -16,7 +16,7 @@ from recon.types import F64, PointCloud
 from service.cli import app
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.las import write_laz
+from service.scans.las import write_laz
 
 TRUTH_AT = LocalFrame(47.3977, 8.5456, 488.0)
 SCAN_AT = LocalFrame(47.3980, 8.5450, 540.0)  # another origin, 33 m north and 45 m west

@@ -12,15 +12,15 @@ import pytest
 
 from recon.belief_propagation import BeliefPropagationConfig
 from recon.types import U8, DepthMap, DisparityMap, Registration
-from service import backend_choice
-from service.backend_choice import FallbackBackend, choose_backend
 from service.bench.stereo import (
     bad_share,
     semi_global_disparity,
     true_pairs,
 )
 from service.cli import main
-from service.commands.stereo import matching_config
+from service.compute import backend_choice
+from service.compute.backend_choice import FallbackBackend, choose_backend
+from service.compute.rectified_pair import matching_config
 from service.errors import InputError, OutsideError
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "stereo_gt_middlebury"

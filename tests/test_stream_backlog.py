@@ -13,9 +13,9 @@ import pytest
 from mavlink.rehearsal import RehearsalControl
 from mavlink.vehicle import VehicleConfig, VehicleLink
 from service.config import Config
-from service.datalink import DaemonLink, open_backlog
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
+from service.onboard.datalink import DaemonLink, open_backlog
 from service.stream.backlog import delivered, open_undelivered
 from service.stream.link import DatalinkSender
 from service.stream.records import PoseRecord, ScanHeader

@@ -23,9 +23,9 @@ from mavlink.wire import dialect
 from recon import se3
 from recon.types import DepthMap, Keyframe, Pose
 from service.config import Config, DatalinkConfig
-from service.datalink import OWN_LINKS, DaemonLink
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
+from service.onboard.datalink import OWN_LINKS, DaemonLink
 from service.stream import codec
 from service.stream.link import DatalinkSender
 from service.stream.radio_link import GROUND, TUNNEL, EndpointCarrier, RadioLink, RadioSender

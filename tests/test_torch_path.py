@@ -255,7 +255,7 @@ def test_the_backend_gives_the_path_to_the_service_and_falls_back(device: str) -
     """The same depth through the fallback; stage by stage once the device failed."""
     from recon.backends import DenseStages, PathBackend, load_backend
     from recon.backends.torch_backend import TorchBackend
-    from service.backend_choice import FallbackBackend
+    from service.compute.backend_choice import FallbackBackend
 
     stages = DenseStages(BeliefPropagationConfig(), UpsamplingConfig(), ALL)
     pair = stereo_pair(54, 96, 16, 1)

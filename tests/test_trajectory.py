@@ -11,7 +11,7 @@ import pytest
 from recon import se3
 from recon.trajectory import Trajectory
 from recon.types import F64, DepthMap, Keyframe, Pose, PosePrior
-from service.fused_cloud import fused_cloud
+from service.scans.fused_cloud import fused_cloud
 from service.stream import codec
 from service.stream.records import Repose, ScanHeader
 from service.stream.store import ScanStore

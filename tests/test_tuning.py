@@ -18,10 +18,10 @@ from mavlink.wire import dialect
 from recon.types import Camera
 from service.cameras.images import open_images
 from service.config import Config, load_config
+from service.daemon.runtime import Daemon
+from service.daemon.tuning import TUNABLES, parameters_of, with_parameter
 from service.errors import InputError
-from service.runtime import Daemon
-from service.scan import Scan, ScanInputs, create_store
-from service.tuning import TUNABLES, parameters_of, with_parameter
+from service.onboard.scan import Scan, ScanInputs, create_store
 
 
 class Operator:

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from service.config import load_config
+from service.daemon.vehicle_config import vehicle_config
 from service.errors import InputError
-from service.vehicle_config import vehicle_config
 
 
 def test_every_key_reaches_the_link(tmp_path: Path) -> None:

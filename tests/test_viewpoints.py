@@ -12,7 +12,7 @@ from recon.matching import Pyramid
 from recon.odometry import Tracked
 from recon.types import PosePrior
 from service.config import ScanConfig
-from service.viewpoints import Offer, Viewpoint, Viewpoints, frames_apart
+from service.onboard.viewpoints import Offer, Viewpoint, Viewpoints, frames_apart
 
 
 def frame(seq: int, x_m: float, state: str, segment: int = 0, blurred: bool = False) -> Offer:

@@ -12,11 +12,11 @@ import pytest
 
 from mavlink.control import Phase
 from service.cameras import CameraFrame
+from service.compute.side_by_side import SideBySide
 from service.config import load_config
-from service.frame_gate import FrameGate
-from service.runtime import COMPILING_S, HUNG_S, Daemon
-from service.side_by_side import SideBySide
-from service.warm_up import MadeUpGround, is_warm, warm_up
+from service.daemon.frame_gate import FrameGate
+from service.daemon.runtime import COMPILING_S, HUNG_S, Daemon
+from service.daemon.warm_up import MadeUpGround, is_warm, warm_up
 
 
 def test_made_up_ground_is_scanned_and_marked(
@@ -28,7 +28,7 @@ def test_made_up_ground_is_scanned_and_marked(
     assert seconds > 0
     assert keyframes >= 5
     assert is_warm()
-    monkeypatch.setattr("service.warm_up.software", lambda: "another version")
+    monkeypatch.setattr("service.daemon.warm_up.software", lambda: "another version")
     assert not is_warm()
     monkeypatch.delenv("NUMBA_CACHE_DIR")
     assert not is_warm()

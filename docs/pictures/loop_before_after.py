@@ -22,7 +22,7 @@ from recon.camera_model import rays
 from recon.trajectory import Trajectory
 from recon.types import F64
 from service.cli import app
-from service.scoring import read_truth
+from service.sim.scoring import read_truth
 from service.stream.store import ScanStore
 
 DRIFT = se3.exp(np.array([0.0, 0.0, 0.001, 0.0, 0.0, 0.15]))
@@ -94,9 +94,9 @@ def section(scan: Path, flight: Path) -> np.ndarray:
 def main() -> None:
     """Replay twice and draw both sections, one above the other."""
     flight, out = Path(sys.argv[1]), Path(sys.argv[2])
-    import service.dense
+    import service.onboard.dense
 
-    vars(service.dense)["Trajectory"] = Drifting
+    vars(service.onboard.dense)["Trajectory"] = Drifting
     rows = []
     for loops, title in ((False, "without loops"), (True, "with loops")):
         replay(flight, out / title.replace(" ", "_"), loops)

@@ -16,7 +16,7 @@ import numpy as np
 from recon.types import Camera
 from service.bench import BenchOptions, BenchResult
 from service.bench.pipeline import FPS, SIZE, K, make_video, resident_mib
-from service.scan import Scan
+from service.onboard.scan import Scan
 
 
 def run(options: BenchOptions) -> list[BenchResult]:
@@ -63,7 +63,7 @@ def _fly(video: Path, folder: Path, watch: _Watch) -> dict[str, int]:
     from recon.backends import load_backend
     from service.cameras import open_camera
     from service.config import load_config
-    from service.scan import ScanInputs, create_store
+    from service.onboard.scan import ScanInputs, create_store
 
     config = load_config(None, ["scan.assumed_agl_m=60"])
     source = open_camera(str(video))

@@ -95,7 +95,7 @@ def _path(video: Path, folder: Path, upsample: bool, sgbm: bool) -> dict[str, fl
     from recon.backends import load_backend
     from service.cameras import open_camera
     from service.config import load_config
-    from service.scan import Scan, ScanInputs, create_store
+    from service.onboard.scan import Scan, ScanInputs, create_store
 
     flags = [f"compute.upsample={str(upsample).lower()}", "compute.pairs=30"]
     config = load_config(None, [*flags, "scan.assumed_agl_m=60"])

@@ -16,9 +16,9 @@ import numpy as np
 
 from recon.belief_propagation import BeliefPropagationConfig
 from recon.types import F32, U8, Bool
-from service.backend_choice import choose_backend
 from service.bench import BenchOptions, BenchResult, compare
-from service.commands.stereo import matching_config, read_grey
+from service.compute.backend_choice import choose_backend
+from service.compute.rectified_pair import matching_config, read_grey
 from service.errors import InputError
 
 SIZES = ((320, 180, 16), (640, 360, 32))

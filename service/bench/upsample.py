@@ -9,8 +9,8 @@ import numpy as np
 
 from recon.types import DisparityMap
 from recon.upsampling import UpsamplingConfig
-from service.backend_choice import choose_backend
 from service.bench import BenchOptions, BenchResult, compare
+from service.compute.backend_choice import choose_backend
 
 COARSE = (180, 320)
 GUIDES = ((720, 1280), (1520, 2704))

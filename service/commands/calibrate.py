@@ -13,7 +13,7 @@ from service.errors import InputError
 
 if TYPE_CHECKING:
     from recon.calibration import Board, Calibration
-    from service.board_pictures import BoardSet
+    from service.cameras.board_pictures import BoardSet
 
 
 def calibrate(
@@ -31,8 +31,8 @@ def calibrate(
     """
     from recon.calibration import FEWEST_VIEWS, CalibrationConfig
     from recon.calibration import calibrate as fit
-    from service.board_pictures import draw_coverage, find_boards, write_picture
-    from service.camera_file import save_camera
+    from service.cameras.board_pictures import draw_coverage, find_boards, write_picture
+    from service.cameras.camera_file import save_camera
 
     board = _board(pattern, square_m)
     boards = find_boards(sources, board)

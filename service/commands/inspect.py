@@ -30,8 +30,8 @@ def inspect(
     import numpy as np
 
     from service.exports.view import ScanView
-    from service.inspection import middle_keyframe, stages
-    from service.scan_folder import writing
+    from service.scans.inspection import middle_keyframe, stages
+    from service.scans.writing import writing
 
     with ScanView(scan_dir) as scan:
         seqs = scan.store.seqs()

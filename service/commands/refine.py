@@ -35,9 +35,9 @@ def refine(
     written again.
     """
     from service.errors import InputError
-    from service.refinement import RefineOptions
-    from service.refinement import refine as run
-    from service.refinement import undo as run_undo
+    from service.refine.refinement import RefineOptions
+    from service.refine.refinement import refine as run
+    from service.refine.refinement import undo as run_undo
 
     if intrinsics:
         raise InputError(

@@ -35,11 +35,11 @@ def refly(
 
     import numpy as np
 
-    from service.coverage import coverage_of
     from service.errors import InputError
     from service.exports.view import ScanView
-    from service.refly import plan_json, suggest, waypoints_text
-    from service.scan_folder import writing
+    from service.refine.refly import plan_json, suggest, waypoints_text
+    from service.scans.coverage import coverage_of
+    from service.scans.writing import writing
 
     path = out or scan_dir / "refly.plan"
     if path.suffix not in (".plan", ".waypoints"):

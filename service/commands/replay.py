@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from recon.types import Camera
     from service.cameras.source import CameraSource
     from service.config import Config
-    from service.scan import Scan
+    from service.onboard.scan import Scan
 
 
 def replay(
@@ -61,7 +61,7 @@ def replay(
 
 
 def _load_model(path: Path | None, config: Config) -> Camera | None:
-    from service.camera_file import load_camera
+    from service.cameras.camera_file import load_camera
 
     chosen = path or (Path(config.camera.model) if config.camera.model else None)
     return None if chosen is None else load_camera(chosen)
@@ -93,11 +93,11 @@ def _replay(
     as_json: bool,
 ) -> dict[str, Any]:
     from service.cameras.pace import paced
-    from service.compute import open_backend
-    from service.datalink import open_datalink
+    from service.compute.opening import open_backend
     from service.errors import InputError
-    from service.scan import Scan, ScanInputs, create_store
-    from service.scan_folder import write_deliverables
+    from service.onboard.datalink import open_datalink
+    from service.onboard.scan import Scan, ScanInputs, create_store
+    from service.scans.folder import write_deliverables
 
     notes: list[str] = []
     if camera is None:

@@ -12,7 +12,7 @@ import typer
 if TYPE_CHECKING:
     from mavlink.first_beat import FirstBeats
     from service.config import Config
-    from service.runtime import Daemon
+    from service.daemon.runtime import Daemon
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ def run(
 
     chosen = load_config(config, set_ or [])
     first = _first_beats(chosen)
-    from service.runtime import Daemon
+    from service.daemon.runtime import Daemon
 
     daemon = Daemon(chosen, first)
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -15,7 +15,7 @@ def score(
     as_json: Annotated[bool, typer.Option("--json", help="Report as one JSON object.")] = False,
 ) -> None:
     """Accuracy, completeness and trajectory error of a scan of a simulated flight."""
-    from service import scoring
+    from service.sim import scoring
 
     report = scoring.score(scan_dir, truth_dir)
     print(json.dumps(report) if as_json else _text(report))

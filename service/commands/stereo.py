@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from service.compute.rectified_pair import matching_config, read_grey
 from service.errors import InputError, OutsideError
 
 if TYPE_CHECKING:
     from recon.backends import Backend
-    from recon.belief_propagation import BeliefPropagationConfig
     from recon.types import F32, U8
 
 
@@ -71,45 +71,12 @@ def stereo(
 def open_matcher(backend: str, model: Path | None) -> Backend:
     """The backend of that name, or the operator's learned model."""
     if model is not None:
-        from service.learned_model import load_learned_model
+        from service.compute.learned_model import load_learned_model
 
         return load_learned_model(model)
-    from service.backend_choice import choose_backend
+    from service.compute.backend_choice import choose_backend
 
     return choose_backend(backend)
-
-
-def matching_config(iterations: int, min_disparity: int, checked: bool) -> BeliefPropagationConfig:
-    """How the pair is matched; InputError for numbers out of range."""
-    from recon.belief_propagation import BeliefPropagationConfig
-
-    try:
-        if checked:
-            return BeliefPropagationConfig(iterations=iterations, min_disparity=min_disparity)
-        return BeliefPropagationConfig(
-            iterations=iterations,
-            min_disparity=min_disparity,
-            min_evidence=0.1,
-            min_contrast=0.3,
-            fill_occluded=True,
-        )
-    except ValueError as error:
-        raise InputError(f"stereo: {error}") from error
-
-
-def read_grey(path: Path) -> U8:
-    """A grey 8-bit image (h, w); InputError when there is none."""
-    import cv2
-    import numpy as np
-
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE) if (
-        path.stat().st_size
-    ) else None  # fmt: skip
-    if image is None:
-        raise InputError(f"{path}: not an image that can be read; give PNG, JPEG or TIFF")
-    return np.asarray(image, np.uint8)
 
 
 def check_output(path: Path, suffix: str) -> None:

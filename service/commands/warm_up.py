@@ -22,7 +22,7 @@ def warm_up(
 
     Run it as the service's user with its NUMBA_CACHE_DIR; the installer does.
     """
-    from service.warm_up import warm_up as scan_made_up_ground
+    from service.daemon.warm_up import warm_up as scan_made_up_ground
 
     seconds, keyframes = scan_made_up_ground(load_config(config, set_ or []))
     if as_json:

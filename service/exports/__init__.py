@@ -17,7 +17,11 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
         "contours.geojson",
         "Height contours, GeoJSON.",
     ),
-    "coverage": ("service.coverage:write_coverage", "coverage.tif", "Views, sigma, height, COG."),
+    "coverage": (
+        "service.exports.coverage:write_coverage",
+        "coverage.tif",
+        "Views, sigma, height, COG.",
+    ),
     "geojson": ("service.exports.flight:write_geojson", "flight.geojson", "The flight, GeoJSON."),
     "kml": ("service.exports.flight:write_kml", "flight.kml", "The flight, KML."),
     "colmap": (

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from recon.types import F64
 from service.exports.view import ExportOptions, ScanView
-from service.las import SCALE_M, las_header, point_record
-from service.scan_folder import writing
+from service.scans.las import SCALE_M, las_header, point_record
+from service.scans.writing import writing
 
 if TYPE_CHECKING:
     import copclib

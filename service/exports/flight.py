@@ -20,7 +20,7 @@ from recon import se3
 from recon.types import F64, Keyframe
 from service.errors import OutsideError
 from service.exports.view import ExportOptions, ScanView
-from service.scan_folder import writing
+from service.scans.writing import writing
 
 
 def _geodetic(scan: ScanView, what: str) -> F64:

@@ -27,7 +27,7 @@ from recon.types import F64, U8, Keyframe, PointCloud
 from recon.voxel_map import ground_sample_m
 from service.errors import OutsideError, SkyreliefError
 from service.exports.pictures import stored_pictures, video_pictures
-from service.fused_cloud import fused_cloud
+from service.scans.fused_cloud import fused_cloud
 from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)

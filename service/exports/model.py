@@ -12,7 +12,7 @@ from service.errors import InputError
 from service.exports.glb import glb
 from service.exports.mesh_tiles import TileJob, footprints, run_tiles, tile_boxes
 from service.exports.view import ExportOptions, ScanView
-from service.scan_folder import writing
+from service.scans.writing import writing
 
 METHODS = ("auto", "height", "poisson")
 OBLIQUE_SHARE = 0.25

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from service.exports.view import ExportOptions, ScanView
-from service.las import write_laz
-from service.scan_folder import writing
+from service.scans.las import write_laz
+from service.scans.writing import writing
 
 PLY_TYPES = [
     ("x", "<f8", "double"),

@@ -14,7 +14,7 @@ import numpy as np
 from recon.raster import Grid, Raster, fill_holes, surface_model
 from recon.types import F64, Array
 from service.exports.view import ExportOptions, ScanView
-from service.scan_folder import writing
+from service.scans.writing import writing
 
 NODATA_M = -9999.0
 SHORTEST_CONTOUR_CELLS = 12

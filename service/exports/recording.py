@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from service.exports.view import ExportOptions, ScanView
-from service.scan_folder import writing
+from service.scans.writing import writing
 
 
 def write_mcap(scan: ScanView, out: Path, options: ExportOptions) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from service.exports.flight import writing_folder
 from service.exports.view import ExportOptions, ScanView
-from service.las import write_laz
+from service.scans.las import write_laz
 
 EARTH_CENTRED = 4978
 

@@ -15,10 +15,10 @@ from recon.raster import Grid, Raster, grid_over, rasterise_points
 from recon.types import F64
 from service.errors import InputError, OutsideError
 from service.exports import EXPORTERS
-from service.fused_cloud import FusedCloud, fused_cloud
 from service.georeference import LocalFrame
-from service.las import placed
-from service.scan_folder import latest, local_frame
+from service.scans.fused_cloud import FusedCloud, fused_cloud
+from service.scans.las import placed
+from service.scans.track import latest, local_frame
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 

@@ -20,7 +20,8 @@ from typing import Any
 
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.ground.mcap_import import header_in, store_from_mcap
-from service.scan_folder import SUMMARY, write_deliverables, writing
+from service.scans.folder import SUMMARY, write_deliverables
+from service.scans.writing import writing
 from service.stream.store import ScanStore
 
 BIN = ".bin"

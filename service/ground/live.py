@@ -32,7 +32,7 @@ import numpy as np
 
 from recon.cloud_fusion import cloud_of
 from recon.types import F64, DepthMap, Keyframe
-from service.scan_folder import latest
+from service.scans.track import latest
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 

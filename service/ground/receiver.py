@@ -372,7 +372,7 @@ def _idle(writing: Future[None] | None) -> bool:
 
 
 def _deliver(folder: Path, store: ScanStore) -> None:
-    from service.scan_folder import write_deliverables
+    from service.scans.folder import write_deliverables
 
     try:
         write_deliverables(folder, store, {})

@@ -9,10 +9,10 @@ from typing import Any
 
 from starlette.requests import HTTPConnection
 
-from service.coverage import LiveCoverages
 from service.ground.jobs import Jobs
 from service.ground.library import Library
 from service.ground.vehicle import Vehicle
+from service.scans.coverage import LiveCoverages
 
 
 @dataclass(slots=True, eq=False)

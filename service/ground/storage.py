@@ -63,6 +63,6 @@ def merge(source: ScanStore, target: ScanStore) -> int:
 
 
 def _deliver(folder: Path, store: ScanStore) -> None:
-    from service.scan_folder import write_deliverables
+    from service.scans.folder import write_deliverables
 
     write_deliverables(folder, store, {})

@@ -9,8 +9,8 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from service.commands.ctl import order
 from service.errors import InputError, OutsideError
+from service.ground.orders import order
 
 if TYPE_CHECKING:
     from service.ground.operator import Operator

@@ -16,7 +16,7 @@ import numpy as np
 
 from recon.se3 import quaternion_from_rotation
 from recon.types import F64, U8, Camera
-from service.camera_file import save_camera
+from service.cameras.camera_file import save_camera
 from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
 from service.sim import flight as flights

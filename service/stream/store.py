@@ -119,7 +119,7 @@ class ScanStore:
 
     @property
     def refinement(self) -> dict[str, Any] | None:
-        """The figures of the refinement in force (:mod:`service.revisions`); None without one."""
+        """The figures of the refinement in force (:mod:`service.refine.revisions`), or None."""
         figures = json.loads(self._db.get("refinement") or "{}").get("figures", {})
         return dict(figures) if figures and not figures.get("undone") else None
 

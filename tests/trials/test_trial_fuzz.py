@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from trial_decoders import DECODERS, seeds
 from trial_rig import WHOLE, Row
 
-from service.health import HealthServer
+from service.daemon.health import HealthServer
 
 pytestmark = [pytest.mark.trial, pytest.mark.timeout(3600 if WHOLE else 280)]
 

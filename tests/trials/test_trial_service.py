@@ -41,10 +41,10 @@ from mavlink.control import Phase
 from recon.backends.cpu import CpuBackend
 from recon.belief_propagation import BeliefPropagationConfig
 from recon.types import U8, DisparityMap
-from service.backend_choice import FallbackBackend
+from service.compute.backend_choice import FallbackBackend
 from service.config import load_config
+from service.daemon.runtime import Daemon
 from service.errors import OutsideError
-from service.runtime import Daemon
 from service.stream.store import ScanStore
 
 KILLS = int(os.environ.get("SKYRELIEF_KILLS", "50" if WHOLE else "2"))
@@ -395,7 +395,7 @@ def test_gpu_out_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reco
 
 
 def _machine() -> Any:
-    from service.machine import read_machine
+    from service.daemon.machine import read_machine
 
     return read_machine(Path("/"))
 
@@ -455,7 +455,7 @@ def test_a_scan_that_fails_is_started_again(
         daemon.scanning._stop.wait(PATIENCE_S)
 
     monkeypatch.setattr(daemon.scanning, "_scan_once", scan_once)
-    monkeypatch.setattr("service.scanning.FIRST_RETRY_S", 0.01)
+    monkeypatch.setattr("service.daemon.scanning.FIRST_RETRY_S", 0.01)
     daemon.scanning._retry_s = 0.01
     daemon.actions.start_scan()
     deadline = time.monotonic() + PATIENCE_S

@@ -14,7 +14,7 @@ from mavlink.ftp import parse_request
 from mavlink.logs import load_telemetry
 from mavlink.wire import dialect as our_dialect
 from recon.types import DepthMap, Keyframe, Pose
-from service.camera_file import load_camera
+from service.cameras.camera_file import load_camera
 from service.config import load_config
 from service.errors import SkyreliefError
 from service.stream import codec, layer, messages, planes, prediction, radio_messages

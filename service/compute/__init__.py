@@ -1,0 +1,1 @@
+"""What computes: the backend that is chosen, and how threads share the cores."""

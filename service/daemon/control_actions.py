@@ -1,0 +1,172 @@
+"""What commands ask of the service, and what it answers; each call returns at once."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from mavlink.control import ACCEPTED, Answer, Handled, Phase, Power, Result, ScanStatus, Work
+from mavlink.status import INFO, WARNING
+from service.daemon.scanning import Scanning
+from service.daemon.tuning import with_parameter
+from service.errors import InputError, OutsideError, SkyreliefError
+
+LEAST_FREE_MIB = 500.0
+"""The self-test fails with less than that on the disk."""
+
+
+class ControlActions:
+    """The scanning service as commands see it: :class:`mavlink.control.ScanControl`."""
+
+    def __init__(self, scanning: Scanning, restart: Callable[[], None]) -> None:
+        """``restart`` ends the service, which the init system starts again."""
+        self.is_ready = False  # still starting
+        self._scanning, self._restart = scanning, restart
+
+    def status(self) -> ScanStatus:
+        """A snapshot for the operator."""
+        scanning = self._scanning
+        disk = shutil.disk_usage(_existing(Path(scanning.config.scan.folder)))
+        scan = scanning.scan
+        recorder = scan.recorder if scan is not None else None
+        latency = scan.check.latency if scan is not None else None
+        recording = scanning.phase in (Phase.SCANNING, Phase.PAUSED)
+        return ScanStatus(
+            phase=scanning.phase,
+            scan_id=scanning.scan_id,
+            recording_ms=int(1e3 * (time.monotonic() - scanning.started_s)) if recording else 0,
+            storage_total_mib=disk.total / 2**20,
+            storage_free_mib=disk.free / 2**20,
+            speed_m_s=recorder.speed_m_s if recorder is not None else math.nan,
+            distance_m=recorder.distance_m if recorder is not None else math.nan,
+            turn_rate_rad_s=recorder.turn_rate_rad_s if recorder is not None else math.nan,
+            camera_latency_ms=latency.latency_ms if latency is not None else math.nan,
+            camera_latency_sigma_ms=latency.sigma_ms if latency is not None else math.nan,
+        )
+
+    def start_scan(self) -> Handled:
+        """Start a scan."""
+        if not self.is_ready:
+            return Answer(Result.TEMPORARILY_REJECTED, "still starting")
+        if self._scanning.is_running:
+            return Answer(Result.TEMPORARILY_REJECTED, f"a scan is {self._scanning.phase.value}")
+        self._scanning.start()
+        return ACCEPTED
+
+    def stop_scan(self) -> Handled:
+        """Close the running scan; the files are written after the answer."""
+        self._scanning.stop()
+        return ACCEPTED
+
+    def finalise(self) -> Handled:
+        """Close the scan and answer when everything is written out."""
+        return self._scanning.finalise() if self._scanning.is_running else ACCEPTED
+
+    def pause(self) -> Handled:
+        """Take no frames until :meth:`resume`."""
+        if self._scanning.phase is not Phase.SCANNING:
+            return Answer(Result.DENIED, "no scan is running")
+        self._scanning.pause()
+        return ACCEPTED
+
+    def resume(self) -> Handled:
+        """Go on after a pause."""
+        if self._scanning.phase is not Phase.PAUSED:
+            return Answer(Result.DENIED, "the scan is not paused")
+        self._scanning.resume()
+        return ACCEPTED
+
+    def capture_keyframe(self) -> Handled:
+        """Make the next frame a keyframe; refused while no scan runs."""
+        scan = self._scanning.scan
+        if scan is None or self._scanning.phase is not Phase.SCANNING:
+            return Answer(Result.TEMPORARILY_REJECTED, "start a scan first")
+        scan.pipeline.viewpoints.take_next()
+        return ACCEPTED
+
+    def clear_map(self) -> Handled:
+        """Forget which surface is known, so that everything counts as new again."""
+        scan = self._scanning.scan
+        if scan is None:
+            return Answer(Result.DENIED, "no scan is running")
+        scan.pipeline.dense.forget_map()
+        return ACCEPTED
+
+    def self_test(self) -> Handled:
+        """Camera and disk, one after the other, off the protocol's thread."""
+        work = Work()
+        threading.Thread(target=self._test, args=(work,), name="self-test", daemon=True).start()
+        return work
+
+    def erase_scans(self) -> Handled:
+        """Delete the finished scans."""
+        work = Work()
+        threading.Thread(target=self._erase, args=(work,), name="erase", daemon=True).start()
+        return work
+
+    def power(self, action: Power) -> Handled:
+        """Restart the service; rebooting or shutting down the computer is the system's."""
+        if action is Power.RESTART_SERVICE:
+            self._restart()
+            return ACCEPTED
+        return _systemctl("reboot" if action is Power.REBOOT else "poweroff")
+
+    def parameter_changed(self, name: str, value: float) -> Answer:
+        """Work by another value of a parameter, or say why not."""
+        try:
+            self._scanning.follow(with_parameter(self._scanning.config, name, value))
+        except InputError as error:
+            return Answer(Result.DENIED, str(error))
+        return ACCEPTED
+
+    # ---- work of its own thread --------------------------------------------------------------
+
+    def _test(self, work: Work) -> None:
+        from service.cameras import open_camera
+
+        config, vehicle = self._scanning.config, self._scanning.vehicle
+        try:
+            source = open_camera(config.camera.source)
+            work.report(0.5)
+            source.close()
+            folder = _existing(Path(config.scan.folder))
+            free_mib = shutil.disk_usage(folder).free / 2**20
+            if free_mib < LEAST_FREE_MIB:
+                raise OutsideError(f"{folder} has {free_mib:.0f} MiB left")
+            work.finish(ACCEPTED)
+            vehicle.statustext("Self-test passed", INFO)
+        except SkyreliefError as error:
+            work.finish(Answer(Result.FAILED, str(error)))
+            vehicle.statustext(f"Self-test: {error}", WARNING)
+
+    def _erase(self, work: Work) -> None:
+        folders = [p.parent for p in Path(self._scanning.config.scan.folder).glob("*/scan.db")]
+        try:
+            for i, folder in enumerate(folders):
+                shutil.rmtree(folder)
+                work.report((i + 1) / len(folders))
+            work.finish(ACCEPTED)
+        except OSError as error:
+            work.finish(Answer(Result.FAILED, f"{error.filename}: {error.strerror}"))
+
+
+def _existing(folder: Path) -> Path:
+    """The folder, or the nearest of its parents that exists."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder
+
+
+def _systemctl(verb: str) -> Answer:
+    """Ask the init system to reboot or power off."""
+    import subprocess
+
+    try:
+        subprocess.run(["systemctl", verb], check=True, capture_output=True, timeout=10)
+    except (OSError, subprocess.SubprocessError) as error:
+        return Answer(Result.FAILED, f"systemctl {verb}: {error}")
+    return ACCEPTED

@@ -1,0 +1,259 @@
+"""One look at everything that a flight needs: what works, what does not, what to do about it."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from service.compute.threading_layer import REMEDY, kernels_may_overlap
+from service.config import Config
+from service.daemon.warm_up import is_warm
+from service.errors import InputError, SkyreliefError
+
+if TYPE_CHECKING:
+    from recon.types import Camera
+
+GOOD, NOTE, BAD = "good", "note", "bad"
+CORE = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "pymavlink", "eclipse-zenoh")
+NEEDED_MIB = {"disk": 1000.0, "memory": 700.0}
+HOT_C = 85.0
+WARM_UP = (
+    "sudo -u skyrelief env NUMBA_CACHE_DIR=/var/cache/skyrelief "
+    "/opt/skyrelief/current/bin/skyrelief warm-up"
+)
+EARLIEST_UNIX_S = 1_735_689_600  # 2025-01-01: a clock before this was never set
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at."""
+
+    what: str
+    verdict: str  # GOOD, NOTE (flies, but know it) or BAD
+    text: str
+
+
+def examine(config: Config, listen_s: float) -> Iterator[Finding]:
+    """Every finding, as soon as it is there."""
+    checks: tuple[Callable[[], Iterator[Finding]], ...] = (
+        _software,
+        lambda: _machine(config),
+        _clock,
+        lambda: _folder(Path(config.scan.folder)),
+        lambda: _compute(config),
+        lambda: _camera(config),
+        lambda: _mavlink(config, listen_s),
+        lambda: _datalink(config),
+        lambda: _to_fly(config),
+    )
+    for check in checks:
+        yield from check()
+
+
+def _software() -> Iterator[Finding]:
+    found, missing = [], []
+    for name in CORE:
+        try:
+            found.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            missing.append(name)
+    yield Finding("python", GOOD, f"{platform.python_version()} in {sys.prefix}")
+    if missing:
+        yield Finding("packages", BAD, f"not installed: {', '.join(missing)}; install again")
+    else:
+        yield Finding("packages", GOOD, ", ".join(found))
+    parents = {_parent(name) for name in ("service", "recon", "mavlink")}
+    if len(parents) > 1:
+        where = ", ".join(sorted(parents))
+        yield Finding(
+            "packages", BAD, f"a foreign package hides one of ours ({where}); use a fresh venv"
+        )
+
+
+def _parent(name: str) -> str:
+    spec = find_spec(name)
+    origin = spec.origin if spec is not None else None
+    return str(Path(origin).resolve().parents[1]) if origin else f"{name} is missing"
+
+
+def _machine(config: Config) -> Iterator[Finding]:
+    from service.daemon.machine import read_machine
+
+    m = read_machine(Path(config.scan.folder))
+    yield Finding("machine", GOOD, f"{m.model}, {os.cpu_count()} cores")
+    yield from _board(config, m.model)
+    if m.memory_free_mib is not None:
+        short = m.memory_free_mib < NEEDED_MIB["memory"]
+        text = f"{m.memory_free_mib:.0f} MiB free"
+        yield Finding("memory", BAD if short else GOOD, text + ("; end other services" * short))
+    if m.temperature_c is not None:
+        hot = m.temperature_c > HOT_C
+        text = f"{m.temperature_c:.0f} degrees" + ("; it will slow down: give it air" * hot)
+        yield Finding("heat", NOTE if hot else GOOD, text)
+    if m.throttled:
+        yield Finding("heat", NOTE, "throttled right now, by heat or a weak supply")
+
+
+def _board(config: Config, model: str) -> Iterator[Finding]:
+    from service.daemon.boards import board_of, other_than_profile, profile_path
+
+    name = board_of(model)
+    path = profile_path(name)
+    if path is None:
+        yield Finding("board", NOTE, f"no settings are delivered for {model}: the defaults hold")
+        return
+    others = other_than_profile(config, path)
+    if others:
+        yield Finding("board", NOTE, f"other than {path}: {'; '.join(others)}")
+    else:
+        yield Finding("board", GOOD, f"the settings of {name} are in force")
+
+
+def _to_fly(config: Config) -> Iterator[Finding]:
+    """What the service does not start without, or a flight is poor without."""
+    needed = [n for n in ("source", "model") if not getattr(config.camera, n)]
+    if needed:
+        names = " and ".join(f"camera.{n}" for n in needed)
+        yield Finding("to fly", BAD, f"set {names}; the service does not start without")
+    elif not config.mavlink.links:
+        yield Finding("to fly", NOTE, "set mavlink.links: without it no commands, scale or place")
+    else:
+        yield Finding("to fly", GOOD, "all that is needed is set")
+
+
+def _clock() -> Iterator[Finding]:
+    text = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
+    if time.time() < EARLIEST_UNIX_S:
+        yield Finding("clock", NOTE, f"{text} was never set; scans get wrong names and times")
+    else:
+        yield Finding("clock", GOOD, text)
+
+
+def _folder(folder: Path) -> Iterator[Finding]:
+    import shutil
+
+    nearest = folder
+    while not nearest.exists() and nearest != nearest.parent:
+        nearest = nearest.parent
+    if not os.access(nearest, os.W_OK):
+        yield Finding("scans", BAD, f"{folder} cannot be written; set scan.folder or its owner")
+        return
+    free = shutil.disk_usage(nearest).free / 2**20
+    verdict = GOOD if free > NEEDED_MIB["disk"] else BAD
+    yield Finding("scans", verdict, f"{folder}: {free / 1024:.1f} GiB free")
+
+
+def _compute(config: Config) -> Iterator[Finding]:
+    from service.compute.opening import open_backend
+
+    start = time.monotonic()
+    try:
+        backend = open_backend(config.compute)
+    except SkyreliefError as error:
+        yield Finding("compute", BAD, str(error))
+        return
+    seconds = time.monotonic() - start
+    yield Finding("compute", GOOD, f"{backend.name} on {backend.device}, up in {seconds:.1f} s")
+    if kernels_may_overlap():
+        yield Finding("threads", GOOD, "OpenMP or TBB: tracking and stereo run side by side")
+    else:
+        yield Finding("threads", BAD, f"no OpenMP: half as fast, one core idle; {REMEDY}")
+    if is_warm():
+        yield Finding("kernels", GOOD, "compiled for this version")
+    else:
+        yield Finding("kernels", NOTE, f"the first scan may have to compile; {WARM_UP}")
+
+
+def _camera(config: Config) -> Iterator[Finding]:
+    from service.cameras import open_camera
+
+    model = None
+    if config.camera.model:
+        model, finding = _model(config)
+        yield finding
+    else:
+        yield Finding("camera model", NOTE, "none; 'skyrelief calibrate' makes one")
+    if not config.camera.source:
+        yield Finding("camera", NOTE, "camera.source is not set")
+        return
+    try:
+        source = open_camera(config.camera.source)
+    except SkyreliefError as error:
+        yield Finding("camera", BAD, str(error))
+        return
+    with_rate = f" at {source.fps:.1f} a second" if source.fps else ""
+    W, H = source.size_px
+    source.close()
+    yield Finding("camera", GOOD, f"{source.description}: {W}x{H}{with_rate}")
+    if model is not None and model.size_px != source.size_px:
+        size = f"{model.size_px[0]}x{model.size_px[1]}"
+        yield Finding("camera", BAD, f"the camera model is for {size}; calibrate at {W}x{H}")
+
+
+def _model(config: Config) -> tuple[Camera | None, Finding]:
+    from service.cameras.camera_file import load_camera
+
+    try:
+        model = load_camera(config.camera.model)
+    except InputError as error:
+        return None, Finding("camera model", BAD, str(error))
+    text = f"{config.camera.model}: {model.size_px[0]}x{model.size_px[1]}, fx {model.K[0, 0]:.0f}"
+    return model, Finding("camera model", GOOD, text)
+
+
+def _mavlink(config: Config, listen_s: float) -> Iterator[Finding]:
+    if not config.mavlink.links:
+        yield Finding("mavlink", NOTE, "mavlink.links is empty: no telemetry, no commands")
+    for text in config.mavlink.links:
+        yield _one_link(text, listen_s)
+
+
+def _one_link(text: str, listen_s: float) -> Finding:
+    """What is heard on a link within ``listen_s``."""
+    from mavlink.framing import Framer
+    from mavlink.link import Link, parse_link
+
+    try:
+        spec = parse_link(text)
+    except ValueError as error:
+        return Finding("mavlink", BAD, str(error))
+    framer = Framer()
+    systems: dict[int, int] = {}
+
+    def hear(data: bytes, _: int) -> None:
+        for packet in framer.feed(data):
+            systems[packet.system] = systems.get(packet.system, 0) + 1
+
+    link = Link(spec, hear)
+    link.start()
+    time.sleep(listen_s)
+    up = link.is_up
+    link.stop()
+    if systems:
+        heard = ", ".join(f"system {s}: {n / listen_s:.0f}/s" for s, n in sorted(systems.items()))
+        return Finding("mavlink", GOOD, f"{spec.name}: {heard}")
+    reason = "silent: is the autopilot on, its port set to MAVLink 2?" if up else "does not open"
+    return Finding("mavlink", BAD, f"{spec.name}: {reason}")
+
+
+def _datalink(config: Config) -> Iterator[Finding]:
+    import socket
+
+    if not (config.datalink.connect or config.datalink.listen):
+        yield Finding("datalink", NOTE, "no endpoints: scans stay on board")
+    for endpoint in config.datalink.connect:
+        host, _, port = endpoint.partition("/")[2].partition("?")[0].rpartition(":")
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), timeout=3.0).close()
+        except (OSError, ValueError) as error:
+            yield Finding("datalink", NOTE, f"{endpoint} does not answer now ({error})")
+        else:
+            yield Finding("datalink", GOOD, f"{endpoint} answers")

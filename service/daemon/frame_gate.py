@@ -1,0 +1,136 @@
+"""Between camera and scan: which frames pass, and which are only kept on the disk.
+
+Kept pictures are JPEG files named by their time, a folder that ``skyrelief replay`` takes as it
+is: what was not reconstructed in flight is reconstructed later from it and the scan's .tlog.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from threading import Event
+
+from service.cameras.source import CameraFrame, CameraSource
+from service.daemon.degradation import STRIDE, Level
+
+log = logging.getLogger(__name__)
+
+KEEP_EVERY_NS = 200_000_000
+"""Between two kept pictures; 2 m of flight at 10 m/s."""
+
+QUALITY = 90
+LEAST_FREE_MIB = 500.0
+
+
+class FrameGate:
+    """A camera of which frames pass as the ladder's level has it."""
+
+    def __init__(
+        self,
+        source: CameraSource,
+        folder: Path,
+        zero_unix_ns: int,
+        alive: Callable[[], None],
+        paused: Event,
+    ) -> None:
+        """Kept pictures go to ``folder``; ``zero_unix_ns`` is the unix time of time 0.
+
+        ``alive`` is called for every frame that ends here, so that nobody takes the scan for
+        hung. While ``paused`` is set nothing is kept.
+        """
+        self._source, self._folder = source, folder
+        self._zero_unix_ns, self._alive, self._paused = zero_unix_ns, alive, paused
+        self.level = Level.FULL
+        self.frames = self.kept = self.lost = 0
+        self.age_s = 0.0  # of the newest frame when it came out of the camera's queue
+        self._taken_s: float | None = None  # when the frame at work was handed on
+        self._kept_ns = -KEEP_EVERY_NS
+        self._faulty = False
+        self.description, self.size_px = source.description, source.size_px
+        self.epoch_unix_ns, self.fps = source.epoch_unix_ns, source.fps
+        self.start_monotonic_ns = source.start_monotonic_ns
+        self.is_live = True
+        self.warnings = source.warnings
+
+    def __iter__(self) -> Iterator[CameraFrame]:
+        try:
+            yield from self._passing()
+        finally:
+            if self.kept:
+                self.warnings.append(
+                    f"{self.kept} pictures were only kept in {self._folder.name}/, "
+                    "for a replay later"
+                )
+
+    def _passing(self) -> Iterator[CameraFrame]:
+        for frame in self._source:
+            self.frames += 1
+            self._measure(frame)
+            level = self.level
+            if level is Level.RECORD_ONLY:
+                self._keep(frame)
+            elif level is Level.FULL or self.frames % STRIDE == 0:
+                self._taken_s = time.monotonic()
+                yield frame
+                self._taken_s = None
+                continue
+            self._alive()
+
+    @property
+    def busy_s(self) -> float:
+        """Seconds for which one frame has been worked on; 0 while the camera is waited for."""
+        taken_s = self._taken_s
+        return 0.0 if taken_s is None else time.monotonic() - taken_s
+
+    @property
+    def late(self) -> int:
+        """Frames that the camera gave and nobody took up in time."""
+        return int(getattr(self._source, "dropped", 0))
+
+    def close(self) -> None:
+        """Close the camera."""
+        self._source.close()
+
+    def _measure(self, frame: CameraFrame) -> None:
+        if self.start_monotonic_ns is not None:
+            shown_ns = self.start_monotonic_ns + frame.time_ns
+            self.age_s = max(0.0, 1e-9 * (time.monotonic_ns() - shown_ns))
+
+    def _keep(self, frame: CameraFrame) -> None:
+        """Write the picture, when one is due and there is room."""
+        if self._paused.is_set() or frame.time_ns - self._kept_ns < KEEP_EVERY_NS:
+            return
+        self._kept_ns = frame.time_ns
+        try:
+            self._write(frame)
+        except OSError as error:
+            self.lost += 1
+            if not self._faulty:
+                log.error("pictures cannot be kept in %s: %s", self._folder, error.strerror)
+            self._faulty = True
+        else:
+            self.kept += 1
+            self._faulty = False
+
+    def _write(self, frame: CameraFrame) -> None:
+        import cv2
+
+        self._folder.mkdir(parents=True, exist_ok=True)
+        if shutil.disk_usage(self._folder).free < LEAST_FREE_MIB * 2**20:
+            raise OSError(28, "the disk is nearly full")
+        _, data = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        path = self._folder / picture_name(self._zero_unix_ns + frame.time_ns)
+        part = path.with_suffix(".part")
+        part.write_bytes(data.tobytes())
+        os.replace(part, path)
+
+
+def picture_name(unix_ns: int) -> str:
+    """A file name that tells the time in UTC to the microsecond: 20261121130501123456Z.jpg."""
+    seconds, rest_ns = divmod(unix_ns, 1_000_000_000)
+    moment = time.strftime("%Y%m%d%H%M%S", time.gmtime(seconds))
+    return f"{moment}{rest_ns // 1000:06d}Z.jpg"

@@ -1,0 +1,211 @@
+"""The daemon's life: heartbeats first, then the heavy imports, then scans; and how it goes.
+
+MAVLink starts first and on threads of its own, so that its heartbeat does not wait for the
+heavy imports; the scan runs on one worker thread (:mod:`service.daemon.scanning`).
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mavlink.control import Phase
+from mavlink.first_beat import FirstBeats
+from mavlink.presence import Health
+from mavlink.vehicle import VehicleLink
+from service.compute.threading_layer import kernels_may_overlap
+from service.config import Config, reload
+from service.daemon.control_actions import ControlActions
+from service.daemon.health import HealthServer, Notifier
+from service.daemon.load_control import LoadControl
+from service.daemon.machine import CoreLoad, computer_load, read_machine
+from service.daemon.scanning import Scanning
+from service.daemon.tuning import TUNABLES, parameters_of
+from service.daemon.vehicle_config import vehicle_config
+from service.errors import OutsideError
+from service.scans.retention import close_open_scans, make_room
+from service.version import software
+
+log = logging.getLogger(__name__)
+
+STUCK_S = 10.0
+"""A scan without a processed frame for so long is reported as critical."""
+
+HUNG_S = 20.0
+"""Work on one frame or view for so long is a hang: the watchdog is no longer fed."""
+
+COMPILING_S = 180.0
+"""The same before anything was compiled, where nobody ran ``skyrelief warm-up``."""
+
+
+class Daemon:
+    """The service on the aircraft."""
+
+    def __init__(self, config: Config, first: FirstBeats | None = None) -> None:
+        """``first`` speaks on the MAVLink links already."""
+        self._started_s = time.time()
+        self._wanted = config  # as it was asked for last; operators may have tuned it since
+        self._quit = threading.Event()
+        self.scanning = Scanning(config)
+        self.load_control = LoadControl(self.scanning)
+        self.actions = ControlActions(self.scanning, self.quit)
+        self.vehicle = VehicleLink(vehicle_config(config), self.actions, first)
+        self.scanning.vehicle = self.vehicle
+
+    @property
+    def config(self) -> Config:
+        """What is in force."""
+        return self.scanning.config
+
+    def run(self) -> None:
+        """Serve until :meth:`quit`; raises InputError when the configuration cannot work."""
+        notifier = Notifier()
+        self.vehicle.set_health(Health.BOOT)
+        self.vehicle.start()
+        http = self._serve_health()
+        try:
+            self.scanning.load()
+            self.actions.is_ready = True
+            notifier.ready()
+            self._begin(self._tidy)
+            if kernels_may_overlap():
+                self._begin(self._recover)
+            else:
+                self._recover()
+            if self.config.scan.start == "on-boot":
+                self.actions.start_scan()
+            self._watch(notifier)
+        finally:
+            notifier.stopping()
+            self.scanning.end()
+            self.vehicle.stop()
+            if http is not None:
+                http.close()
+
+    def _begin(self, work: Callable[[], None]) -> None:
+        threading.Thread(target=work, name=work.__name__[1:], daemon=True).start()
+
+    def _watch(self, notifier: Notifier) -> None:
+        """Keep the operator and the init system told until :meth:`quit`."""
+        scanning, was_armed = self.scanning, False
+        while not self._quit.wait(0.25):
+            self.vehicle.set_health(self._health())
+            was_armed = self._follow_arming(was_armed)
+            scanning.retry()
+            if self.is_progressing:
+                notifier.alive(scanning.phase.value)
+
+    @property
+    def is_progressing(self) -> bool:
+        """False for a hang that only a restart ends; a camera that gives nothing is none."""
+        most_s = HUNG_S if self.scanning.is_warm else COMPILING_S
+        return self.scanning.busy_s < most_s and self.vehicle.is_serving
+
+    def quit(self) -> None:
+        """Close a running scan, then let :meth:`run` return."""
+        self._quit.set()
+
+    def _serve_health(self) -> HealthServer | None:
+        """The server of health.http; a flight goes on without it."""
+        if not self.config.health.http:
+            return None
+        try:
+            return HealthServer(self.config.health.http, self.snapshot)
+        except OutsideError as error:
+            log.error("%s", error)
+            return None
+
+    def snapshot(self) -> dict[str, Any]:
+        """How it goes, for /status and /metrics."""
+        health, status = self._health(), self.actions.status()
+        figures = {"speed_m_s": status.speed_m_s, "distance_m": status.distance_m}
+        scan = self.scanning.scan
+        if scan is not None:
+            figures |= {
+                "frames": scan.recorder.frames,
+                "clouds": scan.recorder.keyframes,
+                "points": scan.recorder.points,
+                "camera_latency_ms": status.camera_latency_ms,
+                "camera_latency_sigma_ms": status.camera_latency_sigma_ms,
+            }
+        return {
+            "ok": health is not Health.CRITICAL,
+            "state": self.scanning.phase.value if self.actions.is_ready else "starting",
+            "fault": self.scanning.fault,
+            "software": software(),
+            "scan": status.scan_id,
+            "recording_s": status.recording_ms / 1e3,
+            "backend": self.scanning.backend_name,
+            "backend_failure": self.scanning.backend_failure,
+            "load": self.load_control.to_dict(),
+            "mavlink": self._mavlink(),
+            "machine": read_machine(Path(self.config.scan.folder)).to_dict(),
+        } | {key: value for key, value in figures.items() if math.isfinite(value)}
+
+    def _mavlink(self) -> dict[str, Any]:
+        """How the links to the vehicle do, as far as it is known."""
+        report = self.vehicle.report()
+        figures = {
+            "links_up": sum(link.is_up for link in report.links),
+            "packets": sum(link.packets for link in report.links),
+            "skipped_bytes": sum(link.skipped_bytes for link in report.links),
+            "dropped": report.dropped,
+            "unverified": report.unverified,
+            "armed": report.is_armed,
+            "autopilot_age_s": report.autopilot_age_s,
+            "round_trip_ms": report.timesync_round_trip_ms,
+        }
+        return {key: value for key, value in figures.items() if value is not None}
+
+    def reload(self, wanted: Config) -> None:
+        """Take over what of ``wanted`` may change while running; the rest waits for a restart."""
+        config, taken, waiting = reload(self.config, wanted, self._wanted)
+        self._wanted = wanted
+        self.scanning.follow(config)
+        tuned = parameters_of(config).items()
+        self.vehicle.show_parameters({n: v for n, v in tuned if TUNABLES[n].key in taken})
+        log.info("configuration: now in force: %s", ", ".join(taken) or "nothing new")
+        if waiting:
+            log.warning("configuration: after a restart: %s", ", ".join(waiting))
+
+    def _recover(self) -> None:
+        """Close what a crash or a power cut left open; then offer what the ground lacks."""
+        close_open_scans(Path(self.config.scan.folder), self._started_s)
+        self.scanning.offer_backlog()
+
+    def _tidy(self) -> None:
+        """Watch the machine, do less when it cannot keep up, keep room on the disk."""
+        folder = Path(self.config.scan.folder)
+        cores = CoreLoad()
+        while not self._quit.wait(2.0):
+            keep_free_mib = self.config.scan.keep_free_mib
+            machine = read_machine(folder)
+            self.vehicle.set_load(computer_load(machine, cores.percent(), keep_free_mib))
+            self.load_control.look(machine)
+            make_room(folder, keep_free_mib, self.scanning.scan_id)
+
+    def _health(self) -> Health:
+        if not self.actions.is_ready:
+            return Health.BOOT
+        if self.scanning.fault:
+            return Health.CRITICAL
+        if (
+            self.scanning.phase is Phase.SCANNING
+            and time.monotonic() - self.scanning.progress_s > STUCK_S
+        ):
+            return Health.CRITICAL
+        return Health.ACTIVE if self.scanning.phase is not Phase.IDLE else Health.STANDBY
+
+    def _follow_arming(self, was_armed: bool) -> bool:
+        is_armed = self.vehicle.report().is_armed
+        if self.config.scan.start == "on-arm" and is_armed != was_armed:
+            if is_armed:
+                self.actions.start_scan()
+            else:
+                self.actions.stop_scan()
+        return is_armed

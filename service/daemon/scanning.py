@@ -1,0 +1,335 @@
+"""The scan's thread: open the camera, scan, close the scan, and scan again after a fault.
+
+This is the only place that catches what the outside world throws at a scan.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mavlink.control import ACCEPTED, Answer, Phase, Result, Work
+from mavlink.status import CRITICAL, WARNING
+from mavlink.vehicle import VehicleLink
+from service.config import Config
+from service.daemon.degradation import Level, lowered
+from service.daemon.warm_up import is_warm
+from service.errors import InputError, OutsideError, SkyreliefError
+from service.onboard.datalink import DaemonLink
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from mavlink.state import VehicleState
+    from recon.backends import Backend
+    from recon.types import Camera, Keyframe
+    from service.cameras.source import CameraSource
+    from service.daemon.frame_gate import FrameGate
+    from service.onboard.pipeline import Step
+    from service.onboard.scan import Scan
+    from service.stream.store import ScanStore
+
+log = logging.getLogger(__name__)
+
+FIRST_RETRY_S, LAST_RETRY_S = 1.0, 8.0
+"""Back-off between attempts to open a camera or to scan again; names of scans are seconds."""
+
+
+LATER = "later"
+"""Folder within a scan's for pictures that were only kept."""
+
+
+class Scanning:
+    """One scan at a time, on a thread of its own."""
+
+    vehicle: VehicleLink
+    """Telemetry and the operator; set by who owns both, before the first scan."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.phase = Phase.IDLE
+        self.fault = ""
+        self.scan: Scan | None = None
+        self.gate: FrameGate | None = None
+        self.level = Level.FULL
+        self.is_warm = is_warm()  # nothing is left to compile
+        self.started_s = self.progress_s = time.monotonic()
+        self._backend: Backend | None = None
+        self._camera: Camera | None = None
+        self._stop, self._ended = threading.Event(), threading.Event()
+        self._paused = threading.Event()
+        self._worker: threading.Thread | None = None
+        self._closing: Work | None = None
+        self._retry_at_s: float | None = None
+        self._retry_s = FIRST_RETRY_S
+        self._latency_ms: float | None = None  # of the camera, as the last scan found it
+        self.link = DaemonLink()
+
+    def load(self) -> None:
+        """The heavy part of the start: camera model and backend; InputError without them."""
+        from service.cameras.camera_file import load_camera
+        from service.compute.opening import open_backend
+
+        if not self.config.camera.source:
+            raise InputError("camera.source is not set; give it in the configuration file")
+        if not self.config.camera.model:
+            raise InputError(
+                "camera.model is not set; make one with 'skyrelief calibrate' and name it"
+            )
+        self._camera = load_camera(Path(self.config.camera.model))
+        self._backend = open_backend(self.config.compute, self._camera.size_px)
+        log.info("ready: backend %s", self._backend.name)
+
+    # ---- what may be asked of it -----------------------------------------------------------
+
+    @property
+    def is_running(self) -> bool:
+        """True from the start of a scan until its files are written."""
+        return self._worker is not None and self._worker.is_alive()
+
+    @property
+    def scan_id(self) -> str:
+        """Of the scan that runs; else empty."""
+        scan = self.scan
+        return scan.inputs.scan_id if scan is not None else ""
+
+    def start(self) -> None:
+        """Start a scan; to be asked while none is running."""
+        self.fault = ""
+        self._retry_at_s = None
+        self._stop.clear()
+        self._paused.clear()
+        self.phase = Phase.SCANNING
+        self.started_s = self.progress_s = time.monotonic()
+        self._worker = threading.Thread(target=self._work, name="scan", daemon=True)
+        self._worker.start()
+
+    def stop(self) -> None:
+        """Close the running scan, also where it waits for a dead camera, and start no other."""
+        self._retry_at_s = None
+        self._stop_feeding()
+
+    def _stop_feeding(self) -> None:
+        self._stop.set()
+        scan = self.scan
+        if scan is not None:
+            scan.source.close()
+
+    def finalise(self) -> Work:
+        """Close the running scan; done when everything is written out."""
+        self._closing = Work()
+        self._stop_feeding()
+        return self._closing
+
+    def pause(self) -> None:
+        """Take no frames until :meth:`resume`."""
+        self._paused.set()
+        self.phase = Phase.PAUSED
+
+    def resume(self) -> None:
+        """Go on after a pause."""
+        self._paused.clear()
+        self.phase = Phase.SCANNING
+        self.progress_s = time.monotonic()
+
+    def follow(self, config: Config) -> None:
+        """Work by another configuration: what can change in flight also in the scan that runs."""
+        self.config = config
+        scan = self.scan
+        if scan is not None:
+            scan.pipeline.set_baseline(config.scan)
+            scan.check.set_camera(config.camera)
+        self.link.follow(config)
+
+    @property
+    def busy_s(self) -> float:
+        """Seconds for which one frame or view has been worked on; 0 while the camera is awaited."""
+        scan, gate = self.scan, self.gate
+        if scan is None or gate is None or self.phase is not Phase.SCANNING:
+            return 0.0
+        return max(gate.busy_s, scan.pipeline.busy_s)
+
+    def set_level(self, level: Level) -> None:
+        """Do less with the pictures, or more again, in this scan and in the next."""
+        self.level = level
+        scan, gate = self.scan, self.gate
+        if scan is not None and gate is not None:
+            scan.pipeline.set_effort(lowered(self.config.compute, level))
+            gate.level = level
+
+    @property
+    def backend_name(self) -> str:
+        """Of the backend that computes now; empty while starting."""
+        return self._backend.name if self._backend is not None else ""
+
+    @property
+    def backend_failure(self) -> str:
+        """Why the backend that was chosen gave way to the CPU; empty when it did not."""
+        return getattr(self._backend, "failure", None) or ""
+
+    def retry(self) -> None:
+        """Start the next scan when a fault ended the last one and nobody stopped it."""
+        due = self._retry_at_s is not None and time.monotonic() >= self._retry_at_s
+        if due and not self.is_running:
+            self.start()
+
+    def end(self) -> None:
+        """Close the running scan, wait for its files, and start no other."""
+        self._ended.set()
+        self._stop_feeding()
+        if self._worker is not None:
+            self._worker.join()
+        self.link.rest()
+
+    # ---- the scan's thread ------------------------------------------------------------------
+
+    def _work(self) -> None:
+        try:
+            self._scan_once()
+        except SkyreliefError as error:
+            self._fail(str(error))
+        except Exception as error:
+            log.exception("the scan ended with a fault of ours")
+            first, *_ = str(error).strip().splitlines() or [type(error).__name__]
+            self._fail(f"internal fault: {first}")
+        finally:
+            self.scan = self.gate = None
+            self.phase = Phase.IDLE
+            if self._closing is not None:
+                failed = Answer(Result.FAILED, self.fault)
+                self._closing.finish(failed if self.fault else ACCEPTED)
+                self._closing = None
+            self.offer_backlog()
+
+    def offer_backlog(self) -> None:
+        """Send earlier scans that the ground lacks while none is flown."""
+        self.link.offer_backlog(
+            self.config, lambda: self.phase is Phase.IDLE and not self._ended.is_set()
+        )
+
+    def _fail(self, text: str) -> None:
+        self.fault = text
+        log.error("%s", text)
+        self.vehicle.statustext(f"Scan failed: {text}", CRITICAL)
+        if not (self._stop.is_set() or self._ended.is_set()):
+            log.warning("scanning again in %.1f s", self._retry_s)
+            self._retry_at_s = time.monotonic() + self._retry_s
+            self._retry_s = min(2 * self._retry_s, LAST_RETRY_S)
+
+    def _scan_once(self) -> None:
+        """Open the camera, scan until stopped or the recording ends, close the scan."""
+        from service.daemon.frame_gate import FrameGate
+        from service.onboard.scan import Scan, ScanInputs, create_store
+        from service.scans.folder import write_deliverables
+
+        assert self._camera is not None and self._backend is not None
+        source = self._open_camera()
+        if source is None:
+            return
+        scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        folder = Path(self.config.scan.folder) / scan_id
+        zero_ns, offset = _zero_ns(source), time.time_ns() - time.monotonic_ns()
+        gate = FrameGate(source, folder / LATER, zero_ns + offset, self._alive, self._paused)
+        inputs = ScanInputs(
+            gate,
+            self._camera,
+            self.config,
+            self._backend,
+            folder,
+            scan_id,
+            zero_ns,
+            unix_offset_ns=offset,
+            history=self.vehicle.history,
+            extra={"backend": self._backend.name, "source": source.description},
+            latency_ms=self._latency_ms,
+            tell=lambda text: self.vehicle.statustext(text, WARNING),
+            on_step=self._odometry_report(),
+            on_keyframe=self._on_keyframe,
+        )
+        store = create_store(inputs)
+        self.vehicle.record(folder / "link.tlog")
+        self.link.take_off(store, self.config, self.vehicle)
+        self.scan, self.gate = Scan(inputs, store), gate
+        self.set_level(self.level)
+        self.vehicle.statustext(f"Scan {scan_id} started")
+        try:
+            self.scan.run(self._stop, self._on_frame, self._paused)
+        finally:
+            source.close()
+            self.phase = Phase.FINALISING
+            self.vehicle.record(None)
+            try:
+                self._close_scan(self.scan, store)
+            finally:
+                write_deliverables(folder, store, {})
+                self.link.land(self.config)
+                store.close()
+
+    def _odometry_report(self) -> Callable[[Step, VehicleState | None, int], None] | None:
+        """What tells the autopilot how it moves, where that is wanted."""
+        if not self.config.mavlink.odometry:
+            return None
+        from service.onboard.odometry_report import OdometryReport
+
+        return OdometryReport(self.config.camera, self.vehicle.report_odometry).tell
+
+    def _close_scan(self, scan: Scan, store: ScanStore) -> None:
+        """Finish the scan; when the pipeline cannot, what is stored is kept as interrupted."""
+        try:
+            summary = scan.close()
+        except Exception:
+            store.finish({"interrupted": True})
+            raise
+        if scan.check.latency is not None and scan.check.latency.is_settled:
+            self._latency_ms = scan.check.latency.latency_ms
+        self.vehicle.statustext(
+            f"Scan {scan.inputs.scan_id}: {summary['clouds']} clouds, {summary['distance_m']:.0f} m"
+        )
+
+    def _open_camera(self) -> CameraSource | None:
+        """The camera at its own pace, tried until it answers; None when stopped meanwhile."""
+        from service.cameras import open_camera
+        from service.cameras.pace import paced
+
+        wait_s = FIRST_RETRY_S
+        while not (self._stop.is_set() or self._ended.is_set()):
+            try:
+                source = open_camera(self.config.camera.source)
+                return source if source.is_live else paced(source)
+            except OutsideError as error:
+                log.warning("%s; trying again in %.1f s", error, wait_s)
+                self.vehicle.statustext(f"Camera: {error}", WARNING)
+                self._stop.wait(wait_s)
+                wait_s = min(2 * wait_s, LAST_RETRY_S)
+        return None
+
+    def _alive(self) -> None:
+        self.progress_s = time.monotonic()
+
+    def _on_frame(self, scan: Scan) -> None:
+        self._alive()
+        self.is_warm = self.is_warm or scan.recorder.keyframes > 1
+        if scan.recorder.keyframes:
+            self._retry_s = FIRST_RETRY_S
+
+    def _on_keyframe(self, keyframe: Keyframe) -> None:
+        """Tell ground stations of a keyframe, at the pose that it has now."""
+        from service.onboard.keyframe_report import keyframe_report
+
+        scan = self.scan
+        if scan is not None:
+            frame, inputs = scan.pipeline.rig.frame, scan.inputs
+            state = self.vehicle.history.state_at(keyframe.time_ns)
+            agl_m = None if state is None else state.alt_agl_m
+            time_ns = keyframe.time_ns + inputs.unix_offset_ns
+            T = keyframe.pose.T_world_camera
+            self.vehicle.report_keyframe(keyframe_report(time_ns, T, frame, agl_m))
+
+
+def _zero_ns(source: CameraSource) -> int:
+    """Monotonic clock at the source's time 0: its own word if it is live, else now."""
+    start_ns = source.start_monotonic_ns
+    return time.monotonic_ns() if start_ns is None else start_ns

@@ -1,0 +1,126 @@
+"""A short scan of a made-up ground, so that every compiled kernel lies in numba's cache on disk.
+
+The installer does this once for a version: the first scan of a flight then loads its kernels
+instead of compiling them for minutes on a small board, and a scan that stands still for seconds
+can be taken for hung.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Event
+
+import numpy as np
+
+from service.cameras.source import CameraFrame
+from service.config import Config, change
+from service.version import software
+
+log = logging.getLogger(__name__)
+
+SIZE_PX = (320, 240)
+FOCAL_PX = 300.0
+STEP_PX = 10
+FRAMES = 40
+MARKER = "warm"
+
+
+class MadeUpGround:
+    """A camera over flat ground with a slab on it, flown straight on; nothing is random twice."""
+
+    def __init__(self, frames: int = FRAMES) -> None:
+        self.description, self.size_px = "made-up ground", SIZE_PX
+        self.epoch_unix_ns: int | None = None
+        self.start_monotonic_ns: int | None = None
+        self.fps: float | None = 10.0
+        self.is_live = False
+        self.warnings: list[str] = []
+        self._frames = frames
+
+    def __iter__(self) -> Iterator[CameraFrame]:
+        import cv2
+
+        W, H = SIZE_PX
+        rng = np.random.default_rng(0)
+        noise = rng.integers(0, 256, (H, W + STEP_PX * self._frames, 3), np.uint8)
+        smooth = np.asarray(cv2.GaussianBlur(noise, (0, 0), 1.5), np.float64)
+        ground = np.clip(5.0 * (smooth - 127.5) + 127.5, 0, 255).astype(np.uint8)
+        for i in range(self._frames):
+            x = STEP_PX * i
+            image = ground[:, x : x + W].copy()
+            left = W - round(1.1 * x) % (2 * W)  # nearer by a tenth: it passes by faster
+            a, b = max(0, left), min(W, left + 80)
+            if a < b:
+                image[60:140, a:b] = ground[150:230, a - left : b - left]
+            yield CameraFrame(image, 100_000_000 * i, i, None, f"frame {i}")
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def warm_up(config: Config) -> tuple[float, int]:
+    """Scan the made-up ground with the configured backend; (seconds, keyframes) of it.
+
+    Leaves the mark that :func:`is_warm` looks for.
+    """
+    from recon.backends.cpu import warm_up as warm_up_backend
+    from recon.types import Camera
+    from service.compute.opening import open_backend
+    from service.onboard.scan import Scan, ScanInputs, create_store
+    from service.scans.folder import write_deliverables
+
+    start = time.monotonic()
+    warm_up_backend()  # what a device that fails would fall back to
+    for key in ("scan.assumed_agl_m=60", "scan.keep_debug=false", "scan.baseline=auto"):
+        config = change(config, *key.split("="))
+    W, H = SIZE_PX
+    K = np.array([[FOCAL_PX, 0, W / 2 - 0.5], [0, FOCAL_PX, H / 2 - 0.5], [0, 0, 1.0]])
+    with TemporaryDirectory(prefix="skyrelief-warm-") as folder:
+        inputs = ScanInputs(
+            MadeUpGround(),
+            Camera(K, np.zeros(5), SIZE_PX),
+            config,
+            open_backend(config.compute),
+            Path(folder),
+            "warm-up",
+            time.time_ns(),
+        )
+        store = create_store(inputs)
+        scan = Scan(inputs, store)
+        scan.run(Event())
+        summary = scan.close()
+        write_deliverables(Path(folder), store, {})
+        store.close()
+    _mark()
+    return time.monotonic() - start, int(summary["keyframes"])
+
+
+def is_warm() -> bool:
+    """True when this version was warmed up with the cache that is in use."""
+    marker = _marker()
+    try:
+        return marker is not None and marker.read_text(encoding="utf-8") == software()
+    except OSError:
+        return False
+
+
+def _mark() -> None:
+    marker = _marker()
+    if marker is None:
+        return
+    try:
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        marker.write_text(software(), encoding="utf-8")
+    except OSError as error:
+        log.warning("%s cannot be written: %s", marker, error.strerror)
+
+
+def _marker() -> Path | None:
+    """Beside the kernels; None when they lie with the sources, where no version is told apart."""
+    folder = os.environ.get("NUMBA_CACHE_DIR", "")
+    return Path(folder) / MARKER if folder else None

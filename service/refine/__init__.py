@@ -1,0 +1,1 @@
+"""A finished scan adjusted as a whole, and what to fly again."""

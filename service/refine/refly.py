@@ -1,0 +1,361 @@
+"""A second flight over what the first saw too little of, as a mission for ground stations.
+
+Lines run over the weak cells of the coverage layer at the height flown, as far apart as the
+camera's picture and the wanted overlap allow. The camera starts before the first line and
+stops after the last, so that the second flight is one scan.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import cv2
+import numpy as np
+
+from recon.coverage import Footprint
+from recon.raster import Grid
+from recon.types import F64, Array, Bool
+from service.errors import InputError
+from service.georeference import LocalFrame
+from service.scans.coverage import Coverage
+
+MOST_LINES = 150
+TAKEOFF, WAYPOINT, RETURN, SPEED = 22, 16, 20, 178
+VIDEO_START, VIDEO_STOP, PHOTO_START, PHOTO_STOP = 2500, 2501, 2000, 2001
+AMSL, MISSION, RELATIVE = 0, 2, 3  # MAV_FRAME
+SMALLEST_SHARE = 0.005
+"""Weak patches smaller than this share of a picture are left to chance."""
+
+FORWARD_OVERLAP = 0.8
+"""Of two photographs one after the other, when photographs are taken."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Line:
+    """One straight line of the camera over the ground, ENU metres."""
+
+    start_m: F64  # (2,)
+    end_m: F64  # (2,)
+
+    @property
+    def length_m(self) -> float:
+        """From end to end."""
+        return float(np.linalg.norm(self.end_m - self.start_m))
+
+
+@dataclass(frozen=True, slots=True)
+class Swath:
+    """How the camera flew: its picture on the ground and where it looks."""
+
+    across_m: float
+    along_m: float
+    ahead_m: float  # from below the camera to the middle of its picture, along the flight
+    heading_rad: float  # most flown, from east to north
+    altitude_amsl_m: float
+    speed_m_s: float
+    height_m: float | None  # above the ground
+
+
+@dataclass(frozen=True, slots=True)
+class MissionItem:
+    """One MAVLink mission item."""
+
+    command: int
+    frame: int
+    params: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    lat_deg: float = 0.0
+    lon_deg: float = 0.0
+    alt_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refly:
+    """The flight suggested."""
+
+    lines: tuple[Line, ...]
+    items: tuple[MissionItem, ...]
+    home: tuple[float, float, float]  # latitude, longitude, AMSL metres
+    swath: Swath
+    spacing_m: float
+    weak_m2: float
+    patches: int
+
+    @property
+    def length_m(self) -> float:
+        """All lines and the ways between them."""
+        ways = sum(float(np.linalg.norm(b.start_m - a.end_m)) for a, b in pairwise(self.lines))
+        return sum(line.length_m for line in self.lines) + ways
+
+
+def flown_swath(
+    places: Sequence[Footprint], frame: LocalFrame, speed_m_s: float, height_m: float | None
+) -> Swath:
+    """What the keyframes' pictures say of camera and flight. Raises InputError for one alone."""
+    if len(places) < 2:
+        raise InputError("the scan holds a single keyframe: no line was flown to go by")
+    cameras = np.array([p.camera_m for p in places])
+    steps = np.gradient(cameras[:, :2], axis=0)
+    length = np.linalg.norm(steps, axis=1)
+    if length.max() < 0.1:
+        raise InputError("the camera never moved in this scan: no line was flown to go by")
+    ways = steps / np.maximum(length, 1e-6)[:, None]
+    edges = np.array([[p.corners_m[1] - p.corners_m[0], p.corners_m[2] - p.corners_m[1]]
+                      for p in places])  # fmt: skip
+    sizes = np.linalg.norm(edges, axis=2)
+    cosine = np.abs(np.einsum("nec,nc->ne", edges, ways)) / np.maximum(sizes, 1e-6)
+    along = np.argmax(cosine, axis=1)
+    rows = np.arange(len(places))
+    middles = np.array([p.centre_m for p in places])
+    ahead = np.sum((middles - cameras[:, :2]) * ways, axis=1)
+    moving = length > 0.3 * np.median(length)
+    return Swath(
+        across_m=float(np.median(sizes[rows, 1 - along])),
+        along_m=float(np.median(sizes[rows, along])),
+        ahead_m=float(np.median(ahead[moving])),
+        heading_rad=_usual_heading(ways[moving]),
+        altitude_amsl_m=frame.alt_amsl_m + float(np.median(cameras[:, 2])),
+        speed_m_s=speed_m_s,
+        height_m=height_m,
+    )
+
+
+def _usual_heading(ways: F64) -> float:
+    """Direction of most of the (N, 2) unit steps, there and back alike, from east to north."""
+    doubled = np.exp(2j * np.arctan2(ways[:, 1], ways[:, 0]))
+    most = np.ones(len(doubled), np.bool_)
+    for _ in range(5):
+        mean = doubled[most].sum()
+        most = np.abs(np.angle(doubled * np.conj(mean))) <= np.radians(40.0)
+        if not most.any():
+            break
+    return float(np.angle(mean) / 2)
+
+
+def weak_patches(weak: Bool, grid: Grid, swath: Swath) -> list[F64]:
+    """(N, 2) cell centres of each group of weak patches that one set of lines can serve."""
+    cell = grid.cell_m
+    tidy = weak.astype(np.uint8)
+    for step in (cv2.MORPH_CLOSE, cv2.MORPH_OPEN):  # heal single cells, then drop thin strips
+        tidy = np.asarray(cv2.morphologyEx(tidy, step, np.ones((3, 3), np.uint8)), np.uint8)
+    count, label, stats, _ = cv2.connectedComponentsWithStats(tidy, connectivity=8)
+    least = max(4.0, SMALLEST_SHARE * swath.across_m * swath.along_m / cell**2)
+    large = np.array([n > 0 and stats[n, cv2.CC_STAT_AREA] >= least for n in range(count)])
+    kept = large[label]
+    if not kept.any():
+        return []
+    reach = 2 * int(0.25 * min(swath.across_m, swath.along_m) / cell) + 1
+    grown = cv2.dilate(kept.astype(np.uint8), np.ones((reach, reach), np.uint8))
+    groups, member = cv2.connectedComponents(grown, connectivity=8)
+    out = []
+    for n in range(1, groups):
+        row, col = np.nonzero(kept & (member == n))
+        if len(row):
+            x = grid.west_m + (col + 0.5) * cell
+            y = grid.north_m - (row + 0.5) * cell
+            out.append(np.column_stack([x, y]))
+    return out
+
+
+def lines_over(cells_m: F64, swath: Swath, overlap: float) -> list[Line]:
+    """Parallel lines that cover (N, 2) cells, in the direction that takes the shortest way."""
+    box = cv2.minAreaRect(cells_m.astype(np.float32))
+    turn = np.radians(box[2])
+    best: list[Line] = []
+    least = np.inf
+    for angle in (swath.heading_rad, turn, turn + np.pi / 2):
+        lines = _parallel(cells_m, angle, swath, overlap)
+        length = sum(line.length_m for line in lines) + swath.across_m * len(lines)
+        if length < 0.8 * least:  # the heading flown is preferred where little is lost
+            best, least = lines, length
+    return best
+
+
+def _parallel(cells_m: F64, angle: float, swath: Swath, overlap: float) -> list[Line]:
+    """Lines at ``angle`` (from east to north), back and forth."""
+    way = np.array([np.cos(angle), np.sin(angle)])
+    side = np.array([-way[1], way[0]])
+    s, t = cells_m @ way, cells_m @ side
+    low, width = float(t.min()), float(np.ptp(t))
+    spacing = swath.across_m * (1.0 - overlap)
+    count = max(1, int(np.ceil(width / spacing)))
+    step = width / count
+    lines: list[Line] = []
+    for k in range(count):
+        here = np.abs(t - (low + (k + 0.5) * step)) <= 0.5 * step + 1e-6
+        if not here.any():
+            continue
+        # Half a picture before and after, so that the ends are seen as often as the middle.
+        first, last = s[here].min() - 0.5 * swath.along_m, s[here].max() + 0.5 * swath.along_m
+        middle = (low + (k + 0.5) * step) * side
+        ends = [first * way + middle, last * way + middle]
+        if len(lines) % 2:
+            ends.reverse()
+        lines.append(Line(ends[0], ends[1]))
+    return lines
+
+
+def in_order(groups: Sequence[Sequence[Line]], begin_m: F64) -> list[Line]:
+    """All groups' lines, the nearest next, each group entered at its nearer end."""
+    left = [list(group) for group in groups if group]
+    out: list[Line] = []
+    here = begin_m
+    while left:
+        choices = [(_entries(group), group) for group in left]
+        ways = [(float(np.linalg.norm(e[0].start_m - here)), k, e)
+                for k, (entries, _) in enumerate(choices) for e in entries]  # fmt: skip
+        _, k, nearest = min(ways, key=lambda w: w[:2])
+        left.pop(k)
+        out += nearest
+        here = nearest[-1].end_m
+    return out
+
+
+def _entries(group: list[Line]) -> list[list[Line]]:
+    """The four ways to fly a group: from its first or last line, from either end."""
+    swapped = [Line(line.end_m, line.start_m) for line in group]
+    return [group, swapped, group[::-1], swapped[::-1]]
+
+
+def suggest(
+    coverage: Coverage,
+    speed_m_s: float,
+    height_m: float | None,
+    overlap: float = 0.6,
+    relative: bool = False,
+    photos: bool = False,
+    home: tuple[float, float, float] | None = None,
+) -> Refly | None:
+    """A flight over the weak areas; None when nothing is weak.
+
+    ``overlap`` is that of neighbouring lines' pictures. Altitudes are AMSL as flown, or
+    ``relative`` to home by the height above ground flown.
+
+    Raises InputError when the scan has no place on the globe, holds too few keyframes, or the
+    weak areas would take more than MOST_LINES lines.
+    """
+    if not 0.0 <= overlap <= 0.9:
+        raise InputError(f"overlap {overlap:g} is not 0 to 0.9")
+    frame = coverage.frame
+    if frame is None:
+        raise InputError("the scan has no georeference; a mission needs one (fly with GNSS)")
+    if relative and height_m is None:
+        raise InputError("the scan knows no height above ground; leave --relative out")
+    swath = flown_swath(coverage.footprints, frame, speed_m_s, height_m)
+    patches = weak_patches(coverage.weak, coverage.layer.grid, swath)
+    if not patches:
+        return None
+    groups = [lines_over(cells, swath, overlap) for cells in patches]
+    count = sum(map(len, groups))
+    if count > MOST_LINES:
+        raise InputError(
+            f"{count} lines would be needed, more than {MOST_LINES}; raise --sigma-m, lower "
+            "--views or fly the whole area again"
+        )
+    begin = coverage.footprints[-1].camera_m[:2]
+    lines = [_behind(line, swath) for line in in_order(groups, begin)]
+    if home is None:
+        home = _first_place(coverage, frame, height_m)
+    items = _items(lines, frame, swath, relative, photos)
+    area = sum(map(len, patches)) * coverage.layer.grid.cell_m**2
+    return Refly(
+        tuple(lines), tuple(items), home, swath, swath.across_m * (1 - overlap), area, len(patches)
+    )
+
+
+def _behind(line: Line, swath: Swath) -> Line:
+    """Where to fly so that the picture's middle follows ``line``."""
+    way = (line.end_m - line.start_m) / max(line.length_m, 1e-6)
+    return Line(line.start_m - swath.ahead_m * way, line.end_m - swath.ahead_m * way)
+
+
+def _first_place(
+    coverage: Coverage, frame: LocalFrame, height_m: float | None
+) -> tuple[float, float, float]:
+    """The ground below the first keyframe."""
+    camera = coverage.footprints[0].camera_m
+    lat, lon, alt = frame.to_geodetic(camera[None])[0]
+    return float(lat), float(lon), float(alt) - (height_m or 0.0)
+
+
+def _items(
+    lines: Sequence[Line], frame: LocalFrame, swath: Swath, relative: bool, photos: bool
+) -> list[MissionItem]:
+    """Take-off, speed, camera on, all lines, camera off, return."""
+    where = RELATIVE if relative else AMSL
+    altitude = (swath.height_m or 0.0) if relative else swath.altitude_amsl_m
+    altitude = round(altitude, 2)
+    ends = np.array([end for line in lines for end in (line.start_m, line.end_m)])
+    places = frame.to_geodetic(np.column_stack([ends, np.zeros(len(ends))]))
+    points = [(round(float(p[0]), 8), round(float(p[1]), 8)) for p in places]
+
+    def at(command: int, point: tuple[float, float]) -> MissionItem:
+        return MissionItem(command, where, (0.0, 0.0, 0.0, 0.0), *point, altitude)
+
+    speed = max(swath.speed_m_s, 1.0)
+    interval = max(round((1 - FORWARD_OVERLAP) * swath.along_m / speed, 1), 0.5)
+    start = MissionItem(PHOTO_START, MISSION, (0.0, interval, 0.0, 0.0))
+    stop = MissionItem(PHOTO_STOP, MISSION)
+    if not photos:
+        start, stop = MissionItem(VIDEO_START, MISSION), MissionItem(VIDEO_STOP, MISSION)
+    return [
+        at(TAKEOFF, points[0]),
+        MissionItem(SPEED, MISSION, (1.0, round(speed, 1), -1.0, 0.0)),
+        at(WAYPOINT, points[0]),
+        start,
+        *(at(WAYPOINT, point) for point in points[1:]),
+        stop,
+        MissionItem(RETURN, MISSION),
+    ]
+
+
+def plan_json(refly: Refly) -> str:
+    """The mission as QGroundControl's .plan."""
+    items: list[dict[str, Any]] = []
+    for n, item in enumerate(refly.items, 1):
+        placed = item.frame != MISSION
+        entry: dict[str, Any] = {
+            "type": "SimpleItem",
+            "autoContinue": True,
+            "command": item.command,
+            "doJumpId": n,
+            "frame": item.frame,
+            "params": [*item.params, item.lat_deg, item.lon_deg, item.alt_m],
+        }
+        if placed:
+            mode = 1 if item.frame == RELATIVE else 2
+            entry |= {"AMSLAltAboveTerrain": None, "Altitude": item.alt_m, "AltitudeMode": mode}
+        items.append(entry)
+    document = {
+        "fileType": "Plan",
+        "version": 1,
+        "groundStation": "QGroundControl",
+        "geoFence": {"circles": [], "polygons": [], "version": 2},
+        "rallyPoints": {"points": [], "version": 2},
+        "mission": {
+            "version": 2,
+            "firmwareType": 0,
+            "globalPlanAltitudeMode": 1 if refly.items[0].frame == RELATIVE else 2,
+            "vehicleType": 2,
+            "cruiseSpeed": refly.swath.speed_m_s,
+            "hoverSpeed": max(round(refly.swath.speed_m_s, 1), 1.0),
+            "plannedHomePosition": list(refly.home),
+            "items": items,
+        },
+    }
+    return json.dumps(document, indent=4) + "\n"
+
+
+def waypoints_text(refly: Refly) -> str:
+    """The mission as QGC WPL 110, which Mission Planner and MAVProxy read; home comes first."""
+    rows: list[Array | tuple[Any, ...]] = [(0, 1, 0, WAYPOINT, 0, 0, 0, 0, *refly.home, 1)]
+    for n, i in enumerate(refly.items, 1):
+        rows.append((n, 0, i.frame, i.command, *i.params, i.lat_deg, i.lon_deg, i.alt_m, 1))
+    return "QGC WPL 110\n" + "".join("\t".join(_number(v) for v in row) + "\n" for row in rows)
+
+
+def _number(value: float) -> str:
+    return f"{value:.8f}" if isinstance(value, float) else str(value)

@@ -1,0 +1,285 @@
+"""The coverage layer of a scan: kept up to date from its store, as picture, figures and GeoTIFF.
+
+Drone and ground make the same layer, because both read the same store. In flight
+:class:`LiveCoverage` reads only keyframes that are new or were moved.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from recon.coverage import CoverageGrid, CoverageMap, Footprint, usual_cell_m
+from recon.types import U8, Array, DepthMap
+from service.errors import OutsideError
+from service.georeference import LocalFrame
+from service.scans.track import local_frame
+from service.scans.writing import writing
+from service.stream.store import ScanStore
+
+log = logging.getLogger(__name__)
+
+PICTURE, FIGURES = "coverage.png", "coverage.json"
+LEAST_VIEWS = 3
+"""Pictures of a place below which it counts as weak: two alone can agree on what is wrong."""
+
+MOST_SIGMAS = 3.0
+"""A surface is weak where its sigma is this many times the scan's median."""
+
+GAP, SELDOM, UNSURE = (70, 60, 220), (60, 160, 245), (90, 220, 245)  # BGR
+BEST, USUAL = (110, 190, 60), (190, 220, 160)
+LEGEND = {
+    "gap": "inside what was flown, no surface measured",
+    "seldom": "covered by too few pictures",
+    "unsure": "sigma too large",
+    "good": "measured; the darker, the surer",
+}
+LARGEST_PX = 1600
+WRITE_EVERY_S = 15.0
+"""In flight the layer is written beside the scan this often."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What counts as weak."""
+
+    least_views: int
+    most_sigma_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """The layer of a scan at one moment, in the scan's ENU metres."""
+
+    layer: CoverageGrid
+    frame: LocalFrame | None
+    footprints: tuple[Footprint, ...]  # of the keyframes, in order of their number
+    limits: Limits
+
+    @cached_property
+    def weak(self) -> Array:
+        """(rows, cols) bool: cells worth flying over again."""
+        return self.layer.weak(self.limits.least_views, self.limits.most_sigma_m)
+
+    @property
+    def bounds_m(self) -> tuple[float, float, float, float]:
+        """(west, south, east, north) in ENU metres of the scan's origin."""
+        return self.layer.grid.bounds
+
+    def corners_lat_lon(self) -> list[tuple[float, float]] | None:
+        """(latitude, longitude) of the picture's NW, NE, SE and SW corners, if it has a place."""
+        if self.frame is None:
+            return None
+        west, south, east, north = self.bounds_m
+        enu = np.array([[west, north, 0], [east, north, 0], [east, south, 0], [west, south, 0]])
+        rows = self.frame.to_geodetic(enu.astype(np.float64))
+        return [(round(float(r[0]), 8), round(float(r[1]), 8)) for r in rows]
+
+    def figures(self) -> dict[str, Any]:
+        """What the layer says in numbers, fit for JSON."""
+        layer, area = self.layer, self.layer.grid.cell_m**2
+        known, inside = layer.known, layer.inside
+        sigma, views = layer.sigma_m[known], layer.views[inside]
+        some = bool(known.any())
+        return {
+            "cell_m": layer.grid.cell_m,
+            "bounds_m": [round(v, 3) for v in self.bounds_m],
+            "corners_lat_lon": self.corners_lat_lon(),
+            "keyframes": len(self.footprints),
+            "measured_m2": round(float(known.sum()) * area, 1),
+            "flown_m2": round(float(inside.sum()) * area, 1),
+            "gaps_m2": round(float(layer.gaps.sum()) * area, 1),
+            "weak_m2": round(float(self.weak.sum()) * area, 1),
+            "views_median": float(np.median(views)) if len(views) else 0.0,
+            "sigma_median_m": round(float(np.median(sigma)), 4) if some else None,
+            "sigma_90_percent_m": round(float(np.percentile(sigma, 90)), 4) if some else None,
+            "least_views": self.limits.least_views,
+            "most_sigma_m": round(self.limits.most_sigma_m, 4),
+            "legend": LEGEND,
+        }
+
+    def picture(self) -> U8:
+        """(rows, cols, 4) BGRA, north up: what is weak and why; clear where nobody flew."""
+        layer, limits = self.layer, self.limits
+        out = np.zeros((*layer.grid.shape, 4), np.uint8)
+        known, inside = layer.known, layer.inside
+        with np.errstate(invalid="ignore"):
+            share = np.clip(layer.sigma_m / max(limits.most_sigma_m, 1e-6), 0.0, 1.0)
+        share = np.nan_to_num(share, nan=1.0)[..., None]
+        shade = np.array(BEST) * (1 - share) + np.array(USUAL) * share
+        out[..., :3] = np.where(known[..., None], shade, 0).astype(np.uint8)
+        for cells, colour in (
+            (layer.unsure(limits.most_sigma_m), UNSURE),
+            (layer.seldom(limits.least_views), SELDOM),
+            (layer.gaps, GAP),
+        ):
+            out[cells, :3] = colour
+        out[..., 3] = np.where(known | inside, 210, 0)
+        return out
+
+    def png_bytes(self) -> bytes:
+        """The picture as PNG with its alpha, a pixel per cell (fewer where it is very large)."""
+        image = self.picture()
+        step = -(-max(image.shape[:2]) // LARGEST_PX)
+        return cv2.imencode(".png", np.ascontiguousarray(image[::step, ::step]))[1].tobytes()
+
+    def json_bytes(self) -> bytes:
+        """:meth:`figures` as JSON."""
+        return (json.dumps(self.figures(), indent=2, sort_keys=True) + "\n").encode()
+
+
+class LiveCoverage:
+    """The layer of an open store, brought up to date by :meth:`refresh`."""
+
+    def __init__(self, store: ScanStore, cell_m: float | None = None) -> None:
+        self._store = store
+        self._cell_m = cell_m
+        self._map: CoverageMap | None = None
+        self._state: dict[int, tuple[bool, int]] = {}  # seq to (fine layer there, revision)
+
+    def refresh(self) -> Coverage | None:
+        """The layer as the store has it now; None while it holds no surface."""
+
+        fine = self._store.numbers_of("k1")
+        for seq in self._store.seqs():
+            repose = self._store.repose(seq)
+            state = (seq in fine, 0 if repose is None else repose.revision)
+            before = self._state.get(seq)
+            if before != state:
+                self._put(seq, finer=before is not None and before[0] != state[0])
+                self._state[seq] = state
+        if self._map is None:
+            return None
+        self._map.refill(self._depths(self._map.stale()))
+        layer = self._map.grid()
+        if layer is None or not layer.known.any():
+            return None
+        places = tuple(place for _, place in sorted(self._map.footprints.items()))
+        limits = Limits(LEAST_VIEWS, MOST_SIGMAS * float(np.median(layer.sigma_m[layer.known])))
+        return Coverage(layer, local_frame(self._store.header), places, limits)
+
+    def _put(self, seq: int, finer: bool) -> None:
+        keyframe = self._store.keyframe(seq)
+        if keyframe is None:
+            return
+        if self._map is None:
+            cell = self._cell_m or usual_cell_m(keyframe.depth)
+            if cell is None:
+                return
+            self._map = CoverageMap(cell)
+        self._map.put(seq, keyframe.time_ns, keyframe.depth, finer)
+
+    def _depths(self, seqs: list[int]) -> Iterator[tuple[int, DepthMap]]:
+        for seq in seqs:
+            keyframe = self._store.keyframe(seq)
+            if keyframe is not None:
+                yield seq, keyframe.depth
+
+
+def coverage_of(store: ScanStore, cell_m: float | None = None) -> Coverage | None:
+    """The layer of all that ``store`` holds; None without any surface.
+
+    Cells of ``cell_m``; by default about four pixels of the first keyframe's depth image.
+    """
+    return LiveCoverage(store, cell_m).refresh()
+
+
+def write_coverage_files(folder: Path, store: ScanStore) -> Coverage | None:
+    """Write coverage.png and coverage.json beside the scan; the layer, None without surface."""
+    found = coverage_of(store)
+    if found is not None:
+        _write(folder, found)
+    return found
+
+
+def _write(folder: Path, found: Coverage) -> None:
+
+    with writing(folder / PICTURE) as part:
+        part.write_bytes(found.png_bytes())
+    with writing(folder / FIGURES) as part:
+        part.write_bytes(found.json_bytes())
+
+
+class CoverageWriter:
+    """Writes coverage.png and coverage.json beside a growing scan, on a thread of its own.
+
+    For a ``with`` about the flight; failures of the disk are logged and tried again.
+    """
+
+    def __init__(self, store: ScanStore, every_s: float = WRITE_EVERY_S) -> None:
+        self._live, self._folder = LiveCoverage(store), store.path.parent
+        self._every_s = every_s
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="coverage", daemon=True)
+
+    def __enter__(self) -> CoverageWriter:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _work(self) -> None:
+        while not self._stop.wait(self._every_s):
+            try:
+                found = self._live.refresh()
+                if found is not None:
+                    _write(self._folder, found)
+            except OutsideError as error:
+                log.warning("coverage not written: %s", error)
+
+
+class LiveCoverages:
+    """The layers of scans that people look at, each refreshed at most every ``least_s``.
+
+    For a server: safe between threads; keeps the ``most`` scans looked at last.
+    """
+
+    def __init__(self, least_s: float = 3.0, most: int = 4) -> None:
+        self._least_s, self._most = least_s, most
+        self._lock = threading.Lock()
+        self._kept: OrderedDict[Path, tuple[LiveCoverage, ScanStore, float, Coverage | None]] = (
+            OrderedDict()
+        )
+
+    def of(self, folder: Path) -> Coverage | None:
+        """The layer of the scan in ``folder``; None while it holds no surface.
+
+        Raises InputError when the folder holds no scan.
+        """
+        with self._lock:
+            held = self._kept.pop(folder, None)
+            if held is None:
+                store = ScanStore.open(folder / "scan.db")
+                held = (LiveCoverage(store), store, -np.inf, None)
+            live, store, then, found = held
+            if time.monotonic() - then >= self._least_s:
+                found, then = live.refresh(), time.monotonic()
+            self._kept[folder] = (live, store, then, found)
+            while len(self._kept) > self._most:
+                self._kept.popitem(last=False)[1][1].close()
+            return found
+
+    def forget(self, folder: Path) -> None:
+        """Close what is held of a folder, such as before it is deleted."""
+        with self._lock:
+            held = self._kept.pop(folder, None)
+            if held is not None:
+                held[1].close()
+
+    def close(self) -> None:
+        """Close all that is held."""
+        for folder in list(self._kept):
+            self.forget(folder)

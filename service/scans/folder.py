@@ -1,0 +1,220 @@
+"""The files of a finished (or still growing) scan, made from its store alone.
+
+Drone and ground hold the same store, so both make the same files: ``cloud.laz``,
+``trajectory.tum``, ``trajectory.csv``, ``scan.json``, ``preview.jpg``, ``coverage.png``,
+``coverage.json`` and ``report.html``.
+Each is written beside its place and then renamed, so a reader never sees half a file.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from recon.raster import Raster, grid_over, rasterise
+from service.errors import OutsideError
+from service.georeference import LocalFrame
+from service.scans.coverage import write_coverage_files
+from service.scans.fused_cloud import FusedCloud, fused_cloud
+from service.scans.inspection import middle_keyframe, stages
+from service.scans.las import write_laz
+from service.scans.preview import blank_preview, draw_preview
+from service.scans.report import report_html
+from service.scans.track import csv_table, latest, local_frame, tum_lines
+from service.scans.writing import writing
+from service.stream.records import PoseRecord, ScanHeader
+from service.stream.store import ScanStore
+
+log = logging.getLogger(__name__)
+
+CLOUD, TUM, CSV = "cloud.laz", "trajectory.tum", "trajectory.csv"
+SUMMARY, PREVIEW, REPORT = "scan.json", "preview.jpg", "report.html"
+PREVIEW_CELLS = 6e6
+NO_GEOREFERENCE = (
+    "no georeference: coordinates are metres east, north and up of the scan's own origin"
+)
+
+
+def write_deliverables(
+    folder: Path, store: ScanStore, extra: dict[str, Any], voxel_m: float | None = None
+) -> dict[str, Any]:
+    """Write the scan folder's files from ``store``; returns what scan.json holds.
+
+    Args:
+        extra: more figures of the run, kept with those of the store under ``run`` in
+            scan.json; nothing here where the files shall be the same at both ends.
+        voxel_m: size of the fused voxels; by default ``scan.resolution_m`` of the scan's own
+            configuration, else the ground sample distance.
+
+    Raises OutsideError when the folder cannot be written.
+    """
+    header = store.header
+    frame = local_frame(header)
+    poses = latest(store.poses())
+    fused = fused_cloud(store, voxel_m or _resolution_m(header))
+    raster = surface(fused)
+    run = (store.summary or {}) | extra
+    summary = _summary(header, frame, poses, fused, raster, run, store.finished)
+    with writing(folder / CLOUD) as part:
+        write_laz(part, fused.cloud, frame, header.started_unix_ns)
+    with writing(folder / TUM) as part:
+        part.write_text(tum_lines(poses), encoding="ascii")
+    with writing(folder / CSV) as part:
+        part.write_text(csv_table(poses), encoding="utf-8")
+    coverage = write_coverage_files(folder, store)
+    summary["coverage"] = None if coverage is None else coverage.figures()
+    summary["refinement"] = store.refinement
+    preview = _preview(raster, poses, summary)
+    with writing(folder / PREVIEW) as part:
+        part.write_bytes(preview)
+    with writing(folder / REPORT) as part:
+        shown = _stages(folder, store)
+        page = report_html(summary, poses, fused.cloud, raster, preview, coverage, shown)
+        part.write_text(page, encoding="utf-8")
+    with writing(folder / SUMMARY) as part:
+        part.write_text(json.dumps(summary, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+    return summary
+
+
+def _stages(folder: Path, store: ScanStore) -> bytes | None:
+    """JPEG of a keyframe's stages for the report; None for a scan without keyframes."""
+    seq = middle_keyframe(folder, store.seqs())
+    keyframe = None if seq is None else store.keyframe(seq)
+    if keyframe is None:
+        return None
+    picture, _ = stages(folder, store.header.scan_id, keyframe)
+    return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
+
+
+def _resolution_m(header: ScanHeader) -> float | None:
+    """``scan.resolution_m`` of the scan's configuration; None when it leaves that open."""
+    section = header.configuration.get("scan", {})
+    value = section.get("resolution_m") if isinstance(section, dict) else None
+    return float(value) if isinstance(value, int | float) and value > 0.0 else None
+
+
+def surface(fused: FusedCloud, most_cells: float = PREVIEW_CELLS) -> Raster | None:
+    """The upper surface in the scan's own ENU metres, or None without points.
+
+    Cells are the voxels, doubled until there are at most ``most_cells`` in the rectangle.
+    """
+    if not len(fused.cloud):
+        return None
+    xy = fused.cloud.xyz_m[:, :2].astype(np.float64)
+    cell = fused.voxel_m
+    span = np.ptp(xy, axis=0)
+    while float(np.prod(span / cell + 2.0)) > most_cells:
+        cell *= 2.0
+    return rasterise(fused.cloud, grid_over(xy, cell, margin_cells=1))
+
+
+def _summary(
+    header: ScanHeader,
+    frame: LocalFrame | None,
+    poses: Sequence[PoseRecord],
+    fused: FusedCloud,
+    raster: Raster | None,
+    extra: dict[str, Any],
+    finished: bool,
+) -> dict[str, Any]:
+    """What scan.json holds."""
+    notes = list(header.notes) + list(fused.notes)
+    if frame is None:
+        notes.append(NO_GEOREFERENCE)
+    times = [p.time_unix_ns / 1e9 for p in poses]
+    origin = None
+    if frame is not None:
+        origin = {
+            "lat_deg": frame.lat_deg,
+            "lon_deg": frame.lon_deg,
+            "alt_amsl_m": frame.alt_amsl_m,
+        }
+    return {
+        "schema": 1,
+        "id": header.scan_id,
+        "drone": header.drone,
+        "times": {
+            "started_unix_s": header.started_unix_ns / 1e9,
+            "first_pose_unix_s": times[0] if times else None,
+            "last_pose_unix_s": times[-1] if times else None,
+        },
+        "finished": finished,
+        "origin": origin,
+        "epsg": None if frame is None else frame.epsg,
+        "heights": "metres above mean sea level" if frame else "metres above the scan's origin",
+        "georeference": header.georeference,
+        "camera": header.camera,
+        "configuration": header.configuration,
+        "software": header.software,
+        "counts": {
+            "keyframes": fused.keyframes,
+            "points": len(fused.cloud),
+            "points_before_fusion": fused.points_in,
+            "poses": len(poses),
+        },
+        "quality": _quality(fused, raster, poses),
+        "notes": notes,
+        "run": extra,
+    }
+
+
+def _quality(
+    fused: FusedCloud, raster: Raster | None, poses: Sequence[PoseRecord]
+) -> dict[str, Any]:
+    """Figures of the cloud and the track; None where there is nothing to measure."""
+    cloud = fused.cloud
+    none = not len(cloud)
+    return {
+        "voxel_m": round(fused.voxel_m, 4),
+        "ground_sample_m": None
+        if fused.ground_sample_m is None
+        else round(fused.ground_sample_m, 4),
+        "sigma_median_m": None if none else round(float(np.median(cloud.sigma_m)), 4),
+        "sigma_90_percent_m": None if none else round(float(np.percentile(cloud.sigma_m, 90)), 4),
+        "views_median": None if none else float(np.median(cloud.views)),
+        "seen_once_share": None if none else round(float((cloud.views <= 1).mean()), 4),
+        "area_m2": 0.0 if raster is None else round(raster.area_m2, 1),
+        "distance_m": round(poses[-1].distance_m, 2) if poses else 0.0,
+        "position_sigma_median_m": (
+            round(float(np.median([p.sigma_m for p in poses])), 4) if poses else None
+        ),
+    }
+
+
+def _preview(raster: Raster | None, poses: Sequence[PoseRecord], summary: dict[str, Any]) -> bytes:
+    """preview.jpg."""
+    lines = _key_figures(summary)
+    if raster is None:
+        picture = blank_preview(lines)
+    else:
+        track = np.array([p.T_world_camera[:3, 3] for p in poses]).reshape(-1, 3)
+        zero = summary["origin"]["alt_amsl_m"] if summary["origin"] else 0.0
+        picture = draw_preview(raster, track, lines, height_of_zero_m=zero)
+    ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])
+    if not ok:
+        raise OutsideError("preview.jpg: OpenCV cannot write JPEG on this machine")
+    return data.tobytes()
+
+
+def _key_figures(summary: dict[str, Any]) -> list[str]:
+    """Two or three lines of text for the preview (ASCII: OpenCV's letters have no more)."""
+    counts, quality, origin = summary["counts"], summary["quality"], summary["origin"]
+    place = "no georeference"
+    if origin is not None:
+        place = f"{origin['lat_deg']:.6f}, {origin['lon_deg']:.6f}  EPSG:{summary['epsg']}"
+    figures = [f"{counts['points']} points from {counts['keyframes']} keyframes"]
+    if counts["points"]:
+        figures += [
+            f"{quality['area_m2']:.0f} m2",
+            f"sigma {quality['sigma_median_m']:.2f} m",
+            f"voxel {quality['voxel_m']:.2f} m",
+        ]
+    figures.append(f"{quality['distance_m']:.0f} m flown")
+    name = summary["id"].encode("ascii", "replace").decode()
+    return [f"{name}   {place}", ",  ".join(figures)]

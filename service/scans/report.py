@@ -1,0 +1,236 @@
+"""``report.html``: what was flown, coverage, accuracy, speeds and faults, in one file.
+
+Pictures and curves are inside the file, and nothing in it is fetched or run.
+"""
+
+from __future__ import annotations
+
+import base64
+import datetime as dt
+import math
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+import cv2
+import numpy as np
+
+from recon.raster import Raster, grid_over
+from recon.types import F32, U8, PointCloud
+from service.scans.coverage import Coverage
+from service.scans.inspection import coloured
+from service.scans.report_consistency import consistency, rows_table
+from service.scans.report_map import map_figure
+from service.stream.records import PoseRecord
+
+LARGEST_MAP_PX = 900
+SPEEDS = (
+    "frames", "frames_tracked", "frames_lost", "segments", "pairs", "clouds",
+    "clouds_per_second", "seconds", "backend",
+)  # fmt: skip
+CURVE_PX = (820, 150)
+STYLE = (
+    "body{font:15px/1.5 system-ui,sans-serif;color:#20252b;max-width:960px;margin:24px auto;"
+    "padding:0 16px}h1{font-size:24px}h2{font-size:18px;margin-top:30px}table{border-collapse:"
+    "collapse}td,th{padding:3px 14px 3px 0;text-align:left;border-bottom:1px solid #e3e7eb}"
+    "td+td{font-variant-numeric:tabular-nums}img{max-width:100%;border:1px solid #e3e7eb}"
+    "figure{margin:14px 0}figcaption{color:#56606a;font-size:13.5px}"
+)
+
+
+def report_html(
+    summary: dict[str, Any],
+    poses: Sequence[PoseRecord],
+    cloud: PointCloud,
+    raster: Raster | None,
+    preview_jpg: bytes,
+    coverage: Coverage | None = None,
+    keyframe_jpg: bytes | None = None,
+) -> str:
+    """The report of a scan whose scan.json holds ``summary``.
+
+    ``keyframe_jpg`` shows the stages of one keyframe.
+    """
+    run = summary["run"]
+    parts = [
+        f"<h1>{escape(summary['id'])}</h1>",
+        _table(_flown(summary, poses)),
+        _picture(preview_jpg, "image/jpeg", "Colour and height from above, with the track."),
+        "<h2>Coverage and accuracy</h2>",
+        map_figure(summary, poses, coverage),
+        _table([*_covered(coverage), *_accuracy(summary, raster)]),
+        *_maps(cloud, raster),
+        *consistency(summary, poses),
+        "<h2>The flight</h2>",
+        *_curves(poses),
+        *_stages(keyframe_jpg),
+        "<h2>Speeds and faults</h2>",
+        _table(_rows(run, SPEEDS)),
+        _counted("Not used for stereo", run.get("refusals")),
+        _counted("Readings left out of the pose graph", (run.get("graph") or {}).get("left_out")),
+        _counted("Clouds registered", run.get("registrations")),
+        _counted("Milliseconds per call of each stage", run.get("stage_ms")),
+        *(f"<p>Note: {escape(str(note))}</p>" for note in summary["notes"]),
+        f"<p>{escape(summary['software'])}</p>",
+    ]
+    head = f"<!doctype html><html lang=en><meta charset=utf-8><title>{escape(summary['id'])}"
+    return f"{head}</title><style>{STYLE}</style><body>{''.join(parts)}</body></html>\n"
+
+
+def _stages(picture: bytes | None) -> list[str]:
+    if picture is None:
+        return []
+    words = "Stages of a keyframe in the middle; all of them with scan.keep_debug=true."
+    return ["<h2>A keyframe</h2>", _picture(picture, "image/jpeg", words)]
+
+
+def _flown(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[tuple[str, str]]:
+    origin, times = summary["origin"], summary["times"]
+    rows = [("drone", summary["drone"]), ("began", _when(times["started_unix_s"]))]
+    if poses:
+        seconds = times["last_pose_unix_s"] - times["first_pose_unix_s"]
+        rows += [
+            ("lasted", f"{seconds:.0f} s"),
+            ("flown", f"{summary['quality']['distance_m']:.0f} m"),
+            ("speed, median", f"{np.median([p.speed_m_s for p in poses]):.1f} m/s"),
+        ]
+        heights = [p.agl_m for p in poses if p.agl_m is not None]
+        if heights:
+            rows.append(("height above ground, median", f"{np.median(heights):.1f} m"))
+    if origin is None:
+        rows.append(("place", "no georeference: metres about the scan's own origin"))
+    else:
+        rows.append(("origin", f"{origin['lat_deg']:.7f}, {origin['lon_deg']:.7f}"))
+        rows.append(("coordinates", f"EPSG:{summary['epsg']}, {summary['heights']}"))
+    rows.append(("finished", "yes" if summary["finished"] else "no, still growing or cut off"))
+    return rows
+
+
+def _accuracy(summary: dict[str, Any], raster: Raster | None) -> list[tuple[str, str]]:
+    quality, counts = summary["quality"], summary["counts"]
+    rows = [
+        ("points", f"{counts['points']} from {counts['keyframes']} keyframes"),
+        ("area", f"{quality['area_m2']:.0f} m2"),
+        ("voxel", f"{quality['voxel_m']:.3f} m"),
+    ]
+    for name, key, unit in (
+        ("sigma of the points, median", "sigma_median_m", "m"),
+        ("sigma of the points, 90 %", "sigma_90_percent_m", "m"),
+        ("stereo pairs per point, median", "views_median", ""),
+        ("seen by one pair only", "seen_once_share", "of 1"),
+        ("sigma of the camera's position, median", "position_sigma_median_m", "m"),
+    ):
+        if quality[key] is not None:
+            rows.append((name, f"{quality[key]:.3g} {unit}"))
+    if raster is not None and quality["area_m2"]:
+        rows.append(("points per m2", f"{counts['points'] / quality['area_m2']:.1f}"))
+    return rows
+
+
+def _covered(coverage: Coverage | None) -> list[tuple[str, str]]:
+    if coverage is None:
+        return []
+    f = coverage.figures()
+    return [
+        ("flown over", f"{f['flown_m2']:.0f} m2"),
+        ("of that without a surface", f"{f['gaps_m2']:.0f} m2"),
+        ("of that weak (skyrelief refly plans a flight over it)", f"{f['weak_m2']:.0f} m2"),
+        ("pictures of a place, median", f"{f['views_median']:.0f}"),
+    ]
+
+
+def _maps(cloud: PointCloud, raster: Raster | None) -> list[str]:
+    """How often and how well each place was seen."""
+    if raster is None:
+        return ["<p>There is no surface.</p>"]
+    cell = raster.grid.cell_m
+    while max(raster.grid.shape) * raster.grid.cell_m / cell > LARGEST_MAP_PX:
+        cell *= 2.0
+    views, sigma = _per_cell(cloud, cell)
+    out = []
+    for title, values, unit, colours in (
+        ("Stereo pairs that agree, most per cell:", views, "", cv2.COLORMAP_VIRIDIS),
+        ("Sigma, least per cell:", sigma, "m", cv2.COLORMAP_MAGMA),
+    ):
+        panel = coloured(title, values, unit, colours)
+        caption = panel.title.rpartition(",")[0] or panel.title
+        out.append(_picture(_png(panel.image), "image/png", caption + ", dark to light."))
+    return out
+
+
+def _per_cell(cloud: PointCloud, cell_m: float) -> tuple[F32, F32]:
+    """Most views and least sigma of the points in each cell, NaN where there are none."""
+    xy = cloud.xyz_m[:, :2].astype(np.float64)
+    grid = grid_over(xy, cell_m)
+    col, row = np.rint(grid.pixels(xy)).astype(np.int64).T
+    at = np.clip(row, 0, grid.shape[0] - 1) * grid.shape[1] + np.clip(col, 0, grid.shape[1] - 1)
+    views = np.full(grid.shape[0] * grid.shape[1], -np.inf)
+    sigma = np.full(len(views), np.inf)
+    np.maximum.at(views, at, cloud.views)
+    np.minimum.at(sigma, at, cloud.sigma_m)
+    shaped = (np.where(np.isfinite(a), a, np.nan).reshape(grid.shape) for a in (views, sigma))
+    first, second = (a.astype(np.float32) for a in shaped)
+    return first, second
+
+
+def _curves(poses: Sequence[PoseRecord]) -> list[str]:
+    if len(poses) < 2:
+        return ["<p>There is no trajectory.</p>"]
+    t = np.array([(p.time_unix_ns - poses[0].time_unix_ns) / 1e9 for p in poses])
+    series = {
+        "height above ground, m": [math.nan if p.agl_m is None else p.agl_m for p in poses],
+        "height of the camera above the origin, m": [p.T_world_camera[2, 3] for p in poses],
+        "speed, m/s": [p.speed_m_s for p in poses],
+        "turn rate, degrees/s": [math.degrees(p.turn_rate_rad_s) for p in poses],
+        "sigma of the position, m": [p.sigma_m for p in poses],
+    }
+    return [_curve(name, t, np.array(values, float)) for name, values in series.items()]
+
+
+def _curve(name: str, t: np.typing.NDArray[Any], values: np.typing.NDArray[Any]) -> str:
+    """One quantity over time as SVG; at most a point per pixel."""
+    known = np.isfinite(values)
+    if known.sum() < 2:
+        return ""
+    t, values = t[known], values[known]
+    step = max(1, len(t) // CURVE_PX[0])
+    low, high = float(values.min()), float(values.max())
+    w, h = CURVE_PX
+    x = 4 + (w - 8) * (t - t[0]) / max(float(t[-1] - t[0]), 1e-9)
+    y = h - 6 - (h - 12) * (values - low) / max(high - low, 1e-9)
+    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x[::step], y[::step], strict=True))
+    line = f'<polyline fill="none" stroke="#1a5fd0" points="{points}"/>'
+    frame = f'<rect width="{w}" height="{h}" fill="none" stroke="#d5dbe1"/>'
+    caption = f"{escape(name)}: {low:.2f} to {high:.2f}, over {t[-1] - t[0]:.0f} s"
+    svg = f'<svg viewBox="0 0 {w} {h}" width="{w}" height="{h}">{frame}{line}</svg>'
+    return f"<figure>{svg}<figcaption>{caption}</figcaption></figure>"
+
+
+def _rows(values: dict[str, Any], names: Sequence[str]) -> list[tuple[str, str]]:
+    return [(name.replace("_", " "), str(values[name])) for name in names if name in values]
+
+
+def _counted(title: str, values: Any) -> str:
+    """A table of names and numbers; nothing when there are none."""
+    if not isinstance(values, dict) or not values:
+        return ""
+    return f"<h3>{escape(title)}</h3>" + _table([(str(k), str(v)) for k, v in values.items()])
+
+
+def _table(rows: Sequence[tuple[str, str]]) -> str:
+    return rows_table((), rows)
+
+
+def _picture(data: bytes, kind: str, caption: str) -> str:
+    code = base64.b64encode(data).decode("ascii")
+    image = f'<img alt="" src="data:{kind};base64,{code}">'
+    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def _png(image: U8) -> bytes:
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def _when(unix_s: float) -> str:
+    when = dt.datetime.fromtimestamp(unix_s, dt.timezone.utc)
+    return when.strftime("%Y-%m-%d %H:%M:%S UTC")

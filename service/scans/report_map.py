@@ -1,0 +1,199 @@
+"""The report's map: coverage, the way flown with error ellipses, loops and surveyed points."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from recon import se3
+from recon.types import F64
+from service.scans.coverage import BEST, GAP, SELDOM, UNSURE, Coverage
+from service.stream.records import PoseRecord
+
+WIDTH_PX, LARGEST_HEIGHT_PX = 860, 900
+MOST_ELLIPSES = 40
+SIGMAS = 2.0
+SMALLEST_ELLIPSE_PX = 5.0
+TRACK, LOOP, WAITING = "#20252b", "#1a5fd0", "#d08a1a"
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """Metres east and north to pixels."""
+
+    west_m: float
+    north_m: float
+    px_per_m: float
+    size_px: tuple[int, int]
+
+    def at(self, xy_m: F64) -> F64:
+        """(N, 2) pixels of (N, 2) metres."""
+        x = (xy_m[:, 0] - self.west_m) * self.px_per_m
+        y = (self.north_m - xy_m[:, 1]) * self.px_per_m
+        return np.column_stack([x, y])
+
+
+def map_figure(
+    summary: dict[str, Any], poses: Sequence[PoseRecord], coverage: Coverage | None
+) -> str:
+    """A figure of inline SVG; empty when there is neither a track nor a surface."""
+    if not poses and coverage is None:
+        return ""
+    view = _view(poses, coverage)
+    parts = [_ground(coverage, view)] if coverage is not None else []
+    track = np.array([p.T_world_camera[:2, 3] for p in poses]).reshape(-1, 2)
+    grown = 1
+    if len(track):
+        parts.append(_polyline(view.at(track), TRACK))
+        ellipses, grown = _ellipses(poses, view)
+        parts += ellipses
+        parts += _loops(summary, poses, view)
+    parts += _survey(summary, view)
+    parts.append(_scale_bar(view))
+    w, h = view.size_px
+    svg = f'<svg viewBox="0 0 {w} {h}" width="{w}" height="{h}">{"".join(parts)}</svg>'
+    return f"<figure>{svg}<figcaption>{_caption(coverage, summary, grown)}</figcaption></figure>"
+
+
+def position_covariance(pose: PoseRecord) -> F64:
+    """(3, 3) of the camera's place, from the covariance of its pose."""
+    lever = np.hstack([-se3.hat(pose.T_world_camera[:3, 3]), np.eye(3)])
+    return np.asarray(lever @ pose.covariance @ lever.T)
+
+
+def _view(poses: Sequence[PoseRecord], coverage: Coverage | None) -> _View:
+    spots = [p.T_world_camera[:2, 3] for p in poses]
+    if coverage is not None:
+        west, south, east, north = coverage.bounds_m
+        spots += [np.array([west, south]), np.array([east, north])]
+    low, high = np.min(spots, axis=0), np.max(spots, axis=0)
+    margin = 0.02 * float(np.max(high - low)) + 1.0
+    span = high - low + 2 * margin
+    scale = min(WIDTH_PX / span[0], LARGEST_HEIGHT_PX / span[1])
+    size = (math.ceil(span[0] * scale), math.ceil(span[1] * scale))
+    return _View(float(low[0] - margin), float(high[1] + margin), float(scale), size)
+
+
+def _ground(coverage: Coverage, view: _View) -> str:
+    west, south, east, north = coverage.bounds_m
+    (x, y), (x1, y1) = view.at(np.array([[west, north], [east, south]]))
+    code = base64.b64encode(coverage.png_bytes()).decode("ascii")
+    return (
+        f'<image x="{x:.1f}" y="{y:.1f}" width="{x1 - x:.1f}" height="{y1 - y:.1f}" '
+        f'preserveAspectRatio="none" style="image-rendering:pixelated" '
+        f'href="data:image/png;base64,{code}"/>'
+    )
+
+
+def _polyline(px: F64, colour: str) -> str:
+    step = max(1, len(px) // 1500)
+    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in px[::step])
+    return f'<polyline fill="none" stroke="{colour}" stroke-width="1.2" points="{points}"/>'
+
+
+def _ellipses(poses: Sequence[PoseRecord], view: _View) -> tuple[list[str], int]:
+    """Ellipses of the horizontal place at some keyframes, and how many times enlarged."""
+    keys = [p for p in poses if p.keyframe_seq is not None] or list(poses)
+    keys = keys[:: max(1, -(-len(keys) // MOST_ELLIPSES))]
+    shapes = [np.linalg.eigh(position_covariance(p)[:2, :2]) for p in keys]
+    usual = SIGMAS * float(np.median([np.sqrt(max(v[1], 0.0)) for v, _ in shapes]))
+    grown = 1
+    while usual > 0 and usual * grown * view.px_per_m < SMALLEST_ELLIPSE_PX and grown < 1000:
+        grown *= 10
+    out = []
+    for pose, (values, axes) in zip(keys, shapes, strict=True):
+        x, y = view.at(pose.T_world_camera[None, :2, 3])[0]
+        small, large = (
+            SIGMAS * float(np.sqrt(max(v, 0.0))) * grown * view.px_per_m for v in values
+        )
+        turn = -math.degrees(math.atan2(axes[1, 1], axes[0, 1]))
+        out.append(
+            f'<ellipse cx="{x:.1f}" cy="{y:.1f}" rx="{min(large, 400):.1f}" '
+            f'ry="{min(small, 400):.1f}" transform="rotate({turn:.1f} {x:.1f} {y:.1f})" '
+            f'fill="{LOOP}" fill-opacity="0.07" stroke="{LOOP}" stroke-opacity="0.5"/>'
+        )
+    return out, grown
+
+
+def _loops(summary: dict[str, Any], poses: Sequence[PoseRecord], view: _View) -> list[str]:
+    """Lines between the ends of loops; broken ones did not count."""
+    where = {p.keyframe_seq: p.T_world_camera[:2, 3] for p in poses if p.keyframe_seq is not None}
+    out = []
+    for a, b, used in loop_pairs(summary):
+        if a in where and b in where:
+            (x, y), (x1, y1) = view.at(np.array([where[a], where[b]]))
+            look = f'stroke="{LOOP}"' if used else f'stroke="{WAITING}" stroke-dasharray="4 3"'
+            out.append(
+                f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x1:.1f}" y2="{y1:.1f}" '
+                f'{look} stroke-width="1.5"/>'
+            )
+    return out
+
+
+def loop_pairs(summary: dict[str, Any]) -> list[tuple[int, int, bool]]:
+    """(keyframe, keyframe, used) of the refinement's loops, else of the flight's."""
+    refined = summary.get("refinement") or {}
+    flown = summary.get("run", {}).get("graph") or {}
+    pairs = (refined.get("loops") or {}).get("pairs") or (flown.get("loops") or {}).get("pairs")
+    return [(int(a), int(b), bool(used)) for a, b, used in pairs or []]
+
+
+def _survey(summary: dict[str, Any], view: _View) -> list[str]:
+    """Triangles for control, circles for checks, red where refused."""
+    out = []
+    for p in (summary.get("refinement") or {}).get("points", []):
+        if p.get("place_m") is None:
+            continue
+        x, y = view.at(np.array([p["place_m"][:2]]))[0]
+        if not (0 <= x <= view.size_px[0] and 0 <= y <= view.size_px[1]):
+            continue
+        colour = "#d03030" if p["refused"] else "#fff"
+        shape = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5"'
+        if p["role"] == "control":
+            corners = f"{x:.1f},{y - 7:.1f} {x - 6:.1f},{y + 4:.1f} {x + 6:.1f},{y + 4:.1f}"
+            shape = f'<polygon points="{corners}"'
+        out.append(f'{shape} fill="{colour}" stroke="{TRACK}" stroke-width="1.5"/>')
+        out.append(
+            f'<text x="{x + 8:.1f}" y="{y + 4:.1f}" font-size="11">{escape(p["name"])}</text>'
+        )
+    return out
+
+
+def _scale_bar(view: _View) -> str:
+    """A bar of 1, 2 or 5 times a power of ten, and north."""
+    target = 0.2 * view.size_px[0] / view.px_per_m
+    power = 10.0 ** math.floor(math.log10(target))
+    length_m = max(m * power for m in (1.0, 2.0, 5.0) if m * power <= target)
+    length, y, x = length_m * view.px_per_m, view.size_px[1] - 12, view.size_px[0] - 16
+    return (
+        f'<path d="M12 {y - 5}v5h{length:.1f}v-5M{x} 34v-24m-4 8l4 -8l4 8" fill="none" '
+        f'stroke="{TRACK}" stroke-width="1.5"/><text x="16" y="{y - 6}" font-size="11">'
+        f'{length_m:g} m</text><text x="{x - 4}" y="46" font-size="11">N</text>'
+    )
+
+
+def _caption(coverage: Coverage | None, summary: dict[str, Any], grown: int) -> str:
+    """What the signs mean."""
+    times = "" if grown == 1 else f", {grown} times enlarged"
+    out = [f"The way flown with error ellipses of {SIGMAS:g} sigma{times}."]
+    if coverage is not None:
+        f = coverage.figures()
+        marks = (
+            (BEST, "measured"),
+            (UNSURE, f"sigma over {f['most_sigma_m']:.2f} m"),
+            (SELDOM, f"in fewer than {f['least_views']} pictures"),
+            (GAP, "no surface"),
+        )
+        out += [f'<span style="color:rgb({b[2]},{b[1]},{b[0]})">&#9632;</span> {t}.'
+                for b, t in marks]  # fmt: skip
+    if loop_pairs(summary):
+        out.append("Blue lines: loops; broken lines: loops that did not count.")
+    if (summary.get("refinement") or {}).get("points"):
+        out.append("Triangles: control points; circles: check points; red: refused.")
+    return " ".join(out)

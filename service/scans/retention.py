@@ -1,0 +1,83 @@
+"""Scans that are left on the disk: open ones are closed after a crash, old ones make room."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import sqlite3
+from pathlib import Path
+
+from service.errors import SkyreliefError
+
+log = logging.getLogger(__name__)
+
+MIB = 2**20
+
+PAGES = "map-pages"
+"""Folder of the map inside a scan's folder; gone when the scan is closed."""
+
+
+def close_open_scans(folder: Path, before_unix_s: float) -> list[str]:
+    """Finish the scans in ``folder`` that a crash or a power cut left open; their names.
+
+    Only stores that were not written since ``before_unix_s`` are touched. What they hold is
+    kept and their files are written, with ``interrupted`` in the summary. One that cannot be
+    read is left as it is, with a warning.
+    """
+    from service.scans.folder import write_deliverables
+    from service.stream.store import ScanStore
+
+    closed = []
+    for path in sorted(folder.glob("*/scan.db")):
+        if _written_unix_s(path) >= before_unix_s:
+            continue  # the scan that is being made
+        try:
+            with ScanStore.open(path) as store:
+                if store.finished:
+                    continue
+                shutil.rmtree(path.parent / PAGES, ignore_errors=True)
+                store.finish({"interrupted": True})
+                write_deliverables(path.parent, store, {})
+        except (SkyreliefError, ValueError, OSError, sqlite3.Error) as error:
+            log.warning("%s cannot be closed: %s", path.parent, error)
+            continue
+        closed.append(path.parent.name)
+        log.info("%s was left open; it is closed and kept", path.parent)
+    return closed
+
+
+def _written_unix_s(path: Path) -> float:
+    """When the store at ``path`` was last written, its write-ahead log included."""
+    files = [path, path.with_name(path.name + "-wal")]
+    return max(file.stat().st_mtime for file in files if file.exists())
+
+
+def make_room(folder: Path, keep_free_mib: float, keep: str = "") -> list[str]:
+    """Delete the oldest finished scans until ``keep_free_mib`` are free; names of the deleted.
+
+    The scan called ``keep`` and scans that are still open stay.
+    """
+    deleted: list[str] = []
+    if keep_free_mib <= 0 or not folder.is_dir():
+        return deleted
+    candidates = [path.parent for path in folder.glob("*/scan.db") if path.parent.name != keep]
+    for scan in sorted(candidates, key=lambda p: p.name):  # names are times
+        if shutil.disk_usage(folder).free >= keep_free_mib * MIB:
+            break
+        if not _finished(scan):
+            continue
+        shutil.rmtree(scan, ignore_errors=True)
+        if not scan.exists():
+            deleted.append(scan.name)
+            log.warning("the disk is full: deleted the oldest scan, %s", scan)
+    return deleted
+
+
+def _finished(scan: Path) -> bool:
+    from service.stream.store import ScanStore
+
+    try:
+        with ScanStore.open(scan / "scan.db") as store:
+            return store.finished
+    except (SkyreliefError, ValueError, OSError, sqlite3.Error):
+        return False

@@ -1,0 +1,85 @@
+"""Where a stored scan lies, and the way it was flown, also as tables."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterator, Sequence
+
+from recon import se3
+from service.georeference import LocalFrame
+from service.stream.records import PoseRecord, ScanHeader
+
+CSV_COLUMNS = (
+    "time_unix_s",
+    "lat_deg",
+    "lon_deg",
+    "alt_amsl_m",
+    "agl_m",
+    "roll_deg",
+    "pitch_deg",
+    "yaw_deg",
+    "speed_m_s",
+    "distance_m",
+    "turn_rate_deg_s",
+    "sources",
+    "sigma_m",
+)
+
+
+def local_frame(header: ScanHeader) -> LocalFrame | None:
+    """The scan's place on the globe, or None when it has none."""
+    lat, lon, alt = header.origin_lat_deg, header.origin_lon_deg, header.origin_alt_amsl_m
+    if lat is None or lon is None:
+        return None
+    return LocalFrame(lat, lon, alt or 0.0)
+
+
+def latest(poses: Iterator[PoseRecord]) -> list[PoseRecord]:
+    """The poses in order of time; where a time was written again, only its last record."""
+    return sorted({p.time_unix_ns: p for p in poses}.values(), key=lambda p: p.time_unix_ns)
+
+
+def tum_lines(poses: Sequence[PoseRecord]) -> str:
+    """TUM lines: unix seconds, then T_world_camera as tx ty tz qx qy qz qw."""
+    lines = []
+    for pose in poses:
+        w, x, y, z = se3.quaternion_from_rotation(pose.T_world_camera[:3, :3])
+        numbers = " ".join(f"{v:.6f}" for v in pose.T_world_camera[:3, 3])
+        lines.append(f"{_seconds(pose.time_unix_ns)} {numbers} {x:.9f} {y:.9f} {z:.9f} {w:.9f}\n")
+    return "".join(lines)
+
+
+def _seconds(time_unix_ns: int) -> str:
+    """Seconds with nine decimals, exactly."""
+    return f"{time_unix_ns // 10**9}.{time_unix_ns % 10**9:09d}"
+
+
+def csv_table(poses: Sequence[PoseRecord]) -> str:
+    """The trajectory as a table; a value that is not known is empty."""
+    out = io.StringIO()
+    table = csv.writer(out, lineterminator="\n")
+    table.writerow(CSV_COLUMNS)
+    for p in poses:
+        angles = (p.roll_rad, p.pitch_rad, p.yaw_rad)
+        table.writerow(
+            [
+                _seconds(p.time_unix_ns),
+                _cell(p.lat_deg, 9),
+                _cell(p.lon_deg, 9),
+                _cell(p.alt_amsl_m, 3),
+                _cell(p.agl_m, 3),
+                *(_cell(math.degrees(a), 4) for a in angles),
+                _cell(p.speed_m_s, 3),
+                _cell(p.distance_m, 3),
+                _cell(math.degrees(p.turn_rate_rad_s), 3),
+                "+".join(p.sources),
+                _cell(p.sigma_m, 4),
+            ]
+        )
+    return out.getvalue()
+
+
+def _cell(value: float | None, decimals: int) -> str:
+    return "" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}"

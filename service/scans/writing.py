@@ -1,0 +1,31 @@
+"""Files that are there whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from service.errors import OutsideError
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[Path]:
+    """A path beside ``path`` to write to; renamed onto it when all went well, else removed.
+
+    A failure of the disk becomes an OutsideError.
+    """
+    part = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield part
+        with open(part, "rb+") as written:
+            os.fsync(written.fileno())
+        os.replace(part, path)
+    except OSError as error:
+        raise OutsideError(
+            f"cannot write {path} ({error.strerror or error}); check the disk and its rights"
+        ) from error
+    finally:
+        part.unlink(missing_ok=True)
