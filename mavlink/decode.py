@@ -57,7 +57,7 @@ def _gps_raw(m: Message) -> Sample | None:
     fix = m.fix_type >= 3
     sigma_h = m.h_acc * 1e-3 if m.h_acc else _from_dop(m.eph, HDOP_TO_M)
     sigma_v = m.v_acc * 1e-3 if m.v_acc else _from_dop(m.epv, HDOP_TO_M)
-    return AccuracySample(None, fix, sigma_h, sigma_v)
+    return AccuracySample(None, fix, sigma_h, sigma_v, m.alt * 1e-3 if fix else None)
 
 
 def _from_dop(dop_cent: int, metres: float) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 
 from mavlink.gimbal import GimbalConfig, steadiest_frame, to_earth
 from mavlink.quaternion import Quaternion, down_component, multiply, slerp
+from mavlink.receiver import receiver_above
 from mavlink.samples import (
     AccuracySample,
     AttitudeSample,
@@ -60,7 +61,7 @@ class VehicleHistory:
         self._lock = threading.Lock()
         self._attitude = Track()  # w x y z
         self._position = Track()  # lat lon alt relative vn ve vd, NaN where unknown
-        self._accuracy = Track()  # has_fix sigma_h sigma_v
+        self._accuracy = Track()  # has_fix sigma_h sigma_v alt, NaN where unknown
         self._range = Track()  # distance
         self._terrain = Track()  # agl sigma
         self._gimbals: dict[tuple[int, int], Track] = {}  # (rank, component): w x y z frame
@@ -172,7 +173,8 @@ class VehicleHistory:
             where = (sample.lat_deg, sample.lon_deg, alt)
             return self._position, (*where, relative, *velocity)
         if isinstance(sample, AccuracySample):
-            row = (float(sample.has_fix), sample.sigma_h_m, sample.sigma_v_m)
+            alt = math.nan if sample.alt_amsl_m is None else sample.alt_amsl_m
+            row = (float(sample.has_fix), sample.sigma_h_m, sample.sigma_v_m, alt)
             return self._accuracy, row
         if isinstance(sample, RangeSample):
             return self._range, (sample.distance_m,)
@@ -287,7 +289,7 @@ class VehicleHistory:
         if at is None:
             return None
         accuracy = self._accuracy.around(state.time_ns, ACCURACY_GAP_NS, ACCURACY_GAP_NS)
-        nearest = None if accuracy is None else _nearer(accuracy)
+        nearest = None if accuracy is None else accuracy.nearer
         if nearest is not None and not nearest[0]:
             return at  # no fix: the estimator's place is not worth a tag
         sigma_h, sigma_v = self.config.sigma_h_m, self.config.sigma_v_m
@@ -301,6 +303,7 @@ class VehicleHistory:
         if math.isfinite(alt):
             state.fields["alt_amsl_m"] = alt
             state.fields["sigma_v_m"] = math.hypot(sigma_v, bend)
+        state.fields["receiver"] = receiver_above(accuracy, self._position)
         return at
 
     def _tell_agl(
@@ -357,10 +360,6 @@ def _quaternion(row: Row) -> Quaternion:
 def _apart(a: Quaternion, b: Quaternion) -> float:
     """Grows with the angle between two rotations; 0 when they are the same."""
     return 1.0 - abs(sum(p * q for p, q in zip(a, b, strict=True)))
-
-
-def _nearer(at: Bracket) -> Row:
-    return at.before if at.fraction < 0.5 else at.after
 
 
 def _mix(at: Bracket, k: int) -> float:

@@ -44,11 +44,12 @@ class PositionSample(Sample):
 
 @dataclass(frozen=True, slots=True)
 class AccuracySample(Sample):
-    """The GNSS receiver's own estimate of its accuracy, 1 sigma."""
+    """The GNSS receiver's own estimate of its accuracy, 1 sigma, and its own altitude."""
 
     has_fix: bool
     sigma_h_m: float
     sigma_v_m: float
+    alt_amsl_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,14 @@ import numpy.typing as npt
 F64 = npt.NDArray[np.float64]
 
 
+@dataclass(frozen=True, slots=True)
+class ReceiverAltitude:
+    """One fix of the GNSS receiver beside the autopilot's altitude at the same instant."""
+
+    time_ns: int
+    above_m: float  # the receiver's altitude less the autopilot's
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class VehicleState:
     """Attitude, gimbal attitude, position and height at ``time_ns``; a missing part is None.
@@ -32,6 +40,7 @@ class VehicleState:
     sigma_attitude_rad: float | None = None  # roll and pitch of the body
     sigma_yaw_rad: float | None = None
     sigma_gimbal_rad: float | None = None  # roll and pitch of the gimbal head
+    receiver: ReceiverAltitude | None = None  # of the fix nearest in time
     age_ms: Mapping[str, float] = field(default_factory=dict)  # source to ms from its next sample
     sources: tuple[
         str, ...

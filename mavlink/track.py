@@ -28,6 +28,16 @@ class Bracket:
         return (self.time_ns - self.before_ns) / span if span else 0.0
 
     @property
+    def nearer(self) -> Row:
+        """The sample nearer to the instant."""
+        return self.before if self.fraction < 0.5 else self.after
+
+    @property
+    def nearer_ns(self) -> int:
+        """Its time."""
+        return self.before_ns if self.fraction < 0.5 else self.after_ns
+
+    @property
     def gap_s(self) -> float:
         """Seconds between the two samples."""
         return (self.after_ns - self.before_ns) * 1e-9

@@ -64,6 +64,10 @@ class Similarity:
         """Relative 1-sigma uncertainty of the scale."""
         return float(np.sqrt(self.covariance[6, 6]))
 
+    def place(self, x_odom: F64) -> F64:
+        """(3,) m of a place (3,) in the odometry."""
+        return np.asarray(self.scale * self.R @ x_odom + self.t)
+
     def pose(self, T_odom_camera: F64) -> F64:
         """(4, 4) T_world_camera in metres of a pose of the odometry."""
         return se3.compose(
@@ -79,6 +83,12 @@ class Anchor:
     prior: PosePrior
     height: float | None  # of the camera above ground that it sees, in odometry units
     lean: float = 0.0  # 1 - cosine of how far off the vertical that ground is; 0 is below
+
+    @property
+    def place_of_fix(self) -> F64:
+        """(3,) where the prior's position was, in the odometry."""
+        offset, T = self.prior.fix_offset, self.T_odom_camera
+        return T[:3, 3] if offset is None else T[:3, :3] @ offset + T[:3, 3]
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +176,7 @@ class _Readings:
             [[a.prior.sigma_tilt_rad] * 2 + [a.prior.sigma_yaw_rad] for a in turned], (3,)
         )
         self.heading_known = self.sigma_turn[:, 2] < 1.0
-        self.x = _stack([a.T_odom_camera[:3, 3] for a in fixed], (3,))
+        self.x = _stack([a.place_of_fix for a in fixed], (3,))
         self.fix = _stack([a.prior.position_m for a in fixed], (3,))
         self.sigma_fix = _stack([a.prior.sigma_position_m for a in fixed], (3,))
         self.log_ratio = _stack([h[0] for h in heights], ())

@@ -42,7 +42,7 @@ class PoseGraph:
         self.config = config or PoseGraphConfig()
         self._kept_counts: Counter[str] = Counter()  # of what happens once, whatever is rebuilt
         self._nodes: dict[int, Node] = {}  # by keyframe number, in order of time
-        self._segments = SegmentFrames(self.config.least_anchors)
+        self._segments = SegmentFrames(self.config.least_anchors, self.config.fix_s)
         self._book = LoopBook(self.config, self)
         self._built = 0
         self._start()
@@ -391,7 +391,7 @@ class PoseGraph:
         if not self._nodes or prior.position_m is None:
             return prior
         before = self._newest().prior.position_m
-        if before is None or not np.array_equal(before, prior.position_m):
+        if before is None or np.abs(before - prior.position_m).max() > 1e-6:
             return prior
         self._kept_counts["position frozen"] += 1
         return replace(prior, sigma_position_m=None)

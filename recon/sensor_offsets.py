@@ -93,7 +93,7 @@ def _fixes(anchors: Sequence[Anchor], frame: Similarity) -> tuple[F64, F64, F64,
     """Centre, shift, warp (3, 3) and reach of the fixes, turned and stretched about the centre."""
     nothing = np.zeros(3), np.zeros(3), np.zeros((3, 3)), 0.0
     rows = [
-        (frame.pose(a.T_odom_camera)[:3, 3], a.prior.position_m, a.prior.sigma_position_m)
+        (frame.place(a.place_of_fix), a.prior.position_m, a.prior.sigma_position_m)
         for a in anchors
         if a.prior.position_m is not None and a.prior.sigma_position_m is not None
     ]

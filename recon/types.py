@@ -51,6 +51,11 @@ class PosePrior:
     sigma_agl_m: float = 5.0
     altitude_m: float | None = None  # world z up to a constant, as a barometer gives it
     sigma_altitude_m: float = 1.0
+    fix_offset: F64 | None = None  # (3,) from the camera to where position_m was, in its frame, in
+    # units of the odometry: the mean of several fixes lies beside the track
+    above_m: float | None = None  # altitude by the GNSS receiver alone less position_m's
+    above_fixes: int = 0  # whose mean that is
+    above_ns: int = 0  # time of the newest of them
 
 
 @dataclass(frozen=True, slots=True, eq=False)

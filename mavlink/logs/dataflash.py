@@ -78,6 +78,7 @@ class _Reader:
     def __init__(self) -> None:
         self._velocity: tuple[float, tuple[float, float, float]] | None = None
         self._fix = True
+        self._fix_alt_m: float | None = None
 
     def sample(self, name: str, m: Any) -> Sample | None:
         try:
@@ -107,10 +108,11 @@ class _Reader:
 
     def _gps(self, m: Any) -> Sample | None:
         self._fix = m.Status >= 3
+        self._fix_alt_m = getattr(m, "Alt", None) if self._fix else None
         return None if self._fix else AccuracySample(None, False, 1e3, 1e3)
 
     def _gps_accuracy(self, m: Any) -> Sample | None:
-        return AccuracySample(None, self._fix, m.HAcc, m.VAcc)
+        return AccuracySample(None, self._fix, m.HAcc, m.VAcc, self._fix_alt_m)
 
     def _range(self, m: Any) -> Sample | None:
         if getattr(m, "Orient", DOWNWARD) != DOWNWARD or getattr(m, "Stat", GOOD) != GOOD:
