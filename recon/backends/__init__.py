@@ -17,6 +17,7 @@ from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPai
 from recon.upsampling import UpsamplingConfig
 
 if TYPE_CHECKING:
+    from recon.backends.torch_kernels import Kernels
     from recon.registration import IcpConfig
 
 
@@ -72,6 +73,15 @@ class PathBackend(Protocol):
         stages: DenseStages,
     ) -> DepthMap | None:
         """Depth of a keyframe on its grid ``size_px`` (w, h); None: do it stage by stage."""
+        ...
+
+
+@runtime_checkable
+class KernelBackend(Protocol):
+    """A backend that may compute some operations by fused kernels."""
+
+    def use(self, kernels: Kernels) -> None:
+        """Compute with these kernels from now on."""
         ...
 
 

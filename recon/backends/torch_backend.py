@@ -12,6 +12,7 @@ from torch import Tensor
 from recon.backends import DenseStages
 from recon.backends.room import pyramid_levels, room
 from recon.backends.torch_dense import DenseStereo
+from recon.backends.torch_kernels import PLAIN, Kernels
 from recon.backends.torch_path import DensePath
 from recon.backends.torch_plan import Part, Plan, part, read
 from recon.backends.torch_upsampling import JointBilateral
@@ -43,9 +44,16 @@ class TorchBackend:
             raise ValueError(f"messages are 'int16' or 'float32', not {messages!r}")
         self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         self.messages: torch.dtype = getattr(torch, messages)
+        self.kernels = PLAIN
         self._plans: dict[Any, Plan] = {}
         self._path: tuple[DenseStages, DensePath] | None = None
         torch.zeros(8, device=self.device).add_(1).cpu()  # fails here rather than in flight
+
+    def use(self, kernels: Kernels) -> None:
+        """Compute with these kernels from now on; what was captured before is forgotten."""
+        self.kernels = kernels
+        self._plans.clear()
+        self._path = None
 
     def belief_propagation(
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
@@ -58,7 +66,7 @@ class TorchBackend:
         true = np.array([h, w, labels])
         px, confidence = self._run(
             ("stereo", *space, label_room, levels, config),
-            lambda: DenseStereo(label_room, levels, config, self.messages),
+            lambda: DenseStereo(label_room, levels, config, self.messages, self.kernels),
             [part(left, (space[0], space[1])), part(right, (space[0], space[1])), part(true)],
             (left, right, true),
         )
@@ -78,7 +86,7 @@ class TorchBackend:
         )  # fmt: skip
         px, confidence = self._run(
             ("upsample", *small, *large, config),
-            lambda: JointBilateral(config),
+            lambda: JointBilateral(config, self.kernels),
             [
                 part(given[0], small), part(given[1], small), part(given[2], (*small, 3)),
                 part(guide, (*large, 3)), part(given[4]),
@@ -108,8 +116,9 @@ class TorchBackend:
             return None
         if self._path is None or self._path[0] != stages:
             path = DensePath(
-                self.device, stages.matching, stages.upsampling, stages.fusion, self.messages
-            )
+                self.device, stages.matching, stages.upsampling, stages.fusion, self.messages,
+                self.kernels,
+            )  # fmt: skip
             self._path = stages, path
         return self._path[1].depth(pairs, K, size_px, T_world_camera)
 

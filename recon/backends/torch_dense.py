@@ -16,6 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from recon.backends.torch_kernels import PLAIN, Kernels, Sweep
 from recon.belief_propagation import BeliefPropagationConfig
 from recon.disparity_selection import NOISE, RADIUS, SURE_EVIDENCE
 from recon.matching_cost import CENSUS_RADIUS, COST_UNIT
@@ -33,7 +34,8 @@ class DenseStereo(torch.nn.Module):
     """Grey images (h, w) in 0 to 255 to labels and their confidence, two (h, w).
 
     ``labels`` is the room for them, ``levels`` counts those of the pyramid; ``messages`` is the
-    type of costs and messages, torch.int16 (where they fit) or torch.float32.
+    type of costs and messages, torch.int16 (where they fit) or torch.float32. The kernel of
+    ``kernels`` renews messages of 16 bits.
     """
 
     def __init__(
@@ -42,6 +44,7 @@ class DenseStereo(torch.nn.Module):
         levels: int,
         config: BeliefPropagationConfig,
         messages: torch.dtype = torch.float32,
+        kernels: Kernels = PLAIN,
     ) -> None:
         super().__init__()
         self.labels = labels
@@ -49,6 +52,7 @@ class DenseStereo(torch.nn.Module):
         self.config = config
         short = messages == torch.int16 and config.truncation <= MAX_SHORT_TRUNCATION
         self.messages = torch.int16 if short else torch.float32
+        self.sweep = kernels.sweep if short else None
 
     def forward(self, left: Tensor, right: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
         """Labels, NaN where the partner is outside the right image; confidence, 0: not believed.
@@ -59,7 +63,7 @@ class DenseStereo(torch.nn.Module):
         left, right = left.float(), right.float()
         cost = matching_cost(left, right, self.labels, true, self.config)
         edges = edge_weights(left, true, self.config)
-        belief = propagate(cost, edges, true, self.levels, self.config, self.messages)
+        belief = propagate(cost, edges, true, self.levels, self.config, self.messages, self.sweep)
         return select(belief, cost, true, self.config)
 
 
@@ -134,8 +138,12 @@ def propagate(
     levels: int,
     config: BeliefPropagationConfig,
     kind: torch.dtype,
+    sweep: Sweep | None = None,
 ) -> Tensor:
-    """(L, h, w) beliefs, as :func:`recon.message_passing.propagate` (Eq. 1)."""
+    """(L, h, w) beliefs, as :func:`recon.message_passing.propagate` (Eq. 1).
+
+    ``sweep`` renews the messages of one colour in place; None: in plain torch.
+    """
     labels = true[2]
     pyramid = [_cut(cost.to(kind), labels, config.truncation)]
     edges, sizes = [weights], [true[:2]]
@@ -149,15 +157,30 @@ def propagate(
         if messages.shape[2:] != data.shape[1:]:
             messages = messages.repeat_interleave(2, 2).repeat_interleave(2, 3)[:, :, :h, :w]
             messages = messages * inside(data.shape, size)
-        rows = torch.arange(h, device=data.device)[:, None]
-        colour = (rows + torch.arange(w, device=data.device)[None, :]) % 2
         slope = torch.floor(weight * (COST_UNIT / FULL_WEIGHT)).to(kind)
         cut = torch.floor(weight * (config.truncation / FULL_WEIGHT)).to(kind)
         smooth = (_per_direction(slope), _per_direction(cut))
+        if sweep is not None:
+            messages = messages.contiguous()
         for t in range(config.iterations):
-            fresh = _outgoing(data, messages, *smooth, config)
-            messages = torch.where(colour == t % 2, fresh, messages)
+            if sweep is not None:
+                sweep(data, messages, *smooth, t % 2)
+            else:
+                messages = sweep_plainly(data, messages, *smooth, t % 2, config.truncation)
     return pyramid[0] + _total(_arriving(messages))
+
+
+def sweep_plainly(
+    data: Tensor, messages: Tensor, slope: Tensor, cut: Tensor, colour: int, truncation: int
+) -> Tensor:
+    """(4, L, h, w) messages of which those of the pixels of ``colour`` are new.
+
+    ``slope`` and ``cut`` (4, 1, h, w) are of the edge that each direction crosses.
+    """
+    _, h, w = data.shape
+    rows = torch.arange(h, device=data.device)[:, None]
+    ours = (rows + torch.arange(w, device=data.device)[None, :]) % 2 == colour
+    return torch.where(ours, _outgoing(data, messages, slope, cut, truncation), messages)
 
 
 def _beyond(values: Tensor) -> float:
@@ -215,14 +238,14 @@ def _total(arriving: Tensor) -> Tensor:
 
 
 def _outgoing(
-    data: Tensor, messages: Tensor, slope: Tensor, cut: Tensor, config: BeliefPropagationConfig
+    data: Tensor, messages: Tensor, slope: Tensor, cut: Tensor, truncation: int
 ) -> Tensor:
     """Lower envelope of all other news; a label further than ``steps`` costs the cut anyway."""
     arriving = _arriving(messages)
     total = data + _total(arriving)
     rest = total - torch.stack([arriving[1], arriving[0], arriving[3], arriving[2]])
     labels = data.shape[0]
-    steps = min(math.ceil(config.truncation / COST_UNIT) + 1, labels - 1)
+    steps = min(math.ceil(truncation / COST_UNIT) + 1, labels - 1)
     wide = F.pad(rest, (0, 0, 0, 0, steps, steps), value=_beyond(rest))
     best = rest
     for k in range(1, steps + 1):

@@ -18,6 +18,7 @@ from recon.backends.room import pyramid_levels, room
 from recon.backends.torch_believe import believe, drop_unseen
 from recon.backends.torch_dense import DenseStereo
 from recon.backends.torch_depth import fuse, reproject
+from recon.backends.torch_kernels import PLAIN, Kernels
 from recon.backends.torch_plan import Plan, part, read
 from recon.backends.torch_upsampling import JointBilateral, averaged
 from recon.belief_propagation import BeliefPropagationConfig
@@ -42,6 +43,7 @@ class DensePath:
         upsampling: UpsamplingConfig,
         fusion: FusionConfig,
         messages: torch.dtype = torch.int16,
+        kernels: Kernels = PLAIN,
     ) -> None:
         if matching.fill_occluded or upsampling.method != "bilateral":
             raise ValueError("the path on the device neither fills nor uses the guided filter")
@@ -50,6 +52,7 @@ class DensePath:
         self.upsampling = upsampling
         self.fusion = fusion
         self.messages = messages
+        self.kernels = kernels
         self._plans: dict[Any, Plan] = {}
 
     def depth(
@@ -98,8 +101,8 @@ class PairDepthStage(torch.nn.Module):
 
     def __init__(self, path: DensePath, labels: int, levels: int, size_px: tuple[int, int]) -> None:
         super().__init__()
-        self.stereo = DenseStereo(labels, levels, path.matching, path.messages)
-        self.upsampling = JointBilateral(path.upsampling)
+        self.stereo = DenseStereo(labels, levels, path.matching, path.messages, path.kernels)
+        self.upsampling = JointBilateral(path.upsampling, path.kernels)
         self.matching = path.matching
         self.size_px = size_px
 

@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor
 
+from recon.backends.torch_kernels import PLAIN, Kernels
 from recon.upsampling import MIN_CONFIDENCE, RANGE_FLOOR, UpsamplingConfig
 
 FAR_TAP = -1.0e4
@@ -18,21 +19,20 @@ FAR_TAP = -1.0e4
 
 
 class JointBilateral(torch.nn.Module):
-    """From (h, w) to the size of the guide (H, W, 3)."""
+    """From (h, w) to the size of the guide (H, W, 3); a kernel may do all of it."""
 
-    def __init__(self, config: UpsamplingConfig) -> None:
+    def __init__(self, config: UpsamplingConfig, kernels: Kernels = PLAIN) -> None:
         super().__init__()
         self.config = config
+        self.kernel = kernels.bilateral
 
     def forward(
         self, px: Tensor, confidence: Tensor, taps: Tensor, guide: Tensor, true: Tensor
     ) -> tuple[Tensor, Tensor]:
         """``taps`` (h, w, 3) and ``guide`` (H, W, 3) in grey levels; ``true`` (4,) h, w, H, W."""
-        known = px == px
-        trust = torch.where(known, confidence.clamp(min=MIN_CONFIDENCE), 0.0)
-        value = torch.where(known, px, 0.0) * trust
-        colour = taps.float().permute(2, 0, 1)
-        layers = torch.cat([colour, torch.stack([trust, value, known.float()])])
+        if self.kernel is not None:
+            return self.kernel(px, confidence, taps, guide, true, self.config)
+        layers = tap_layers(px, confidence, taps)
         image = guide.float().permute(2, 0, 1)
         everything = torch.zeros_like(image[0])
         sums = torch.zeros_like(image)
@@ -50,6 +50,15 @@ class JointBilateral(torch.nn.Module):
         good = sums[2] > self.config.min_support * everything
         out = torch.where(good, sums[1] / sums[0], math.nan)
         return out, torch.where(good, sums[0] / everything, 0.0)
+
+
+def tap_layers(px: Tensor, confidence: Tensor, taps: Tensor) -> Tensor:
+    """(6, h, w) what a tap brings: three colours, trust, trust times label, 1 where known."""
+    known = px == px
+    trust = torch.where(known, confidence.clamp(min=MIN_CONFIDENCE), 0.0)
+    value = torch.where(known, px, 0.0) * trust
+    colour = taps.float().permute(2, 0, 1)
+    return torch.cat([colour, torch.stack([trust, value, known.float()])])
 
 
 def window(

@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from recon.backends import BACKENDS, Backend, DenseStages, PathBackend, load_backend
+from recon.backends import (
+    BACKENDS,
+    Backend,
+    DenseStages,
+    KernelBackend,
+    PathBackend,
+    load_backend,
+)
 from recon.belief_propagation import BeliefPropagationConfig
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 from recon.upsampling import UpsamplingConfig
@@ -138,7 +145,7 @@ def fastest_backend() -> Backend:
             log.info("backend %s: not tried, %s", candidate, reason)
             continue
         try:
-            backend = load_backend(candidate, engine_folder())
+            backend = with_kernels(load_backend(candidate, engine_folder()))
         except (ImportError, RuntimeError, ValueError) as error:
             log.info("backend %s: cannot run here, %s", candidate, error)
             continue
@@ -174,10 +181,19 @@ def named_backend(name: str) -> Backend:
     if name not in BACKENDS:
         raise InputError(f"backend {name}: there are auto, {', '.join(BACKENDS)}")
     try:
-        backend = load_backend(name, engine_folder())
+        backend = with_kernels(load_backend(name, engine_folder()))
     except (ImportError, RuntimeError, ValueError) as error:
         raise OutsideError(f"backend {name} cannot run here: {error}") from error
     log.info("backend %s on %s, as named", backend.name, backend.device)
+    return backend
+
+
+def with_kernels(backend: Backend) -> Backend:
+    """The backend, on CUDA with the fused kernels that proved right and faster there."""
+    if isinstance(backend, KernelBackend) and backend.device.startswith("cuda"):
+        from service.compute.fused_kernels import choose_kernels
+
+        backend.use(choose_kernels(backend.device))
     return backend
 
 

@@ -1,0 +1,145 @@
+"""Fused kernels that may take the place of plain torch operations, and how they are tried.
+
+A kernel is used only where it was shown, on the device at hand, to give what the plain
+operation gives (:func:`trials`) and to be faster, which the service measures. Without Triton,
+as with many wheels for the Jetson, everything goes on in plain torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from subprocess import SubprocessError
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from recon.upsampling import UpsamplingConfig
+
+
+class Sweep(Protocol):
+    """Renews in place the messages that leave one colour of the checkerboard."""
+
+    def __call__(
+        self, data: Tensor, messages: Tensor, slope: Tensor, cut: Tensor, colour: int, /
+    ) -> None:
+        """See :func:`recon.backends.triton_propagation.sweep`."""
+        ...
+
+
+class Bilateral(Protocol):
+    """Joint bilateral upsampling in one go."""
+
+    def __call__(
+        self, px: Tensor, confidence: Tensor, taps: Tensor, guide: Tensor, true: Tensor,
+        config: UpsamplingConfig, /,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """See :class:`recon.backends.torch_upsampling.JointBilateral`."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Kernels:
+    """What replaces plain operations; None: nothing does."""
+
+    sweep: Sweep | None = None
+    bilateral: Bilateral | None = None
+
+
+Results = Callable[[], tuple[Tensor, ...]]
+
+PLAIN = Kernels()
+"""Everything in plain torch."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """One kernel beside the plain operation, on the same made-up inputs of a device."""
+
+    name: str
+    alone: Kernels  # this kernel and no other
+    plain: Results
+    fused: Results
+    tolerance: float  # of every number; 0: equal
+
+    def difference(self) -> str | None:
+        """How the two disagree, or None: NaN at the same places, and numbers alike."""
+        for a, b in zip(self.plain(), self.fused(), strict=True):
+            if bool((torch.isnan(a) != torch.isnan(b)).any()):
+                return "other pixels are unknown"
+            off = float((a.double() - b.double()).abs().nan_to_num().max())
+            if off > self.tolerance:
+                return f"a number is off by {off:.3g}, {self.tolerance:g} is allowed"
+        return None
+
+
+def load_kernels() -> Kernels:
+    """All kernels there are; ImportError without Triton."""
+    from recon.backends.triton_propagation import sweep
+    from recon.backends.triton_upsampling import bilateral
+
+    return Kernels(sweep, bilateral)
+
+
+def failures() -> tuple[type[Exception], ...]:
+    """What loading, compiling or launching a kernel may raise where Triton does not fit."""
+    kinds: tuple[type[Exception], ...] = (ImportError, OSError, RuntimeError, SubprocessError)
+    try:
+        from triton.errors import TritonError
+    except ImportError:
+        return kinds
+    return (*kinds, TritonError)
+
+
+def trials(
+    kernels: Kernels, device: str, size_px: tuple[int, int], guide_px: tuple[int, int], labels: int
+) -> list[Trial]:
+    """Each kernel beside the plain operation, at a size (w, h) and with a guide (W, H)."""
+    from recon.backends.room import pyramid_levels
+    from recon.backends.torch_dense import edge_weights, matching_cost, propagate
+    from recon.backends.torch_upsampling import JointBilateral, averaged
+    from recon.belief_propagation import BeliefPropagationConfig
+
+    (w, h), (W, H) = size_px, guide_px
+    given = torch.Generator().manual_seed(0)
+    guide = torch.randint(0, 256, (H, W, 3), generator=given, dtype=torch.uint8).to(device)
+    left = torch.randint(0, 256, (h, w), generator=given).float().to(device)
+    right = left.roll(-labels // 2, 1)
+    matching, upsampling = BeliefPropagationConfig(), UpsamplingConfig()
+    own = torch.tensor([h - 1, w - 1, labels - 1], device=device)
+    sizes = torch.tensor([h - 1, w - 1, H - 1, W - 1], device=device)
+    cost = matching_cost(left, right, labels, own, matching)
+    edges = edge_weights(left, own, matching)
+    levels = pyramid_levels(h, w, matching)
+    px = labels * torch.rand((h, w), generator=given)
+    px = torch.where(px > 0.8 * labels, torch.nan, px).to(device)
+    sure = torch.rand((h, w), generator=given).to(device)
+    taps = averaged(guide, (h, w), sizes)
+
+    def believed(sweep: Sweep | None) -> tuple[Tensor, ...]:
+        return (propagate(cost, edges, own, levels, matching, torch.int16, sweep),)
+
+    def upsampled(kernels: Kernels) -> tuple[Tensor, ...]:
+        found: tuple[Tensor, ...] = JointBilateral(upsampling, kernels)(
+            px, sure, taps, guide, sizes
+        )
+        return tuple(layer[: H - 1, : W - 1] for layer in found)
+
+    swept, bilateral = Kernels(sweep=kernels.sweep), Kernels(bilateral=kernels.bilateral)
+
+    def both(kernels: Kernels) -> tuple[Results, Results]:
+        return lambda: believed(kernels.sweep), lambda: upsampled(kernels)
+
+    (plain, plain_px), (fused, _), (_, fused_px) = both(PLAIN), both(swept), both(bilateral)
+    return [
+        Trial("belief propagation", swept, plain, fused, 0.0),
+        Trial("upsampling", bilateral, plain_px, fused_px, 0.01),
+    ]
+
+
+def joined(kernels: Sequence[Kernels]) -> Kernels:
+    """All that any of them replaces."""
+    sweeps = [k.sweep for k in kernels if k.sweep is not None]
+    bilaterals = [k.bilateral for k in kernels if k.bilateral is not None]
+    return Kernels(sweeps[0] if sweeps else None, bilaterals[0] if bilaterals else None)
