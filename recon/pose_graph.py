@@ -23,6 +23,7 @@ from recon.graph_readings import BLOCK, Readings
 from recon.graph_records import Loop, Node, PoseGraphConfig
 from recon.loop_book import Edge, LoopBook
 from recon.segment_frames import SegmentFrames
+from recon.sensor_offsets import Constants
 from recon.smoother import ROUNDS, SCALAR, Smoother, moved_covariance
 from recon.types import F64, Pose, PosePrior
 
@@ -42,7 +43,9 @@ class PoseGraph:
         self.config = config or PoseGraphConfig()
         self._kept_counts: Counter[str] = Counter()  # of what happens once, whatever is rebuilt
         self._nodes: dict[int, Node] = {}  # by keyframe number, in order of time
-        self._segments = SegmentFrames(self.config.least_anchors, self.config.fix_s)
+        self._segments = SegmentFrames(
+            self.config.least_anchors, self.config.fix_s, self.config.attitude_s
+        )
         self._book = LoopBook(self.config, self)
         self._built = 0
         self._start()
@@ -168,6 +171,10 @@ class PoseGraph:
     def similarity(self, segment: int) -> Similarity | None:
         """What brings a segment's odometry to the world; None before telemetry or a loop does."""
         return self._segments.known(segment)
+
+    def constants(self) -> Constants:
+        """What the sensors are constantly off by, as known for the newest segment."""
+        return self._segments.constants(self._newest().segment) if self._nodes else Constants()
 
     def is_tied(self, segment: int) -> bool:
         """True when fixes or a loop tell where the segment lies."""

@@ -9,9 +9,8 @@ import numpy as np
 
 from recon import alignment, se3
 from recon.alignment import Anchor, Scale, Similarity
-from recon.altitude_datum import AltitudeDatum, altitude_datum
 from recon.graph_records import Node
-from recon.sensor_offsets import Offsets, offsets
+from recon.sensor_offsets import Constants, Offsets, constants, offsets
 from recon.types import F64
 
 REFIT_GROWTH, SETTLED_GROWTH = 1.3, 1.6
@@ -21,21 +20,18 @@ and once it has settled."""
 SETTLED = 100
 """Keyframes after which a segment's frame is taken over only when it has changed notably."""
 
-DATUM_M = 0.1
-"""Change of the altitude's datum that is notable."""
-
 
 class SegmentFrames:
     """Keyframes by segment, and each segment's similarity once telemetry or a loop tells it."""
 
-    def __init__(self, least_anchors: int, fix_s: float = 60.0) -> None:
+    def __init__(self, least_anchors: int, fix_s: float = 60.0, attitude_s: float = 40.0) -> None:
         """``least_anchors`` keyframes must be there before telemetry places a segment.
 
-        A receiver's error wanders with the time constant ``fix_s``.
+        Fixes and attitudes wander with the time constants ``fix_s`` and ``attitude_s``.
         """
         self.nodes: dict[int, list[Node]] = {}
-        self._least, self._fix_s = least_anchors, fix_s
-        self._datums: dict[int, AltitudeDatum] = {}  # that the frame was fitted with
+        self._least, self._wander_s = least_anchors, (fix_s, attitude_s)
+        self._constants: dict[int, Constants] = {}  # that the frame was fitted with
         self._frames: dict[int, Similarity] = {}
         self._offsets: dict[int, Offsets] = {}
         self._fitted: dict[int, int] = {}  # keyframes that the frame was fitted to
@@ -60,7 +56,7 @@ class SegmentFrames:
 
     def freed(self, node: Node) -> Node:
         """The node without its sensors' constants, its fix brought to the camera."""
-        prior = self._datum(node.segment).applied(node.prior)
+        prior = self.constants(node.segment).applied(node.prior)
         if node.segment in self._offsets:
             prior = self._offsets[node.segment].applied(prior, node.lean)
         if prior.fix_offset is not None and prior.position_m is not None:
@@ -69,8 +65,9 @@ class SegmentFrames:
             prior = replace(prior, position_m=prior.position_m - off, fix_offset=None)
         return node if prior is node.prior else replace(node, prior=prior)
 
-    def _datum(self, segment: int) -> AltitudeDatum:
-        return self._datums.get(segment, AltitudeDatum())
+    def constants(self, segment: int) -> Constants:
+        """What the sensors are constantly off by, as the segment's frame was fitted with."""
+        return self._constants.get(segment, Constants())
 
     def rests_on_fixes(self, segment: int) -> bool:
         """True when positions place the segment."""
@@ -91,7 +88,7 @@ class SegmentFrames:
 
     def forget(self, segment: int) -> bool:
         """Count the segment as not placed; True when no fix can place it again."""
-        for known in (self._frames, self._offsets, self._fitted, self._datums):
+        for known in (self._frames, self._offsets, self._fitted, self._constants):
             known.pop(segment, None)
         self._tied.discard(segment)
         return all(n.prior.sigma_position_m is None for n in self.nodes[segment])
@@ -106,27 +103,30 @@ class SegmentFrames:
         if len(nodes) < max(self._least, int(growth * fitted)) or segment in self._tied:
             return False
         self._fitted[segment] = len(nodes)
-        datum = self._newest_datum()
-        anchors = self._anchors(segment, datum)
+        fresh = self._newest_constants()
+        anchors = self._anchors(segment, fresh)
         found = alignment.fit(anchors)
         if found is None:
             return False
         if "gnss" not in found.sources and nodes[0].key > 0:
             found = _kept_in_place(found, nodes[0], pose(nodes[0].key))
         before = self._frames.get(segment)
-        raised = abs(datum.shift_m - self._datum(segment).shift_m) > DATUM_M
-        is_settled = before is not None and len(nodes) >= SETTLED and not raised
+        is_settled = len(nodes) >= SETTLED and not fresh.differ(self.constants(segment))
         if before is not None and is_settled and not _differ(before, found, nodes):
             return False  # the graph itself follows such small changes
-        self._frames[segment], self._datums[segment] = found, datum
+        self._frames[segment], self._constants[segment] = found, fresh
         self._offsets[segment] = offsets(anchors, found)
         return True
 
-    def _newest_datum(self) -> AltitudeDatum:
-        """By the fixes of all segments: it is one receiver and one barometer."""
+    def _newest_constants(self) -> Constants:
+        """By all segments: the sensors stay the same."""
         nodes = [n for segment in self.nodes.values() for n in segment]
         span_s = (nodes[-1].time_ns - nodes[0].time_ns) * 1e-9
-        return altitude_datum([n.prior for n in nodes], span_s, self._fix_s)
+        stretches = [
+            ([n.T_odom_camera for n in segment], [n.prior for n in segment])
+            for segment in self.nodes.values()
+        ]
+        return constants(stretches, span_s, *self._wander_s)
 
     def altitude_offset(self) -> float | None:
         """Altitude less world z over all placed keyframes; None without any."""
@@ -143,11 +143,11 @@ class SegmentFrames:
         frame = self._frames.get(segment)
         if frame is None:
             return None, None
-        return alignment.scales(self._anchors(segment, self._datum(segment)), frame)
+        return alignment.scales(self._anchors(segment, self.constants(segment)), frame)
 
-    def _anchors(self, segment: int, datum: AltitudeDatum) -> list[Anchor]:
+    def _anchors(self, segment: int, known: Constants) -> list[Anchor]:
         return [
-            Anchor(n.T_odom_camera, datum.applied(n.prior), n.height, n.lean)
+            Anchor(n.T_odom_camera, known.applied(n.prior), n.height, n.lean)
             for n in self.nodes[segment]
         ]
 

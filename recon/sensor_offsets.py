@@ -14,6 +14,8 @@ import numpy as np
 
 from recon import se3
 from recon.alignment import Anchor, Similarity, height_ratios
+from recon.altitude_datum import AltitudeDatum, altitude_datum
+from recon.boresight import Boresight, Turns, boresight
 from recon.types import F64, PosePrior
 
 PRIOR_SIGMA = 0.1
@@ -21,6 +23,43 @@ PRIOR_SIGMA = 0.1
 
 NEAR_SIGMAS = 5.0
 """Fixes further from the track, or attitudes from their median, are no part of a constant."""
+
+
+NOTABLE_M, NOTABLE_RAD = 0.1, 0.003
+"""Changes of the constants of a whole flight that the map must follow."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Constants:
+    """What is constant over a whole flight, whatever becomes of the track."""
+
+    datum: AltitudeDatum = field(default_factory=AltitudeDatum)
+    boresight: Boresight = field(default_factory=Boresight)
+
+    def applied(self, prior: PosePrior) -> PosePrior:
+        """The prior without them."""
+        return self.boresight.applied(self.datum.applied(prior))
+
+    def differ(self, other: Constants) -> bool:
+        """True when the other's would notably move the map."""
+        raised = abs(self.datum.shift_m - other.datum.shift_m) > NOTABLE_M
+        turned = float(np.abs(self.boresight.turn - other.boresight.turn).max()) > NOTABLE_RAD
+        return raised or turned
+
+
+def constants(
+    stretches: Sequence[tuple[Sequence[F64], Sequence[PosePrior]]],
+    span_s: float,
+    fix_s: float = 60.0,
+    attitude_s: float = 40.0,
+) -> Constants:
+    """Those of a flight of ``span_s`` from poses (4, 4) and priors, stretch by stretch of vision.
+
+    ``fix_s`` and ``attitude_s`` are the time constants with which the sensors wander.
+    """
+    turns = [t for poses, priors in stretches if (t := Turns.of(poses, priors)) is not None]
+    every = [prior for _, priors in stretches for prior in priors]
+    return Constants(altitude_datum(every, span_s, fix_s), boresight(turns, span_s, attitude_s))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
