@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from autopilot import attitude, packed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,22 +16,6 @@ from mavlink.framing import Decoder, Framer, check_packet, packet_length
 from mavlink.samples import PositionSample, RangeSample, TerrainSample
 from mavlink.telemetry import TelemetryDecoder
 from mavlink.wire import dialect, numbers_of, x25crc
-
-AUTOPILOT = (1, 1)
-
-
-def packed(message: Any, source: tuple[int, int] = AUTOPILOT, seq: int = 0) -> bytes:
-    mouth = dialect.MAVLink(None, *source)
-    mouth.seq = seq
-    return bytes(message.pack(mouth))
-
-
-def beat(system: int = 1, token: int = 0, autopilot: int = 3, armed: bool = False) -> Any:
-    return dialect.MAVLink_heartbeat_message(2, autopilot, 128 if armed else 0, token, 4, 3)
-
-
-def attitude(boot_ms: int, roll: float = 0.0) -> Any:
-    return dialect.MAVLink_attitude_message(boot_ms, roll, 0.0, 0.0, 0, 0, 0)
 
 
 def mixture(rng: random.Random, count: int) -> tuple[bytes, int]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from autopilot import attitude, beat, packed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -27,21 +28,6 @@ from mavlink.wire import CRC_EXTRA, dialect, x25crc
 
 MS = 1_000_000
 S = 1_000_000_000
-AUTOPILOT = (1, 1)
-
-
-def packed(message: Any, source: tuple[int, int] = AUTOPILOT, seq: int = 0) -> bytes:
-    mouth = dialect.MAVLink(None, *source)
-    mouth.seq = seq
-    return bytes(message.pack(mouth))
-
-
-def beat(system: int = 1, token: int = 0, autopilot: int = 3, armed: bool = False) -> Any:
-    return dialect.MAVLink_heartbeat_message(2, autopilot, 128 if armed else 0, token, 4, 3)
-
-
-def attitude(boot_ms: int, roll: float = 0.0) -> Any:
-    return dialect.MAVLink_attitude_message(boot_ms, roll, 0.0, 0.0, 0, 0, 0)
 
 
 class Station:

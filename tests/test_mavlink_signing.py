@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from autopilot import beat, packed
 
 from mavlink.framing import Framer
 from mavlink.messages import Outgoing
@@ -16,18 +17,7 @@ from mavlink.wire import dialect
 
 S = 1_000_000_000
 KEY = bytes(range(32))
-AUTOPILOT = (1, 1)
 NOW = timestamp_of(1_760_000_000 * S)
-
-
-def packed(message: Any, source: tuple[int, int] = AUTOPILOT, seq: int = 0) -> bytes:
-    mouth = dialect.MAVLink(None, *source)
-    mouth.seq = seq
-    return bytes(message.pack(mouth))
-
-
-def beat(system: int = 1, token: int = 0, autopilot: int = 3, armed: bool = False) -> Any:
-    return dialect.MAVLink_heartbeat_message(2, autopilot, 128 if armed else 0, token, 4, 3)
 
 
 def signed(message: Any, timestamp: int, key: bytes = KEY, link: int = 3) -> bytes:
