@@ -33,6 +33,9 @@ HUBER = 2.5
 WILD = 5.0
 """Median of the whitened residuals beyond which attitudes and pictures do not belong together."""
 
+SURE = 9.0
+"""Squared sigmas by which a boresight must differ from none before attitudes are corrected."""
+
 ROUNDS = 6
 
 
@@ -43,10 +46,15 @@ class Boresight:
     turn: F64 = field(default_factory=lambda: np.zeros(3))  # rad, in the camera's frame
     sigma: F64 = field(default_factory=lambda: np.full(3, SIGMA_RAD))
 
+    @property
+    def is_sure(self) -> bool:
+        """True when it is there beyond doubt; what is not is left alone."""
+        return float(np.sum(np.square(self.turn / self.sigma))) > SURE
+
     def applied(self, prior: PosePrior) -> PosePrior:
-        """The prior with the camera's own attitude."""
+        """The prior with the camera's own attitude, once that is sure to be another."""
         R = prior.R_world_camera
-        if R is None or not self.turn.any():
+        if R is None or not self.is_sure:
             return prior
         return replace(prior, R_world_camera=R @ se3.so3_exp(self.turn))
 

@@ -43,7 +43,8 @@ class Constants:
     def differ(self, other: Constants) -> bool:
         """True when the other's would notably move the map."""
         raised = abs(self.datum.shift_m - other.datum.shift_m) > NOTABLE_M
-        turned = float(np.abs(self.boresight.turn - other.boresight.turn).max()) > NOTABLE_RAD
+        turn, before = (b.turn * b.is_sure for b in (self.boresight, other.boresight))
+        turned = float(np.abs(turn - before).max()) > NOTABLE_RAD
         return raised or turned
 
 
