@@ -8,6 +8,7 @@ import numpy as np
 
 from recon import matching, prediction
 from recon.keyframe_window import Incoming, OdometryKeyframe
+from recon.matcher import Matcher
 from recon.types import F64, Bool, Camera
 
 
@@ -21,7 +22,9 @@ class FirstViews:
         config: matching.MatchingConfig,
         radius_px: float,
         least_shift_confidence: float,
+        matcher: Matcher,
     ) -> None:
+        self._matcher = matcher
         self._K, self._config, self._radius_px = camera.K, config, radius_px
         self._least_shift_confidence = least_shift_confidence
         self._drift = np.eye(3)  # from the first frame's pixels to the last one's
@@ -39,7 +42,7 @@ class FirstViews:
         """
         best: tuple[F64, Bool] | None = None
         for guess in self._guesses(new, first, R_b_a, still):
-            found = matching.match(
+            found = self._matcher.match(
                 first.pyramid,
                 first.uv.astype(np.float32),
                 new.pyramid,

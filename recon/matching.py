@@ -29,7 +29,8 @@ __all__ = [
     "match",
 ]
 
-_FAR = 1e6  # px; stands for a prediction that is not a number
+FAR = 1e6
+"""px; stands for a prediction that is not a number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +88,7 @@ class Pyramid:
     """A grey picture and its halvings, each (ceil(H / 2^l), ceil(W / 2^l)) uint8."""
 
     levels: tuple[U8, ...]
+    held: object = None  # the same where the matcher that made it keeps them
 
     @staticmethod
     def build(gray: U8, levels: int = 5) -> Pyramid:
@@ -132,15 +134,16 @@ def harris_grid(gray: U8, config: MatchingConfig, mask: U8 | None = None) -> Cor
     return Corners(np.ascontiguousarray(best[:, :2]), np.ascontiguousarray(best[:, 2]))
 
 
-def _points(uv_px: npt.ArrayLike, name: str, count: int | None = None) -> F64:
+def checked_points(uv_px: npt.ArrayLike, name: str, count: int | None = None) -> F64:
+    """(N, 2) points, those that are not finite far away; ValueError for another shape."""
     uv = np.array(uv_px, dtype=np.float64)
     if uv.ndim != 2 or uv.shape[1] != 2 or (count is not None and uv.shape[0] != count):
         raise ValueError(f"{name} must be (N, 2), got {uv.shape}")
-    uv[~np.isfinite(uv).all(axis=1)] = -_FAR
-    return np.clip(uv, -_FAR, _FAR)
+    uv[~np.isfinite(uv).all(axis=1)] = -FAR
+    return np.clip(uv, -FAR, FAR)
 
 
-def _warps(warp: npt.ArrayLike | None, count: int) -> tuple[F64, F64]:
+def checked_warps(warp: npt.ArrayLike | None, count: int) -> tuple[F64, F64]:
     """Forward and inverse warps as (N, 4) rows; a singular warp becomes the identity."""
     matrices = np.eye(2) if warp is None else np.asarray(warp, dtype=np.float64)
     if matrices.shape not in ((2, 2), (count, 2, 2)):
@@ -225,7 +228,7 @@ def _consensus(uv: F64, residual: F64, good: Bool, tolerance_px: float) -> F64 |
     return np.asarray(everywhere)
 
 
-def _start(radius_px: float, levels: int, config: MatchingConfig) -> tuple[int, int]:
+def start_level(radius_px: float, levels: int, config: MatchingConfig) -> tuple[int, int]:
     """Level to start at and the search radius in its pixels."""
     level = 0
     usable = min(levels, config.search_levels)
@@ -253,15 +256,15 @@ def match(
     others. Points that are not finite are not ok. Raises ValueError on wrong shapes.
     """
     config = config or MatchingConfig()
-    a = _points(uv_a, "uv_a")
-    predicted = _points(uv_b_predicted, "uv_b_predicted", len(a))
+    a = checked_points(uv_a, "uv_a")
+    predicted = checked_points(uv_b_predicted, "uv_b_predicted", len(a))
     if not (np.isfinite(radius_px) and radius_px > 0):
         raise ValueError(f"radius_px must be positive, got {radius_px}")
-    forward_warp, inverse_warp = _warps(warp, len(a))
+    forward_warp, inverse_warp = checked_warps(warp, len(a))
     forward = _Search(pyramid_a.levels, pyramid_b.levels, a, inverse_warp, config)
-    level, reach = _start(radius_px, min(len(pyramid_a.levels), len(pyramid_b.levels)), config)
+    level, reach = start_level(radius_px, min(len(pyramid_a.levels), len(pyramid_b.levels)), config)
 
-    everyone: Bool = np.abs(np.hstack([a, predicted])).max(axis=1, initial=0.0) < _FAR
+    everyone: Bool = np.abs(np.hstack([a, predicted])).max(axis=1, initial=0.0) < FAR
     coarse = forward.at(level, predicted, everyone, reach)
     uv = coarse.uv
     # A coarse pixel blurs; the fine patches have the last word on likeness.

@@ -26,6 +26,7 @@ from recon.keyframe_window import (
     triangulate,
 )
 from recon.landmarks import I64, Landmarks
+from recon.matcher import HostMatcher, Matcher
 from recon.types import F64, U8, Bool, Camera, PosePrior
 
 OVERDUE = 1.3
@@ -85,8 +86,17 @@ class _Located:
 class Odometry:
     """Follows one camera without distortion; feed it every frame in order."""
 
-    def __init__(self, camera: Camera, config: OdometryConfig | None = None) -> None:
-        """``camera`` has no distortion and the size of the frames to come."""
+    def __init__(
+        self,
+        camera: Camera,
+        config: OdometryConfig | None = None,
+        matcher: Matcher | None = None,
+    ) -> None:
+        """``camera`` has no distortion and the size of the frames to come.
+
+        ``matcher`` finds and follows corners; None: the processor does.
+        """
+        self._matcher = matcher or HostMatcher()
         self.camera = camera
         self.K = camera.K
         self.config = config or OdometryConfig()
@@ -101,6 +111,7 @@ class Odometry:
             self.config.matching,
             self.config.wide_search_share * camera.size_px[0],
             self.config.least_shift_confidence,
+            self._matcher,
         )
         self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
 
@@ -123,7 +134,7 @@ class Odometry:
             mask: (H, W) non-zero where the picture is valid.
             blurred: a later frame makes a better keyframe, if it comes soon.
         """
-        pyramid = matching.Pyramid.build(grey, self.config.matching.search_levels)
+        pyramid = self._matcher.pyramid(grey, self.config.matching.search_levels)
         new = Incoming(grey, pyramid, seq, time_ns, prior, mask, blurred)
         self._gap_ns, self._frame_ns = time_ns - self._frame_ns, time_ns
         if not self.keyframes:
@@ -152,8 +163,8 @@ class Odometry:
         new: Incoming,
     ) -> Tracked:
         """Begin a segment at this frame."""
-        corners = matching.harris_grid(new.grey, self.config.matching, new.mask)
-        if corners.uv_px.shape[0] < 2 * self.config.min_tracks:
+        uv = self._corners(new)
+        if len(uv) < 2 * self.config.min_tracks:
             return Tracked("lost", self.segment, reason="too little texture")
         self.segment += 1
         self._metric, self._lost = False, 0
@@ -166,7 +177,6 @@ class Odometry:
         )
         t = new.prior.position_m if new.prior.position_m is not None else np.zeros(3)
         T_odom_camera = se3.compose(R, t)
-        uv = corners.uv_px.astype(np.float64)
         self.keyframes = [
             OdometryKeyframe(
                 new.seq,
@@ -183,6 +193,11 @@ class Odometry:
         ]
         self._last = (new.time_ns, T_odom_camera, new.prior)
         return Tracked("started", self.segment, T_odom_camera, np.zeros((6, 6)))
+
+    def _corners(self, new: Incoming) -> F64:
+        """(N, 2) Harris corners of the frame, Eq. 4-5."""
+        found = self._matcher.corners(new.pyramid, self.config.matching, new.mask)
+        return found.uv_px.astype(np.float64)
 
     # ---- the second view --------------------------------------------------------------
 
@@ -336,7 +351,7 @@ class Odometry:
         index = np.flatnonzero(visible)
         if index.size < least:
             return "the view left the map"
-        found = matching.match(
+        found = self._matcher.match(
             key.pyramid,
             key.uv[index].astype(np.float32),
             pyramid,
@@ -426,7 +441,9 @@ class Odometry:
         least = 0.5 * self.config.least_base_to_height
         triangulate(key, T_camera_odom, uv, ok, self.K, least, self.config.loose_px)
         kept = np.flatnonzero(ok)
-        fresh = prediction.fresh_corners(new.grey, uv[kept], self.config.matching, new.mask)
+        fresh = prediction.fresh_corners(
+            self._corners(new), uv[kept], self.camera.size_px, self.config.matching.grid
+        )
         key_new = OdometryKeyframe(
             new.seq,
             new.time_ns,

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from recon import matching, se3, two_view
+from recon import se3, two_view
 from recon.camera_model import rays
 from recon.keyframe_window import OdometryKeyframe
-from recon.types import F64, U8, Bool, PosePrior
+from recon.types import F64, Bool, PosePrior
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,12 +118,10 @@ def _inverse_depth_plane(K: F64, P: F64) -> F64:
     return np.asarray(q)
 
 
-def fresh_corners(grey: U8, kept: F64, config: matching.MatchingConfig, mask: U8 | None) -> F64:
-    """(N, 2) corners in grid cells that no kept track occupies."""
-    corners = matching.harris_grid(grey, config, mask).uv_px.astype(np.float64)
-    H, W = grey.shape
-    taken = np.zeros((config.grid, config.grid), np.bool_)
-    cell = (kept / [W, H] * config.grid).astype(np.int64).clip(0, config.grid - 1)
+def fresh_corners(corners: F64, kept: F64, size_px: tuple[int, int], grid: int) -> F64:
+    """(N, 2) of the ``corners`` in cells of the ``grid`` that no kept track occupies."""
+    taken = np.zeros((grid, grid), np.bool_)
+    cell = (kept / size_px * grid).astype(np.int64).clip(0, grid - 1)
     taken[cell[:, 1], cell[:, 0]] = True
-    cell = (corners / [W, H] * config.grid).astype(np.int64).clip(0, config.grid - 1)
+    cell = (corners / size_px * grid).astype(np.int64).clip(0, grid - 1)
     return np.asarray(corners[~taken[cell[:, 1], cell[:, 0]]])

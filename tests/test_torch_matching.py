@@ -127,3 +127,75 @@ def test_refinement_ends_where_the_compiled_one_does(device: str) -> None:
     near &= np.abs(got.contrast_b.cpu().numpy() - contrast_b) < 0.1
     assert near[~lost].mean() > 0.98
     assert np.median(np.linalg.norm(got.uv.cpu().numpy() - truth, axis=1)[~lost]) < 0.05
+
+
+def large_picture(seed: int, height: int = 300, width: int = 420) -> U8:
+    """Texture that survives three halvings, and a patch that repeats."""
+    rng = np.random.default_rng(seed)
+    image = sum(
+        cv2.GaussianBlur(rng.normal(0, 50 * s, (height, width)), (0, 0), s) for s in (1, 3, 7)
+    )
+    image = np.clip(np.asarray(image) + 128, 0, 255)
+    tile = rng.integers(60, 200, (9, 9))
+    image[200:263, 300:363] = np.tile(tile, (7, 7))
+    return np.asarray(image, np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("radius_px", "shift", "zoom"), [(6.0, 2.4, 1.0), (14.0, 8.3, 1.02), (50.0, 31.7, 0.96)]
+)
+def test_matching_on_the_device_is_that_of_the_host(
+    device: str, radius_px: float, shift: float, zoom: float
+) -> None:
+    """From one level, two and four: the same points, at the same places to 0.02 px."""
+    from recon.backends.torch_matcher import TorchMatcher
+    from recon.matcher import HostMatcher, Matcher
+
+    A = np.array([[zoom, 0.02], [-0.02, zoom]])
+    t = np.array([shift, -0.6 * shift])
+    a = large_picture(7)
+    moved = cv2.warpAffine(a, np.column_stack([A, t]), a.shape[::-1], flags=cv2.INTER_CUBIC)
+    b = np.clip(0.9 * np.asarray(moved, np.float64) + 12, 0, 255).astype(np.uint8)
+    mask = np.full(a.shape, 255, np.uint8)
+    mask[:, :20] = 0
+    matchers: list[Matcher] = [HostMatcher(), TorchMatcher(device)]
+    levels = [(m.pyramid(a, 5), m.pyramid(b, 5)) for m in matchers]
+    corners, found = [], []
+    for matcher, (first, _) in zip(matchers, levels, strict=True):
+        corners.append({tuple(uv) for uv in matcher.corners(first, CONFIG, mask).uv_px.tolist()})
+    assert len(corners[0] & corners[1]) >= 0.99 * len(corners[0] | corners[1])
+    uv = np.array(sorted(corners[0]))
+    guess = uv @ A.T + t + np.random.default_rng(1).uniform(-2, 2, uv.shape)
+    guess[::23] = np.nan
+    for matcher, (first, second) in zip(matchers, levels, strict=True):
+        found.append(matcher.match(first, uv, second, guess, radius_px, A, CONFIG))
+    want, got = found
+    assert 0.5 < want.ok.mean() < 1.0
+    assert (want.ok == got.ok).mean() >= 0.98
+    both = want.ok & got.ok
+    assert (np.abs(want.uv_px - got.uv_px)[both].max(axis=1) < 0.02).mean() >= 0.98
+    assert (np.abs(want.zssd - got.zssd)[both] < 4e-3).mean() >= 0.98
+    truth = uv @ A.T + t
+    assert np.median(np.linalg.norm(got.uv_px - truth, axis=1)[got.ok]) < 0.1
+
+
+def test_what_the_matcher_is_given_is_checked(device: str) -> None:
+    """Shapes, sizes and radius; no points are no matches; a pyramid of another maker will do."""
+    from recon.backends.torch_matcher import TorchMatcher
+    from recon.matching import Pyramid
+
+    own = TorchMatcher(device)
+    a = own.pyramid(picture(1), 5)
+    with pytest.raises(ValueError, match="differ"):
+        own.corners(a, CONFIG, np.ones((3, 3), np.uint8))
+    with pytest.raises(ValueError, match="radius_px must be positive"):
+        own.match(a, [[50.0, 50.0]], a, [[50.0, 50.0]], 0.0, None, CONFIG)
+    with pytest.raises(ValueError, match="pyramids"):
+        smaller = Pyramid.build(picture(1)[:100])
+        own.match(a, [[50.0, 50.0]], smaller, [[50.0, 50.0]], 4.0, None, CONFIG)
+    nothing = own.match(a, np.zeros((0, 2)), a, np.zeros((0, 2)), 4.0, None, CONFIG)
+    assert nothing.uv_px.shape == (0, 2) and nothing.ok.shape == (0,)
+    uv = own.corners(a, CONFIG, None).uv_px
+    same = own.match(Pyramid.build(picture(1)), uv, a, uv + 1.0, 4.0, None, CONFIG)
+    assert same.ok.mean() > 0.8
+    assert np.abs(same.uv_px - uv)[same.ok].max() < 0.02

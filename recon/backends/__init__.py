@@ -18,6 +18,7 @@ from recon.upsampling import UpsamplingConfig
 
 if TYPE_CHECKING:
     from recon.backends.torch_kernels import Kernels
+    from recon.matcher import Matcher
     from recon.registration import IcpConfig
 
 
@@ -73,6 +74,15 @@ class PathBackend(Protocol):
         stages: DenseStages,
     ) -> DepthMap | None:
         """Depth of a keyframe on its grid ``size_px`` (w, h); None: do it stage by stage."""
+        ...
+
+
+@runtime_checkable
+class MatchingBackend(Protocol):
+    """A backend that finds corners and follows them on its device."""
+
+    def matcher(self) -> Matcher:
+        """One for a thread of its own, beside the one that reconstructs."""
         ...
 
 

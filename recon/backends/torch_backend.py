@@ -22,6 +22,7 @@ from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration, St
 from recon.upsampling import UpsamplingConfig, check_guide, guide_at_taps, upsample
 
 if TYPE_CHECKING:
+    from recon.matcher import Matcher
     from recon.registration import IcpConfig
 
 KEPT_PLANS = 8
@@ -54,6 +55,12 @@ class TorchBackend:
         self.kernels = kernels
         self._plans.clear()
         self._path = None
+
+    def matcher(self) -> Matcher:
+        """Corners and tracks on the same device, for another thread."""
+        from recon.backends.torch_matcher import TorchMatcher
+
+        return TorchMatcher(self.device)
 
     def belief_propagation(
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig

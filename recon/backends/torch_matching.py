@@ -157,10 +157,7 @@ def _scores(
     v = centre[:, 1, None] - reach - radius + side
     flat = image.float().view(-1) - 128
     window = flat[v.clamp(0, H - 1)[:, :, None] * W + u.clamp(0, W - 1)[:, None, :]]
-    scores = torch.zeros((len(centre), S, S), device=image.device)
-    for y in range(n):
-        for x in range(n):
-            scores = scores + patch[:, y, x, None, None] * window[:, y : y + S, x : x + S]
+    scores = F.conv2d(window[None], patch[:, None], groups=len(centre))[0]
     s1 = F.avg_pool2d(window, n, 1, divisor_override=1)
     s2 = F.avg_pool2d(window * window, n, 1, divisor_override=1)
     power = s2 - s1 * s1 / n**2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,9 @@ from recon.types import Array
 log = logging.getLogger(__name__)
 
 ALIGNMENT = 64  # bytes
+
+_capturing = Lock()
+"""One thread captures at a time; what others launch meanwhile is no part of its graph."""
 
 Part = tuple[tuple[int, ...], torch.dtype]
 """Shape and type of an input."""
@@ -95,7 +99,7 @@ class Plan:
                 self._module(*self._inputs)
         torch.cuda.current_stream().wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
+        with _capturing, torch.cuda.graph(graph, capture_error_mode="thread_local"):
             self._outputs = self._module(*self._inputs)
         self._replay = graph.replay
         log.debug("captured a CUDA graph for %s", [shape for shape, _ in self._parts])

@@ -12,16 +12,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from recon.backends import (
     BACKENDS,
     Backend,
     DenseStages,
     KernelBackend,
+    MatchingBackend,
     PathBackend,
     load_backend,
 )
 from recon.belief_propagation import BeliefPropagationConfig
+from recon.matcher import HostMatcher, Matcher
+from recon.matching import Corners, Matches, MatchingConfig, Pyramid
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 from recon.upsampling import UpsamplingConfig
 from service.errors import InputError, OutsideError
@@ -92,21 +96,69 @@ class FallbackBackend:
             )
         )
 
+    def matcher(self) -> Matcher:
+        """Of the backend's device while it works, else of the processor."""
+        return FallbackMatcher(self)
+
+    def device_matcher(self) -> Matcher | None:
+        """That of the backend at work; None where the processor follows corners."""
+        return self._backend.matcher() if isinstance(self._backend, MatchingBackend) else None
+
+    def fail(self, error: Exception) -> None:
+        """Compute on the processor from now on, because of this error."""
+        self.failure = str(error).splitlines()[0] if str(error) else type(error).__name__
+        log.error(
+            "backend %s on %s failed (%s): the CPU goes on", self.name, self.device, self.failure
+        )
+        self._backend = load_backend("cpu")
+
     def _run(self, operation: Callable[[Backend], Result]) -> Result:
+        backend = self._backend
         try:
-            return operation(self._backend)
+            return operation(backend)
         except (RuntimeError, MemoryError) as error:
-            if self._backend.name == "cpu":
+            if backend.name == "cpu":
                 raise
-            self.failure = str(error).splitlines()[0] if str(error) else type(error).__name__
-            log.error(
-                "backend %s on %s failed (%s): the CPU goes on",
-                self.name,
-                self.device,
-                self.failure,
-            )
-            self._backend = load_backend("cpu")
+            if self._backend is backend:
+                self.fail(error)
             return operation(self._backend)
+
+
+class FallbackMatcher:
+    """Corners and tracks by a backend's device, and by the processor once either failed."""
+
+    def __init__(self, backend: FallbackBackend) -> None:
+        self._fallback = backend
+        self._host = HostMatcher()
+        self._own = backend.device_matcher()
+
+    def pyramid(self, gray: U8, levels: int) -> Pyramid:
+        """See :class:`recon.matcher.Matcher`."""
+        return self._run(lambda m: m.pyramid(gray, levels))
+
+    def corners(self, pyramid: Pyramid, config: MatchingConfig, mask: U8 | None) -> Corners:
+        """See :class:`recon.matcher.Matcher`."""
+        return self._run(lambda m: m.corners(pyramid, config, mask))
+
+    def match(
+        self, pyramid_a: Pyramid, uv_a: npt.ArrayLike, pyramid_b: Pyramid,
+        uv_b_predicted: npt.ArrayLike, radius_px: float, warp: npt.ArrayLike | None,
+        config: MatchingConfig,
+    ) -> Matches:  # fmt: skip
+        """See :class:`recon.matcher.Matcher`."""
+        return self._run(
+            lambda m: m.match(pyramid_a, uv_a, pyramid_b, uv_b_predicted, radius_px, warp, config)
+        )
+
+    def _run(self, operation: Callable[[Matcher], Result]) -> Result:
+        if self._own is not None and self._fallback.failure is None:
+            try:
+                return operation(self._own)
+            except (RuntimeError, MemoryError) as error:
+                if self._fallback.failure is None:
+                    self._fallback.fail(error)
+        self._own = None
+        return operation(self._host)
 
 
 def choose_backend(name: str = "auto") -> Backend:

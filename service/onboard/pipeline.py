@@ -16,9 +16,10 @@ import numpy as np
 
 from mavlink.state import VehicleState
 from recon import se3
-from recon.backends import Backend
+from recon.backends import Backend, MatchingBackend
 from recon.camera_model import Undistorter, scaled
 from recon.exposure import stretch
+from recon.fix_average import FixAverage
 from recon.keyframe_window import OdometryKeyframe, landmarks
 from recon.odometry import Odometry, OdometryConfig, Tracked
 from recon.sharpness import BlurWatch
@@ -80,6 +81,7 @@ class Pipeline:
         self.odometry = Odometry(
             _within_width(self.undistorter.camera, 1280),
             OdometryConfig(base_to_height=config.scan.base_to_height),
+            backend.matcher() if isinstance(backend, MatchingBackend) else None,
         )
         self._blur = BlurWatch()
         self.viewpoints = Viewpoints(config.scan, config.compute.pairs)
@@ -98,6 +100,8 @@ class Pipeline:
         self._views: dict[int, Viewpoint] = {}  # asked for and not done yet
         self._carriers: dict[int, list[Anchorage]] = {}  # per segment, what is on the chain
         self._segment = self.odometry.segment
+        self._fixes = FixAverage()
+        self._priors: dict[int, PosePrior] = {}  # of the views that wait
         self._latest: Offer | None = None  # the last tracked frame that did not become a view
 
     # ---- one frame, as in Figure 1 -----------------------------------------------------
@@ -123,8 +127,9 @@ class Pipeline:
         key = self.odometry.keyframes[-1]
         offer = Offer(frame.seq, frame.time_ns, picture, tracked, key, prior, blurred)
         viewpoint = self.viewpoints.offer(offer)
+        self._fixes.take(tracked.T_odom_camera, prior)
         if viewpoint is not None:
-            self._waiting.append(viewpoint)
+            self._wait(viewpoint, prior)
         self._latest = offer if viewpoint is None else None
         self._ask_for_ready()
         keyframes = self._collect()
@@ -171,8 +176,14 @@ class Pipeline:
         """Make a view of a stretch's last frame: only it shows what the camera saw last."""
         viewpoint = self.viewpoints.end_stretch(self._latest)
         if viewpoint is not None:
-            self._waiting.append(viewpoint)
+            self._wait(viewpoint, viewpoint.prior)
+        self._fixes.forget()
         self._latest = None
+
+    def _wait(self, viewpoint: Viewpoint, prior: PosePrior) -> None:
+        """Keep a view until its partners are there; all fixes since the last one are its own."""
+        self._waiting.append(viewpoint)
+        self._priors[viewpoint.seq] = self._fixes.given(viewpoint.T_odom_camera, prior)
 
     def _pictures(self, image: U8) -> tuple[U8, U8, U8 | None]:
         """Undistorted picture, its grey version at the odometry's size, and the mask of that."""
@@ -193,6 +204,7 @@ class Pipeline:
         """Hand over the views whose partners are there."""
         while self._waiting and (everything or self.viewpoints.ready(self._waiting[0])):
             viewpoint = self._waiting.popleft()
+            prior = self._priors.pop(viewpoint.seq)
             if not self.viewpoints.confirmed(viewpoint):
                 self.refusals["seen by two views only"] += 1
                 continue
@@ -200,10 +212,10 @@ class Pipeline:
                 self.refusals["blurred"] += 1
                 continue
             self._views[viewpoint.seq] = viewpoint
-            self._jobs.offer(self._job(viewpoint))
+            self._jobs.offer(self._job(viewpoint, prior))
             self._asked.append(viewpoint)
 
-    def _job(self, viewpoint: Viewpoint) -> Job:
+    def _job(self, viewpoint: Viewpoint, prior: PosePrior) -> Job:
         points, _ = landmarks(viewpoint.key)
         segment = viewpoint.key.segment
         assert viewpoint.bgr is not None
@@ -211,7 +223,7 @@ class Pipeline:
             self._view(viewpoint),
             viewpoint.bgr,
             segment,
-            viewpoint.prior,
+            prior,
             tuple(self._view(p) for p in self.viewpoints.partners(viewpoint)),
             se3.transform(se3.inverse(viewpoint.T_key_camera), points),
             viewpoint.key.covariance,
