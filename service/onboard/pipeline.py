@@ -16,7 +16,7 @@ import numpy as np
 
 from mavlink.state import VehicleState
 from recon import se3
-from recon.backends import Backend, MatchingBackend
+from recon.backends import Backend
 from recon.camera_model import Undistorter, scaled
 from recon.exposure import stretch
 from recon.fix_average import FixAverage
@@ -81,7 +81,6 @@ class Pipeline:
         self.odometry = Odometry(
             _within_width(self.undistorter.camera, 1280),
             OdometryConfig(base_to_height=config.scan.base_to_height),
-            backend.matcher() if isinstance(backend, MatchingBackend) else None,
         )
         self._blur = BlurWatch()
         self.viewpoints = Viewpoints(config.scan, config.compute.pairs)

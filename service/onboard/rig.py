@@ -66,6 +66,9 @@ class Rig:
         position, sigma = self._position(fix)
         agl, sigma_agl = self._agl(state, tag)
         prior = PosePrior(R, tilt, yaw, position, sigma, agl, sigma_agl)
+        if position is not None and state is not None and state.receiver is not None:
+            above = state.receiver
+            prior = replace(prior, above_m=above.above_m, above_fixes=1, above_ns=above.time_ns)
         # With a position the altitude is part of it.
         if position is None and state is not None and self._fusion.altitude:
             prior = replace(prior, altitude_m=state.alt_amsl_m)
