@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from recon import se3
 from recon.alignment import Similarity
-from recon.pose_graph import PoseGraph, PoseGraphConfig
+from recon.keyframe_graph import KeyframeGraph
+from recon.pose_graph import PoseGraph
 from recon.types import F64, PosePrior
 
 
@@ -87,10 +88,11 @@ class Trajectory:
     """Keyframe poses of one scan, segment by segment."""
 
     def __init__(
-        self, config: TrajectoryConfig | None = None, graph: PoseGraphConfig | None = None
+        self, config: TrajectoryConfig | None = None, graph: KeyframeGraph | None = None
     ) -> None:
+        """``graph`` places the keyframes; a :class:`recon.pose_graph.PoseGraph` when left out."""
         self.config = config or TrajectoryConfig()
-        self.graph = PoseGraph(graph)
+        self.graph: KeyframeGraph = PoseGraph() if graph is None else graph
         self._told = _Told()
 
     def add(

@@ -43,6 +43,7 @@ from recon.virtual_stereo import (
 from recon.voxel_map import VoxelMap, VoxelMapConfig
 from service.compute.stopwatch import Stopwatch
 from service.config import ComputeConfig, Config
+from service.onboard.graph_aside import GraphAside
 from service.onboard.loops import LoopSearch
 from service.onboard.map_pages import PagedMap
 
@@ -73,10 +74,15 @@ class Dense:
         backend: Backend,
         least_base_to_height: float,
         pages: Path | None = None,
+        aside: bool = False,
     ) -> None:
-        """``pages`` is a folder for the parts of the map flown long ago; None: forget them."""
+        """``pages`` is a folder for the parts of the map flown long ago; None: forget them.
+
+        ``aside`` gives the pose graph a process of its own, so that nobody waits for it.
+        """
         compute = config.compute
-        self.trajectory = Trajectory()
+        self._aside = GraphAside() if aside else None
+        self.trajectory = Trajectory(graph=self._aside)
         self.lock = threading.Lock()
         self.stopwatch = Stopwatch()
         self.refusals: Counter[str] = Counter()
@@ -108,6 +114,11 @@ class Dense:
         if isinstance(self._map, PagedMap):
             self._map.close()
         self._map = None
+
+    def close(self) -> None:
+        """End what runs beside; call it last. The trajectory stays readable."""
+        if self._aside is not None:
+            self._aside.close()
 
     def set_least_base_to_height(self, least: float) -> None:
         """Accept baselines as short as ``least`` of the distance."""

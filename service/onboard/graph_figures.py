@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from recon.pose_graph import PoseGraph
+from recon.keyframe_graph import KeyframeGraph
 from service.stream.records import pack_covariance, pack_motion
 
 MOST_LOOPS = 300
 """Loops that a summary carries with their motions; of more, an even sample."""
 
 
-def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:
+def graph_figures(graph: KeyframeGraph) -> dict[str, Any] | None:
     """Residuals by kind of factor, loops and readings left out, fit for JSON; None when empty.
 
     ``loops.motions`` are the accepted loops as refinement takes them: two keyframes, seven

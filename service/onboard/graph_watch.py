@@ -6,7 +6,7 @@ import math
 import threading
 from collections.abc import Callable
 
-from recon.pose_graph import PoseGraph
+from recon.keyframe_graph import KeyframeGraph
 
 LEAST = 5
 """Readings of one kind left out before it is said."""
@@ -29,7 +29,9 @@ LEFT_OUT = {
 class GraphWatch:
     """Looks at a pose graph now and then; what it finds goes to ``tell`` when it is new."""
 
-    def __init__(self, graph: PoseGraph, lock: threading.Lock, tell: Callable[[str], None]) -> None:
+    def __init__(
+        self, graph: KeyframeGraph, lock: threading.Lock, tell: Callable[[str], None]
+    ) -> None:
         """``lock`` guards the graph."""
         self._graph, self._lock, self._tell = graph, lock, tell
         self._seen = 0

@@ -60,7 +60,8 @@ class Pipeline:
     """One scan: feed :meth:`step` every frame in order, then call :meth:`finish`.
 
     Tracking runs in the caller's thread, reconstruction beside it. ``live`` lets old work give
-    way when it cannot keep up; otherwise nothing is dropped.
+    way when it cannot keep up, and gives the pose graph a process of its own; otherwise nothing is
+    dropped.
     """
 
     def __init__(
@@ -85,7 +86,8 @@ class Pipeline:
         )
         self._blur = BlurWatch()
         self.viewpoints = Viewpoints(config.scan, config.compute.pairs)
-        self.dense = Dense(config, backend, self.viewpoints.least_base_to_height, pages)
+        least = self.viewpoints.least_base_to_height
+        self.dense = Dense(config, backend, least, pages, aside=live)
         self.stopwatch = self.dense.stopwatch
         self.refusals: Counter[str] = Counter()
         self._jobs: SideBySide[Job, Keyframe | None] = SideBySide(

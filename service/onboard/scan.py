@@ -189,6 +189,7 @@ class Scan:
             "warnings": [*self.inputs.notes, *self.inputs.source.warnings, *self._doubts()],
         }
         summary = self.recorder.close(extra | self.inputs.extra)
+        self.pipeline.dense.close()
         summary["clouds_per_second"] = round(summary["clouds"] / elapsed, 2)
         self.store.finish(summary)
         return summary
