@@ -6,7 +6,6 @@ I/O: :mod:`service.onboard.recorder` writes what comes out, and the commands fee
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections import Counter, deque
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,27 +19,19 @@ from recon.backends import Backend, MatchingBackend
 from recon.camera_model import Undistorter, scaled
 from recon.exposure import stretch
 from recon.fix_average import FixAverage
-from recon.keyframe_window import OdometryKeyframe, landmarks
+from recon.keyframe_window import landmarks
 from recon.odometry import Odometry, OdometryConfig, Tracked
 from recon.sharpness import BlurWatch
 from recon.trajectory import Placed
-from recon.types import F64, U8, Camera, Frame, Keyframe, PosePrior
+from recon.types import U8, Camera, Frame, Keyframe, PosePrior
 from recon.virtual_stereo import View
 from service.cameras.source import GeoTag
 from service.compute.side_by_side import SideBySide
 from service.config import ComputeConfig, Config, ScanConfig
+from service.onboard.anchorage import Anchorage, Carriers, Key
 from service.onboard.dense import Dense, Job
 from service.onboard.rig import Rig
 from service.onboard.viewpoints import Offer, Viewpoint, Viewpoints
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Anchorage:
-    """A frame's pose relative to an odometry keyframe, whose own pose gets better."""
-
-    seq: int
-    key: OdometryKeyframe
-    T_key_camera: F64  # (4, 4)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +91,7 @@ class Pipeline:
         self._waiting: deque[Viewpoint] = deque()
         self._asked: deque[Viewpoint] = deque(maxlen=8)  # whose reconstruction was asked for
         self._views: dict[int, Viewpoint] = {}  # asked for and not done yet
-        self._carriers: dict[int, list[Anchorage]] = {}  # per segment, what is on the chain
+        self._carriers = Carriers()
         self._segment = self.odometry.segment
         self._fixes = FixAverage()
         self._priors: dict[int, PosePrior] = {}  # of the views that wait
@@ -237,11 +228,12 @@ class Pipeline:
         out = []
         for job, keyframe in self._jobs.finished(everything):
             viewpoint = self._views.pop(job.view.seq)
-            self._carriers.setdefault(job.segment, []).append(
-                Anchorage(viewpoint.seq, viewpoint.key, viewpoint.T_key_camera)
-            )
+            for seq in [seq for seq in self._views if seq < viewpoint.seq]:
+                del self._views[seq]  # gave way
+            self._carriers.add(Anchorage(viewpoint.seq, viewpoint.key, viewpoint.T_key_camera))
             if keyframe is not None:
                 out.append(keyframe)
+        self._carriers.settle(self.is_settled)
         return tuple(out)
 
     # ---- poses -------------------------------------------------------------------------
@@ -259,15 +251,18 @@ class Pipeline:
 
     def place(self, anchor: Anchorage) -> Placed:
         """A frame in the world, carried by the chain's keyframe at or before it."""
-        T_odom_camera = anchor.key.T_odom_camera @ anchor.T_key_camera
-        carriers = self._carriers.get(anchor.key.segment)
-        if not carriers:
+        T_odom_camera = anchor.T_odom_camera
+        carrier = self._carriers.of(anchor)
+        if carrier is None:
             return Placed(anchor.key.seq, T_odom_camera, 1.0, np.eye(6), ("vision",))
-        i = bisect_right(carriers, anchor.seq, key=lambda c: c.seq)
-        carrier = carriers[max(i - 1, 0)]
-        T_carrier = carrier.key.T_odom_camera @ carrier.T_key_camera
+        moved = se3.inverse(carrier.T_odom_camera) @ T_odom_camera
         with self.dense.lock:
-            return self.dense.trajectory.ride(carrier.seq, se3.inverse(T_carrier) @ T_odom_camera)
+            return self.dense.trajectory.ride(carrier.seq, moved)
+
+    def is_settled(self, key: Key) -> bool:
+        """True when the odometry adjusts a keyframe of its no longer."""
+        window = self.odometry.keyframes
+        return key.segment != self.odometry.segment or not window or key.seq < window[0].seq
 
     def _moved(self, final: bool = False) -> tuple[Placed, ...]:
         with self.dense.lock:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from recon.trajectory import Placed
 from recon.types import F64, Keyframe
+from service.onboard.anchorage import Told, ToldFrames
 from service.onboard.graph_figures import graph_figures
-from service.onboard.pipeline import Anchorage, Pipeline, Step
+from service.onboard.pipeline import Pipeline, Step
 from service.onboard.rig import attitude_of
 from service.scans.inspection import save_debug
 from service.stream.codec import CodecConfig, encode
@@ -22,17 +22,6 @@ from service.stream.store import ScanStore
 
 TOLD_M = 0.05
 """A frame's pose that moved by more than this until the end is written again."""
-
-
-@dataclass(slots=True, eq=False)
-class _Told:
-    """A frame's pose as it was written."""
-
-    time_ns: int
-    anchor: Anchorage | None  # None: by telemetry alone, never corrected
-    position_m: F64  # (3,)
-    agl_m: float | None
-    is_view: bool
 
 
 class Recorder:
@@ -54,7 +43,7 @@ class Recorder:
         self.last: PoseRecord | None = None
         self._offset_ns = clock_offset_ns
         self._codec = CodecConfig()
-        self._told: list[_Told] = []
+        self._told = ToldFrames(store.path.parent)
         self._revision: Counter[int] = Counter()
         self._last: tuple[int, F64] | None = None  # unix ns and T_world_camera of the last pose
         self._origin_written = False
@@ -68,8 +57,8 @@ class Recorder:
         if step.placed is None:
             return
         position = step.placed.T_world_camera[:3, 3]
-        told = _Told(time_ns + self._offset_ns, step.anchor, position, agl_m, step.is_view)
-        self._told.append(told)
+        told = Told(time_ns + self._offset_ns, step.anchor, position, agl_m, step.is_view)
+        self._told.add(told, self.pipeline.is_settled)
         self.last = self._record(told, step.placed)
         self.store.add_pose(self.last)
 
@@ -77,6 +66,7 @@ class Recorder:
         """Write what is left, correct the trajectory, close the scan; return its summary."""
         self._write_keyframes(self.pipeline.finish())
         self._correct_trajectory()
+        self._told.close()
         summary = self.summary() | {"graph": graph_figures(self.pipeline.dense.trajectory.graph)}
         summary |= extra
         self.store.finish(summary)
@@ -85,9 +75,8 @@ class Recorder:
     def _correct_trajectory(self) -> None:
         """Write those poses again that corrections have moved; the newest of a time holds."""
         self._last, self.distance_m = None, 0.0
-        for told in self._told:
-            if told.anchor is None:
-                continue
+        for told in self._told.corrigible():
+            assert told.anchor is not None
             record = self._record(told, self.pipeline.place(told.anchor))
             if np.linalg.norm(record.T_world_camera[:3, 3] - told.position_m) > TOLD_M:
                 self.store.add_pose(record)
@@ -170,7 +159,7 @@ class Recorder:
             placed.covariance,
         )
 
-    def _record(self, told: _Told, placed: Placed) -> PoseRecord:
+    def _record(self, told: Told, placed: Placed) -> PoseRecord:
         """The pose record of a frame, with speed and turn from the one before it."""
         T = placed.T_world_camera
         roll, pitch, yaw = attitude_of(T)

@@ -1,0 +1,124 @@
+"""What a scan remembers of its frames: the same poses as ever, in memory that stays small."""
+
+from __future__ import annotations
+
+import resource
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.types import F64
+from service.errors import OutsideError
+from service.onboard.anchorage import Anchorage, Carriers, Key, Told, ToldFrames
+from service.onboard.pipeline import Pipeline
+
+RNG = np.random.default_rng(4)
+
+
+@dataclass
+class Refined:
+    """A keyframe of the odometry that is still adjusted."""
+
+    seq: int
+    segment: int
+    T_odom_camera: F64
+
+
+def some_pose() -> F64:
+    return se3.exp(RNG.normal(size=6))
+
+
+def before(limit: int) -> Any:
+    """Keyframes before ``limit`` no longer change."""
+
+    def is_settled(key: Key) -> bool:
+        return key.seq < limit
+
+    return is_settled
+
+
+def told(seq: int, key: Key, agl_m: float | None = 41.5) -> Told:
+    anchor = Anchorage(seq, key, some_pose())
+    return Told(10**18 + seq, anchor, RNG.normal(size=3), agl_m, seq % 2 == 0)
+
+
+def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
+    keys = [Refined(n, n // 20, some_pose()) for n in range(0, 40, 10)]
+    frames = [told(seq, keys[seq // 10], None if seq == 3 else 41.5) for seq in range(40)]
+    kept = ToldFrames(tmp_path)
+    for frame in frames:
+        kept.add(frame, before(20))
+    keys[2].T_odom_camera = some_pose()  # still in the window: the newest pose counts
+    found = list(kept.corrigible())
+    assert not list(tmp_path.iterdir())  # no name: nothing is left behind
+    for one, other in zip(frames, found, strict=True):
+        assert one.anchor is not None
+        assert other.anchor is not None
+        assert (one.time_ns, one.agl_m, one.is_view) == (other.time_ns, other.agl_m, other.is_view)
+        assert np.array_equal(one.position_m, other.position_m)
+        assert np.array_equal(one.anchor.T_odom_camera, other.anchor.T_odom_camera)
+        assert (one.anchor.seq, one.anchor.key.seq) == (other.anchor.seq, other.anchor.key.seq)
+        assert one.anchor.key.segment == other.anchor.key.segment
+    kept.close()
+
+
+def test_only_frames_of_keyframes_that_change_stay_in_memory(tmp_path: Path) -> None:
+    kept = ToldFrames(tmp_path)
+    for seq in range(500):
+        key = Refined(seq, 0, some_pose())
+        kept.add(told(seq, key), before(seq - 9))
+        kept.add(Told(10**18 + seq, None, np.zeros(3), None, False), before(seq - 9))
+    assert len(kept._fresh) <= 22
+    assert len(list(kept.corrigible())) == 500
+    kept.close()
+
+
+def test_a_full_disk_is_the_outside_worlds_fault(tmp_path: Path) -> None:
+    kept = ToldFrames(tmp_path)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with pytest.raises(OutsideError):
+            for seq in range(1000):
+                kept.add(told(seq, Refined(seq, 0, some_pose())), before(seq))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    kept.close()
+
+
+def test_carriers_keep_their_places_when_they_settle() -> None:
+    keys = [Refined(n, n // 50, some_pose()) for n in range(0, 100, 10)]
+    carriers = Carriers()
+    for key in keys:
+        carriers.add(Anchorage(key.seq, key, some_pose()))
+    frames = [Anchorage(seq, keys[seq // 10], some_pose()) for seq in range(100)]
+    found = [carriers.of(frame) for frame in frames]
+    carriers.settle(before(70))
+    for frame, old in zip(frames, found, strict=True):
+        new = carriers.of(frame)
+        assert new is not None
+        assert old is not None
+        assert new.seq == old.seq == frame.seq // 10 * 10
+        assert np.array_equal(new.T_odom_camera, old.T_odom_camera)
+        assert isinstance(new.key, Refined) == (new.seq >= 70)
+    assert carriers.of(Anchorage(0, Refined(0, 7, np.eye(4)), np.eye(4))) is None
+
+
+def test_views_that_gave_way_are_let_go() -> None:
+    """Live, a view that was never reconstructed must not be held with its pictures."""
+    pipeline: Any = Pipeline.__new__(Pipeline)
+    key = Refined(0, 0, np.eye(4))
+    pipeline._views = {
+        seq: SimpleNamespace(seq=seq, key=key, T_key_camera=np.eye(4)) for seq in (1, 3, 5, 7)
+    }
+    done = SimpleNamespace(view=SimpleNamespace(seq=5))
+    pipeline._jobs = SimpleNamespace(finished=lambda everything: [(done, None)])
+    pipeline._carriers = Carriers()
+    pipeline.odometry = SimpleNamespace(keyframes=[], segment=0)
+    assert pipeline._collect() == ()
+    assert list(pipeline._views) == [7]
