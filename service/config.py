@@ -140,6 +140,11 @@ class ComputeConfig:
         "last only record; undone when it passes",
         live=True,
     )
+    map_voxels: int = key(
+        2_000_000,
+        "known surface held in memory, some 40 bytes a voxel; what was flown longest ago is paged "
+        "to the scan's folder",
+    )
     hottest_c: float = key(90.0, "degrees of the hottest sensor that count as too hot", live=True)
     least_memory_mib: float = key(300.0, "memory left that counts as short", live=True)
 
@@ -151,6 +156,7 @@ class ComputeConfig:
         _within("compute.iterations", self.iterations, 1, 100)
         _within("compute.pairs", self.pairs, 1, 64)
         _within("compute.guide_width", self.guide_width, 64, 8192)
+        _within("compute.map_voxels", self.map_voxels, 1000, 8_000_000)
         _within("compute.hottest_c", self.hottest_c, 30, 150)
         _within("compute.least_memory_mib", self.least_memory_mib, 0, 1e6)
         if self.guide_width < self.stereo_width:
@@ -199,6 +205,13 @@ class FusionConfig:
     attitude: bool = key(True, "use roll, pitch and yaw")
     altitude: bool = key(True, "use the height above ground")
     loops: bool = key(True, "look for places seen before and close the loop")
+    loop_views: int = key(
+        400, "keyframes remembered for that, 0.1 MB each; of more, every second old one goes"
+    )
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        _within("fusion.loop_views", self.loop_views, 2, 100_000)
 
 
 @dataclass(frozen=True, slots=True)

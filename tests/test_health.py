@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import shutil
 import socket
@@ -14,7 +15,9 @@ import pytest
 
 from service.config import Config, load_config, reload
 from service.daemon.health import HealthServer, Notifier, metrics_text
+from service.daemon.health_api import STATUS
 from service.daemon.machine import CoreLoad, Machine, computer_load, read_machine
+from service.daemon.runtime import Daemon
 from service.errors import OutsideError
 from service.scans.retention import close_open_scans, make_room
 from service.stream.records import ScanHeader
@@ -58,10 +61,35 @@ def test_http_tells_health_status_and_metrics() -> None:
         assert code == 503
         assert json.loads(text)["fault"] == "camera lost"
         assert fetch(server.port, "/etc/passwd")[0] == 404
+        described = json.loads(fetch(server.port, "/openapi.json")[1])["paths"]
+        assert set(described) == {"/healthz", "/status", "/metrics", "/openapi.json"}
+        for method, code in (("HEAD", 200), ("POST", 405), ("DELETE", 405)):
+            assert asked(server.port, "/status", method) == (code, "")
         with pytest.raises(OutsideError, match="another port"):
             HealthServer(f"127.0.0.1:{server.port}", lambda: snapshot)
     finally:
         server.close()
+
+
+def asked(port: int, path: str, method: str) -> tuple[int, str]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    try:
+        connection.request(method, path)
+        answer = connection.getresponse()
+        return answer.status, answer.read().decode()
+    finally:
+        connection.close()
+
+
+def test_the_description_holds_for_what_the_daemon_says(tmp_path: Path) -> None:
+    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
+    found = daemon.snapshot()
+    kinds = {"string": str, "boolean": bool, "integer": int, "object": dict}
+    for schema, value in ((STATUS, found), (STATUS["properties"]["load"], found["load"])):
+        assert set(schema["required"]) <= set(value) <= set(schema["properties"])
+        for name, given in value.items():
+            kind = schema["properties"][name]["type"]
+            assert isinstance(given, kinds.get(kind, (int, float))), name
 
 
 @pytest.mark.parametrize(
@@ -201,15 +229,20 @@ def scan(folder: Path, name: str, finished: bool) -> Path:
 def test_open_scans_are_closed_after_a_crash(tmp_path: Path) -> None:
     left = scan(tmp_path, "20260101T000000Z", finished=False)
     done = scan(tmp_path, "20260102T000000Z", finished=True)
+    (done / "scan.json").write_text("{}")
+    half = scan(tmp_path, "20260103T000000Z", finished=True)  # killed before its files were there
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "scan.db").write_bytes(b"no database")
     assert close_open_scans(tmp_path, before_unix_s=0.0) == []  # written since: in use
-    assert close_open_scans(tmp_path, FAR_FUTURE_S) == [left.name]
+    assert close_open_scans(tmp_path, FAR_FUTURE_S) == [left.name, half.name]
     with ScanStore.open(left / "scan.db") as store:
         assert store.finished
         assert store.summary == {"interrupted": True}
     assert json.loads((left / "scan.json").read_text())["finished"] is True
-    assert not (done / "scan.json").exists()
+    assert (done / "scan.json").read_text() == "{}"
+    with ScanStore.open(half / "scan.db") as store:
+        assert store.summary == {"frames": 1}
+    assert (half / "cloud.laz").is_file()
     assert close_open_scans(tmp_path, FAR_FUTURE_S) == []
 
 

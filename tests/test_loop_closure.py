@@ -228,10 +228,9 @@ def test_a_lost_stretch_is_found_again_from_the_pictures() -> None:
 
 
 def test_the_search_keeps_a_bounded_number_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.onboard.loops.MOST_VIEWS", 6)
     seen = view(A, 1)
     trajectory = Trajectory()
-    search = LoopSearch(trajectory, threading.Lock())
+    search = LoopSearch(trajectory, threading.Lock(), most_views=6)
     for i in range(20):
         T = camera(300.0 * i, 0.0, 40.0, 0.0)
         trajectory.add(i, 0, T, PosePrior(), None, i * 10**9, np.eye(6) * 1e-4)

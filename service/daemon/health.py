@@ -14,12 +14,16 @@ from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
+from service.daemon.health_api import DOCUMENT
 from service.errors import OutsideError
 
 log = logging.getLogger(__name__)
 
 Snapshot = Callable[[], dict[str, Any]]
 PREFIX = "skyrelief_"
+
+EXTENSION_US = 30_000_000
+"""Without progress for so long, systemd ends a service that is closing its scan."""
 
 
 class Notifier:
@@ -39,6 +43,10 @@ class Notifier:
         """Progress was made; feeds the watchdog."""
         self._send("WATCHDOG=1" + (f"\nSTATUS={status}" if status else ""))
 
+    def closing(self) -> None:
+        """Closing gets on: systemd waits for another :data:`EXTENSION_US`."""
+        self._send(f"EXTEND_TIMEOUT_USEC={EXTENSION_US}")
+
     def stopping(self) -> None:
         """The service is on its way out."""
         self._send("STOPPING=1")
@@ -55,8 +63,9 @@ class Notifier:
 class HealthServer:
     """``/healthz`` (200 or 503), ``/status`` (JSON) and ``/metrics`` (Prometheus) over HTTP.
 
-    ``snapshot`` is called for each request, on a thread of its own; its ``ok`` decides about
-    ``/healthz``, its numbers become metrics.
+    ``/openapi.json`` describes them (:mod:`service.daemon.health_api`). ``snapshot`` is called
+    for each request, on a thread of its own; its ``ok`` decides about ``/healthz``, its numbers
+    become metrics.
     """
 
     def __init__(self, address: str, snapshot: Snapshot) -> None:
@@ -108,6 +117,9 @@ def _handler(snapshot: Snapshot) -> type[BaseHTTPRequestHandler]:
 
         def do_GET(self) -> None:
             path = self.path.partition("?")[0]
+            if path == "/openapi.json":
+                self._answer(200, json.dumps(DOCUMENT), "application/json")
+                return
             found = snapshot()
             if path == "/healthz":
                 ok = bool(found.get("ok"))
@@ -120,6 +132,17 @@ def _handler(snapshot: Snapshot) -> type[BaseHTTPRequestHandler]:
             else:
                 self._answer(404, "there are /healthz, /status and /metrics\n", "text/plain")
 
+        do_HEAD = do_GET
+
+        def _refuse(self) -> None:
+            self.send_response(405)
+            self.send_header("Allow", "GET, HEAD")
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+            self.close_connection = True  # a body may follow, which nobody reads
+
+        do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = _refuse
+
         def _answer(self, code: int, text: str, kind: str) -> None:
             body = text.encode()
             self.send_response(code)
@@ -127,7 +150,8 @@ def _handler(snapshot: Snapshot) -> type[BaseHTTPRequestHandler]:
             self.send_header("Content-Length", str(len(body)))
             self.send_header("Cache-Control", "no-store")
             self.end_headers()
-            self.wfile.write(body)
+            if self.command != "HEAD":
+                self.wfile.write(body)
 
         def log_message(self, format: str, *args: Any) -> None:
             log.debug("http: " + format, *args)

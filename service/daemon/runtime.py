@@ -39,6 +39,9 @@ STUCK_S = 10.0
 HUNG_S = 20.0
 """Work on one frame or view for so long is a hang: the watchdog is no longer fed."""
 
+CLOSING_S = 120.0
+"""Closing a scan without a step, a read or a written byte for so long is a hang, too."""
+
 COMPILING_S = 180.0
 """The same before anything was compiled, where nobody ran ``skyrelief warm-up``."""
 
@@ -82,7 +85,7 @@ class Daemon:
             self._watch(notifier)
         finally:
             notifier.stopping()
-            self.scanning.end()
+            self.scanning.end(notifier.closing)
             self.vehicle.stop()
             if http is not None:
                 http.close()
@@ -104,7 +107,12 @@ class Daemon:
     def is_progressing(self) -> bool:
         """False for a hang that only a restart ends; a camera that gives nothing is none."""
         most_s = HUNG_S if self.scanning.is_warm else COMPILING_S
-        return self.scanning.busy_s < most_s and self.vehicle.is_serving
+        most_closing_s = CLOSING_S + self.config.datalink.drain_s  # a dead radio is waited for
+        return (
+            self.scanning.busy_s < most_s
+            and self.scanning.idle_closing_s < most_closing_s
+            and self.vehicle.is_serving
+        )
 
     def quit(self) -> None:
         """Close a running scan, then let :meth:`run` return."""

@@ -9,13 +9,15 @@ import logging
 import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mavlink.control import ACCEPTED, Answer, Phase, Result, Work
 from mavlink.status import CRITICAL, WARNING
 from mavlink.vehicle import VehicleLink
 from service.config import Config
+from service.daemon.closing import ClosingWatch, sizes
 from service.daemon.degradation import Level, lowered
+from service.daemon.memory import give_back
 from service.daemon.warm_up import is_warm
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.onboard.datalink import DaemonLink
@@ -63,6 +65,8 @@ class Scanning:
         self._paused = threading.Event()
         self._worker: threading.Thread | None = None
         self._closing: Work | None = None
+        self._watch = ClosingWatch()
+        self._store: ScanStore | None = None  # of the scan that runs
         self._retry_at_s: float | None = None
         self._retry_s = FIRST_RETRY_S
         self._latency_ms: float | None = None  # of the camera, as the last scan found it
@@ -152,6 +156,26 @@ class Scanning:
             return 0.0
         return max(gate.busy_s, scan.pipeline.busy_s)
 
+    @property
+    def idle_closing_s(self) -> float:
+        """Seconds for which the closing of a scan has not got on; 0 while none is closed.
+
+        To be asked often: progress is what has changed since it was asked last.
+        """
+        return self._watch.look(self._closing_marks() if self._is_closing else None)
+
+    @property
+    def _is_closing(self) -> bool:
+        return self.is_running and (self._stop.is_set() or self.phase is Phase.FINALISING)
+
+    def _closing_marks(self) -> tuple[Any, ...]:
+        """What changes when closing gets on: uses of the store, bytes of files, keyframes."""
+        scan, store, worker = self.scan, self._store, self._worker
+        if scan is None or store is None or worker is None:
+            return (self.phase,)
+        folder = scan.inputs.folder
+        return (self.phase, store.uses(worker.ident or 0), scan.recorder.keyframes, sizes(folder))
+
     def set_level(self, level: Level) -> None:
         """Do less with the pictures, or more again, in this scan and in the next."""
         self.level = level
@@ -176,12 +200,18 @@ class Scanning:
         if due and not self.is_running:
             self.start()
 
-    def end(self) -> None:
-        """Close the running scan, wait for its files, and start no other."""
+    def end(self, alive: Callable[[], None] = lambda: None) -> None:
+        """Close the running scan, wait for its files, and start no other.
+
+        ``alive`` is called every second while closing gets on.
+        """
         self._ended.set()
         self._stop_feeding()
-        if self._worker is not None:
-            self._worker.join()
+        worker = self._worker
+        while worker is not None and worker.is_alive():
+            if self.idle_closing_s < 1.5:
+                alive()
+            worker.join(1.0)
         self.link.rest()
 
     # ---- the scan's thread ------------------------------------------------------------------
@@ -196,8 +226,9 @@ class Scanning:
             first, *_ = str(error).strip().splitlines() or [type(error).__name__]
             self._fail(f"internal fault: {first}")
         finally:
-            self.scan = self.gate = None
+            self.scan = self.gate = self._store = None
             self.phase = Phase.IDLE
+            give_back()
             if self._closing is not None:
                 failed = Answer(Result.FAILED, self.fault)
                 self._closing.finish(failed if self.fault else ACCEPTED)
@@ -252,7 +283,7 @@ class Scanning:
         store = create_store(inputs)
         self.vehicle.record(folder / "link.tlog")
         self.link.take_off(store, self.config, self.vehicle)
-        self.scan, self.gate = Scan(inputs, store), gate
+        self.scan, self.gate, self._store = Scan(inputs, store), gate, store
         self.set_level(self.level)
         self.vehicle.statustext(f"Scan {scan_id} started")
         try:

@@ -107,7 +107,10 @@ class Dense:
         self._resolution_m = config.scan.resolution_m
         self._before: tuple[int, DepthMap | None, F64] | None = None  # seq, depth, T_map_camera
         self._relief = (0.0, 0.0)
-        self.loops = LoopSearch(self.trajectory, self.lock) if config.fusion.loops else None
+        self._map_voxels = compute.map_voxels
+        self.loops: LoopSearch | None = None
+        if config.fusion.loops:
+            self.loops = LoopSearch(self.trajectory, self.lock, most_views=config.fusion.loop_views)
 
     def forget_map(self) -> None:
         """Count every surface as new again."""
@@ -232,7 +235,9 @@ class Dense:
                 voxel_m = max(2.0 * ground_m, self._resolution_m, 1e-3)
                 fine = VoxelMapConfig(voxel_m=voxel_m)
                 pages = self._pages
-                self._map = PagedMap(fine, pages) if pages is not None else VoxelMap(fine)
+                self._map = (
+                    VoxelMap(fine) if pages is None else PagedMap(fine, pages, self._map_voxels)
+                )
             fresh = self._map.fresh(in_map)
             self._map.insert(in_map, fresh)
         with self.lock:

@@ -21,9 +21,6 @@ WIDTH_PX = 640
 LEAST_DEPTH_PX = 120
 """A depth image at least twice as wide is kept at half its size."""
 
-MOST_VIEWS = 400
-"""Kept at once, about 0.1 MB each; on longer flights every second of the older half goes."""
-
 TRIES = 2
 """Verifications per keyframe, at most. Each is bounded work: some 30 to 120 ms on one core."""
 
@@ -79,9 +76,18 @@ class LoopSearch:
     """Remembers keyframes, finds earlier ones that see the same, and tells the trajectory."""
 
     def __init__(
-        self, trajectory: Trajectory, lock: threading.Lock, config: LoopConfig | None = None
+        self,
+        trajectory: Trajectory,
+        lock: threading.Lock,
+        config: LoopConfig | None = None,
+        most_views: int = 400,
     ) -> None:
-        """``lock`` guards the trajectory."""
+        """``lock`` guards the trajectory.
+
+        Of more than ``most_views`` keyframes, about 0.1 MB each, every second of the older half
+        is forgotten.
+        """
+        self._most_views = most_views
         self.counts: Counter[str] = Counter()  # "tried", "verified", "taken"
         self.trajectory, self._lock = trajectory, lock
         self._config = config or LoopConfig()
@@ -105,7 +111,7 @@ class LoopSearch:
             self._rest -= 1
         else:
             self._search(new)
-        if len(self._kept) > MOST_VIEWS:
+        if len(self._kept) > self._most_views:
             self._thin()
 
     def _search(self, new: _Kept) -> None:

@@ -24,7 +24,7 @@ def close_open_scans(folder: Path, before_unix_s: float) -> list[str]:
     kept and their files are written, with ``interrupted`` in the summary. One that cannot be
     read is left as it is, with a warning.
     """
-    from service.scans.folder import write_deliverables
+    from service.scans.folder import SUMMARY, write_deliverables
     from service.stream.store import ScanStore
 
     closed = []
@@ -33,10 +33,11 @@ def close_open_scans(folder: Path, before_unix_s: float) -> list[str]:
             continue  # the scan that is being made
         try:
             with ScanStore.open(path) as store:
-                if store.finished:
+                if store.finished and (path.parent / SUMMARY).is_file():  # its last file
                     continue
                 shutil.rmtree(path.parent / PAGES, ignore_errors=True)
-                store.finish({"interrupted": True})
+                if not store.finished:
+                    store.finish({"interrupted": True})
                 write_deliverables(path.parent, store, {})
         except (SkyreliefError, ValueError, OSError, sqlite3.Error) as error:
             log.warning("%s cannot be closed: %s", path.parent, error)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sqlite3
 import threading
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ class Database:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.uses: Counter[int] = Counter()  # queries that came back, by thread
         self.lock = threading.RLock()
         try:
             self._connection = sqlite3.connect(path, check_same_thread=False, timeout=10.0)
@@ -61,7 +63,9 @@ class Database:
         """All rows of a query. Raises OutsideError when the file cannot be read."""
         try:
             with self.lock:
-                return self._connection.execute(sql, values).fetchall()
+                rows = self._connection.execute(sql, values).fetchall()
+                self.uses[threading.get_ident()] += 1
+                return rows
         except sqlite3.Error as error:
             raise OutsideError(f"cannot read {self.path} ({error}); check the disk") from error
 
@@ -80,6 +84,7 @@ class Database:
                 raise OutsideError(
                     f"cannot write {self.path} ({error}); free some space or check the disk"
                 ) from error
+            self.uses[threading.get_ident()] += 1
             return self._connection.total_changes - before
 
     def get(self, key: str) -> str | None:

@@ -95,6 +95,10 @@ class ScanStore:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def uses(self, thread: int) -> int:
+        """How often a thread (``Thread.ident``) has read or written it so far."""
+        return self._db.uses[thread]
+
     # Header and summary
 
     @property

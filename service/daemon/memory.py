@@ -1,0 +1,32 @@
+"""Keeps a long-lived process from holding memory that nothing uses.
+
+The C library gives threads pools of their own, and keeps what was freed in them. Pictures are
+taken and freed on several threads, so that each pool would grow to the largest need of all.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+
+M_ARENA_MAX = -8  # mallopt(3)
+POOLS = 2
+
+
+def few_pools() -> bool:
+    """True when the C library keeps to two pools from now on; threads that run have theirs."""
+    libc = _libc("mallopt")
+    return libc is not None and libc.mallopt(M_ARENA_MAX, POOLS) == 1
+
+
+def give_back() -> bool:
+    """True when freed memory went back to the system; to be asked after a scan."""
+    gc.collect()
+    libc = _libc("malloc_trim")
+    return libc is not None and libc.malloc_trim(0) == 1
+
+
+def _libc(name: str) -> ctypes.CDLL | None:
+    """The C library if it has that function (glibc has)."""
+    libc = ctypes.CDLL(None)
+    return libc if hasattr(libc, name) else None

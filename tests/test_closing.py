@@ -1,0 +1,130 @@
+"""Closing a scan: progress is seen, a hang is found out, the scan is kept."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from loopback import until
+
+from mavlink.control import Phase
+from service.config import load_config
+from service.daemon import runtime
+from service.daemon.closing import ClosingWatch, sizes
+from service.daemon.memory import few_pools, give_back
+from service.daemon.runtime import Daemon
+from service.daemon.scanning import Scanning
+from service.stream.records import ScanHeader
+from service.stream.store import ScanStore
+
+
+def test_only_what_changes_is_progress() -> None:
+    now_s = 100.0
+    watch = ClosingWatch(lambda: now_s)
+    assert watch.look(None) == 0.0
+    assert watch.look((1, "a")) == 0.0
+    now_s = 130.0
+    assert watch.look((1, "a")) == 30.0
+    assert watch.look((2, "a")) == 0.0  # it got on
+    now_s = 135.0
+    assert watch.look((2, "a")) == 5.0
+    assert watch.look(None) == 0.0  # closed
+    now_s = 150.0
+    assert watch.look((2, "a")) == 0.0  # another scan is closed
+
+
+def test_files_grow_but_not_by_the_work_of_others(tmp_path: Path) -> None:
+    assert sizes(tmp_path / "none") == ()
+    (tmp_path / ".cloud.laz.part").write_bytes(b"12")
+    before = sizes(tmp_path)
+    for name in ("scan.db-wal", "scan.db", "link.tlog"):
+        (tmp_path / name).write_bytes(b"acknowledged by the ground meanwhile")
+    assert sizes(tmp_path) == before
+    (tmp_path / ".cloud.laz.part").write_bytes(b"123")
+    assert sizes(tmp_path) != before
+
+
+class Hung:
+    """A scan whose closing waits at a gate, then uses its store, then waits for good."""
+
+    def __init__(self, scanning: Scanning, folder: Path) -> None:
+        header = ScanHeader("s", "d", 1, camera={}, configuration={}, software="test")
+        self.store = ScanStore.create(folder / "s" / "scan.db", header)
+        self.scanning, self.step, self.end = scanning, threading.Event(), threading.Event()
+
+    def scan_once(self) -> None:
+        scanning: Any = self.scanning
+        scanning.scan = SimpleNamespace(
+            source=SimpleNamespace(close=lambda: None),
+            inputs=SimpleNamespace(folder=self.store.path.parent, scan_id="s"),
+            recorder=SimpleNamespace(keyframes=3),
+        )
+        scanning._store = self.store
+        scanning._stop.wait(60.0)
+        scanning.phase = Phase.FINALISING
+        self.step.wait(60.0)
+        self.store.seqs()
+        self.end.wait(60.0)
+
+
+def test_a_closing_that_hangs_is_no_progress(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
+    scanning, now_s = daemon.scanning, 0.0
+    monkeypatch.setattr(type(daemon.vehicle), "is_serving", True)
+    scanning._watch = ClosingWatch(lambda: now_s)
+    hung = Hung(scanning, tmp_path)
+    monkeypatch.setattr(scanning, "_scan_once", hung.scan_once)
+    limit_s = runtime.CLOSING_S + daemon.config.datalink.drain_s
+    scanning.start()
+    now_s = 10.0 * limit_s
+    assert daemon.is_progressing  # scanning, not closing
+    scanning.stop()
+    until(lambda: scanning.phase is Phase.FINALISING)
+    assert daemon.is_progressing
+    now_s += 0.9 * limit_s
+    assert daemon.is_progressing
+    hung.store.set_held("ground", {})  # another thread's use of the store is no progress
+    now_s += 0.2 * limit_s
+    assert not daemon.is_progressing
+    hung.step.set()  # a step of the closing itself is
+    until(lambda: daemon.is_progressing)
+    now_s += 1.1 * limit_s
+    assert not daemon.is_progressing
+    hung.end.set()
+    until(lambda: not scanning.is_running)
+    assert daemon.is_progressing
+    hung.store.close()
+
+
+def test_systemd_is_asked_to_wait_only_while_closing_gets_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
+    scanning, now_s, asked = daemon.scanning, 0.0, []
+    scanning._watch = ClosingWatch(lambda: now_s)
+    hung = Hung(scanning, tmp_path)
+    monkeypatch.setattr(scanning, "_scan_once", hung.scan_once)
+    scanning.start()
+    until(lambda: scanning.scan is not None)
+
+    def alive() -> None:
+        nonlocal now_s
+        asked.append(now_s)
+        now_s += 100.0  # from here on nothing gets on
+        hung.step.set()
+        hung.end.set()
+
+    scanning.end(alive)
+    assert asked[0] == 0.0
+    assert len(asked) <= 2
+    hung.store.close()
+
+
+def test_memory_settings_are_taken_where_the_library_has_them() -> None:
+    assert few_pools()
+    assert give_back() in (True, False)
