@@ -112,6 +112,24 @@ def test_silent_sensors_are_exact() -> None:
     np.testing.assert_allclose(sensors.R_ned_gimbal(t), flight.R_ned_gimbal(t), atol=1e-12)
 
 
+@pytest.mark.parametrize(("word", "slow", "white"), [("wander", 1.0, 0.0), ("white", 0.0, 1.0)])
+def test_gnss_errs_slowly_or_in_each_fix(word: str, slow: float, white: float) -> None:
+    noise = SensorNoise.of(word, SensorNoise(gps_m=1.0, gps_white_m=0.0))
+    flight = fly(still(duration_s=3000.0, speed_m_s=0.1), 1)
+    t = seconds(3000.0, 0.2)
+    error = Sensors(flight, noise, np.random.default_rng(0)).gps(t) - flight.position(t)
+    assert error[:, :2].std() == pytest.approx(1.0, rel=0.3)
+    step = np.diff(error[:, 0]).std() / np.sqrt(2)  # what differs from fix to fix
+    assert step == pytest.approx(white, abs=0.1) and noise.gps_m == slow
+
+
+def test_exact_gnss_makes_every_sensor_exact() -> None:
+    noise = SensorNoise.of("exact", SensorNoise())
+    assert not any(getattr(noise, name) for name in noise.__slots__)
+    with pytest.raises(ValueError, match="'pink'"):
+        SensorNoise.of("pink", SensorNoise())
+
+
 @pytest.mark.parametrize(
     "changes",
     [

@@ -182,6 +182,26 @@ def test_vehicle_history_gives_the_true_attitude(frame: str, tmp_path: Path) -> 
         assert np.degrees(turn.magnitude()) < 0.5
 
 
+def test_a_boresight_and_a_leaning_rangefinder(tmp_path: Path) -> None:
+    """The gimbal's word is off by the angles asked for; the range is that along the body."""
+    folder = tmp_path / "flight"
+    simulate(folder, "--gnss-noise", "exact", "--no-video", "--boresight-deg", "2:-1",
+             "--relief-m", "0", "--density", "0", "--duration-s", "20")  # fmt: skip
+    assert not (folder / "flight.mp4").exists()
+    history, rows = load_telemetry(folder / "flight.tlog").history, trajectory(folder)
+    off = []
+    for row in rows[:: len(rows) // 12]:
+        state = history.state_at(round(row[0] * 1e9))
+        assert state is not None and state.q_ned_gimbal_wxyz is not None
+        said = R_ENU_NED @ rotation_from_quaternion(state.q_ned_gimbal_wxyz) @ R_GIMBAL_CAMERA
+        axis = said.T @ Rotation.from_quat(row[4:8]).as_matrix()[:, 2]  # in the said camera
+        angles = np.degrees(np.arctan2([axis[0], -axis[1]], axis[2]))
+        np.testing.assert_allclose(angles, [2.0, -1.0], atol=0.3)
+        assert state.alt_agl_m is not None
+        off.append(state.alt_agl_m - row[3])
+    assert np.median(np.abs(off)) < 0.03  # but for what stands in open country
+
+
 def test_same_seed_same_files(exact: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         simulate(tmp_path / name, "--duration-s", "1")
@@ -223,6 +243,8 @@ def test_flight_without_telemetry(tmp_path: Path) -> None:
         (["--blank", "three"], "--blank"),
         (["--telemetry-gap", "1"], "--telemetry-gap"),
         (["--gimbal-frame", "moon"], "gimbal frame"),
+        (["--gnss-noise", "pink"], "pink"),
+        (["--boresight-deg", "60:0"], "boresight"),
         (["--photos", "nowhere"], "no such folder"),
         (["--duration-s", "7000", "--speed-m-s", "50"], "shorter"),
         (["--height-m", "nan"], "height"),

@@ -38,11 +38,18 @@ def simulate(
     density: Annotated[float, typer.Option(help="Houses and trees; 0 is open country.")] = 1.0,
     photos: Annotated[Path | None, typer.Option(help="Aerial photos as the ground.")] = None,
     gps_noise_m: Annotated[float, typer.Option(help="Wander of the GPS.")] = 1.0,
+    gnss_noise: Annotated[
+        str, typer.Option(help="wander: slowly; white: each fix anew; exact: no sensor errs.")
+    ] = "wander",
+    boresight_deg: Annotated[
+        str, typer.Option(help="RIGHT:UP degrees, where the camera looks off the gimbal's word.")
+    ] = "0:0",
     baro_noise_m: Annotated[float, typer.Option(help="Wander of the altitude.")] = 0.5,
     attitude_noise_deg: Annotated[float, typer.Option(help="Wander of roll and pitch.")] = 0.3,
     yaw_noise_deg: Annotated[float, typer.Option(help="Wander of the heading.")] = 1.0,
     image_noise: Annotated[float, typer.Option(help="Sensor noise in grey levels.")] = 1.5,
     telemetry: Annotated[bool, typer.Option(help="Write flight.tlog.")] = True,
+    video: Annotated[bool, typer.Option(help="Render flight.mp4.")] = True,
     gimbal_frame: Annotated[str, typer.Option(help="Yaw of the gimbal: earth, vehicle.")] = "earth",
     rangefinder: Annotated[bool, typer.Option(help="Send DISTANCE_SENSOR.")] = True,
     telemetry_gap: Annotated[str, typer.Option(help="FROM:TO seconds without packets.")] = "",
@@ -77,13 +84,17 @@ def simulate(
                 pattern, duration_s, height_m, speed_m_s, heading_deg, camera_pitch_deg, legs,
                 spacing_m, wobble_deg, sway_m,
             ),
-            SensorNoise(
-                gps_m=gps_noise_m, baro_m=baro_noise_m, attitude_deg=attitude_noise_deg,
-                yaw_deg=yaw_noise_deg,
+            SensorNoise.of(
+                gnss_noise,
+                SensorNoise(
+                    gps_m=gps_noise_m, baro_m=baro_noise_m, attitude_deg=attitude_noise_deg,
+                    yaw_deg=yaw_noise_deg,
+                ),
             ),
             TelemetryOptions(
                 gimbal_frame, rangefinder,
                 _pair(telemetry_gap, "--telemetry-gap") if telemetry_gap else None, log_lead_s,
+                _pair(boresight_deg, "--boresight-deg"),
             ),
             Look(noise=image_noise),
             recording.Faults(
@@ -92,7 +103,7 @@ def simulate(
             ),
             seed, _size(size), fps, focal,
             recording.DISTORTION if distortion else (0.0, 0.0, 0.0, 0.0, 0.0),
-            relief_m, density, photos, depth_frames, crf, telemetry,
+            relief_m, density, photos, depth_frames, crf, telemetry, video,
         )  # fmt: skip
         simulation = recording.prepare(options)
     except ValueError as error:
@@ -155,6 +166,8 @@ def _report(out: Path, result: dict[str, Any], seconds: float, as_json: bool) ->
         f"{result['path_m']:.0f} m at {result['median_agl_m']:.0f} m above ground, "
         f"in {seconds:.0f} s"
     )
+    if not (out / "flight.mp4").exists():
+        return
     telemetry = f"--telemetry {out / 'flight.tlog'} " if result["packets"] else ""
     print(f"next: skyrelief replay {out / 'flight.mp4'} {telemetry}"
           f"--camera-model {out / 'camera.yaml'} --out SCAN")  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -193,6 +193,21 @@ class SensorNoise:
     yaw_deg: float = 1.0  # slowly wandering
     attitude_white_deg: float = 0.05
     range_m: float = 0.05
+
+    @staticmethod
+    def of(gnss: str, noise: SensorNoise) -> SensorNoise:
+        """The noise with a GNSS that errs as ``gnss`` says; ValueError for an unknown word.
+
+        "wander": slowly, as it is; "white": by as much in each fix anew; "exact": no sensor
+        errs at all.
+        """
+        if gnss == "wander":
+            return noise
+        if gnss == "white":
+            return replace(noise, gps_m=0.0, gps_white_m=noise.gps_m)
+        if gnss == "exact":
+            return SensorNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        raise ValueError(f"GNSS noise {gnss!r} is not 'wander', 'white' or 'exact'")
 
     def __post_init__(self) -> None:
         for name in self.__slots__:

@@ -33,6 +33,9 @@ log = logging.getLogger(__name__)
 EPOCH_UNIX_S = 1_777_629_600  # 2026-05-01 10:00:00 UTC: containers keep whole seconds
 ORIGIN = LocalFrame(47.3977, 8.5456, 488.0)
 DISTORTION = (-0.12, 0.03, 0.0, 0.0, 0.0)
+TERRAIN_STEPS = 6
+"""Steps to where a ray meets the terrain; hills are far flatter than the ray."""
+
 LARGEST_TEXELS = 120_000_000
 REPEATABLE = "bframes=0:mbtree=0:scenecut=0"
 """x264's look-ahead differs from run to run; without it equal frames give equal files."""
@@ -66,6 +69,7 @@ class SimulationOptions:
     depth_frames: int = 12
     crf: int = 18
     with_telemetry: bool = True
+    with_video: bool = True
 
     def __post_init__(self) -> None:
         W, H = self.size_px
@@ -118,12 +122,18 @@ class Simulation:
         look = Look(options.look.noise, options.look.vignette, gain)
         return self.renderer.frame(self.poses[index], index, look)
 
-    def surface_height(self, x_m: F64, y_m: F64) -> F64:
-        """(N,) height of the highest surface at (N,) positions; the terrain's beside the scene."""
-        top = float(self.scene.grid.bounds[5]) + 1.0
-        origins = np.column_stack([x_m, y_m, np.full(len(x_m), top)])
-        t, _ = self.scene.grid.cast(origins, np.tile([0.0, 0.0, -1.0], (len(x_m), 1)))
-        return np.asarray(np.where(np.isfinite(t), top - t, self.scene.terrain.height(x_m, y_m)))
+    def surface_range(self, origins: F64, directions: F64) -> F64:
+        """(N,) metres from (N, 3) places along (N, 3) unit directions to the first surface.
+
+        Beside the scene it is the terrain's, for directions that lead downwards.
+        """
+        met, _ = self.scene.grid.cast(origins, directions)
+        beside = np.zeros(len(origins))
+        for _ in range(TERRAIN_STEPS):
+            at = origins + beside[:, None] * directions
+            above = at[:, 2] - self.scene.terrain.height(at[:, 0], at[:, 1])
+            beside += above / np.maximum(-directions[:, 2], 0.1)
+        return np.asarray(np.where(np.isfinite(met), met, beside))
 
     def sensors(self) -> Sensors:
         """The drone's sensors, fresh from their seed."""
@@ -185,13 +195,14 @@ def write(
         if options.with_telemetry:
             stream = packets(
                 simulation.sensors(), ORIGIN, EPOCH_UNIX_S,
-                simulation.surface_height, options.telemetry,
+                simulation.surface_range, options.telemetry,
             )  # fmt: skip
             packet_count = write_tlog(folder / "flight.tlog", EPOCH_UNIX_S, stream)
         _write_truth(simulation, truth)
         parameters = _parameters(simulation, packet_count)
         (truth / "params.json").write_text(json.dumps(parameters, indent=2) + "\n")
-        _write_video(simulation, folder / "flight.mp4", progress)
+        if options.with_video:
+            _write_video(simulation, folder / "flight.mp4", progress)
     except OSError as error:
         raise OutsideError(f"{folder} cannot be written: {error.strerror or error}") from error
     return parameters

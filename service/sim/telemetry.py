@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.frames import rotation_from_rpy
-from recon.se3 import quaternion_from_rotation
+from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
+from recon.se3 import quaternion_from_rotation, so3_exp
 from recon.types import F64
 from service.georeference import LocalFrame
 from service.sim.flight import LEAD_S, Sensors
@@ -21,7 +21,9 @@ from service.sim.flight import LEAD_S, Sensors
 BOOT_BEFORE_VIDEO_S = 100.0
 GIMBAL_COMPONENT = 154
 ROLL_LOCK, PITCH_LOCK, YAW_IN_VEHICLE_FRAME, YAW_IN_EARTH_FRAME = 4, 8, 32, 64
-HEIGHT_OF_GROUND = Callable[[F64, F64], F64]
+RANGE_TO_GROUND = Callable[[F64, F64], F64]
+"""(N,) metres along rays from (N, 3) places in (N, 3) directions of length one."""
+
 Timed = tuple[Any, int, float]
 """A message, the component that sends it, and when, in seconds since the first frame."""
 
@@ -34,8 +36,11 @@ class TelemetryOptions:
     rangefinder: bool = True
     gap_s: tuple[float, float] | None = None  # nothing is sent between these times
     lead_s: float = 0.0  # how long before the first frame the log begins
+    boresight_deg: tuple[float, float] = (0.0, 0.0)  # the camera looks right and up of it
 
     def __post_init__(self) -> None:
+        if not all(abs(angle) <= 45.0 for angle in self.boresight_deg):
+            raise ValueError(f"boresight of {self.boresight_deg} deg is not within 45 deg")
         if not 0.0 <= self.lead_s <= LEAD_S:
             raise ValueError(f"log lead of {self.lead_s:g} s is not within 0 to {LEAD_S:g} s")
         if self.gimbal_frame not in ("earth", "vehicle"):
@@ -46,13 +51,13 @@ def packets(
     sensors: Sensors,
     origin: LocalFrame,
     epoch_unix_s: float,
-    ground_height: HEIGHT_OF_GROUND,
+    ground_range: RANGE_TO_GROUND,
     options: TelemetryOptions,
 ) -> Iterator[tuple[float, bytes]]:
     """(seconds since the first frame, MAVLink 2 packet) in the order of time."""
     from pymavlink.dialects.v20 import common as dialect  # type: ignore[import-untyped]
 
-    kinds = _kinds(sensors, origin, epoch_unix_s, ground_height, options, dialect)
+    kinds = _kinds(sensors, origin, epoch_unix_s, ground_range, options, dialect)
     senders = {
         1: dialect.MAVLink(None, srcSystem=1, srcComponent=1),
         GIMBAL_COMPONENT: dialect.MAVLink(None, srcSystem=1, srcComponent=GIMBAL_COMPONENT),
@@ -92,7 +97,7 @@ def _kinds(
     sensors: Sensors,
     origin: LocalFrame,
     epoch_unix_s: float,
-    ground_height: HEIGHT_OF_GROUND,
+    ground_range: RANGE_TO_GROUND,
     options: TelemetryOptions,
     dialect: Any,
 ) -> list[Iterator[Timed]]:
@@ -106,7 +111,7 @@ def _kinds(
         _satellites(sensors, origin, duration, dialect),
     ]
     if options.rangefinder:
-        kinds.append(_range(sensors, ground_height, duration, dialect))
+        kinds.append(_range(sensors, ground_range, duration, dialect))
     return kinds
 
 
@@ -143,7 +148,9 @@ def _gimbal(
 ) -> Iterator[Timed]:
     """GIMBAL_DEVICE_ATTITUDE_STATUS at 20 Hz, from the gimbal's own component."""
     t = _times(20.0, duration_s) + 0.003
-    R = sensors.R_ned_gimbal(t)
+    right, up = np.radians(options.boresight_deg)
+    off = R_GIMBAL_CAMERA @ so3_exp(-np.array([up, right, 0.0])) @ R_GIMBAL_CAMERA.T
+    R = sensors.R_ned_gimbal(t) @ off
     flags = ROLL_LOCK | PITCH_LOCK | YAW_IN_EARTH_FRAME
     if options.gimbal_frame == "vehicle":
         flags = ROLL_LOCK | PITCH_LOCK | YAW_IN_VEHICLE_FRAME
@@ -194,15 +201,16 @@ def _satellites(
 
 
 def _range(
-    sensors: Sensors, ground_height: HEIGHT_OF_GROUND, duration_s: float, dialect: Any
+    sensors: Sensors, ground_range: RANGE_TO_GROUND, duration_s: float, dialect: Any
 ) -> Iterator[Timed]:
-    """DISTANCE_SENSOR straight down at 10 Hz, up to 120 m."""
+    """DISTANCE_SENSOR along the body's z axis at 10 Hz, up to 120 m."""
     t = _times(10.0, duration_s) + 0.002
-    at = sensors.flight.position(t)
-    agl = at[:, 2] - ground_height(at[:, 0], at[:, 1])
-    agl = agl + sensors.noise.range_m * sensors.rng.normal(size=len(t))
+    rpy = sensors.flight.vehicle_rpy(t)
+    down = np.array([R_ENU_NED @ rotation_from_rpy(*map(float, row))[:, 2] for row in rpy])
+    ways = ground_range(sensors.flight.position(t), down)
+    ways = ways + sensors.noise.range_m * sensors.rng.normal(size=len(t))
     for k, boot in enumerate(_boot_ms(t)):
-        if 0.1 < agl[k] < 120.0:
-            cm = round(float(agl[k]) * 100)
+        if 0.1 < ways[k] < 120.0:
+            cm = round(float(ways[k]) * 100)
             message = dialect.MAVLink_distance_sensor_message(int(boot), 10, 12000, cm, 0, 1, 25, 0)
             yield message, 1, float(t[k])
