@@ -16,13 +16,28 @@ from recon import icp_kernels, se3
 from recon.camera_model import rays
 from recon.types import F32, F64, Bool, DepthMap, Registration
 
-__all__ = ["IcpConfig", "Surface", "register_clouds", "register_projective", "register_surfaces"]
+__all__ = [
+    "Equations",
+    "IcpConfig",
+    "Surface",
+    "conclude",
+    "register_clouds",
+    "register_projective",
+    "register_surfaces",
+]
 
 
 # Variance that the residuals do not show: edges half seen, errors of the normals; measured.
 _UNSEEN_VARIANCE = 1.5
 # Neighbours of a loose cloud share the points that their normals are made from; measured.
 _CLOUD_CORRELATION = 1.4
+
+AREA_SIGMAS, AREA_LAGS = 4.685, 12
+"""Residuals beyond so many sigmas say nothing of how neighbours err; the longest distance asked."""
+
+
+MIN_PARTNERS = 50
+"""Fewer are no overlap."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +101,21 @@ class Surface:
         return Surface(elements, intrinsics, centre, max(float(lever), 1e-6))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Equations:
+    """What an iteration sums up over all partners, see recon.icp_kernels.normal_equations."""
+
+    H: F64  # (6, 6)
+    common: F64  # (6, 6)
+    g: F64  # (6,)
+    sums: F64  # (4,)
+    scale: float  # robust standard deviation of the residuals in sigmas
+    centre: F64  # (3,) m, target frame
+    lever_m: float
+    area: float | None = None  # neighbours whose residuals err together, when known
+    partners: int = MIN_PARTNERS
+
+
 @dataclass(slots=True, eq=False)
 class _Problem:
     """The weighted normal equations of one iteration, rotating about the points' centre."""
@@ -100,6 +130,7 @@ class _Problem:
     shared: F64  # (6,) the part of the information that both surfaces agree on
     gradient: F64  # (6,) along the principal directions
     strong: Bool  # (6,) directions that the surface determines
+    area: float | None = None  # neighbours that err together; None: asked of ``size``
 
     def step(self) -> F64:
         """(4, 4) left correction in the target frame; weak directions stay put."""
@@ -146,13 +177,20 @@ def _weighed(
 ) -> _Problem | None:
     """The problem of partners that were found, or None when they are fewer than 50."""
     matched = size[size < icp_kernels.UNMATCHED]
-    if len(matched) < 50:
+    if len(matched) < MIN_PARTNERS:
         return None
     every = max(len(matched) // 2000, 1)
     scale = max(float(np.median(np.abs(matched[::every]))) / 0.6745, 1e-3)
     H, common, g, sums = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(4)
     limit = scale * (config.tukey_sigmas if tukey else config.huber_sigmas)
     icp_kernels.normal_equations(size, rows, centre, limit, tukey, H, common, g, sums)
+    equations = Equations(H, common, g, sums, scale, centre, lever_m)
+    return _along_directions(equations, size, config)
+
+
+def _along_directions(equations: Equations, size: F32, config: IcpConfig) -> _Problem:
+    """The problem in its principal directions."""
+    H, common, g, lever_m = equations.H, equations.common, equations.g, equations.lever_m
     unit = np.array([1 / lever_m] * 3 + [1.0] * 3)
     values, vectors = np.linalg.eigh(H * np.outer(unit, unit))
     shared = np.einsum("ik,ij,jk->k", vectors, common * np.outer(unit, unit), vectors)
@@ -161,8 +199,25 @@ def _weighed(
     enough = config.weak_slope**2 * max(float(values[-1]), 1e-30)
     strong = (shared > enough) & (shared > 0.35 * values)
     return _Problem(
-        size, scale, centre, unit, sums, values, vectors, shared, vectors.T @ (unit * g), strong
-    )
+        size, equations.scale, equations.centre, unit, equations.sums, values, vectors, shared,
+        vectors.T @ (unit * g), strong, equations.area,
+    )  # fmt: skip
+
+
+def conclude(
+    equations: Equations, T: F64, T_start: F64, available: int, iterations: int, config: IcpConfig
+) -> Registration:
+    """The registration after a last step from ``T`` (4, 4), for a search made elsewhere.
+
+    ``available`` counts the source's surface elements. Fewer than 50 partners: rejected.
+    """
+    if equations.partners < MIN_PARTNERS:
+        return _no_overlap(T_start, iterations)
+    problem = _along_directions(equations, np.zeros((0, 0), np.float32), config)
+    depth = float(problem.centre[2])
+    limits = config.max_rms_share * depth, config.max_step_share * depth
+    moved = problem.step() @ T
+    return _judged(problem, moved, T_start, available, limits, iterations + 1, config)
 
 
 def register_projective(
@@ -242,7 +297,11 @@ def _covariance(problem: _Problem, config: IcpConfig) -> tuple[F64, F64]:
     """(6, 6) covariance of a left perturbation and the (k, 6) weak directions, unit rows."""
     weights, squares = float(problem.sums[0]), float(problem.sums[1])
     # Residuals of neighbours err together, so they count as fewer than they are.
-    area = float(icp_kernels.correlated_area(problem.size, 4.685 * problem.scale, 12))
+    area = problem.area
+    if area is None:
+        area = float(
+            icp_kernels.correlated_area(problem.size, AREA_SIGMAS * problem.scale, AREA_LAGS)
+        )
     variance = max(squares / max(weights - 6.0, 1.0), 1e-6) * area * _UNSEEN_VARIANCE
     # Information from noise in the normals is none: only the shared part moves the estimate.
     information = np.maximum(problem.shared, 1e-30) ** 2 / np.maximum(problem.values, 1e-30)

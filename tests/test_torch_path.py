@@ -276,30 +276,3 @@ def test_the_backend_gives_the_path_to_the_service_and_falls_back(device: str) -
     assert backend.failure == "CUDA error: device lost"
     assert backend.name == "cpu"
     assert not isinstance(load_backend("cpu"), PathBackend)
-
-
-def test_nothing_is_read_on_the_host_between_upload_and_result() -> None:
-    """On tensors without contents a hidden wait (a value read, a mask counted) would raise."""
-    from recon.backends.torch_depth import fuse
-    from recon.backends.torch_matching import harris_cells, refine, search
-    from recon.backends.torch_path import DensePath, PairDepthStage
-    from recon.matching import MatchingConfig
-
-    def empty(kind: Any, *shape: int) -> Any:
-        return torch.empty(shape, dtype=kind, device="meta")
-
-    matching = BeliefPropagationConfig(iterations=2, speckle_px=2)
-    path = DensePath("meta", matching, UpsamplingConfig(diameter_px=2), ALL)
-    stage = PairDepthStage(path, 4, 2, SIZE)
-    pictures = [empty(torch.uint8, 64, 96) for _ in range(4)]
-    guide = empty(torch.uint8, 256, 384, 3)
-    numbers = empty(torch.int64, 5), empty(torch.float64, 14)
-    depth, sigma = stage(*pictures, guide, *numbers)
-    fused = fuse(torch.stack([depth] * 3), torch.stack([sigma] * 3), ALL)
-    image, uv = empty(torch.uint8, 96, 128), empty(torch.float64, 9, 2)
-    given = image, image, uv, uv, empty(torch.float64, 9, 4), empty(torch.bool, 9)
-    found = search(*given, 3, 2, 2.0), refine(*given, 2, 2)
-    cells = harris_cells(image, MatchingConfig(), image)
-    for tensor in (*fused, cells, found[0].uv, found[0].second, found[1].uv):
-        assert tensor.device.type == "meta"
-    assert fused[0].shape == (SIZE[1], SIZE[0])

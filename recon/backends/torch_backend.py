@@ -22,6 +22,7 @@ from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration, St
 from recon.upsampling import UpsamplingConfig, check_guide, guide_at_taps, upsample
 
 if TYPE_CHECKING:
+    from recon.backends.torch_icp import DeviceIcp
     from recon.matcher import Matcher
     from recon.registration import IcpConfig
 
@@ -46,6 +47,7 @@ class TorchBackend:
         self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         self.messages: torch.dtype = getattr(torch, messages)
         self.kernels = PLAIN
+        self._icp: DeviceIcp | None = None
         self._plans: dict[Any, Plan] = {}
         self._path: tuple[DenseStages, DensePath] | None = None
         torch.zeros(8, device=self.device).add_(1).cpu()  # fails here rather than in flight
@@ -106,9 +108,11 @@ class TorchBackend:
         self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
     ) -> Registration:
         """Projective point-to-plane ICP from the given start."""
-        from recon.backends.torch_icp import register_projective
+        from recon.backends.torch_icp import DeviceIcp
 
-        return register_projective(source, target, T_target_source, config, self.device)
+        if self._icp is None:
+            self._icp = DeviceIcp(self.device)
+        return self._icp.register(source, target, T_target_source, config)
 
     def fused_depth(
         self,

@@ -1,164 +1,229 @@
-"""Projective point-to-plane ICP with the work per pixel in torch.
+"""Projective point-to-plane ICP in torch: two depth maps go up, a few numbers come down.
 
-Each iteration matches every ``stride``-th source element on the device and brings back two
-6x6 matrices and a few sums: one wait per iteration. The last iteration, the covariance and the
-verdict are those of :mod:`recon.registration`.
+Surfaces, partners, weights and steps stay on the device, for a fixed number of iterations; one
+that has settled stands still. Nothing is read in between, so on CUDA all of it is one captured
+graph. The verdict and the covariance are those of :mod:`recon.registration`, from the sums of
+one more iteration.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from recon import se3
-from recon.registration import IcpConfig, Surface, register_surfaces
-from recon.types import F64, DepthMap, Registration
+from recon.backends.torch_linear import median, solve
+from recon.backends.torch_partners import Partners, correlation_sums, match, points
+from recon.backends.torch_plan import Plan, part
+from recon.backends.torch_surface import DOUBLE, DeviceSurface, build
+from recon.registration import (
+    AREA_LAGS,
+    AREA_SIGMAS,
+    MIN_PARTNERS,
+    Equations,
+    IcpConfig,
+    conclude,
+)
+from recon.types import F64, Array, DepthMap, Registration
 
-MIN_PARTNERS = 50
-DOUBLE = torch.float64
+KEPT_PLANS = 4
+MEDIAN_OF = 4000
+"""About so many residuals give the scale of all."""
 
+SHARED = 0.35
+"""A direction counts when this share of its information is common to both surfaces."""
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Partners:
-    """Elements that found each other, in the target's frame; rows of the same N."""
-
-    normal: Tensor  # (N, 3) of the target
-    own_normal: Tensor  # (N, 3) of the source
-    point: Tensor  # (N, 3) m
-    information: Tensor  # (N,) 1 / m
-    residual: Tensor  # (N,) in sigmas
-    found: Tensor  # (N,) 1 where there is a partner, else 0
-
-
-def register_projective(
-    source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig, device: str
-) -> Registration:
-    """As :func:`recon.registration.register_projective`, on ``device``."""
-    T = np.array(T_target_source, np.float64)
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise ValueError("T_target_source must be (4, 4) finite numbers")
-    a, b = Surface.build(source, config), Surface.build(target, config)
-    with torch.inference_mode():
-        T = _descend(a, b, T, config, device)
-    last = replace(config, strides=config.strides[-1:], iterations=(1,))
-    found = register_surfaces(a, b, T, last)
-    change = found.T_target_source @ se3.inverse(np.asarray(T_target_source, np.float64))
-    centre = found.T_target_source[:3, :3] @ a.centre + found.T_target_source[:3, 3]
-    step = float(np.linalg.norm(change[:3, :3] @ centre + change[:3, 3] - centre))
-    turn = float(np.linalg.norm(se3.so3_log(change[:3, :3])))
-    if step > config.max_step_share * float(centre[2]) or turn > config.max_turn_rad:
-        return replace(found, verdict="rejected")
-    return found
+SIGN_ROUNDS = 26
+"""A round takes a small eigenvalue 1.5 times nearer to one: to 3e-5 of the largest."""
 
 
-def _descend(a: Surface, b: Surface, T: F64, config: IcpConfig, device: str) -> F64:
-    """The motion after the iterations of every level; the start when too few partners."""
-    elements_a = torch.from_numpy(a.elements).to(device, non_blocking=True)
-    elements_b = torch.from_numpy(b.elements).to(device, non_blocking=True)
-    last = len(config.strides) - 1
-    for level, (stride, limit) in enumerate(zip(config.strides, config.iterations, strict=True)):
-        points, normals, sigma = _points(elements_a[stride // 2 :: stride, stride // 2 :: stride],
-                                         a.intrinsics, stride)  # fmt: skip
-        for _ in range(limit):
-            move = torch.from_numpy(T).to(device, non_blocking=True)
-            partners = _match(points, normals, sigma, elements_b, b.intrinsics, move, config)
-            centre = T[:3, :3] @ a.centre + T[:3, 3]
-            sums = _normal_equations(partners, centre, level == last, config).cpu().numpy()
-            if sums[78] < MIN_PARTNERS:
-                return T
-            step, settled = _step(sums, centre, a.lever_m, 0.3 if level == last else 1.0, config)
-            T = step @ T
-            if settled:
+class DeviceIcp:
+    """Registers depth maps on ``device``; one thread at a time."""
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+        self._plans: dict[Any, Plan] = {}
+
+    def register(
+        self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
+    ) -> Registration:
+        """As :func:`recon.registration.register_projective`."""
+        start = np.array(T_target_source, np.float64)
+        if start.shape != (4, 4) or not np.isfinite(start).all():
+            raise ValueError("T_target_source must be (4, 4) finite numbers")
+        given = [*_inputs(source), *_inputs(target), start]
+        key = (source.depth_m.shape, target.depth_m.shape, config)
+        with torch.inference_mode():
+            if key not in self._plans:
+                while len(self._plans) >= KEPT_PLANS:
+                    self._plans.pop(next(iter(self._plans)))
+                self._plans[key] = Plan(self.device, _descent(config), [part(a) for a in given])
+            plan = self._plans[key]
+            plan.upload(given)
+            told = plan.run()[0].cpu().numpy()
+        return _concluded(told, start, config)
+
+
+def _inputs(depth: DepthMap) -> list[Array]:
+    """Depth, sigma and intrinsics; ValueError when shapes disagree."""
+    h, w = depth.depth_m.shape
+    if depth.sigma_m.shape != (h, w) or min(h, w) < 8:
+        raise ValueError(f"depth {h, w} and sigma {depth.sigma_m.shape} do not fit")
+    K = depth.K
+    intrinsics = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], np.float64)
+    z, sigma = (np.ascontiguousarray(a, np.float32) for a in (depth.depth_m, depth.sigma_m))
+    return [z, sigma, intrinsics]
+
+
+def _descent(config: IcpConfig) -> Callable[..., tuple[Tensor, ...]]:
+    """What a plan runs: from two depth maps and a start to the numbers of :func:`_concluded`."""
+
+    def run(
+        z_a: Tensor, sigma_a: Tensor, K_a: Tensor, z_b: Tensor, sigma_b: Tensor, K_b: Tensor,
+        T: Tensor,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        a = build(z_a, sigma_a, K_a, config.edge_share)
+        b = build(z_b, sigma_b, K_b, config.edge_share)
+        last = len(config.strides) - 1
+        done = torch.zeros((), dtype=DOUBLE, device=T.device)
+        overlap = torch.ones((), dtype=torch.bool, device=T.device)
+        for level, (stride, limit) in enumerate(
+            zip(config.strides, config.iterations, strict=True)
+        ):
+            seen = points(a, stride)
+            moving = overlap
+            for _ in range(limit):
+                sums = _sums(match(seen, b, T, config), a, T, level == last, config)
+                overlap = overlap & (sums.partners >= MIN_PARTNERS)
+                moving = moving & overlap
+                step, settled = _step(sums, 0.3 if level == last else 1.0, config)
+                T = torch.where(moving, step @ T, T)
+                done = done + moving
+                moving = moving & ~settled
+        found = match(seen, b, T, config)
+        sums = _sums(found, a, T, True, config)
+        size = found.residual.view(seen.shape)
+        near = (found.found.view(seen.shape) > 0) & (size.abs() < AREA_SIGMAS * sums.scale)
+        numbers = [
+            sums.H, sums.common, sums.g, sums.sums, sums.scale, sums.centre, a.lever_m,
+            sums.partners * overlap, seen.known.sum(), done, T,
+            correlation_sums(torch.where(near, size, 0.0), near, AREA_LAGS),
+        ]  # fmt: skip
+        return (torch.cat([n.reshape(-1).to(DOUBLE) for n in numbers]),)
+
+    return run
+
+
+def _concluded(told: F64, start: F64, config: IcpConfig) -> Registration:
+    """The registration from the numbers that came down."""
+    ends = np.cumsum([36, 36, 6, 4, 1, 3, 1, 1, 1, 1, 16])
+    H, common, g, sums, scale, centre, lever, partners, available, done, T, lags = np.split(
+        told, ends
+    )
+    if not np.isfinite(told[: ends[-1]]).all():  # a start from which nothing can be computed
+        partners = np.zeros(1)
+    equations = Equations(
+        H.reshape(6, 6), common.reshape(6, 6), g, sums, float(scale[0]), centre, float(lever[0]),
+        _area(lags.reshape(2, 3, AREA_LAGS)), int(partners[0]),
+    )  # fmt: skip
+    return conclude(equations, T.reshape(4, 4), start, int(available[0]), int(done[0]), config)
+
+
+def _area(lags: F64) -> float:
+    """How many neighbours err together, as :func:`recon.icp_kernels.correlated_area`."""
+    area = 1.0
+    for products, powers, counts in lags:
+        length = 1.0
+        for product, power, count in zip(products, powers, counts, strict=True):
+            if count < 30 or product < 0.03 * power:
                 break
-    return T
+            length += 2.0 * float(product) / float(power)
+        area *= length
+    return area
 
 
-def _points(elements: Tensor, intrinsics: F64, stride: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Where the rays meet the elements (N, 3), their normals (N, 3) and sigmas (N,)."""
-    h, w = elements.shape[:2]
-    fx, fy, cx, cy = (float(k) for k in intrinsics)
-    v = torch.arange(h, device=elements.device, dtype=DOUBLE)[:, None] * stride + stride // 2
-    u = torch.arange(w, device=elements.device, dtype=DOUBLE)[None, :] * stride + stride // 2
-    x, y = ((u - cx) / fx).expand(h, w), ((v - cy) / fy).expand(h, w)
-    ray = torch.stack([x, y, torch.ones_like(x)], -1)
-    element = elements.to(DOUBLE)
-    along = (element[..., :3] * ray).sum(-1)
-    z = element[..., 3] / torch.where(along.abs() > 1e-9, along, 1.0)
-    return (
-        (ray * z[..., None]).reshape(-1, 3),
-        element[..., :3].reshape(-1, 3),
-        element[..., 4].reshape(-1),
-    )
+class _Sums:
+    """The weighted normal equations on the device, as :class:`recon.registration.Equations`."""
+
+    def __init__(
+        self, partners: Partners, centre: Tensor, lever_m: Tensor, tukey: bool, config: IcpConfig
+    ) -> None:
+        self.centre, self.lever_m = centre, lever_m
+        self.partners = partners.found.sum()
+        size = partners.residual.abs()
+        every = max(len(size) // MEDIAN_OF, 1)
+        middle = median(size[::every], partners.found[::every] > 0)
+        self.scale = (middle / 0.6745).clamp(min=1e-3)
+        if tukey:
+            weight = (1 - (size / (config.tukey_sigmas * self.scale)) ** 2).clamp(min=0) ** 2
+        else:
+            weight = (config.huber_sigmas * self.scale / size.clamp(min=1e-12)).clamp(max=1)
+        weight = weight * partners.found
+        J, own = (
+            torch.cat([torch.linalg.cross(partners.point - centre, n), n], 1)
+            * partners.information[:, None]
+            for n in (partners.normal, partners.own_normal)
+        )
+        weighed = J * weight[:, None]
+        mixed = weighed.T @ own
+        self.H, self.common = weighed.T @ J, 0.5 * (mixed + mixed.T)
+        self.g = weighed.T @ partners.residual
+        squares = weight * size**2
+        metres = squares / partners.information.clamp(min=1e-12) ** 2
+        self.sums = torch.stack(
+            [weight.sum(), squares.sum(), (weight > 0.1).to(DOUBLE).sum(), metres.sum()]
+        )
 
 
-def _match(
-    points: Tensor, normals: Tensor, sigma: Tensor, target: Tensor, intrinsics: F64, T: Tensor,
-    config: IcpConfig,
-) -> _Partners:  # fmt: skip
-    """Each element with the target element of the pixel that it projects to."""
-    h, w = target.shape[:2]
-    fx, fy, cx, cy = (float(k) for k in intrinsics)
-    p = points @ T[:3, :3].T + T[:3, 3]
-    n = normals @ T[:3, :3].T
-    depth = torch.where(p[:, 2] > 1e-3, p[:, 2], 1.0)
-    u, v = fx * p[:, 0] / depth + cx + 0.5, fy * p[:, 1] / depth + cy + 0.5
-    found = (sigma > 0) & (p[:, 2] > 1e-3) & (u >= 0) & (v >= 0) & (u < w) & (v < h)
-    index = v.clamp(0, h - 1).long() * w + u.clamp(0, w - 1).long()
-    e = target.reshape(-1, target.shape[2])[index].to(DOUBLE)
-    along = (e[:, :3] * p).sum(-1)
-    r = along - e[:, 3]
-    found = found & (e[:, 4] > 0) & (r.abs() <= config.gate_share * p[:, 2])
-    found = found & ((n * e[:, :3]).sum(-1) >= 0.707)
-    spread = along.abs() * torch.sqrt(e[:, 4] ** 2 + sigma**2) + 1e-9
-    share = found.to(DOUBLE)
-    return _Partners(e[:, :3], n, p, share * depth / spread, share * r * depth / spread, share)
+def _sums(
+    partners: Partners, source: DeviceSurface, T: Tensor, tukey: bool, config: IcpConfig
+) -> _Sums:
+    centre = T[:3, :3] @ source.centre + T[:3, 3]
+    return _Sums(partners, centre, source.lever_m, tukey, config)
 
 
-def _normal_equations(partners: _Partners, centre: F64, tukey: bool, config: IcpConfig) -> Tensor:
-    """(79,) H (36), H with the source's normals on one side (36), g (6), number of partners.
+def _step(sums: _Sums, share: float, config: IcpConfig) -> tuple[Tensor, Tensor]:
+    """(4, 4) left correction along what the surface determines; () True when it is small.
 
-    The scale is the median magnitude of the residuals, as a value of the device.
+    The host splits the directions by the eigenvectors of H. Here the split is the spectral
+    projector of ``C - SHARED H``, C the part of H that both surfaces share: positive where more
+    than that share is common and the slope is above ``weak_slope``. Its sign is found by Newton
+    and Schulz (Higham, Functions of Matrices, 2008, chapter 5), with matrix products alone.
     """
-    c = torch.from_numpy(centre).to(partners.point.device, non_blocking=True)
-    size = partners.residual.abs()
-    nan = torch.full_like(size, torch.nan)
-    median = torch.nanmedian(torch.where(partners.found > 0, size, nan))
-    scale = (torch.nan_to_num(median) / 0.6745).clamp(min=1e-3)
-    if tukey:
-        weight = (1 - (size / (config.tukey_sigmas * scale)) ** 2).clamp(min=0) ** 2
-    else:
-        weight = (config.huber_sigmas * scale / size.clamp(min=1e-12)).clamp(max=1)
-    weight = weight * partners.found
-
-    def lever(normal: Tensor) -> Tensor:
-        turn = torch.linalg.cross(partners.point - c, normal)
-        return torch.cat([turn, normal], 1) * partners.information[:, None]
-
-    J, own = lever(partners.normal), lever(partners.own_normal)
-    H = (J * weight[:, None]).T @ J
-    mixed = (J * weight[:, None]).T @ own
-    g = J.T @ (weight * partners.residual)
-    parts = [H.reshape(-1), (0.5 * (mixed + mixed.T)).reshape(-1), g, partners.found.sum()[None]]
-    return torch.cat(parts)
-
-
-def _step(
-    sums: F64, centre: F64, lever_m: float, share: float, config: IcpConfig
-) -> tuple[F64, bool]:
-    """(4, 4) left correction along the directions that the surface determines; True when small."""
-    unit = np.array([1 / lever_m] * 3 + [1.0] * 3)
-    H, common, g = sums[:36].reshape(6, 6), sums[36:72].reshape(6, 6), sums[72:78]
-    values, vectors = np.linalg.eigh(H * np.outer(unit, unit))
-    shared = np.einsum("ik,ij,jk->k", vectors, common * np.outer(unit, unit), vectors)
-    strong = (shared > config.weak_slope**2 * max(float(values[-1]), 1e-30)) & (
-        shared > 0.35 * values
+    device = sums.H.device
+    eye = torch.eye(6, dtype=DOUBLE, device=device)
+    unit = torch.cat([(1 / sums.lever_m).expand(3), torch.ones(3, dtype=DOUBLE, device=device)])
+    H, common = (A * unit[:, None] * unit[None, :] for A in (sums.H, sums.common))
+    squared = H @ H
+    largest = (squared * squared).sum() ** 0.25 + 1e-30  # eigenvalue, to a factor of 1.6
+    flat = (1 - SHARED) * config.weak_slope**2
+    sign = (common - SHARED * H) / largest - flat * eye
+    for _ in range(SIGN_ROUNDS):
+        sign = torch.addmm(sign, sign @ sign, sign, beta=1.5, alpha=-0.5)
+    P = 0.5 * (eye + sign)
+    restricted = P @ H @ P + largest * (eye - P)
+    solved = solve(restricted, torch.cat([P @ (unit * sums.g)[:, None], P], 1))
+    twist = -unit * (P @ solved[:, 0])
+    twist = torch.where(torch.isfinite(twist).all(), twist, 0.0)
+    sigma = (P @ solved[:, 1:]).diagonal().amax().clamp(min=0).sqrt()
+    turned, moved = twist[:3].norm() * sums.lever_m, twist[3:].norm()
+    return _about(sums.centre, twist), torch.maximum(turned, moved) < (share * sigma).clamp(
+        min=1e-7
     )
-    part = np.where(strong, vectors.T @ (unit * g) / np.maximum(values, 1e-30), 0.0)
-    twist = -unit * (vectors @ part)
-    R = se3.so3_exp(twist[:3])
-    sigma = 1 / np.sqrt(max(float(values[strong].min(initial=1e30)), 1e-30))
-    moved = max(float(np.linalg.norm(twist[3:])), float(np.linalg.norm(twist[:3])) * lever_m)
-    return se3.compose(R, centre - R @ centre + twist[3:]), moved < max(share * sigma, 1e-7)
+
+
+def _about(centre: Tensor, twist: Tensor) -> Tensor:
+    """(4, 4) the turn ``twist[:3]`` about ``centre`` and the shift ``twist[3:]``."""
+    x, y, z = twist[:3]
+    none = torch.zeros_like(x)
+    K = torch.stack([none, -z, y, z, none, -x, -y, x, none]).view(3, 3)
+    angle = twist[:3].norm().clamp(min=1e-12)
+    half = torch.sin(angle / 2) / (angle / 2)
+    eye = torch.eye(3, dtype=DOUBLE, device=twist.device)
+    R = eye + (torch.sin(angle) / angle) * K + 0.5 * half**2 * (K @ K)
+    shift = centre - R @ centre + twist[3:]
+    bottom = torch.cat([torch.zeros_like(eye[:1]), torch.ones_like(eye[:1, :1])], 1)
+    return torch.cat([torch.cat([R, shift[:, None]], 1), bottom])
