@@ -4,7 +4,8 @@ An autopilot's altitude follows its barometer, whose zero is off by decimetres t
 receiver's own altitudes scatter more, but about another mean. What of the receiver's claimed
 sigma shows as scatter from fix to fix averages out; the rest wanders (first-order Gauss-Markov,
 as in :mod:`recon.graph_readings`) and stays. The autopilot's altitude rests on the same
-receiver, so the receiver's mean is taken over only as far as it is surely the better one.
+receiver, so the receiver's mean is taken over only as far as it is the better one. Where the
+scatter could be all of the sigma, it is taken to be.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ STEADY_SHARE = 0.1
 OFF_SIGMAS = 4.0
 """Intervals further from the median than so many of the scatter and the sigma do not count."""
 
-MEDIAN_OF_CHI2 = 0.4549
-"""Of one degree of freedom."""
+WILD_STEPS = 36.0
+"""Squared steps from fix to fix beyond so many of their median are jumps, not scatter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,12 +61,14 @@ def altitude_datum(
     above, fixes, claimed = np.array(rows, np.float64).T
     sigma = float(np.median(claimed))
     steps = np.diff(above) ** 2 / (1.0 / fixes[1:] + 1.0 / fixes[:-1])
-    white = float(np.sqrt(np.median(steps) / MEDIAN_OF_CHI2))  # of one fix
+    usual = steps[steps <= WILD_STEPS * np.median(steps)]
+    white = float(np.sqrt(usual.mean()))  # of one fix
+    doubt = 1.0 + 2.0 * np.sqrt(3.0 / len(usual))  # of a variance by so many steps
     apart = np.abs(above - np.median(above))
     near = apart <= OFF_SIGMAS * np.sqrt(white**2 / fixes + sigma**2)
     mean = float(np.average(above[near], weights=fixes[near]))
-    slow = max(sigma**2 - white**2, (STEADY_SHARE * sigma) ** 2)
+    slow = max(sigma**2 - doubt * white**2, (STEADY_SHARE * sigma) ** 2)
     slow /= 1.0 + max(span_s, 0.0) / (2.0 * max(wander_s, 1e-3))
     left = slow + white**2 / float(fixes[near].sum())
     share = max(0.0, 1.0 - 2.0 * left / sigma**2)
-    return AltitudeDatum(share * mean, float(np.sqrt(left)) if share > 0 else sigma)
+    return AltitudeDatum(float(share * mean), float(np.sqrt(left)) if share > 0 else sigma)

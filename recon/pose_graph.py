@@ -17,7 +17,7 @@ import numpy as np
 
 from recon import graph_factors, se3
 from recon.alignment import Scale, Similarity
-from recon.dead_reckoning import dead_reckoned
+from recon.dead_reckoning import carried
 from recon.graph_factors import pose3
 from recon.graph_readings import BLOCK, Readings
 from recon.graph_records import Loop, Node, PoseGraphConfig
@@ -374,14 +374,15 @@ class PoseGraph:
     def _link(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
         """Dead reckoning where vision was lost: telemetry's motion, else the last one's, wide."""
         self._left_out["stretch without vision"] += 1
-        seconds = max((node.time_ns - last.time_ns) * 1e-9, 1.0)
+        passed_s = (node.time_ns - last.time_ns) * 1e-9
         frame = self._segments.known(node.segment)
         if frame is not None:  # already placed, by telemetry or by a loop
             T = frame.pose(node.T_odom_camera)
         else:
-            T = dead_reckoned(last, node, T_last, self._velocity(last, T_last))
+            priors = self._segments.at_camera(last), self._segments.at_camera(node)
+            T = carried(*priors, T_last, self._velocity(last, T_last), passed_s)
         sigma_r = self.config.sigma_link_rad if node.prior.sigma_yaw_rad < 1.0 else 1.5
-        sigma = np.array([sigma_r] * 3 + [self.config.sigma_link_m * seconds + 5.0] * 3)
+        sigma = np.array([sigma_r] * 3 + [self.config.sigma_link_m * max(passed_s, 1.0) + 5.0] * 3)
         self._sources[node.key].add("dead reckoning")
         return se3.inverse(T_last) @ T, np.diag(sigma**2)
 

@@ -11,7 +11,7 @@ from recon import alignment, se3
 from recon.alignment import Anchor, Scale, Similarity
 from recon.graph_records import Node
 from recon.sensor_offsets import Constants, Offsets, constants, offsets
-from recon.types import F64
+from recon.types import F64, PosePrior
 
 REFIT_GROWTH, SETTLED_GROWTH = 1.3, 1.6
 """A segment's similarity is fitted again when its keyframes have grown by so much: at first,
@@ -59,11 +59,17 @@ class SegmentFrames:
         prior = self.constants(node.segment).applied(node.prior)
         if node.segment in self._offsets:
             prior = self._offsets[node.segment].applied(prior, node.lean)
-        if prior.fix_offset is not None and prior.position_m is not None:
-            frame = self.frame(node.segment)
-            off = frame.scale * frame.R @ node.T_odom_camera[:3, :3] @ prior.fix_offset
-            prior = replace(prior, position_m=prior.position_m - off, fix_offset=None)
+        prior = self.at_camera(replace(node, prior=prior))
         return node if prior is node.prior else replace(node, prior=prior)
+
+    def at_camera(self, node: Node) -> PosePrior:
+        """The node's prior, with its fix brought to where the camera is."""
+        prior = node.prior
+        if prior.fix_offset is None or prior.position_m is None:
+            return prior
+        frame = self.frame(node.segment)
+        off = frame.scale * frame.R @ node.T_odom_camera[:3, :3] @ prior.fix_offset
+        return replace(prior, position_m=prior.position_m - off, fix_offset=None)
 
     def constants(self, segment: int) -> Constants:
         """What the sensors are constantly off by, as the segment's frame was fitted with."""

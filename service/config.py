@@ -42,6 +42,9 @@ class CameraConfig:
     mount_roll_deg: float = key(0.0, "fixed mount: roll of the optical axis in the body frame")
     mount_pitch_deg: float = key(-90.0, "fixed mount: -90 looks straight down, 0 looks ahead")
     mount_yaw_deg: float = key(0.0, "fixed mount: 0 puts the picture's top towards the nose")
+    lever_forward_m: float = key(0.0, "camera ahead of the autopilot's position, body frame")
+    lever_right_m: float = key(0.0, "the same to the right")
+    lever_down_m: float = key(0.0, "the same downwards")
     latency_ms: float = key(0.0, "from mid-exposure to the picture's time stamp", live=True)
     latency: Literal["fixed", "auto"] = key(
         "fixed", "fixed: latency_ms; auto: latency_ms until the pictures' rotation says", live=True
@@ -52,6 +55,8 @@ class CameraConfig:
         _within("camera.mount_roll_deg", self.mount_roll_deg, -180, 180)
         _within("camera.mount_pitch_deg", self.mount_pitch_deg, -180, 180)
         _within("camera.mount_yaw_deg", self.mount_yaw_deg, -360, 360)
+        for axis in ("forward", "right", "down"):
+            _within(f"camera.lever_{axis}_m", getattr(self, f"lever_{axis}_m"), -100, 100)
         _within("camera.latency_ms", self.latency_ms, -10_000, 10_000)
 
 

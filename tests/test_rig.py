@@ -69,6 +69,23 @@ def test_the_first_position_is_the_origin() -> None:
     np.testing.assert_allclose(second.position_m, [0.0, 111.2, 10.0], atol=0.2)
 
 
+def test_the_camera_hangs_beside_the_vehicles_position() -> None:
+    """Half a metre ahead, 0.2 to the right and 0.1 below, of a vehicle heading east."""
+    hung = rig(CameraConfig(lever_forward_m=0.5, lever_right_m=0.2, lever_down_m=0.1))
+    state = VehicleState(
+        0, q_ned_body_wxyz=q(0, 0, 90), lat_deg=47.0, lon_deg=8.0, alt_amsl_m=500.0,
+        alt_agl_m=60.0, sigma_h_m=1.0, sigma_v_m=1.5,
+    )  # fmt: skip
+    prior = hung.prior(state, None)
+    assert prior.position_m is not None
+    np.testing.assert_allclose(prior.position_m, [0.5, -0.2, -0.1], atol=1e-6)
+    assert prior.agl_m == pytest.approx(59.9)
+    assumed = hung.prior(VehicleState(0, q_ned_body_wxyz=q(0, 0, 90)), None)
+    assert assumed.agl_m == ASSUMED_AGL_M
+    blind = rig(CameraConfig(lever_down_m=0.1), FusionConfig(gnss=False)).prior(state, None)
+    assert blind.altitude_m == pytest.approx(499.9)
+
+
 def test_a_picture_tag_serves_when_there_is_no_telemetry() -> None:
     some = rig()
     tag = GeoTag(30.0, -98.0, 300.0, ypr_deg=(90.0, -90.0, 0.0), relative_alt_m=80.0)

@@ -17,6 +17,7 @@ from mavlink.state import VehicleState
 from recon import se3
 from recon.backends import Backend, MatchingBackend
 from recon.camera_model import Undistorter, scaled
+from recon.dead_reckoning import carried
 from recon.exposure import stretch
 from recon.fix_average import FixAverage
 from recon.keyframe_window import landmarks
@@ -95,6 +96,7 @@ class Pipeline:
         self._segment = self.odometry.segment
         self._fixes = FixAverage()
         self._priors: dict[int, PosePrior] = {}  # of the views that wait
+        self._seen: tuple[int, PosePrior, Placed] | None = None  # what vision placed last
         self._latest: Offer | None = None  # the last tracked frame that did not become a view
 
     # ---- one frame, as in Figure 1 -----------------------------------------------------
@@ -115,7 +117,7 @@ class Pipeline:
             self._segment = tracked.segment
         if tracked.T_odom_camera is None:
             self.refusals[tracked.reason] += 1
-            placed = _by_telemetry(frame.seq, prior) if tracked.state == "lost" else None
+            placed = self._by_telemetry(frame.seq, prior) if tracked.state == "lost" else None
             return Step(tracked, prior, placed)
         key = self.odometry.keyframes[-1]
         offer = Offer(frame.seq, frame.time_ns, picture, tracked, key, prior, blurred)
@@ -129,7 +131,9 @@ class Pipeline:
         anchor = Anchorage(frame.seq, key, se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera)
         is_view = viewpoint is not None
         moved = self._moved() if keyframes else ()
-        return Step(tracked, prior, self.place(anchor), is_view, anchor, keyframes, moved)
+        placed = self.place(anchor)
+        self._seen = tracked.segment, prior, placed
+        return Step(tracked, prior, placed, is_view, anchor, keyframes, moved)
 
     def set_baseline(self, config: ScanConfig) -> None:
         """Follow another ``scan.baseline`` from the next frame on."""
@@ -264,23 +268,32 @@ class Pipeline:
         window = self.odometry.keyframes
         return key.segment != self.odometry.segment or not window or key.seq < window[0].seq
 
+    def _by_telemetry(self, seq: int, prior: PosePrior) -> Placed | None:
+        """Where telemetry alone says the camera is; None without attitude, heading or position.
+
+        Telemetry is off by as much as it was when vision was lost, so that the track goes on.
+        """
+        R, position, sigma = prior.R_world_camera, prior.position_m, prior.sigma_position_m
+        if R is None or position is None or sigma is None or prior.sigma_yaw_rad > 1.0:
+            return None
+        T = se3.compose(R, position)
+        if self._seen is not None:
+            segment, before, seen = self._seen
+            with self.dense.lock:
+                is_aligned = self.dense.trajectory.similarity(segment) is not None
+            if is_aligned:
+                T = carried(before, prior, seen.T_world_camera, None, 0.0)
+        tilt, yaw = prior.sigma_tilt_rad, prior.sigma_yaw_rad
+        covariance = np.diag(np.square([tilt, tilt, yaw, *sigma]))
+        told = ("attitude", "gnss", "dead reckoning")
+        return Placed(seq, T, 1.0, covariance, told)
+
     def _moved(self, final: bool = False) -> tuple[Placed, ...]:
         with self.dense.lock:
             moved = self.dense.trajectory.moved(final)
             for placed in moved:
                 self.dense.trajectory.tell(placed)
         return tuple(moved)
-
-
-def _by_telemetry(seq: int, prior: PosePrior) -> Placed | None:
-    """Where telemetry alone says the camera is; None without attitude, heading or position."""
-    R, position, sigma = prior.R_world_camera, prior.position_m, prior.sigma_position_m
-    if R is None or position is None or sigma is None or prior.sigma_yaw_rad > 1.0:
-        return None
-    tilt, yaw = prior.sigma_tilt_rad, prior.sigma_yaw_rad
-    covariance = np.diag(np.square([tilt, tilt, yaw, *sigma]))
-    told = ("attitude", "gnss", "dead reckoning")
-    return Placed(seq, se3.compose(R, position), 1.0, covariance, told)
 
 
 def _within_width(camera: Camera, width_px: int) -> Camera:

@@ -46,6 +46,9 @@ class Rig:
         self._camera, self._scan, self._fusion = camera, scan, fusion
         self.frame: LocalFrame | None = None
         self.georeference = "none"
+        self._lever_body = np.array(
+            [camera.lever_forward_m, camera.lever_right_m, camera.lever_down_m]
+        )
         self._R_body_camera = (
             rotation_from_rpy(
                 math.radians(camera.mount_roll_deg),
@@ -65,14 +68,24 @@ class Rig:
         fix = self._fix(state, tag)
         position, sigma = self._position(fix)
         agl, sigma_agl = self._agl(state, tag)
+        lever = self._lever(state)
+        position = None if position is None else position + lever
         prior = PosePrior(R, tilt, yaw, position, sigma, agl, sigma_agl)
         if position is not None and state is not None and state.receiver is not None:
             above = state.receiver
             prior = replace(prior, above_m=above.above_m, above_fixes=1, above_ns=above.time_ns)
         # With a position the altitude is part of it.
         if position is None and state is not None and self._fusion.altitude:
-            prior = replace(prior, altitude_m=state.alt_amsl_m)
+            altitude = state.alt_amsl_m
+            prior = replace(prior, altitude_m=None if altitude is None else altitude + lever[2])
         return prior
+
+    def _lever(self, state: VehicleState | None) -> F64:
+        """(3,) ENU metres from the vehicle's position to the camera; zero without its attitude."""
+        if state is None or state.q_ned_body_wxyz is None:
+            return np.zeros(3)
+        R_ned_body = se3.rotation_from_quaternion(state.q_ned_body_wxyz)
+        return np.asarray(R_ENU_NED @ R_ned_body @ self._lever_body)
 
     def _rotation(self, state: VehicleState | None, tag: GeoTag | None) -> tuple[F64, float, float]:
         if state is not None and self._fusion.attitude:
@@ -126,7 +139,8 @@ class Rig:
         if state is not None and state.alt_agl_m is not None and state.alt_agl_m > 1.0:
             if self._fusion.altitude:
                 spread = state.sigma_agl_m or 3.0
-                return state.alt_agl_m, max(spread, 0.03 * state.alt_agl_m)
+                agl = state.alt_agl_m + float(self._lever(state)[2])
+                return agl, max(spread, 0.03 * state.alt_agl_m)
         elif tag is not None and tag.relative_alt_m is not None and tag.relative_alt_m > 1.0:
             return tag.relative_alt_m, 0.1 * tag.relative_alt_m + 2.0
         return ASSUMED_AGL_M, 0.5 * ASSUMED_AGL_M
