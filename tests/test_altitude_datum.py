@@ -31,7 +31,7 @@ def test_white_fixes_tell_the_barometers_zero(offset: float) -> None:
         found = altitude_datum(intervals(list(above)), 30.0)
         errors.append(found.shift_m - offset)
         sigmas.append(found.sigma_m)
-    assert np.sqrt(np.mean(np.square(errors))) < 0.25  # of 1.5 m in one fix
+    assert np.sqrt(np.mean(np.square(errors))) < 0.4  # of 1.5 m in one fix
     assert np.median(np.abs(errors)) < np.median(sigmas) < 0.3
 
 
