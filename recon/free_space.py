@@ -1,4 +1,4 @@
-"""Points that other views see through: what stereo invented on repeated texture.
+"""What views see through: points that stereo invented, and places that are open to the sky.
 
 A keyframe that sees surface well behind a point, all around the pixel where the point would
 be, says that the point's place is empty. One that sees surface at the point confirms it
@@ -7,7 +7,7 @@ be, says that the point's place is empty. One that sees surface at the point con
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -53,6 +53,60 @@ def seen_through(cloud: PointCloud, views: Iterable[DepthMap]) -> Bool:
     out: Bool = np.zeros(len(cloud), np.bool_)
     out[order] = through > confirmed
     return out
+
+
+def open_above(places_m: F64, heights_m: Sequence[float], views: Iterable[DepthMap]) -> Bool:
+    """(N,) places above which each of the heights has been seen to be empty by some keyframe.
+
+    A camera that looks sideways sees ground below a crown or an eave; where nothing above
+    the ground was seen to be empty, the ground need not be the highest surface there. Places
+    are (N, 3) in the world of the depth maps. Raises ValueError for more than 8 heights.
+    """
+    if not 0 < len(heights_m) <= 8:
+        raise ValueError(f"give 1 to 8 heights, not {len(heights_m)}")
+    order = np.argsort(places_m[:, 0], kind="stable")
+    xyz = np.ascontiguousarray(places_m[order], np.float32)
+    up = np.asarray(heights_m, np.float64)
+    seen = np.zeros(len(xyz), np.uint8)
+    for depth in views:
+        first, last = np.searchsorted(xyz[:, 0], _reach_east(depth))
+        if last > first:
+            _look_above(
+                xyz[first:last],
+                up,
+                np.ascontiguousarray(depth.depth_m, np.float32),
+                np.ascontiguousarray(depth.sigma_m, np.float32),
+                np.ascontiguousarray(depth.K, np.float64),
+                np.linalg.inv(depth.T_world_camera),
+                seen[first:last],
+            )
+    out: Bool = np.zeros(len(xyz), np.bool_)
+    out[order] = seen == (1 << len(up)) - 1
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _look_above(
+    xyz: F32, up_m: F64, depth: F32, depth_sigma: F32, K: F64, T: F64, seen: U8
+) -> None:
+    """Set bit j of ``seen`` where a keyframe sees through the place ``up_m[j]`` higher."""
+    h, w = depth.shape
+    for p in range(xyz.shape[0]):
+        for j in range(up_m.shape[0]):
+            if seen[p] & (1 << j):
+                continue
+            x, y, z = float(xyz[p, 0]), float(xyz[p, 1]), float(xyz[p, 2]) + up_m[j]
+            cz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+            if cz <= 0.1:
+                continue
+            cx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+            cy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+            u = int(np.floor(K[0, 0] * cx / cz + K[0, 2] + 0.5))
+            v = int(np.floor(K[1, 1] * cy / cz + K[1, 2] + 0.5))
+            if not (0 <= u < w and 0 <= v < h):
+                continue
+            if depth[v, u] - cz > AGREES_SIGMAS * float(depth_sigma[v, u]):
+                seen[p] |= np.uint8(1 << j)
 
 
 def _reach_east(depth: DepthMap) -> tuple[float, float]:

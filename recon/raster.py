@@ -26,6 +26,8 @@ SMEAR_SLOPE = 1.2
 SMEAR_CELLS = (1, 2, 4, 6)
 EDGE_CELLS = 3
 EDGE_PRECISION = 1.25
+SPARSE_CELLS = 8
+SPARSE_SHARE = 0.5
 
 LARGEST_CELLS = 200_000_000
 
@@ -159,18 +161,21 @@ def surface_model(xyz_m: F64 | F32, rgb: U8, sigma_m: F32, grid: Grid) -> Raster
     Cells beside a step that may as well be roof as ground stay unknown (:func:`reliable`);
     holes are filled on level ground only.
     """
-    certain = reliable(rasterise_points(xyz_m, rgb, sigma_m, grid))
-    return fill_holes(certain, level_m=STEP_M / 2.0)
+    all_cells = rasterise_points(xyz_m, rgb, sigma_m, grid)
+    certain = reliable(all_cells)
+    doubtful = all_cells.known & ~certain.known
+    return without_cells(fill_holes(certain, level_m=STEP_M / 2.0), doubtful)
 
 
 def reliable(raster: Raster) -> Raster:
     """``raster`` without the cells that stereo cannot place at a step of STEP_M or more.
 
-    Two kinds are left out. Cells on a slope steeper than SMEAR_SLOPE both up and down are what
+    Three kinds are left out. Cells on a slope steeper than SMEAR_SLOPE both up and down are what
     matching draws across the ground hidden behind a wall. Cells above a step, within the
     width that matching windows make a roof too wide, are kept only where they are known
     clearly better than their neighbourhood: a true roof edge is seen by all views, a spill
-    beside it by few.
+    beside it by few. And cells high above ground nearby with less than SPARSE_SHARE
+    of the usual number of known neighbours: crumbs of what hides behind a roof or in a crown.
     """
     height = raster.height_m.copy()
     sigma = np.nan_to_num(raster.sigma_m, nan=1.0)
@@ -186,9 +191,34 @@ def reliable(raster: Raster) -> Raster:
     above = height - _highest_lowest(height, EDGE_CELLS)[1] > STEP_M
     height[above & (precision < EDGE_PRECISION * mean)] = np.nan
     known = np.isfinite(height)
-    rgb = np.where(known[..., None], raster.rgb, 0).astype(np.uint8)
+    held = cv2.boxFilter(known.astype(np.float32), -1, (5, 5))
+    high = height - _highest_lowest(height, SPARSE_CELLS)[1] > STEP_M
+    usual = float(np.median(held[known])) if known.any() else 1.0
+    height[high & (held < SPARSE_SHARE * usual)] = np.nan
+    return without_cells(raster, ~np.isfinite(height))
+
+
+def without_cells(raster: Raster, unknown: Bool) -> Raster:
+    """``raster`` with the cells that ``unknown`` (rows, cols) marks taken out."""
+    known = raster.known & ~unknown
+    height = np.where(known, raster.height_m, np.float32(np.nan)).astype(np.float32)
     spread = np.where(known, raster.sigma_m, np.float32(np.nan)).astype(np.float32)
+    rgb = np.where(known[..., None], raster.rgb, 0).astype(np.uint8)
     return Raster(raster.grid, height, spread, rgb)
+
+
+def standing_height(raster: Raster, reach_m: float = 2.0, share: float = 0.99) -> float:
+    """How high things stand on this ground: a high quantile of the height above what is near.
+
+    0 where nothing is known. ``share`` of the cells lie less high above the lowest known cell
+    within ``reach_m``.
+    """
+    known = raster.known
+    if not known.any():
+        return 0.0
+    reach = max(1, round(reach_m / raster.grid.cell_m))
+    low = _highest_lowest(raster.height_m, reach)[1]
+    return float(np.quantile((raster.height_m - low)[known], share))
 
 
 def _highest_lowest(height_m: F32, reach_cells: int) -> tuple[F32, F32]:

@@ -16,7 +16,7 @@ import numpy as np
 from recon import metrics, se3
 from recon.camera_model import rays
 from recon.types import F64
-from service.sim.scoring import Truth, read_truth
+from service.sim.truth import Truth, read_truth
 from service.stream.store import ScanStore
 
 COLUMNS = ("name", "keyframe_seq", "u_px", "v_px", "lat", "lon", "alt_amsl_m",

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from recon.cloud_fusion import cloud_of
-from recon.free_space import seen_through
+from recon.free_space import open_above, seen_through
 from recon.types import DepthMap, PointCloud
 
 if TYPE_CHECKING:
@@ -74,3 +75,28 @@ def test_unknown_surroundings_are_no_evidence(house: HouseFlight) -> None:
     keep[::3, ::3] = True
     sparse.depth_m[~keep] = np.nan
     assert not seen_through(blob, [sparse]).any()
+
+
+def test_ground_is_open_where_a_ray_passes_above_it(house: HouseFlight) -> None:
+    """Against the cone of one camera: 4 m above the ground it is a tenth narrower."""
+    one = house.keyframe(0, -100.0).depth  # over level ground only
+    x, y = np.meshgrid(np.linspace(-130.0, -70.0, 121), np.linspace(-16.0, 16.0, 65))
+    ground = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    found = open_above(ground, (2.0, 4.0), [one])
+    half = 36.0 * np.array([80.0, 45.0]) / 140.0  # the picture's half size, 4 m up
+    gap = (np.abs(ground[:, :2] - [-100.0, 0.0]) - half).max(axis=1)
+    assert found[gap < -0.3].all() and not found[gap > 0.3].any()
+
+
+def test_ground_below_an_eave_is_not_open(house: HouseFlight) -> None:
+    """A roof 3 m up hides what is above it from the camera that sees both."""
+    flat = house.keyframe(0, -100.0).depth
+    depth = flat.depth_m.copy()
+    depth[40:50, 70:90] = 37.0
+    roofed = replace(flat, depth_m=depth)
+    below = np.array([[-100.0, 0.0, 0.0], [-90.0, 5.0, 0.0]])
+    assert open_above(below, (2.0,), [roofed]).tolist() == [False, True]
+    assert open_above(below, (2.0,), [roofed, flat]).all()  # another saw it before it was built
+    assert not open_above(below, (2.0,), []).any()
+    with pytest.raises(ValueError, match="1 to 8 heights"):
+        open_above(below, (), [flat])

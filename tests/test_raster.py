@@ -15,6 +15,7 @@ from recon.raster import (
     hillshade,
     rasterise,
     reliable,
+    standing_height,
     surface_model,
 )
 from recon.types import F32, F64, PointCloud
@@ -183,3 +184,22 @@ def test_the_surface_model_of_a_plain_cloud_is_its_upper_surface() -> None:
     model = surface_model(points.xyz_m, points.rgb, points.sigma_m, grid)
     assert model.known.mean() > 0.99
     assert np.nanmax(np.abs(model.height_m - 2.0)) < 0.06
+
+
+def test_crumbs_high_above_the_ground_are_left_out_and_a_roof_stays() -> None:
+    height = np.zeros((60, 60), np.float32)
+    height[10:25, 10:25] = 5.0
+    height[35:50, 35:50] = np.nan  # what a tree hides, with crumbs of its crown
+    height[38:48:4, 38:48:4] = 6.0
+    found = reliable(raster_of(height, 0.25)).height_m
+    assert np.isnan(found[35:50, 35:50]).all()
+    assert (found[14:21, 14:21] == 5.0).all()
+    assert np.isfinite(found[:8]).all()
+
+
+def test_standing_height_is_that_of_the_things_on_the_ground() -> None:
+    height = np.tile(np.linspace(0.0, 3.0, 100, dtype=np.float32), (100, 1))  # a gentle slope
+    assert standing_height(raster_of(height, 0.25)) < 0.6
+    height[40:60, 40:60] += 5.0
+    assert 4.9 < standing_height(raster_of(height, 0.25)) < 5.6
+    assert standing_height(raster_of(np.full((5, 5), np.nan, np.float32))) == 0.0

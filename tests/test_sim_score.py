@@ -11,12 +11,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+from recon.meshing import Mesh
 from recon.se3 import so3_exp
 from recon.types import F64, PointCloud
 from service.cli import app
 from service.errors import InputError
+from service.exports.glb import glb
 from service.georeference import LocalFrame
 from service.scans.las import write_laz
+from service.sim.above import view_from_above
+from service.sim.surface_file import read_surface
+from service.sim.truth import heights_below, read_truth
 
 TRUTH_AT = LocalFrame(47.3977, 8.5456, 488.0)
 SCAN_AT = LocalFrame(47.3980, 8.5450, 540.0)  # another origin, 33 m north and 45 m west
@@ -77,8 +82,8 @@ def write_scan(
     return folder
 
 
-def score(scan: Path, truth: Path) -> dict[str, Any]:
-    result = CliRunner().invoke(app, ["score", str(scan), str(truth), "--json"])
+def score(scan: Path, truth: Path, *options: str) -> dict[str, Any]:
+    result = CliRunner().invoke(app, ["score", str(scan), str(truth), "--json", *options])
     if result.exception is not None:
         raise result.exception
     report = json.loads(result.stdout.strip().splitlines()[-1])
@@ -212,3 +217,73 @@ def test_missing_or_damaged_parts_are_named(
     with pytest.raises(InputError, match=word) as caught:
         score(scan, truth)
     assert "\n" not in str(caught.value)
+
+
+def delivered(scan: Path, flight: Path, shift_east_m: float, shift_up_m: float) -> None:
+    """Write a DSM, an orthophoto and a mesh made of the truth itself, shifted."""
+    rasterio = pytest.importorskip("rasterio")
+    pytest.importorskip("trimesh")
+    truth = read_truth(flight)
+    shape, cell = (200, 240), 0.25
+    centre = truth.poses[len(truth.poses) // 2][:3, 3]
+    middle = TRUTH_AT.to_utm(np.array([[centre[0], centre[1], 0.0]]))[0]
+    west, north = np.floor(middle[:2] + np.array([-30.0, 25.0]))
+    row, col = np.indices(shape).reshape(2, -1)
+    utm = np.column_stack([west + (col + 0.5) * cell, north - (row + 0.5) * cell, 0 * col + 488.0])
+    xy = TRUTH_AT.from_utm(utm)[:, :2]
+    height = heights_below(truth.surface, xy) + 488.0 + shift_up_m
+    place = {
+        "crs": "EPSG:32632", "height": shape[0], "width": shape[1],
+        "transform": rasterio.transform.from_origin(west + shift_east_m, north, cell, cell),
+    }  # fmt: skip
+    with rasterio.open(
+        scan / "dsm.tif", "w", driver="GTiff", count=1, dtype="float32", nodata=-9999.0, **place
+    ) as image:
+        image.write(height.reshape(shape).astype(np.float32), 1)
+    low, high = xy.min(axis=0) - 1.0, xy.max(axis=0) + 1.0
+    size = np.ceil((high - low) / 0.125).astype(int)
+    above = view_from_above(truth.folder, low[0], high[1], 0.125, (int(size[1]), int(size[0])))
+    at = np.floor((xy - [low[0], high[1]]) / [0.125, -0.125]).astype(int)
+    rgba = np.full((4, *shape), 255, np.uint8)
+    rgba[:3] = above[at[:, 1], at[:, 0], ::-1].reshape(*shape, 3).transpose(2, 0, 1)
+    with rasterio.open(
+        scan / "ortho.tif", "w", driver="GTiff", count=4, dtype="uint8", **place
+    ) as image:
+        image.write(rgba)
+    vertices, faces = read_surface(truth.folder / "surface.ply")
+    moved = vertices + np.array([shift_east_m, 0.0, shift_up_m])
+    mesh = Mesh(SCAN_AT.to_enu(TRUTH_AT.to_geodetic(moved)), faces)
+    origin = [SCAN_AT.lat_deg, SCAN_AT.lon_deg, SCAN_AT.alt_amsl_m]
+    (scan / "mesh.glb").write_bytes(glb([(mesh, None)], {"origin_lat_lon_amsl": origin}))
+
+
+def test_files_are_measured_where_they_say_they_are(flight: Path, tmp_path: Path) -> None:
+    """Files made of the truth, 0.8 m too far east and 0.3 m too high."""
+    scan = write_scan(
+        tmp_path / "scan", flight, true_cloud(flight), True, np.eye(3), np.zeros(3), 0.1
+    )
+    delivered(scan, flight, 0.8, 0.3)
+    found = score(scan, flight, "--deliverables")["deliverables"]
+    assert {k: v["file"] for k, v in found.items()} == {
+        "dsm": "dsm.tif", "ortho": "ortho.tif", "mesh": "mesh.glb", "laz": "cloud.laz",
+    }  # fmt: skip
+    dsm, ortho, mesh = (found[k]["raw"] for k in ("dsm", "ortho", "mesh"))
+    assert dsm["bias_m"] == pytest.approx(0.3, abs=0.02)
+    assert dsm["completeness"] > 0.3
+    assert ortho["median_m"] == pytest.approx(0.8, abs=0.05)
+    assert ortho["east_m"] == pytest.approx(0.8, abs=0.05)
+    assert abs(ortho["north_m"]) < 0.05 and found["ortho"]["matched_share"] > 0.9
+    assert 0.2 < mesh["median_m"] < 0.4 and mesh["completeness"] > 0.85
+    assert found["laz"]["raw"]["median_m"] < 0.02 and found["laz"]["epsg"] == 32632
+
+
+def test_a_file_that_is_none_is_named(flight: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rasterio")
+    scan = write_scan(
+        tmp_path / "scan", flight, true_cloud(flight), True, np.eye(3), np.zeros(3), 0.1
+    )
+    (scan / "dsm.tif").write_bytes(b"II*\0 not much more")
+    arguments = ["score", str(scan), str(flight), "--deliverables"]
+    result = CliRunner().invoke(app, arguments)
+    assert isinstance(result.exception, InputError)
+    assert "dsm.tif" in str(result.exception) and "\n" not in str(result.exception)

@@ -22,7 +22,7 @@ from recon.camera_model import rays
 from recon.trajectory import Trajectory
 from recon.types import F64
 from service.cli import app
-from service.sim.scoring import read_truth
+from service.sim.truth import read_truth
 from service.stream.store import ScanStore
 
 DRIFT = se3.exp(np.array([0.0, 0.0, 0.001, 0.0, 0.0, 0.15]))

@@ -15,9 +15,6 @@ from service.exports.view import ExportOptions, ScanView
 from service.scans.writing import writing
 
 METHODS = ("auto", "height", "poisson")
-OBLIQUE_SHARE = 0.25
-"""Above this share of keyframes that look more than 30 degrees off nadir, auto is Poisson."""
-
 TILE_POINTS = 20_000_000
 LARGEST_ATLAS_PX = 8192
 TILED_ATLAS_PX = 4096
@@ -53,7 +50,7 @@ def write_mesh(
         raise InputError(f"mesh by {how.method!r}: there are {', '.join(METHODS)}")
     method = how.method
     if method == "auto":
-        method = "poisson" if _oblique_share(scan) > OBLIQUE_SHARE else "height"
+        method = "poisson" if scan.oblique else "height"
     prints = footprints(scan.store)
     if not prints:
         raise InputError(f"{scan.folder} holds no points yet; nothing to mesh")
@@ -91,12 +88,6 @@ def write_mesh(
     with writing(out) as part:
         part.write_bytes(glb([(p.mesh, p.picture) for p in parts], _extras(scan) | figures))
     return figures
-
-
-def _oblique_share(scan: ScanView) -> float:
-    """Share of the keyframes whose optical axis is more than 30 degrees off straight down."""
-    down = [-k.depth.T_world_camera[2, 2] for k in scan.store.keyframes()]
-    return float(np.mean(np.array(down) < np.cos(np.radians(30.0)))) if down else 0.0
 
 
 def _extras(scan: ScanView) -> dict[str, Any]:

@@ -11,27 +11,65 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.raster import Grid, Raster, fill_holes, surface_model
+from recon.free_space import open_above
+from recon.raster import (
+    Grid,
+    Raster,
+    fill_holes,
+    standing_height,
+    surface_model,
+    without_cells,
+)
 from recon.types import F64, Array
 from service.exports.view import ExportOptions, ScanView
 from service.scans.writing import writing
 
 NODATA_M = -9999.0
 SHORTEST_CONTOUR_CELLS = 12
+OPEN_STEP_M = 2
+MOST_OPEN_M, MOST_OPEN_SIDEWAYS_M = 4, 6
+"""Free air above a cell that is asked for at most: trees and eaves hang over higher up as well,
+but every metre costs ground at the border of the survey. Looking sideways one sees more of
+the ground below them."""
 
 
 def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """Heights in AMSL metres (float32, -9999 where unknown); band 2 holds their sigma.
 
-    Unknown is also what cannot be placed beside a step (:func:`recon.raster.surface_model`).
+    Unknown is also what cannot be placed beside a step (:func:`recon.raster.surface_model`),
+    and ground above which something may stand that no picture shows.
     """
     cloud = scan.fused.cloud
     raster = surface_model(scan.xyz_m, cloud.rgb, cloud.sigma_m, scan.grid(options.cell_m))
+    raster = _open_to_the_sky(scan, raster)
     known = raster.known
     bands = np.stack(
         [np.where(known, raster.height_m, NODATA_M), np.where(known, raster.sigma_m, NODATA_M)]
     ).astype(np.float32)
     write_cog(scan, out, raster.grid, bands, ("height AMSL, m", "sigma, m"), nodata=NODATA_M)
+
+
+def _open_to_the_sky(scan: ScanView, raster: Raster) -> Raster:
+    """``raster`` where the air above was seen to be free, as high as things stand on this site."""
+    highest = min(standing_height(raster), MOST_OPEN_SIDEWAYS_M if scan.oblique else MOST_OPEN_M)
+    heights_m = [float(m) for m in range(OPEN_STEP_M, math.ceil(highest) + 1, OPEN_STEP_M)]
+    if not heights_m:
+        return raster
+    rows, cols = np.nonzero(raster.known)
+    grid = raster.grid
+    places = np.column_stack(
+        [
+            grid.west_m + (cols + 0.5) * grid.cell_m,
+            grid.north_m - (rows + 0.5) * grid.cell_m,
+            raster.height_m[rows, cols].astype(np.float64),
+        ]
+    )
+    if scan.frame is not None:
+        places = scan.frame.from_utm(places)
+    depths = (k.depth for k in scan.store.keyframes())
+    hidden = np.zeros(grid.shape, np.bool_)
+    hidden[rows, cols] = ~open_above(places, heights_m, depths)
+    return without_cells(raster, hidden)
 
 
 def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:

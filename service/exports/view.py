@@ -22,6 +22,9 @@ from service.scans.track import latest, local_frame
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
+OBLIQUE_SHARE = 0.25
+"""Share of the keyframes looking sideways above which a scan counts as oblique."""
+
 
 @dataclass(frozen=True, slots=True)
 class ExportOptions:
@@ -73,6 +76,13 @@ class ScanView:
     def poses(self) -> list[PoseRecord]:
         """The trajectory in order of time."""
         return latest(self.store.poses())
+
+    @cached_property
+    def oblique(self) -> bool:
+        """True when many keyframes look more than 30 degrees off straight down."""
+        down = [-k.depth.T_world_camera[2, 2] for k in self.store.keyframes()]
+        off = np.array(down) < np.cos(np.radians(30.0))
+        return bool(len(down)) and float(off.mean()) > OBLIQUE_SHARE
 
     @cached_property
     def fused(self) -> FusedCloud:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,37 +9,30 @@ from typing import Any
 
 import numpy as np
 
-from recon import metrics, se3, triangle_grid
+from recon import metrics, se3
 from recon.metrics import Fit
 from recon.raster import Grid, grid_over, rasterise_points, surface_model
-from recon.triangle_grid import TriangleGrid
 from recon.types import F32, F64
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.sim.surface_file import read_surface
+from service.sim.deliverable_scoring import score_files
+from service.sim.truth import (
+    SeenSurface,
+    Truth,
+    heights_below,
+    json_object,
+    read_truth,
+    read_tum,
+    seen_surface,
+    short,
+)
 
 log = logging.getLogger(__name__)
 
 REACH_M = 5.0
 COMPLETE_WITHIN_M = 0.5
-SAMPLE_SPACING_M = 0.4
 DSM_CELL_M = 0.25
-FRAMES_FOR_VISIBILITY = 60
-VIEWS_TO_COUNT = 3
 MOST_POINTS = 300_000
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Truth:
-    """What ``simulate`` wrote into ``truth/``."""
-
-    frame: LocalFrame
-    surface: TriangleGrid
-    times_s: F64  # (F,)
-    poses: F64  # (F, 4, 4)
-    K: F64
-    size_px: tuple[int, int]
-    agl_m: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,8 +46,11 @@ class ScanResult:
     placed: bool  # False: coordinates are the scan's own
 
 
-def score(scan_folder: Path, truth_folder: Path) -> dict[str, Any]:
-    """All figures of a scan against the truth, ready for JSON; InputError for missing parts."""
+def score(scan_folder: Path, truth_folder: Path, deliverables: bool = False) -> dict[str, Any]:
+    """All figures of a scan against the truth, ready for JSON; InputError for missing parts.
+
+    With ``deliverables`` the exported files in the scan folder are measured too.
+    """
     truth = read_truth(truth_folder)
     scan = read_scan(scan_folder, truth.frame)
     at_truth, known = metrics.poses_at(truth.times_s, truth.poses, scan.times_s)
@@ -88,9 +83,13 @@ def score(scan_folder: Path, truth_folder: Path) -> dict[str, Any]:
         for name, fit in fits["surface"].items()
         if name in ("raw", best)
     }
-    report["completeness"] = _completeness(scan, truth, fits["surface"][best])
+    seen = seen_surface(truth)
+    report["completeness"] = _completeness(scan, seen, fits["surface"][best])
     for name, fit in fits["surface"].items():
         report["surface"][name]["fit"] = _fit_size(fit, scan.points)
+    if deliverables:
+        chosen = {name: fit for name, fit in fits["surface"].items() if name in ("raw", best)}
+        report["deliverables"] = score_files(scan_folder, truth, seen.places, chosen)
     return report
 
 
@@ -161,9 +160,7 @@ def _truth_heights(truth: Truth, grid: Grid) -> F64:
     rows, cols = np.indices(grid.shape)
     x = grid.west_m + (cols.ravel() + 0.5) * grid.cell_m
     y = grid.north_m - (rows.ravel() + 0.5) * grid.cell_m
-    above = np.column_stack([x, y, np.full(len(x), truth.surface.bounds[5] + 10.0)])
-    t, _ = truth.surface.cast(above, np.tile([0.0, 0.0, -1.0], (len(x), 1)))
-    return np.asarray((above[:, 2] - t).reshape(grid.shape))
+    return heights_below(truth.surface, np.column_stack([x, y])).reshape(grid.shape)
 
 
 def _range_of_three(height: F64) -> F64:
@@ -185,59 +182,25 @@ def _fit_size(fit: Fit, points: F64) -> dict[str, float]:
     }
 
 
-def _completeness(scan: ScanResult, truth: Truth, fit: Fit) -> dict[str, float]:
+def _completeness(scan: ScanResult, seen: SeenSurface, fit: Fit) -> dict[str, float]:
     """Share of the surface that the flight saw and the cloud has, in all and by steepness."""
-    samples, normals = metrics.sample_surface(truth.surface, SAMPLE_SPACING_M)
-    frames = np.unique(np.linspace(0, len(truth.poses) - 1, FRAMES_FOR_VISIBILITY).astype(int))
-    views = np.zeros(len(samples), np.int64)
-    for k in frames:
-        views += metrics.seen_from(
-            samples, normals, truth.surface, truth.poses[k], truth.K, np.array(truth.size_px)
-        )
-    seen = views >= min(VIEWS_TO_COUNT, len(frames))
-    if not seen.any():
-        raise InputError("the truth's cameras see none of the truth's surface; wrong folder?")
-    covered = metrics.share_covered(samples[seen], fit.points(scan.points), COMPLETE_WITHIN_M)
-    flat = np.abs(normals[seen, 2]) > 0.5
-    area = float(truth.surface.areas().sum()) * float(seen.mean())
+    covered = metrics.share_covered(seen.places, fit.points(scan.points), COMPLETE_WITHIN_M)
+    flat = np.abs(seen.normals[:, 2]) > 0.5
     return {
         "share": float(covered.mean()),
         "share_flat": float(covered[flat].mean()) if flat.any() else float("nan"),
         "share_steep": float(covered[~flat].mean()) if (~flat).any() else float("nan"),
         "steep_part": float((~flat).mean()),
-        "seen_m2": area,
+        "seen_m2": seen.area_m2,
         "within_m": COMPLETE_WITHIN_M,
     }
-
-
-def read_truth(folder: Path) -> Truth:
-    """The truth in ``folder``, or in its ``truth`` subfolder."""
-    if not (folder / "surface.ply").exists() and (folder / "truth").is_dir():
-        folder = folder / "truth"
-    if not folder.is_dir():
-        raise InputError(f"truth {folder}: no such folder; `skyrelief simulate` makes one")
-    origin = _json(folder / "origin.json")
-    params = _json(folder / "params.json")
-    vertices, triangles = read_surface(folder / "surface.ply")
-    times, poses = read_tum(folder / "trajectory.tum")
-    try:
-        frame = LocalFrame(origin["lat_deg"], origin["lon_deg"], origin["alt_amsl_m"])
-        K = np.array(params["K"], np.float64).reshape(3, 3)
-        width, height = (int(v) for v in params["size_px"])
-        agl = float(params["median_agl_m"])
-        surface = triangle_grid.build(vertices, triangles)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"truth {folder}: unusable ({_short(error)})") from error
-    if len(times) < 2:
-        raise InputError(f"truth {folder}: trajectory.tum has fewer than two poses")
-    return Truth(frame, surface, times, poses, K, (width, height), agl)
 
 
 def read_scan(folder: Path, frame: LocalFrame) -> ScanResult:
     """The scan in ``folder``, brought into ``frame`` when it has a place on the globe."""
     if not folder.is_dir():
         raise InputError(f"scan {folder}: no such folder")
-    summary = _json(folder / "scan.json")
+    summary = json_object(folder / "scan.json")
     points, sigma = _read_cloud(folder / "cloud.laz")
     if len(points) == 0:
         raise InputError(f"scan {folder}: cloud.laz holds no points; nothing to score")
@@ -248,7 +211,7 @@ def read_scan(folder: Path, frame: LocalFrame) -> ScanResult:
     try:
         own = LocalFrame(origin["lat_deg"], origin["lon_deg"], origin["alt_amsl_m"])
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"scan {folder}: origin in scan.json ({_short(error)})") from error
+        raise InputError(f"scan {folder}: origin in scan.json ({short(error)})") from error
     if own.epsg != epsg:
         raise InputError(f"scan {folder}: EPSG {epsg} in scan.json is not that of its origin")
     enu = frame.to_enu(own.to_geodetic(own.from_utm(points)))
@@ -268,24 +231,6 @@ def _moved_poses(poses: F64, own: LocalFrame, frame: LocalFrame) -> F64:
     return out
 
 
-def read_tum(path: Path) -> tuple[F64, F64]:
-    """(times (N,) unix s, poses (N, 4, 4)) of a TUM trajectory, in order of time."""
-    text = _text(path)
-    rows = [r.split() for r in text.splitlines() if r.strip() and not r.startswith("#")]
-    try:
-        table = np.array([[float(v) for v in row] for row in rows]).reshape(len(rows), 8)
-        if not np.isfinite(table).all():
-            raise ValueError("numbers that are not finite")
-        table = table[np.argsort(table[:, 0], kind="stable")]
-        poses = np.tile(np.eye(4), (len(table), 1, 1))
-        for k, row in enumerate(table):
-            poses[k, :3, :3] = se3.rotation_from_quaternion(row[[7, 4, 5, 6]])
-        poses[:, :3, 3] = table[:, 1:4]
-    except ValueError as error:
-        raise InputError(f"trajectory {path}: not a TUM file ({_short(error)})") from error
-    return table[:, 0], poses
-
-
 def _read_cloud(path: Path) -> tuple[F64, F32 | None]:
     """(points (N, 3), sigma_m (N,) or None) of a LAZ file."""
     import laspy
@@ -296,30 +241,7 @@ def _read_cloud(path: Path) -> tuple[F64, F32 | None]:
     except FileNotFoundError:
         raise InputError(f"cloud {path}: no such file; was the scan finished?") from None
     except (laspy.errors.LaspyException, RuntimeError, ValueError, OSError) as error:
-        raise InputError(f"cloud {path}: cannot be read ({_short(error)})") from error
+        raise InputError(f"cloud {path}: cannot be read ({short(error)})") from error
     names = set(las.point_format.extra_dimension_names)
     sigma = np.asarray(las["sigma_m"], np.float32) if "sigma_m" in names else None
     return points, sigma
-
-
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(_text(path))
-    except ValueError as error:
-        raise InputError(f"{path}: not JSON ({_short(error)})") from error
-    if not isinstance(value, dict):
-        raise InputError(f"{path}: not a JSON object")
-    return value
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({_short(error)})") from error
-
-
-def _short(error: Exception) -> str:
-    return " ".join(str(error).split())[:120]

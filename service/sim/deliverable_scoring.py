@@ -1,0 +1,290 @@
+"""The exported files of a scan against the truth of a simulated flight.
+
+The files are read as anyone would read them (rasterio, laspy, trimesh), and placed by what
+they say of themselves: the coordinate system and geotransform, or the origin in the glTF's
+``asset.extras``.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import struct
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from recon import metrics, triangle_grid
+from recon.metrics import Fit
+from recon.picture_shift import patch_shifts
+from recon.triangle_grid import TriangleGrid
+from recon.types import F32, F64, Array
+from service.errors import InputError
+from service.georeference import LocalFrame
+from service.sim.above import view_from_above
+from service.sim.truth import Truth, heights_below, short
+
+log = logging.getLogger(__name__)
+
+REACH_M = 5.0
+COVERED_WITHIN_M = 0.5
+ORTHO_REACH_M = 3.0
+SAMPLE_SPACING_M = 0.25
+MOST_POINTS = 300_000
+
+Fits = dict[str, Fit]
+
+
+def score_files(folder: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
+    """Figures of each exported file in ``folder`` by name; a file that is not there is left out.
+
+    ``seen`` (S, 3) are places of the true surface that the flight saw; each file is measured
+    after each of the ``fits``. Raises InputError when there is no file, or one is unfit.
+    """
+    out: dict[str, Any] = {}
+    for kind, (name, measure) in _READERS.items():
+        path = folder / name
+        if path.is_file():
+            log.info("measuring %s", path)
+            out[kind] = {"file": name} | measure(path, truth, seen, fits)
+    if not out:
+        raise InputError(f"{folder}: no exported file; `skyrelief export` and `mesh` write them")
+    return out
+
+
+def _dsm(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
+    """Heights of the cells less the truth's, straight below or above their middles."""
+    image = _Raster(path, truth.frame)
+    height = image.bands[0].astype(np.float64)
+    known = np.isfinite(height) & (height != image.nodata)
+    rows, cols = np.nonzero(known)
+    cells = image.places(cols, rows, height[known])
+    out: dict[str, Any] = image.facts | {"cells": len(cells)}
+    for name, fit in fits.items():
+        moved = fit.points(cells)
+        error = moved[:, 2] - heights_below(truth.surface, moved[:, :2])
+        error = error[np.isfinite(error)]
+        share = _seen_in(seen, image, known, fit, truth)
+        out[name] = {"completeness": share} | _height_figures(error)
+    return out
+
+
+def _height_figures(error: F64) -> dict[str, float]:
+    if not len(error):
+        return {}
+    size = np.abs(error)
+    return {
+        "rms_m": float(np.sqrt(np.mean(error**2))),
+        "median_m": float(np.median(size)),
+        "bias_m": float(np.median(error)),
+        "p95_m": float(np.percentile(size, 95)),
+        "within_30cm": float(np.mean(size < 0.3)),
+    }
+
+
+def _seen_in(seen: F64, image: _Raster, known: Array, fit: Fit, truth: Truth) -> float:
+    """Share of the seen places that are open to the sky and whose cell is known."""
+    top = heights_below(truth.surface, seen[:, :2])
+    open_m = seen[np.abs(top - seen[:, 2]) < 0.05]
+    cols, rows = image.cells_of((open_m - fit.t) @ fit.R / fit.scale)
+    inside = (cols >= 0) & (cols < known.shape[1]) & (rows >= 0) & (rows < known.shape[0])
+    held = np.zeros(len(open_m), np.bool_)
+    held[inside] = known[rows[inside], cols[inside]]
+    return float(held.mean()) if len(held) else float("nan")
+
+
+def _ortho(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
+    """Shifts of patches against the place rendered from straight above."""
+    image = _Raster(path, truth.frame)
+    if len(image.bands) < 4:
+        raise InputError(f"{path}: {len(image.bands)} bands; expected red, green, blue, opacity")
+    known = image.bands[3] > 0
+    try:
+        should = _true_picture(image, known.shape, truth)
+    except InputError as error:
+        return image.facts | {"trouble": str(error)}
+    colour = np.ascontiguousarray(image.bands[:3].transpose(1, 2, 0))
+    shown = cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    found = patch_shifts(shown, should, known, round(ORTHO_REACH_M / image.cell_m))
+    out: dict[str, Any] = image.facts | {
+        "patches": found.tried,
+        "matched_share": found.matched_share,
+        "reach_m": ORTHO_REACH_M,
+    }
+    if not len(found.likeness):
+        return out
+    (col, row), (du, dv) = found.middle_px.T, found.shift_px.T
+    level = np.full(len(col), truth.frame.alt_amsl_m)
+    here, there = image.places(col, row, level), image.places(col - du, row - dv, level)
+    here[:, 2] = np.nan_to_num(heights_below(truth.surface, there[:, :2]))
+    for name, fit in fits.items():
+        off = (fit.points(here) - there)[:, :2]
+        length = np.hypot(*off.T)
+        out[name] = {
+            "median_m": float(np.median(length)),
+            "p95_m": float(np.percentile(length, 95)),
+            "within_50cm": float(np.mean(length < 0.5)),
+            "east_m": float(np.median(off[:, 0])),
+            "north_m": float(np.median(off[:, 1])),
+        }
+    return out
+
+
+def _true_picture(image: _Raster, shape: tuple[int, int], truth: Truth) -> F32:
+    """(rows, cols) grey of the true place, rendered at half the cells and laid on the file's."""
+    row, col = np.indices(shape).reshape(2, -1)
+    ground = image.places(col, row, np.full(len(col), truth.frame.alt_amsl_m))
+    step = 0.5 * image.cell_m
+    west, north = ground[:, 0].min() - 2 * step, ground[:, 1].max() + 2 * step
+    width, height = (int(n) for n in np.ceil(np.ptp(ground[:, :2], axis=0) / step) + 4)
+    true = view_from_above(truth.folder, west, north, step, (height, width))
+    soft = cv2.GaussianBlur(cv2.cvtColor(true, cv2.COLOR_BGR2GRAY), (0, 0), 1.0)
+    x = ((ground[:, 0] - west) / step - 0.5).reshape(shape).astype(np.float32)
+    y = ((north - ground[:, 1]) / step - 0.5).reshape(shape).astype(np.float32)
+    return np.asarray(cv2.remap(soft.astype(np.float32), x, y, cv2.INTER_LINEAR), np.float32)
+
+
+def _mesh(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
+    """Distances of the mesh to the true surface, evenly by area, and of the truth to the mesh."""
+    import trimesh
+
+    try:
+        extras = _glb_extras(path)
+        mesh: Any = trimesh.load(str(path), force="mesh", process=False)
+        x, up, south = np.asarray(mesh.vertices, np.float64).T
+        local = np.column_stack([x, -south, up])
+        faces = np.asarray(mesh.faces)
+        origin = extras.get("origin_lat_lon_amsl")
+        own = None if origin is None else LocalFrame(*(float(v) for v in origin))
+        placed = local if own is None else truth.frame.to_enu(own.to_geodetic(local))
+        triangle_grid.build(placed, faces)
+    except (ValueError, TypeError, KeyError, AttributeError, struct.error) as error:
+        raise InputError(f"{path}: not a mesh of ours ({short(error)})") from error
+    out: dict[str, Any] = {"vertices": len(local), "faces": len(faces), "placed": own is not None}
+    for name, fit in fits.items():
+        grid = triangle_grid.build(fit.points(placed), faces)
+        out[name] = _mesh_figures(grid, truth, seen)
+    return out
+
+
+def _mesh_figures(grid: TriangleGrid, truth: Truth, seen: F64) -> dict[str, float]:
+    samples, _ = metrics.sample_surface(grid, SAMPLE_SPACING_M)
+    distance, _ = metrics.distances(samples, truth.surface, REACH_M)
+    d = np.where(np.isfinite(distance), distance, REACH_M)
+    gap, _, _ = grid.closest(seen, COVERED_WITHIN_M)
+    return {
+        "median_m": float(np.median(d)),
+        "p95_m": float(np.percentile(d, 95)),
+        "rms_m": float(np.sqrt(np.mean(d**2))),
+        "median_percent_of_altitude": 100.0 * float(np.median(d)) / truth.agl_m,
+        "completeness": float(np.isfinite(gap).mean()),
+    }
+
+
+def _glb_extras(path: Path) -> dict[str, Any]:
+    """``asset.extras`` of a binary glTF file; ValueError or struct.error when it is none."""
+    with path.open("rb") as file:
+        magic, _, _, length, kind = struct.unpack("<4sIII4s", file.read(20))
+        if magic != b"glTF" or kind != b"JSON" or length > path.stat().st_size:
+            raise ValueError("not a binary glTF file")
+        return dict(json.loads(file.read(length))["asset"].get("extras", {}))
+
+
+def _cloud(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
+    """Distances of the points to the true surface, placed by the file's own coordinate system."""
+    import laspy
+
+    try:
+        with laspy.open(str(path)) as reader:
+            crs = reader.header.parse_crs()
+        if path.name.endswith(".copc.laz"):  # by its octree, as a viewer would
+            with laspy.CopcReader.open(str(path)) as octree:
+                las: Any = octree.query()
+        else:
+            las = laspy.read(str(path))
+        points = np.column_stack([las.x, las.y, las.z]).astype(np.float64)
+    except (laspy.errors.LaspyException, RuntimeError, ValueError, OSError) as error:
+        raise InputError(f"{path}: cannot be read ({short(error)})") from error
+    out: dict[str, Any] = {"epsg": None if crs is None else crs.to_epsg(), "points": len(points)}
+    step = max(1, -(-len(points) // MOST_POINTS))
+    places = _enu(crs, points[::step], truth.frame)
+    for name, fit in fits.items():
+        distance, signed = metrics.distances(fit.points(places), truth.surface, REACH_M)
+        out[name] = asdict(metrics.surface_errors(distance, signed, REACH_M))
+    return out
+
+
+class _Raster:
+    """A GeoTIFF in memory, with the way from its cells to the truth's frame."""
+
+    def __init__(self, path: Path, frame: LocalFrame) -> None:
+        """Raises InputError for a file that is no north-up GeoTIFF."""
+        import rasterio
+
+        try:
+            with rasterio.open(path) as image:
+                self.bands = image.read()
+                self.nodata = image.nodata
+                self._to_map = image.transform
+                self._crs = image.crs
+        except (rasterio.errors.RasterioError, OSError) as error:
+            raise InputError(f"{path}: cannot be read ({short(error)})") from error
+        self._frame = frame
+        self.cell_m = float(self._to_map.a)
+        if not self.cell_m > 0.0 or self._to_map.b or self._to_map.d:
+            raise InputError(f"{path}: not a north-up map")
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What the file says of itself."""
+        return {"epsg": None if self._crs is None else self._crs.to_epsg(), "cell_m": self.cell_m}
+
+    def places(self, col: Array, row: Array, height_m: Array) -> F64:
+        """(N, 3) of cells (their middles at whole numbers) at heights, in the truth's frame."""
+        x = self._to_map.c + self._to_map.a * (np.asarray(col) + 0.5)
+        y = self._to_map.f + self._to_map.e * (np.asarray(row) + 0.5)
+        return _enu(self._crs, np.column_stack([x, y, height_m]), self._frame)
+
+    def cells_of(self, enu_m: F64) -> tuple[Array, Array]:
+        """(column, row) of the cells that hold (N, 3) places of the truth's frame."""
+        x, y = _from_enu(self._crs, enu_m, self._frame).T[:2]
+        col, row = (x - self._to_map.c) / self._to_map.a, (y - self._to_map.f) / self._to_map.e
+        return np.floor(col).astype(np.int64), np.floor(row).astype(np.int64)
+
+
+def _enu(crs: Any, xyz: F64, frame: LocalFrame) -> F64:
+    """(N, 3) coordinates of a file in ``frame``; heights pass through. Without a system: as is."""
+    if crs is None:
+        return xyz
+    lon, lat = _to_globe(crs).transform(xyz[:, 0], xyz[:, 1])
+    return frame.to_enu(np.column_stack([lat, lon, xyz[:, 2]]))
+
+
+def _from_enu(crs: Any, enu_m: F64, frame: LocalFrame) -> F64:
+    """Undoes :func:`_enu`."""
+    if crs is None:
+        return enu_m
+    geodetic = frame.to_geodetic(enu_m)
+    x, y = _to_globe(crs).transform(geodetic[:, 1], geodetic[:, 0], direction="INVERSE")
+    return np.column_stack([x, y, geodetic[:, 2]])
+
+
+def _to_globe(crs: Any) -> Any:
+    """The transformation from a file's coordinate system to longitude and latitude."""
+    from pyproj import CRS, Transformer
+
+    return Transformer.from_crs(CRS.from_user_input(crs), CRS.from_epsg(4326), always_xy=True)
+
+
+_READERS: dict[str, tuple[str, Callable[[Path, Truth, F64, Fits], dict[str, Any]]]] = {
+    "dsm": ("dsm.tif", _dsm),
+    "ortho": ("ortho.tif", _ortho),
+    "mesh": ("mesh.glb", _mesh),
+    "laz": ("cloud.laz", _cloud),
+    "copc": ("cloud.copc.laz", _cloud),
+}
+"""Kind to its usual name in the scan folder and what measures it."""

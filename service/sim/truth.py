@@ -1,0 +1,133 @@
+"""What ``simulate`` wrote into ``truth/``, read back: place, surface, poses, and what was seen."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recon import metrics, se3, triangle_grid
+from recon.triangle_grid import TriangleGrid
+from recon.types import F64
+from service.errors import InputError
+from service.georeference import LocalFrame
+from service.sim.surface_file import read_surface
+
+SAMPLE_SPACING_M = 0.4
+FRAMES_FOR_VISIBILITY = 60
+VIEWS_TO_COUNT = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """What ``simulate`` wrote into ``truth/``."""
+
+    folder: Path
+    frame: LocalFrame
+    surface: TriangleGrid
+    times_s: F64  # (F,)
+    poses: F64  # (F, 4, 4)
+    K: F64
+    size_px: tuple[int, int]
+    agl_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenSurface:
+    """Places of the true surface, evenly by area, that the flight saw."""
+
+    places: F64  # (S, 3)
+    normals: F64  # (S, 3)
+    area_m2: float
+
+
+def read_truth(folder: Path) -> Truth:
+    """The truth in ``folder``, or in its ``truth`` subfolder."""
+    if not (folder / "surface.ply").exists() and (folder / "truth").is_dir():
+        folder = folder / "truth"
+    if not folder.is_dir():
+        raise InputError(f"truth {folder}: no such folder; `skyrelief simulate` makes one")
+    origin = json_object(folder / "origin.json")
+    params = json_object(folder / "params.json")
+    vertices, triangles = read_surface(folder / "surface.ply")
+    times, poses = read_tum(folder / "trajectory.tum")
+    try:
+        frame = LocalFrame(origin["lat_deg"], origin["lon_deg"], origin["alt_amsl_m"])
+        K = np.array(params["K"], np.float64).reshape(3, 3)
+        width, height = (int(v) for v in params["size_px"])
+        agl = float(params["median_agl_m"])
+        surface = triangle_grid.build(vertices, triangles)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"truth {folder}: unusable ({short(error)})") from error
+    if len(times) < 2:
+        raise InputError(f"truth {folder}: trajectory.tum has fewer than two poses")
+    return Truth(folder, frame, surface, times, poses, K, (width, height), agl)
+
+
+def heights_below(surface: TriangleGrid, xy_m: F64) -> F64:
+    """(N,) height of the highest surface at (N, 2) places; NaN outside."""
+    above = np.column_stack([xy_m, np.full(len(xy_m), surface.bounds[5] + 10.0)])
+    t, _ = surface.cast(above, np.tile([0.0, 0.0, -1.0], (len(above), 1)))
+    return np.asarray(above[:, 2] - t)
+
+
+def seen_surface(truth: Truth) -> SeenSurface:
+    """What at least VIEWS_TO_COUNT of the flight's frames see; InputError when that is nothing."""
+    samples, normals = metrics.sample_surface(truth.surface, SAMPLE_SPACING_M)
+    frames = np.unique(np.linspace(0, len(truth.poses) - 1, FRAMES_FOR_VISIBILITY).astype(int))
+    views = np.zeros(len(samples), np.int64)
+    for k in frames:
+        views += metrics.seen_from(
+            samples, normals, truth.surface, truth.poses[k], truth.K, np.array(truth.size_px)
+        )
+    seen = views >= min(VIEWS_TO_COUNT, len(frames))
+    if not seen.any():
+        raise InputError("the truth's cameras see none of the truth's surface; wrong folder?")
+    area = float(truth.surface.areas().sum()) * float(seen.mean())
+    return SeenSurface(samples[seen], normals[seen], area)
+
+
+def read_tum(path: Path) -> tuple[F64, F64]:
+    """(times (N,) unix s, poses (N, 4, 4)) of a TUM trajectory, in order of time."""
+    text = _text(path)
+    rows = [r.split() for r in text.splitlines() if r.strip() and not r.startswith("#")]
+    try:
+        table = np.array([[float(v) for v in row] for row in rows]).reshape(len(rows), 8)
+        if not np.isfinite(table).all():
+            raise ValueError("numbers that are not finite")
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        poses = np.tile(np.eye(4), (len(table), 1, 1))
+        for k, row in enumerate(table):
+            poses[k, :3, :3] = se3.rotation_from_quaternion(row[[7, 4, 5, 6]])
+        poses[:, :3, 3] = table[:, 1:4]
+    except ValueError as error:
+        raise InputError(f"trajectory {path}: not a TUM file ({short(error)})") from error
+    return table[:, 0], poses
+
+
+def json_object(path: Path) -> dict[str, Any]:
+    """The JSON object in a file; InputError, in one line, for anything else."""
+    try:
+        value = json.loads(_text(path))
+    except ValueError as error:
+        raise InputError(f"{path}: not JSON ({short(error)})") from error
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: not a JSON object")
+    return value
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({short(error)})") from error
+
+
+def short(error: Exception) -> str:
+    """The start of an error's text, in one line."""
+    return " ".join(str(error).split())[:120]
