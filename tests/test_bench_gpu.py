@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import math
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
 
 from recon.belief_propagation import BeliefPropagationConfig
-from service.bench import BenchOptions
+from service.bench import BenchOptions, gpu_floor
 from service.bench import gpu as bench_gpu
-from service.bench.gpu import Floor, propagation_work
+from service.bench.gpu_floor import Floor, propagation_work
 from service.cli import main
 
 pytest.importorskip("torch")
 
 STAGES = (
     "stereo", "what is believed", "upsampling", "reprojection", "fusion", "corners", "search",
-    "refinement", "cloud",
+    "refinement", "tracks", "ICP", "cloud",
 )  # fmt: skip
 
 
@@ -28,7 +29,7 @@ def test_every_stage_is_measured_beside_its_floor(
     """Small pictures here; the figures are those of ``skyrelief bench gpu``."""
     from service.bench import gpu_stages
 
-    for module in (bench_gpu, gpu_stages):
+    for module in (bench_gpu, gpu_stages, gpu_floor):
         monkeypatch.setattr(module, "SIZE", (96, 54))
     for guide in ("GUIDE", "GUIDE_ON_DEVICE"):
         monkeypatch.setattr(bench_gpu, guide, (192, 108))
@@ -39,7 +40,7 @@ def test_every_stage_is_measured_beside_its_floor(
     )  # fmt: skip
     device = str(request.config.getoption("--device"))
     for table in ("COPY_MB", "PRODUCT"):
-        monkeypatch.setattr(bench_gpu, table, {device: 16})
+        monkeypatch.setattr(gpu_floor, table, {device: 16})
     results = bench_gpu.run(BenchOptions(rounds=1, warm_up=0, device=device))
     on_device = {r.what: r for r in results if r.peer == "floor of the device"}
     for stage in STAGES:
@@ -73,3 +74,22 @@ def test_an_unknown_device_is_refused(
         main()
     assert stop.value.code == 2
     assert "give cuda or cpu" in capsys.readouterr().err
+
+
+def test_a_fused_kernel_has_lines_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside the plain ones, with the launches that it saves."""
+    from recon.backends.torch_kernels import Kernels
+    from service.bench import gpu_stages
+
+    for module in (bench_gpu, gpu_stages, gpu_floor):
+        monkeypatch.setattr(module, "SIZE", (96, 54))
+
+    def bilateral(px: Any, sure: Any, taps: Any, guide: Any, true: Any, config: Any) -> Any:
+        return guide[:, :, 0].float(), guide[:, :, 1].float()
+
+    pair = bench_gpu.flown_pair((192, 108))
+    (fused,) = gpu_stages.fused_stages("cpu", pair, Kernels(None, bilateral))
+    assert fused.what == "upsampling to 192x108, exact, on the device, fused"
+    (plain,) = [s for s in gpu_stages.dense_stages("cpu", pair, Kernels()) if "exact" in s.what]
+    saved = [int(s.note.split()[0]) for s in (plain, fused)]
+    assert saved[1] < 0.1 * saved[0]

@@ -66,6 +66,10 @@ class DeviceIcp:
             told = plan.run()[0].cpu().numpy()
         return _concluded(told, start, config)
 
+    def plan(self) -> Plan:
+        """Of the last new pair of sizes, with its inputs on the device."""
+        return list(self._plans.values())[-1]
+
 
 def _inputs(depth: DepthMap) -> list[Array]:
     """Depth, sigma and intrinsics; ValueError when shapes disagree."""

@@ -73,12 +73,16 @@ class Plan:
     def run(self) -> tuple[Tensor, ...]:
         """The results, on the device; on CUDA overwritten by the next run."""
         if not self._on_cuda:
-            return self._module(*self._inputs)
+            return self.eager()
         if self._replay is None:
             self._capture()
         assert self._replay is not None
         self._replay()
         return self._outputs
+
+    def eager(self) -> tuple[Tensor, ...]:
+        """The results, kernel by kernel, without a graph."""
+        return self._module(*self._inputs)
 
     @property
     def _on_cuda(self) -> bool:

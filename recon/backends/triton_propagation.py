@@ -6,7 +6,7 @@ and down, which is the lower envelope of Felzenszwalb and Huttenlocher
 32-bit integers, what is stored are 16-bit ones, so the messages are exact.
 
 Floor of L labels at h x w: costs and four arriving messages read, four written, 2 bytes each,
-of every other pixel: 9 L h w bytes (8.3 MB at 320x180x16); 38 operations a label and pixel of
+of every other pixel: 9 L h w bytes (8.3 MB at 320x180x16); 36 operations a label and pixel of
 the colour. The way up leaves its envelope in the message's own place, another 16 bytes a label
 and pixel that stay in the caches. Plain torch makes some 60 passes over all pixels.
 """

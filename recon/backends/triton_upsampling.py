@@ -1,8 +1,8 @@
 """Joint bilateral upsampling (Eq. 2) as one Triton kernel: every tap, all sums in registers.
 
 Floor of a guide of H x W px: 3 bytes read and 8 written a pixel, 11 H W bytes (45 MB at
-2704x1520); a window of D x D taps takes 14 operations and one power of two a tap and pixel
-(D = 10: 5.8 G operations). The coarse layers, 20 bytes a tap, and the two tables stay in the
+2704x1520); 20 operations, one of them a power of two, for each of the D x D taps of a pixel
+(D = 10: 8.2 G operations). The coarse layers, 20 bytes a tap, and the two tables stay in the
 caches. Plain torch writes some 50 floats a tap and pixel instead.
 """
 

@@ -10,43 +10,32 @@ alone there, and nothing about a GPU.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from recon.backends import Backend, load_backend
 from recon.belief_propagation import BeliefPropagationConfig
-from recon.matching_cost import COST_UNIT
 from recon.registration import IcpConfig
-from recon.types import DepthMap, StereoPair
+from recon.types import StereoPair
 from recon.upsampling import UpsamplingConfig
 from service.bench import BenchOptions, BenchResult, compare
+from service.bench.gpu_floor import (
+    LABELS,
+    SIZE,
+    Floor,
+    Stage,
+    camera,
+    finished,
+    ground,
+    measure_floor,
+)
 from service.bench.stereo import scene
 
-if TYPE_CHECKING:
-    from service.bench.gpu_stages import Stage
-
-SIZE, LABELS = (320, 180), 16
 GUIDE = (640, 360)
 GUIDE_ON_DEVICE = (2704, 1520)
-COPY_MB = {"cuda": 1024, "cpu": 64}
-PRODUCT = {"cuda": 8192, "cpu": 768}
-
-
-@dataclass(frozen=True, slots=True)
-class Floor:
-    """What the device can do at best."""
-
-    bytes_per_s: float
-    operations_per_s: float
-
-    def ms(self, moved_bytes: float, operations: float) -> float:
-        """Least milliseconds for that much work."""
-        return 1e3 * max(moved_bytes / self.bytes_per_s, operations / self.operations_per_s)
 
 
 def run(options: BenchOptions) -> list[BenchResult]:
@@ -68,17 +57,22 @@ def torch_results(compiled: Backend, options: BenchOptions) -> list[BenchResult]
     import torch
 
     from recon.backends.torch_backend import TorchBackend
+    from recon.backends.torch_kernels import PLAIN
     from service.bench.gpu_stages import stages, whole_path
+    from service.compute.fused_kernels import choose_kernels
 
     device = options.device or ("cuda" if torch.cuda.is_available() else "cpu")
     backend = TorchBackend(device)
     floor, results = measure_floor(device, options)
     guide = GUIDE_ON_DEVICE if device == "cuda" else GUIDE
     pair = flown_pair(guide)
-    for stage in stages(device, pair):
+    kernels = choose_kernels(device) if device == "cuda" else PLAIN
+    for stage in stages(device, pair, kernels):
         results.append(against_floor(stage, floor, options))
+    backend.use(kernels)
     results += calls(backend, compiled, guide, options)
-    results += [against_floor(stage, floor, options) for stage in whole_path(device, pair)]
+    whole = whole_path(device, pair, kernels)
+    results += [against_floor(stage, floor, options) for stage in whole]
     return results
 
 
@@ -86,57 +80,6 @@ def onnx_results(compiled: Backend, options: BenchOptions) -> list[BenchResult]:
     """The calls of the ONNX backend with the providers that it finds."""
     backend = load_backend("onnx")
     return calls(backend, compiled, GUIDE if backend.device == "cpu" else GUIDE_ON_DEVICE, options)
-
-
-def device_name(device: str) -> str:
-    """Of the GPU, or how many threads of the processor."""
-    import torch
-
-    if device == "cuda":
-        return str(torch.cuda.get_device_name())
-    return f"processor, {torch.get_num_threads()} threads"
-
-
-def finished(device: str, work: Callable[[], object]) -> Callable[[], None]:
-    """``work``, and the wait until the device has done it."""
-    import torch
-
-    def timed() -> None:
-        with torch.inference_mode():
-            work()
-        if device == "cuda":
-            torch.cuda.synchronize()
-
-    return timed
-
-
-def measure_floor(device: str, options: BenchOptions) -> tuple[Floor, list[BenchResult]]:
-    """Rates of a large copy and of a float32 matrix product, and the lines that say so."""
-    import torch
-
-    source = torch.ones(COPY_MB[device] << 18, device=device)
-    target = torch.empty_like(source)
-    n = PRODUCT[device]
-    a = torch.ones((n, n), device=device)
-    b = torch.empty_like(a)
-    name = device_name(device)
-    copy = compare(
-        "gpu", f"copy of {COPY_MB[device]} MiB", finished(device, lambda: target.copy_(source)),
-        options, note=name,
-    )  # fmt: skip
-    product = compare(
-        "gpu", f"matrix product of {n}", finished(device, lambda: torch.matmul(a, a, out=b)),
-        options, note=name,
-    )  # fmt: skip
-    moved = 2.0 * source.numel() * 4
-    floor = Floor(moved / copy.value * 1e3, 2.0 * n**3 / product.value * 1e3)
-    rates = [
-        BenchResult("gpu", "bandwidth of the device", floor.bytes_per_s / 1e9, "GB/s", note=name),
-        BenchResult(
-            "gpu", "float32 rate of the device", floor.operations_per_s / 1e9, "Gop/s", note=name
-        ),
-    ]
-    return floor, [copy, product, *rates]
 
 
 def against_floor(stage: Stage, floor: Floor, options: BenchOptions) -> BenchResult:
@@ -200,37 +143,3 @@ def flown_pair(guide_px: tuple[int, int]) -> StereoPair:
         left_seen=np.ones(left.shape, np.bool_),
         right_seen=np.ones(left.shape, np.bool_),
     )
-
-
-def camera() -> Any:
-    """(3, 3) intrinsics at ``SIZE``."""
-    width, height = SIZE
-    return np.array([[190.0, 0, width / 2 - 0.5], [0, 190.0, height / 2 - 0.5], [0, 0, 1]])
-
-
-def ground(shift_m: float) -> DepthMap:
-    """Rolling ground 50 m below, seen from ``shift_m`` further along."""
-    width, height = SIZE
-    K = camera()
-    v, u = np.mgrid[0:height, 0:width]
-    x, y = (u - K[0, 2]) / K[0, 0] * 50 + shift_m, (v - K[1, 2]) / K[1, 1] * 50
-    depth = (50 + 2 * np.sin(x / 6) * np.cos(y / 7)).astype(np.float32)
-    sigma = np.full(depth.shape, 0.05, np.float32)
-    return DepthMap(depth, sigma, np.ones(depth.shape, np.uint8), K, np.eye(4))
-
-
-def propagation_work(config: BeliefPropagationConfig, bytes_each: int) -> tuple[float, float]:
-    """Bytes and operations that belief propagation cannot do without.
-
-    An iteration reads cost and four messages of every other pixel and writes four; it adds
-    them, takes an envelope of ``2 steps`` neighbours in four directions and normalises.
-    """
-    h, w = SIZE[1], SIZE[0]
-    steps = math.ceil(config.truncation / COST_UNIT) + 1
-    moved = operations = 0.0
-    for _ in range(config.levels):
-        cells = 0.5 * h * w * LABELS * config.iterations
-        moved += 9 * cells * bytes_each
-        operations += cells * (8 + 4 * (3 * steps + 3))
-        h, w = (h + 1) // 2, (w + 1) // 2
-    return moved, operations

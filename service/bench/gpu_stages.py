@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from recon.backends.room import pyramid_levels
 from recon.backends.torch_believe import believe, drop_unseen
 from recon.backends.torch_dense import DenseStereo
 from recon.backends.torch_depth import fuse, reproject
+from recon.backends.torch_icp import DeviceIcp
+from recon.backends.torch_kernels import PLAIN, Kernels
+from recon.backends.torch_matcher import TorchMatcher
 from recon.backends.torch_matching import harris_cells, refine, search
 from recon.backends.torch_path import DensePath
 from recon.backends.torch_plan import Plan, part
@@ -22,30 +26,56 @@ from recon.backends.torch_upsampling import JointBilateral, averaged
 from recon.belief_propagation import BeliefPropagationConfig
 from recon.depth_fusion import FusionConfig
 from recon.matching import MatchingConfig, harris_grid
+from recon.registration import IcpConfig
 from recon.types import U8, Array, StereoPair
 from recon.upsampling import UpsamplingConfig
-from service.bench.gpu import LABELS, SIZE, propagation_work
+from service.bench.gpu_floor import LABELS, SIZE, Stage, ground, propagation_work
 
 PAIRS = 4
 REACH = 8
 ITERATIONS = 6
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Stage:
-    """Something to be timed on a device."""
-
-    what: str
-    device: str
-    work: Callable[[], object]
-    moved_bytes: float
-    operations: float
-    note: str = ""
+VIEWS = {
+    "view", "_unsafe_view", "expand", "slice", "select", "permute", "transpose", "t", "unsqueeze",
+    "squeeze", "alias", "unfold", "detach", "as_strided", "split", "unbind", "diagonal", "empty",
+    "empty_like", "lift_fresh",
+}  # fmt: skip
+"""Operations that launch nothing."""
 
 
-def stages(device: str, pair: StereoPair) -> list[Stage]:
-    """Cost and belief propagation, what is believed, upsampling, depth, fusion, matching."""
-    return [*dense_stages(device, pair), *matching_stages(device)]
+class Launches(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Counts the operations that launch a kernel, one or more."""
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.count = 0
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        self.count += func.overloadpacket.__name__ not in VIEWS
+        return func(*args, **(kwargs or {}))
+
+
+def stages(device: str, pair: StereoPair, kernels: Kernels = PLAIN) -> list[Stage]:
+    """Cost and belief propagation, what is believed, upsampling, depth, fusion, ICP, matching."""
+    return [
+        *dense_stages(device, pair, PLAIN),
+        *(fused_stages(device, pair, kernels) if kernels != PLAIN else []),
+        icp_stage(device),
+        *matching_stages(device),
+    ]
+
+
+def staged(
+    what: str, device: str, plan: Plan, moved: float, operations: float, note: str = ""
+) -> Stage:
+    """The stage that a plan runs, with the number of operations it launches."""
+    with torch.inference_mode(), Launches() as launches:
+        plan.eager()
+    words = [f"{launches.count} launches", *([note] if note else [])]
+    return Stage(what, device, plan.run, moved, operations, ", ".join(words))
 
 
 def planned(device: str, stage: Callable[..., Any], *arrays: Array) -> Plan:
@@ -62,7 +92,28 @@ def planned(device: str, stage: Callable[..., Any], *arrays: Array) -> Plan:
     return plan
 
 
-def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
+def fused_stages(device: str, pair: StereoPair, kernels: Kernels) -> list[Stage]:
+    """The stages that a fused kernel changes."""
+    found = dense_stages(device, pair, kernels)
+    chosen = [found[0]] if kernels.sweep is not None else []
+    if kernels.bilateral is not None:
+        chosen += [s for s in found if s.what.startswith("upsampling")]
+    return [replace(s, what=f"{s.what}, fused") for s in chosen]
+
+
+def icp_stage(device: str) -> Stage:
+    """Six iterations on all points: surfaces, partners, sums and steps."""
+    icp = DeviceIcp(device)
+    config = IcpConfig(strides=(1,), iterations=(6,))
+    icp.register(ground(0.3), ground(0.0), np.eye(4), config)
+    points, rounds = SIZE[0] * SIZE[1], config.iterations[0] + 1
+    return staged(
+        f"ICP of {points} points, 6 iterations, on the device", device, icp.plan(),
+        points * (2 * 8.0 + rounds * 48), points * (2 * 200.0 + rounds * 180),
+    )  # fmt: skip
+
+
+def dense_stages(device: str, pair: StereoPair, kernels: Kernels) -> list[Stage]:
     """From two rectified pictures to fused depth, one after the other."""
     w, h = SIZE
     matching, upsampling = BeliefPropagationConfig(), UpsamplingConfig()
@@ -74,10 +125,11 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
     found = []
     for kind in (torch.int16, torch.float32):
         stereo = planned(
-            device, DenseStereo(LABELS, levels, matching, kind), pair.left, pair.right, own
-        )
+            device, DenseStereo(LABELS, levels, matching, kind, kernels), pair.left, pair.right,
+            own,
+        )  # fmt: skip
         found.append(
-            Stage(f"stereo {w}x{h}, {LABELS} labels, on the device", device, stereo.run, moved,
+            staged(f"stereo {w}x{h}, {LABELS} labels, on the device", device, stereo, moved,
                   operations, f"messages of {str(kind).removeprefix('torch.')}")
         )  # fmt: skip
     px, sure = (t.cpu().numpy() for t in stereo.run())
@@ -90,7 +142,7 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
         pair.left, px, sure, seen, seen, own,
     )  # fmt: skip
     px, sure = (t.cpu().numpy() for t in trusted.run())
-    bilateral = JointBilateral(upsampling)
+    bilateral = JointBilateral(upsampling, kernels)
     finer = planned(
         device,
         lambda p, s, guide, true: bilateral(p, s, averaged(guide, (h, w), true), guide, true),
@@ -109,13 +161,13 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
     taps, pixels = upsampling.diameter_px**2, w * h
     return [
         *found,
-        Stage(f"what is believed, {w}x{h}, on the device", device, trusted.run,
+        staged(f"what is believed, {w}x{h}, on the device", device, trusted,
               20.0 * pixels, 60.0 * pixels, "contrast, visibility, speckles, both pictures"),
-        Stage(f"upsampling to {W}x{H}, exact, on the device", device, finer.run,
+        staged(f"upsampling to {W}x{H}, exact, on the device", device, finer,
               11.0 * W * H, 20.0 * taps * W * H, f"{taps} taps"),
-        Stage(f"reprojection to {w}x{h}, on the device", device, depth.run,
+        staged(f"reprojection to {w}x{h}, on the device", device, depth,
               (8 * 5 + 8.0) * pixels, 60.0 * pixels),
-        Stage(f"fusion of {PAIRS} pairs, on the device", device, fused.run,
+        staged(f"fusion of {PAIRS} pairs, on the device", device, fused,
               (8.0 * PAIRS + 12) * pixels, 20.0 * PAIRS**2 * pixels),
     ]  # fmt: skip
 
@@ -147,13 +199,22 @@ def matching_stages(device: str) -> list[Stage]:
     n, area = len(uv), (2 * r + 1) ** 2
     places = (2 * REACH + 1) ** 2
     size = f"{a.shape[1]}x{a.shape[0]}"
+    matcher = TorchMatcher(device)
+
+    def tracks() -> object:
+        key, new = (matcher.pyramid(p, config.search_levels) for p in (a, b))
+        return matcher.match(key, uv, new, uv, 4.0 * REACH, None, config)
+
     return [
-        Stage(f"corners of {size}, on the device", device, corners.run, 1.0 * a.size,
+        staged(f"corners of {size}, on the device", device, corners, 1.0 * a.size,
               60.0 * a.size),
-        Stage(f"search of {n} corners, on the device", device, look.run,
+        staged(f"search of {n} corners, on the device", device, look,
               n * (2 * REACH + 2 * r + 1.0) ** 2, 2.0 * n * area * places, f"reach {REACH} px"),
-        Stage(f"refinement of {n} places, on the device", device, place.run,
+        staged(f"refinement of {n} places, on the device", device, place,
               n * (2.0 * r + 4) ** 2, 20.0 * n * area * ITERATIONS, f"{ITERATIONS} iterations"),
+        Stage(f"tracks of {n} corners from picture to picture, with uploads", device, tracks,
+              2.7 * a.size, 2.0 * n * area * (places + 81 + 20 * ITERATIONS),
+              "pyramids up, search and refinement both ways, matches down"),
     ]  # fmt: skip
 
 
@@ -165,10 +226,12 @@ def moved_pictures() -> tuple[U8, U8]:
     return np.ascontiguousarray(canvas[2:722, 2:1282]), np.ascontiguousarray(canvas[:720, :1280])
 
 
-def whole_path(device: str, pair: StereoPair) -> list[Stage]:
+def whole_path(device: str, pair: StereoPair, kernels: Kernels = PLAIN) -> list[Stage]:
     """A cloud of one pair: inputs on the device, then pictures up and depth down, and four."""
     assert pair.guide is not None
-    path = DensePath(device, BeliefPropagationConfig(), UpsamplingConfig(), FusionConfig())
+    path = DensePath(
+        device, BeliefPropagationConfig(), UpsamplingConfig(), FusionConfig(), kernels=kernels
+    )
     path.depth([pair], pair.K, SIZE, np.eye(4))
     plan = next(iter(path._plans.values()))
     moved, operations = propagation_work(path.matching, 2)
@@ -182,7 +245,7 @@ def whole_path(device: str, pair: StereoPair) -> list[Stage]:
 
     up = plan.upload_bytes / 1e6
     return [
-        Stage(f"{what}, on the device", device, plan.run, moved, operations, "one pair"),
+        staged(f"{what}, on the device", device, plan, moved, operations, "one pair"),
         Stage(f"{what}, with uploads", device, cloud(1), moved, operations,
               f"one pair, {up:.3g} MB up"),
         Stage(f"{what}, {PAIRS} pairs, with uploads", device, cloud(PAIRS), PAIRS * moved,
