@@ -8,6 +8,7 @@ from typing import Protocol
 from recon.alignment import Scale, Similarity
 from recon.graph_records import Loop, Node
 from recon.loop_book import Edge
+from recon.sensor_offsets import Constants
 from recon.types import F64, Pose, PosePrior
 
 
@@ -71,6 +72,10 @@ class KeyframeGraph(Protocol):
 
     def residuals(self) -> dict[str, F64]:
         """Whitened residuals by kind of factor."""
+        ...
+
+    def constants(self) -> Constants:
+        """What the sensors are constantly off by."""
         ...
 
     def metric_loops(self) -> list[Loop]:

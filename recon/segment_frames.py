@@ -9,6 +9,7 @@ import numpy as np
 
 from recon import alignment, se3
 from recon.alignment import Anchor, Scale, Similarity
+from recon.fix_average import at_camera
 from recon.graph_records import Node
 from recon.sensor_offsets import Constants, Offsets, constants, offsets
 from recon.types import F64, PosePrior
@@ -64,12 +65,8 @@ class SegmentFrames:
 
     def at_camera(self, node: Node) -> PosePrior:
         """The node's prior, with its fix brought to where the camera is."""
-        prior = node.prior
-        if prior.fix_offset is None or prior.position_m is None:
-            return prior
         frame = self.frame(node.segment)
-        off = frame.scale * frame.R @ node.T_odom_camera[:3, :3] @ prior.fix_offset
-        return replace(prior, position_m=prior.position_m - off, fix_offset=None)
+        return at_camera(node.prior, frame.R @ node.T_odom_camera[:3, :3], frame.scale)
 
     def constants(self, segment: int) -> Constants:
         """What the sensors are constantly off by, as the segment's frame was fitted with."""

@@ -24,10 +24,12 @@ import numpy as np
 
 from recon import se3
 from recon.alignment import Scale, Similarity
-from recon.dead_reckoning import dead_reckoned
+from recon.dead_reckoning import carried
+from recon.fix_average import at_camera
 from recon.graph_records import Loop, Node
 from recon.loop_book import Edge
 from recon.pose_graph import SOURCES
+from recon.sensor_offsets import Constants
 from recon.smoother import moved_covariance
 from recon.types import F64, Pose, PosePrior
 from service.onboard.graph_server import GraphState, Order, Watched
@@ -278,6 +280,11 @@ class GraphAside:
         found: dict[str, F64] = self._answer(("residuals",))
         return found
 
+    def constants(self) -> Constants:
+        """What the sensors are constantly off by; waits for everything that went in."""
+        found: Constants = self._answer(("constants",))
+        return found
+
     def metric_loops(self) -> list[Loop]:
         """Accepted loops with lengths in metres; waits for everything that went in."""
         found: list[Loop] = self._answer(("metric_loops",))
@@ -393,7 +400,8 @@ class GraphAside:
         before = self._guess(last.key)
         if node.segment != last.segment:
             frame = self.similarity(node.segment)
-            T = dead_reckoned(last, node, before.T, None)
+            known = at_camera(last.prior, before.T[:3, :3], before.scale)
+            T = carried(known, node.prior, before.T, None, 0.0)
             scale = 1.0 if frame is None else frame.scale
             return _Carried(T, scale, before.covariance + LOST, ("dead reckoning",))
         motion = se3.inverse(last.T_odom_camera) @ node.T_odom_camera

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from recon.keyframe_graph import KeyframeGraph
+from recon.sensor_offsets import Constants
 from service.stream.records import pack_covariance, pack_motion
 
 MOST_LOOPS = 300
@@ -47,5 +48,23 @@ def graph_figures(graph: KeyframeGraph) -> dict[str, Any] | None:
                 for loop in accepted[::step]
             ],
         },
+        **_constants(graph.constants()),
         "left_out": {str(k): int(v) for k, v in graph.counts.items()},
+    }
+
+
+def _constants(found: Constants) -> dict[str, Any]:
+    """Boresight and altitude's zero. ``boresight.deg`` turns the reported camera about its x, y
+    and z axes (right, down, ahead); it is used when it is sure."""
+    one, datum = found.boresight, found.datum
+    return {
+        "boresight": {
+            "deg": [round(float(v), 3) for v in np.degrees(one.turn)],
+            "sigma_deg": [round(float(v), 3) for v in np.degrees(one.sigma)],
+            "sure": one.is_sure,
+        },
+        "altitude_datum": {
+            "shift_m": round(datum.shift_m, 3),
+            "sigma_m": round(datum.sigma_m, 3) if np.isfinite(datum.sigma_m) else None,
+        },
     }

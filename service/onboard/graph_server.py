@@ -85,7 +85,7 @@ class Watched:
         if name == "solve":
             self.graph.solve()
             return self.state(True)
-        if name in ("residuals", "metric_loops"):
+        if name in ("residuals", "metric_loops", "constants"):
             return getattr(self.graph, name)()
         raise ValueError(f"no such order: {name}")
 
