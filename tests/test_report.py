@@ -11,11 +11,15 @@ import numpy as np
 import pytest
 
 from recon import se3
+from recon.altitude_datum import AltitudeDatum
+from recon.boresight import Boresight
 from recon.pose_graph import PoseGraph
+from recon.sensor_offsets import Constants
 from recon.types import PosePrior
 from service.onboard.graph_figures import graph_figures
 from service.scans.coverage import coverage_of
 from service.scans.folder import write_deliverables
+from service.scans.report import sensor_constants
 from service.scans.report_consistency import consistency
 from service.scans.report_map import map_figure, position_covariance
 from service.scans.track import latest
@@ -133,6 +137,10 @@ def test_accepted_loops_come_back_with_motion_and_covariance() -> None:
         def metric_loops(self) -> list[Any]:
             return [self]
 
+        def constants(self) -> Constants:
+            turn, sigma = np.radians([1.6, -1.2, 0.0]), np.radians([0.2, 0.2, 2.0])
+            return Constants(AltitudeDatum(-0.71234, 0.2), Boresight(turn, sigma))
+
         a, b = 3, 40
         T_a_b = se3.exp(np.array([0.1, 0.0, 0.3, 4.0, 5.0, 6.0]))
         covariance = np.diag([1e-6] * 3 + [1e-3] * 3)
@@ -142,6 +150,13 @@ def test_accepted_loops_come_back_with_motion_and_covariance() -> None:
     assert figures is not None
     ((a, b, motion, upper),) = figures["loops"]["motions"]
     assert (a, b) == (3, 40) and figures["left_out"] == {"loop waits": 1}
+    assert figures["boresight"] == {
+        "deg": [1.6, -1.2, 0.0], "sigma_deg": [0.2, 0.2, 2.0], "sure": True
+    }  # fmt: skip
+    assert figures["altitude_datum"] == {"shift_m": -0.712, "sigma_m": 0.2}
+    rows = dict(sensor_constants(figures))
+    assert "+1.60 +- 0.20, -1.20 +- 0.20" in rows["boresight about right, down, ahead"]
+    assert rows["altitude raised to the receiver's"] == "-0.71 m"
     found = unpack_motion(motion)
     assert found is not None and np.allclose(found, Fixed.T_a_b, atol=1e-7)
     assert np.allclose(unpack_covariance(upper), Fixed.covariance, rtol=1e-5)

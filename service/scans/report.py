@@ -124,6 +124,21 @@ def _accuracy(summary: dict[str, Any], raster: Raster | None) -> list[tuple[str,
             rows.append((name, f"{quality[key]:.3g} {unit}"))
     if raster is not None and quality["area_m2"]:
         rows.append(("points per m2", f"{counts['points'] / quality['area_m2']:.1f}"))
+    return [*rows, *sensor_constants((summary.get("run") or {}).get("graph") or {})]
+
+
+def sensor_constants(graph: dict[str, Any]) -> list[tuple[str, str]]:
+    """What the sensors were found to be constantly off by."""
+    rows = []
+    boresight, datum = graph.get("boresight"), graph.get("altitude_datum")
+    if boresight is not None:
+        told = ("{:+.2f} +- {:.2f}".format(*pair) for pair in
+                zip(boresight["deg"], boresight["sigma_deg"], strict=True))  # fmt: skip
+        verdict = "taken out" if boresight["sure"] else "not sure, left alone"
+        name = "boresight about right, down, ahead"
+        rows.append((name, f"{', '.join(told)} degrees: {verdict}"))
+    if datum is not None and datum["shift_m"]:
+        rows.append(("altitude raised to the receiver's", f"{datum['shift_m']:+.2f} m"))
     return rows
 
 
