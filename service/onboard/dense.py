@@ -112,6 +112,16 @@ class Dense:
         if config.fusion.loops:
             self.loops = LoopSearch(self.trajectory, self.lock, most_views=config.fusion.loop_views)
 
+    @property
+    def held(self) -> dict[str, int]:
+        """What memory holds of this scan: the map's voxels, its tiles on disk, views for loops."""
+        paged = self._map if isinstance(self._map, PagedMap) else None
+        return {
+            "map_voxels": 0 if self._map is None else len(self._map),
+            "map_tiles_on_disk": 0 if paged is None else paged.tiles_on_disk,
+            "loop_views": 0 if self.loops is None else len(self.loops),
+        }
+
     def forget_map(self) -> None:
         """Count every surface as new again."""
         if isinstance(self._map, PagedMap):

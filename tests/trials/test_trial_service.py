@@ -1,4 +1,4 @@
-"""Trials that try to break the daemon: kills, a full disk, cameras, clocks, memory; short here.
+"""Trials that try to break the daemon: kills, a full disk, cameras, clocks; short here.
 
 The whole of them: ``make trials``, which writes a table of what was tried and what came of it.
 """
@@ -9,39 +9,32 @@ import contextlib
 import json
 import os
 import random
-import resource
 import shutil
 import signal
 import socket
 import subprocess
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
+from loopback import free_port
+from trial_autopilot import Autopilot
 from trial_rig import (
     BACK_S,
-    DEMO,
     PATIENCE_S,
     WHOLE,
     Chunk,
     Row,
     Service,
     burn,
-    free_port,
     small_model,
     stored,
     stream_to,
+    with_site,
 )
 
 from mavlink.control import Phase
-from recon.backends.cpu import CpuBackend
-from recon.belief_propagation import BeliefPropagationConfig
-from recon.types import U8, DisparityMap
-from service.compute.backend_choice import FallbackBackend
 from service.config import load_config
 from service.daemon.runtime import Daemon
 from service.errors import OutsideError
@@ -216,10 +209,8 @@ time.time_ns = lambda: _time_ns() + int(_offset() * 1e9)
 
 def test_wall_clock_steps(tmp_path: Path, record: Row) -> None:
     steps = [3600.0, -86400.0, 8e8] if WHOLE else [3600.0, -86400.0]
-    (tmp_path / "site").mkdir()
-    (tmp_path / "site" / "sitecustomize.py").write_text(CLOCK)
     clock = tmp_path / "clock"
-    environment = {"PYTHONPATH": str(tmp_path / "site"), "TRIAL_CLOCK": str(clock)}
+    environment = with_site(tmp_path, CLOCK) | {"TRIAL_CLOCK": str(clock)}
     with Service(tmp_path, environment=environment) as service:
         service.until(lambda: service.frames > 0, "frames")
         back_s = []
@@ -232,30 +223,6 @@ def test_wall_clock_steps(tmp_path: Path, record: Row) -> None:
     record("wall clock steps", len(steps), "times of the scan go on evenly", "-", max(back_s))
     assert times == sorted(times)
     assert times[-1] - times[0] < 600.0
-
-
-class Autopilot(threading.Thread):
-    """Heartbeats and attitude by UDP, with a boot clock that can start anew."""
-
-    def __init__(self, port: int) -> None:
-        super().__init__(daemon=True)
-        self.port, self.ended, self.silent = port, threading.Event(), threading.Event()
-        self.boot_s = time.monotonic() - 1000.0
-
-    def run(self) -> None:
-        """Send until :attr:`ended`."""
-        link: Any = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-            while not self.ended.wait(0.1):
-                if self.silent.is_set():
-                    continue
-                boot_ms = int(1e3 * (time.monotonic() - self.boot_s))
-                messages = (
-                    dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3),
-                    dialect.MAVLink_attitude_message(boot_ms, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0),
-                )
-                for message in messages:
-                    out.sendto(message.pack(link), ("127.0.0.1", self.port))
 
 
 def test_autopilot_reboots(tmp_path: Path, record: Row) -> None:
@@ -287,130 +254,6 @@ def test_autopilot_reboots(tmp_path: Path, record: Row) -> None:
     record("autopilot reboots (its clock at 0)", times, "the same scan goes on", "-", max(back_s))
     assert same
     assert max(back_s) < BACK_S
-
-
-def test_memory_short_is_relieved(tmp_path: Path, record: Row) -> None:
-    """Relief by the ladder, live: nothing reconstructed, pictures kept, and back."""
-    short = '[compute]\nbackend = "cpu"\nguide_width = 320\n'
-    with Service(tmp_path) as service:
-        service.until(lambda: service.frames > 0, "frames")
-        service.reload((short, short + "least_memory_mib = 1e6\n"))
-        service.until(lambda: service.get()["load"]["name"] == "record only", "relief")
-        service.until(lambda: service.get()["load"].get("pictures_kept", 0) > 1, "kept pictures")
-        service.reload(("least_memory_mib = 1e6", "relief = false"))
-        back_s = service.until_more_frames("frames")
-        assert service.get()["load"]["name"] == "full"
-        (folder,) = service.scans.iterdir()
-        assert service.stop() == 0
-    kept = list((folder / "later").glob("*.jpg"))
-    record("memory short", 1, f"record only: {len(kept)} pictures kept for a replay", "-", back_s)
-    assert kept
-    run = json.loads((folder / "scan.json").read_text())["run"]
-    assert any("later/" in warning for warning in run["warnings"])
-
-
-def test_memory_limit_hit_and_lifted(tmp_path: Path, record: Row) -> None:
-    """No more address space for a while; a service that dies of it is started as by systemd."""
-    with Service(tmp_path) as service:
-        service.until(lambda: stored(service.scans), "a chunk")
-        pages = int(Path(f"/proc/{service.process.pid}/statm").read_text().split()[0])
-        limit = pages * resource.getpagesize() + (1 << 20)
-        unlimited = (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
-        resource.prlimit(service.process.pid, resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
-        time.sleep(20.0 if WHOLE else 5.0)
-        acknowledged = stored(service.scans)
-        survived = service.process.poll() is None
-        if survived:
-            resource.prlimit(service.process.pid, resource.RLIMIT_AS, unlimited)
-            back_s = service.until_more_frames("frames")
-            service.stop()
-    if not survived:
-        time.sleep(1.0)
-        with Service(tmp_path) as again:
-            back_s = again.until(lambda: again.frames > 0, "frames") + 1.0
-            again.stop()
-    lost = acknowledged - stored(service.scans)
-    record(
-        "memory limit hit",
-        1,
-        "survived" if survived else "died, started again",
-        f"{len(lost)} of {len(acknowledged)} chunks",
-        back_s,
-    )
-    assert not lost
-    assert back_s < BACK_S
-
-
-class OutOfMemory(CpuBackend):
-    """A GPU, as far as anyone can tell, until its memory is gone."""
-
-    name, device = "torch", "cuda"
-
-    def __init__(self) -> None:
-        self.full = threading.Event()
-
-    def belief_propagation(
-        self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
-    ) -> DisparityMap:
-        """As the CPU's, until it is full."""
-        if self.full.is_set():
-            raise RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB")
-        return super().belief_propagation(left, right, labels, config)
-
-
-def test_gpu_out_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: Row) -> None:
-    given = [f"scan.folder={tmp_path}", "health.http=", f"camera.model={DEMO / 'camera.yaml'}"]
-    given += [f"camera.source=images:{DEMO / 'frames'}?interval_s=0.7", "compute.guide_width=320"]
-    daemon = Daemon(load_config(None, [*given, "compute.backend=cpu"]))
-    heard: list[str] = []
-    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_: heard.append(text))
-    daemon.scanning.load()
-    gpu = OutOfMemory()
-    daemon.scanning._backend = FallbackBackend(gpu)
-    daemon.scanning.start()
-
-    def keyframes(more_than: int) -> int:
-        deadline = time.monotonic() + PATIENCE_S
-        while time.monotonic() < deadline:
-            scan = daemon.scanning.scan
-            if scan is not None and scan.recorder.keyframes > more_than:
-                return scan.recorder.keyframes
-            time.sleep(0.05)
-        raise AssertionError(f"no keyframe after {more_than}: {daemon.scanning.fault}")
-
-    before = keyframes(0)
-    gpu.full.set()
-    start = time.monotonic()
-    for _ in range(5):  # a keyframe or two may have been under way
-        before = keyframes(before)
-        if daemon.snapshot()["backend"] == "cpu":
-            break
-    back_s = time.monotonic() - start
-    daemon.load_control.look(machine=_machine())
-    assert daemon.snapshot()["backend"] == "cpu"
-    daemon.scanning.end()
-    record("GPU out of memory (simulated)", 1, "the same scan goes on by the CPU", "-", back_s)
-    assert any("out of memory" in text for text in heard)
-    assert not daemon.scanning.fault
-
-
-def _machine() -> Any:
-    from service.daemon.machine import read_machine
-
-    return read_machine(Path("/"))
-
-
-def test_term_closes_the_scan(tmp_path: Path, record: Row) -> None:
-    with Service(tmp_path) as service:
-        service.until(lambda: stored(service.scans), "a chunk")
-        assert service.stop() == 0
-        (folder,) = service.scans.iterdir()
-        with ScanStore.open(folder / "scan.db") as store:
-            assert store.finished
-            assert store.summary is not None
-            assert "interrupted" not in store.summary, service.log.read_text()[-3000:]
-        assert (folder / "preview.jpg").is_file()
-    record("TERM while scanning", 1, "scan closed, files written", "nothing")
 
 
 def test_broken_configuration_at_reload_changes_nothing(tmp_path: Path, record: Row) -> None:

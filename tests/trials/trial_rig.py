@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import platform
@@ -18,6 +19,8 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
+
+from loopback import free_port
 
 DEMO = Path(__file__).resolve().parents[2] / "demo" / "caliterra"
 WHOLE = os.environ.get("SKYRELIEF_TRIALS") == "whole"
@@ -45,60 +48,55 @@ class Line:
     outcome: str
     lost: str
     back_s: float | None
+    when: str = "-"  # UTC
 
 
 class Table:
-    """The outcomes, kept as JSON and as a page; lines of earlier runs stay until tried again."""
+    """The outcomes, kept as JSON and as a page; lines of earlier runs stay until tried again.
+
+    Several runs may fill one table at the same time.
+    """
 
     def __init__(self, target: Path | None) -> None:
         self._target = target
-        self._lines: dict[str, Line] = {}
-        kept = target.with_suffix(".json") if target is not None else None
-        if kept is not None and kept.is_file():
-            for line in json.loads(kept.read_text(encoding="utf-8"))["trials"]:
-                self._lines[line["fault"]] = Line(**line)
 
     def add(
         self, fault: str, times: int, outcome: str, lost: str = "-", back_s: float | None = None
     ) -> None:
-        """See :class:`Row`."""
-        rounded = None if back_s is None else round(back_s, 1)
-        self._lines[fault] = Line(fault, times, outcome, lost, rounded)
-        self.write()  # at once: a run that is broken off keeps what it found
-
-    def write(self) -> None:
-        """Keep what there is, where a place was named."""
-        if self._target is None or not self._lines:
+        """See :class:`Row`. Written at once: a run that is broken off keeps what it found."""
+        if self._target is None:
             return
-        machine = (
-            f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
-        )
-        lines = sorted(self._lines.values(), key=lambda line: line.fault)
-        kept = {"machine": machine, "trials": [asdict(line) for line in lines]}
-        self._target.with_suffix(".json").write_text(json.dumps(kept, indent=1) + "\n", "utf-8")
-        rows = [
-            f"| {x.fault} | {x.times} | {x.outcome} | {x.lost} | "
-            f"{'-' if x.back_s is None else f'{x.back_s:.1f} s'} |"
-            for x in lines
-        ]
-        self._target.write_text(
-            "# What was tried to break it\n\n"
-            f"Written by the trials ({machine}); rows of earlier runs stay until tried again.\n"
-            "*Lost*: of what the store had acknowledged; *scanning again* is the longest time\n"
-            "from the end of the cause to the next frame. `make trials` is the whole form,\n"
-            "`make test` has a short one.\n\n"
-            "| fault | times | outcome | lost | scanning again |\n|---|---|---|---|---|\n"
-            + "\n".join(rows)
-            + "\n",
-            encoding="utf-8",
-        )
+        kept = self._target.with_suffix(".json")
+        now = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
+        rounded = None if back_s is None else round(back_s, 1)
+        with kept.open("a+", encoding="utf-8") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            file.seek(0)
+            known = json.loads(file.read() or '{"trials": []}')["trials"]
+            lines = {line["fault"]: Line(**line) for line in known}
+            lines[fault] = Line(fault, times, outcome, lost, rounded, now)
+            _write(self._target, kept, sorted(lines.values(), key=lambda line: line.fault))
 
 
-def free_port() -> int:
-    """A port of this machine that nobody uses."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+def _write(page: Path, kept: Path, lines: list[Line]) -> None:
+    machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
+    content = {"machine": machine, "trials": [asdict(line) for line in lines]}
+    kept.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    rows = [
+        f"| {x.fault} | {x.times} | {x.outcome} | {x.lost} | "
+        f"{'-' if x.back_s is None else f'{x.back_s:.1f} s'} | {x.when} |"
+        for x in lines
+    ]
+    page.write_text(
+        "# What was tried to break it\n\n"
+        f"Written by the trials ({machine}); rows of earlier runs stay until tried again.\n"
+        "*Lost*: of what the store had acknowledged; *scanning again* is the longest time\n"
+        "from the end of the cause to the next frame; *when* is in UTC. `make trials` is the\n"
+        "whole form, `make test` has a short one.\n\n"
+        "| fault | times | outcome | lost | scanning again | when |\n"
+        "|---|---|---|---|---|---|\n" + "\n".join(rows) + "\n",
+        encoding="utf-8",
+    )
 
 
 class Service:
@@ -114,14 +112,16 @@ class Service:
         largest_file_bytes: int | None = None,
         scans: Path | None = None,
         more: str = "",
+        compute: str = "",
     ) -> None:
-        self.port = free_port()
+        """``more`` sections and lines of ``compute`` go into the configuration."""
+        self.port = free_port(socket.SOCK_STREAM)
         self.configuration = folder / "skyrelief.toml"
         self.scans = scans or folder / "scans"
         self.configuration.write_text(
             f'[camera]\nsource = "{camera}"\nmodel = "{model}"\n'
             f'[scan]\nfolder = "{self.scans}"\nstart = "{start}"\n'
-            '[compute]\nbackend = "cpu"\nguide_width = 320\n'
+            f'[compute]\nbackend = "cpu"\nguide_width = 320\n{compute}'
             f'[health]\nhttp = "127.0.0.1:{self.port}"\n{more}'
         )
         self.log = folder / "log.txt"
@@ -206,6 +206,14 @@ def _limit_files(largest_bytes: int | None) -> None:
 
 
 Chunk = tuple[str, int, int, int]
+
+
+def with_site(folder: Path, code: str) -> dict[str, str]:
+    """The environment in which every Python process runs ``code`` at its start."""
+    site = folder / "site"
+    site.mkdir()
+    (site / "sitecustomize.py").write_text(code)
+    return {"PYTHONPATH": os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")])}
 
 
 def stored(scans: Path) -> set[Chunk]:

@@ -1,0 +1,55 @@
+"""A ground station that is gone for minutes."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from loopback import free_port
+from trial_rig import BACK_S, WHOLE, Row, Service, stored
+
+pytestmark = [pytest.mark.trial, pytest.mark.timeout(7200 if WHOLE else 280)]
+
+
+def test_ground_gone_for_minutes(tmp_path: Path, record: Row) -> None:
+    pytest.importorskip("zenoh")
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    store, gone_s = tmp_path / "ground", 180.0 if WHOLE else 5.0
+    command = [sys.executable, "-m", "service.cli", "ground", "--store", str(store)]
+    command += ["--listen", endpoint]
+
+    def ground() -> subprocess.Popen[bytes]:
+        with (tmp_path / "ground.log").open("ab") as log:
+            return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+
+    link = f'[datalink]\nconnect = ["{endpoint}"]\nbudget_kbit_s = 8000\n'
+    receiver = ground()
+    try:
+        with Service(tmp_path, more=link) as service:
+            service.until(lambda: stored(store), "a chunk at the ground")
+            receiver.kill()
+            receiver.wait()
+            time.sleep(gone_s)
+            aboard = stored(service.scans)
+            receiver = ground()
+            back_s = service.until(lambda: aboard <= stored(store), "what was missed")
+            scanned_on = bool(stored(service.scans))
+            service.stop()
+    finally:
+        receiver.kill()
+        receiver.wait()
+    lost = aboard - stored(store)
+    record(
+        f"ground station gone for {gone_s:g} s",
+        1,
+        "fetches what it missed",
+        f"{len(lost)} of {len(aboard)} chunks",
+        back_s,
+    )
+    assert scanned_on
+    assert not lost
+    assert back_s < 6.0 * BACK_S

@@ -1,0 +1,222 @@
+"""Too much to do, too little memory, no GPU any more: what the service gives up, and back."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import resource
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from loopback import free_port
+from trial_autopilot import Autopilot
+from trial_rig import (
+    BACK_S,
+    DEMO,
+    PATIENCE_S,
+    WHOLE,
+    Row,
+    Service,
+    burn,
+    small_model,
+    stored,
+    stream_to,
+)
+
+from recon.backends.cpu import CpuBackend
+from recon.belief_propagation import BeliefPropagationConfig
+from recon.types import U8, DisparityMap
+from service.compute.backend_choice import FallbackBackend
+from service.config import load_config
+from service.daemon.machine import read_machine
+from service.daemon.runtime import Daemon
+
+pytestmark = [pytest.mark.trial, pytest.mark.timeout(1800 if WHOLE else 280)]
+
+MOST_HOGS = 64
+"""Per core, before it is said that nothing makes the service late."""
+
+
+@contextlib.contextmanager
+def hogs(processes: int) -> Iterator[None]:
+    """So many processes that take all the time they get."""
+    running = burn(processes)
+    try:
+        yield
+    finally:
+        for process in running:
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.skipif(not WHOLE, reason="minutes: only in the whole trials")
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
+def test_lag_is_relieved_and_passes(tmp_path: Path, record: Row) -> None:
+    """Real lag: processes that take the cores, more of them until the service is late."""
+    port, link = free_port(), free_port()
+    autopilot = Autopilot(link, attitude=False)
+    autopilot.start()
+    sender = stream_to(port, "640:480", "-framerate 8 -pattern_type glob -i " + PICTURES)
+    camera, model = f"stream:udp://127.0.0.1:{port}", small_model(tmp_path, 640)
+    more = f'[mavlink]\nlinks = ["udpin:127.0.0.1:{link}"]\n'
+    steps: list[str] = []
+    try:
+        with Service(tmp_path, camera=camera, model=model, more=more) as service:
+
+            def step() -> str:
+                name = str(service.get().get("load", {}).get("name", ""))
+                if name and (not steps or steps[-1] != name):
+                    steps.append(name)
+                return name
+
+            service.until(lambda: service.frames > 20, "frames")
+            cores, count = os.cpu_count() or 1, 4
+            while count <= MOST_HOGS and step() in ("full", ""):
+                with hogs(count * cores), contextlib.suppress(TimeoutError):
+                    deadline = time.monotonic() + 40.0
+                    while step() in ("full", "") and time.monotonic() < deadline:
+                        time.sleep(0.3)
+                    if step() != "full":
+                        time.sleep(15.0)  # further down, if that did not help
+                        step()
+                count *= 2
+            start = time.monotonic()
+            down = len(steps)
+            while step() != "full" and time.monotonic() < start + 10.0 * PATIENCE_S:
+                assert service.process.poll() is None
+                time.sleep(0.3)
+            calm_s = time.monotonic() - start
+            back_s = service.until_more_frames("frames")
+            (folder,) = service.scans.iterdir()
+            assert service.stop() == 0
+    finally:
+        autopilot.ended.set()
+        sender.kill()
+        sender.wait()
+    told = [text for text in autopilot.texts if text.startswith("Load:")]
+    record(
+        f"lag: {count // 2 * cores} processes that take the cores",
+        1,
+        f"{' > '.join(steps)}; each step told ({len(told)} texts); full again after {calm_s:.0f} s",
+        "-",
+        back_s,
+    )
+    assert steps[0] == "full"
+    assert steps[-1] == "full"
+    assert down > 1, "nothing made the service late"
+    assert "Load: full quality again" in told
+    assert any("lower rate" in text and "(" in text for text in told)
+    assert (folder / "cloud.laz").is_file()
+
+
+PICTURES = f"{DEMO}/frames/*.jpg"
+
+
+def test_memory_short_is_relieved(tmp_path: Path, record: Row) -> None:
+    """Relief by the ladder, live: nothing reconstructed, pictures kept, and back."""
+    short = '[compute]\nbackend = "cpu"\nguide_width = 320\n'
+    with Service(tmp_path) as service:
+        service.until(lambda: service.frames > 0, "frames")
+        service.reload((short, short + "least_memory_mib = 1e6\n"))
+        service.until(lambda: service.get()["load"]["name"] == "record only", "relief")
+        service.until(lambda: service.get()["load"].get("pictures_kept", 0) > 1, "kept pictures")
+        service.reload(("least_memory_mib = 1e6", "relief = false"))
+        back_s = service.until_more_frames("frames")
+        assert service.get()["load"]["name"] == "full"
+        (folder,) = service.scans.iterdir()
+        assert service.stop() == 0
+    kept = list((folder / "later").glob("*.jpg"))
+    record("memory short", 1, f"record only: {len(kept)} pictures kept for a replay", "-", back_s)
+    assert kept
+    run = json.loads((folder / "scan.json").read_text())["run"]
+    assert any("later/" in warning for warning in run["warnings"])
+
+
+def test_memory_limit_hit_and_lifted(tmp_path: Path, record: Row) -> None:
+    """No more address space for a while; a service that dies of it is started as by systemd."""
+    with Service(tmp_path) as service:
+        service.until(lambda: stored(service.scans), "a chunk")
+        pages = int(Path(f"/proc/{service.process.pid}/statm").read_text().split()[0])
+        limit = pages * resource.getpagesize() + (1 << 20)
+        unlimited = (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
+        resource.prlimit(service.process.pid, resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
+        time.sleep(20.0 if WHOLE else 5.0)
+        acknowledged = stored(service.scans)
+        survived = service.process.poll() is None
+        if survived:
+            resource.prlimit(service.process.pid, resource.RLIMIT_AS, unlimited)
+            back_s = service.until_more_frames("frames")
+            service.stop()
+    if not survived:
+        time.sleep(1.0)
+        with Service(tmp_path) as again:
+            back_s = again.until(lambda: again.frames > 0, "frames") + 1.0
+            again.stop()
+    lost = acknowledged - stored(service.scans)
+    record(
+        "memory limit hit",
+        1,
+        "survived" if survived else "died, started again",
+        f"{len(lost)} of {len(acknowledged)} chunks",
+        back_s,
+    )
+    assert not lost
+    assert back_s < BACK_S
+
+
+class OutOfMemory(CpuBackend):
+    """A GPU, as far as anyone can tell, until its memory is gone."""
+
+    name, device = "torch", "cuda"
+
+    def __init__(self) -> None:
+        self.full = threading.Event()
+
+    def belief_propagation(
+        self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
+    ) -> DisparityMap:
+        """As the CPU's, until it is full."""
+        if self.full.is_set():
+            raise RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB")
+        return super().belief_propagation(left, right, labels, config)
+
+
+def test_gpu_out_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: Row) -> None:
+    given = [f"scan.folder={tmp_path}", "health.http=", f"camera.model={DEMO / 'camera.yaml'}"]
+    given += [f"camera.source=images:{DEMO / 'frames'}?interval_s=0.7", "compute.guide_width=320"]
+    daemon = Daemon(load_config(None, [*given, "compute.backend=cpu"]))
+    heard: list[str] = []
+    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_: heard.append(text))
+    daemon.scanning.load()
+    gpu = OutOfMemory()
+    daemon.scanning._backend = FallbackBackend(gpu)
+    daemon.scanning.start()
+
+    def keyframes(more_than: int) -> int:
+        deadline = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline:
+            scan = daemon.scanning.scan
+            if scan is not None and scan.recorder.keyframes > more_than:
+                return scan.recorder.keyframes
+            time.sleep(0.05)
+        raise AssertionError(f"no keyframe after {more_than}: {daemon.scanning.fault}")
+
+    before = keyframes(0)
+    gpu.full.set()
+    start = time.monotonic()
+    for _ in range(5):  # a keyframe or two may have been under way
+        before = keyframes(before)
+        if daemon.snapshot()["backend"] == "cpu":
+            break
+    back_s = time.monotonic() - start
+    daemon.load_control.look(read_machine(Path("/")))
+    assert daemon.snapshot()["backend"] == "cpu"
+    daemon.scanning.end()
+    record("GPU out of memory (simulated)", 1, "the same scan goes on by the CPU", "-", back_s)
+    assert any("out of memory" in text for text in heard)
+    assert not daemon.scanning.fault

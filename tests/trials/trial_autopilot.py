@@ -1,0 +1,53 @@
+"""An autopilot for the trials: heartbeats, attitude, arming; it hears the status texts."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
+
+ARMED, CUSTOM = 128, 1
+
+
+class Autopilot(threading.Thread):
+    """Speaks by UDP to a port of this machine, with a boot clock that can start anew."""
+
+    def __init__(self, port: int, attitude: bool = True) -> None:
+        """With ``attitude`` it tells that too, not only that it is there."""
+        super().__init__(daemon=True)
+        self.port, self.attitude = port, attitude
+        self.ended, self.silent, self.armed = (threading.Event() for _ in range(3))
+        self.boot_s = time.monotonic() - 1000.0
+        self.texts: list[str] = []  # STATUSTEXT that came back
+
+    def run(self) -> None:
+        """Send until :attr:`ended`."""
+        link: Any = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
+        link.robust_parsing = True
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
+            port.setblocking(False)
+            while not self.ended.wait(0.1):
+                if not self.silent.is_set():
+                    for message in self._due():
+                        with contextlib.suppress(OSError):  # nobody is there yet
+                            port.sendto(message.pack(link), ("127.0.0.1", self.port))
+                self._hear(port, link)
+
+    def _due(self) -> list[Any]:
+        mode = CUSTOM | (ARMED if self.armed.is_set() else 0)
+        out = [dialect.MAVLink_heartbeat_message(2, 3, mode, 0, 4, 3)]
+        if self.attitude:
+            boot_ms = int(1e3 * (time.monotonic() - self.boot_s))
+            out.append(dialect.MAVLink_attitude_message(boot_ms, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0))
+        return out
+
+    def _hear(self, port: socket.socket, link: Any) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                for message in link.parse_buffer(port.recv(4096)) or []:
+                    if message.get_type() == "STATUSTEXT":
+                        self.texts.append(message.text)
