@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from recon import se3
 from recon.backends import reference
 from recon.belief_propagation import BeliefPropagationConfig
 from recon.matching_cost import matching_cost
-from recon.types import F32, U8, DisparityMap
+from recon.registration import IcpConfig, register_projective
+from recon.types import F32, U8, DepthMap, DisparityMap
 from recon.upsampling import UpsamplingConfig, guide_at_taps
 
 torch = pytest.importorskip("torch")
@@ -112,28 +114,86 @@ def test_upsampling_in_one_kernel_is_the_reference(
     assert np.abs(trust - want.confidence)[both].max() < 1e-3
 
 
+def rolling(east_m: float, up_m: float) -> DepthMap:
+    """(54, 80) depth of rolling ground, with a hole, from a place of a camera that looks down."""
+    v, u = np.mgrid[0:54, 0:80]
+    rays = np.stack([(u - 39.5) / 60, (v - 26.5) / 60], -1)
+    z = np.full(u.shape, 40.0)
+    for _ in range(60):
+        x, y = rays[..., 0] * z + east_m, rays[..., 1] * z
+        z += 0.7 * (40 + up_m - 3 * np.sin(x / 5) * np.cos(y / 6) - z)
+    z = z + np.random.default_rng(int(10 * up_m) + 7).normal(0, 0.02, z.shape)
+    z[10:16, 20:30] = np.nan
+    K = np.array([[60.0, 0, 39.5], [0, 60.0, 26.5], [0, 0, 1]])
+    sigma = np.full(z.shape, 0.02, np.float32)
+    return DepthMap(z.astype(np.float32), sigma, np.ones(z.shape, np.uint8), K, np.eye(4))
+
+
+def test_registration_by_kernels_is_the_compiled_one(kernels: Any, device: str) -> None:
+    """Every iteration of both levels; sums, directions and steps as plain torch has them."""
+    from recon.backends.torch_icp import DeviceIcp, descend
+    from recon.backends.torch_partners import points
+    from recon.backends.torch_sums import weigh
+    from recon.backends.torch_surface import build
+
+    source, target = rolling(0.6, 0.3), rolling(0.0, 0.0)
+    config = IcpConfig(strides=(4, 2), iterations=(4, 3))
+    want = register_projective(source, target, np.eye(4), config)
+    found = DeviceIcp(device, kernels).register(source, target, np.eye(4), config)
+    assert found.verdict == want.verdict == "converged"
+    between = found.T_target_source @ se3.inverse(want.T_target_source)
+    twist = np.r_[se3.so3_log(between[:3, :3]), between[:3, 3]]
+    assert np.sqrt(twist @ np.linalg.solve(want.covariance, twist)) < 0.2
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(found.covariance), np.linalg.eigvalsh(want.covariance), rtol=0.2
+    )
+    plain = DeviceIcp(device).register(source, target, np.eye(4), config)
+    np.testing.assert_allclose(found.T_target_source, plain.T_target_source, atol=1e-7)
+    assert found.iterations == plain.iterations
+    surfaces = []
+    for depth in (source, target):
+        z, sigma = (torch.from_numpy(x).to(device) for x in (depth.depth_m, depth.sigma_m))
+        K = torch.tensor([60.0, 60.0, 39.5, 26.5], dtype=torch.float64, device=device)
+        surfaces.append(build(z, sigma, K, config.edge_share))
+    a, b = surfaces
+    T, _, _ = descend(a, b, torch.eye(4, dtype=torch.float64, device=device), config)
+    for tukey in (False, True):
+        seen = points(a, 3)
+        mine, theirs = (look(seen, a, b, T, tukey, config) for look in (kernels.weigh, weigh))
+        for name in ("H", "common", "g", "sums", "scale", "residual", "found", "partners"):
+            got, wanted = getattr(mine, name).cpu().numpy(), getattr(theirs, name).cpu().numpy()
+            np.testing.assert_allclose(got, wanted, rtol=1e-6, atol=1e-6 * np.abs(wanted).max())
+
+
 COMPILE = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
+from recon.backends.triton_icp import POINTS, ROW, _advance, _normal_equations, _residuals
 from recon.backends.triton_propagation import CELLS, _sweep
 from recon.backends.triton_upsampling import COLUMNS, ROWS, _bilateral
 
-def compiled(kernel, words, constants, capability):
+def compiled(capability, warps, kernel, words, *constants):
     names = kernel.arg_names
     kinds = dict(zip(names, words.split() + ["constexpr"] * len(constants), strict=True))
-    constants = dict(zip(names[-len(constants):], constants, strict=True))
-    source = ASTSource(fn=kernel, signature=kinds, constexprs=constants)
-    found = triton.compile(source, target=GPUTarget("cuda", capability, 32))
+    values = dict(zip(names[len(names) - len(constants):], constants, strict=True))
+    source = ASTSource(fn=kernel, signature=kinds, constexprs=values)
+    target = GPUTarget("cuda", capability, 32)
+    found = triton.compile(source, target=target, options={"num_warps": warps})
     print(capability, found.name, "cubin" in found.asm, "ld.local" in found.asm["ptx"])
 
+matched = "*fp64 *fp64 *fp64 *fp32 *fp64 *fp64 "
+tables = "*fp32 *u8 *i32 *fp32 *i32 *fp32 *fp32 *fp32 "
 for capability in (87, 90):
-    compiled(_sweep, "*i16 *i16 *i16 *i16 i32 i32 i32 i32", [CELLS], capability)
+    compiled(capability, 4, _sweep, "*i16 *i16 *i16 *i16 i32 i32 i32 i32", CELLS)
     compiled(
-        _bilateral,
-        "*fp32 *u8 *i32 *fp32 *i32 *fp32 *fp32 *fp32 i32 i32 i32 i32 fp32 fp32 fp32",
-        [10, ROWS, COLUMNS], capability,
+        capability, 4, _bilateral, tables + "i32 i32 i32 i32 fp32 fp32 fp32", 10, ROWS, COLUMNS
     )
+compiled(90, 1, _residuals, matched + "*fp64 *fp64 i32 i32 i32 fp32", POINTS)
+compiled(
+    90, 1, _normal_equations, matched + "*fp64 *fp64 *fp64 i32 i32 i32 fp32 fp32 i32", POINTS, ROW
+)
+compiled(90, 1, _advance, "*fp64 " * 8 + "fp32 fp32 fp32 i32 i32")
 """
 
 
@@ -146,10 +206,9 @@ def test_kernels_compile_for_orin_and_hopper(tmp_path: Path) -> None:
         text=True, timeout=120, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert sorted(done.stdout.splitlines()) == [
-        "87 _bilateral True False", "87 _sweep True False",
-        "90 _bilateral True False", "90 _sweep True False",
-    ]  # fmt: skip
+    names = ("_advance", "_bilateral", "_normal_equations", "_residuals", "_sweep")
+    want = ["87 _bilateral", "87 _sweep", *(f"90 {name}" for name in names)]
+    assert sorted(done.stdout.splitlines()) == [f"{name} True False" for name in want]
 
 
 @pytest.fixture
@@ -164,6 +223,7 @@ def test_a_kernel_is_used_only_when_it_agrees_and_is_faster(
 ) -> None:
     """A wrong one, a slow one, one that cannot run, and no Triton at all."""
     from recon.backends.torch_kernels import PLAIN, Kernels
+    from recon.backends.torch_sums import advance, weigh
     from recon.backends.torch_upsampling import JointBilateral
     from service.compute import fused_kernels
 
@@ -179,16 +239,23 @@ def test_a_kernel_is_used_only_when_it_agrees_and_is_faster(
     def missing() -> Kernels:
         raise ImportError("No module named 'triton'")
 
-    times = iter([2.0, 1.0, 1.0, 2.0])
+    times = iter([2.0, 1.0, 1.0, 2.0, 3.0, 1.0])
     monkeypatch.setattr(fused_kernels, "_least_ms", lambda work, device: next(times))
 
     def chosen(load: Callable[[], Kernels]) -> Kernels:
         return fused_kernels.choose_kernels(device, load, (40, 24), (80, 48))
 
-    assert chosen(lambda: Kernels(wrong, right)) == Kernels(None, right)
+    def off(weighed: Any, a: Any, T: Any, state: Any, share: float, config: Any) -> Any:
+        moved, state = advance(weighed, a, T, state, share, config)
+        return moved + 1e-4, state
+
+    icp = weigh, off
+    assert chosen(lambda: Kernels(wrong, right, *icp)) == Kernels(None, right)
+    assert "registration: not used, a number is off by" in told()
     assert "belief propagation: not used, a number is off by" in told()
     assert "upsampling: used, 1.00 ms beside 2.00 ms of plain torch" in told()
-    assert chosen(lambda: Kernels(broken, right)) == PLAIN
+    icp = weigh, advance
+    assert chosen(lambda: Kernels(broken, right, *icp)) == Kernels(None, None, *icp)
     assert "belief propagation: cannot run, no C compiler" in told()
     assert "upsampling: not used, 2.00 ms beside 1.00 ms" in told()
     assert chosen(missing) == PLAIN

@@ -56,7 +56,7 @@ class TorchBackend:
         """Compute with these kernels from now on; what was captured before is forgotten."""
         self.kernels = kernels
         self._plans.clear()
-        self._path = None
+        self._path = self._icp = None
 
     def matcher(self) -> Matcher:
         """Corners and tracks on the same device, for another thread."""
@@ -111,7 +111,7 @@ class TorchBackend:
         from recon.backends.torch_icp import DeviceIcp
 
         if self._icp is None:
-            self._icp = DeviceIcp(self.device)
+            self._icp = DeviceIcp(self.device, self.kernels)
         return self._icp.register(source, target, T_target_source, config)
 
     def fused_depth(

@@ -15,14 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.backends.torch_linear import median, solve
-from recon.backends.torch_partners import Partners, correlation_sums, match, points
+from recon.backends.torch_kernels import PLAIN, Kernels
+from recon.backends.torch_partners import SourcePoints, correlation_sums, points
 from recon.backends.torch_plan import Plan, part
+from recon.backends.torch_sums import advance, weigh
 from recon.backends.torch_surface import DOUBLE, DeviceSurface, build
 from recon.registration import (
     AREA_LAGS,
     AREA_SIGMAS,
-    MIN_PARTNERS,
     Equations,
     IcpConfig,
     conclude,
@@ -30,21 +30,14 @@ from recon.registration import (
 from recon.types import F64, Array, DepthMap, Registration
 
 KEPT_PLANS = 4
-MEDIAN_OF = 4000
-"""About so many residuals give the scale of all."""
-
-SHARED = 0.35
-"""A direction counts when this share of its information is common to both surfaces."""
-
-SIGN_ROUNDS = 26
-"""A round takes a small eigenvalue 1.5 times nearer to one: to 3e-5 of the largest."""
 
 
 class DeviceIcp:
     """Registers depth maps on ``device``; one thread at a time."""
 
-    def __init__(self, device: str) -> None:
+    def __init__(self, device: str, kernels: Kernels = PLAIN) -> None:
         self.device = device
+        self._kernels = kernels
         self._plans: dict[Any, Plan] = {}
 
     def register(
@@ -60,7 +53,8 @@ class DeviceIcp:
             if key not in self._plans:
                 while len(self._plans) >= KEPT_PLANS:
                     self._plans.pop(next(iter(self._plans)))
-                self._plans[key] = Plan(self.device, _descent(config), [part(a) for a in given])
+                stage = _descent(config, self._kernels)
+                self._plans[key] = Plan(self.device, stage, [part(a) for a in given])
             plan = self._plans[key]
             plan.upload(given)
             told = plan.run()[0].cpu().numpy()
@@ -82,7 +76,7 @@ def _inputs(depth: DepthMap) -> list[Array]:
     return [z, sigma, intrinsics]
 
 
-def _descent(config: IcpConfig) -> Callable[..., tuple[Tensor, ...]]:
+def _descent(config: IcpConfig, kernels: Kernels) -> Callable[..., tuple[Tensor, ...]]:
     """What a plan runs: from two depth maps and a start to the numbers of :func:`_concluded`."""
 
     def run(
@@ -91,34 +85,34 @@ def _descent(config: IcpConfig) -> Callable[..., tuple[Tensor, ...]]:
     ) -> tuple[Tensor, ...]:  # fmt: skip
         a = build(z_a, sigma_a, K_a, config.edge_share)
         b = build(z_b, sigma_b, K_b, config.edge_share)
-        last = len(config.strides) - 1
-        done = torch.zeros((), dtype=DOUBLE, device=T.device)
-        overlap = torch.ones((), dtype=torch.bool, device=T.device)
-        for level, (stride, limit) in enumerate(
-            zip(config.strides, config.iterations, strict=True)
-        ):
-            seen = points(a, stride)
-            moving = overlap
-            for _ in range(limit):
-                sums = _sums(match(seen, b, T, config), a, T, level == last, config)
-                overlap = overlap & (sums.partners >= MIN_PARTNERS)
-                moving = moving & overlap
-                step, settled = _step(sums, 0.3 if level == last else 1.0, config)
-                T = torch.where(moving, step @ T, T)
-                done = done + moving
-                moving = moving & ~settled
-        found = match(seen, b, T, config)
-        sums = _sums(found, a, T, True, config)
-        size = found.residual.view(seen.shape)
-        near = (found.found.view(seen.shape) > 0) & (size.abs() < AREA_SIGMAS * sums.scale)
+        T, state, seen = descend(a, b, T, config, kernels)
+        last = (kernels.weigh or weigh)(seen, a, b, T, True, config)
+        size = last.residual.view(seen.shape)
+        near = (last.found.view(seen.shape) > 0) & (size.abs() < AREA_SIGMAS * last.scale)
         numbers = [
-            sums.H, sums.common, sums.g, sums.sums, sums.scale, sums.centre, a.lever_m,
-            sums.partners * overlap, seen.known.sum(), done, T,
+            last.H, last.common, last.g, last.sums, last.scale, last.centre, a.lever_m,
+            last.partners * state[0], seen.known.sum(), state[2], T,
             correlation_sums(torch.where(near, size, 0.0), near, AREA_LAGS),
         ]  # fmt: skip
         return (torch.cat([n.reshape(-1).to(DOUBLE) for n in numbers]),)
 
     return run
+
+
+def descend(
+    a: DeviceSurface, b: DeviceSurface, T: Tensor, config: IcpConfig, kernels: Kernels = PLAIN
+) -> tuple[Tensor, Tensor, SourcePoints]:
+    """The motion after the iterations of every level, their state, and the last level's points."""
+    look, move = kernels.weigh or weigh, kernels.advance or advance
+    last = len(config.strides) - 1
+    state = torch.tensor([1.0, 1.0, 0.0], dtype=DOUBLE).to(T.device, non_blocking=True)
+    for level, (stride, limit) in enumerate(zip(config.strides, config.iterations, strict=True)):
+        seen = points(a, stride)
+        state = torch.stack([state[0], state[0], state[2]])
+        for _ in range(limit):
+            found = look(seen, a, b, T, level == last, config)
+            T, state = move(found, a, T, state, 0.3 if level == last else 1.0, config)
+    return T, state, seen
 
 
 def _concluded(told: F64, start: F64, config: IcpConfig) -> Registration:
@@ -147,87 +141,3 @@ def _area(lags: F64) -> float:
             length += 2.0 * float(product) / float(power)
         area *= length
     return area
-
-
-class _Sums:
-    """The weighted normal equations on the device, as :class:`recon.registration.Equations`."""
-
-    def __init__(
-        self, partners: Partners, centre: Tensor, lever_m: Tensor, tukey: bool, config: IcpConfig
-    ) -> None:
-        self.centre, self.lever_m = centre, lever_m
-        self.partners = partners.found.sum()
-        size = partners.residual.abs()
-        every = max(len(size) // MEDIAN_OF, 1)
-        middle = median(size[::every], partners.found[::every] > 0)
-        self.scale = (middle / 0.6745).clamp(min=1e-3)
-        if tukey:
-            weight = (1 - (size / (config.tukey_sigmas * self.scale)) ** 2).clamp(min=0) ** 2
-        else:
-            weight = (config.huber_sigmas * self.scale / size.clamp(min=1e-12)).clamp(max=1)
-        weight = weight * partners.found
-        J, own = (
-            torch.cat([torch.linalg.cross(partners.point - centre, n), n], 1)
-            * partners.information[:, None]
-            for n in (partners.normal, partners.own_normal)
-        )
-        weighed = J * weight[:, None]
-        mixed = weighed.T @ own
-        self.H, self.common = weighed.T @ J, 0.5 * (mixed + mixed.T)
-        self.g = weighed.T @ partners.residual
-        squares = weight * size**2
-        metres = squares / partners.information.clamp(min=1e-12) ** 2
-        self.sums = torch.stack(
-            [weight.sum(), squares.sum(), (weight > 0.1).to(DOUBLE).sum(), metres.sum()]
-        )
-
-
-def _sums(
-    partners: Partners, source: DeviceSurface, T: Tensor, tukey: bool, config: IcpConfig
-) -> _Sums:
-    centre = T[:3, :3] @ source.centre + T[:3, 3]
-    return _Sums(partners, centre, source.lever_m, tukey, config)
-
-
-def _step(sums: _Sums, share: float, config: IcpConfig) -> tuple[Tensor, Tensor]:
-    """(4, 4) left correction along what the surface determines; () True when it is small.
-
-    The host splits the directions by the eigenvectors of H. Here the split is the spectral
-    projector of ``C - SHARED H``, C the part of H that both surfaces share: positive where more
-    than that share is common and the slope is above ``weak_slope``. Its sign is found by Newton
-    and Schulz (Higham, Functions of Matrices, 2008, chapter 5), with matrix products alone.
-    """
-    device = sums.H.device
-    eye = torch.eye(6, dtype=DOUBLE, device=device)
-    unit = torch.cat([(1 / sums.lever_m).expand(3), torch.ones(3, dtype=DOUBLE, device=device)])
-    H, common = (A * unit[:, None] * unit[None, :] for A in (sums.H, sums.common))
-    squared = H @ H
-    largest = (squared * squared).sum() ** 0.25 + 1e-30  # eigenvalue, to a factor of 1.6
-    flat = (1 - SHARED) * config.weak_slope**2
-    sign = (common - SHARED * H) / largest - flat * eye
-    for _ in range(SIGN_ROUNDS):
-        sign = torch.addmm(sign, sign @ sign, sign, beta=1.5, alpha=-0.5)
-    P = 0.5 * (eye + sign)
-    restricted = P @ H @ P + largest * (eye - P)
-    solved = solve(restricted, torch.cat([P @ (unit * sums.g)[:, None], P], 1))
-    twist = -unit * (P @ solved[:, 0])
-    twist = torch.where(torch.isfinite(twist).all(), twist, 0.0)
-    sigma = (P @ solved[:, 1:]).diagonal().amax().clamp(min=0).sqrt()
-    turned, moved = twist[:3].norm() * sums.lever_m, twist[3:].norm()
-    return _about(sums.centre, twist), torch.maximum(turned, moved) < (share * sigma).clamp(
-        min=1e-7
-    )
-
-
-def _about(centre: Tensor, twist: Tensor) -> Tensor:
-    """(4, 4) the turn ``twist[:3]`` about ``centre`` and the shift ``twist[3:]``."""
-    x, y, z = twist[:3]
-    none = torch.zeros_like(x)
-    K = torch.stack([none, -z, y, z, none, -x, -y, x, none]).view(3, 3)
-    angle = twist[:3].norm().clamp(min=1e-12)
-    half = torch.sin(angle / 2) / (angle / 2)
-    eye = torch.eye(3, dtype=DOUBLE, device=twist.device)
-    R = eye + (torch.sin(angle) / angle) * K + 0.5 * half**2 * (K @ K)
-    shift = centre - R @ centre + twist[3:]
-    bottom = torch.cat([torch.zeros_like(eye[:1]), torch.ones_like(eye[:1, :1])], 1)
-    return torch.cat([torch.cat([R, shift[:, None]], 1), bottom])

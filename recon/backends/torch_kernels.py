@@ -8,14 +8,20 @@ as with many wheels for the Jetson, everything goes on in plain torch.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from subprocess import SubprocessError
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor
 
 from recon.upsampling import UpsamplingConfig
+
+if TYPE_CHECKING:
+    from recon.backends.torch_partners import SourcePoints
+    from recon.backends.torch_sums import Weighed
+    from recon.backends.torch_surface import DeviceSurface
+    from recon.registration import IcpConfig
 
 
 class Sweep(Protocol):
@@ -39,12 +45,36 @@ class Bilateral(Protocol):
         ...
 
 
+class Weigh(Protocol):
+    """Partners, weights and sums of an iteration of ICP."""
+
+    def __call__(
+        self, seen: SourcePoints, a: DeviceSurface, b: DeviceSurface, T: Tensor, tukey: bool,
+        config: IcpConfig, /,
+    ) -> Weighed:  # fmt: skip
+        """See :func:`recon.backends.torch_sums.weigh`."""
+        ...
+
+
+class Advance(Protocol):
+    """The step of an iteration of ICP."""
+
+    def __call__(
+        self, weighed: Weighed, a: DeviceSurface, T: Tensor, state: Tensor, share: float,
+        config: IcpConfig, /,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """See :func:`recon.backends.torch_sums.advance`."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Kernels:
     """What replaces plain operations; None: nothing does."""
 
     sweep: Sweep | None = None
     bilateral: Bilateral | None = None
+    weigh: Weigh | None = None
+    advance: Advance | None = None
 
 
 Results = Callable[[], tuple[Tensor, ...]]
@@ -76,10 +106,11 @@ class Trial:
 
 def load_kernels() -> Kernels:
     """All kernels there are; ImportError without Triton."""
+    from recon.backends.triton_icp import advance, weigh
     from recon.backends.triton_propagation import sweep
     from recon.backends.triton_upsampling import bilateral
 
-    return Kernels(sweep, bilateral)
+    return Kernels(sweep, bilateral, weigh, advance)
 
 
 def failures() -> tuple[type[Exception], ...]:
@@ -132,14 +163,38 @@ def trials(
         return lambda: believed(kernels.sweep), lambda: upsampled(kernels)
 
     (plain, plain_px), (fused, _), (_, fused_px) = both(PLAIN), both(swept), both(bilateral)
+    icp = Kernels(weigh=kernels.weigh, advance=kernels.advance)
+    register = _registered(device, size_px)
     return [
         Trial("belief propagation", swept, plain, fused, 0.0),
         Trial("upsampling", bilateral, plain_px, fused_px, 0.01),
+        Trial("registration", icp, lambda: register(PLAIN), lambda: register(icp), 1e-6),
     ]
 
 
 def joined(kernels: Sequence[Kernels]) -> Kernels:
     """All that any of them replaces."""
-    sweeps = [k.sweep for k in kernels if k.sweep is not None]
-    bilaterals = [k.bilateral for k in kernels if k.bilateral is not None]
-    return Kernels(sweeps[0] if sweeps else None, bilaterals[0] if bilaterals else None)
+    chosen = {
+        field.name: getattr(k, field.name)
+        for k in kernels
+        for field in fields(Kernels)
+        if getattr(k, field.name) is not None
+    }
+    return Kernels(**chosen)
+
+
+def _registered(device: str, size_px: tuple[int, int]) -> Callable[[Kernels], tuple[Tensor, ...]]:
+    """ICP of rolling ground seen from two places: kernels to the motion (4, 4)."""
+    from recon.backends.torch_icp import descend
+    from recon.backends.torch_surface import DOUBLE, build
+    from recon.registration import IcpConfig
+
+    (w, h), config = size_px, IcpConfig()
+    intrinsics = torch.tensor([0.6 * w, 0.6 * w, w / 2, h / 2], dtype=DOUBLE, device=device)
+    u = torch.arange(w, device=device)[None, :] / w
+    v = torch.arange(h, device=device)[:, None] / w
+    seen = [50 + 2 * torch.sin(9 * u + away) * torch.cos(8 * v) for away in (0.0, 0.1)]
+    sigma = torch.full((h, w), 0.05, device=device)
+    a, b = (build(z, sigma, intrinsics, config.edge_share) for z in seen)
+    start = torch.eye(4, dtype=DOUBLE, device=device)
+    return lambda kernels: (descend(a, b, start, config, kernels)[0],)

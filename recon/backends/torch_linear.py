@@ -5,6 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+MEDIAN_OF = 4000
+"""About so many residuals give the scale of all."""
+
 
 def solve(A: Tensor, B: Tensor) -> Tensor:
     """X (n, k) with ``A X = B``, A (n, n) symmetric and positive definite; Gauss and Jordan.
@@ -28,3 +31,10 @@ def median(values: Tensor, chosen: Tensor) -> Tensor:
     count = chosen.sum()
     middle = torch.stack([(count - 1).clamp(min=0) // 2, count // 2])
     return ordered.gather(0, middle.clamp(max=len(values) - 1)).mean()
+
+
+def scale_of(residual: Tensor, found: Tensor) -> Tensor:
+    """() standard deviation of the residuals (N,) that are ``found``, by their median."""
+    every = max(len(residual) // MEDIAN_OF, 1)
+    middle = median(residual[::every].abs(), found[::every] > 0)
+    return (middle / 0.6745).clamp(min=1e-3)

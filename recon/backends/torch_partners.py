@@ -45,8 +45,9 @@ def points(source: DeviceSurface, stride: int) -> SourcePoints:
     z = torch.where(known, element[..., 3] / torch.where(known, along, 1.0), 0.0)
     point = torch.stack([x * z, y * z, z], -1).view(-1, 3)
     shape = (element.shape[0], element.shape[1])
+    normal, sigma = element[..., :3].contiguous(), element[..., 4].contiguous()
     return SourcePoints(
-        shape, point, element[..., :3].reshape(-1, 3), element[..., 4].reshape(-1), known.view(-1)
+        shape, point, normal.view(-1, 3), sigma.view(-1), known.contiguous().view(-1)
     )
 
 

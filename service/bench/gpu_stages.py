@@ -98,18 +98,20 @@ def fused_stages(device: str, pair: StereoPair, kernels: Kernels) -> list[Stage]
     chosen = [found[0]] if kernels.sweep is not None else []
     if kernels.bilateral is not None:
         chosen += [s for s in found if s.what.startswith("upsampling")]
+    if kernels.weigh is not None:
+        chosen.append(icp_stage(device, kernels))
     return [replace(s, what=f"{s.what}, fused") for s in chosen]
 
 
-def icp_stage(device: str) -> Stage:
+def icp_stage(device: str, kernels: Kernels = PLAIN) -> Stage:
     """Six iterations on all points: surfaces, partners, sums and steps."""
-    icp = DeviceIcp(device)
+    icp = DeviceIcp(device, kernels)
     config = IcpConfig(strides=(1,), iterations=(6,))
     icp.register(ground(0.3), ground(0.0), np.eye(4), config)
     points, rounds = SIZE[0] * SIZE[1], config.iterations[0] + 1
     return staged(
         f"ICP of {points} points, 6 iterations, on the device", device, icp.plan(),
-        points * (2 * 8.0 + rounds * 48), points * (2 * 200.0 + rounds * 180),
+        points * (2 * 8.0 + rounds * 176), points * (2 * 200.0 + rounds * 400),
     )  # fmt: skip
 
 
