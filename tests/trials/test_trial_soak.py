@@ -7,6 +7,7 @@ so memory is compared flight by flight, at the same time after each take-off.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
@@ -80,13 +81,11 @@ def held(pid: int) -> tuple[float, int]:
     text = Path(f"/proc/{pid}/status").read_text()
     rows = [line.split() for line in text.splitlines() if line.startswith("VmRSS:")]
     mib, files = float(rows[0][1]) / 1024.0, len(os.listdir(f"/proc/{pid}/fd"))
-    children = Path(f"/proc/{pid}/task").glob("*/children")
-    for child in " ".join(path.read_text() for path in children).split():
-        try:
-            more = held(int(child))
-        except (OSError, IndexError):
-            continue  # it has ended
-        mib, files = mib + more[0], files + more[1]
+    for thread in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(OSError, IndexError):  # the thread or the child has ended
+            for child in (thread / "children").read_text().split():
+                more = held(int(child))
+                mib, files = mib + more[0], files + more[1]
     return mib, files
 
 
