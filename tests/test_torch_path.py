@@ -276,3 +276,22 @@ def test_the_backend_gives_the_path_to_the_service_and_falls_back(device: str) -
     assert backend.failure == "CUDA error: device lost"
     assert backend.name == "cpu"
     assert not isinstance(load_backend("cpu"), PathBackend)
+
+
+@pytest.mark.parametrize(("truncation", "exact"), [(2.0, True), (2.5, False)])
+def test_half_precision_holds_the_sums_of_small_truncations(
+    device: str, truncation: float, exact: bool
+) -> None:
+    """Whole numbers up to 2048: eight truncations of 2 labels fit, of 2.5 they do not."""
+    from recon.backends.torch_dense import edge_weights, propagate
+
+    config = BeliefPropagationConfig(smoothness_truncation=truncation)
+    rng = np.random.default_rng(0)
+    true = torch.tensor([40, 60, 12], device=device)
+    cost = on(device, rng.integers(0, 1301, (12, 40, 60)).astype(np.float32))[0]
+    edges = edge_weights(torch.full((40, 60), 90.0, device=device), true, config)
+    half, whole = (
+        propagate(cost, edges, true, 3, config, kind).double()
+        for kind in (torch.float16, torch.int16)
+    )
+    assert bool((half == whole).all()) is exact

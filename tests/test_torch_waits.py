@@ -167,6 +167,56 @@ def test_a_frame_of_the_odometry(device: str, reads: list[int]) -> None:
     assert reads[2:] == [8 * 8 * 3, 128 * 4]
 
 
+class OffTheDevice(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Notes tensors of the host in the work of a device without contents."""
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.seen: list[str] = []
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        out = func(*args, **(kwargs or {}))
+        made = out if isinstance(out, (tuple, list)) else (out,)
+        if any(isinstance(t, torch.Tensor) and t.device.type != "meta" and t.dim() for t in made):
+            self.seen.append(func.overloadpacket.__name__)
+        return out
+
+
+def test_nothing_is_made_on_the_host_between_upload_and_result() -> None:
+    """A graph cannot capture a copy from the host's memory; on a processor it would not show."""
+    from recon.backends.torch_icp import _descent
+    from recon.backends.torch_kernels import PLAIN
+    from recon.backends.torch_matching import harris_cells
+    from recon.backends.torch_path import DensePath, PairDepthStage
+    from recon.backends.torch_tracking import match
+
+    def empty(kind: Any, *shape: int) -> Any:
+        return torch.empty(shape, dtype=kind, device="meta")
+
+    matching = BeliefPropagationConfig(iterations=1, speckle_px=1)
+    path = DensePath("meta", matching, UpsamplingConfig(diameter_px=2), FusionConfig())
+    pair = [empty(torch.uint8, 64, 96) for _ in range(4)]
+    pair += [empty(torch.uint8, 128, 192, 3), empty(torch.int64, 5), empty(torch.float64, 14)]
+    depth = [empty(torch.float32, 48, 60)] * 2 + [empty(torch.float64, 4)]
+    levels = [empty(torch.uint8, 128 >> k, 160 >> k) for k in range(3)]
+    uv, warp, radius = empty(torch.float64, 9, 2), empty(torch.float64, 9, 4), empty(torch.float64)
+    with OffTheDevice() as off:
+        found = [
+            *PairDepthStage(path, 4, 2, (96, 54))(*pair),
+            *_descent(IcpConfig(), PLAIN)(*depth, *depth, empty(torch.float64, 4, 4)),
+            harris_cells(levels[0], MatchingConfig(), levels[0]),
+            match(levels, levels, uv, uv, (warp, warp), empty(torch.bool, 9), radius, (2, 8),
+                  MatchingConfig()),
+        ]  # fmt: skip
+    assert off.seen == []
+    assert all(t.device.type == "meta" for t in found)
+    with OffTheDevice() as off:
+        torch.tensor([1.0, 2.0]).to("meta")
+    assert off.seen
+
+
 def test_a_wait_would_be_seen(device: str) -> None:
     """A value read, a mask counted, a median, an eigenvalue."""
     values = torch.arange(12.0, device=device).view(3, 4)

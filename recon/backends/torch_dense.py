@@ -185,7 +185,7 @@ def sweep_plainly(
 
 def _beyond(values: Tensor) -> float:
     """A number of their type above all of them."""
-    return BEYOND if values.dtype == torch.int16 else FAR
+    return FAR if values.dtype == torch.float32 else BEYOND
 
 
 def _cut(data: Tensor, labels: Tensor, truncation: int) -> Tensor:

@@ -105,7 +105,8 @@ def descend(
     """The motion after the iterations of every level, their state, and the last level's points."""
     look, move = kernels.weigh or weigh, kernels.advance or advance
     last = len(config.strides) - 1
-    state = torch.tensor([1.0, 1.0, 0.0], dtype=DOUBLE).to(T.device, non_blocking=True)
+    ones = torch.ones(2, dtype=DOUBLE, device=T.device)
+    state = torch.cat([ones, torch.zeros_like(ones[:1])])
     for level, (stride, limit) in enumerate(zip(config.strides, config.iterations, strict=True)):
         seen = points(a, stride)
         state = torch.stack([state[0], state[0], state[2]])
