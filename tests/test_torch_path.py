@@ -278,11 +278,11 @@ def test_the_backend_gives_the_path_to_the_service_and_falls_back(device: str) -
     assert not isinstance(load_backend("cpu"), PathBackend)
 
 
-@pytest.mark.parametrize(("truncation", "exact"), [(2.0, True), (2.5, False)])
+@pytest.mark.parametrize(("truncation", "exact"), [(1.0, True), (2.0, False), (2.5, False)])
 def test_half_precision_holds_the_sums_of_small_truncations(
     device: str, truncation: float, exact: bool
 ) -> None:
-    """Whole numbers up to 2048: eight truncations of 2 labels fit, of 2.5 they do not."""
+    """Whole numbers up to 2048: four costs of four truncations fit for 1 label, not for 2.5."""
     from recon.backends.torch_dense import edge_weights, propagate
 
     config = BeliefPropagationConfig(smoothness_truncation=truncation)
