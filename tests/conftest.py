@@ -91,7 +91,7 @@ class HouseFlight:
         return store
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def house() -> HouseFlight:
     """The flight over the house."""
     return HouseFlight()

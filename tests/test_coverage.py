@@ -19,7 +19,7 @@ from recon.types import F64, DepthMap
 from service.errors import InputError
 from service.exports.view import ExportOptions, ScanView, export
 from service.georeference import LocalFrame
-from service.ground.http import Portal, PortalConfig
+from service.ground.portal import Portal, PortalConfig
 from service.scans.coverage import (
     FIGURES,
     PICTURE,

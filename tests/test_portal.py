@@ -22,9 +22,9 @@ pytest.importorskip("websockets")
 
 from recon import se3
 from service.errors import InputError, OutsideError
-from service.ground.http import Portal, PortalConfig, open_portal, parse_address
 from service.ground.library import Library
 from service.ground.live import SIGMA_STEP_M, LiveFeed, StoreIndex
+from service.ground.portal import Portal, PortalConfig, open_portal, parse_address
 from service.ground.scan_files import DARK
 from service.ground.scan_files import _closed as closed_picture
 from service.ground.vehicle import Vehicle
@@ -161,11 +161,23 @@ def test_rename_and_tag_with_any_letters(client: Client, store: Path) -> None:
     title = "<script>alert(1)</script> Ölmühle\n Süd"
     status, labels, _ = client.ask(one, "PATCH", {"title": title, "tags": ["a", "b", "a"]})
     assert status == 200
-    assert labels == {"title": "<script>alert(1)</script> Ölmühle Süd", "tags": ["a", "b"]}
+    assert labels == {
+        "title": "<script>alert(1)</script> Ölmühle Süd",
+        "tags": ["a", "b"],
+        "edition": 1,
+    }
     assert client.ask(one)[1]["tags"] == ["a", "b"]
     client.ask(one, "PATCH", {"title": "only this"})
     assert client.ask(one)[1]["tags"] == ["a", "b"]
-    for bad in ({"title": 3}, {"title": "x" * 999}, {"tags": "a"}, {"tags": [1]}, {"x": 1}, [1]):
+    for bad in (
+        {"edition": "1"},
+        {"title": 3},
+        {"title": "x" * 999},
+        {"tags": "a"},
+        {"tags": [1]},
+        {"x": 1},
+        [1],
+    ):
         assert client.ask(one, "PATCH", bad)[0] == 400
     assert client.ask(one, "PATCH", {"title": "x" * 70_000})[0] == 413
     (store / "drone-1/test-1/library.json").write_text("{broken")
@@ -185,6 +197,17 @@ def test_two_renames_at_once_leave_one_whole(store: Path) -> None:
         thread.join()
     entry = library.entry("drone-1", "test-1")
     assert entry["title"] in [t[:200] for t in titles]
+
+
+def test_a_change_to_labels_that_are_no_longer_so_is_refused(client: Client) -> None:
+    one = "/api/scans/drone-1/test-1"
+    seen = client.ask(one)[1]["edition"]
+    assert client.ask(one, "PATCH", {"title": "first", "edition": seen})[0] == 200
+    status, answer, _ = client.ask(one, "PATCH", {"tags": ["late"], "edition": seen})
+    assert status == 409 and "first" in answer["error"]
+    entry = client.ask(one)[1]
+    assert (entry["title"], entry["tags"]) == ("first", [])
+    assert client.ask(one, "PATCH", {"tags": ["late"], "edition": entry["edition"]})[0] == 200
 
 
 def test_delete_goes_to_the_bin_and_comes_back(client: Client, store: Path) -> None:

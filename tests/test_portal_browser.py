@@ -18,7 +18,8 @@ pytest.importorskip("websockets")
 from mavlink.rehearsal import RehearsalVehicle
 from service.bench.browser import Browser, chromium
 from service.exports.view import ExportOptions, ScanView, export
-from service.ground.http import PAGE, Portal, PortalConfig
+from service.ground.http import PAGE
+from service.ground.portal import Portal, PortalConfig
 from service.ground.vehicle import Vehicle
 from service.scans.folder import write_deliverables
 from service.stream.codec import encode

@@ -26,35 +26,24 @@ def chromium() -> str:
     return next(filter(None, map(shutil.which, names)), "")
 
 
-class Browser:
-    """One page; close it at the end. Dialogs are accepted with :attr:`dialog` as the text."""
+class Page:
+    """One page; dialogs are accepted with :attr:`dialog` as the text."""
 
-    def __init__(self, profile: Path, *flags: str) -> None:
-        """Start Chromium with a fresh ``profile`` folder."""
+    def __init__(self, process: subprocess.Popen[bytes], address: str) -> None:
+        """Take over the page whose DevTools answer at the WebSocket ``address``."""
         from websockets.sync.client import connect
 
-        self.process = subprocess.Popen(
-            [chromium(), *FLAGS.split(), *flags, f"--user-data-dir={profile}", "about:blank"],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        port_file = profile / "DevToolsActivePort"
-        self.until(lambda: port_file.is_file() and port_file.read_text().count("\n") > 0)
-        port = port_file.read_text().split()[0]
-        pages = json.load(urllib.request.urlopen(f"http://127.0.0.1:{port}/json"))
-        page = next(p for p in pages if p["type"] == "page")
-        self._socket = connect(page["webSocketDebuggerUrl"], max_size=None)
+        self.process = process
+        self._socket = connect(address, max_size=None)
         self._number = 0
         self.requests: list[str] = []
         self.dialog = ""  # what the next prompt is answered with
         for domain in ("Page", "Runtime", "Network"):
             self.call(f"{domain}.enable")
 
-    def close(self) -> None:
-        """End the browser."""
+    def leave(self) -> None:
+        """Let go of the page."""
         self._socket.close()
-        self.process.terminate()
-        self.process.wait(timeout=10)
 
     def call(self, method: str, **params: Any) -> Any:
         """The result of a DevTools method; RuntimeError when it fails."""
@@ -118,3 +107,49 @@ class Browser:
                 raise RuntimeError("the browser ended")
             time.sleep(0.05)
         return value
+
+
+class Browser(Page):
+    """A Chromium and its first page; close it at the end."""
+
+    def __init__(self, profile: Path, *flags: str) -> None:
+        """Start Chromium with a fresh ``profile`` folder."""
+        self.process = subprocess.Popen(
+            [chromium(), *FLAGS.split(), *flags, f"--user-data-dir={profile}", "about:blank"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        port_file = profile / "DevToolsActivePort"
+        self.until(lambda: port_file.is_file() and port_file.read_text().count("\n") > 0)
+        port, own = port_file.read_text().split()
+        self._host = f"127.0.0.1:{port}"
+        pages = json.load(urllib.request.urlopen(f"http://{self._host}/json"))
+        page = next(p for p in pages if p["type"] == "page")
+        super().__init__(self.process, page["webSocketDebuggerUrl"])
+        self._own = f"ws://{self._host}{own}"
+        self._others: list[Page] = []
+
+    def other(self) -> Page:
+        """A page as of another person's browser: nothing is shared with the first."""
+        from websockets.sync.client import connect
+
+        def ask(number: int, method: str, **params: Any) -> Any:
+            whole.send(json.dumps({"id": number, "method": method, "params": params}))
+            while True:
+                message = json.loads(whole.recv(timeout=ANSWER_S))
+                if message.get("id") == number:
+                    return message["result"]
+
+        whole = self._whole = connect(self._own, max_size=None)  # the context lives as long
+        context = ask(1, "Target.createBrowserContext")["browserContextId"]
+        made = ask(2, "Target.createTarget", url="about:blank", browserContextId=context)
+        page = Page(self.process, f"ws://{self._host}/devtools/page/{made['targetId']}")
+        self._others.append(page)
+        return page
+
+    def close(self) -> None:
+        """End the browser."""
+        for page in (*self._others, self):
+            page.leave()
+        self.process.terminate()
+        self.process.wait(timeout=10)

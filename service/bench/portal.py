@@ -1,8 +1,9 @@
 """``skyrelief bench portal``: the page in a headless Chromium, drawn in software.
 
 Page load on loopback, from a keyframe in the receiver's store to its points in the browser,
-and frame times of ten million points. SwiftShader draws on the processor: a graphics card is
-one to two orders of magnitude faster.
+and ten million points: frame times while flying, and how long all of them take, slice by
+slice. SwiftShader draws on the processor: a graphics card is one to two orders of magnitude
+faster.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from service.bench import BenchOptions, BenchResult
 from service.bench.browser import Browser, chromium
 from service.bench.keyframes import make_keyframe
 from service.errors import OutsideError
-from service.ground.http import PAGE, Portal, PortalConfig
+from service.ground.http import PAGE
+from service.ground.portal import Portal, PortalConfig
 from service.stream.codec import encode
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
@@ -27,7 +29,7 @@ NOTE = "software rendering (SwiftShader), 1280x800"
 LARGE_PX = (640, 360)
 KEYFRAMES = 44  # of 230,400 points: ten million
 ARRIVALS = 15
-SETTLING, FRAMES, FULL_FRAMES = 16, 20, 5
+SETTLING, FRAMES, WHOLE_PICTURES = 16, 20, 3
 TOKEN = "a-token-for-the-benchmark"
 FRAME_TIMES = """new Promise(done => {
   const gl = document.querySelector('.stage canvas').getContext('webgl2');
@@ -52,8 +54,20 @@ BUDGET = """(() => {
     .find(l => l.textContent.startsWith('Points drawn'));
   const input = label.querySelector('input'); input.value = '7.1'; input.oninput();
 })()"""
-FULL_DETAIL = """[...document.querySelectorAll('.settings label')]
-  .find(l => l.textContent.startsWith('Full detail')).querySelector('input').click()"""
+ALL_DRAWN = """new Promise(done => {
+  const press = (kind) => dispatchEvent(new KeyboardEvent(kind, { key: 'd' }));
+  const times = []; let last = performance.now(), begun = false, still = 0;
+  press('keydown');
+  setTimeout(() => { press('keyup'); still = performance.now(); }, 500);
+  const tick = () => {
+    const now = performance.now(), drawn = Number(document.body.dataset.drawn);
+    times.push(now - last); last = now;
+    begun ||= still > 0 && drawn < %(points)d;
+    if (begun && drawn >= %(points)d) return done([now - still, ...times]);
+    requestAnimationFrame(tick);
+  };
+  requestAnimationFrame(tick);
+})"""
 
 
 def run(options: BenchOptions) -> list[BenchResult]:
@@ -69,12 +83,13 @@ def run(options: BenchOptions) -> list[BenchResult]:
         with store, growing, _page(root) as (browser, base):
             load = _page_loads(browser, base, max(3, options.rounds // 5))
             arrivals = _arrivals(browser, base, growing)
-            flying, still = _frame_times(browser, base)
+            flying, whole, stops = _frame_times(browser, base)
     return [
         _result("page load, cold cache, list drawn", load),
         _result("keyframe in the store to points in the browser", arrivals),
         _result("frame while flying over 10.1 M points, thinned to keep up", flying),
-        _result("frame with all 10.1 M points drawn", still),
+        _result("all 10.1 M points drawn after a movement, slice by slice", whole),
+        _result("longest stop of the page meanwhile", stops),
     ]
 
 
@@ -142,14 +157,17 @@ def _arrivals(browser: Browser, base: str, store: ScanStore) -> list[float]:
     return times
 
 
-def _frame_times(browser: Browser, base: str) -> tuple[list[float], list[float]]:
-    """Milliseconds of frames while flying over the scan: as usual, and with full detail."""
+def _frame_times(browser: Browser, base: str) -> tuple[list[float], list[float], list[float]]:
+    """Milliseconds of frames while flying over the scan, until all of it is drawn, of stops."""
     points = KEYFRAMES * LARGE_PX[0] * LARGE_PX[1]
     browser.open(f"{base}/#/view/bench/large")
     browser.wait(f"Number(document.body.dataset.points) >= {0.99 * points}", 120)
     browser.run(BUDGET)
     browser.run(FRAME_TIMES % SETTLING)  # until the page knows what this machine can draw
-    flying = browser.run(FRAME_TIMES % FRAMES)
-    browser.run(FULL_DETAIL)
-    still = browser.run(FRAME_TIMES % FULL_FRAMES)
-    return [float(t) for t in flying], [float(t) for t in still]
+    flying = [float(t) for t in browser.run(FRAME_TIMES % FRAMES)]
+    whole, stops = [], []
+    for _ in range(WHOLE_PICTURES):
+        total, *ticks = browser.run(ALL_DRAWN % {"points": round(0.99 * points)})
+        whole.append(float(total))
+        stops.append(max(float(t) for t in ticks))
+    return flying, whole, stops

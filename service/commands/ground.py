@@ -15,7 +15,7 @@ import typer
 from service.errors import OutsideError
 
 if TYPE_CHECKING:
-    from service.ground.http import Portal
+    from service.ground.portal import Portal
     from service.ground.receiver import Receiver
     from service.stream.radio_link import RadioLink
 
@@ -136,7 +136,7 @@ def _open_portal(
 ) -> Portal:
     """The portal, started; its address is printed."""
     try:
-        from service.ground.http import open_portal
+        from service.ground.portal import open_portal
         from service.ground.vehicle import Vehicle
     except ModuleNotFoundError as error:
         raise OutsideError(

@@ -14,7 +14,7 @@ import shutil
 import sqlite3
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -61,10 +61,15 @@ class Labels:
 
     title: str = ""
     tags: tuple[str, ...] = ()
+    edition: int = 0  # counts the changes
+
+
+class StaleError(InputError):
+    """A change to labels that someone else has changed meanwhile."""
 
 
 class Library:
-    """The scans below one folder. Safe for several threads; the last of two renames holds."""
+    """The scans below one folder. Safe for several threads."""
 
     def __init__(self, store: Path) -> None:
         self.store = store
@@ -93,6 +98,7 @@ class Library:
             "scan": scan,
             "title": labels.title or scan,
             "tags": list(labels.tags),
+            "edition": labels.edition,
             "files": _files(folder),
             "preview": (folder / "preview.jpg").is_file(),
             "tiles": (folder / "3dtiles" / "tileset.json").is_file(),
@@ -114,17 +120,32 @@ class Library:
             raise InputError(f"no file {name} in {drone}/{scan}"[:200])
         return path
 
-    def label(self, drone: str, scan: str, title: str | None, tags: list[str] | None) -> Labels:
-        """Rename or tag a scan; what is None stays. Raises InputError for unfit values."""
+    def label(
+        self,
+        drone: str,
+        scan: str,
+        title: str | None,
+        tags: list[str] | None,
+        edition: int | None = None,
+    ) -> Labels:
+        """Rename or tag a scan; what is None stays. Raises InputError for unfit values.
+
+        ``edition`` is that of the labels the change was made on: StaleError when they have
+        changed since, and nothing is written. Without it the last of two changes holds.
+        """
         folder = self.folder(drone, scan)
         with self._lock:
             old = read_labels(folder)
+            if edition is not None and edition != old.edition:
+                name = old.title or scan
+                raise StaleError(f"someone else has just changed “{name}”; look again, then change")
             new = Labels(
                 old.title if title is None else _title(title),
                 old.tags if tags is None else _tags(tags),
+                old.edition + 1,
             )
             with writing(folder / LABELS) as part:
-                part.write_text(json.dumps({"title": new.title, "tags": list(new.tags)}))
+                part.write_text(json.dumps(asdict(new)))
         return new
 
     def delete(self, drone: str, scan: str) -> str:
@@ -220,7 +241,12 @@ def read_labels(folder: Path) -> Labels:
     """The labels of a scan folder; none when the file is missing or unfit."""
     try:
         document = json.loads(_small_text(folder / LABELS))
-        return Labels(_title(document["title"]), _tags(document["tags"]))
+        edition = document.get("edition", 0)
+        return Labels(
+            _title(document["title"]),
+            _tags(document["tags"]),
+            edition if isinstance(edition, int) else 0,
+        )
     except (OSError, ValueError, KeyError, TypeError, RecursionError, InputError):
         return Labels()
 

@@ -43,10 +43,14 @@ DOCUMENT: dict[str, Any] = {
             "scan",
             get=_operation("One scan with its files and jobs.", "a scan"),
             patch=_operation(
-                "Rename or tag.",
+                "Rename or tag. With the edition that was seen: 409 when it is no longer the last.",
                 "the labels",
                 True,
-                {"title": _TEXT, "tags": {"type": "array", "items": _TEXT}},
+                {
+                    "title": _TEXT,
+                    "tags": {"type": "array", "items": _TEXT},
+                    "edition": {"type": "integer"},
+                },
             ),
             delete=_operation("Move to the bin.", "the name in the bin", True),
         ),

@@ -18,6 +18,7 @@ export interface Scan {
   scan: string;
   title: string;
   tags: string[];
+  edition: number;
   files: { name: string; what: string; bytes: number }[];
   preview: boolean;
   tiles: boolean;
@@ -54,7 +55,7 @@ export const scans = (): Promise<Scan[]> => ask("/api/scans");
 export const scan = (drone: string, name: string): Promise<Scan> =>
   ask(place({ drone, scan: name }));
 export const label = (s: Scan, body: { title?: string; tags?: string[] }): Promise<unknown> =>
-  ask(place(s), "PATCH", body);
+  ask(place(s), "PATCH", { ...body, edition: s.edition });
 export const remove = (s: Scan): Promise<unknown> => ask(place(s), "DELETE");
 export const make = (s: Scan, kind: string): Promise<Job> =>
   ask(`${place(s)}/exports`, "POST", { kind });

@@ -144,14 +144,14 @@ function makeMenu(s: api.Scan, again: () => void): HTMLElement {
 
 function rename(s: api.Scan, again: () => void): void {
   const title = prompt("Name of this scan", s.title);
-  if (title !== null) void api.label(s, { title }).then(again, tell);
+  if (title !== null) void api.label(s, { title }).catch(tell).then(again);
 }
 
 function retag(s: api.Scan, again: () => void): void {
   const text = prompt("Tags, separated by commas", s.tags.join(", "));
   if (text === null) return;
   const tags = text.split(",").map((t) => t.trim()).filter(Boolean);
-  void api.label(s, { tags }).then(again, tell);
+  void api.label(s, { tags }).catch(tell).then(again);
 }
 
 function remove(s: api.Scan, again: () => void): void {

@@ -6,17 +6,25 @@ import { EffectComposer } from "three/addons/postprocessing/EffectComposer.js";
 import { OutputPass } from "three/addons/postprocessing/OutputPass.js";
 import { RenderPass } from "three/addons/postprocessing/RenderPass.js";
 import { UnrealBloomPass } from "three/addons/postprocessing/UnrealBloomPass.js";
-import type { Stage } from "./stage";
+import type { Effects } from "./painter";
 
-export class Look {
+export class Look implements Effects {
   private readonly composer: EffectComposer;
   private readonly focus: BokehPass;
 
-  constructor(private readonly stage: Stage, bloom: boolean, depthOfField: boolean) {
-    const size = stage.renderer.getSize(new THREE.Vector2());
-    this.composer = new EffectComposer(stage.renderer);
-    this.composer.addPass(new RenderPass(stage.scene, stage.camera));
-    this.focus = new BokehPass(stage.scene, stage.camera, { focus: 100, aperture: 2e-5, maxblur: 0.008 });
+  /** Effects over `scene`, sharpest at the distance of `target`. */
+  constructor(
+    renderer: THREE.WebGLRenderer,
+    scene: THREE.Scene,
+    private readonly camera: THREE.PerspectiveCamera,
+    private readonly target: THREE.Vector3,
+    bloom: boolean,
+    depthOfField: boolean,
+  ) {
+    const size = renderer.getSize(new THREE.Vector2());
+    this.composer = new EffectComposer(renderer);
+    this.composer.addPass(new RenderPass(scene, camera));
+    this.focus = new BokehPass(scene, camera, { focus: 100, aperture: 2e-5, maxblur: 0.008 });
     this.focus.enabled = depthOfField;
     this.composer.addPass(this.focus);
     if (bloom) this.composer.addPass(new UnrealBloomPass(size, 0.25, 0.4, 0.7));
@@ -24,9 +32,8 @@ export class Look {
   }
 
   render(): void {
-    const { camera, controls } = this.stage;
     const uniforms = this.focus.uniforms as Record<string, THREE.IUniform>;
-    uniforms["focus"]!.value = camera.position.distanceTo(controls.target);
+    uniforms["focus"]!.value = this.camera.position.distanceTo(this.target);
     this.composer.render();
   }
 

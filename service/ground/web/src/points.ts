@@ -2,6 +2,7 @@
 
 import * as THREE from "three";
 import type { Chunk } from "./live";
+import type { Gradual } from "./painter";
 
 export const COLOURS = ["colour", "height", "sigma", "views", "age"] as const;
 export type Colour = (typeof COLOURS)[number];
@@ -55,11 +56,10 @@ interface Held {
   time: number;
 }
 
-export class Cloud {
+export class Cloud implements Gradual {
   readonly group = new THREE.Group();
   budget = 3_000_000;
   drawn = 0;
-  private detail = 1;
   private readonly chunks = new Map<number, Held>();
   private readonly shared = {
     size: { value: 300 },
@@ -96,7 +96,6 @@ export class Cloud {
     this.chunks.set(chunk.seq, held);
     this.place(held, chunk.T, 1);
     this.group.add(object);
-    this.thin();
   }
 
   /** Moves a chunk to its corrected pose; its points stay as they are. */
@@ -107,7 +106,7 @@ export class Cloud {
 
   colour(mode: Colour): void {
     this.shared.mode.value = COLOURS.indexOf(mode);
-    if (mode === "height") this.range();
+    if (mode === "height") this.heightScale();
     if (mode === "age") this.ages();
   }
 
@@ -128,26 +127,27 @@ export class Cloud {
     this.shared.size.value = pixelsAtOneMetre;
   }
 
-  /** Draws at most the budget: of each chunk, whose points are shuffled, the first part. */
-  thin(): void {
-    const share = Math.min(1, this.budget / Math.max(1, this.total)) * this.detail;
+  /** Points to draw: all, or the budget; none while they are hidden. */
+  get wanted(): number {
+    return this.group.visible ? Math.min(this.total, this.budget) : 0;
+  }
+
+  /**
+   * Draws the points between two shares of what is wanted. Each chunk's points are shuffled, so
+   * any part of them is an even sample.
+   */
+  range(from: number, to: number): void {
+    const share = Math.min(1, this.budget / Math.max(1, this.total));
     this.drawn = 0;
     for (const { object, points } of this.chunks.values()) {
-      const count = Math.ceil(points * share);
-      object.geometry.setDrawRange(0, count);
-      this.drawn += count;
+      const [start, end] = [Math.ceil(points * share * from), Math.ceil(points * share * to)];
+      object.geometry.setDrawRange(start, end - start);
+      this.drawn += end - start;
     }
   }
 
-  /** Draws this share of what the budget allows. */
-  setDetail(share: number): void {
-    if (share === this.detail) return;
-    this.detail = share;
-    this.thin();
-  }
-
   /** Heights of the middle 96 % of a sample of the points, for the colour scale. */
-  private range(): void {
+  private heightScale(): void {
     const heights: number[] = [];
     const p = new THREE.Vector3();
     for (const { object } of this.chunks.values()) {

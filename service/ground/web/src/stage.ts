@@ -4,14 +4,12 @@ import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 import { VRButton } from "three/addons/webxr/VRButton.js";
-import type { Look } from "./look";
+import { type Gradual, Painter } from "./painter";
 
 export const BACKGROUND = 0x171b20;
 const INPUTS = ["pointerdown", "click", "input", "change", "keydown", "wheel"];
 const MOVING_MS = 250;
 const LIVELY_MS = 500;
-const MOVING_FRAME_MS = 70;
-const LEAST_SHARE = 0.02;
 
 /** False when this browser cannot draw in 3D. */
 export function canDraw(): boolean {
@@ -23,18 +21,17 @@ export function canDraw(): boolean {
 }
 
 export class Stage {
-  readonly renderer = new THREE.WebGLRenderer({ antialias: true, powerPreference: "high-performance" });
+  readonly renderer = new THREE.WebGLRenderer({
+    antialias: true,
+    powerPreference: "high-performance",
+    preserveDrawingBuffer: true, // the painter adds to the last picture
+  });
   readonly scene = new THREE.Scene();
   readonly camera = new THREE.PerspectiveCamera(60, 1, 0.1, 20000);
   readonly controls: OrbitControls;
   readonly model = new THREE.Group();
   follow = true;
-  frames_per_s = 0;
-  look: Look | null = null;
-  /** Draw all points also while the view moves, however long it takes. */
-  fullDetail = false;
-  /** Told what share of the points to draw: less while the view moves, to keep up. */
-  onDetail: (share: number) => void = () => undefined;
+  readonly painter: Painter;
   /** Called before each picture. */
   readonly before: (() => void)[] = [];
   private readonly world = new THREE.Group(); // what VR shrinks and lays at one's feet
@@ -45,9 +42,6 @@ export class Stage {
   private readonly watcher: ResizeObserver;
   private touched = performance.now();
   private moved = -1e9;
-  private drawn = 0; // when the last picture was drawn; 0 when the one before was left out
-  private settled = false;
-  private share = 1; // of the points, while moving
   private readonly keys = new Set<string>();
   private last = performance.now();
 
@@ -60,6 +54,7 @@ export class Stage {
     this.track.frustumCulled = false;
     this.world.add(this.track, this.model);
     this.scene.add(this.world, new THREE.AmbientLight(0xffffff, 2));
+    this.painter = new Painter(this.renderer, this.scene, this.camera, this.world);
     host.append(this.renderer.domElement);
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.renderer.xr.enabled = true;
@@ -74,6 +69,17 @@ export class Stage {
 
   add(object: THREE.Object3D): void {
     this.world.add(object);
+  }
+
+  /** Adds an object that is drawn with every slice of the points. */
+  addAgain(object: THREE.Object3D): void {
+    this.world.add(object);
+    this.painter.again.add(object);
+  }
+
+  /** The points that are drawn bit by bit; their object is added by `addAgain`. */
+  drawGradually(points: Gradual): void {
+    this.painter.gradual = points;
   }
 
   close(): void {
@@ -160,7 +166,7 @@ export class Stage {
     this.touched = performance.now();
   };
 
-  /** One tick. Nothing is drawn while nothing changes; the last picture has full detail. */
+  /** One tick. Nothing is drawn once all is drawn and nothing changes. */
   private draw(): void {
     const now = performance.now();
     const presenting = this.renderer.xr.isPresenting;
@@ -170,26 +176,9 @@ export class Stage {
     }
     this.last = now;
     const moving = presenting || now - this.moved < MOVING_MS;
-    const lively = moving || now - this.touched < LIVELY_MS;
-    if (!lively && this.settled) {
-      this.drawn = 0;
-      return;
-    }
-    this.settled = !lively;
-    if (this.drawn) this.pace(now - this.drawn, moving);
-    this.drawn = now;
-    this.onDetail(moving && !this.fullDetail ? this.share : 1);
-    for (const call of this.before) call();
-    if (this.look && !presenting) this.look.render();
-    else this.renderer.render(this.scene, this.camera);
-  }
-
-  /** Keeps the frame rate's figure, and the share of points that holds MOVING_FRAME_MS. */
-  private pace(ms: number, moving: boolean): void {
-    this.frames_per_s = 1000 / Math.max(ms, 1);
-    if (!moving) return;
-    const change = Math.min(Math.max(MOVING_FRAME_MS / Math.max(ms, 1), 0.5), 1.2);
-    this.share = Math.min(Math.max(this.share * change, LEAST_SHARE), 1);
+    this.painter.tick(now, moving || now - this.touched < LIVELY_MS, this.before);
+    const still = this.painter.still ? "yes" : "no";
+    if (document.body.dataset["still"] !== still) document.body.dataset["still"] = still;
   }
 
   /** W A S D fly over the ground, R and F up and down; faster the farther one looks. */
@@ -225,7 +214,7 @@ export class Stage {
     this.camera.aspect = w / h;
     this.camera.updateProjectionMatrix();
     this.renderer.setSize(w, h);
-    this.look?.resize(w, h);
+    this.painter.effects?.resize(w, h);
     this.touch();
   }
 }

@@ -178,7 +178,7 @@ function settings({ stage, cloud }: Parts): HTMLElement {
     panel.append(el("label", {}, el("span", { textContent: text }), input, shown));
   };
   slide("Point size", 50, 1500, 10, 300, (v) => cloud.pointSize(v), (v) => `${(v / 300).toFixed(1)} x`);
-  slide("Points drawn", 5, 8, 0.1, 6.5, (v) => ((cloud.budget = 10 ** v), cloud.thin()), (v) => `${(10 ** (v - 6)).toFixed(1)} M`);
+  slide("Points drawn", 5, 8, 0.1, 6.5, (v) => (cloud.budget = 10 ** v), (v) => `${(10 ** (v - 6)).toFixed(1)} M`);
   slide("Field of view", 20, 100, 1, 60, (v) => stage.fieldOfView(v), (v) => `${v}°`);
   slide("Exposure", -2, 2, 0.1, 0, (v) => (stage.renderer.toneMappingExposure = 2 ** v), (v) => `${v > 0 ? "+" : ""}${v.toFixed(1)} EV`);
   const tone = el("select", {});
@@ -195,7 +195,7 @@ function settings({ stage, cloud }: Parts): HTMLElement {
   const blur = el("input", { type: "checkbox" });
   bloom.onchange = blur.onchange = () => void looks(stage, bloom.checked, blur.checked).catch(tell);
   const full = el("input", { type: "checkbox" });
-  full.onchange = () => (stage.fullDetail = full.checked);
+  full.onchange = () => (stage.painter.fullDetail = full.checked);
   panel.append(
     el("label", { title: "draw all points also while the view moves" }, el("span", { textContent: "Full detail" }), full),
     el("label", {}, el("span", { textContent: "Bloom" }), bloom),
@@ -206,9 +206,12 @@ function settings({ stage, cloud }: Parts): HTMLElement {
 }
 
 async function looks(stage: Stage, bloom: boolean, depthOfField: boolean): Promise<void> {
-  stage.look?.close();
-  stage.look = null;
-  if (!bloom && !depthOfField) return;
-  const { Look } = await import("./look");
-  stage.look = new Look(stage, bloom, depthOfField);
+  const { painter, renderer, scene, camera, controls } = stage;
+  painter.effects?.close();
+  painter.effects = null;
+  if (bloom || depthOfField) {
+    const { Look } = await import("./look");
+    painter.effects = new Look(renderer, scene, camera, controls.target, bloom, depthOfField);
+  }
+  stage.touch();
 }

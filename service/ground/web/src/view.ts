@@ -40,8 +40,9 @@ export function showView(root: HTMLElement, drone: string, name: string): () => 
   const cloud = new Cloud();
   const cameras = new Cameras();
   const ruler = new Ruler();
-  stage.onDetail = (share) => cloud.setDetail(share);
-  for (const part of [cloud.group, cameras.group, ruler.group]) stage.add(part);
+  stage.drawGradually(cloud);
+  stage.add(cameras.group);
+  for (const part of [cloud.group, ruler.group]) stage.addAgain(part);
   bar.append(toolbar({ stage, cloud, cameras, ruler, legend, coverage, id }));
 
   let last: LastPose | undefined;
@@ -90,7 +91,8 @@ export function showView(root: HTMLElement, drone: string, name: string): () => 
     if (cameras.refresh()) stage.touch();
     figures.replaceChildren(...rows(cloud, stage, last, ruler));
     document.body.dataset["points"] = String(cloud.total);
-    document.body.dataset["fps"] = stage.frames_per_s.toFixed(1);
+    document.body.dataset["drawn"] = String(cloud.drawn);
+    document.body.dataset["fps"] = stage.painter.frames_per_s.toFixed(1);
   }, 300);
   return () => {
     clearInterval(clock);
@@ -144,7 +146,7 @@ function rows(cloud: Cloud, stage: Stage, last: LastPose | undefined, ruler: Rul
     if (last.lat_deg !== null && last.lon_deg !== null)
       facts.push(["At", `${last.lat_deg.toFixed(6)}, ${last.lon_deg.toFixed(6)}`]);
   }
-  facts.push(["Pictures", `${stage.frames_per_s.toFixed(stage.frames_per_s < 3 ? 1 : 0)} /s`]);
+  facts.push(["Pictures", `${stage.painter.frames_per_s.toFixed(stage.painter.frames_per_s < 3 ? 1 : 0)} /s`]);
   if (ruler.active) facts.push(["Ruler", ruler.text()]);
   return facts.map(([k, v]) => el("div", {}, el("dt", { textContent: k }), el("dd", { textContent: v })));
 }

@@ -1,0 +1,141 @@
+// When and how much is drawn: little while the view moves, then the rest slice by slice, so that
+// no picture takes long and the page stays usable however many points there are.
+
+import * as THREE from "three";
+
+/** A part of the scene of which any share can be drawn. */
+export interface Gradual {
+  /** How many points there are to draw. */
+  readonly wanted: number;
+  /** Draws the points between two shares, 0 to 1. */
+  range(from: number, to: number): void;
+}
+
+/** What lays effects over the plain picture; it draws the whole picture at once. */
+export interface Effects {
+  render(): void;
+  resize(w: number, h: number): void;
+  close(): void;
+}
+
+const MOVING_MS = 70;
+const SLICE_MS = 120;
+const FIRST_POINTS = 100_000;
+const LEAST_POINTS = 20_000;
+const EFFECTS_TIMES = 3; // of the points drawn while moving, once the view stands still
+
+/** Work given to the graphics card, until it has done it. */
+interface Work {
+  sync: WebGLSync | null;
+  since: number;
+  kind: "whole" | "slice";
+}
+
+export class Painter {
+  /** Draw all points in every picture, however long it takes. */
+  fullDetail = false;
+  effects: Effects | null = null;
+  frames_per_s = 0;
+  /** Share of the points that the picture shows so far. */
+  shown = 0;
+  gradual: Gradual | null = null;
+  /** Objects drawn with every slice; all others are in the first picture only. */
+  readonly again = new Set<THREE.Object3D>();
+  private moving = FIRST_POINTS;
+  private slice = FIRST_POINTS;
+  private work: Work | null = null;
+  private settled = false;
+
+  constructor(
+    private readonly renderer: THREE.WebGLRenderer,
+    private readonly scene: THREE.Scene,
+    private readonly camera: THREE.Camera,
+    private readonly world: THREE.Group,
+  ) {}
+
+  /** True when the picture is whole and nothing is being drawn. */
+  get still(): boolean {
+    return this.settled && this.shown >= 1 && !this.work;
+  }
+
+  /**
+   * One tick: a new picture while something changes, then slices over it until all is drawn.
+   * Nothing is given to the graphics card before it has done what it was given.
+   */
+  tick(now: number, lively: boolean, before: readonly (() => void)[]): void {
+    const presenting = this.renderer.xr.isPresenting;
+    if (!presenting && this.work && !this.done(this.work, now)) return;
+    if (presenting && this.work) this.paced(this.work, now);
+    this.work = null;
+    if (!lively && this.settled) {
+      if (this.shown < 1) this.addSlice(now);
+      return;
+    }
+    this.settled = !lively;
+    for (const call of before) call();
+    this.whole(!lively && this.effects !== null);
+    this.give("whole", now);
+  }
+
+  /** Draws the picture anew; with effects, the last one has no slices to follow. */
+  private whole(last: boolean): void {
+    const wanted = Math.max(1, this.gradual?.wanted ?? 0);
+    const points = last ? EFFECTS_TIMES * this.moving : this.moving;
+    const share = this.fullDetail ? 1 : Math.min(1, points / wanted);
+    this.gradual?.range(0, share);
+    if (this.effects && !this.renderer.xr.isPresenting) this.effects.render();
+    else this.renderer.render(this.scene, this.camera);
+    this.shown = last || !this.gradual?.wanted ? 1 : share;
+  }
+
+  /** Draws the next slice of the points over the picture there is. */
+  private addSlice(now: number): void {
+    const gradual = this.gradual;
+    if (!gradual) return;
+    const next = Math.min(1, this.shown + this.slice / Math.max(1, gradual.wanted));
+    gradual.range(this.shown, next);
+    const hidden = this.world.children.filter((c) => c.visible && !this.again.has(c));
+    const background = this.scene.background;
+    for (const object of hidden) object.visible = false;
+    this.scene.background = null;
+    this.renderer.autoClear = false;
+    this.renderer.render(this.scene, this.camera);
+    this.renderer.autoClear = true;
+    this.scene.background = background;
+    for (const object of hidden) object.visible = true;
+    gradual.range(0, next); // what the picture shows, for those who measure in it
+    this.shown = next;
+    this.give("slice", now);
+  }
+
+  private give(kind: Work["kind"], now: number): void {
+    const gl = this.renderer.getContext() as WebGL2RenderingContext;
+    const sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    this.work = { sync, since: now, kind };
+  }
+
+  /** True when the graphics card has done the work; takes its time into account. */
+  private done(work: Work, now: number): boolean {
+    const gl = this.renderer.getContext() as WebGL2RenderingContext;
+    if (work.sync) {
+      if (gl.clientWaitSync(work.sync, 0, 0) === gl.TIMEOUT_EXPIRED) return false;
+      gl.deleteSync(work.sync);
+    }
+    this.paced(work, now);
+    return true;
+  }
+
+  /** Fits the number of points to the time that the last ones took. */
+  private paced(work: Work, now: number): void {
+    const ms = Math.max(now - work.since, 1);
+    if (work.kind === "slice") {
+      this.slice = Math.max(LEAST_POINTS, this.slice * Math.min(Math.max(SLICE_MS / ms, 0.5), 1.5));
+      return;
+    }
+    this.frames_per_s = 1000 / ms;
+    const most = Math.max(this.gradual?.wanted ?? 0, FIRST_POINTS);
+    const change = Math.min(Math.max(MOVING_MS / ms, 0.5), 1.2);
+    this.moving = Math.min(Math.max(this.moving * change, LEAST_POINTS), most);
+  }
+}

@@ -1,0 +1,248 @@
+"""What the portal's buttons and settings do in a real browser; skipped without one.
+
+One browser and one portal serve all tests of this file.
+"""
+
+from __future__ import annotations
+
+import base64
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("starlette")
+pytest.importorskip("uvicorn")
+pytest.importorskip("websockets")
+
+from mavlink.control import Answer, Result
+from mavlink.rehearsal import RehearsalVehicle
+from recon.types import U8
+from service.bench.browser import Browser, Page, chromium
+from service.ground.http import PAGE
+from service.ground.portal import Portal, PortalConfig
+from service.ground.vehicle import Vehicle
+from service.scans.folder import write_deliverables
+
+if TYPE_CHECKING:
+    from conftest import HouseFlight
+
+pytestmark = [
+    pytest.mark.skipif(not chromium(), reason="needs Chromium"),
+    pytest.mark.skipif(not (PAGE / "index.html").is_file(), reason="needs the built page"),
+]
+TOKEN = "a-token-of-enough-letters"
+
+FAKE_HEADSET = """
+window.headset = { asked: [], frames: 0, ended: null };
+delete window.XRWebGLBinding;
+window.XRWebGLLayer = class {
+  framebuffer = null; framebufferWidth = 640; framebufferHeight = 480; fixedFoveation = 0;
+  getViewport() { return { x: 0, y: 0, width: 640, height: 480 }; }
+};
+WebGL2RenderingContext.prototype.makeXRCompatible = async () => undefined;
+const view = {
+  eye: 'left',
+  transform: { matrix: [1,0,0,0, 0,1,0,0, 0,0,1,0, 0,1.6,0,1] },
+  projectionMatrix: [1,0,0,0, 0,1.33,0,0, 0,0,-1,-1, 0,0,-0.2,0],
+};
+class Session extends EventTarget {
+  renderState = {}; inputSources = []; enabledFeatures = []; environmentBlendMode = 'opaque';
+  updateRenderState(state) { Object.assign(this.renderState, state); }
+  async requestReferenceSpace() { return {}; }
+  requestAnimationFrame(call) {
+    return setTimeout(() => {
+      headset.frames++;
+      call(performance.now(), { session: this, getViewerPose: () => ({ views: [view] }) });
+    }, 16);
+  }
+  cancelAnimationFrame(id) { clearTimeout(id); }
+  async end() { this.dispatchEvent(Object.assign(new Event('end'), { session: this })); }
+}
+Object.defineProperty(navigator, 'xr', { configurable: true, value: {
+  addEventListener() {},
+  isSessionSupported: async (mode) => mode === 'immersive-vr',
+  requestSession: async (mode) => {
+    headset.asked.push(mode);
+    return headset.session = new Session();
+  },
+} });
+"""
+TOLD = " field.dispatchEvent(new Event('input', { bubbles: true }))"
+PICTURE = "document.querySelector('.stage canvas').toDataURL('image/png').split(',')[1]"
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    one = Browser(tmp_path_factory.mktemp("chromium"))
+    yield one
+    one.close()
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory, house: HouseFlight) -> Path:
+    root = tmp_path_factory.mktemp("scans")
+    folder = root / "drone-1" / "test-1"
+    with house.flown(folder) as scan:
+        scan.finish({})
+        write_deliverables(folder, scan, {})
+    return root
+
+
+@pytest.fixture(scope="module")
+def portal(store: Path) -> Iterator[Portal]:
+    one = Portal(PortalConfig(store, port=0, token=TOKEN))
+    one.start()
+    yield one
+    one.close()
+
+
+def open_scan(page: Page, portal: Portal) -> None:
+    """Show the scan, all its points drawn."""
+    page.open(portal.url)
+    page.wait("document.querySelectorAll('article').length === 1")
+    page.open(f"{portal.url.split('/?')[0]}/#/view/drone-1/test-1")
+    page.wait("Number(document.body.dataset.points) > 1000")
+    page.wait("document.body.dataset.picture === '4'")
+    page.wait("document.body.dataset.drawn === document.body.dataset.points")
+    page.wait("document.body.dataset.still === 'yes'")
+
+
+def drawn(page: Page) -> U8:
+    """What the stage shows, once it stands still."""
+    page.run("new Promise(r => setTimeout(r, 100))")
+    page.wait("document.body.dataset.still === 'yes'")
+    data = np.frombuffer(base64.b64decode(page.run(PICTURE)), np.uint8)
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+
+
+def setting(page: Page, name: str, act: str) -> None:
+    """Do ``act`` with the input or list of a setting, as an operator would."""
+    page.run(
+        "(() => { const label = [...document.querySelectorAll('.settings label')]"
+        f".find(l => l.textContent.startsWith('{name}'));"
+        f" const field = label.querySelector('input, select'); {act} }})()"
+    )
+
+
+def difference(a: U8, b: U8) -> float:
+    """Share of the pixels that are not the same."""
+    return float((cv2.absdiff(a, b).max(axis=2) > 4).mean())
+
+
+def test_settings_change_the_picture_and_go_back(browser: Browser, portal: Portal) -> None:
+    open_scan(browser, portal)
+    plain = drawn(browser)
+    sky = np.full_like(plain, plain[0, 0])
+    assert difference(plain, sky) > 0.05  # the site is there
+    assert difference(plain, drawn(browser)) == 0.0
+    for name in ("Bloom", "Depth of field"):
+        setting(browser, name, "field.click()")
+        browser.run("new Promise(r => setTimeout(r, 700))")  # the effects are loaded when asked
+        assert difference(plain, drawn(browser)) > 0.01, name
+        setting(browser, name, "field.click()")
+    setting(browser, "Field of view", "field.value = 25;" + TOLD)
+    narrow = drawn(browser)
+    assert difference(plain, narrow) > 0.1
+    ground = narrow.max(axis=2) > 60
+    assert ground.mean() > 1.5 * (plain.max(axis=2) > 60).mean()  # nearer, so larger
+    setting(browser, "Field of view", "field.value = 60;" + TOLD)
+    assert difference(plain, drawn(browser)) < 0.03  # points in one place hide each other by turns
+
+
+def test_tone_mapping_and_exposure_change_the_mesh(
+    browser: Browser, portal: Portal, store: Path
+) -> None:
+    pytest.importorskip("open3d")
+    open_scan(browser, portal)
+    browser.click("Mesh")
+    browser.wait("document.body.dataset.mesh === 'shown'", 60)
+    plain = drawn(browser)
+    choose = "field.value = [...field.options].find(o => o.text === 'Reinhard').value;"
+    setting(browser, "Tone", choose + TOLD.replace("input", "change"))
+    reinhard = drawn(browser)
+    assert difference(plain, reinhard) > 0.05
+    setting(browser, "Exposure", "field.value = 1.5;" + TOLD)
+    brighter = drawn(browser)
+    assert brighter.mean() > reinhard.mean() + 3.0
+    browser.click("Points")
+
+
+def test_vr_is_offered_entered_and_left(browser: Browser, portal: Portal) -> None:
+    """Through a headset that is only pretended: what the page asks of WebXR, and draws for it."""
+    script = browser.call("Page.addScriptToEvaluateOnNewDocument", source=FAKE_HEADSET)
+    try:
+        browser.open("about:blank")
+        open_scan(browser, portal)
+        browser.wait("document.querySelector('#VRButton').textContent === 'ENTER VR'")
+        browser.click("ENTER VR")
+        browser.wait("document.querySelector('#VRButton').textContent === 'EXIT VR'")
+        assert browser.run("headset.asked") == ["immersive-vr"]
+        browser.wait("headset.frames > 5")
+        assert browser.run("!!headset.session.renderState.baseLayer")
+        browser.click("EXIT VR")
+        browser.wait("document.querySelector('#VRButton').textContent === 'ENTER VR'")
+        after = browser.run("headset.frames")
+        browser.run("new Promise(r => setTimeout(r, 200))")
+        assert browser.run("headset.frames") <= after + 1
+        drawn(browser)
+    finally:
+        browser.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script["identifier"])
+        browser.open("about:blank")
+
+
+def test_without_a_headset_there_is_no_vr_button(browser: Browser, portal: Portal) -> None:
+    open_scan(browser, portal)
+    assert browser.run("document.querySelector('#VRButton')") is None
+
+
+def test_of_two_people_renaming_at_once_the_second_is_told(
+    browser: Browser, portal: Portal
+) -> None:
+    other = browser.other()
+    for page in (browser, other):
+        page.open(portal.url)
+        page.wait("document.querySelectorAll('article').length === 1")
+    other.dialog = "south roof"
+    other.click("Rename")
+    other.wait("document.querySelector('article h2').textContent === 'south roof'")
+    browser.dialog = "garden"
+    browser.click("Tags")  # on a list that is no longer so
+    browser.wait("document.querySelector('.note').textContent.includes('someone else')")
+    browser.wait("document.querySelector('article h2').textContent === 'south roof'")
+    assert browser.run("document.querySelectorAll('.tags span').length") == 0
+    browser.click("Tags")  # having looked again
+    browser.wait("document.querySelector('.tags span').textContent === 'garden'")
+    assert browser.run("document.querySelector('article h2').textContent") == "south roof"
+
+
+def test_a_refused_stop_shows_the_companions_own_words(browser: Browser, store: Path) -> None:
+    """Over MAVLink between the portal's client and the companion's link, both ours and real."""
+    pytest.importorskip("mavsdk")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    vehicle = Vehicle(f"udpin://127.0.0.1:{port}")
+    one = Portal(PortalConfig(store, port=0, token=TOKEN), vehicle=vehicle)
+    one.start()
+    try:
+        with RehearsalVehicle(f"udpout:127.0.0.1:{port}") as companion:
+            companion.control.answers["stop_scan"] = Answer(Result.DENIED, "the disk is in use")
+            vehicle.start()
+            browser.open(one.url)
+            browser.wait("document.querySelector('.vehicle').textContent.includes('connected')", 30)
+            browser.click("Start scan")
+            browser.wait("document.querySelector('.note').textContent === 'start: accepted'", 30)
+            browser.click("Stop scan")
+            browser.wait(
+                "[...document.querySelectorAll('.note')].some(n =>"
+                " n.textContent.startsWith('stop denied'))",
+                30,
+            )
+            assert companion.control.asked == ["start_scan", "stop_scan"]
+    finally:
+        one.close()
