@@ -110,7 +110,8 @@ def row(flight: Path, out: Path, key: str, truth: Truth) -> str:
 
 def told(scan: Path) -> str:
     """The boresight that the scan reports, when it is sure of one."""
-    found: dict[str, Any] = json.loads((scan / "scan.json").read_text()).get("graph") or {}
+    summary: dict[str, Any] = json.loads((scan / "scan.json").read_text())
+    found = (summary.get("run") or {}).get("graph") or {}
     bore = found.get("boresight") or {}
     return f" boresight {bore['deg']}" if bore.get("sure") else ""
 
