@@ -4,7 +4,7 @@
 
 ``FLIGHT`` is made by ``skyrelief simulate``. The flight's other logs are made as it was, with
 the sensors' noise of their row and without pictures. Prints a row of the table for each, or
-only for the rows named.
+only for the rows named; scans that lie in ``OUT`` already are not made again.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
 from mavlink.logs import load_telemetry
@@ -40,7 +41,12 @@ ROWS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
 }
 """Row to its name, the simulator's options and the settings of the replay."""
 
-HEAD = "| sensors | rms | less mean | mean | mean of fixes | rigid | scaled | drift | surface |"
+HEAD = (
+    "| sensors | rms | less mean | mean | mean of fixes | rigid | scaled | drift | step | surface |"
+)
+NEAR_M, APART_S = 35.0, 10.0
+"""Poses so near in place and so far apart in time lie on two legs."""
+
 FLOWN = {
     "pattern": "--pattern", "duration_s": "--duration-s", "height_m": "--height-m",
     "speed_m_s": "--speed-m-s", "heading_deg": "--heading-deg", "legs": "--legs",
@@ -86,26 +92,44 @@ def row(flight: Path, out: Path, key: str, truth: Truth) -> str:
     """One row of the table, from a fresh log, replay and score."""
     name, noise, settings = ROWS[key]
     log, scan = log_of(flight, out, noise), out / key
-    shutil.rmtree(scan, ignore_errors=True)
+    if not (scan / "scan.json").exists():
+        shutil.rmtree(scan, ignore_errors=True)
+        replay(flight, log, scan, settings)
+    report = json.loads(skyrelief("score", str(scan), str(flight / "truth"), "--json"))
+    found = read_scan(scan, truth.frame)
+    at, known = metrics.poses_at(truth.times_s, truth.poses, found.times_s)
+    poses, at = found.poses[known], at[known]
+    placed = ["local", "", "", ""]
+    if report["georeferenced"]:
+        off = poses[:, :3, 3] - at[:, :3, 3]
+        means = off.mean(axis=0), bias(log, truth)
+        placed = [f"{v:.2f}" for v in (rms(off), rms(off - means[0]))]
+        placed += [vector(v) for v in means]
+    track = report["trajectory"]
+    fits = [f"{track[fit]['rms_m']:.2f}" for fit in ("rigid", "similarity")]
+    drift = f"{track['rigid']['drift_percent']:.2f}"
+    fitted = metrics.fit_trajectory(poses, at, False).poses(poses)
+    apart = step(fitted[:, :3, 3] - at[:, :3, 3], at[:, :3, 3], found.times_s[known])
+    surface = f"{report['surface'][report['judged_after']]['median_m']:.3f}"
+    return " | ".join(["| " + name, *placed, *fits, drift, apart, surface]) + " |" + told(scan)
+
+
+def replay(flight: Path, log: Path, scan: Path, settings: tuple[str, ...]) -> None:
+    """The flight through the whole onboard path."""
     skyrelief(
         "replay", str(flight / "flight.mp4"), "--telemetry", str(log),
         "--camera-model", str(flight / "camera.yaml"), "--out", str(scan), "--backend", "cpu",
         *(word for setting in settings for word in ("--set", setting)), "--json",
     )  # fmt: skip
-    report = json.loads(skyrelief("score", str(scan), str(flight / "truth"), "--json"))
-    track = report["trajectory"]
-    placed = ["local", "", "", ""]
-    if report["georeferenced"]:
-        found = read_scan(scan, truth.frame)
-        at, known = metrics.poses_at(truth.times_s, truth.poses, found.times_s)
-        off = found.poses[known, :3, 3] - at[known, :3, 3]
-        numbers = track["raw"]["rms_m"], rms(off - off.mean(axis=0))
-        means = off.mean(axis=0), bias(log, truth)
-        placed = [f"{v:.2f}" for v in numbers] + [vector(v) for v in means]
-    fits = [f"{track[fit]['rms_m']:.2f}" for fit in ("rigid", "similarity")]
-    drift = f"{track['rigid']['drift_percent']:.2f}"
-    surface = f"{report['surface'][report['judged_after']]['median_m']:.3f}"
-    return " | ".join(["| " + name, *placed, *fits, drift, surface]) + " |" + told(scan)
+
+
+def step(off: F64, places: F64, times_s: F64) -> str:
+    """Median metres by which two legs are off against each other; "" of a single leg."""
+    pairs = cKDTree(places[:, :2]).query_pairs(NEAR_M, output_type="ndarray")
+    pairs = pairs[np.abs(times_s[pairs[:, 0]] - times_s[pairs[:, 1]]) > APART_S]
+    if not len(pairs):
+        return ""
+    return f"{np.median(np.linalg.norm(off[pairs[:, 0]] - off[pairs[:, 1]], axis=1)):.2f}"
 
 
 def told(scan: Path) -> str:
@@ -129,6 +153,6 @@ def vector(v: F64) -> str:
 if __name__ == "__main__":
     at, into = Path(sys.argv[1]), Path(sys.argv[2])
     exact = read_truth(at / "truth")
-    print(HEAD, "|---|" + "---|" * 8, sep="\n")
+    print(HEAD, "|---|" + "---|" * 9, sep="\n")
     for which in sys.argv[3:] or ROWS:
         print(row(at, into, which, exact), flush=True)
