@@ -21,7 +21,14 @@ from service.cameras import CameraFrame
 from service.cli import app
 from service.errors import InputError, OutsideError
 from service.exports import mesh_tiles, pictures
-from service.exports.mesh_tiles import Footprint, TileJob, TilePart, run_tiles, tile_boxes
+from service.exports.mesh_tiles import (
+    Footprint,
+    TileJob,
+    TilePart,
+    mesh_tile,
+    run_tiles,
+    tile_boxes,
+)
 from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
@@ -204,3 +211,43 @@ def test_an_empty_scan_is_refused(tmp_path: Path) -> None:
     ScanStore.create(tmp_path / "scan.db", ScanHeader("x", "d", 0)).close()
     failed = CliRunner().invoke(app, ["mesh", str(tmp_path)])
     assert isinstance(failed.exception, InputError)
+
+
+def test_the_recording_that_a_scan_names_is_found(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "scan"
+    with house.flown(folder) as store:
+        camera = {"K": [1.0] * 9, "distortion": [0.0] * 5, "width": 320, "height": 180}
+        header = replace(store.header, camera=camera)
+    monkeypatch.setattr(pictures, "open_camera", lambda _: FakeVideo(house))
+    assert pictures.recording_of(folder, header).path is None  # no scan.json yet
+
+    def name(source: object) -> pictures.Recording:
+        (folder / "scan.json").write_text(json.dumps({"run": {"source": source}}))
+        return pictures.recording_of(folder, header)
+
+    assert name("flight.mp4").path is None and "is not there" in name("flight.mp4").words
+    video = tmp_path / "flight.mp4"
+    video.touch()
+    assert name("flight.mp4").path == video  # beside the scan folder
+    assert name(str(video)).path == video
+    for unfit in (None, 7, ["x"]):
+        assert "does not name" in name(unfit).words
+    monkeypatch.setattr(pictures, "open_camera", lambda _: FakeVideo(house, (640, 360)))
+    assert name("flight.mp4").path is None and "another recording" in name("flight.mp4").words
+    bare = replace(header, camera={})
+    assert pictures.recording_of(folder, bare).path is None
+
+
+def test_a_recording_found_by_itself_that_does_not_fit_is_left(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    """The scan names a file that is no video: the mesh is made from the store, and says so."""
+    house.flown(tmp_path).close()
+    job = replace(jobs(tmp_path)[0], video=str(tmp_path / "none.mp4"))
+    told: list[str] = []
+    assert mesh_tile(replace(job, video_named=False), told.append) is not None
+    assert any("after all" in text for text in told)
+    with pytest.raises(InputError, match=r"none\.mp4"):
+        mesh_tile(job, told.append)

@@ -20,8 +20,11 @@ def mesh(
     ] = None,
     video: Annotated[
         Path | None,
-        typer.Option(help="texture from the flight's video or folder of pictures, sharper"),
+        typer.Option(help="the flight's video or folder of pictures; default: as scan.json names"),
     ] = None,
+    stored: Annotated[
+        bool, typer.Option("--stored", help="texture from the scan's own small pictures")
+    ] = False,
     video_epoch: Annotated[
         float | None, typer.Option(help="unix seconds of its start; default: the scan's start")
     ] = None,
@@ -48,7 +51,9 @@ def mesh(
     except ValueError as error:
         raise InputError(f"mesh: {error}") from error
     epoch_ns = None if video_epoch is None else round(video_epoch * 1e9)
-    how = MeshOptions(method, faces, tile_points, scheduler, video, epoch_ns)
+    if stored and video is not None:
+        raise InputError("mesh: give either --video or --stored")
+    how = MeshOptions(method, faces, tile_points, scheduler, video, not stored, epoch_ns)
     path = out or scan_dir / "mesh.glb"
     started = time.monotonic()
     with ScanView(scan_dir, voxel_m) as scan:

@@ -22,12 +22,14 @@ from recon.cloud_fusion import cloud_of, fuse, without
 from recon.free_space import seen_through
 from recon.meshing import Mesh, cut, height_mesh, poisson_mesh
 from recon.raster import Raster, fill_holes, grid_over, rasterise, smoothed
+from recon.texture_views import TextureView
 from recon.texturing import texture
 from recon.types import F64, U8, Keyframe, PointCloud
 from recon.voxel_map import ground_sample_m
 from service.errors import OutsideError, SkyreliefError
 from service.exports.pictures import stored_pictures, video_pictures
 from service.scans.fused_cloud import fused_cloud
+from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
@@ -52,6 +54,7 @@ class TileJob:
     largest_texture_px: int
     video: str | None = None
     video_epoch_ns: int | None = None
+    video_named: bool = True  # False: found by itself; without it the stored pictures do
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,11 +153,7 @@ def mesh_tile(job: TileJob, progress: Callable[[str], None] = lambda _: None) ->
         if not len(mesh.faces):
             return None
         progress(f"{len(mesh.faces)} triangles; reading pictures")
-        views = (
-            stored_pictures(keyframes)
-            if job.video is None
-            else video_pictures(keyframes, store.header, Path(job.video), job.video_epoch_ns)
-        )
+        views = _pictures(job, keyframes, store.header, progress)
     finally:
         store.close()
     done = texture(mesh, views, job.largest_texture_px, progress)
@@ -167,6 +166,24 @@ def mesh_tile(job: TileJob, progress: Callable[[str], None] = lambda _: None) ->
         "texture_px": [done.picture.shape[1], done.picture.shape[0]],
     }
     return TilePart(done.mesh, done.picture, figures)
+
+
+def _pictures(
+    job: TileJob,
+    keyframes: Sequence[Keyframe],
+    header: ScanHeader,
+    progress: Callable[[str], None],
+) -> list[TextureView]:
+    """The views of the job's video, else of the store."""
+    if job.video is None:
+        return stored_pictures(keyframes)
+    try:
+        return video_pictures(keyframes, header, Path(job.video), job.video_epoch_ns)
+    except SkyreliefError as error:
+        if job.video_named:
+            raise
+        progress(f"textures from the scan's own pictures after all: {error}")
+        return stored_pictures(keyframes)
 
 
 def _overlap(a: Iterable[float], b: Iterable[float]) -> bool:

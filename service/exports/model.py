@@ -11,6 +11,7 @@ import numpy as np
 from service.errors import InputError
 from service.exports.glb import glb
 from service.exports.mesh_tiles import TileJob, footprints, run_tiles, tile_boxes
+from service.exports.pictures import recording_of
 from service.exports.view import ExportOptions, ScanView
 from service.scans.writing import writing
 
@@ -28,7 +29,8 @@ class MeshOptions:
     largest_faces: int = 400_000
     tile_points: int = TILE_POINTS
     scheduler: str | None = None
-    video: Path | None = None
+    video: Path | None = None  # None: the scan's recording, when it is still there
+    recording: bool = True  # False: never look for the recording
     video_epoch_ns: int | None = None
 
 
@@ -55,6 +57,11 @@ def write_mesh(
     if not prints:
         raise InputError(f"{scan.folder} holds no points yet; nothing to mesh")
     voxel_m = options.voxel_m or float(np.median([p.sample_m for p in prints]))
+    video = how.video
+    if video is None and how.recording:
+        recording = recording_of(scan.folder, scan.store.header)
+        options.progress(recording.words)
+        video = recording.path
     boxes = tile_boxes(prints, how.tile_points)
     jobs = [
         TileJob(
@@ -64,8 +71,9 @@ def write_mesh(
             method,
             max(1000, how.largest_faces // len(boxes)),
             LARGEST_ATLAS_PX if len(boxes) == 1 else TILED_ATLAS_PX,
-            None if how.video is None else str(how.video.resolve()),
+            None if video is None else str(video.resolve()),
             how.video_epoch_ns,
+            how.video is not None,
         )
         for box in boxes
     ]
@@ -82,6 +90,7 @@ def write_mesh(
                 [p.figures["seen"] for p in parts], weights=[p.figures["faces"] for p in parts]
             )
         ),
+        "pictures": "store" if video is None else str(video),
         "texture_px": [p.figures["texture_px"] for p in parts],
     }
     options.progress(f"writing {figures['faces']} triangles")

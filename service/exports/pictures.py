@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -12,7 +14,8 @@ from recon.camera_model import Undistorter, scaled_K
 from recon.texture_views import TextureView
 from recon.types import U8, Camera, Keyframe
 from service.cameras import open_camera
-from service.errors import InputError
+from service.errors import InputError, SkyreliefError
+from service.scans.folder import SUMMARY
 from service.stream.records import ScanHeader
 
 MOST_BYTES = 1_500_000_000
@@ -31,6 +34,41 @@ def stored_pictures(keyframes: Sequence[Keyframe]) -> list[TextureView]:
         )
         for k in keyframes
     ]
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """Where the pictures of a mesh come from; without a path from the scan's own store."""
+
+    path: Path | None
+    words: str  # for the operator
+
+
+def recording_of(folder: Path, header: ScanHeader) -> Recording:
+    """The video or folder of stills that a scan was made from, when it still is where it was.
+
+    ``scan.json`` names it (``run.source``). A relative path is looked for from here, from the
+    scan folder and from the folder that holds it. Never raises.
+    """
+    stored = "textures from the scan's own pictures, at the depth's resolution"
+    try:
+        named = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["run"]["source"]
+        path = Path(named)
+    except (OSError, ValueError, KeyError, TypeError):
+        return Recording(None, f"{stored}: the scan does not name a recording; give --video")
+    places = [path, folder / path, folder.parent / path]
+    found = next((p for p in places if p.is_file() or p.is_dir()), None)
+    if found is None:
+        return Recording(None, f"{stored}: {named} is not there; give the flight's --video")
+    try:
+        camera, source = _camera(header), open_camera(str(found))
+        size_px = source.size_px
+        source.close()
+    except SkyreliefError as error:
+        return Recording(None, f"{stored}: {error}")
+    if size_px != camera.size_px:
+        return Recording(None, f"{stored}: {found} is another recording; give the flight's --video")
+    return Recording(found, f"textures from {found}, which the scan was made from")
 
 
 def video_pictures(
