@@ -22,7 +22,16 @@ LEAST_RAD, LEAST_SHARE = 2e-4, 0.1
 """A loop's sigmas are no less than this, and than this share of its depths' sigma: what the
 points of one depth map have in common does not average out."""
 
-__all__ = ["LoopClosure", "LoopConfig", "LoopView", "candidates", "verify"]
+__all__ = [
+    "LoopClosure",
+    "LoopConfig",
+    "LoopView",
+    "candidates",
+    "ground_seen",
+    "landmarks",
+    "verify",
+    "warps",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,25 +80,70 @@ class LoopClosure:
     growth: float = 1.0  # of b's depths, to fit a's
 
 
+def ground_seen(depth: DepthMap) -> F64:
+    """(N, 3) what a camera sees, in its frame: a grid over the whole picture.
+
+    Where nothing was measured lies the plane through what was.
+    """
+    h, w = depth.depth_m.shape
+    u, v = np.meshgrid(np.linspace(0, w - 1, 17), np.linspace(0, h - 1, 11))
+    uv = np.column_stack([u.ravel(), v.ravel()])
+    at = np.rint(uv).astype(np.int64)
+    grid = rays(depth.K, uv)
+    z = depth.depth_m[at[:, 1], at[:, 0]].astype(np.float64)
+    known = np.isfinite(z)
+    if not known.any():
+        return np.zeros((0, 3))
+    normal = plane_normal(grid[known] * z[known, None])
+    level = float(np.median(np.sum(grid[known] * normal, axis=1) * z[known]))
+    slope = grid @ normal
+    ahead = slope * np.sign(level) > 1e-3  # the others look above the horizon
+    z[~known & ahead] = level / slope[~known & ahead]
+    usable = (z > 0) & (z < 5.0 * float(np.median(z[known])))
+    return np.asarray(grid[usable] * z[usable, None])
+
+
+def plane_normal(points: F64) -> F64:
+    """(3,) unit normal of the plane that most of the points (N, 3) lie near, away from the camera.
+
+    Of fewer than three points, or points in a line, the camera's axis.
+    """
+    weight, normal = np.ones(len(points)), np.array([0.0, 0.0, 1.0])
+    if len(points) < 3:
+        return normal
+    for _ in range(8):
+        about = points - weight @ points / weight.sum()
+        _, size, rows = np.linalg.svd(about * np.sqrt(weight)[:, None], full_matrices=False)
+        if size[1] < 0.02 * size[0]:
+            return np.array([0.0, 0.0, 1.0])
+        normal = rows[2] * np.sign(rows[2, 2] if rows[2, 2] else 1.0)
+        off = np.abs(about @ normal)
+        weight = 1.0 / np.maximum(off, max(float(np.median(off)), 1e-6))
+    return np.asarray(normal)
+
+
 def candidates(
-    poses: Mapping[int, F64], newest: int, K: F64, size_px: tuple[int, int], depth_m: float,
+    poses: Mapping[int, F64], newest: int, K: F64, size_px: tuple[int, int], ground: F64,
     config: LoopConfig | None = None,
 ) -> list[tuple[int, float]]:  # fmt: skip
     """Earlier keyframes that see what ``newest`` sees, with the share of its view, best first.
 
-    ``poses`` are T_world_camera (4, 4) by keyframe number, ``depth_m`` the usual depth.
+    ``poses`` are T_world_camera (4, 4) by keyframe number; ``ground`` (N, 3) is what the newest
+    sees, in its camera's frame (:func:`ground_seen`).
     """
     config = config or LoopConfig()
     W, H = size_px
-    u, v = np.meshgrid(np.linspace(0, W - 1, 17), np.linspace(0, H - 1, 11))
-    grid = rays(K, np.column_stack([u.ravel(), v.ravel()])) * depth_m
-    ground = se3.transform(poses[newest], grid)
+    if not len(ground):
+        return []
+    ground = se3.transform(poses[newest], ground)
     order = list(poses)
     position = order.index(newest)
     found = []
     for seq in order[: max(position - config.least_gap + 1, 0)]:
-        seen = project(K, se3.transform(se3.inverse(poses[seq]), ground))
+        there = se3.transform(se3.inverse(poses[seq]), ground)
+        seen = project(K, there)
         inside = (seen >= 0).all(axis=1) & (seen <= [W - 1, H - 1]).all(axis=1)
+        inside &= there[:, 2] > 0
         share = float(np.mean(inside))
         if share >= config.least_overlap:
             found.append((seq, share))
@@ -108,13 +162,13 @@ def verify(
     between the pictures is tried.
     """
     config = config or LoopConfig()
-    uv, points = _landmarks(a, config)
+    uv, points = landmarks(a, config.matching)
     if len(uv) < config.min_matches:
         return None
     pyramids = tuple(matching.Pyramid.build(v.gray, config.matching.search_levels) for v in (a, b))
     T_b_a = se3.inverse(T_a_b_guess)
     predicted = project(b.K, se3.transform(T_b_a, points))
-    warp = _warp(a.K, b.K, T_b_a, float(np.median(points[:, 2])))
+    warp = warps(a.K, b.K, T_b_a, uv, points)
     solved = _pose(pyramids, uv, points, predicted, warp, b, T_b_a, config)
     if solved is None and a.gray.shape == b.gray.shape:
         shift = matching.global_shift(a.gray, b.gray)
@@ -127,9 +181,9 @@ def verify(
     return _with_icp(a, b, T_a_b, A @ solved.covariance @ A.T, solved, config)
 
 
-def _landmarks(view: LoopView, config: LoopConfig) -> tuple[F64, F64]:
+def landmarks(view: LoopView, config: matching.MatchingConfig) -> tuple[F64, F64]:
     """(N, 2) corners with a known depth and their (N, 3) points in the camera frame."""
-    corners = matching.harris_grid(view.gray, config.matching).uv_px.astype(np.float64)
+    corners = matching.harris_grid(view.gray, config).uv_px.astype(np.float64)
     h, w = view.depth.depth_m.shape
     H, W = view.gray.shape
     place = np.rint((corners + 0.5) * [w / W, h / H] - 0.5).astype(np.int64)
@@ -150,12 +204,22 @@ def _at_edge(depth: F32, place: np.ndarray[tuple[int, ...], np.dtype[np.int64]])
     return np.asarray(~(spread < 0.03 * here))
 
 
-def _warp(K_a: F64, K_b: F64, T_b_a: F64, depth_m: float) -> F64:
-    """(2, 2) map of offsets in a to offsets in b for level ground at the picture's centre."""
-    centre = np.array([[K_a[0, 2], K_a[1, 2]]])
-    steps = centre + np.array([[0.0, 0.0], [8.0, 0.0], [0.0, 8.0]])
-    there = project(K_b, se3.transform(T_b_a, rays(K_a, steps) * depth_m))
-    return np.asarray(((there[1:] - there[0]) / 8.0).T)
+def warps(K_a: F64, K_b: F64, T_b_a: F64, uv: F64, points: F64) -> F64:
+    """(N, 2, 2) maps of offsets about landmarks in a to offsets in b, all of one slope.
+
+    Each landmark's surface is taken to be parallel to the plane that most of them lie on, so
+    that two oblique views of the ground from opposite sides still compare like with like.
+    """
+    normal = plane_normal(points)
+    level = np.sum(points * normal, axis=1)
+    out = np.empty((len(uv), 2, 2))
+    here = project(K_b, se3.transform(T_b_a, points))
+    for axis in range(2):
+        ways = rays(K_a, uv + 8.0 * np.eye(2)[axis])
+        slope = ways @ normal
+        beside = ways * (level / np.where(np.abs(slope) > 1e-6, slope, np.nan))[:, None]
+        out[:, :, axis] = (project(K_b, se3.transform(T_b_a, beside)) - here) / 8.0
+    return out
 
 
 def _pose(

@@ -13,7 +13,7 @@ import scipy.ndimage as ndi
 
 from recon import se3
 from recon.camera_model import rays, scaled_K
-from recon.loop_closure import LoopConfig, LoopView, candidates, verify
+from recon.loop_closure import LoopConfig, LoopView, candidates, ground_seen, verify
 from recon.pose_graph import PoseGraph
 from recon.trajectory import Trajectory
 from recon.types import F64, DepthMap, PosePrior
@@ -74,6 +74,8 @@ def view(T: F64, seed: int = 0, ground: int = 1, sigma_m: float = 0.08) -> LoopV
 
 
 A = camera(0.0, 0.0, 40.0, 0.0)
+ADJACENT = LoopConfig(least_gap=1)
+LEVEL = np.array([[x, y, 40.0] for x in np.linspace(-28, 28, 9) for y in np.linspace(-15, 15, 7)])
 
 
 @pytest.mark.parametrize("yaw", [0.1, 1.6, 3.1])
@@ -89,6 +91,45 @@ def test_a_place_seen_again_is_found_from_any_side(yaw: float) -> None:
     assert np.linalg.norm(miss) < 0.08
     assert error @ np.linalg.solve(loop.covariance, error) < 30
     assert loop.sources == ("epnp", "icp") and loop.matches > 60
+
+
+def oblique(x: float, y: float, yaw: float) -> F64:
+    """A camera 40 m up that looks 25 degrees ahead of straight down, along ``yaw``."""
+    ahead = se3.so3_exp(np.array([np.radians(25.0), 0.0, 0.0]))
+    turn = se3.so3_exp(np.array([0.0, 0.0, -yaw]))
+    return se3.compose(turn.T @ NADIR @ ahead, np.array([x, y, 40.0]))
+
+
+@pytest.mark.parametrize("across_m", [0.0, 12.0])
+def test_oblique_views_from_opposite_sides_are_one_place(across_m: float) -> None:
+    """50 degrees between the rays, pictures turned by half a circle."""
+    near = 40.0 * np.tan(np.radians(25.0))
+    A, B = oblique(0.0, -near, 0.0), oblique(across_m, near, np.pi)
+    assert np.allclose((A[:3, 3] + A[:3, 2] * 40.0 / -A[2, 2])[:2], [0, 0], atol=0.1)
+    assert np.allclose((B[:3, 3] + B[:3, 2] * 40.0 / -B[2, 2])[:2], [across_m, 0], atol=0.1)
+    a, b = view(A, 1), view(B, 2)
+    found = dict(candidates({0: A, 1: B}, 1, K, SIZE, ground_seen(b.depth), ADJACENT))
+    assert found[0] > 0.5
+    truth = se3.inverse(A) @ B
+    guess = se3.exp(np.array([0.01, -0.01, 0.02, 0.8, -0.5, 0.4])) @ truth
+    loop = verify(a, b, guess)
+    assert loop is not None
+    middle = np.array([[0.0, 0.0, 44.0]])
+    miss = se3.transform(loop.T_a_b, middle) - se3.transform(truth, middle)
+    assert np.linalg.norm(miss) < 0.12
+
+
+def test_what_is_seen_goes_on_where_nothing_was_measured() -> None:
+    whole = view(oblique(0.0, 0.0, 0.4), 1).depth
+    z = whole.depth_m.copy()
+    z[:, 160:] = np.nan
+    part = ground_seen(DepthMap(z, whole.sigma_m, whole.views, whole.K, whole.T_world_camera))
+    full = ground_seen(whole)
+    assert len(part) == len(full) == 17 * 11
+    assert np.abs(part[:, 2] / full[:, 2] - 1.0).max() < 0.25
+    z[:] = np.nan
+    none = DepthMap(z, whole.sigma_m, whole.views, whole.K, whole.T_world_camera)
+    assert len(ground_seen(none)) == 0
 
 
 def test_a_guess_far_off_is_helped_by_the_pictures() -> None:
@@ -140,13 +181,13 @@ def lawnmower() -> dict[int, F64]:
 
 def test_candidates_are_the_earlier_views_of_the_same_ground() -> None:
     poses = lawnmower()
-    found = candidates(poses, 55, K, SIZE, 40.0)
+    found = candidates(poses, 55, K, SIZE, LEVEL)
     assert found and all(seq <= 55 - 10 for seq, _ in found)
     shares = [share for _, share in found]
     assert shares == sorted(shares, reverse=True) and shares[-1] >= 0.35
     # Keyframe 55 is over x = 16 m: the first leg passed there at keyframe 4.
     assert abs(found[0][0] - 4) <= 1
-    assert candidates(poses, 10, K, SIZE, 40.0) == []
+    assert candidates(poses, 10, K, SIZE, LEVEL) == []
 
 
 def test_two_verified_loops_close_the_map() -> None:

@@ -65,6 +65,13 @@ def _lines(figures: dict[str, Any]) -> list[str]:
     ]
     if not figures["changed"]:
         out[0] += "; nothing new since the last refinement"
+    step = found["step_m"]
+    if step is not None:
+        out.append(
+            f"step where ground was seen twice: {step['before']['median']:.2f} -> "
+            f"{step['after']['median']:.2f} m (most {step['before']['most']:.2f} -> "
+            f"{step['after']['most']:.2f} m)"
+        )
     for p in figures["points"]:
         line = f"  {p['role']:<8}{p['name']:<12}{p['marks']:>3} marks"
         for name in ("before_m", "after_m"):

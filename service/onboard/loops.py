@@ -11,7 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.camera_model import scaled_K
-from recon.loop_closure import LoopClosure, LoopConfig, LoopView, candidates, verify
+from recon.loop_closure import (
+    LoopClosure,
+    LoopConfig,
+    LoopView,
+    candidates,
+    ground_seen,
+    verify,
+)
 from recon.trajectory import Trajectory
 from recon.types import F64, U8, DepthMap
 
@@ -158,7 +165,8 @@ class LoopSearch:
         some = {seq: poses[graph.node(seq).key] for seq in near}
         some[new.seq] = here
         config = self._config.without_gap()
-        found = [s for s, _ in candidates(some, new.seq, new.K, new.size_px, depth_m, config)]
+        ground = ground_seen(view.depth)
+        found = [s for s, _ in candidates(some, new.seq, new.K, new.size_px, ground, config)]
         return (found[: TRIES - 1] + self._by_turns(new, seqs) + found[TRIES - 1 :])[:TRIES]
 
     def _by_turns(self, new: _Kept, seqs: list[int]) -> list[int]:

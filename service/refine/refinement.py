@@ -14,11 +14,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
-from scipy.spatial import cKDTree
 
-from recon import loop_closure, se3
+from recon import se3
 from recon.ground_control import (
     Adjusted,
     BatchConfig,
@@ -29,8 +27,8 @@ from recon.ground_control import (
     map_position,
     supported,
 )
-from recon.loop_closure import LoopConfig, LoopView
-from recon.types import F64, Keyframe, PosePrior
+from recon.submap_loops import SubmapLoopConfig
+from recon.types import Keyframe, PosePrior
 from service.config import CameraConfig, FusionConfig, ScanConfig
 from service.errors import InputError
 from service.georeference import LocalFrame
@@ -44,7 +42,8 @@ from service.refine.control_points import (
     screen,
 )
 from service.refine.refinement_figures import in_words, told
-from service.refine.revisions import KeyframeState, Revisions, copy_store
+from service.refine.revisions import Revisions, copy_store
+from service.refine.stored_loops import StoredLoops, loose
 from service.refine.survey_file import read_survey
 from service.scans.folder import write_deliverables
 from service.scans.track import local_frame
@@ -60,10 +59,6 @@ log = logging.getLogger(__name__)
 
 LINK_LOG = "link.tlog"
 """What the daemon keeps of the flight's telemetry beside a scan."""
-
-LOOPS_PER_KEYFRAME = 2
-LOOP_SCALE = 0.005
-"""Sigma of a loop's length, as a share of it, from the scale of the depths that gave it."""
 
 LEAST_SIGMA_SCALE = 0.003
 BY_SURVEY = "control points"
@@ -165,9 +160,9 @@ class _Refinement:
         track = replace(track, loops=[*flown, *kept])
         found = self._adjusted(track, candidates)
         seqs = [s.seq for s in self.states]
-        figures = told(seqs, track, found, candidates, len(flown) + len(closures)) | {
-            "notes": self.notes
-        }
+        verified = len(flown) + len(closures)
+        figures = told(seqs, track, found, candidates, verified, self._ahead_m())
+        figures["notes"] = self.notes
         header = replace(self.header, notes=(*self.header.notes, in_words(figures)))
         frames = moved_frames(self.frames, self.states, found, self.frame)
         changed = self.revisions.append(self._reposes(found), frames, header, figures)
@@ -263,47 +258,26 @@ class _Refinement:
                 T = grown(T, self.grown)
                 units = np.array([1.0] * 3 + [self.grown] * 3)
                 spread = unpack_covariance(upper) * np.outer(units, units)
-                # Its length is that of depths, which err together.
-                spread[3:, 3:] += LOOP_SCALE**2 * np.outer(T[:3, 3], T[:3, 3])
-                out.append(Closure(at[a], at[b], T, spread))
+                out.append(Closure(at[a], at[b], T, loose(T, spread)))
         return out
 
     def _closures(self, track: Track) -> list[Closure]:
         """All pairs of keyframes far apart in time that see the same place, verified."""
-        config = LoopConfig()
-        views = [self._size(s) for s in self.states]
-        depth_m = float(np.median([v[2] for v in views if v is not None] or [1.0]))
-        tree = cKDTree(track.poses[:, :2, 3])
-        out = []
-        for b, view in enumerate(views):
-            if view is None:
-                continue
-            near = tree.query_ball_point(track.poses[b, :2, 3], 2.0 * depth_m)
-            earlier = sorted(a for a in near if a <= b - config.least_gap and views[a] is not None)
-            subset = {a: track.poses[a] for a in (*earlier, b)}
-            options = replace(config, least_gap=1)
-            found = loop_closure.candidates(subset, b, view[0], view[1], depth_m, options)
-            for a, _ in found[:LOOPS_PER_KEYFRAME]:
-                closure = self._verified(a, b, track)
-                if closure is not None:
-                    out.append(closure)
-        return out
 
-    def _size(self, state: KeyframeState) -> tuple[F64, tuple[int, int], float] | None:
-        """Optics, size and usual depth of a keyframe; None without surface."""
-        keyframe = self.keyframe(state)
-        if keyframe is None or not np.isfinite(keyframe.depth.depth_m).any():
-            return None
-        h, w = keyframe.depth.depth_m.shape
-        return keyframe.depth.K, (w, h), float(np.nanmedian(keyframe.depth.depth_m))
+        def at(k: int) -> Keyframe | None:
+            found = self.keyframe(self.states[k])
+            if found is None:
+                return None
+            return replace(found, depth=replace(found.depth, T_world_camera=track.poses[k]))
 
-    def _verified(self, a: int, b: int, track: Track) -> Closure | None:
-        one, two = self.keyframe(self.states[a]), self.keyframe(self.states[b])
-        if one is None or two is None:
-            return None
-        guess = se3.inverse(track.poses[a]) @ track.poses[b]
-        found = loop_closure.verify(_loop_view(one), _loop_view(two), guess)
-        return None if found is None else Closure(a, b, found.T_a_b, found.covariance)
+        return StoredLoops(track, at, SubmapLoopConfig()).find()
+
+    def _ahead_m(self) -> float:
+        """Usual distance of the ground; 0 without any surface."""
+        some = [self.keyframe(s) for s in self.states[:: max(1, len(self.states) // 16)]]
+        depths = [one.depth.depth_m for one in some if one is not None]
+        known = [float(np.nanmedian(z)) for z in depths if np.isfinite(z).any()]
+        return float(np.median(known)) if known else 0.0
 
     def _config(self) -> BatchConfig:
         """How sure the scan's scale is, by its own word."""
@@ -348,14 +322,6 @@ class _Refinement:
                 self.states, found.poses, found.scales, found.covariances, strict=True
             )
         ]
-
-
-def _loop_view(keyframe: Keyframe) -> LoopView:
-    return LoopView(
-        np.asarray(cv2.cvtColor(keyframe.bgr, cv2.COLOR_BGR2GRAY), np.uint8),
-        keyframe.depth.K,
-        keyframe.depth,
-    )
 
 
 Section = TypeVar("Section")

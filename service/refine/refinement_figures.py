@@ -10,6 +10,7 @@ import numpy as np
 from recon.ground_control import Adjusted, Track, map_position
 from recon.types import F64
 from service.refine.control_points import Candidate
+from service.refine.stored_loops import steps_m
 
 
 def told(
@@ -18,11 +19,12 @@ def told(
     found: Adjusted,
     candidates: Sequence[Candidate],
     verified: int,
+    ahead_m: float = 0.0,
 ) -> dict[str, Any]:
     """What the adjustment of the keyframes ``seqs`` did, fit for JSON.
 
     ``verified``: loops of the flight and loops that matching confirmed; of these the track
-    has those with support.
+    has those with support. ``ahead_m`` is the usual distance of the ground.
     """
     shift = np.linalg.norm((found.poses - track.poses)[:, :3, 3], axis=1)
     points = [_told_point(c, found) for c in candidates]
@@ -35,6 +37,7 @@ def told(
             "verified": verified,
             "used": len(track.loops) - len(found.loops_refused),
             "refused": verified - len(track.loops) + len(found.loops_refused),
+            "step_m": _steps(track, found, ahead_m),
             "pairs": [
                 [seqs[loop.a], seqs[loop.b], k not in found.loops_refused]
                 for k, loop in enumerate(track.loops)
@@ -49,6 +52,21 @@ def told(
         "control": _summed([p for p in points if p["role"] == "control"]),
         "check": _summed([p for p in points if p["role"] == "check"]),
     }
+
+
+def _steps(track: Track, found: Adjusted, ahead_m: float) -> dict[str, Any] | None:
+    """How far apart the two ends of the used loops have the same ground; None without any."""
+    used = [loop for k, loop in enumerate(track.loops) if k not in found.loops_refused]
+    if not used:
+        return None
+    out: dict[str, Any] = {}
+    for when, poses, scales in (
+        ("before", track.poses, np.ones(len(track.poses))),
+        ("after", found.poses, found.scales),
+    ):
+        steps = steps_m(used, poses, scales, ahead_m)
+        out[when] = {"median": _round(np.median(steps)), "most": _round(steps.max())}
+    return out
 
 
 def _told_point(one: Candidate, found: Adjusted) -> dict[str, Any]:
