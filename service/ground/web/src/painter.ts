@@ -19,7 +19,7 @@ export interface Effects {
 }
 
 const MOVING_MS = 70;
-const SLICE_MS = 120;
+const SLICE_MS = 90;
 const FIRST_POINTS = 100_000;
 const LEAST_POINTS = 20_000;
 const EFFECTS_TIMES = 3; // of the points drawn while moving, once the view stands still
@@ -130,7 +130,7 @@ export class Painter {
   private paced(work: Work, now: number): void {
     const ms = Math.max(now - work.since, 1);
     if (work.kind === "slice") {
-      this.slice = Math.max(LEAST_POINTS, this.slice * Math.min(Math.max(SLICE_MS / ms, 0.5), 1.5));
+      this.slice = Math.max(LEAST_POINTS, this.slice * Math.min(Math.max(SLICE_MS / ms, 0.25), 1.2));
       return;
     }
     this.frames_per_s = 1000 / ms;

@@ -60,6 +60,8 @@ export class Cloud implements Gradual {
   readonly group = new THREE.Group();
   budget = 3_000_000;
   drawn = 0;
+  /** What is added to heights that are shown: the origin's altitude above the sea. */
+  datum_m = 0;
   private readonly chunks = new Map<number, Held>();
   private readonly shared = {
     size: { value: 300 },
@@ -115,7 +117,7 @@ export class Cloud implements Gradual {
     const { x, y } = this.shared.range.value;
     const words: Record<Colour, [string, string] | null> = {
       colour: null,
-      height: [`${x.toFixed(1)} m`, `${y.toFixed(1)} m`],
+      height: [x, y].map((z) => `${(z + this.datum_m).toFixed(1)} m`) as [string, string],
       sigma: ["0 m", "σ 1 m"],
       views: ["1 view", "8 views"],
       age: ["first", "last"],
@@ -142,7 +144,7 @@ export class Cloud implements Gradual {
     for (const { object, points } of this.chunks.values()) {
       const [start, end] = [Math.ceil(points * share * from), Math.ceil(points * share * to)];
       object.geometry.setDrawRange(start, end - start);
-      this.drawn += end - start;
+      if (this.group.visible) this.drawn += end - start;
     }
   }
 

@@ -113,15 +113,36 @@ export class Stage {
 
   /** Looks at everything there is, from the south and above. */
   frame(): void {
-    const box = new THREE.Box3().setFromObject(this.world);
+    const box = new THREE.Box3();
+    for (const object of this.painter.again) box.expandByObject(object);
+    if (box.isEmpty()) box.setFromObject(this.world);
     if (box.isEmpty()) return;
     const centre = box.getCenter(new THREE.Vector3());
     const reach = Math.max(box.getSize(new THREE.Vector3()).length(), 1);
+    const back = new THREE.Vector3(0, -0.65, 0.76);
     this.controls.target.copy(centre);
-    this.camera.position.copy(centre).add(new THREE.Vector3(0, -0.4 * reach, 0.47 * reach));
+    this.camera.position.copy(centre).addScaledVector(back, this.distance(box, centre, back));
     this.camera.near = reach / 2000;
     this.camera.far = reach * 20;
     this.camera.updateProjectionMatrix();
+  }
+
+  /** How far `back` from `centre` every corner of `box` is in sight. */
+  private distance(box: THREE.Box3, centre: THREE.Vector3, back: THREE.Vector3): number {
+    const right = new THREE.Vector3().crossVectors(this.camera.up, back).normalize();
+    const up = new THREE.Vector3().crossVectors(back, right);
+    const high = Math.tan(THREE.MathUtils.degToRad(this.camera.fov / 2));
+    let least = 1;
+    for (let k = 0; k < 8; k++) {
+      const corner = new THREE.Vector3(
+        k & 1 ? box.max.x : box.min.x,
+        k & 2 ? box.max.y : box.min.y,
+        k & 4 ? box.max.z : box.min.z,
+      ).sub(centre);
+      const aside = Math.abs(corner.dot(right)) / (high * this.camera.aspect);
+      least = Math.max(least, corner.dot(back) + Math.max(aside, Math.abs(corner.dot(up)) / high));
+    }
+    return 1.05 * least;
   }
 
   fieldOfView(degrees: number): void {
@@ -163,6 +184,7 @@ export class Stage {
 
   /** Something changed that is to be seen: pictures are drawn again for a moment. */
   readonly touch = (): void => {
+    document.body.dataset["still"] = "no";
     this.touched = performance.now();
   };
 

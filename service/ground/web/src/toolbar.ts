@@ -93,13 +93,25 @@ function cameraButton(cameras: Cameras): HTMLElement {
   return button;
 }
 
+/** The colours of service/scans/coverage.py, over white. */
+const COVERAGE_KEYS = [
+  ["good", "#79d29a"], ["seldom seen", "#f8bd78"], ["unsure", "#f8e78d"], ["gap", "#e7787f"],
+] as const;
+
+function key(text: string, colour: string): HTMLElement {
+  const patch = el("i", {});
+  patch.style.background = colour;
+  return el("span", {}, patch, text);
+}
+
 /** The coverage layer beside the scene: gaps and weak places, new every few seconds. */
 function coverageButton({ coverage, id }: Parts): HTMLElement {
   const button = el("button", { textContent: "Coverage", title: "gaps and weak places so far" });
   const picture = el("img", { alt: "coverage: gaps red, weak yellow, good green" });
   const none = el("p", { textContent: "No surface yet." });
+  const keys = el("p", { className: "keys" }, ...COVERAGE_KEYS.map(([text, colour]) => key(text, colour)));
   picture.onerror = () => coverage.replaceChildren(none);
-  picture.onload = () => coverage.replaceChildren(picture);
+  picture.onload = () => coverage.replaceChildren(picture, keys);
   const refresh = (): void => {
     if (coverage.hidden || !coverage.isConnected) return;
     picture.src = `${api.scanAddress(id)}/coverage.png?t=${Date.now()}`;
@@ -128,6 +140,7 @@ function showGroup(parts: Parts): HTMLElement {
       close();
       close = next;
       cloud.group.visible = chosen === points;
+      parts.legend.hidden ||= chosen !== points;
       stage.touch();
       buttons.forEach((b) => b.classList.toggle("on", b === chosen));
     } catch (error) {

@@ -24,8 +24,10 @@ export function showView(root: HTMLElement, drone: string, name: string): () => 
   const latest = el("figure", { className: "panel latest", hidden: true });
   root.replaceChildren(el("div", { className: "view" }, bar, host, figures, legend, coverage, latest));
   const id = { drone, scan: name };
+  const cloud = new Cloud();
   void api.scan(drone, name).then((s) => {
     title.textContent = s.title;
+    cloud.datum_m = s.origin?.alt_amsl_m ?? 0;
     if (s.files.some((f) => f.name === "report.html"))
       bar.append(el("a", { href: api.file(s, "report.html"), textContent: "Report" }));
   }, tell);
@@ -37,7 +39,6 @@ export function showView(root: HTMLElement, drone: string, name: string): () => 
     return () => undefined;
   }
   const stage = new Stage(host);
-  const cloud = new Cloud();
   const cameras = new Cameras();
   const ruler = new Ruler();
   stage.drawGradually(cloud);
