@@ -251,7 +251,7 @@ def correlated_area(size: Any, limit: float, lags: int) -> float:
                         product += a * b
                         power += 0.5 * (a * a + b * b)
                         count += 1
-            if count < 30 or product < 0.03 * power:
+            if count < 30 or product <= 0.03 * power:
                 break
             length += 2.0 * product / power
         area *= length

@@ -156,6 +156,10 @@ def test_residuals_that_err_together_are_counted_alike(device: str) -> None:
     from recon.backends.torch_partners import correlation_sums
 
     rng = np.random.default_rng(0)
+    none = np.zeros((20, 30))
+    assert icp_kernels.correlated_area(none.astype(np.float32), 1.0, 12) == 1.0
+    still = torch.from_numpy(none).to(device)
+    assert _area(correlation_sums(still, still == 0, 12).cpu().numpy()) == 1.0
     for blur in (0.0, 1.5, 3.0):
         field = rng.normal(0, 1, (60, 100))
         if blur:

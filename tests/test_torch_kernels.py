@@ -114,6 +114,24 @@ def test_upsampling_in_one_kernel_is_the_reference(
     assert np.abs(trust - want.confidence)[both].max() < 1e-3
 
 
+@pytest.mark.parametrize(
+    ("height", "width", "labels", "first"), [(13, 21, 9, 0), (9, 40, 5, -3), (8, 16, 12, 4)]
+)
+def test_costs_of_one_kernel_are_the_compiled_ones(
+    kernels: Any, device: str, height: int, width: int, labels: int, first: int
+) -> None:
+    """Census at the borders, partners outside either way, and room around the pair."""
+    config = BeliefPropagationConfig(min_disparity=first)
+    left, right = textured(height, width, 1), textured(height, width, 2)
+    want = matching_cost(left, right, labels, config.cost, first)
+    wide = [np.pad(image, ((0, 3), (0, 5)), mode="edge") for image in (left, right)]
+    a, b = (torch.from_numpy(image).float().to(device) for image in wide)
+    true = torch.tensor([height, width, labels], device=device)
+    found = kernels.cost(a, b, labels + 2, true, config).permute(1, 0, 2).cpu().numpy()
+    np.testing.assert_array_equal(found[:height, :labels, :width], want)
+    assert not found[height:].any() and not found[:, :, width:].any()
+
+
 def rolling(east_m: float, up_m: float) -> DepthMap:
     """(54, 80) depth of rolling ground, with a hole, from a place of a camera that looks down."""
     v, u = np.mgrid[0:54, 0:80]
@@ -169,7 +187,8 @@ COMPILE = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from recon.backends.triton_icp import POINTS, ROW, _advance, _normal_equations, _residuals
+from recon.backends.triton_cost import PIXELS, _census, _cost
+from recon.backends.triton_icp import ROW, _advance, _normal_equations, _residuals
 from recon.backends.triton_propagation import CELLS, _sweep
 from recon.backends.triton_upsampling import COLUMNS, ROWS, _bilateral
 
@@ -184,14 +203,16 @@ def compiled(capability, warps, kernel, words, *constants):
 
 matched = "*fp64 *fp64 *fp64 *fp32 *fp64 *fp64 "
 tables = "*fp32 *u8 *i32 *fp32 *i32 *fp32 *fp32 *fp32 "
-for capability in (87, 90):
-    compiled(capability, 4, _sweep, "*i16 *i16 *i16 *i16 i32 i32 i32 i32", CELLS)
-    compiled(
-        capability, 4, _bilateral, tables + "i32 i32 i32 i32 fp32 fp32 fp32", 10, ROWS, COLUMNS
-    )
-compiled(90, 1, _residuals, matched + "*fp64 *fp64 i32 i32 i32 fp32", POINTS)
+compiled(87, 4, _sweep, "*i16 *i16 *i16 *i16 i32 i32 i32 i32", CELLS)
+compiled(87, 4, _bilateral, tables + "i32 i32 i32 i32 fp32 fp32 fp32", 10, ROWS, COLUMNS)
+compiled(90, 4, _census, "*fp32 *i32 i32 i32 i32", PIXELS)
 compiled(
-    90, 1, _normal_equations, matched + "*fp64 *fp64 *fp64 i32 i32 i32 fp32 fp32 i32", POINTS, ROW
+    90, 4, _cost,
+    "*fp32 *fp32 *i32 *i64 *fp32 i32 i32 i32 i32 i32 i32 fp32 i32 i32 fp32", PIXELS,
+)
+compiled(90, 1, _residuals, matched + "*fp64 *fp64 i32 i32 i32 fp32", 32)
+compiled(
+    90, 1, _normal_equations, matched + "*fp64 *fp64 *fp64 i32 i32 i32 fp32 fp32 i32", 32, ROW
 )
 compiled(90, 1, _advance, "*fp64 " * 8 + "fp32 fp32 fp32 i32 i32")
 """
@@ -206,8 +227,8 @@ def test_kernels_compile_for_orin_and_hopper(tmp_path: Path) -> None:
         text=True, timeout=120, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    names = ("_advance", "_bilateral", "_normal_equations", "_residuals", "_sweep")
-    want = ["87 _bilateral", "87 _sweep", *(f"90 {name}" for name in names)]
+    names = "_advance _census _cost _normal_equations _residuals"
+    want = ["87 _bilateral", "87 _sweep", *(f"90 {name}" for name in names.split())]
     assert sorted(done.stdout.splitlines()) == [f"{name} True False" for name in want]
 
 

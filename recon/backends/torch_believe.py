@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from recon.backends.torch_dense import inside
+from recon.backends.torch_cost import inside
 from recon.belief_propagation import SPECKLE_STEP, BeliefPropagationConfig
 
 CONTRAST_PX = 9

@@ -137,7 +137,7 @@ def _area(lags: F64) -> float:
     for products, powers, counts in lags:
         length = 1.0
         for product, power, count in zip(products, powers, counts, strict=True):
-            if count < 30 or product < 0.03 * power:
+            if count < 30 or product <= 0.03 * power:
                 break
             length += 2.0 * float(product) / float(power)
         area *= length

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from recon.backends.torch_partners import SourcePoints
     from recon.backends.torch_sums import Weighed
     from recon.backends.torch_surface import DeviceSurface
+    from recon.belief_propagation import BeliefPropagationConfig
     from recon.registration import IcpConfig
 
 
@@ -31,6 +32,17 @@ class Sweep(Protocol):
         self, data: Tensor, messages: Tensor, slope: Tensor, cut: Tensor, colour: int, /
     ) -> None:
         """See :func:`recon.backends.triton_propagation.sweep`."""
+        ...
+
+
+class Cost(Protocol):
+    """Matching cost of every label."""
+
+    def __call__(
+        self, left: Tensor, right: Tensor, labels: int, true: Tensor,
+        config: BeliefPropagationConfig, /,
+    ) -> Tensor:  # fmt: skip
+        """See :func:`recon.backends.torch_cost.matching_cost`."""
         ...
 
 
@@ -75,6 +87,7 @@ class Kernels:
     bilateral: Bilateral | None = None
     weigh: Weigh | None = None
     advance: Advance | None = None
+    cost: Cost | None = None
 
 
 Results = Callable[[], tuple[Tensor, ...]]
@@ -106,11 +119,12 @@ class Trial:
 
 def load_kernels() -> Kernels:
     """All kernels there are; ImportError without Triton."""
+    from recon.backends.triton_cost import matching_cost
     from recon.backends.triton_icp import advance, weigh
     from recon.backends.triton_propagation import sweep
     from recon.backends.triton_upsampling import bilateral
 
-    return Kernels(sweep, bilateral, weigh, advance)
+    return Kernels(sweep, bilateral, weigh, advance, matching_cost)
 
 
 def failures() -> tuple[type[Exception], ...]:
@@ -126,9 +140,10 @@ def failures() -> tuple[type[Exception], ...]:
 def trials(
     kernels: Kernels, device: str, size_px: tuple[int, int], guide_px: tuple[int, int], labels: int
 ) -> list[Trial]:
-    """Each kernel beside the plain operation, at a size (w, h) and with a guide (W, H)."""
+    """Each of the kernels beside the plain operation, at a size (w, h) and with a guide (W, H)."""
     from recon.backends.room import pyramid_levels
-    from recon.backends.torch_dense import edge_weights, matching_cost, propagate
+    from recon.backends.torch_cost import matching_cost
+    from recon.backends.torch_dense import edge_weights, propagate
     from recon.backends.torch_upsampling import JointBilateral, averaged
     from recon.belief_propagation import BeliefPropagationConfig
 
@@ -164,12 +179,18 @@ def trials(
 
     (plain, plain_px), (fused, _), (_, fused_px) = both(PLAIN), both(swept), both(bilateral)
     icp = Kernels(weigh=kernels.weigh, advance=kernels.advance)
-    register = _registered(device, size_px)
-    return [
+    register, priced = _registered(device, size_px), Kernels(cost=kernels.cost)
+
+    def compared(kernels: Kernels) -> tuple[Tensor, ...]:
+        return ((kernels.cost or matching_cost)(left, right, labels, own, matching),)
+
+    every = [
         Trial("belief propagation", swept, plain, fused, 0.0),
         Trial("upsampling", bilateral, plain_px, fused_px, 0.01),
+        Trial("matching cost", priced, lambda: compared(PLAIN), lambda: compared(priced), 0.0),
         Trial("registration", icp, lambda: register(PLAIN), lambda: register(icp), 1e-6),
     ]
+    return [trial for trial in every if trial.alone != PLAIN]
 
 
 def joined(kernels: Sequence[Kernels]) -> Kernels:

@@ -95,7 +95,7 @@ def planned(device: str, stage: Callable[..., Any], *arrays: Array) -> Plan:
 def fused_stages(device: str, pair: StereoPair, kernels: Kernels) -> list[Stage]:
     """The stages that a fused kernel changes."""
     found = dense_stages(device, pair, kernels)
-    chosen = [found[0]] if kernels.sweep is not None else []
+    chosen = [found[0]] if kernels.sweep is not None or kernels.cost is not None else []
     if kernels.bilateral is not None:
         chosen += [s for s in found if s.what.startswith("upsampling")]
     if kernels.weigh is not None:
