@@ -1,0 +1,54 @@
+"""The receiver's own altitude beside the autopilot's, from messages to the prior."""
+
+from __future__ import annotations
+
+import pytest
+from pymavlink.dialects.v20 import common as dialect  # type: ignore[import-untyped]
+
+from mavlink.decode import decode
+from mavlink.history import VehicleHistory
+from mavlink.samples import AccuracySample, PositionSample
+from service.config import CameraConfig, FusionConfig, ScanConfig
+from service.onboard.rig import Rig
+
+S = 1_000_000_000
+
+
+def climbing() -> VehicleHistory:
+    """Two metres a second up from 500 m by the autopilot; fixes 1.5 m above that."""
+    history = VehicleHistory()
+    for tenth in range(31):
+        at = tenth / 10.0
+        position = PositionSample(None, 47.0, 8.0, 500.0 + 2.0 * at, None, (0.0, 0.0, -2.0))
+        history.add(position, round(at * S))
+    for fix in range(4):
+        at = 0.05 + fix
+        history.add(AccuracySample(None, True, 1.0, 1.5, 501.5 + 2.0 * at), round(at * S))
+    return history
+
+
+def test_fixes_are_compared_at_their_own_time() -> None:
+    state = climbing().state_at(round(1.4 * S))
+    assert state is not None and state.receiver is not None
+    assert state.receiver.time_ns == round(1.05 * S)
+    assert state.receiver.above_m == pytest.approx(1.5, abs=1e-6)
+    prior = Rig(CameraConfig(), ScanConfig(), FusionConfig()).prior(state, None)
+    assert prior.above_m == pytest.approx(1.5, abs=1e-6)
+    assert (prior.above_fixes, prior.above_ns) == (1, round(1.05 * S))
+
+
+def test_an_accuracy_without_altitude_says_nothing() -> None:
+    history = climbing()
+    history.add(AccuracySample(None, True, 1.0, 1.5), round(1.4 * S))
+    state = history.state_at(round(1.4 * S))
+    assert state is not None and state.receiver is None
+
+
+def test_only_a_fix_has_an_altitude() -> None:
+    for kind, altitude in ((3, 612.345), (1, None)):
+        message = dialect.MAVLink_gps_raw_int_message(
+            0, kind, 470000000, 80000000, 612345, 80, 120, 0, 0, 14, 0, 900, 1400, 0, 0
+        )
+        sample = decode(message)
+        assert isinstance(sample, AccuracySample)
+        assert sample.alt_amsl_m == altitude
