@@ -503,7 +503,7 @@ def test_files_that_are_no_tables(tmp_path: Path) -> None:
         read_survey(tmp_path / "bytes.csv")
 
 
-def test_the_command_reports_and_refuses_intrinsics(flight: Flight) -> None:
+def test_the_command_reports_and_takes_no_other_video(flight: Flight) -> None:
     gcp = write_csv(flight.folder / "points.csv", flight.survey(SPOTS))
     run = CliRunner().invoke
     answer = run(app, ["refine", str(flight.scan), "--gcp", str(gcp)])
@@ -511,8 +511,10 @@ def test_the_command_reports_and_refuses_intrinsics(flight: Flight) -> None:
     assert "check points (2), rms" in answer.stdout
     answer = run(app, ["refine", str(flight.scan), "--gcp", str(gcp), "--json"])
     assert json.loads(answer.stdout.splitlines()[-1])["changed"] is False
-    refused = run(app, ["refine", str(flight.scan), "--intrinsics"])
+    video = flight.folder / "other.mp4"
+    video.write_bytes(b"no video")
+    refused = run(app, ["refine", str(flight.scan), "--intrinsics", "--video", str(video)])
     assert isinstance(refused.exception, InputError)
-    assert "calibrate" in str(refused.exception)
+    assert "other.mp4" in str(refused.exception)
     assert run(app, ["refine", str(flight.scan), "--undo"]).exit_code == 0
     assert errors(flight).min() > 2.0

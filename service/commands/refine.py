@@ -22,8 +22,11 @@ def refine(
     ] = None,
     loops: Annotated[bool, typer.Option(help="search for places seen twice")] = True,
     intrinsics: Annotated[
-        bool, typer.Option("--intrinsics", help="refused: see docs/refine.md")
+        bool, typer.Option("--intrinsics", help="find the camera's model; takes --video")
     ] = False,
+    video: Annotated[
+        Path | None, typer.Option(help="the flight's recording, for --intrinsics")
+    ] = None,
     undo: Annotated[
         bool, typer.Option("--undo", help="bring back the scan as it was flown")
     ] = False,
@@ -36,14 +39,18 @@ def refine(
     """
     from service.errors import InputError
     from service.refine.refinement import RefineOptions
+    from service.refine.refinement import intrinsics as run_intrinsics
     from service.refine.refinement import refine as run
     from service.refine.refinement import undo as run_undo
 
-    if intrinsics:
-        raise InputError(
-            "--intrinsics: the stored depth images were made with the scan's camera model and "
-            "cannot be bent to another; calibrate anew and replay the flight"
-        )
+    if intrinsics != (video is not None):
+        raise InputError("--intrinsics and --video FILE go together")
+    if video is not None:
+        if gcp or undo:
+            raise InputError("--intrinsics takes --video, --telemetry and --out only")
+        figures = run_intrinsics(scan_dir, video, telemetry, out)
+        print(json.dumps(figures) if as_json else "\n".join(_camera_lines(figures)))
+        return
     if undo:
         if gcp or telemetry or out:
             raise InputError("--undo takes nothing else")
@@ -51,6 +58,19 @@ def refine(
     else:
         figures = run(scan_dir, RefineOptions(gcp, telemetry, out, loops))
     print(json.dumps(figures) if as_json else "\n".join(_lines(figures)))
+
+
+def _camera_lines(figures: dict[str, Any]) -> list[str]:
+    (f_old, f_new), (c_old, c_new) = figures["focal_px"], figures["centre_px"]
+    (k_old, k_new), (before, after) = figures["k1_k2"], figures["rms_px"]
+    return [
+        f"focal length {f_old:.1f} -> {f_new:.1f} px (+- {figures['sigma_focal_percent']:.2f} %), "
+        f"centre {c_old[0]:.1f} {c_old[1]:.1f} -> {c_new[0]:.1f} {c_new[1]:.1f}, "
+        f"k1 k2 {k_old[0]:.4f} {k_old[1]:.4f} -> {k_new[0]:.4f} {k_new[1]:.4f}; "
+        f"pixels off by {before:.2f} -> {after:.2f} (rms)",
+        f"written to {figures['camera_file']}; the scan is as it was: replay the flight with "
+        "--camera-model and that file",
+    ] + [f"note: {note}" for note in figures["notes"]]
 
 
 def _lines(figures: dict[str, Any]) -> list[str]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from recon import se3
 from recon.ground_control import (
+    FIX_S,
     Adjusted,
     BatchConfig,
     Closure,
@@ -27,12 +28,14 @@ from recon.ground_control import (
     map_position,
     supported,
 )
+from recon.self_calibration import SelfCalibrated
 from recon.submap_loops import SubmapLoopConfig
-from recon.types import Keyframe, PosePrior
+from recon.types import F64, Camera, Keyframe, PosePrior
 from service.config import CameraConfig, FusionConfig, ScanConfig
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.onboard.rig import Rig
+from service.refine import own_camera
 from service.refine.carried_frames import grown, moved_frames
 from service.refine.control_points import (
     Candidate,
@@ -101,6 +104,20 @@ def undo(folder: Path) -> dict[str, Any]:
     return _deliver(target, {"undone": True, "keyframes": len(states)})
 
 
+def intrinsics(
+    folder: Path, video: Path, telemetry: Path | None, out: Path | None
+) -> dict[str, Any]:
+    """Find the camera from the flight's video and write its file beside the scan, or in ``out``.
+
+    The scan itself stays as it is. Raises InputError, in one line, when the flight cannot tell.
+    """
+    _open_target(folder, None)
+    with ScanStore.open(folder / "scan.db") as store, Revisions(store) as revisions:
+        job = _Refinement(folder, store, revisions, RefineOptions(telemetry=telemetry))
+        found, given = job.own_camera(video)
+    return own_camera.write(found, given, out or folder) | {"notes": job.notes}
+
+
 def _deliver(target: Path, figures: dict[str, Any]) -> dict[str, Any]:
     with ScanStore.open(target / "scan.db") as store:
         write_deliverables(target, store, {})
@@ -122,6 +139,18 @@ def _open_target(folder: Path, out: Path | None) -> Path:
         return folder
     copy_store(path, out / "scan.db")
     return out
+
+
+def fixes_of(track: Track) -> tuple[F64, F64]:
+    """(N, 3) measured places, NaN where there is none, and their sigmas as of independent ones."""
+    places = np.full((len(track.poses), 3), np.nan)
+    sigma = np.ones((len(track.poses), 3))
+    gap_s = max(float(np.median(np.diff(track.times_s))), 1e-3)
+    for k, prior in enumerate(track.priors):
+        if prior.position_m is not None and prior.sigma_position_m is not None:
+            places[k] = prior.position_m
+            sigma[k] = prior.sigma_position_m * np.sqrt(max(1.0, 2.0 * FIX_S / gap_s))
+    return places, sigma
 
 
 class _Refinement:
@@ -167,6 +196,17 @@ class _Refinement:
         frames = moved_frames(self.frames, self.states, found, self.frame)
         changed = self.revisions.append(self._reposes(found), frames, header, figures)
         return figures | {"changed": changed}
+
+    def own_camera(self, video: Path) -> tuple[SelfCalibrated, Camera]:
+        """The camera by the flight's own pictures, and the one that it was flown with."""
+        track, given = self._track(), own_camera.camera_of(self.header)
+        times = [s.time_ns for s in self.states]
+        pictures = own_camera.pictures_at(video, self.header.started_unix_ns, times)
+        ahead = track.poses[:, :3, 2] * self._ahead_m()
+        ground_m = float(np.median(track.poses[:, 2, 3] + ahead[:, 2]))
+        fixes, sigma = fixes_of(track)
+        found = own_camera.found_camera(pictures, given, track.poses, ground_m, fixes, sigma)
+        return found, given
 
     # ---- what goes in ------------------------------------------------------------------------
 

@@ -1,0 +1,161 @@
+"""The camera's model from the flight's own video: ``refine --intrinsics --video FILE``.
+
+Corners of each keyframe's picture are found again in its neighbours' (undistorted by the model
+given, ZSSD), and :mod:`recon.self_calibration` adjusts poses, landmarks and the camera at once.
+What comes out is a camera file to replay the flight with: depth images that were made with
+another focal length cannot be bent to this one. The scan and its own model stay as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from recon import matching, se3
+from recon.camera_model import Undistorter, project, rays
+from recon.self_calibration import SelfCalibrated, Sightings, self_calibrate
+from recon.types import F64, U8, Camera
+from service.cameras.camera_file import save_camera
+from service.cameras.file import open_file
+from service.errors import InputError
+from service.stream.records import ScanHeader
+
+FILE = "camera.refined.yaml"
+WITHIN_S = 0.02
+"""A picture belongs to a keyframe when their times differ by no more."""
+
+REACH = 3
+"""A keyframe's corners are looked for in so many before and after it."""
+
+SEARCH_SHARE = 0.05
+"""Of the picture's width about the predicted place."""
+
+LEAST_SHARE = 0.5
+"""Of the keyframes, whose pictures the video must hold."""
+
+CORNERS = matching.MatchingConfig(grid=16)
+
+
+def camera_of(header: ScanHeader) -> Camera:
+    """The camera that a scan was flown with."""
+    c = header.camera
+    K = np.array(c["K"], np.float64).reshape(3, 3)
+    size = int(c["width"]), int(c["height"])
+    return Camera(K, np.array(c["distortion"], np.float64), size)
+
+
+def pictures_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dict[int, U8]:
+    """Grey pictures of the video by the position of the moment in ``times_ns`` they show."""
+    wanted = np.array(times_ns, np.int64)
+    found: dict[int, U8] = {}
+    with closing(open_file(str(video), {})) as source:
+        for frame in source:
+            apart = np.abs(wanted - (start_unix_ns + frame.time_ns))
+            k = int(np.argmin(apart))
+            if apart[k] <= WITHIN_S * 1e9 and k not in found:
+                found[k] = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
+    if len(found) < max(3, LEAST_SHARE * len(wanted)):
+        raise InputError(
+            f"{video}: holds pictures of {len(found)} of {len(wanted)} keyframes; give the video "
+            "that the scan was made of"
+        )
+    return found
+
+
+def sightings(
+    pictures: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float
+) -> tuple[F64, Sightings]:
+    """(P, 3) landmarks and where they are seen in the distorted pictures.
+
+    ``pictures`` by view, with ``poses`` (N, 4, 4) of all views; the ground lies about
+    ``ground_m`` up in the world.
+    """
+    flat, W = Undistorter(camera), camera.size_px[0]
+    views = sorted(pictures)
+    stacks = {k: matching.Pyramid.build(flat.image(pictures[k])) for k in views}
+    landmarks: list[F64] = []
+    rows: list[tuple[int, int, F64]] = []
+    for position, k in enumerate(views):
+        uv = matching.harris_grid(stacks[k].levels[0], CORNERS, flat.valid).uv_px.astype(np.float64)
+        ways = rays(camera.K, uv) @ poses[k][:3, :3].T
+        far = (ground_m - poses[k][2, 3]) / np.where(ways[:, 2] < -0.1, ways[:, 2], np.nan)
+        near = np.isfinite(far)
+        uv, points = uv[near], poses[k][:3, 3] + ways[near] * far[near, None]
+        first = len(landmarks)
+        seen = np.zeros(len(uv), bool)
+        for other in views[max(position - REACH, 0) : position + REACH + 1]:
+            if other == k:
+                continue
+            at, ok = _matched(stacks, camera, poses, (k, other), uv, points, SEARCH_SHARE * W)
+            rows += [(other, first + int(i), at[i]) for i in np.flatnonzero(ok)]
+            seen |= ok
+        rows += [(k, first + int(i), uv[i]) for i in np.flatnonzero(seen)]
+        landmarks += list(points)
+    if not rows:
+        raise InputError("no corner was found again in a neighbour's picture; is this the video?")
+    at = _distorted(camera, np.array([row[2] for row in rows]))
+    seen_in = np.array([row[0] for row in rows], np.int64)
+    return np.array(landmarks), Sightings(seen_in, np.array([row[1] for row in rows]), at)
+
+
+def _matched(
+    stacks: Mapping[int, matching.Pyramid], camera: Camera, poses: F64, pair: tuple[int, int],
+    uv: F64, points: F64, radius: float,
+) -> tuple[F64, np.ndarray[Any, np.dtype[np.bool_]]]:  # fmt: skip
+    """Where the corners of the first view lie in the second, and which were found."""
+    k, other = pair
+    T = se3.inverse(poses[other])
+    predicted = project(camera.K, se3.transform(T, points))
+    beside = []
+    for axis in range(2):  # what a step in the first picture is in the second, on the ground
+        ways = rays(camera.K, uv + 8.0 * np.eye(2)[axis]) @ poses[k][:3, :3].T
+        far = (points[:, 2] - poses[k][2, 3]) / np.where(ways[:, 2] < -0.1, ways[:, 2], np.nan)
+        there = se3.transform(T, poses[k][:3, 3] + ways * far[:, None])
+        beside.append((project(camera.K, there) - predicted) / 8.0)
+    warp = np.stack(beside, axis=2)
+    found = matching.match(stacks[k], uv, stacks[other], predicted, radius, warp, CORNERS)
+    return found.uv_px.astype(np.float64), np.asarray(found.ok)
+
+
+def _distorted(camera: Camera, uv: F64) -> F64:
+    """(M, 2) pixels of the camera's own pictures, from those without distortion."""
+    ahead = rays(camera.K, uv)
+    zero = np.zeros(3)
+    out, _ = cv2.projectPoints(ahead[:, None], zero, zero, camera.K, camera.distortion)
+    return np.asarray(out.reshape(-1, 2), np.float64)
+
+
+def found_camera(
+    pictures: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float, fixes: F64,
+    sigma_fixes: F64,
+) -> SelfCalibrated:  # fmt: skip
+    """The camera as the flight tells it; InputError, in one line, when it does not."""
+    landmarks, seen = sightings(pictures, camera, poses, ground_m)
+    try:
+        found = self_calibrate(camera, poses, landmarks, seen, fixes, sigma_fixes)
+    except (ValueError, RuntimeError) as error:  # GTSAM's of an ill-posed problem
+        raise InputError(f"--intrinsics: {str(error).strip().splitlines()[0]}") from error
+    if found.why_not:
+        raise InputError(f"--intrinsics: {found.why_not}; nothing was changed")
+    return found
+
+
+def write(found: SelfCalibrated, given: Camera, folder: Path) -> dict[str, Any]:
+    """Write the camera file into ``folder``; the figures of it."""
+    path = folder / FILE
+    folder.mkdir(parents=True, exist_ok=True)
+    save_camera(path, found.camera)
+    new, old = found.camera, given
+    return {
+        "camera_file": str(path),
+        "focal_px": [round(float(old.K[0, 0]), 2), round(float(new.K[0, 0]), 2)],
+        "sigma_focal_percent": round(100.0 * found.sigma_focal, 3),
+        "centre_px": [[round(float(v), 1) for v in c.K[:2, 2]] for c in (old, new)],
+        "k1_k2": [[round(float(v), 4) for v in c.distortion[:2]] for c in (old, new)],
+        "rms_px": [round(found.rms_before_px, 2), round(found.rms_after_px, 2)],
+    }

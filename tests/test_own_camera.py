@@ -1,0 +1,115 @@
+"""The camera found from rendered pictures of a flight, and what the command refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.ndimage as ndi
+import yaml
+from typer.testing import CliRunner
+
+from recon import se3
+from recon.camera_model import rays
+from recon.types import F64, U8, Camera
+from service.cli import app
+from service.errors import InputError
+from service.refine.own_camera import FILE, found_camera, sightings, write
+
+SIZE = (480, 270)
+TRUE = Camera(
+    np.array([[360.0, 0.0, 241.0], [0.0, 360.0, 133.0], [0.0, 0.0, 1.0]]), np.zeros(5), SIZE
+)
+TEXEL_M = 0.16
+
+
+def _texture() -> F64:
+    rng = np.random.default_rng(3)
+    layers = [ndi.gaussian_filter(rng.normal(size=(1100, 1100)), 1.3 * 2.0**k) for k in range(5)]
+    total = np.asarray(sum(2.0**k * layer / layer.std() for k, layer in enumerate(layers)))
+    return np.asarray(128 + 45 * (total - total.mean()) / total.std())
+
+
+TEXTURE = _texture()
+
+
+def _height(x: F64, y: F64) -> F64:
+    return np.asarray(2.0 * np.sin(x / 9.0) * np.cos(y / 11.0))
+
+
+def _picture(T: F64, seed: int) -> U8:
+    """The ground through the true camera, with noise."""
+    w, h = SIZE
+    v, u = np.mgrid[0:h, 0:w].astype(np.float64)
+    ways = rays(TRUE.K, np.column_stack([u.ravel(), v.ravel()])) @ T[:3, :3].T
+    z = np.full(len(ways), T[2, 3])
+    for _ in range(8):
+        p = T[:3, 3] + ways * z[:, None]
+        z += (p[:, 2] - _height(p[:, 0], p[:, 1])) / -ways[:, 2]
+    p = (T[:3, 3] + ways * z[:, None])[:, :2] / TEXEL_M + 550
+    grey = ndi.map_coordinates(TEXTURE, p.T, order=1, mode="reflect").reshape(h, w)
+    noise = np.random.default_rng(seed).normal(size=grey.shape)
+    return np.asarray(np.clip(grey + noise, 0, 255), np.uint8)
+
+
+def _pose(x: float, y: float, yaw: float, ahead_deg: float) -> F64:
+    R = se3.so3_exp(np.array([0.0, 0.0, -yaw])).T @ np.diag([1.0, -1.0, -1.0])
+    R = R @ se3.so3_exp(np.array([np.radians(ahead_deg), 0.0, 0.0]))
+    return se3.compose(R, np.array([x, y, 60.0]))
+
+
+def _flight(ahead_deg: float) -> F64:
+    """A half circle, looking ahead of straight down, or straight lines when that is 0."""
+    if ahead_deg == 0.0:
+        return np.array([_pose(0.0, 5.0 * k - 15.0, 0.0, 0.0) for k in range(7)])
+    angles = np.linspace(0.0, np.pi, 13)
+    return np.array(
+        [_pose(25 * (1 - np.cos(a)) - 25, 25 * np.sin(a), -a, ahead_deg) for a in angles]
+    )
+
+
+WRONG = Camera(TRUE.K * [[1.02, 1, 1], [1, 1.02, 1], [1, 1, 1]], np.zeros(5), SIZE)
+
+
+def _off(poses: F64) -> F64:
+    rng = np.random.default_rng(8)
+    return np.array([se3.exp(rng.normal(size=6) * ([3e-3] * 3 + [0.15] * 3)) @ T for T in poses])
+
+
+def test_the_pictures_of_an_oblique_turn_tell_the_focal_length(tmp_path: Path) -> None:
+    poses = _flight(38.0)
+    pictures = {k: _picture(T, k) for k, T in enumerate(poses)}
+    fixes, sigma = poses[:, :3, 3], np.full((len(poses), 3), 0.5)
+    found = found_camera(pictures, WRONG, _off(poses), 0.0, fixes, sigma)
+    assert abs(found.camera.K[0, 0] / 360.0 - 1.0) < 0.003
+    assert found.rms_after_px < 0.3 * found.rms_before_px
+    figures = write(found, WRONG, tmp_path)
+    kept = yaml.safe_load((tmp_path / FILE).read_text(encoding="utf-8"))
+    assert kept["camera_matrix"]["data"][0] == pytest.approx(found.camera.K[0, 0])
+    assert figures["focal_px"] == [367.2, pytest.approx(360.0, abs=1.1)]
+
+
+def test_a_straight_line_looking_down_is_refused_in_one_line() -> None:
+    poses = _flight(0.0)
+    pictures = {k: _picture(T, k) for k, T in enumerate(poses)}
+    fixes, sigma = poses[:, :3, 3], np.full((len(poses), 3), 1.0)
+    with pytest.raises(InputError, match="cannot tell the focal length") as refused:
+        found_camera(pictures, WRONG, _off(poses), 0.0, fixes, sigma)
+    assert "\n" not in str(refused.value) and "nothing was changed" in str(refused.value)
+
+
+def test_pictures_of_something_else_are_refused() -> None:
+    poses = _flight(0.0)
+    blank = {k: np.full((SIZE[1], SIZE[0]), 100, np.uint8) for k in range(len(poses))}
+    with pytest.raises(InputError, match="is this the video"):
+        sightings(blank, WRONG, poses, 0.0)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--intrinsics"], ["--video", "x.mp4"], ["--intrinsics", "--video", "x", "--undo"]],
+)
+def test_the_command_says_what_goes_together(tmp_path: Path, arguments: list[str]) -> None:
+    refused = CliRunner().invoke(app, ["refine", str(tmp_path), *arguments])
+    assert isinstance(refused.exception, InputError) and "--video" in str(refused.exception)

@@ -1,0 +1,150 @@
+"""A camera found again from the flight, against projections by OpenCV; refused where it must be."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.self_calibration import Sightings, self_calibrate, without_k3
+from recon.types import F64, Camera
+
+SIZE = (1280, 720)
+TRUE = Camera(
+    np.array([[960.0, 0.0, 643.3], [0.0, 960.0, 356.6], [0.0, 0.0, 1.0]]),
+    np.array([-0.12, 0.03, 0.0, 0.0, 0.0]), SIZE,
+)  # fmt: skip
+SIGMA_PX = 0.3
+
+
+def _pose(x: float, y: float, z: float, yaw: float, ahead: float) -> F64:
+    R = se3.so3_exp(np.array([0.0, 0.0, -yaw])).T @ np.diag([1.0, -1.0, -1.0])
+    return se3.compose(R @ se3.so3_exp(np.array([ahead, 0.0, 0.0])), np.array([x, y, z]))
+
+
+def _oblique_turn() -> F64:
+    """Out, round and back, looking 25 degrees ahead of straight down."""
+    tilt, out = np.radians(25.0), []
+    for k in range(8):
+        out.append(_pose(0.0, 6.0 * k, 60.0, 0.0, tilt))
+    for k in range(1, 6):
+        angle = np.pi * k / 6
+        place = 14.0 * (1 - np.cos(angle)), 42.0 + 14.0 * np.sin(angle)
+        out.append(_pose(*place, 60.0, -angle, tilt))
+    for k in range(8):
+        out.append(_pose(28.0, 42.0 - 6.0 * k, 60.0, np.pi, tilt))
+    return np.array(out)
+
+
+def _nadir(heights: tuple[float, ...]) -> F64:
+    return np.array(
+        [_pose(6.0 * k, 15.0 * i, z, 0.0, 0.0) for i, z in enumerate(heights) for k in range(10)]
+    )
+
+
+def _shown(points: F64, camera: Camera) -> F64:
+    """(N, 2) distorted pixels of points in the camera's frame, by OpenCV."""
+    zero = np.zeros(3)
+    uv, _ = cv2.projectPoints(points[:, None], zero, zero, camera.K, camera.distortion)
+    return np.asarray(uv[:, 0], np.float64)
+
+
+def _seen(poses: F64, camera: Camera, seed: int = 0) -> tuple[F64, Sightings]:
+    """Landmarks on gentle ground and where OpenCV projects them to, with noise."""
+    rng = np.random.default_rng(seed)
+    low, high = poses[:, :2, 3].min(axis=0) - 35, poses[:, :2, 3].max(axis=0) + 35
+    spots = rng.uniform(low, high, (600, 2))
+    points = np.column_stack([spots, 2.0 * np.sin(spots[:, 0] / 15) + rng.uniform(0, 3, 600)])
+    view, landmark, uv = [], [], []
+    for k, T in enumerate(poses):
+        T_camera_world = se3.inverse(T)
+        here = se3.transform(T_camera_world, points)
+        flat = here[:, :2] / here[:, 2:]
+        near = np.flatnonzero((here[:, 2] > 1) & (np.abs(flat) < [0.72, 0.42]).all(axis=1))
+        shown = _shown(here[near], camera)
+        inside = ((shown >= 0) & (shown < SIZE)).all(axis=1)
+        view += [k] * int(inside.sum())
+        landmark += near[inside].tolist()
+        uv.append(shown[inside])
+    noisy = np.concatenate(uv) + rng.normal(size=(len(view), 2)) * SIGMA_PX
+    return points, Sightings(np.array(view), np.array(landmark), noisy)
+
+
+def _guess(points: F64, poses: F64, seed: int = 5) -> tuple[F64, F64]:
+    """Poses and landmarks as a scan with a wrong camera has them."""
+    rng = np.random.default_rng(seed)
+    off = np.array([se3.exp(rng.normal(size=6) * [2e-3, 2e-3, 2e-3, 0.1, 0.1, 0.1]) @ T
+                    for T in poses])  # fmt: skip
+    return off, points + rng.normal(size=points.shape) * 0.3
+
+
+WRONG = Camera(TRUE.K * [[1.02, 1, 1], [1, 1.02, 1], [1, 1, 1]], np.zeros(5), SIZE)
+
+
+def test_a_focal_length_two_percent_off_is_found_on_an_oblique_turn() -> None:
+    poses = _oblique_turn()
+    points, seen = _seen(poses, TRUE)
+    fixes = poses[:, :3, 3] + np.random.default_rng(3).normal(size=(len(poses), 3)) * 0.5
+    start, near = _guess(points, poses)
+    found = self_calibrate(WRONG, start, near, seen, fixes, np.full((len(poses), 3), 0.5))
+    assert not found.why_not
+    assert abs(found.camera.K[0, 0] / 960.0 - 1.0) < 0.003
+    assert abs(found.camera.K[1, 1] / 960.0 - 1.0) < 0.003
+    assert np.abs(found.camera.K[:2, 2] - TRUE.K[:2, 2]).max() < 6.0
+    assert np.abs(found.camera.distortion[:2] - TRUE.distortion[:2]).max() < 0.03
+    assert abs(found.camera.K[0, 0] - 960.0) < 4.0 * found.sigma_focal * 960.0
+    assert found.rms_before_px > 3 * found.rms_after_px and found.rms_after_px < 0.4
+    assert found.camera.size_px == SIZE
+
+
+def test_straight_down_from_one_height_it_cannot_be_told() -> None:
+    poses = _nadir((60.0, 60.0))
+    points, seen = _seen(poses, TRUE)
+    start, near = _guess(points, poses)
+    none = np.full((len(poses), 3), np.nan)
+    found = self_calibrate(WRONG, start, near, seen, none, none)
+    assert "straight down from one height" in found.why_not
+
+
+def test_two_heights_known_to_centimetres_tell_it() -> None:
+    poses = _nadir((60.0, 90.0))
+    points, seen = _seen(poses, TRUE)
+    start, near = _guess(points, poses)
+    fixes = poses[:, :3, 3] + np.random.default_rng(3).normal(size=(len(poses), 3)) * 0.02
+    found = self_calibrate(WRONG, start, near, seen, fixes, np.full((len(poses), 3), 0.02))
+    assert not found.why_not and abs(found.camera.K[0, 0] / 960.0 - 1.0) < 0.003
+
+
+def test_a_camera_beyond_belief_and_wild_sightings() -> None:
+    poses = _oblique_turn()
+    points, seen = _seen(poses, TRUE)
+    start, near = _guess(points, poses)
+    fixes, sigma = poses[:, :3, 3], np.full((len(poses), 3), 0.3)
+    uv = seen.uv_px.copy()
+    uv[::23] += np.random.default_rng(1).uniform(-60, 60, uv[::23].shape)
+    wild = Sightings(seen.view, seen.landmark, uv)
+    found = self_calibrate(WRONG, start, near, wild, fixes, sigma)
+    assert not found.why_not and abs(found.camera.K[0, 0] / 960.0 - 1.0) < 0.003
+    far = Camera(TRUE.K * [[1.25, 1, 1], [1, 1.25, 1], [1, 1, 1]], np.zeros(5), SIZE)
+    assert "chessboard" in self_calibrate(far, start, near, seen, fixes, sigma).why_not
+
+
+def test_the_third_radial_term_is_taken_out_of_the_pixels() -> None:
+    full = Camera(TRUE.K, np.array([-0.12, 0.03, 0.001, -0.002, 0.02]), SIZE)
+    fewer = Camera(TRUE.K, np.array([-0.12, 0.03, 0.001, -0.002, 0.0]), SIZE)
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.5, 0.5, 40), rng.uniform(-0.3, 0.3, 40), np.ones(40)])
+    shown = [_shown(points, c) for c in (full, fewer)]
+    np.testing.assert_allclose(without_k3(full, shown[0]), shown[1], atol=0.02)
+    assert without_k3(fewer, shown[1]) is shown[1]
+
+
+def test_wrong_calls_are_refused() -> None:
+    poses = _nadir((60.0,))
+    points, seen = _seen(poses, TRUE)
+    few = Sightings(seen.view[:20], seen.landmark[:20], seen.uv_px[:20])
+    with pytest.raises(ValueError, match="too few"):
+        self_calibrate(TRUE, poses, points, few, poses[:, :3, 3], poses[:, :3, 3])
+    with pytest.raises(ValueError, match="three poses"):
+        self_calibrate(TRUE, poses[:2], points, seen, poses[:2, :3, 3], poses[:2, :3, 3])
