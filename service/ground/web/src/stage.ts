@@ -142,7 +142,7 @@ export class Stage {
       const aside = Math.abs(corner.dot(right)) / (high * this.camera.aspect);
       least = Math.max(least, corner.dot(back) + Math.max(aside, Math.abs(corner.dot(up)) / high));
     }
-    return 1.05 * least;
+    return 1.12 * least;
   }
 
   fieldOfView(degrees: number): void {
