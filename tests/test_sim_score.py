@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ from service.errors import InputError
 from service.exports.glb import glb
 from service.georeference import LocalFrame
 from service.scans.las import write_laz
-from service.sim.above import view_from_above
+from service.sim.above import options_of, view_from_above
+from service.sim.recording import Faults, SimulationOptions
 from service.sim.surface_file import read_surface
 from service.sim.truth import heights_below, read_truth
 
@@ -287,3 +289,12 @@ def test_a_file_that_is_none_is_named(flight: Path, tmp_path: Path) -> None:
     result = CliRunner().invoke(app, arguments)
     assert isinstance(result.exception, InputError)
     assert "dsm.tif" in str(result.exception) and "\n" not in str(result.exception)
+
+
+def test_options_come_back_from_their_file() -> None:
+    options = SimulationOptions(
+        faults=Faults(blank=((3, 2),), exposure=((1.0, 0.5),)), photos=Path("mosaic"), seed=7
+    )
+    values = json.loads(json.dumps(asdict(replace(options, photos=None))))
+    assert options_of(values) == replace(options, photos=None)
+    assert options_of(values | {"photos": "mosaic", "of later": 1}) == options
