@@ -355,6 +355,15 @@ def test_a_point_two_metres_off_is_told_from_the_others(flight: Flight) -> None:
     assert errors(flight).max() < 0.2
 
 
+def test_points_in_one_corner_are_told(flight: Flight) -> None:
+    corner = {"A": (4.0, -6.0), "B": (14.0, -4.0), "D": (12.0, 6.0), "C1": (36.0, 18.0)}
+    gcp = write_csv(flight.folder / "points.csv", flight.survey(corner))
+    (note,) = refine(flight.scan, RefineOptions(gcp))["notes"]
+    assert "span 10 m of 42 m flown" in note
+    gcp = write_csv(flight.folder / "all.csv", flight.survey(SPOTS))
+    assert refine(flight.scan, RefineOptions(gcp))["notes"] == []
+
+
 def test_check_points_never_take_part(flight: Flight) -> None:
     rows = flight.survey(SPOTS)
     one = refine(

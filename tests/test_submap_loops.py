@@ -8,7 +8,7 @@ import scipy.ndimage as ndi
 
 from recon import se3
 from recon.camera_model import rays
-from recon.ground_control import Track, adjust, supported
+from recon.ground_control import Closure, Track, adjust, supported
 from recon.loop_closure import LoopView
 from recon.submap import filled
 from recon.submap_loops import SubmapLoopConfig, verify_surfaces
@@ -124,6 +124,26 @@ def test_another_ground_and_views_without_any_are_no_loop() -> None:
     assert verify_surfaces(_view(a), _view(b), guess) is None
     assert verify_surfaces(_view(a), _view(_masked(b, slice(0, 0))), guess) is None
     assert verify_surfaces(_view(_masked(a, slice(0, 0))), _view(b), guess) is None
+
+
+def test_a_repeated_texture_is_no_loop_at_the_wrong_place() -> None:
+    """Every eight metres the same: a track that has slipped by as much finds perfect matches."""
+    period = round(8.0 / METRES)
+    tiled = np.tile(GROUND[:period, :period], (900 // period + 1,) * 2)[:900, :900]
+    poses = _legs()
+    slip = se3.compose(np.eye(3), np.array([period * METRES, 0.0, 0.0]))
+    loops = []
+    for a, b in ((1, 8), (2, 7), (2, 8)):
+        one, two = (_view(_keyframe(k, poses[k], tiled)) for k in (a, b))
+        guess = se3.inverse(poses[a]) @ slip @ poses[b]
+        found = verify_surfaces(one, two, guess)
+        if found is not None:
+            loops.append(Closure(a, b, found.T_a_b, found.covariance))
+    truth: F64 = np.array(poses)
+    spread = np.array([np.diag([0.01**2] * 3 + [0.3**2] * 3)] * 10)
+    track = Track(truth, np.arange(10) * 5.0, spread, (), supported(loops, truth))
+    held = adjust(track)
+    assert np.abs(held.poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.1
 
 
 def test_stored_keyframes_alone_bring_two_oblique_legs_together() -> None:

@@ -35,6 +35,10 @@ MOST_VIEWS = 6
 MOST_TRIPLES = 400
 
 
+LEAST_SPAN = 0.5
+"""Of the track's length, that control points should span."""
+
+
 @dataclass(slots=True, eq=False)
 class Candidate:
     """A surveyed point with its marks, and what became of it."""
@@ -251,6 +255,26 @@ def _odd_one(voters: Sequence[Candidate]) -> tuple[Candidate, F64] | None:
         if ratio > by:
             worst, by = (one, off), ratio
     return worst
+
+
+def clustered(candidates: Sequence[Candidate], places_m: F64) -> str:
+    """What to tell when the control points span little of the track (N, 3); empty otherwise."""
+    points = [
+        c.surveyed_m for c in candidates
+        if c.usable and not c.point.is_check and c.surveyed_m is not None
+    ]  # fmt: skip
+    if not points:
+        return ""
+    about = places_m[:, :2] - places_m[:, :2].mean(axis=0)
+    along = np.linalg.svd(about, full_matrices=False)[2][0]
+    flown = float(np.ptp(places_m[:, :2] @ along))
+    span = float(np.ptp(np.array(points)[:, :2] @ along))
+    if span >= LEAST_SPAN * flown:
+        return ""
+    return (
+        f"the control points span {span:.0f} m of {flown:.0f} m flown: away from them the map "
+        "rests on the flight's own readings; spread them over the whole site"
+    )
 
 
 def _far(one: Candidate, frame: LocalFrame) -> str:

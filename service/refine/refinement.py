@@ -41,6 +41,7 @@ from service.refine.control_points import (
     Candidate,
     Pictures,
     candidates_of,
+    clustered,
     place_by_survey,
     screen,
 )
@@ -188,6 +189,8 @@ class _Refinement:
         kept = [c for c in supported([*flown, *closures], track.poses) if c not in flown]
         track = replace(track, loops=[*flown, *kept])
         found = self._adjusted(track, candidates)
+        told_clustered = clustered(candidates, track.poses[:, :3, 3])
+        self.notes += [told_clustered] if told_clustered else []
         seqs = [s.seq for s in self.states]
         verified = len(flown) + len(closures)
         figures = told(seqs, track, found, candidates, verified, self._ahead_m())
