@@ -283,6 +283,38 @@ def test_a_kernel_is_used_only_when_it_agrees_and_is_faster(
     assert "fused kernels: none, No module named 'triton'" in told()
 
 
+def test_a_backend_on_cuda_is_given_the_kernels_that_pay(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Compiled ones are kept where the service may write; on a processor nothing is tried."""
+    from recon.backends.torch_kernels import Kernels
+    from service.compute import backend_choice, fused_kernels
+
+    class Device:
+        """Takes kernels."""
+
+        name = "torch"
+
+        def __init__(self, device: str) -> None:
+            self.device = device
+            self.kernels: Kernels | None = None
+
+        def use(self, kernels: Kernels) -> None:
+            self.kernels = kernels
+
+    chosen = Kernels()
+    monkeypatch.setattr(fused_kernels, "choose_kernels", lambda device: chosen)
+    monkeypatch.setenv("CACHE_DIRECTORY", str(tmp_path))
+    monkeypatch.setenv("TRITON_CACHE_DIR", "given")
+    monkeypatch.delenv("TRITON_CACHE_DIR")
+    for device, want in (("cuda", chosen), ("cpu", None)):
+        backend = Device(device)
+        given: Any = backend
+        assert backend_choice.with_kernels(given) is given
+        assert backend.kernels is want
+    assert os.environ["TRITON_CACHE_DIR"] == str(tmp_path / "engines" / "triton")
+
+
 def test_the_backend_computes_with_the_kernels_it_is_given(device: str) -> None:
     """Calls and whole path; what was built before is built anew."""
     from recon.backends.torch_backend import TorchBackend

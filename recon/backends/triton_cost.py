@@ -46,7 +46,7 @@ def matching_cost(
     return cost
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["height", "width"])
 def _census(image, words, height, width, radius, PIXELS: tl.constexpr):
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     here = at < height * width
@@ -76,7 +76,7 @@ def _ones(word):
     return (word + (word >> 8) + (word >> 16) + (word >> 24)) & 63
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["labels", "height", "width", "first"])
 def _cost(
     left, right, words, true, cost, labels, height, width, first, most_bits, bit_weight,
     most_grey, grey_weight, unseen, far, PIXELS: tl.constexpr,

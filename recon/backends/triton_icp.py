@@ -114,7 +114,7 @@ def _partner(points, normals, sigmas, elements, K, T, i, count, height, width, g
     return px, py, pz, ex, ey, ez, nx, ny, nz, information, tl.where(found, r, 0.0), found
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "height", "width"])
 def _residuals(
     points, normals, sigmas, elements, K, T, residual, found, count, height, width, gate,
     POINTS: tl.constexpr,
@@ -149,7 +149,7 @@ def _products(out, weight, a, b, c, d, e, f, x, y, z, u, v, w):
     _row(out + 30, weight * f, x, y, z, u, v, w)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "height", "width", "tukey"])
 def _normal_equations(
     points, normals, sigmas, elements, K, T, centre, scale, partial, count, height, width, gate,
     limit, tukey, POINTS: tl.constexpr, ROW: tl.constexpr,

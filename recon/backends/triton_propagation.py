@@ -36,7 +36,7 @@ def sweep(data: Tensor, messages: Tensor, slope: Tensor, cut: Tensor, colour: in
     )
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["colour", "labels", "height", "width"])
 def _sweep(
     data, messages, slope, cut, colour, labels, height,
     width, CELLS: tl.constexpr,

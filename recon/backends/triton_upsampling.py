@@ -48,7 +48,7 @@ def bilateral(
     return out, sure
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["height", "width", "pitch", "plane"])
 def _bilateral(
     layers, guide, rows, log_y, columns, log_x, out, sure,
     height, width, pitch, plane, scale, floor, support,

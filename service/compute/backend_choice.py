@@ -241,8 +241,14 @@ def named_backend(name: str) -> Backend:
 
 
 def with_kernels(backend: Backend) -> Backend:
-    """The backend, on CUDA with the fused kernels that proved right and faster there."""
+    """The backend, on CUDA with the fused kernels that proved right and faster there.
+
+    What Triton compiles is kept beside the engines of other GPU providers.
+    """
     if isinstance(backend, KernelBackend) and backend.device.startswith("cuda"):
+        folder = engine_folder()
+        if folder is not None:
+            os.environ.setdefault("TRITON_CACHE_DIR", str(Path(folder) / "triton"))
         from service.compute.fused_kernels import choose_kernels
 
         backend.use(choose_kernels(backend.device))
