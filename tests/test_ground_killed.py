@@ -60,7 +60,7 @@ from service.ground import receiver
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream.session import SessionConfig
 
-receiver._deliver = lambda *_: None
+receiver.deliver = lambda _: None
 session = SessionConfig(mode="router", listen=(sys.argv[2],))
 station = Receiver(ReceiverConfig(Path(sys.argv[1]), session))
 station.start()

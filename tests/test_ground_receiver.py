@@ -90,7 +90,7 @@ def assert_equal(onboard: ScanStore, path: Path) -> None:
 def written(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """The folders whose deliverables were asked for; the files are another module's matter."""
     folders: list[Path] = []
-    monkeypatch.setattr(receiver_module, "_deliver", lambda folder, _: folders.append(folder))
+    monkeypatch.setattr(receiver_module, "deliver", lambda scan: folders.append(scan.folder))
     return folders
 
 

@@ -41,7 +41,7 @@ def session_config(home: Path, **more: object) -> SessionConfig:
 def ground(
     fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[tuple[Receiver, str]]:
-    monkeypatch.setattr(receiver_module, "_deliver", lambda *_: None)
+    monkeypatch.setattr(receiver_module, "deliver", lambda _: None)
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tls/127.0.0.1:{probe.getsockname()[1]}"

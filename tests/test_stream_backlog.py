@@ -56,7 +56,7 @@ def test_only_what_was_not_delivered_is_offered(tmp_path: Path) -> None:
 def test_the_backlog_reaches_the_ground_and_is_then_empty(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(receiver_module, "_deliver", lambda *_: None)
+    monkeypatch.setattr(receiver_module, "deliver", lambda _: None)
     scans = tmp_path / "scans"
     make_scan(scans, "one")
     make_scan(scans, "two", finished=False)
@@ -88,7 +88,7 @@ def test_the_backlog_reaches_the_ground_and_is_then_empty(
 def test_the_daemon_offers_earlier_scans_between_flights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(receiver_module, "_deliver", lambda *_: None)
+    monkeypatch.setattr(receiver_module, "deliver", lambda _: None)
     scans = tmp_path / "scans"
     make_scan(scans, "one")
     with socket.socket() as probe:

@@ -258,7 +258,7 @@ def test_over_a_real_link_into_the_ground_station(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("zenoh")
-    monkeypatch.setattr(receiver_module, "_deliver", lambda *_: None)
+    monkeypatch.setattr(receiver_module, "deliver", lambda _: None)
     with socket.socket(type=socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         udp = probe.getsockname()[1]

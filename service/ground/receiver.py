@@ -13,14 +13,14 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.ground.intake import FINE, SILENCE_S, SMALL, ScanIntake
+from service.ground.received import ReceivedScan, deliver
 from service.stream.messages import count, pack_ask, pack_held, unpack_head
 from service.stream.naming import ROOT, place_of, station_name
 from service.stream.radio_messages import RADIO_NOTE
@@ -57,23 +57,6 @@ class ReceiverConfig:
     refresh_s: float = 0.0  # write deliverables of growing scans so often; 0: when complete
 
 
-@dataclass(slots=True, eq=False)
-class _Scan:
-    drone: str
-    scan_id: str
-    intake: ScanIntake
-    reported_at: float = -1e9
-    changed: bool = True  # since the last report
-    unwritten: bool = False  # since the last deliverables
-    rest_until: float = 0.0
-    writing: Future[None] | None = None
-    radio_messages: int = 0
-
-    @property
-    def key(self) -> str:
-        return f"{ROOT}/{self.drone}/{self.scan_id}"
-
-
 class Receiver:
     """Receives on threads of its own between :meth:`start` and :meth:`close`.
 
@@ -88,7 +71,7 @@ class Receiver:
             self._name = config.name or station_name(config.store)
         except OSError as error:
             raise InputError(f"cannot write the store {config.store}: {error.strerror}") from error
-        self._scans: dict[tuple[str, str], _Scan] = {}
+        self._scans: dict[tuple[str, str], ReceivedScan] = {}
         self._events: queue.Queue[Callable[[float], None]] = queue.Queue(MAX_WAITING)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="receiver", daemon=True)
@@ -130,30 +113,7 @@ class Receiver:
 
     def progress(self) -> list[dict[str, Any]]:
         """One entry per scan: drone, scan, items held and missing, bytes, lags, folder."""
-        return [self._scan_progress(scan) for scan in list(self._scans.values())]
-
-    def _scan_progress(self, scan: _Scan) -> dict[str, Any]:
-        intake = scan.intake
-        missing = intake.missing()
-        lags = {
-            kind: round(median(lags), 3)
-            for kind, lags in list(intake.progress.lag_s.items())
-            if lags and kind.startswith("k")
-        }
-        return {
-            "drone": scan.drone,
-            "scan": scan.scan_id,
-            "folder": str(self.folder(scan.drone, scan.scan_id)),
-            "held": {kind: len(n) for kind, n in intake.store.numbers().items()},
-            "missing": {kind: len(n) for kind, n in missing.items()},
-            "finished": intake.store.finished,
-            "complete": intake.complete and scan.writing is not None and scan.writing.done(),
-            "received_bytes": intake.progress.received_bytes,
-            "duplicates": intake.progress.duplicates,
-            "refused": intake.store.refused,
-            "radio_messages": scan.radio_messages,
-            "lag_s": lags,
-        }
+        return [scan.progress() for scan in list(self._scans.values())]
 
     # The worker
 
@@ -205,7 +165,7 @@ class Receiver:
         with contextlib.suppress(zenoh.ZError):
             session.get(f"{ROOT}/*/*/head", lambda _: None, timeout=LOOK_AROUND_S)
 
-    def _tend(self, session: zenoh.Session, scan: _Scan, now: float) -> None:
+    def _tend(self, session: zenoh.Session, scan: ReceivedScan, now: float) -> None:
         """Report, ask, and write what is complete."""
         if now - scan.intake.head_at > DRONE_TIMEOUT_S:
             return
@@ -213,7 +173,7 @@ class Receiver:
         if now - scan.reported_at >= pause:
             scan.reported_at, scan.changed = now, False
             self._put(session, f"{scan.key}/held/{self._name}", pack_held(scan.intake.held()))
-        if scan.unwritten and scan.intake.complete and _idle(scan.writing):
+        if scan.unwritten and scan.intake.complete and scan.idle:
             scan.changed = True
             self._write(scan)
         if now >= scan.rest_until:
@@ -234,7 +194,7 @@ class Receiver:
         except zenoh.ZError as error:
             log.debug("report not sent: %s", error)
 
-    def _ask(self, session: zenoh.Session, scan: _Scan, slot: int, now: float) -> None:
+    def _ask(self, session: zenoh.Session, scan: ReceivedScan, slot: int, now: float) -> None:
         import zenoh
 
         wanted = scan.intake.next_ask(slot, now)
@@ -264,11 +224,10 @@ class Receiver:
         except zenoh.ZError as error:
             log.debug("not asked: %s", error)
 
-    def _write(self, scan: _Scan) -> None:
+    def _write(self, scan: ReceivedScan) -> None:
         """Have the scan's deliverables written beside its database."""
         scan.unwritten = False
-        folder = self.folder(scan.drone, scan.scan_id)
-        scan.writing = self._writer.submit(_deliver, folder, scan.intake.store)
+        scan.writing = self._writer.submit(deliver, scan)
 
     # What comes
 
@@ -339,10 +298,10 @@ class Receiver:
             return
         self._refresh_at = now + self._config.refresh_s
         for scan in self._scans.values():
-            if scan.unwritten and _idle(scan.writing):
+            if scan.unwritten and scan.idle:
                 self._write(scan)
 
-    def _scan(self, drone: str, scan_id: str) -> _Scan | None:
+    def _scan(self, drone: str, scan_id: str) -> ReceivedScan | None:
         found = self._scans.get((drone, scan_id))
         if found is not None:
             return found
@@ -361,20 +320,9 @@ class Receiver:
             log.error("%s", error)
             self.dropped += 1
             return None
-        scan = self._scans[drone, scan_id] = _Scan(drone, scan_id, ScanIntake(store, self._name))
+        scan = self._scans[drone, scan_id] = ReceivedScan(
+            drone, scan_id, self.folder(drone, scan_id), ScanIntake(store, self._name)
+        )
         scan.unwritten = True
         log.info("receiving %s/%s", drone, scan_id)
         return scan
-
-
-def _idle(writing: Future[None] | None) -> bool:
-    return writing is None or writing.done()
-
-
-def _deliver(folder: Path, store: ScanStore) -> None:
-    from service.scans.folder import write_deliverables
-
-    try:
-        write_deliverables(folder, store, {})
-    except (SkyreliefError, OSError) as error:
-        log.error("deliverables of %s not written: %s", folder, error)
