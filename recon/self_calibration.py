@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.graph_factors import matrix, pose3
-from recon.types import F64, Camera
+from recon.types import F64, Bool, Camera
 
 I64 = npt.NDArray[np.int64]
 
-FAR_OFF_M = 50.0
+FAR_OFF_M = 20.0
 """What a landmark may be off by beforehand."""
 
 MIDDLE_SHARE = 0.8
@@ -93,13 +93,20 @@ def self_calibrate(
         raise ValueError(f"expected three poses (N, 4, 4) or more with fixes, got {poses.shape}")
     if len(seen.view) < config.least_sightings:
         raise ValueError(f"{len(seen.view)} sightings are too few; {config.least_sightings} needed")
+    seen = _shared(seen, np.ones(len(seen.view), bool))
     first = _Bundle(camera, poses, landmarks, seen, fixes, sigma_fixes, config).solved()
     # Once more without wild sightings and with the pixels' own scatter, on which sigmas rest.
     sigma = float(np.clip(first.rms_after_px / MIDDLE_SHARE, 0.1, 2.0))
     config = replace(config, pixel_sigma=sigma)
-    near = first.errors_px < config.gate_sigmas * sigma
-    seen = Sightings(seen.view[near], seen.landmark[near], seen.uv_px[near])
+    seen = _shared(seen, first.errors_px < config.gate_sigmas * sigma)
     return _Bundle(camera, poses, landmarks, seen, fixes, sigma_fixes, config).solved()
+
+
+def _shared(seen: Sightings, kept: Bool) -> Sightings:
+    """The sightings that are ``kept`` (M,), of landmarks that two or more of them show."""
+    often = np.bincount(seen.landmark[kept], minlength=int(seen.landmark.max()) + 1)
+    kept = kept & (often[seen.landmark] >= 2)
+    return Sightings(seen.view[kept], seen.landmark[kept], seen.uv_px[kept])
 
 
 class _Bundle:

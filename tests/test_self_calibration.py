@@ -125,7 +125,7 @@ def test_a_camera_beyond_belief_and_wild_sightings() -> None:
     uv[::23] += np.random.default_rng(1).uniform(-60, 60, uv[::23].shape)
     wild = Sightings(seen.view, seen.landmark, uv)
     found = self_calibrate(WRONG, start, near, wild, fixes, sigma)
-    assert not found.why_not and abs(found.camera.K[0, 0] / 960.0 - 1.0) < 0.003
+    assert not found.why_not and abs(found.camera.K[0, 0] / 960.0 - 1.0) < 0.005
     far = Camera(TRUE.K * [[1.25, 1, 1], [1, 1.25, 1], [1, 1, 1]], np.zeros(5), SIZE)
     assert "chessboard" in self_calibrate(far, start, near, seen, fixes, sigma).why_not
 

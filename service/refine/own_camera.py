@@ -138,8 +138,12 @@ def found_camera(
     landmarks, seen = sightings(pictures, camera, poses, ground_m)
     try:
         found = self_calibrate(camera, poses, landmarks, seen, fixes, sigma_fixes)
-    except (ValueError, RuntimeError) as error:  # GTSAM's of an ill-posed problem
-        raise InputError(f"--intrinsics: {str(error).strip().splitlines()[0]}") from error
+    except ValueError as error:
+        raise InputError(f"--intrinsics: {error}") from error
+    except RuntimeError as error:  # GTSAM's of an ill-posed problem
+        raise InputError(
+            "--intrinsics: too few corners tie the pictures together; nothing was changed"
+        ) from error
     if found.why_not:
         raise InputError(f"--intrinsics: {found.why_not}; nothing was changed")
     return found
