@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import time
@@ -175,6 +176,15 @@ def test_its_process_ends_with_it_and_ignores_the_terminal() -> None:
     assert len(graph.residuals()["vision"]) == 2
     pid = graph.pid
     graph.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+def test_a_graph_that_nobody_closed_leaves_no_process() -> None:
+    graph = GraphAside()
+    pid = graph.pid
+    del graph
+    gc.collect()
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
 

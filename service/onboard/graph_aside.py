@@ -70,7 +70,6 @@ class _Process:
         self.is_dead = False
         threading.Thread(target=self._write, name="graph orders", daemon=True).start()
         threading.Thread(target=self._read, name="graph answers", daemon=True).start()
-        self._end = weakref.finalize(self, _end, self._child, self._orders)
 
     @property
     def pid(self) -> int:
@@ -85,7 +84,7 @@ class _Process:
 
     def close(self) -> None:
         """End the process and wait for it."""
-        self._end()
+        _end(self._child, self._orders)
 
     def send(self, order: Order) -> None:
         """Put an order into the queue."""
@@ -170,8 +169,7 @@ class GraphAside:
         self._carried: list[_Carried] = []  # keyframes after those of the state
         self._here: Watched | None = None  # the graph, when no process can hold it
         self._version = 0
-        self._process = _Process()
-        self._started = time.monotonic()
+        self._process, self._started = self._begin(), time.monotonic()
 
     def close(self) -> None:
         """End the process. What was told stays readable."""
@@ -308,6 +306,12 @@ class GraphAside:
 
     # ---- the process ---------------------------------------------------------------------------
 
+    def _begin(self) -> _Process:
+        """A process that ends with this object, also when nobody closes it."""
+        process = _Process()
+        weakref.finalize(self, process.close)
+        return process
+
     def _give(self, order: Order) -> None:
         self._orders.append(order)
         if self._here is not None:
@@ -325,7 +329,7 @@ class GraphAside:
         time.sleep(max(left_s, 0.0))
         log.warning("the pose graph's process ended; it is started again with all that it knew")
         self._process.close()
-        self._process, self._started = _Process(), time.monotonic()
+        self._process, self._started = self._begin(), time.monotonic()
         for order in self._orders:
             self._process.send(order)
 
