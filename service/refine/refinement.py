@@ -29,6 +29,7 @@ from recon.ground_control import (
     supported,
 )
 from recon.self_calibration import SelfCalibrated
+from recon.sensor_offsets import constants
 from recon.submap_loops import SubmapLoopConfig
 from recon.types import F64, Camera, Keyframe, PosePrior
 from service.config import CameraConfig, FusionConfig, ScanConfig
@@ -286,7 +287,10 @@ class _Refinement:
         if not any(s is not None and s.lat_deg is not None for s in states):
             self.notes.append(f"{path.name} tells no position of any keyframe: not used")
             return []
-        return [PosePrior() if s is None else rig.prior(s, None) for s in states]
+        priors = [PosePrior() if s is None else rig.prior(s, None) for s in states]
+        span_s = (self.states[-1].time_ns - self.states[0].time_ns) * 1e-9
+        known = constants([([s.T_world_camera for s in self.states], priors)], span_s)
+        return [known.applied(prior) for prior in priors]
 
     # ---- loops -------------------------------------------------------------------------------
 
