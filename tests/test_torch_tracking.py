@@ -16,7 +16,8 @@ import pytest
 from recon import se3
 from recon.matcher import Matcher
 from recon.matching import MatchingConfig
-from recon.odometry import Odometry, OdometryConfig, Tracked
+from recon.odometry import Odometry, Tracked
+from recon.odometry_config import OdometryConfig
 from recon.types import F64, U8, Camera, PosePrior
 from service.compute.backend_choice import FallbackBackend
 from service.config import Config

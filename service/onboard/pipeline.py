@@ -21,7 +21,8 @@ from recon.dead_reckoning import carried
 from recon.exposure import stretch
 from recon.fix_average import FixAverage
 from recon.keyframe_window import landmarks
-from recon.odometry import Odometry, OdometryConfig, Tracked
+from recon.odometry import Odometry, Tracked
+from recon.odometry_config import OdometryConfig
 from recon.sharpness import BlurWatch
 from recon.trajectory import Placed
 from recon.types import U8, Camera, Frame, Keyframe, PosePrior
