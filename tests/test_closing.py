@@ -128,3 +128,4 @@ def test_systemd_is_asked_to_wait_only_while_closing_gets_on(
 def test_memory_settings_are_taken_where_the_library_has_them() -> None:
     assert few_pools()
     assert give_back() in (True, False)
+    assert give_back(collect=True) in (True, False)

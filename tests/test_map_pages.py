@@ -10,7 +10,7 @@ import pytest
 from recon import se3
 from recon.types import F64, DepthMap
 from recon.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
-from service.onboard.map_pages import PagedMap
+from service.onboard.map_pages import MOST_OVER, PagedMap
 
 K: F64 = np.array([[60.0, 0.0, 39.5], [0.0, 60.0, 29.5], [0.0, 0.0, 1.0]])
 NADIR: F64 = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
@@ -68,6 +68,19 @@ def test_a_disk_that_takes_no_pages_keeps_the_map_in_memory(tmp_path: Path) -> N
     for depth in survey()[:40]:
         paged.insert(depth)
     assert paged.tiles_on_disk == 0 and not paged.fresh(view(0.0)).any()
+
+
+def test_more_and_more_surface_under_one_view_is_bounded(tmp_path: Path) -> None:
+    """A map that drifts lays surface over surface where the drone hovers."""
+    paged = PagedMap(CONFIG, tmp_path, most_voxels=2_000)
+    held = []
+    for n in range(40):
+        depth = view(0.0)
+        depth.depth_m[:] += 2.0 * n
+        paged.insert(depth)
+        held.append(len(paged))
+    assert max(held) < MOST_OVER * 2_000 + depth.depth_m.size
+    assert held[-1] > 0 and not paged.fresh(depth).any()
 
 
 def test_tiles_under_a_view_hold_all_of_its_voxels() -> None:

@@ -19,9 +19,14 @@ def few_pools() -> bool:
     return libc is not None and libc.mallopt(M_ARENA_MAX, POOLS) == 1
 
 
-def give_back() -> bool:
-    """True when freed memory went back to the system; to be asked after a scan."""
-    gc.collect()
+def give_back(collect: bool = False) -> bool:
+    """True when freed memory went back to the system: a millisecond or two of work.
+
+    With ``collect`` objects that only refer to each other are freed before, as after a scan;
+    that takes longer.
+    """
+    if collect:
+        gc.collect()
     libc = _libc("malloc_trim")
     return libc is not None and libc.malloc_trim(0) == 1
 

@@ -24,6 +24,7 @@ from service.daemon.control_actions import ControlActions
 from service.daemon.health import HealthServer, Notifier
 from service.daemon.load_control import LoadControl
 from service.daemon.machine import CoreLoad, computer_load, read_machine
+from service.daemon.memory import give_back
 from service.daemon.scanning import Scanning
 from service.daemon.tuning import TUNABLES, parameters_of
 from service.daemon.vehicle_config import vehicle_config
@@ -41,6 +42,9 @@ HUNG_S = 20.0
 
 CLOSING_S = 120.0
 """Closing a scan without a step, a read or a written byte for so long is a hang, too."""
+
+TIDY_S = 2.0
+"""From one look at the machine, its memory and its disk to the next."""
 
 COMPILING_S = 180.0
 """The same before anything was compiled, where nobody ran ``skyrelief warm-up``."""
@@ -190,12 +194,13 @@ class Daemon:
         """Watch the machine, do less when it cannot keep up, keep room on the disk."""
         folder = Path(self.config.scan.folder)
         cores = CoreLoad()
-        while not self._quit.wait(2.0):
+        while not self._quit.wait(TIDY_S):
             keep_free_mib = self.config.scan.keep_free_mib
             machine = read_machine(folder)
             self.vehicle.set_load(computer_load(machine, cores.percent(), keep_free_mib))
             self.load_control.look(machine)
             make_room(folder, keep_free_mib, self.scanning.scan_id)
+            give_back()
 
     def _health(self) -> Health:
         if not self.actions.is_ready:

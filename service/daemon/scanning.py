@@ -228,7 +228,7 @@ class Scanning:
         finally:
             self.scan = self.gate = self._store = None
             self.phase = Phase.IDLE
-            give_back()
+            give_back(collect=True)
             if self._closing is not None:
                 failed = Answer(Result.FAILED, self.fault)
                 self._closing.finish(failed if self.fault else ACCEPTED)

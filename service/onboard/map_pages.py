@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,14 @@ from recon.voxel_map import I64, VoxelMap, VoxelMapConfig, Voxels, tile_of, tile
 
 log = logging.getLogger(__name__)
 
+MOST_OVER = 4
+
 
 class PagedMap:
     """A :class:`recon.voxel_map.VoxelMap` that holds at most about ``most_voxels`` in memory.
+
+    The tiles under the view stay, whatever they hold; where they alone have :data:`MOST_OVER`
+    times as many, the half seen longest ago is forgotten, and that surface is sent again.
 
     ``folder`` is made when the first tile leaves and removed by :meth:`close`. A disk that
     takes no more pages costs bandwidth, not data: the map then forgets the oldest half when
@@ -30,7 +36,8 @@ class PagedMap:
         if most_voxels < 1000:
             raise ValueError(f"most_voxels is {most_voxels}, must be at least 1000")
         self.folder, self.most_voxels = folder, most_voxels
-        self._map = VoxelMap(config)
+        largest = min(config.largest_voxels, MOST_OVER * most_voxels)
+        self._map = VoxelMap(replace(config, largest_voxels=largest))
         self._margin_m = config.voxel_m * (config.largest_reach_voxels + 1)
         self._away: set[int] = set()  # tiles that are on disk
         self._broken = False
