@@ -27,6 +27,7 @@ from service.scans.writing import writing
 NODATA_M = -9999.0
 SHORTEST_CONTOUR_CELLS = 12
 OPEN_STEP_M = 2
+SIDEWAYS_DEG = 15.0
 MOST_OPEN_M, MOST_OPEN_SIDEWAYS_M = 4, 6
 """Free air above a cell that is asked for at most: trees and eaves hang over higher up as well,
 but every metre costs ground at the border of the survey. Looking sideways one sees more of
@@ -51,7 +52,8 @@ def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
 def _open_to_the_sky(scan: ScanView, raster: Raster) -> Raster:
     """``raster`` where the air above was seen to be free, as high as things stand on this site."""
-    highest = min(standing_height(raster), MOST_OPEN_SIDEWAYS_M if scan.oblique else MOST_OPEN_M)
+    sideways = float(np.median(scan.off_nadir_deg)) > SIDEWAYS_DEG
+    highest = min(standing_height(raster), MOST_OPEN_SIDEWAYS_M if sideways else MOST_OPEN_M)
     heights_m = [float(m) for m in range(OPEN_STEP_M, math.ceil(highest) + 1, OPEN_STEP_M)]
     if not heights_m:
         return raster

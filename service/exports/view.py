@@ -80,9 +80,14 @@ class ScanView:
     @cached_property
     def oblique(self) -> bool:
         """True when many keyframes look more than 30 degrees off straight down."""
+        off = self.off_nadir_deg
+        return bool(len(off)) and float((off > 30.0).mean()) > OBLIQUE_SHARE
+
+    @cached_property
+    def off_nadir_deg(self) -> F64:
+        """(K,) how far each keyframe looks off straight down."""
         down = [-k.depth.T_world_camera[2, 2] for k in self.store.keyframes()]
-        off = np.array(down) < np.cos(np.radians(30.0))
-        return bool(len(down)) and float(off.mean()) > OBLIQUE_SHARE
+        return np.asarray(np.degrees(np.arccos(np.clip(down, -1.0, 1.0))), np.float64)
 
     @cached_property
     def fused(self) -> FusedCloud:
