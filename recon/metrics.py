@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from recon import se3
-from recon.triangle_grid import TriangleGrid
+from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F64, Array, Bool
 
 STEEPEST_COSINE = 0.25

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.alignment import Anchor, fit, height_above, height_below, scales
 from recon.camera_model import rays
+from recon.graph.alignment import Anchor, fit, height_above, height_below, scales
 from recon.types import F32, F64, DepthMap, PosePrior
 
 

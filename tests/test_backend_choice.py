@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from recon.backends import Backend
-from recon.belief_propagation import BeliefPropagationConfig
+from recon.stereo.belief_propagation import BeliefPropagationConfig
 from service.compute import backend_choice
 from service.compute.backend_choice import choose_backend, engine_folder
 from service.compute.opening import open_backend

@@ -16,11 +16,11 @@ import pytest
 
 from recon import se3
 from recon.backends import BACKENDS, Backend, load_backend, reference
-from recon.belief_propagation import BeliefPropagationConfig
-from recon.matching_cost import MatchingCostConfig, matching_cost
-from recon.registration import IcpConfig
+from recon.clouds.registration import IcpConfig
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.matching_cost import MatchingCostConfig, matching_cost
+from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F64, U8, DepthMap, DisparityMap
-from recon.upsampling import UpsamplingConfig
 
 NEEDS = {"cpu": "numba", "torch": "torch", "onnx": "onnxruntime"}
 BELIEVE_ALL = BeliefPropagationConfig(

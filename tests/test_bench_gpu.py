@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon.belief_propagation import BeliefPropagationConfig
+from recon.stereo.belief_propagation import BeliefPropagationConfig
 from service.bench import BenchOptions, gpu_floor
 from service.bench import gpu as bench_gpu
 from service.bench.gpu_floor import Floor, propagation_work

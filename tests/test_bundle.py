@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon import bundle, se3
-from recon.bundle import I64
+from recon import se3
+from recon.tracking import bundle
+from recon.tracking.bundle import I64
 from recon.types import F64
 
 K = np.array([[1000.0, 0, 640], [0, 1000.0, 360], [0, 0, 1]])

@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
-from recon import coverage, se3
-from recon.coverage import CoverageMap
+from recon import se3
+from recon.surface import coverage
+from recon.surface.coverage import CoverageMap
 from recon.types import F64, DepthMap
 from service.errors import InputError
 from service.exports.view import ExportOptions, ScanView, export

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from recon.cloud_fusion import cloud_of
-from recon.free_space import open_above, seen_through
+from recon.clouds.cloud_fusion import cloud_of
+from recon.clouds.free_space import open_above, seen_through
 from recon.types import DepthMap, PointCloud
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.pose_graph import PoseGraph
-from recon.trajectory import Trajectory
+from recon.graph.pose_graph import PoseGraph
+from recon.graph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 from service.onboard.graph_aside import GraphAside
 from service.onboard.graph_figures import graph_figures

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.pose_graph import PoseGraph
+from recon.graph.pose_graph import PoseGraph
 from recon.types import F64, PosePrior
 from service.onboard.graph_watch import GraphWatch
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon import ground_control, se3
-from recon.ground_control import Closure, Mark, Point, Track, adjust, map_position
+from recon import se3
+from recon.graph import ground_control
+from recon.graph.ground_control import Closure, Mark, Point, Track, adjust, map_position
 from recon.types import F64, PosePrior
 
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])

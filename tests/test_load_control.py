@@ -13,7 +13,7 @@ import pytest
 
 from recon.backends import load_backend
 from recon.backends.cpu import CpuBackend
-from recon.belief_propagation import BeliefPropagationConfig
+from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import U8, DisparityMap
 from service.cameras import CameraFrame, open_camera
 from service.cameras.source import CameraSource

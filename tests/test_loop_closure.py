@@ -13,9 +13,9 @@ import scipy.ndimage as ndi
 
 from recon import se3
 from recon.camera_model import rays, scaled_K
-from recon.loop_closure import LoopConfig, LoopView, candidates, ground_seen, verify
-from recon.pose_graph import PoseGraph
-from recon.trajectory import Trajectory
+from recon.graph.pose_graph import PoseGraph
+from recon.graph.trajectory import Trajectory
+from recon.loops.loop_closure import LoopConfig, LoopView, candidates, ground_seen, verify
 from recon.types import F64, DepthMap, PosePrior
 from service.onboard.loops import LoopSearch
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from recon import se3
+from recon.clouds.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
 from recon.types import F64, DepthMap
-from recon.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
 from service.onboard.map_pages import MOST_OVER, PagedMap
 
 K: F64 = np.array([[60.0, 0.0, 39.5], [0.0, 60.0, 29.5], [0.0, 0.0, 1.0]])

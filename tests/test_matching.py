@@ -13,7 +13,7 @@ import scipy.ndimage as ndi
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.matching import MatchingConfig, Pyramid, global_shift, harris_grid, match
+from recon.tracking.matching import MatchingConfig, Pyramid, global_shift, harris_grid, match
 from recon.types import F64, U8, Bool
 
 CALITERRA = Path(__file__).resolve().parents[2] / "shared" / "data" / "caliterra_nadir" / "frames"

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 pytest.importorskip("open3d")
 
-from recon import triangle_grid
+from recon.surface import triangle_grid
 from service.cameras import CameraFrame
 from service.cli import app
 from service.errors import InputError, OutsideError

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from recon.meshing import Mesh, height_mesh, poisson_mesh
-from recon.raster import Grid, Raster, smoothed
+from recon.surface.meshing import Mesh, height_mesh, poisson_mesh
+from recon.surface.raster import Grid, Raster, smoothed
 from recon.types import F32, PointCloud
 from service.cli import app
 from service.errors import InputError

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from recon import metrics, se3, triangle_grid
+from recon import metrics, se3
 from recon.metrics import Fit
-from recon.triangle_grid import TriangleGrid
+from recon.surface import triangle_grid
+from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F64
 
 

@@ -18,13 +18,14 @@ from mavlink.state import VehicleState
 from mavlink.wire import dialect
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
-from recon.keyframe_window import OdometryKeyframe
-from recon.odometry import Tracked
-from recon.trajectory import Placed
+from recon.graph.trajectory import Placed
+from recon.tracking.keyframe_window import OdometryKeyframe
+from recon.tracking.odometry import Tracked
 from recon.types import F64, PosePrior
 from service.config import CameraConfig
+from service.onboard.anchorage import Anchorage
 from service.onboard.odometry_report import OdometryReport
-from service.onboard.pipeline import Anchorage, Step
+from service.onboard.pipeline import Step
 
 S = 1_000_000_000
 BODY = Rotation.from_euler("ZYX", [0.7, 0.05, -0.1])  # q_ned_body

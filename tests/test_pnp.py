@@ -11,8 +11,9 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon import pnp, se3
+from recon import se3
 from recon.camera_model import project, rays
+from recon.tracking import pnp
 from recon.types import F64, Bool
 
 K = np.array([[930.0, 0, 639.5], [0, 930.0, 359.5], [0, 0, 1.0]])

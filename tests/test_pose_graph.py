@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from recon import se3
-from recon.pose_graph import PoseGraph, PoseGraphConfig
-from recon.track_alignment import mean_rotation, umeyama
+from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.graph.track_alignment import mean_rotation, umeyama
 from recon.types import F64, Pose, PosePrior
 
 STEP_M = 6.0

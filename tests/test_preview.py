@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.raster import Grid, Raster
+from recon.surface.raster import Grid, Raster
 from service.scans.preview import BACKGROUND, MARGIN, TRACK, blank_preview, draw_preview
 
 

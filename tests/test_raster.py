@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from recon.raster import (
+from recon.surface.raster import (
     Grid,
     Raster,
     fill_holes,

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.altitude_datum import AltitudeDatum
-from recon.boresight import Boresight
-from recon.pose_graph import PoseGraph
-from recon.sensor_offsets import Constants
+from recon.graph.altitude_datum import AltitudeDatum
+from recon.graph.boresight import Boresight
+from recon.graph.pose_graph import PoseGraph
+from recon.graph.sensor_offsets import Constants
 from recon.types import PosePrior
 from service.onboard.graph_figures import graph_figures
 from service.scans.coverage import coverage_of

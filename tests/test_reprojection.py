@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.reprojection import LABEL_SIGMA_PX, points_from_depth, reproject
+from recon.stereo.reprojection import LABEL_SIGMA_PX, points_from_depth, reproject
 from recon.types import F64, DepthMap, DisparityMap, StereoPair
 
 K = np.array([[190.0, 0, 159.5], [0, 190.0, 89.5], [0, 0, 1]])

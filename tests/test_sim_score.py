@@ -12,8 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from recon.meshing import Mesh
 from recon.se3 import so3_exp
+from recon.surface.meshing import Mesh
 from recon.types import F64, PointCloud
 from service.cli import app
 from service.errors import InputError

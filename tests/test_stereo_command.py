@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.belief_propagation import BeliefPropagationConfig
+from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import U8, DepthMap, DisparityMap, Registration
 from service.bench.stereo import (
     bad_share,
@@ -234,7 +234,7 @@ def test_learned_model_is_checked_and_used(
 @pytest.mark.skipif(not DATA.is_dir(), reason="the Middlebury pairs are not here")
 def test_better_than_semi_global_matching_on_truth() -> None:
     """Cones within 3.3 % bad pixels, and every pair better than OpenCV's matcher at its best."""
-    from recon.belief_propagation import belief_propagation
+    from recon.stereo.belief_propagation import belief_propagation
 
     for pair in true_pairs(DATA):
         config = matching_config(5, 0, checked=False)

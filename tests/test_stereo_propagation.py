@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from recon.backends import reference
-from recon.belief_propagation import BeliefPropagationConfig, belief_propagation
-from recon.matching_cost import COST_UNIT, MatchingCostConfig, census, matching_cost
-from recon.message_passing import propagate
+from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
+from recon.stereo.matching_cost import COST_UNIT, MatchingCostConfig, census, matching_cost
+from recon.stereo.message_passing import propagate
 from recon.types import F64, U8, Array
 
 BELIEVE_ALL = BeliefPropagationConfig(
@@ -272,7 +272,7 @@ def test_result_does_not_depend_on_the_number_of_threads() -> None:
 
 
 def test_read_only_and_strided_images_compile_nothing_new() -> None:
-    from recon import disparity_selection, message_passing, upsampling
+    from recon.stereo import disparity_selection, message_passing, upsampling
     from recon.types import DisparityMap
 
     image = np.random.default_rng(0).integers(0, 256, (40, 60), np.uint8)

@@ -14,7 +14,7 @@ from mavlink.history import HistoryConfig, VehicleHistory
 from mavlink.quaternion import Quaternion
 from mavlink.samples import AttitudeSample, GimbalFrame, GimbalSample
 from recon.frames import R_GIMBAL_CAMERA
-from recon.odometry import Tracked
+from recon.tracking.odometry import Tracked
 from service.config import CameraConfig
 from service.onboard.telemetry_check import TelemetryCheck
 

@@ -9,9 +9,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon import icp_kernels, se3
-from recon.registration import IcpConfig, Surface
-from recon.registration import register_projective as compiled
+from recon import se3
+from recon.clouds import icp_kernels
+from recon.clouds.registration import IcpConfig, Surface
+from recon.clouds.registration import register_projective as compiled
 from recon.types import F64, DepthMap, Registration
 
 torch = pytest.importorskip("torch")

@@ -17,11 +17,11 @@ import pytest
 
 from recon import se3
 from recon.backends import reference
-from recon.belief_propagation import BeliefPropagationConfig
-from recon.matching_cost import matching_cost
-from recon.registration import IcpConfig, register_projective
+from recon.clouds.registration import IcpConfig, register_projective
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.matching_cost import matching_cost
+from recon.stereo.upsampling import UpsamplingConfig, guide_at_taps
 from recon.types import F32, U8, DepthMap, DisparityMap
-from recon.upsampling import UpsamplingConfig, guide_at_taps
 
 torch = pytest.importorskip("torch")
 
@@ -38,7 +38,7 @@ def kernels(device: str) -> Any:
     if device == "cpu":
         os.environ["TRITON_INTERPRET"] = "1"
     pytest.importorskip("triton", reason="Triton is not installed; torch for CUDA brings it")
-    from recon.backends.torch_kernels import load_kernels
+    from recon.backends.kernel_trials import load_kernels
 
     return load_kernels()
 

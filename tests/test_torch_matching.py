@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
-from recon import patch_search
-from recon.matching import MatchingConfig, harris_grid
+from recon.tracking import patch_search
+from recon.tracking.matching import MatchingConfig, harris_grid
 from recon.types import F64, U8
 
 torch = pytest.importorskip("torch")
@@ -149,7 +149,7 @@ def test_matching_on_the_device_is_that_of_the_host(
 ) -> None:
     """From one level, two and four: the same points, at the same places to 0.02 px."""
     from recon.backends.torch_matcher import TorchMatcher
-    from recon.matcher import HostMatcher, Matcher
+    from recon.tracking.matcher import HostMatcher, Matcher
 
     A = np.array([[zoom, 0.02], [-0.02, zoom]])
     t = np.array([shift, -0.6 * shift])
@@ -182,7 +182,7 @@ def test_matching_on_the_device_is_that_of_the_host(
 def test_what_the_matcher_is_given_is_checked(device: str) -> None:
     """Shapes, sizes and radius; no points are no matches; a pyramid of another maker will do."""
     from recon.backends.torch_matcher import TorchMatcher
-    from recon.matching import Pyramid
+    from recon.tracking.matching import Pyramid
 
     own = TorchMatcher(device)
     a = own.pyramid(picture(1), 5)

@@ -15,16 +15,16 @@ import cv2
 import numpy as np
 import pytest
 
-from recon import belief_propagation as compiled
-from recon.belief_propagation import BeliefPropagationConfig
-from recon.depth_fusion import FusionConfig
-from recon.depth_fusion import fuse as compiled_fuse
-from recon.reprojection import PairDepth
-from recon.reprojection import reproject as compiled_reproject
+from recon.stereo import belief_propagation as compiled
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.depth_fusion import FusionConfig
+from recon.stereo.depth_fusion import fuse as compiled_fuse
+from recon.stereo.reprojection import PairDepth
+from recon.stereo.reprojection import reproject as compiled_reproject
+from recon.stereo.upsampling import UpsamplingConfig, guide_at_taps
+from recon.stereo.upsampling import upsample as compiled_upsample
+from recon.stereo.virtual_stereo import drop_unseen as compiled_drop
 from recon.types import F32, F64, U8, Array, DepthMap, DisparityMap, StereoPair
-from recon.upsampling import UpsamplingConfig, guide_at_taps
-from recon.upsampling import upsample as compiled_upsample
-from recon.virtual_stereo import drop_unseen as compiled_drop
 
 torch = pytest.importorskip("torch")
 

@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.belief_propagation import BeliefPropagationConfig
-from recon.depth_fusion import FusionConfig
-from recon.matching import MatchingConfig
-from recon.registration import IcpConfig
+from recon.clouds.registration import IcpConfig
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.depth_fusion import FusionConfig
+from recon.stereo.upsampling import UpsamplingConfig
+from recon.tracking.matching import MatchingConfig
 from recon.types import U8, DepthMap, StereoPair
-from recon.upsampling import UpsamplingConfig
 
 torch = pytest.importorskip("torch")
 

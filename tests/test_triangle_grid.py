@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon import triangle_grid
+from recon.surface import triangle_grid
 from recon.types import F64, Array
 
 

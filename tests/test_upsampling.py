@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from recon.backends import reference
+from recon.stereo.upsampling import UpsamplingConfig, upsample
 from recon.types import U8, DisparityMap
-from recon.upsampling import UpsamplingConfig, upsample
 
 CONFIG = UpsamplingConfig()
 

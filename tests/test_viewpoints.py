@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.keyframe_window import OdometryKeyframe
-from recon.landmarks import Landmarks
-from recon.matching import Pyramid
-from recon.odometry import Tracked
+from recon.tracking.keyframe_window import OdometryKeyframe
+from recon.tracking.landmarks import Landmarks
+from recon.tracking.matching import Pyramid
+from recon.tracking.odometry import Tracked
 from recon.types import PosePrior
 from service.config import ScanConfig
 from service.onboard.viewpoints import Offer, Viewpoint, Viewpoints, frames_apart

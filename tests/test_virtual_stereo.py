@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.reprojection import reproject
-from recon.types import F64, U8, DepthMap, DisparityMap, StereoPair
-from recon.virtual_stereo import (
+from recon.stereo.reprojection import reproject
+from recon.stereo.virtual_stereo import (
     Refusal,
     View,
     VirtualStereoConfig,
@@ -18,6 +17,7 @@ from recon.virtual_stereo import (
     plane_relief,
     rectify,
 )
+from recon.types import F64, U8, DepthMap, DisparityMap, StereoPair
 
 W, H = 640, 360
 K = np.array([[500.0, 0, 319.5], [0, 500.0, 179.5], [0, 0, 1]])

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.cloud_fusion import CORRELATED_SHARE, fuse, fuse_strips
+from recon.clouds.cloud_fusion import CORRELATED_SHARE, fuse, fuse_strips
+from recon.clouds.voxel_map import VoxelMap, VoxelMapConfig, ground_sample_m
 from recon.types import F64, Bool, DepthMap, PointCloud
-from recon.voxel_map import VoxelMap, VoxelMapConfig, ground_sample_m
 
 K = np.array([[100.0, 0.0, 79.5], [0.0, 100.0, 44.5], [0.0, 0.0, 1.0]])
 NADIR = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])

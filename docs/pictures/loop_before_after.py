@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from recon import se3
 from recon.camera_model import rays
-from recon.trajectory import Trajectory
+from recon.graph.trajectory import Trajectory
 from recon.types import F64
 from service.cli import app
 from service.sim.truth import read_truth

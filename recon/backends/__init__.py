@@ -11,15 +11,15 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
-from recon.belief_propagation import BeliefPropagationConfig
-from recon.depth_fusion import FusionConfig
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.depth_fusion import FusionConfig
+from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
-from recon.upsampling import UpsamplingConfig
 
 if TYPE_CHECKING:
     from recon.backends.torch_kernels import Kernels
-    from recon.matcher import Matcher
-    from recon.registration import IcpConfig
+    from recon.clouds.registration import IcpConfig
+    from recon.tracking.matcher import Matcher
 
 
 class Backend(Protocol):

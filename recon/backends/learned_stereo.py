@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from recon.backends.onnx_backend import OnnxBackend, open_session
-from recon.belief_propagation import BeliefPropagationConfig, believe
-from recon.matching_cost import check_pair
+from recon.stereo.belief_propagation import BeliefPropagationConfig, believe
+from recon.stereo.matching_cost import check_pair
 from recon.types import F32, U8, DisparityMap
 
 

@@ -10,13 +10,13 @@ import onnxruntime  # type: ignore[import-untyped]
 
 from recon.backends.onnx_dense import stereo_model, tap_windows, upsampling_model
 from recon.backends.room import place, pyramid_levels, room
-from recon.belief_propagation import BeliefPropagationConfig, believe
-from recon.matching_cost import check_pair
+from recon.stereo.belief_propagation import BeliefPropagationConfig, believe
+from recon.stereo.matching_cost import check_pair
+from recon.stereo.upsampling import UpsamplingConfig, check_guide, guide_at_taps, upsample
 from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration
-from recon.upsampling import UpsamplingConfig, check_guide, guide_at_taps, upsample
 
 if TYPE_CHECKING:
-    from recon.registration import IcpConfig
+    from recon.clouds.registration import IcpConfig
 
 PROVIDERS = ("TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider")
 """Fastest first; ONNX Runtime falls back along the list."""
@@ -90,7 +90,7 @@ class OnnxBackend:
         self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
     ) -> Registration:
         """Projective point-to-plane ICP from the given start."""
-        from recon.registration import register_projective
+        from recon.clouds.registration import register_projective
 
         return register_projective(source, target, T_target_source, config)
 

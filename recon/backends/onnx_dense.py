@@ -15,12 +15,12 @@ from onnx import TensorProto
 
 from recon.backends.onnx_graph import Graph, Value
 from recon.backends.room import pyramid_levels
-from recon.belief_propagation import BeliefPropagationConfig
-from recon.disparity_selection import NOISE, RADIUS, SURE_EVIDENCE
-from recon.matching_cost import CENSUS_RADIUS, COST_UNIT
-from recon.message_passing import FULL_WEIGHT
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.disparity_selection import NOISE, RADIUS, SURE_EVIDENCE
+from recon.stereo.matching_cost import CENSUS_RADIUS, COST_UNIT
+from recon.stereo.message_passing import FULL_WEIGHT
+from recon.stereo.upsampling import MIN_CONFIDENCE, RANGE_FLOOR, UpsamplingConfig, window
 from recon.types import Array
-from recon.upsampling import MIN_CONFIDENCE, RANGE_FLOOR, UpsamplingConfig, window
 
 FAR = 1.0e6
 
@@ -56,7 +56,7 @@ def stereo_model(
     Iterations and levels are written out. With ``levels`` of the pyramid given the model serves
     every pair up to its size: ``true`` (3,) int64 is height, width and labels of the pair,
     whose last row and column are repeated beyond. The results are those before
-    :func:`recon.belief_propagation.believe`.
+    :func:`recon.stereo.belief_propagation.believe`.
     """
     graph = Graph()
     left = graph.input("left", TensorProto.UINT8, size).numbers()
@@ -93,7 +93,7 @@ def _matching_cost(
     graph: Graph, left: Value, right: Value, size: tuple[int, int], labels: int, pair: _Pair,
     config: BeliefPropagationConfig,
 ) -> Value:  # fmt: skip
-    """(L, h, w), 0 beyond the pair, as :func:`recon.matching_cost.matching_cost`."""
+    """(L, h, w), 0 beyond the pair, as :func:`recon.stereo.matching_cost.matching_cost`."""
     c = config.cost
     h, w = size
     bits_left, bits_right = _census(graph, left, size), _census(graph, right, size)
@@ -244,7 +244,7 @@ def _select(
     graph: Graph, belief: Value, cost: Value, size: tuple[int, int], labels: int, pair: _Pair,
     config: BeliefPropagationConfig,
 ) -> tuple[Value, Value]:  # fmt: skip
-    """Labels and confidence (h, w), as :func:`recon.disparity_selection.select`."""
+    """Labels and confidence (h, w), as :func:`recon.stereo.disparity_selection.select`."""
     w = size[1]
     index = np.arange(labels, dtype=np.float32)[:, None, None]
     partner = np.arange(w, dtype=np.float32)[None, None, :] - index - config.min_disparity

@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from recon.message_passing import FULL_WEIGHT, Smoothness
+from recon.stereo.message_passing import FULL_WEIGHT, Smoothness
+from recon.stereo.upsampling import MIN_CONFIDENCE, RANGE_FLOOR, UpsamplingConfig, guide_at_taps
 from recon.types import F64, U8, DisparityMap
-from recon.upsampling import MIN_CONFIDENCE, RANGE_FLOOR, UpsamplingConfig, guide_at_taps
 
 I64 = npt.NDArray[np.int64]
 

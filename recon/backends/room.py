@@ -7,7 +7,7 @@ almost every pair; here sizes are rounded up, and the true ones go along as numb
 
 from __future__ import annotations
 
-from recon.belief_propagation import BeliefPropagationConfig
+from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import Array
 
 ROOM_PX, ROOM_LABELS = 32, 8

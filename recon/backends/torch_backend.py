@@ -16,15 +16,15 @@ from recon.backends.torch_kernels import PLAIN, Kernels
 from recon.backends.torch_path import DensePath
 from recon.backends.torch_plan import Part, Plan, part, read
 from recon.backends.torch_upsampling import JointBilateral
-from recon.belief_propagation import BeliefPropagationConfig, believe
-from recon.matching_cost import check_pair
+from recon.stereo.belief_propagation import BeliefPropagationConfig, believe
+from recon.stereo.matching_cost import check_pair
+from recon.stereo.upsampling import UpsamplingConfig, check_guide, guide_at_taps, upsample
 from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration, StereoPair
-from recon.upsampling import UpsamplingConfig, check_guide, guide_at_taps, upsample
 
 if TYPE_CHECKING:
     from recon.backends.torch_icp import DeviceIcp
-    from recon.matcher import Matcher
-    from recon.registration import IcpConfig
+    from recon.clouds.registration import IcpConfig
+    from recon.tracking.matcher import Matcher
 
 KEPT_PLANS = 8
 """Shapes whose buffers (and CUDA graph) are kept."""

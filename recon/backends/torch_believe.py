@@ -1,8 +1,8 @@
 """Which labels are believed, in torch: contrast, visibility, size of the surface, both pictures.
 
-The same answers as :func:`recon.belief_propagation.believe` and
-:func:`recon.virtual_stereo.drop_unseen`, without leaving the device. ``true`` begins with the
-height and width of the pair in arrays that may be larger.
+The same answers as :func:`recon.stereo.belief_propagation.believe` and
+:func:`recon.stereo.virtual_stereo.drop_unseen`, without leaving the device. ``true`` begins
+with the height and width of the pair in arrays that may be larger.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from recon.backends.torch_cost import inside
-from recon.belief_propagation import SPECKLE_STEP, BeliefPropagationConfig
+from recon.stereo.belief_propagation import SPECKLE_STEP, BeliefPropagationConfig
 
 CONTRAST_PX = 9
 UNKNOWN = -2048 * SPECKLE_STEP

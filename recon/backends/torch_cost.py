@@ -6,8 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from recon.belief_propagation import BeliefPropagationConfig
-from recon.matching_cost import CENSUS_RADIUS, COST_UNIT
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.matching_cost import CENSUS_RADIUS, COST_UNIT
 
 FAR = 1.0e6
 """More than any cost or sum of costs."""
@@ -31,7 +31,7 @@ def census(image: Tensor) -> Tensor:
 def matching_cost(
     left: Tensor, right: Tensor, labels: int, true: Tensor, config: BeliefPropagationConfig
 ) -> Tensor:
-    """(L, h, w) cost of each label, as :func:`recon.matching_cost.matching_cost`; 0 beyond."""
+    """(L, h, w) cost of each label, see :mod:`recon.stereo.matching_cost`; 0 beyond."""
     c = config.cost
     width = left.shape[1]
     bits_left, bits_right = census(left), census(right)

@@ -18,10 +18,10 @@ from torch import Tensor
 
 from recon.backends.torch_cost import FAR, inside, matching_cost
 from recon.backends.torch_kernels import PLAIN, Kernels, Sweep
-from recon.belief_propagation import BeliefPropagationConfig
-from recon.disparity_selection import NOISE, RADIUS, SURE_EVIDENCE
-from recon.matching_cost import COST_UNIT
-from recon.message_passing import FULL_WEIGHT
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.disparity_selection import NOISE, RADIUS, SURE_EVIDENCE
+from recon.stereo.matching_cost import COST_UNIT
+from recon.stereo.message_passing import FULL_WEIGHT
 
 BEYOND = 28000
 """In place of ``FAR`` in 16 bits: more than any sum, and room for the longest slope on top."""
@@ -95,7 +95,7 @@ def propagate(
     kind: torch.dtype,
     sweep: Sweep | None = None,
 ) -> Tensor:
-    """(L, h, w) beliefs, as :func:`recon.message_passing.propagate` (Eq. 1).
+    """(L, h, w) beliefs, as :func:`recon.stereo.message_passing.propagate` (Eq. 1).
 
     ``sweep`` renews the messages of one colour in place; None: in plain torch.
     """
@@ -212,7 +212,7 @@ def _outgoing(
 def select(
     belief: Tensor, cost: Tensor, true: Tensor, config: BeliefPropagationConfig
 ) -> tuple[Tensor, Tensor]:
-    """Labels and confidence, as :func:`recon.disparity_selection.select`."""
+    """Labels and confidence, as :func:`recon.stereo.disparity_selection.select`."""
     room_for, _, w = belief.shape
     index = torch.arange(room_for, device=belief.device)[:, None, None]
     column = torch.arange(w, device=belief.device)[None, None, :]

@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from recon.depth_fusion import FusionConfig
-from recon.reprojection import LABEL_SIGMA_PX, MIN_CONFIDENCE
+from recon.stereo.depth_fusion import FusionConfig
+from recon.stereo.reprojection import LABEL_SIGMA_PX, MIN_CONFIDENCE
 
 GEOMETRY = 14
 """float64 numbers of a pair: homography to the left picture (9), plane (3), slope, f B."""
@@ -19,7 +19,7 @@ def reproject(
 ) -> tuple[Tensor, Tensor]:
     """Depth and sigma in metres, float32, on the keyframe's grid of ``size_px`` (w, h).
 
-    As :func:`recon.reprojection.reproject`. ``geometry`` (14,) float64; ``true`` (4,) is the
+    As :func:`recon.stereo.reprojection.reproject`. ``geometry`` (14,) float64; ``true`` (4,) is the
     size h, w of the pair and that of ``px``, which may be a larger array.
     """
     u = torch.arange(size_px[0], device=px.device, dtype=torch.float64)[None, :]
@@ -73,7 +73,7 @@ def _label(
 def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Tensor, Tensor]:
     """Depth, sigma and number of views (h, w) float32 of pairs (P, h, w); no view: NaN.
 
-    As :func:`recon.depth_fusion.fuse`: inverse depth of the largest group that agrees.
+    As :func:`recon.stereo.depth_fusion.fuse`: inverse depth of the largest group that agrees.
     """
     z, e = depth.double(), sigma.double()
     usable = (z > 0) & (e < config.most_sigma_share * z)

@@ -2,8 +2,8 @@
 
 Surfaces, partners, weights and steps stay on the device, for a fixed number of iterations; one
 that has settled stands still. Nothing is read in between, so on CUDA all of it is one captured
-graph. The verdict and the covariance are those of :mod:`recon.registration`, from the sums of
-one more iteration.
+graph. The verdict and the covariance are those of :mod:`recon.clouds.registration`, from the
+sums of one more iteration.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from recon.backends.torch_partners import SourcePoints, correlation_sums, points
 from recon.backends.torch_plan import Plan, part
 from recon.backends.torch_sums import advance, weigh
 from recon.backends.torch_surface import DOUBLE, DeviceSurface, build
-from recon.registration import (
+from recon.clouds.registration import (
     AREA_LAGS,
     AREA_SIGMAS,
     Equations,
@@ -43,7 +43,7 @@ class DeviceIcp:
     def register(
         self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
     ) -> Registration:
-        """As :func:`recon.registration.register_projective`."""
+        """As :func:`recon.clouds.registration.register_projective`."""
         start = np.array(T_target_source, np.float64)
         if start.shape != (4, 4) or not np.isfinite(start).all():
             raise ValueError("T_target_source must be (4, 4) finite numbers")
@@ -132,7 +132,7 @@ def _concluded(told: F64, start: F64, config: IcpConfig) -> Registration:
 
 
 def _area(lags: F64) -> float:
-    """How many neighbours err together, as :func:`recon.icp_kernels.correlated_area`."""
+    """How many neighbours err together, as :func:`recon.clouds.icp_kernels.correlated_area`."""
     area = 1.0
     for products, powers, counts in lags:
         length = 1.0

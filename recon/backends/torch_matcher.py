@@ -20,7 +20,7 @@ from torch import Tensor
 from recon.backends.torch_matching import harris_cells
 from recon.backends.torch_plan import Plan, part
 from recon.backends.torch_tracking import match
-from recon.matching import (
+from recon.tracking.matching import (
     FAR,
     Corners,
     Matches,
@@ -41,7 +41,7 @@ Shapes = tuple[tuple[int, int], ...]
 
 
 class TorchMatcher:
-    """A :class:`recon.matcher.Matcher` for one thread at a time."""
+    """A :class:`recon.tracking.matcher.Matcher` for one thread at a time."""
 
     def __init__(self, device: str) -> None:
         self.device = device
@@ -60,7 +60,7 @@ class TorchMatcher:
             return Pyramid(made.levels, self._sent(made))
 
     def corners(self, pyramid: Pyramid, config: MatchingConfig, mask: U8 | None) -> Corners:
-        """As :func:`recon.matching.harris_grid`; ValueError for a mask of another size."""
+        """As :func:`recon.tracking.matching.harris_grid`; ValueError for a mask of another size."""
         shapes = _shapes(pyramid)
         if mask is not None and mask.shape != shapes[0]:
             raise ValueError(f"mask {mask.shape} and image {shapes[0]} differ")
@@ -83,7 +83,7 @@ class TorchMatcher:
         uv_b_predicted: npt.ArrayLike, radius_px: float, warp: npt.ArrayLike | None,
         config: MatchingConfig,
     ) -> Matches:  # fmt: skip
-        """As :func:`recon.matching.match`; both pyramids are of one size."""
+        """As :func:`recon.tracking.matching.match`; both pyramids are of one size."""
         a = checked_points(uv_a, "uv_a")
         predicted = checked_points(uv_b_predicted, "uv_b_predicted", len(a))
         if not (np.isfinite(radius_px) and radius_px > 0):

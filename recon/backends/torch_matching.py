@@ -1,8 +1,9 @@
 """Harris corners and the zero-mean SSD search in torch (paper section 2.3, Eq. 4-5).
 
-The same answers as :mod:`recon.harris` and :mod:`recon.patch_search`, all points at once and
-without leaving the device. Images are (H, W) uint8, points (N, 2) float64 pixels of their
-level, inverse warps (N, 4): rows of the 2x2 matrix that takes an offset in b to one in a.
+The same answers as :mod:`recon.tracking.harris` and :mod:`recon.tracking.patch_search`, all
+points at once and without leaving the device. Images are (H, W) uint8, points (N, 2) float64
+pixels of their level, inverse warps (N, 4): rows of the 2x2 matrix that takes an offset in b to
+one in a.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from recon.matching import MatchingConfig
-from recon.patch_search import NO_SCORE
+from recon.tracking.matching import MatchingConfig
+from recon.tracking.patch_search import NO_SCORE
 
 BINOMIAL = (1.0, 4.0, 6.0, 4.0, 1.0)
 """Window w of Eq. 4 along one axis, over 16."""
@@ -195,8 +196,8 @@ def refine(
 ) -> Refined:  # fmt: skip
     """``uv_b`` moved to the sub-pixel minimum of the normalised zero-mean SSD.
 
-    As :func:`recon.patch_search.refine`, with every iteration done for all points and those
-    that have arrived held still.
+    As :func:`recon.tracking.patch_search.refine`, with every iteration done for all points and
+    those that have arrived held still.
     """
     large, within = _sample(image_a, uv_a, inverse_warp, radius + 1)
     kernels, contrast_a = _template(large - 128)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from recon.backends.torch_surface import DOUBLE, DeviceSurface, rays
-from recon.registration import IcpConfig
+from recon.clouds.registration import IcpConfig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +54,7 @@ def points(source: DeviceSurface, stride: int) -> SourcePoints:
 def match(source: SourcePoints, target: DeviceSurface, T: Tensor, config: IcpConfig) -> Partners:
     """Each element with the target element of the pixel that it projects to.
 
-    As :func:`recon.icp_kernels.residuals`.
+    As :func:`recon.clouds.icp_kernels.residuals`.
     """
     h, w = target.elements.shape[:2]
     fx, fy, cx, cy = target.intrinsics

@@ -21,10 +21,10 @@ from recon.backends.torch_depth import fuse, reproject
 from recon.backends.torch_kernels import PLAIN, Kernels
 from recon.backends.torch_plan import Plan, part, read
 from recon.backends.torch_upsampling import JointBilateral, averaged
-from recon.belief_propagation import BeliefPropagationConfig
-from recon.depth_fusion import FusionConfig
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.depth_fusion import FusionConfig
+from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F64, Array, DepthMap, StereoPair
-from recon.upsampling import UpsamplingConfig
 
 KEPT_PLANS = 8
 

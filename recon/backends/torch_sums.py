@@ -10,7 +10,7 @@ from torch import Tensor
 from recon.backends.torch_linear import scale_of, solve
 from recon.backends.torch_partners import SourcePoints, match
 from recon.backends.torch_surface import DOUBLE, DeviceSurface
-from recon.registration import MIN_PARTNERS, IcpConfig
+from recon.clouds.registration import MIN_PARTNERS, IcpConfig
 
 SHARED = 0.35
 """A direction counts when this share of its information is common to both surfaces."""
@@ -21,7 +21,7 @@ SIGN_ROUNDS = 26
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weighed:
-    """The weighted normal equations, as :class:`recon.registration.Equations`."""
+    """The weighted normal equations, as :class:`recon.clouds.registration.Equations`."""
 
     H: Tensor  # (6, 6)
     common: Tensor  # (6, 6)

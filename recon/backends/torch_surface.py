@@ -1,4 +1,4 @@
-"""Surface elements of depth maps in torch, as :func:`recon.icp_kernels.surface_elements`."""
+"""Surface elements of depth maps in torch, as :func:`recon.clouds.icp_kernels.surface_elements`."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from recon.icp_kernels import MIN_PIXELS, REACH
+from recon.clouds.icp_kernels import MIN_PIXELS, REACH
 
 DOUBLE = torch.float64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeviceSurface:
-    """As :class:`recon.registration.Surface`, on a device."""
+    """As :class:`recon.clouds.registration.Surface`, on a device."""
 
     elements: Tensor  # (h, w, 6) float32
     intrinsics: Tensor  # (4,) float64 fx fy cx cy

@@ -1,4 +1,4 @@
-"""All of :func:`recon.matching.match` in torch: both ways, consensus, refinement, no wait.
+"""All of :func:`recon.tracking.matching.match` in torch: both ways, consensus, refinement, no wait.
 
 The decisions that the host makes between the searches are masks here, so that one call is one
 run of kernels and one small result: place, ZSSD and verdict of each point.
@@ -14,8 +14,8 @@ from torch import Tensor
 
 from recon.backends.torch_linear import median, solve
 from recon.backends.torch_matching import Found, Refined, refine, search
-from recon.matching import MatchingConfig
-from recon.patch_search import NO_SCORE
+from recon.tracking.matching import MatchingConfig
+from recon.tracking.patch_search import NO_SCORE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +111,7 @@ def _consensus(
     """(N, 2) affine trend of ``residual`` over ``uv``, and () True if most good points see it.
 
     Reweighted from the median with a tolerance that narrows, as
-    :func:`recon.affine_trend.affine_trend`.
+    :func:`recon.tracking.affine_trend.affine_trend`.
     """
     X = torch.cat([torch.ones_like(uv[:, :1]), uv / 1000], 1)
     start = torch.stack([median(residual[:, k], good) for k in (0, 1)])

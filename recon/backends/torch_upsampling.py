@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from recon.backends.torch_kernels import PLAIN, Kernels
-from recon.upsampling import MIN_CONFIDENCE, RANGE_FLOOR, UpsamplingConfig
+from recon.stereo.upsampling import MIN_CONFIDENCE, RANGE_FLOOR, UpsamplingConfig
 
 FAR_TAP = -1.0e4
 """Log of the weight of a tap outside the coarse image."""
@@ -77,7 +77,7 @@ def window(
 def averaged(guide: Tensor, room: tuple[int, int], true: Tensor) -> Tensor:
     """(h, w, 3) the guide at the coarse grid: the mean of what each tap covers, in whole levels.
 
-    As :func:`recon.upsampling.guide_at_taps`, where halves may round the other way.
+    As :func:`recon.stereo.upsampling.guide_at_taps`, where halves may round the other way.
     """
     down = _shares(room[0], guide.shape[0], true[0], true[2])
     across = _shares(room[1], guide.shape[1], true[1], true[3])

@@ -19,8 +19,8 @@ import triton.language as tl
 from torch import Tensor
 
 from recon.backends.torch_cost import FAR
-from recon.belief_propagation import BeliefPropagationConfig
-from recon.matching_cost import CENSUS_RADIUS, COST_UNIT
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.matching_cost import CENSUS_RADIUS, COST_UNIT
 
 PIXELS = 128
 """Pixels of one program."""

@@ -23,7 +23,7 @@ from recon.backends.torch_linear import scale_of
 from recon.backends.torch_partners import SourcePoints
 from recon.backends.torch_sums import SHARED, SIGN_ROUNDS, Weighed
 from recon.backends.torch_surface import DeviceSurface
-from recon.registration import MIN_PARTNERS, IcpConfig
+from recon.clouds.registration import MIN_PARTNERS, IcpConfig
 
 POINTS = 128
 """Points of one program."""

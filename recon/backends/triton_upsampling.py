@@ -18,7 +18,7 @@ import triton.language as tl
 from torch import Tensor
 
 from recon.backends.torch_upsampling import tap_layers, window
-from recon.upsampling import RANGE_FLOOR, UpsamplingConfig
+from recon.stereo.upsampling import RANGE_FLOOR, UpsamplingConfig
 
 ROWS, COLUMNS = 4, 64
 """Fine pixels of one program."""

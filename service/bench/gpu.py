@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from recon.backends import Backend, load_backend
-from recon.belief_propagation import BeliefPropagationConfig
-from recon.registration import IcpConfig
+from recon.clouds.registration import IcpConfig
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import StereoPair
-from recon.upsampling import UpsamplingConfig
 from service.bench import BenchOptions, BenchResult, compare
 from service.bench.gpu_floor import (
     LABELS,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.belief_propagation import BeliefPropagationConfig
+from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import DepthMap
 from service.bench import BenchOptions, BenchResult, compare
 

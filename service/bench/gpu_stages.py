@@ -23,12 +23,12 @@ from recon.backends.torch_matching import harris_cells, refine, search
 from recon.backends.torch_path import DensePath
 from recon.backends.torch_plan import Plan, part
 from recon.backends.torch_upsampling import JointBilateral, averaged
-from recon.belief_propagation import BeliefPropagationConfig
-from recon.depth_fusion import FusionConfig
-from recon.matching import MatchingConfig, harris_grid
-from recon.registration import IcpConfig
+from recon.clouds.registration import IcpConfig
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.depth_fusion import FusionConfig
+from recon.stereo.upsampling import UpsamplingConfig
+from recon.tracking.matching import MatchingConfig, harris_grid
 from recon.types import U8, Array, StereoPair
-from recon.upsampling import UpsamplingConfig
 from service.bench.gpu_floor import LABELS, SIZE, Stage, ground, propagation_work
 
 PAIRS = 4

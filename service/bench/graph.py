@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon import se3
-from recon.pose_graph import PoseGraph
-from recon.trajectory import Trajectory
+from recon.graph.pose_graph import PoseGraph
+from recon.graph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 from service.bench import BenchOptions, BenchResult
 from service.onboard.graph_aside import GraphAside

@@ -13,7 +13,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import rays
-from recon.registration import IcpConfig, register_projective
+from recon.clouds.registration import IcpConfig, register_projective
 from recon.types import F64, DepthMap
 from service.bench import BenchOptions, BenchResult, compare
 

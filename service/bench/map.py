@@ -8,10 +8,10 @@ from __future__ import annotations
 import numpy as np
 
 from recon import se3
-from recon.cloud_fusion import cloud_of, fuse
-from recon.free_space import seen_through
+from recon.clouds.cloud_fusion import cloud_of, fuse
+from recon.clouds.free_space import seen_through
+from recon.clouds.voxel_map import VoxelMap, VoxelMapConfig
 from recon.types import Array, DepthMap, PointCloud
-from recon.voxel_map import VoxelMap, VoxelMapConfig
 from service.bench import BenchOptions, BenchResult, compare
 
 SIZE_PX = (320, 180)

@@ -7,7 +7,14 @@ from functools import partial
 import cv2
 import numpy as np
 
-from recon.matching import Corners, MatchingConfig, Pyramid, global_shift, harris_grid, match
+from recon.tracking.matching import (
+    Corners,
+    MatchingConfig,
+    Pyramid,
+    global_shift,
+    harris_grid,
+    match,
+)
 from recon.types import F32, F64, U8
 from service.bench import BenchOptions, BenchResult, compare
 

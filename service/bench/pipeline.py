@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from recon import se3
-from recon.belief_propagation import BeliefPropagationConfig
+from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import F32, F64, U8, Camera, DepthMap, DisparityMap, Registration
 from service.bench import BenchOptions, BenchResult
 

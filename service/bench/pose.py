@@ -7,9 +7,10 @@ from functools import partial
 import cv2
 import numpy as np
 
-from recon import pnp, se3
+from recon import se3
 from recon.camera_model import rays
-from recon.matching import MatchingConfig, Pyramid, harris_grid, match
+from recon.tracking import pnp
+from recon.tracking.matching import MatchingConfig, Pyramid, harris_grid, match
 from recon.types import F64
 from service.bench import BenchOptions, BenchResult, compare
 from service.bench.matching import RADIUS_PX, SHIFT_PX, SIZE, pictures

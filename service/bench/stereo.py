@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.belief_propagation import BeliefPropagationConfig
+from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import F32, U8, Bool
 from service.bench import BenchOptions, BenchResult, compare
 from service.compute.backend_choice import choose_backend

@@ -7,8 +7,8 @@ from functools import partial
 import cv2
 import numpy as np
 
+from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import DisparityMap
-from recon.upsampling import UpsamplingConfig
 from service.bench import BenchOptions, BenchResult, compare
 from service.compute.backend_choice import choose_backend
 

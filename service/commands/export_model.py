@@ -36,8 +36,8 @@ def export_model(
         from recon.backends.onnx_dense import stereo_model, upsampling_model
     except ImportError as error:
         raise OutsideError(f"export needs the onnx package: {error}") from error
-    from recon.belief_propagation import BeliefPropagationConfig
-    from recon.upsampling import UpsamplingConfig
+    from recon.stereo.belief_propagation import BeliefPropagationConfig
+    from recon.stereo.upsampling import UpsamplingConfig
 
     try:
         if fine is None:

@@ -5,16 +5,10 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from subprocess import SubprocessError
 
-from recon.backends.torch_kernels import (
-    PLAIN,
-    Kernels,
-    Trial,
-    failures,
-    joined,
-    load_kernels,
-    trials,
-)
+from recon.backends.kernel_trials import Trial, joined, load_kernels, trials
+from recon.backends.torch_kernels import PLAIN, Kernels
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +29,7 @@ def choose_kernels(
     """
     try:
         candidates = trials(load(), device, size_px, guide_px, LABELS)
-    except failures() as error:
+    except _failures() as error:
         log.info("fused kernels: none, %s; plain torch goes on", _first_line(error))
         return PLAIN
     return joined([trial.alone for trial in candidates if _pays(trial, device)])
@@ -49,7 +43,7 @@ def _pays(trial: Trial, device: str) -> bool:
             log.warning("fused kernel for %s: not used, %s", trial.name, wrong)
             return False
         plain, fused = (_least_ms(work, device) for work in (trial.plain, trial.fused))
-    except failures() as error:
+    except _failures() as error:
         log.info("fused kernel for %s: cannot run, %s", trial.name, _first_line(error))
         return False
     verdict = "used" if fused < plain else "not used"
@@ -86,3 +80,13 @@ def _least_ms(work: Callable[[], object], device: str) -> float:
 
 def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+def _failures() -> tuple[type[Exception], ...]:
+    """What loading, compiling or launching a kernel may raise where Triton does not fit."""
+    kinds: tuple[type[Exception], ...] = (ImportError, OSError, RuntimeError, SubprocessError)
+    try:
+        from triton.errors import TritonError
+    except ImportError:
+        return kinds
+    return (*kinds, TritonError)

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 from service.errors import InputError
 
 if TYPE_CHECKING:
-    from recon.belief_propagation import BeliefPropagationConfig
+    from recon.stereo.belief_propagation import BeliefPropagationConfig
     from recon.types import U8
 
 
 def matching_config(iterations: int, min_disparity: int, checked: bool) -> BeliefPropagationConfig:
     """How the pair is matched; InputError for numbers out of range."""
-    from recon.belief_propagation import BeliefPropagationConfig
+    from recon.stereo.belief_propagation import BeliefPropagationConfig
 
     try:
         if checked:

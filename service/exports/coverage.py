@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from recon.raster import Grid
+from recon.surface.raster import Grid
 from recon.types import Array
 from service.errors import InputError
 from service.exports.rasters import write_cog

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.meshing import Mesh
+from recon.surface.meshing import Mesh
 from recon.types import U8, Array
 
 FLOAT, UNSIGNED_BYTE, UNSIGNED_INT = 5126, 5121, 5125

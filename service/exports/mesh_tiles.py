@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from recon.cloud_fusion import cloud_of, fuse, without
-from recon.free_space import seen_through
-from recon.meshing import Mesh, cut, height_mesh, poisson_mesh
-from recon.raster import Raster, fill_holes, grid_over, rasterise, smoothed
-from recon.texture_views import TextureView
-from recon.texturing import texture
+from recon.clouds.cloud_fusion import cloud_of, fuse, without
+from recon.clouds.free_space import seen_through
+from recon.clouds.voxel_map import ground_sample_m
+from recon.surface.meshing import Mesh, cut, height_mesh, poisson_mesh
+from recon.surface.raster import Raster, fill_holes, grid_over, rasterise, smoothed
+from recon.surface.texture_views import TextureView
+from recon.surface.texturing import texture
 from recon.types import F64, U8, Keyframe, PointCloud
-from recon.voxel_map import ground_sample_m
 from service.errors import OutsideError, SkyreliefError
 from service.exports.pictures import stored_pictures, video_pictures
 from service.scans.fused_cloud import fused_cloud

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from recon.camera_model import Undistorter, scaled_K
-from recon.texture_views import TextureView
+from recon.surface.texture_views import TextureView
 from recon.types import U8, Camera, Keyframe
 from service.cameras import open_camera
 from service.errors import InputError, SkyreliefError

@@ -11,8 +11,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.free_space import open_above
-from recon.raster import (
+from recon.clouds.free_space import open_above
+from recon.surface.raster import (
     Grid,
     Raster,
     fill_holes,
@@ -37,8 +37,9 @@ the ground below them."""
 def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """Heights in AMSL metres (float32, -9999 where unknown); band 2 holds their sigma.
 
-    Unknown is also what cannot be placed beside a step (:func:`recon.raster.surface_model`),
-    and ground above which something may stand that no picture shows.
+    Unknown is also what cannot be placed beside a step
+    (:func:`recon.surface.raster.surface_model`), and ground above which something may stand that
+    no picture shows.
     """
     cloud = scan.fused.cloud
     raster = surface_model(scan.xyz_m, cloud.rgb, cloud.sigma_m, scan.grid(options.cell_m))

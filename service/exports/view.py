@@ -11,7 +11,7 @@ from types import TracebackType
 
 import numpy as np
 
-from recon.raster import Grid, Raster, grid_over, rasterise_points
+from recon.surface.raster import Grid, Raster, grid_over, rasterise_points
 from recon.types import F64
 from service.errors import InputError, OutsideError
 from service.exports import EXPORTERS

@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.cloud_fusion import cloud_of
+from recon.clouds.cloud_fusion import cloud_of
 from recon.types import F64, DepthMap, Keyframe
 from service.scans.track import latest
 from service.stream.records import PoseRecord

@@ -12,14 +12,24 @@ import cv2
 import numpy as np
 
 from recon import se3
-from recon.alignment import height_above, height_below
 from recon.backends import Backend, DenseStages, PathBackend
-from recon.belief_propagation import BeliefPropagationConfig
 from recon.camera_model import scaled_K
-from recon.depth_fusion import FusionConfig, fuse
-from recon.registration import IcpConfig
-from recon.reprojection import PairDepth, reproject
-from recon.trajectory import Trajectory
+from recon.clouds.registration import IcpConfig
+from recon.clouds.voxel_map import VoxelMap, VoxelMapConfig
+from recon.graph.alignment import height_above, height_below
+from recon.graph.trajectory import Trajectory
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.depth_fusion import FusionConfig, fuse
+from recon.stereo.reprojection import PairDepth, reproject
+from recon.stereo.upsampling import UpsamplingConfig
+from recon.stereo.virtual_stereo import (
+    Refusal,
+    View,
+    VirtualStereoConfig,
+    drop_unseen,
+    plane_relief,
+    rectify,
+)
 from recon.types import (
     F64,
     U8,
@@ -31,16 +41,6 @@ from recon.types import (
     Registration,
     StereoPair,
 )
-from recon.upsampling import UpsamplingConfig
-from recon.virtual_stereo import (
-    Refusal,
-    View,
-    VirtualStereoConfig,
-    drop_unseen,
-    plane_relief,
-    rectify,
-)
-from recon.voxel_map import VoxelMap, VoxelMapConfig
 from service.compute.stopwatch import Stopwatch
 from service.config import ComputeConfig, Config
 from service.onboard.graph_aside import GraphAside

@@ -23,14 +23,14 @@ from typing import Any
 import numpy as np
 
 from recon import se3
-from recon.alignment import Scale, Similarity
-from recon.dead_reckoning import carried
-from recon.fix_average import at_camera
-from recon.graph_records import Loop, Node
-from recon.loop_book import Edge
-from recon.pose_graph import SOURCES
-from recon.sensor_offsets import Constants
-from recon.smoother import moved_covariance
+from recon.graph.alignment import Scale, Similarity
+from recon.graph.dead_reckoning import carried
+from recon.graph.fix_average import at_camera
+from recon.graph.loop_book import Edge
+from recon.graph.pose_graph import SOURCES
+from recon.graph.records import Loop, Node
+from recon.graph.sensor_offsets import Constants
+from recon.graph.smoother import moved_covariance
 from recon.types import F64, Pose, PosePrior
 from service.onboard.graph_server import GraphState, Order, Watched
 
@@ -151,7 +151,7 @@ class _Carried:
 
 
 class GraphAside:
-    """A :class:`recon.keyframe_graph.KeyframeGraph` whose graph is in another process.
+    """A :class:`recon.graph.keyframe_graph.KeyframeGraph` whose graph is in another process.
 
     Not for several threads at once. Poses change only with :meth:`add_keyframe`,
     :meth:`add_loop`, :meth:`solve` and :attr:`version`.

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from recon.keyframe_graph import KeyframeGraph
-from recon.sensor_offsets import Constants
+from recon.graph.keyframe_graph import KeyframeGraph
+from recon.graph.sensor_offsets import Constants
 from service.stream.records import pack_covariance, pack_motion
 
 MOST_LOOPS = 300

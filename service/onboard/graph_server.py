@@ -21,9 +21,9 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from recon.alignment import Scale, Similarity
-from recon.loop_book import Edge
-from recon.pose_graph import SOURCES, PoseGraph
+from recon.graph.alignment import Scale, Similarity
+from recon.graph.loop_book import Edge
+from recon.graph.pose_graph import SOURCES, PoseGraph
 from recon.types import F64
 
 Order = tuple[Any, ...]

@@ -6,7 +6,7 @@ import math
 import threading
 from collections.abc import Callable
 
-from recon.keyframe_graph import KeyframeGraph
+from recon.graph.keyframe_graph import KeyframeGraph
 
 LEAST = 5
 """Readings of one kind left out before it is said."""

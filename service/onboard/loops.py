@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.camera_model import scaled_K
-from recon.loop_closure import (
+from recon.graph.trajectory import Trajectory
+from recon.loops.loop_closure import (
     LoopClosure,
     LoopConfig,
     LoopView,
@@ -19,7 +20,6 @@ from recon.loop_closure import (
     ground_seen,
     verify,
 )
-from recon.trajectory import Trajectory
 from recon.types import F64, U8, DepthMap
 
 WIDTH_PX = 640

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from recon.clouds.voxel_map import I64, VoxelMap, VoxelMapConfig, Voxels, tile_of, tiles_under
 from recon.types import Bool, DepthMap
-from recon.voxel_map import I64, VoxelMap, VoxelMapConfig, Voxels, tile_of, tiles_under
 
 log = logging.getLogger(__name__)
 
@@ -22,7 +22,7 @@ MOST_OVER = 4
 
 
 class PagedMap:
-    """A :class:`recon.voxel_map.VoxelMap` that holds at most about ``most_voxels`` in memory.
+    """A voxel map (:mod:`recon.clouds.voxel_map`) with about ``most_voxels`` in memory at most.
 
     The tiles under the view stay, whatever they hold; where they alone have :data:`MOST_OVER`
     times as many, the half seen longest ago is forgotten, and that surface is sent again.

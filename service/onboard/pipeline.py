@@ -17,16 +17,16 @@ from mavlink.state import VehicleState
 from recon import se3
 from recon.backends import Backend, MatchingBackend
 from recon.camera_model import Undistorter, scaled
-from recon.dead_reckoning import carried
-from recon.exposure import stretch
-from recon.fix_average import FixAverage
-from recon.keyframe_window import landmarks
-from recon.odometry import Odometry, Tracked
-from recon.odometry_config import OdometryConfig
-from recon.sharpness import BlurWatch
-from recon.trajectory import Placed
+from recon.graph.dead_reckoning import carried
+from recon.graph.fix_average import FixAverage
+from recon.graph.trajectory import Placed
+from recon.stereo.exposure import stretch
+from recon.stereo.virtual_stereo import View
+from recon.tracking.keyframe_window import landmarks
+from recon.tracking.odometry import Odometry, Tracked
+from recon.tracking.odometry_config import OdometryConfig
+from recon.tracking.sharpness import BlurWatch
 from recon.types import U8, Camera, Frame, Keyframe, PosePrior
-from recon.virtual_stereo import View
 from service.cameras.source import GeoTag
 from service.compute.side_by_side import SideBySide
 from service.config import ComputeConfig, Config, ScanConfig

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.trajectory import Placed
+from recon.graph.trajectory import Placed
 from recon.types import F64, Keyframe
 from service.onboard.anchorage import Told, ToldFrames
 from service.onboard.graph_figures import graph_figures

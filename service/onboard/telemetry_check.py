@@ -17,8 +17,8 @@ from mavlink.latency import LatencyEstimate, LatencyWatch
 from mavlink.quaternion import Quaternion
 from mavlink.samples import GimbalFrame
 from recon.frames import R_GIMBAL_CAMERA
-from recon.odometry import Tracked
 from recon.se3 import quaternion_from_rotation
+from recon.tracking.odometry import Tracked
 from recon.types import F64
 from service.config import CameraConfig
 

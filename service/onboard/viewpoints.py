@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from recon import se3
-from recon.keyframe_window import OdometryKeyframe
-from recon.odometry import Tracked
+from recon.tracking.keyframe_window import OdometryKeyframe
+from recon.tracking.odometry import Tracked
 from recon.types import F64, U8, PosePrior
 from service.config import ScanConfig, parse_baseline
 

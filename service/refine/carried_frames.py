@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from recon import se3
-from recon.ground_control import Adjusted
+from recon.graph.ground_control import Adjusted
 from recon.types import F64
 from service.georeference import LocalFrame
 from service.onboard.rig import attitude_of

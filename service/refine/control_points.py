@@ -12,7 +12,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import project
-from recon.ground_control import Mark, consenting, map_position, placed_by_points
+from recon.graph.ground_control import Mark, consenting, map_position, placed_by_points
 from recon.types import F64, Keyframe
 from service.errors import InputError
 from service.georeference import LocalFrame

@@ -16,9 +16,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon import matching, se3
+from recon import se3
 from recon.camera_model import Undistorter, project, rays
 from recon.self_calibration import SelfCalibrated, Sightings, self_calibrate
+from recon.tracking import matching
 from recon.types import F64, U8, Camera
 from service.cameras.camera_file import save_camera
 from service.cameras.file import open_file

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from recon import se3
-from recon.ground_control import (
+from recon.graph.ground_control import (
     FIX_S,
     Adjusted,
     BatchConfig,
@@ -28,9 +28,9 @@ from recon.ground_control import (
     map_position,
     supported,
 )
+from recon.graph.sensor_offsets import constants
+from recon.loops.submap_loops import SubmapLoopConfig
 from recon.self_calibration import SelfCalibrated
-from recon.sensor_offsets import constants
-from recon.submap_loops import SubmapLoopConfig
 from recon.types import F64, Camera, Keyframe, PosePrior
 from service.config import CameraConfig, FusionConfig, ScanConfig
 from service.errors import InputError

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.ground_control import Adjusted, Track, map_position
+from recon.graph.ground_control import Adjusted, Track, map_position
 from recon.types import F64
 from service.refine.control_points import Candidate
 from service.refine.stored_loops import steps_m

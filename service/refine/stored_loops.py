@@ -15,10 +15,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from recon import se3
-from recon.ground_control import Closure, Track
-from recon.loop_closure import LoopConfig, LoopView, candidates, ground_seen
-from recon.submap import filled
-from recon.submap_loops import SubmapLoopConfig, verify_surfaces
+from recon.graph.ground_control import Closure, Track
+from recon.loops.loop_closure import LoopConfig, LoopView, candidates, ground_seen
+from recon.loops.submap import filled
+from recon.loops.submap_loops import SubmapLoopConfig, verify_surfaces
 from recon.types import F64, Keyframe
 
 NEIGHBOURS = 8

@@ -20,7 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.coverage import CoverageGrid, CoverageMap, Footprint, usual_cell_m
+from recon.surface.coverage import CoverageGrid, CoverageMap, Footprint, usual_cell_m
 from recon.types import U8, Array, DepthMap
 from service.errors import OutsideError
 from service.georeference import LocalFrame

@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.raster import Raster, grid_over, rasterise
+from recon.surface.raster import Raster, grid_over, rasterise
 from service.errors import OutsideError
 from service.georeference import LocalFrame
 from service.scans.coverage import write_coverage_files

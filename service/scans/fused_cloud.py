@@ -8,10 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from recon.cloud_fusion import cloud_of, fuse_strips, without
-from recon.free_space import seen_through
+from recon.clouds.cloud_fusion import cloud_of, fuse_strips, without
+from recon.clouds.free_space import seen_through
+from recon.clouds.voxel_map import ground_sample_m
 from recon.types import F64, PointCloud
-from recon.voxel_map import ground_sample_m
 from service.stream.store import ScanStore
 
 STRIP_POINTS = 4_000_000

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from recon.raster import Grid, Raster, fill_holes, hillshade, smoothed
+from recon.surface.raster import Grid, Raster, fill_holes, hillshade, smoothed
 from recon.types import F32, F64, U8, Bool
 
 BACKGROUND = (250, 248, 246)  # BGR

@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.raster import Raster, grid_over
+from recon.surface.raster import Raster, grid_over
 from recon.types import F32, U8, PointCloud
 from service.scans.coverage import Coverage
 from service.scans.inspection import coloured

@@ -18,10 +18,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon import metrics, triangle_grid
+from recon import metrics
 from recon.metrics import Fit
-from recon.picture_shift import patch_shifts
-from recon.triangle_grid import TriangleGrid
+from recon.surface import triangle_grid
+from recon.surface.picture_shift import patch_shifts
+from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F32, F64, Array
 from service.errors import InputError
 from service.georeference import LocalFrame

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from recon.triangle_grid import first_hit
+from recon.surface.triangle_grid import first_hit
 from recon.types import F32, F64, U8
 from service.sim import shapes
 from service.sim.noise import fractal2, hash01, smoothstep, value2, value3

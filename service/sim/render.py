@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit, prange
 
 from recon.camera_model import check_camera
-from recon.triangle_grid import first_hit
+from recon.surface.triangle_grid import first_hit
 from recon.types import F32, F64, U8, Camera
 from service.sim import shapes
 from service.sim.noise import normal

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from recon import triangle_grid
-from recon.triangle_grid import TriangleGrid
+from recon.surface import triangle_grid
+from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F64, U8
 from service.sim import shapes, terrain
 from service.sim.shapes import FLAT, GABLED, PLAIN, VEHICLE, MeshParts

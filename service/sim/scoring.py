@@ -11,7 +11,7 @@ import numpy as np
 
 from recon import metrics, se3
 from recon.metrics import Fit
-from recon.raster import Grid, grid_over, rasterise_points, surface_model
+from recon.surface.raster import Grid, grid_over, rasterise_points, surface_model
 from recon.types import F32, F64
 from service.errors import InputError
 from service.georeference import LocalFrame

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from recon import metrics, se3, triangle_grid
-from recon.triangle_grid import TriangleGrid
+from recon import metrics, se3
+from recon.surface import triangle_grid
+from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F64
 from service.errors import InputError
 from service.georeference import LocalFrame

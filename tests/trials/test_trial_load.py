@@ -29,7 +29,7 @@ from trial_rig import (
 )
 
 from recon.backends.cpu import CpuBackend
-from recon.belief_propagation import BeliefPropagationConfig
+from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import U8, DisparityMap
 from service.compute.backend_choice import FallbackBackend
 from service.config import load_config

@@ -1,0 +1,1 @@
+"""Clouds that meet: registration, fusion, the voxel map."""

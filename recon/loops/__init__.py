@@ -1,0 +1,1 @@
+"""Places seen again: candidates, and the proof that they are the same."""

@@ -1,0 +1,330 @@
+"""Messages of belief propagation on a checkerboard, 32 pixels of one label at a time.
+
+Layout: the cells of one column parity of a row lie side by side, (row, parity, label, cell),
+so that a SIMD register holds one label of neighbouring pixels of one colour and any number of
+labels costs the same per label. A row of cells ends with at least one empty cell, and the
+messages have an empty row above and below: what lies beyond the border says nothing.
+
+Everything is a 16-bit integer. A cost further than four truncations above its pixel's best
+cannot win its pixel (a message is at most one truncation), so it is cut there, at every level
+before the next coarser one sums it, and no sum overflows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import get_num_threads, njit, prange
+
+from recon.stereo.message_block import LANES, update_block
+from recon.stereo.workspace import Workspace
+from recon.types import U8
+
+I16 = npt.NDArray[np.int16]
+
+BAND_ROWS = 80
+"""Rows that are worth a thread: waiting for it costs more than a smaller band."""
+
+MAX_TRUNCATION = 2048
+"""The largest truncation for which no sum leaves 16 bits."""
+
+FULL_WEIGHT = 256
+
+UP, DOWN, LEFT, RIGHT = 0, 1, 2, 3
+"""Where a message travels."""
+
+_space = Workspace()
+
+
+@dataclass(frozen=True, slots=True)
+class Smoothness:
+    """What a step between neighbouring labels costs, in integer units.
+
+    ``slope`` per label, ``truncation`` at most; both fall, with the contrast of the two
+    pixels, to ``floor`` of that at ``full_contrast`` grey levels and above.
+    """
+
+    slope: int
+    truncation: int
+    floor: float
+    full_contrast: int
+
+    def weights(self, image: U8) -> I16:
+        """Weight of the edge to the pixel above and to the left, (2, h, w) in 1 / FULL_WEIGHT."""
+        contrast = np.arange(256, dtype=np.float64) / self.full_contrast
+        table = np.maximum(1 - contrast * (1 - self.floor), self.floor) * FULL_WEIGHT
+        return np.asarray(_weights(image, np.rint(table).astype(np.int16)))
+
+
+@njit(cache=True, nogil=True)
+def _weights(image: Any, table: Any) -> Any:  # pragma: no cover - compiled
+    height, width = image.shape
+    weights = np.full((2, height, width), np.int16(FULL_WEIGHT), np.int16)
+    for v in range(height):
+        for u in range(width):
+            here = np.int16(image[v, u])
+            if v > 0:
+                weights[0, v, u] = table[abs(here - np.int16(image[v - 1, u]))]
+            if u > 0:
+                weights[1, v, u] = table[abs(here - np.int16(image[v, u - 1]))]
+    return weights
+
+
+@njit(cache=True, nogil=True)
+def _coarser_weights(fine: Any) -> Any:  # pragma: no cover - compiled
+    """Mean of the two edges that lie between two coarse pixels."""
+    _, height, width = fine.shape
+    coarse = np.empty((2, (height + 1) // 2, (width + 1) // 2), np.int16)
+    for v in range(coarse.shape[1]):
+        for u in range(coarse.shape[2]):
+            right, below = min(2 * u + 1, width - 1), min(2 * v + 1, height - 1)
+            coarse[0, v, u] = (fine[0, 2 * v, 2 * u] + fine[0, 2 * v, right]) // 2
+            coarse[1, v, u] = (fine[1, 2 * v, 2 * u] + fine[1, below, 2 * u]) // 2
+    return coarse
+
+
+@njit(cache=True, nogil=True)
+def _edges(
+    weights: Any, cells: int, slope: int, truncation: int
+) -> Any:  # pragma: no cover - compiled
+    """Slope and truncation of each edge: (slope or cut, vertical or horizontal, row, parity, cell).
+
+    A row and a cell beyond the border are never read for a pixel that exists.
+    """
+    _, height, width = weights.shape
+    edges = np.zeros((2, 2, height + 2, 2, cells), np.int16)
+    for kind in range(2):
+        for v in range(height):
+            for u in range(width):
+                w = np.int32(weights[kind, v, u])
+                edges[0, kind, v + 1, u & 1, u // 2] = slope * w // FULL_WEIGHT
+                edges[1, kind, v + 1, u & 1, u // 2] = truncation * w // FULL_WEIGHT
+    return edges
+
+
+def propagate(
+    cost: I16, image: U8, iterations: int, levels: int, smoothness: Smoothness
+) -> tuple[I16, I16]:
+    """Data (h, 2, L, cells) and messages (4, h + 2, 2, L, cells) of the finest level.
+
+    ``cost`` is (h, L, w) int16, at least 0; ``image`` (h, w) uint8 says where surfaces may end.
+    Coarse to fine, each level runs ``iterations``, each of which updates one colour of the
+    checkerboard. The arrays are used again by the next call of the same thread.
+    """
+    truncation = smoothness.truncation
+    height, labels, width = cost.shape
+    pyramid = [_space.take("data 0", (height, 2, labels, cells_of(width)))]
+    _split(cost, truncation, pyramid[0])
+    weights = [smoothness.weights(image)]
+    while len(pyramid) < levels and min(weights[-1].shape[1:]) >= 8:
+        weights.append(_coarser_weights(weights[-1]))
+        _, h, w = weights[-1].shape
+        pyramid.append(_space.take(f"data {len(pyramid)}", (h, 2, labels, cells_of(w))))
+        _coarser(pyramid[-2], w, truncation, pyramid[-1])
+    messages = np.zeros((4, 1, 2, labels, 1), np.int16)
+    for level in range(len(pyramid) - 1, -1, -1):
+        data, weight = pyramid[level], weights[level]
+        h, _, _, cells = data.shape
+        w = weight.shape[2]
+        finer = _space.take(f"messages {level}", (4, h + 2, 2, labels, cells))
+        _start(messages, w, finer)
+        messages = finer
+        edges = _edges(weight, cells, smoothness.slope, truncation)
+        bands = min(get_num_threads(), h // max(BAND_ROWS, 2 * iterations))
+        if bands > 1:
+            _sweeps(data, messages, edges, w, iterations, bands)
+        else:
+            _sweep_band(data, messages, edges, w, iterations, 0, 1)
+    return pyramid[0], messages
+
+
+def cells_of(width: int) -> int:
+    """Length of a row of cells of one parity: whole blocks, and at least one empty cell."""
+    return ((width + 1) // 2 // LANES + 1) * LANES
+
+
+@njit(cache=True, nogil=True)
+def _split(cost: Any, truncation: int, data: Any) -> None:  # pragma: no cover - compiled
+    """(h, L, w) to (h, 2, L, cells), each pixel less its least cost and cut."""
+    height, labels, width = cost.shape
+    for v in range(height):
+        low = cost[v, 0].copy()
+        for label in range(1, labels):
+            row = cost[v, label]
+            for u in range(width):
+                low[u] = min(low[u], row[u])
+        top = np.int16(4 * truncation)
+        for label in range(labels):
+            row = cost[v, label]
+            for parity in range(2):
+                out = data[v, parity, label]
+                count = (width + 1 - parity) // 2
+                for i in range(count):
+                    u = 2 * i + parity
+                    out[i] = min(np.int16(row[u] - low[u]), top)
+                out[count:] = 0
+
+
+@njit(cache=True, nogil=True)
+def _coarser(
+    fine: Any, width: int, truncation: int, data: Any
+) -> None:  # pragma: no cover - compiled
+    """Sum of the costs of 2x2 pixels, less its least, cut again to what can matter."""
+    fine_height, _, labels, _ = fine.shape
+    height = (fine_height + 1) // 2
+    for v in range(height):
+        below = 2 * v + 1 < fine_height
+        top = np.int16(4 * truncation)
+        for parity in range(2):
+            count = (width + 1 - parity) // 2
+            low = np.full(count, np.int16(32767), np.int16)
+            for label in range(labels):
+                out = data[v, parity, label]
+                a, b = fine[2 * v, 0, label], fine[2 * v, 1, label]
+                for i in range(count):
+                    out[i] = np.int16(a[2 * i + parity] + b[2 * i + parity])
+                if below:
+                    a, b = fine[2 * v + 1, 0, label], fine[2 * v + 1, 1, label]
+                    for i in range(count):
+                        out[i] += np.int16(a[2 * i + parity] + b[2 * i + parity])
+                for i in range(count):
+                    low[i] = min(low[i], out[i])
+                out[count:] = 0
+            for label in range(labels):
+                out = data[v, parity, label]
+                for i in range(count):
+                    out[i] = min(np.int16(out[i] - low[i]), top)
+
+
+@njit(cache=True, nogil=True)
+def _start(coarse: Any, width: int, messages: Any) -> None:  # pragma: no cover - compiled
+    """The messages that a level starts from: those of the coarser cells that it divides.
+
+    Only the colour that the first sweep reads is filled; the sweep writes the other.
+    """
+    height, labels, cells = messages.shape[1] - 2, messages.shape[3], messages.shape[4]
+    known = coarse.shape[4]
+    for r in range(height + 2):
+        for direction in range(4):
+            if r in (0, height + 1):
+                messages[direction, r] = 0
+                continue
+            parity = r & 1  # row r - 1 + colour 1
+            # The cell before the first one of the row's other parity is read as a neighbour.
+            messages[direction, r, 1 - parity, labels - 1, cells - 1] = 0
+            for label in range(labels):
+                out = messages[direction, r, parity, label]
+                if known == 1:
+                    out[:] = 0
+                    continue
+                even = coarse[direction, (r + 1) // 2, 0, label]
+                odd = coarse[direction, (r + 1) // 2, 1, label]
+                for i in range(cells // 2):
+                    out[2 * i] = even[i]
+                    out[2 * i + 1] = odd[i]
+                out[(width + 1 - parity) // 2 :] = 0
+
+
+@njit(cache=True, nogil=True)
+def _update_row(
+    data: Any, messages: Any, v: int, colour: int, edges: Any, masks: Any, scratch: Any
+) -> None:  # pragma: no cover - compiled
+    """Messages that leave the pixels of one colour of row ``v``."""
+    _, _, labels, cells = data.shape
+    parity = (v + colour) & 1
+    row = labels * cells * 2  # bytes
+    base = messages.ctypes.data
+    step = (data.shape[0] + 2) * 2 * row  # from direction to direction
+    here = base + (2 * (v + 1) + parity) * row
+    beside = base + (2 * (v + 1) + 1 - parity) * row
+    d = data.ctypes.data + (2 * v + parity) * row
+    line = 2 * cells  # bytes of the edges of one parity of a row
+    side = (data.shape[0] + 2) * 2 * line  # from vertical to horizontal edges
+    for block in range(cells // LANES):
+        at = 2 * LANES * block
+        arriving = (
+            here + 2 * row + UP * step + at,
+            here - 2 * row + DOWN * step + at,
+            beside + LEFT * step + at + 2 * parity,
+            beside + RIGHT * step + at + 2 * parity - 2,
+        )
+        leaving = (here + at, here + step + at, here + 2 * step + at, here + 3 * step + at)
+        e = edges.ctypes.data + at
+        # smoothness towards above, below, left and right
+        places = (
+            e + (2 * (v + 1) + parity) * line,
+            e + (2 * (v + 2) + parity) * line,
+            e + (2 * (v + 1) + parity) * line + side,
+            e + (2 * (v + 1) + 1 - parity) * line + side + 2 * parity,
+        )
+        cut = 2 * side
+        update_block(
+            d + at,
+            arriving,
+            leaving,
+            masks.ctypes.data + parity * 2 * cells + at,
+            scratch.ctypes.data,
+            2 * cells,
+            labels,
+            places,
+            (places[0] + cut, places[1] + cut, places[2] + cut, places[3] + cut),
+        )
+
+
+@njit(cache=True, nogil=True)
+def _masks(width: int, cells: int) -> Any:  # pragma: no cover - compiled
+    """(2, cells) -1 where a cell of that parity is a pixel, else 0."""
+    masks = np.zeros((2, cells), np.int16)
+    masks[0, : (width + 1) // 2] = -1
+    masks[1, : width // 2] = -1
+    return masks
+
+
+@njit(cache=True, nogil=True)
+def _sweep_band(
+    data: Any, messages: Any, edges: Any, width: int, iterations: int, band: int, bands: int
+) -> None:  # pragma: no cover - compiled
+    """All iterations of a band of rows, as far as it can go alone, in one pass of the memory.
+
+    Iteration t of a row needs iteration t - 1 of the rows beside it, so a band does one row
+    less at each inner edge per iteration.
+    """
+    height, _, labels, cells = data.shape
+    masks = _masks(width, cells)
+    scratch = np.empty(labels * 4 * LANES, np.int16)
+    first, last = height * band // bands, height * (band + 1) // bands
+    for front in range(first, last + iterations):
+        for t in range(iterations):
+            v = front - t
+            begin = first + t if band > 0 else 0
+            end = last - t if band < bands - 1 else height
+            if begin <= v < end:
+                _update_row(data, messages, v, t & 1, edges, masks, scratch)
+
+
+@njit(cache=True, nogil=True)
+def _sweep_gap(
+    data: Any, messages: Any, edges: Any, width: int, iterations: int, edge: int
+) -> None:  # pragma: no cover - compiled
+    """What the bands on both sides of row ``edge`` left out."""
+    labels, cells = data.shape[2], data.shape[3]
+    masks = _masks(width, cells)
+    scratch = np.empty(labels * 4 * LANES, np.int16)
+    for t in range(1, iterations):
+        for v in range(edge - t, edge + t):
+            _update_row(data, messages, v, t & 1, edges, masks, scratch)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _sweeps(
+    data: Any, messages: Any, edges: Any, width: int, iterations: int, bands: int
+) -> None:  # pragma: no cover - compiled
+    """All iterations of a level, the bands in parallel."""
+    for band in prange(bands):
+        _sweep_band(data, messages, edges, width, iterations, band, bands)
+    for band in prange(1, bands):
+        edge = data.shape[0] * band // bands
+        _sweep_gap(data, messages, edges, width, iterations, edge)

@@ -1,0 +1,378 @@
+"""Disparity at the resolution of a guidance image: joint bilateral upsampling (Eq. 2).
+
+Kopf et al., https://doi.org/10.1145/1276377.1276497. The taps lie on the coarse grid, the
+range kernel compares the guide at the fine pixel with the guide at the tap. The faster
+guided filter is that of He and Sun, https://arxiv.org/abs/1505.00996, fitted on the coarse
+grid and applied on the fine one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange, types
+from numba.extending import intrinsic
+
+from recon.stereo.matching_cost import plain
+from recon.types import F32, U8, Bool, DisparityMap
+
+I32 = npt.NDArray[np.int32]
+
+PAPER_RATIO = 2704 / 320
+"""Fine pixels per coarse pixel in the paper."""
+
+RANGE_FLOOR = -20.0
+"""log2 of the least range weight, so that a pixel like none of its taps takes their mean."""
+
+MIN_CONFIDENCE = 1e-3
+"""The least weight of a known tap."""
+
+FARTHEST = -40.0
+OUTSIDE = -60.0
+"""log2 of the least spatial weight along one axis, and of that of a tap outside the coarse
+image: nothing beside the nearest tap, and no sum leaves the range of :func:`_exp2`."""
+
+TILE = 64
+GROUP = 5
+BAND = 16
+CHANNELS = 6
+TAP_RUN = GROUP * CHANNELS * TILE
+"""Fine pixels and taps of one run of the compiled loop, rows at most that share their taps
+while these lie in the nearest cache; values that a tap brings; floats of a run of taps."""
+
+
+@dataclass(frozen=True, slots=True)
+class UpsamplingConfig:
+    """The paper's "filter 15, diameter 10", mapped so that any guide size gives one look.
+
+    The spatial sigma is ``filter_px`` pixels of the paper's 2704 px frame, which are
+    15 / 8.45 = 1.78 coarse pixels; the range sigma is ``range_sigma`` grey levels of the
+    Euclidean distance of the colours; the window is the nearest ``diameter_px`` x
+    ``diameter_px`` coarse pixels.
+    """
+
+    method: str = "bilateral"  # "bilateral" (exact) or "guided" (fast)
+    filter_px: float = 15.0
+    range_sigma: float = 15.0  # grey levels
+    diameter_px: int = 10  # coarse pixels
+    min_support: float = 0.5  # share of the weight that must fall on known taps
+    guided_radius_px: int = 4  # coarse pixels, of the guided filter
+    guided_epsilon: float = 4.0  # grey levels; edges below it are smoothed
+
+    def __post_init__(self) -> None:
+        if self.method not in ("bilateral", "guided"):
+            raise ValueError(f"method is 'bilateral' or 'guided', not {self.method!r}")
+        if not (self.filter_px > 0 and self.range_sigma > 0 and self.guided_epsilon > 0):
+            raise ValueError("filter_px, range_sigma and guided_epsilon must be positive")
+        if not 2 <= self.diameter_px <= 64 or not 1 <= self.guided_radius_px <= 64:
+            raise ValueError("diameter_px is 2 to 64 and guided_radius_px 1 to 64")
+        if not 0 <= self.min_support <= 1:
+            raise ValueError(f"min_support is a share, 0 to 1, not {self.min_support}")
+
+    @property
+    def spatial_sigma(self) -> float:
+        """Coarse pixels."""
+        return self.filter_px / PAPER_RATIO
+
+
+def upsample(coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
+    """``coarse`` (h, w) at the size of ``guide`` (H, W, 3) uint8; the values are not rescaled.
+
+    Unknown taps carry no weight; a fine pixel is unknown (NaN) when less than
+    ``config.min_support`` of its weight falls on known ones. Raises ValueError for bad shapes.
+    """
+    check_guide(coarse, guide)
+    if config.method == "guided":
+        return _guided(coarse, guide, config)
+    return _joint_bilateral(coarse, guide, config)
+
+
+def _joint_bilateral(coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
+    """Eq. 2 with every tap of the window."""
+    shape = (guide.shape[0], guide.shape[1])
+    h, w = coarse.px.shape
+    scale = float(np.sqrt(0.5 * np.log2(np.e)) / config.range_sigma)
+    base_y, spatial_y = window(h, shape[0], config)
+    base_x, spatial_x = window(w, shape[1], config)
+    pad = -shape[1] % TILE
+    padded = -config.diameter_px % GROUP
+    out, sure = np.empty((2, *shape), np.float32)
+    _bilateral(
+        _taps(coarse, guide, scale),
+        plain(guide),
+        np.pad(base_x, (0, pad), mode="edge"),
+        base_y,
+        np.pad(spatial_x, ((0, pad), (0, padded)), constant_values=OUTSIDE),
+        np.ascontiguousarray(spatial_y.T),
+        scale,
+        float(config.min_support),
+        out,
+        sure,
+    )
+    return DisparityMap(out, sure)
+
+
+def window(taps: int, fine: int, config: UpsamplingConfig) -> tuple[I32, F32]:
+    """First tap of each fine pixel along one axis (fine,) and log2 of s (fine, diameter)."""
+    q = (np.arange(fine) + 0.5) * (taps / fine) - 0.5
+    first = np.ceil(q - config.diameter_px / 2).astype(np.int32)
+    distance = first[:, None] + np.arange(config.diameter_px) - q[:, None]
+    spatial = -0.5 * np.log2(np.e) * (distance / config.spatial_sigma) ** 2
+    return first, np.maximum(spatial, FARTHEST).astype(np.float32)
+
+
+def _taps(coarse: DisparityMap, guide: U8, scale: float) -> F32:
+    """Colour (3), confidence * disparity, confidence and known, as (h, 6, w) float32."""
+    h, w = coarse.px.shape
+    taps = np.empty((h, CHANNELS, w), np.float32)
+    colour = guide_at_taps(guide, (h, w))
+    _fill_taps(plain(coarse.px), plain(coarse.confidence), colour, scale, taps)
+    return taps
+
+
+@njit(cache=True, nogil=True)
+def _fill_taps(
+    px: Any, confidence: Any, colour: Any, scale: float, taps: Any
+) -> None:  # pragma: no cover - compiled
+    for v in range(px.shape[0]):
+        for u in range(px.shape[1]):
+            known = not np.isnan(px[v, u])
+            c = max(confidence[v, u], np.float32(MIN_CONFIDENCE)) if known else np.float32(0)
+            for channel in range(3):
+                taps[v, channel, u] = np.float32(scale) * np.float32(colour[v, u, channel])
+            taps[v, 3, u] = c * px[v, u] if known else np.float32(0)
+            taps[v, 4, u] = c
+            taps[v, 5, u] = np.float32(known)
+
+
+def check_guide(coarse: DisparityMap, guide: U8) -> None:
+    """Raises ValueError when the shapes do not fit the contract of :func:`upsample`."""
+    if guide.ndim != 3 or guide.shape[2] != 3 or guide.dtype != np.uint8:
+        raise ValueError(f"the guide must be (H, W, 3) uint8, not {guide.shape} {guide.dtype}")
+    if coarse.px.ndim != 2 or coarse.px.shape != coarse.confidence.shape:
+        raise ValueError(f"bad disparity {coarse.px.shape}, {coarse.confidence.shape}")
+    if any(a < b for a, b in zip(guide.shape, coarse.px.shape, strict=False)):
+        raise ValueError(f"guide {guide.shape[:2]} is smaller than disparity {coarse.px.shape}")
+
+
+def guide_at_taps(guide: U8, shape: tuple[int, int]) -> U8:
+    """The guide at the coarse grid, (h, w, 3) uint8: the mean of what each tap covers."""
+    height, width = shape
+    return np.asarray(cv2.resize(guide, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+@intrinsic
+def _as_float(typingctx: Any, bits: Any) -> Any:
+    """The float32 with these 32 bits."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], context.get_value_type(types.float32))
+
+    return types.float32(types.int32), codegen
+
+
+@intrinsic
+def _as_bits(typingctx: Any, value: Any) -> Any:
+    """The 32 bits of a float32."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], context.get_value_type(types.int32))
+
+    return types.int32(types.float32), codegen
+
+
+@njit(inline="always")
+def _exp2(e: Any) -> Any:  # pragma: no cover - compiled
+    """2 to the power e for -126 <= e <= 0, relative error below 8e-5; no branch, no table."""
+    shifted = e + np.float32(12582912.0)  # 1.5 * 2**23 leaves the rounded e in the low bits
+    f = e - (shifted - np.float32(12582912.0))
+    power = np.float32(0.05517148) * f + np.float32(0.24261111)
+    power = power * f + np.float32(0.693261)
+    power = power * f + np.float32(0.99992806)
+    return _as_float(np.int32(_as_bits(power) + np.int32(_as_bits(shifted) << np.int32(23))))
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+def _add_taps(
+    tap: Any, near: Any, spatial: Any, colours: Any, totals: Any
+) -> None:  # pragma: no cover - compiled
+    """Add GROUP neighbouring taps of one coarse row to the sums of some runs of fine pixels.
+
+    Flat arrays and constant offsets, so that the compiler sees that nothing overlaps.
+    """
+    for row in range(spatial.shape[0]):
+        s = spatial[row]
+        colour = colours[row]
+        sums = totals[row]
+        for x in range(TILE):
+            b, g, r = colour[x], colour[TILE + x], colour[2 * TILE + x]
+            everything, known = sums[x], sums[TILE + x]
+            weight, value = sums[2 * TILE + x], sums[3 * TILE + x]
+            for n in range(GROUP):
+                db = b - tap[(CHANNELS * n) * TILE + x]
+                dg = g - tap[(CHANNELS * n + 1) * TILE + x]
+                dr = r - tap[(CHANNELS * n + 2) * TILE + x]
+                tonal = max(-(db * db + dg * dg + dr * dr), np.float32(RANGE_FLOOR))
+                w = _exp2(tonal + (near[n * TILE + x] + s))
+                value += w * tap[(CHANNELS * n + 3) * TILE + x]
+                weight += w * tap[(CHANNELS * n + 4) * TILE + x]
+                known += w * tap[(CHANNELS * n + 5) * TILE + x]
+                everything += w
+            sums[x] = everything
+            sums[TILE + x] = known
+            sums[2 * TILE + x] = weight
+            sums[3 * TILE + x] = value
+
+
+@njit(cache=True, nogil=True)
+def _aligned(size: int) -> Any:  # pragma: no cover - compiled
+    """``size`` float32 that start on a cache line: a load across two lines takes twice as long."""
+    memory = np.empty(size + 16, np.float32)
+    start = (-memory.ctypes.data % 64) // 4
+    return memory[start : start + size]
+
+
+@njit(cache=True, nogil=True)
+def _spread(row: Any, index: Any, tap: Any) -> None:  # pragma: no cover - compiled
+    """Lay the taps of one coarse row beside each fine pixel: (group, [tap, channel, pixel])."""
+    for k in range(index.shape[0]):
+        column = index[k]
+        out = tap[k // GROUP]
+        for channel in range(CHANNELS):
+            source = row[channel]
+            start = (CHANNELS * (k % GROUP) + channel) * TILE
+            for x in range(TILE):
+                out[start + x] = source[column[x]]
+
+
+@njit(cache=True, nogil=True)
+def _columns(
+    base: Any, spatial: Any, first: int, width: int, index: Any, near: Any
+) -> None:  # pragma: no cover - compiled
+    """Coarse column of each (tap, pixel) of a tile, and log2 of its spatial weight."""
+    for k in range(index.shape[0]):
+        for x in range(TILE):
+            i = base[first + x] + k
+            index[k, x] = min(max(i, 0), width - 1)
+            near[k // GROUP, k % GROUP * TILE + x] = (
+                spatial[first + x, k] if i == index[k, x] else OUTSIDE
+            )
+
+
+@njit(cache=True, nogil=True)
+def _load_colour(guide: Any, scale: Any, colour: Any) -> None:  # pragma: no cover - compiled
+    """The scaled colours of a run of fine pixels: (channel, pixel), flat."""
+    for x in range(guide.shape[0]):
+        for channel in range(3):
+            colour[channel * TILE + x] = scale * np.float32(guide[x, channel])
+
+
+@njit(cache=True, nogil=True)
+def _finish(sums: Any, support: Any, out: Any, sure: Any) -> None:  # pragma: no cover - compiled
+    """Eq. 2's division by K_p for one run of fine pixels."""
+    for x in range(out.shape[0]):
+        everything, weight = sums[x], sums[2 * TILE + x]
+        good = sums[TILE + x] > support * everything
+        out[x] = sums[3 * TILE + x] / weight if good else np.float32(np.nan)
+        sure[x] = weight / everything if good else np.float32(0)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _bilateral(
+    taps: Any,
+    guide: Any,
+    base_x: Any,
+    base_y: Any,
+    spatial_x: Any,
+    spatial_y: Any,
+    colour_scale: float,
+    min_support: float,
+    out: Any,
+    sure: Any,
+) -> None:  # pragma: no cover - compiled
+    """Tiles of fine columns in parallel; each goes down the rows with its spread taps at hand."""
+    h = taps.shape[0]
+    height, width = out.shape
+    reach = spatial_y.shape[0]
+    groups = spatial_x.shape[1] // GROUP
+    tiles = (width + TILE - 1) // TILE
+    for tile in prange(tiles):
+        ring = _aligned(reach * groups * TAP_RUN).reshape((reach, groups, TAP_RUN))
+        ready = np.full(reach, -1, np.int64)
+        first = tile * TILE
+        last = min(first + TILE, width)
+        near = _aligned(groups * GROUP * TILE).reshape((groups, GROUP * TILE))
+        index = np.empty((groups * GROUP, TILE), np.uint32)
+        _columns(base_x, spatial_x, first, taps.shape[2], index, near)
+        colour = _aligned(BAND * 3 * TILE).reshape((BAND, 3 * TILE))
+        colour[:] = np.float32(0)
+        sums = _aligned(BAND * 4 * TILE).reshape((BAND, 4 * TILE))
+        top = 0
+        while top < height:
+            rows = 1
+            while rows < BAND and top + rows < height and base_y[top + rows] == base_y[top]:
+                rows += 1
+            for y in range(rows):
+                sums[y, :] = np.float32(0)
+                _load_colour(guide[top + y, first:last], np.float32(colour_scale), colour[y])
+            for k in range(reach):
+                j = base_y[top] + k
+                if 0 <= j < h:
+                    if ready[j % reach] != j:
+                        _spread(taps[j], index, ring[j % reach])
+                        ready[j % reach] = j
+                    for group in range(groups):
+                        tap = ring[j % reach, group]
+                        _add_taps(tap, near[group], spatial_y[k, top : top + rows], colour, sums)
+            for y in range(rows):
+                v = top + y
+                _finish(sums[y], np.float32(min_support), out[v, first:last], sure[v, first:last])
+            top += rows
+
+
+def _guided(coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
+    """Local linear model of the disparity in the guide's brightness, applied at full size."""
+    h, w = coarse.px.shape
+    height, width = guide.shape[:2]
+    grey = np.asarray(cv2.cvtColor(guide, cv2.COLOR_BGR2GRAY))
+    small = np.asarray(cv2.resize(grey, (w, h), interpolation=cv2.INTER_AREA), np.float32)
+    known = np.isfinite(coarse.px)
+    weight = np.where(known, np.maximum(coarse.confidence, 1e-3), 0).astype(np.float32)
+    slope, offset, sure = _linear_fit(
+        small, np.where(known, coarse.px, 0).astype(np.float32), weight, config
+    )
+    size = (width, height)
+    support = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+    full_slope = cv2.resize(slope, size, interpolation=cv2.INTER_LINEAR)
+    px = cv2.resize(offset, size, interpolation=cv2.INTER_LINEAR)
+    px = np.asarray(px + full_slope * grey)
+    unknown: Bool = np.asarray(support) < max(config.min_support, 1e-3)
+    px[unknown] = np.nan
+    confidence = cv2.resize(sure, size, interpolation=cv2.INTER_LINEAR)
+    confidence[unknown] = 0
+    return DisparityMap(np.asarray(px, np.float32), np.asarray(confidence, np.float32))
+
+
+def _linear_fit(guide: F32, px: F32, weight: F32, config: UpsamplingConfig) -> tuple[F32, F32, F32]:
+    """Slope, offset and confidence of the weighted fit about each coarse pixel."""
+    side = (2 * config.guided_radius_px + 1,) * 2
+
+    def mean(image: npt.NDArray[np.float32]) -> F32:
+        return np.asarray(cv2.blur(image, side, borderType=cv2.BORDER_REFLECT), np.float32)
+
+    total = np.maximum(mean(weight), 1e-9)
+    m_guide = mean(weight * guide) / total
+    m_px = mean(weight * px) / total
+    variance = np.maximum(mean(weight * guide * guide) / total - m_guide * m_guide, 0)
+    covariance = mean(weight * guide * px) / total - m_guide * m_px
+    slope = covariance / (variance + config.guided_epsilon**2)
+    offset = m_px - slope * m_guide
+    return (
+        (mean(weight * slope) / total).astype(np.float32),
+        (mean(weight * offset) / total).astype(np.float32),
+        np.minimum(total, 1).astype(np.float32),
+    )

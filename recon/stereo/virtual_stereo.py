@@ -1,0 +1,327 @@
+"""Virtual stereo: two frames of one flying camera made into a rectified stereo pair.
+
+Sections 2.1 and 2.3 of the paper. DEVIATION: the paper takes neighbouring frames as
+rectified already and searches 16 disparities from zero. Here the relative pose of the two
+frames rectifies them in any flight direction, and the labels start at the disparity of the
+ground plane, so that 16 of them cover relief instead of empty air.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from recon import se3
+from recon.camera_model import scaled_K
+from recon.stereo.exposure import stretch
+from recon.types import F64, U8, Bool, DepthMap, DisparityMap, StereoPair
+
+
+@dataclass(frozen=True, slots=True)
+class VirtualStereoConfig:
+    """Parameters of pair selection and rectification."""
+
+    base_to_height: float = 0.1  # wanted baseline over distance
+    least_base_to_height: float = 0.03
+    most_base_to_height: float = 0.45
+    least_overlap: float = 0.4  # share of the left view that the right one sees
+    width_px: int = 320  # of the stereo views, along the picture's width
+    guide_width_px: int = 1280  # of the picture that guides the upsampling
+    guided: bool = True  # make the picture that guides the upsampling
+    labels: int = 16  # the fewest; relief may widen it
+    most_labels: int = 96
+    margin_labels: float = 3.0  # on either side of the relief that the landmarks show
+    epipole_margin: float = 1.3  # the epipole must be this many half pictures away
+
+    def __post_init__(self) -> None:
+        if not 0 < self.least_base_to_height < self.most_base_to_height:
+            raise ValueError("0 < least_base_to_height < most_base_to_height must hold")
+        if self.labels < 4 or self.most_labels < self.labels:
+            raise ValueError("4 <= labels <= most_labels must hold")
+        if self.width_px < 32 or self.guide_width_px < self.width_px:
+            raise ValueError("32 <= width_px <= guide_width_px must hold")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A posed picture without distortion that may become a left or right view."""
+
+    seq: int
+    time_ns: int
+    bgr: U8 | None  # (H, W, 3); only a left view that guides the upsampling needs it
+    grey: U8  # (H, W) the same
+    K: F64  # (3, 3) px of that picture
+    T_odom_camera: F64  # (4, 4)
+    seen: U8 | None = None  # (H, W) zero where the picture has nothing; None: all of it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refusal:
+    """Why two views do not make a stereo pair."""
+
+    reason: str
+
+
+def check_pair(
+    left: View, right: View, depth_m: float, config: VirtualStereoConfig
+) -> Refusal | None:
+    """The reason why the views make no stereo pair, or None when they do.
+
+    ``depth_m`` is the median distance of what the left view sees.
+    """
+    T_left_right = se3.inverse(left.T_odom_camera) @ right.T_odom_camera
+    t = T_left_right[:3, 3]
+    base = float(np.linalg.norm(t))
+    if not depth_m > 0:
+        return Refusal("depth unknown")
+    if base < config.least_base_to_height * depth_m:
+        return Refusal("baseline too short")
+    if base > config.most_base_to_height * depth_m:
+        return Refusal("baseline too long")
+    H, W = left.grey.shape
+    reach = np.hypot(W, H) / 2 / left.K[0, 0]
+    for axis in (t, T_left_right[:3, :3].T @ t):  # seen from the left and from the right view
+        if np.hypot(axis[0], axis[1]) < config.epipole_margin * reach * abs(axis[2]):
+            return Refusal("flying along the line of sight")
+    if _overlap(T_left_right, left.K, (W, H), depth_m) < config.least_overlap:
+        return Refusal("too little overlap")
+    return None
+
+
+def _overlap(T_left_right: F64, K: F64, size: tuple[int, int], depth_m: float) -> float:
+    """Share of the left picture that the right one sees, for ground at one depth."""
+    W, H = size
+    u, v = np.meshgrid(np.linspace(0, W - 1, 12), np.linspace(0, H - 1, 8))
+    ray = np.stack(
+        [(u.ravel() - K[0, 2]) / K[0, 0], (v.ravel() - K[1, 2]) / K[1, 1], np.ones(u.size)], 1
+    )
+    P = se3.transform(se3.inverse(T_left_right), ray * depth_m)
+    uv = P[:, :2] / P[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]
+    inside = (P[:, 2] > 0) & np.all((uv > 0) & (uv < [W, H]), axis=1)
+    return float(inside.mean())
+
+
+def rectify(
+    left: View,
+    right: View,
+    points_m: F64,
+    config: VirtualStereoConfig,
+    relief_m: tuple[float, float] = (0.0, 0.0),
+) -> StereoPair | Refusal:
+    """The rectified pair of two views with its disparity window, or why there is none.
+
+    Args:
+        points_m: (N, 3) some points of the scene in the left camera; their disparities
+            place the ground plane and the window (at least 8).
+        relief_m: lowest and highest surface known, in metres towards the camera from the
+            plane; widens the window.
+    """
+    if len(points_m) < 8:
+        return Refusal("depth unknown")
+    refusal = check_pair(left, right, float(np.median(points_m[:, 2])), config)
+    if refusal is not None:
+        return refusal
+    T_left_right = se3.inverse(left.T_odom_camera) @ right.T_odom_camera
+    base = float(np.linalg.norm(T_left_right[:3, 3]))
+    R_rect_left = _rectifying_rotation(T_left_right)
+    K, size = _rectified_intrinsics(left, R_rect_left, config.width_px)
+    window = _disparity_window(points_m @ R_rect_left.T, K, base, config, relief_m)
+    if isinstance(window, Refusal):
+        return window
+    plane, labels = window
+    R_rect_right = R_rect_left @ T_left_right[:3, :3]
+    scale = max(1.0, config.guide_width_px / config.width_px)
+    left_grey, left_seen = _stereo_view(left, R_rect_left, K, size, None)
+    right_grey, right_seen = _stereo_view(right, R_rect_right, K, size, plane)
+    guide = None
+    if config.guided and left.bgr is not None:
+        guide = _warp(left.bgr, left, R_rect_left, K, size, scale)
+    return StereoPair(
+        left=left_grey,
+        right=right_grey,
+        baseline_m=base,
+        K=K,
+        labels=labels,
+        plane=plane,
+        slope=1.0 - float(plane[0]),
+        T_world_left=left.T_odom_camera @ se3.compose(R_rect_left.T, np.zeros(3)),
+        R_left_keyframe=R_rect_left,
+        guide=guide,
+        left_seen=left_seen,
+        right_seen=right_seen,
+    )
+
+
+def drop_unseen(labels: DisparityMap, pair: StereoPair) -> DisparityMap:
+    """``labels`` (h, w) of the pair without those that rest on nothing in either picture."""
+    h, w = labels.px.shape
+    if pair.left_seen is None or pair.right_seen is None:
+        return labels
+    known = np.isfinite(labels.px)
+    partner = np.rint(np.arange(w) - np.where(known, labels.px, 0.0)).astype(np.int64)
+    inside = known & pair.left_seen & (partner >= 0) & (partner < w)
+    rows = np.arange(h)[:, None]
+    inside &= pair.right_seen[rows, np.clip(partner, 0, w - 1)]
+    return DisparityMap(
+        np.where(inside, labels.px, np.nan).astype(np.float32),
+        np.where(inside, labels.confidence, 0.0).astype(np.float32),
+    )
+
+
+def _rectifying_rotation(T_left_right: F64) -> F64:
+    """(3, 3) R_rect_left: x along the baseline, z as near to both optical axes as can be."""
+    x = T_left_right[:3, 3] / np.linalg.norm(T_left_right[:3, 3])
+    mean_axis = np.array([0.0, 0.0, 1.0]) + T_left_right[:3, 2]
+    z = mean_axis - (mean_axis @ x) * x
+    z /= np.linalg.norm(z)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _rectified_intrinsics(
+    left: View, R_rect_left: F64, width_px: int
+) -> tuple[F64, tuple[int, int]]:
+    """Intrinsics and (w, h) of a rectified picture that holds the whole left view."""
+    H, W = left.grey.shape
+    s = width_px / W
+    corners = np.array([[0, 0, 1], [W - 1, 0, 1], [0, H - 1, 1], [W - 1, H - 1, 1.0]])
+    ray = corners @ np.linalg.inv(left.K).T @ R_rect_left.T
+    xy = ray[:, :2] / np.maximum(ray[:, 2:], 0.2)
+    f = s * left.K[0, 0]
+    low, high = xy.min(axis=0) * f, xy.max(axis=0) * f
+    w, h = (int(n) for n in np.ceil(high - low).clip(32, 2.5 * width_px))
+    K = np.array([[f, 0.0, -low[0]], [0.0, f, -low[1]], [0.0, 0.0, 1.0]])
+    return K, (w, h)
+
+
+def _disparity_window(
+    points: F64,
+    K: F64,
+    base: float,
+    config: VirtualStereoConfig,
+    relief_m: tuple[float, float],
+) -> tuple[F64, int] | Refusal:
+    """Disparity plane of label 0 and the number of labels, from points in the rectified view."""
+    points = points[points[:, 2] > 0]
+    u = K[0, 0] * points[:, 0] / points[:, 2] + K[0, 2]
+    v = K[1, 1] * points[:, 1] / points[:, 2] + K[1, 2]
+    d = K[0, 0] * base / points[:, 2]
+    plane, residual = _fit_plane(u, v, d)
+    if abs(plane[0]) > 0.7:
+        return Refusal("ground too steep to rectify")
+    depth = float(np.median(points[:, 2]))
+    per_metre = float(np.median(d)) / depth  # disparity per metre towards the camera, near it
+    low, high = np.percentile(residual, [1.0, 99.0])
+    low = min(float(low), relief_m[0] * per_metre)
+    near = relief_m[1] if relief_m[1] < 0.7 * depth else 0.7 * depth
+    high = max(float(high), near * per_metre * depth / (depth - near))
+    need = (high - low) / (1.0 - plane[0]) + 2 * config.margin_labels
+    labels = int(np.ceil(need / 16) * 16) if need > config.labels else config.labels
+    if labels > config.most_labels:
+        return Refusal("relief too large for the baseline")
+    spare = 0.5 * (labels - 1 - need) * (1.0 - plane[0])
+    offset = low - config.margin_labels * (1.0 - plane[0]) - spare
+    return plane + np.array([0.0, 0.0, offset]), labels
+
+
+def _fit_plane(u: F64, v: F64, d: F64) -> tuple[F64, F64]:
+    """(3,) plane with ``d ~ plane . (u, v, 1)``, robust, and the residuals (N,)."""
+    A = np.stack([u, v, np.ones_like(u)], axis=1)
+    weights = np.ones_like(u)
+    plane = np.zeros(3)
+    for _ in range(8):
+        Aw = A * weights[:, None]
+        plane = np.linalg.solve(Aw.T @ A + np.diag([1e-6, 1e-6, 1e-9]), Aw.T @ d)
+        residual = d - A @ plane
+        scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
+        weights = 1.0 / (1.0 + (residual / (2 * scale)) ** 2)
+    return np.asarray(plane), np.asarray(d - A @ plane)
+
+
+def _homography(view: View, R_rect_view: F64, K: F64, oversample: float, plane: F64 | None) -> F64:
+    """(3, 3) from a pixel of the rectified picture (``oversample`` finer) to one of the view.
+
+    The shift by the disparity plane is affine along the rows, so it is part of it.
+    """
+    fine = np.array(
+        [
+            [1 / oversample, 0.0, 0.5 / oversample - 0.5],
+            [0.0, 1 / oversample, 0.5 / oversample - 0.5],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    shift = np.eye(3)
+    if plane is not None:
+        shift[0] -= plane
+    return np.asarray(view.K @ R_rect_view.T @ np.linalg.inv(K) @ shift @ fine)
+
+
+def _seen(
+    view: View, R_rect_view: F64, K: F64, size: tuple[int, int], plane: F64 | None = None
+) -> Bool:
+    """(h, w) True where the rectified picture shows something, a pixel inside the border."""
+    H, W = view.grey.shape
+    rim = int(np.ceil(1.0 + view.K[0, 0] / K[0, 0]))
+    inside = np.zeros((H, W), np.uint8)
+    inside[rim:-rim, rim:-rim] = 1 if view.seen is None else view.seen[rim:-rim, rim:-rim]
+    M = _homography(view, R_rect_view, K, 1.0, plane)
+    flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+    seen = cv2.warpPerspective(inside, M, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
+    return np.asarray(seen > 0)
+
+
+def _warp(
+    picture: U8,
+    view: View,
+    R_rect_view: F64,
+    K: F64,
+    size: tuple[int, int],
+    oversample: float,
+    plane: F64 | None = None,
+) -> U8:
+    """The view's ``picture`` as the rectified camera sees it, shifted by the disparity plane.
+
+    It is halved first until no pixel is skipped. Beyond the picture its edge is repeated: a
+    black rim would be matched with the other view's.
+    """
+    M = _homography(view, R_rect_view, K, oversample, plane)
+    ratio = float(view.K[0, 0]) / (K[0, 0] * oversample)
+    while ratio > 1.9:
+        H, W = picture.shape[:2]
+        half = (W // 2, H // 2)
+        M = scaled_K(M, half[0] / W, half[1] / H)
+        picture = np.asarray(cv2.resize(picture, half, interpolation=cv2.INTER_AREA), np.uint8)
+        ratio /= 2
+    fine = (int(size[0] * oversample), int(size[1] * oversample))
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    out = cv2.warpPerspective(picture, M, fine, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(out, dtype=np.uint8)
+
+
+def _stereo_view(
+    view: View, R_rect_view: F64, K: F64, size: tuple[int, int], plane: F64 | None
+) -> tuple[U8, Bool]:
+    """Grey rectified view (h, w), averaged down from twice its size, and where it is seen."""
+    seen = _seen(view, R_rect_view, K, size, plane)
+    double = _warp(view.grey, view, R_rect_view, K, size, 2.0, plane)
+    grey = np.asarray(cv2.resize(double, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return stretch(grey, seen), seen
+
+
+def plane_relief(depth: DepthMap, known: tuple[float, float]) -> tuple[float, float]:
+    """Lowest and highest surface in metres towards the camera from the main plane of a view.
+
+    ``known`` is what earlier views showed; it fades by a tenth per view.
+    """
+    h, w = depth.depth_m.shape
+    step = max(1, h // 60)
+    z = depth.depth_m[::step, ::step].astype(np.float64)
+    u, v = np.meshgrid(np.arange(0, w, step), np.arange(0, h, step))
+    good = np.isfinite(z) & (depth.views[::step, ::step] >= 2)
+    if good.sum() < 50:
+        return known
+    plane, _ = _fit_plane(u[good].astype(np.float64), v[good].astype(np.float64), 1.0 / z[good])
+    flat = 1.0 / np.maximum(plane[0] * u[good] + plane[1] * v[good] + plane[2], 1e-6)
+    low, high = np.percentile(flat - z[good], [0.5, 99.5])
+    return min(0.9 * known[0], float(low)), max(0.9 * known[1], float(high))

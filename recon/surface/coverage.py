@@ -1,0 +1,353 @@
+"""How well each piece of ground was seen, kept up to date keyframe by keyframe.
+
+The ground is cut into square cells, held in tiles that exist only where something was seen,
+so memory follows the area. Per cell: in how many keyframes' pictures it lies, the best sigma
+and the mean height of the surface measured there, and when that was. A keyframe that is
+moved takes its share of the views along; the surface of the tiles it touched is summed up
+again from the keyframes that touch them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numba import njit
+
+from recon import se3
+from recon.camera_model import rays
+from recon.surface.raster import Grid
+from recon.types import F32, F64, Array, Bool, DepthMap
+
+TILE = 64
+"""Cells along a tile's side."""
+
+CELL_SAMPLES = 4.0
+"""A cell is about so many pixels of a keyframe wide on the ground."""
+
+FARTHEST = 3.0
+"""Pictures count as seeing the ground out to this many times their median depth."""
+
+MOST_TILES = 5_000
+"""Tiles at most (20 million cells, 400 MB); what lies beyond them is counted."""
+
+Tile = tuple[int, int]
+
+
+@dataclass(slots=True, eq=False)
+class _Cells:
+    """One tile."""
+
+    views: Array = field(default_factory=lambda: np.zeros((TILE, TILE), np.int32))
+    sigma: F32 = field(default_factory=lambda: np.full((TILE, TILE), np.inf, np.float32))
+    height: F32 = field(default_factory=lambda: np.zeros((TILE, TILE), np.float32))
+    weight: F32 = field(default_factory=lambda: np.zeros((TILE, TILE), np.float32))
+    seen_s: F32 = field(default_factory=lambda: np.full((TILE, TILE), -np.inf, np.float32))
+
+    def forget_surface(self) -> None:
+        self.sigma.fill(np.inf)
+        self.weight.fill(0.0)
+        self.height.fill(0.0)
+        self.seen_s.fill(-np.inf)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Footprint:
+    """What a keyframe's picture covers on level ground at its median height."""
+
+    corners_m: F64  # (4, 2) east and north, around the picture
+    centre_m: F64  # (2,) where the middle of the picture looks
+    camera_m: F64  # (3,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoverageGrid:
+    """The layer on one north-up grid; NaN where no surface was measured."""
+
+    grid: Grid
+    views: Array  # (rows, cols) uint16: keyframes whose picture covers the cell
+    sigma_m: F32  # (rows, cols) best 1 sigma of a point in the cell
+    height_m: F32  # (rows, cols) mean by the inverse of the variance
+    seen_s: F32  # (rows, cols) when a surface was last measured, seconds from the first keyframe
+    inside: Bool  # (rows, cols) within what was flown: the hull of the pictures' middles, and
+    # a quarter of a picture about it
+    core: Bool  # (rows, cols) within that hull itself
+
+    @property
+    def known(self) -> Bool:
+        """(rows, cols) cells with a measured surface."""
+        return np.isfinite(self.sigma_m)
+
+    @property
+    def gaps(self) -> Bool:
+        """(rows, cols) cells within the hull where no surface was measured."""
+        return self.inside & ~self.known
+
+    def seldom(self, least_views: int) -> Bool:
+        """(rows, cols) cells of the core that too few pictures cover; ends of lines are not."""
+        return np.asarray(self.core & (self.views < least_views))
+
+    def unsure(self, most_sigma_m: float) -> Bool:
+        """(rows, cols) cells of what was flown whose surface is less sure than that."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.inside & (self.sigma_m > most_sigma_m))
+
+    def weak(self, least_views: int, most_sigma_m: float) -> Bool:
+        """(rows, cols) cells worth another flight: gaps, seldom seen or unsure."""
+        return np.asarray(self.gaps | self.seldom(least_views) | self.unsure(most_sigma_m))
+
+
+def usual_cell_m(depth: DepthMap) -> float | None:
+    """A round cell size (1, 2 or 5 times a power of ten) that suits a keyframe; None if empty."""
+    known = np.isfinite(depth.depth_m)
+    if not known.any():
+        return None
+    target = CELL_SAMPLES * float(np.median(depth.depth_m[known])) / float(depth.K[0, 0])
+    power = 10.0 ** np.floor(np.log10(target))
+    return float(min((power * m for m in (1, 2, 5, 10)), key=lambda c: abs(np.log(c / target))))
+
+
+def footprint(depth: DepthMap) -> Footprint | None:
+    """Where a keyframe's picture meets level ground; None without any depth."""
+    known = np.isfinite(depth.depth_m)
+    if not known.any():
+        return None
+    h, w = depth.depth_m.shape
+    T = depth.T_world_camera
+    middle_m = float(np.median(depth.depth_m[known]))
+    edge = np.array([[-0.5, -0.5], [w - 0.5, -0.5], [w - 0.5, h - 0.5], [-0.5, h - 0.5]])
+    spots = np.vstack([edge, [[(w - 1) / 2, (h - 1) / 2]]])
+    ways = rays(depth.K, spots) @ T[:3, :3].T
+    drop_m = -float(middle_m * ways[4, 2])  # from the camera to the ground in its middle
+    with np.errstate(divide="ignore"):
+        reach = np.where(ways[:, 2] < 0, -max(drop_m, 0.0) / ways[:, 2], np.inf)
+    reach = np.minimum(reach, FARTHEST * middle_m)
+    ground = T[:2, 3] + reach[:, None] * ways[:, :2]
+    return Footprint(ground[:4], ground[4], T[:3, 3].copy())
+
+
+class CoverageMap:
+    """The layer of one scan. Not safe between threads."""
+
+    def __init__(self, cell_m: float) -> None:
+        """Raises ValueError unless ``cell_m`` is positive."""
+        if not (np.isfinite(cell_m) and cell_m > 0):
+            raise ValueError(f"cell_m is {cell_m}, must be positive")
+        self.cell_m = float(cell_m)
+        self.refused = 0  # tiles that were not made, because there are MOST_TILES
+        self._tiles: dict[Tile, _Cells] = {}
+        self._footprints: dict[int, Footprint] = {}
+        self._seen_s: dict[int, float] = {}
+        self._touches: dict[int, set[Tile]] = {}  # keyframe to the tiles with surface of it
+        self._stale: set[Tile] = set()
+        self._first_ns: int | None = None
+
+    def __contains__(self, seq: int) -> bool:
+        return seq in self._footprints
+
+    @property
+    def footprints(self) -> dict[int, Footprint]:
+        """Keyframe to what its picture covers; not to be changed."""
+        return self._footprints
+
+    @property
+    def tiles(self) -> int:
+        """How many tiles are held."""
+        return len(self._tiles)
+
+    def put(self, seq: int, time_ns: int, depth: DepthMap, finer: bool = False) -> None:
+        """Add a keyframe, or put it where it is now known to have been.
+
+        A keyframe that moved leaves stale tiles; :meth:`refill` mends them. So does one with
+        ``finer`` depth than before. One without any depth is passed over.
+        """
+        place = footprint(depth)
+        if place is None:
+            return
+        if self._first_ns is None:
+            self._first_ns = time_ns
+        before = self._footprints.get(seq)
+        if before is not None:
+            if not finer and self._same(before, place):
+                return
+            self._count(before, -1)
+            self._stale |= self._touches[seq]
+        self._count(place, +1)
+        self._footprints[seq] = place
+        self._seen_s[seq] = (time_ns - self._first_ns) * 1e-9
+        if before is None:
+            self._touches[seq] = self._add_surface(seq, depth, None)
+        else:
+            self._touches[seq] = self._tiles_of(self._points(depth)[0])
+            self._stale |= self._touches[seq]
+
+    def stale(self) -> list[int]:
+        """Keyframes whose depth :meth:`refill` needs, because they touch a stale tile."""
+        return [seq for seq, tiles in self._touches.items() if tiles & self._stale]
+
+    def refill(self, depths: Iterable[tuple[int, DepthMap]]) -> None:
+        """Sum up the surface of the stale tiles anew, from the keyframes of :meth:`stale`."""
+        for key in self._stale:
+            if key in self._tiles:
+                self._tiles[key].forget_surface()
+        for seq, depth in depths:
+            self._touches[seq] = self._add_surface(seq, depth, self._stale)
+        self._stale = set()
+
+    def grid(self) -> CoverageGrid | None:
+        """All tiles on one grid, cut to what was seen; None while there is nothing."""
+        if not self._tiles:
+            return None
+        keys = np.array(list(self._tiles))
+        (west, south), (east, north) = keys.min(axis=0), keys.max(axis=0) + 1
+        shape = (int(north - south) * TILE, int(east - west) * TILE)
+        names = ("views", "sigma", "height", "seen_s", "weight")
+        full = {n: np.zeros(shape, getattr(_Cells(), n).dtype) for n in names}
+        for (i, j), cells in self._tiles.items():
+            row, col = (j - south) * TILE, (i - west) * TILE
+            for name in names:
+                full[name][row : row + TILE, col : col + TILE] = getattr(cells, name)
+        box = _box((full["weight"] > 0) | (full["views"] > 0))
+        rows, cols = box
+        top = int(south) * TILE + rows.stop
+        left = int(west) * TILE + cols.start
+        cut = {n: a[box][::-1] for n, a in full.items()}
+        where = cut["weight"] > 0
+        grid = Grid(left * self.cell_m, top * self.cell_m, self.cell_m, where.shape)
+        nan = np.float32(np.nan)
+        return CoverageGrid(
+            grid,
+            np.clip(cut["views"], 0, 65535).astype(np.uint16),
+            np.where(where, cut["sigma"], nan),
+            np.where(where, cut["height"], nan),
+            np.where(where, cut["seen_s"], nan),
+            *self._hull(grid),
+        )
+
+    # ---- footprints ------------------------------------------------------------------------
+
+    def _same(self, a: Footprint, b: Footprint) -> bool:
+        """True when a keyframe moved by so little that no cell would notice."""
+        return bool(np.abs(a.corners_m - b.corners_m).max() < 0.25 * self.cell_m)
+
+    def _count(self, place: Footprint, change: int) -> None:
+        """Add ``change`` to the views of all cells whose centre the footprint covers."""
+        corners = place.corners_m / self.cell_m - 0.5  # whole numbers at cell centres
+        low = np.floor(corners.min(axis=0)).astype(int)
+        size = np.ceil(corners.max(axis=0)).astype(int) - low + 1
+        mask = np.zeros((size[1], size[0]), np.uint8)
+        shift = 8
+        points = np.rint((corners - low) * (1 << shift)).astype(np.int32)
+        cv2.fillConvexPoly(mask, points[:, None], 1, cv2.LINE_8, shift)
+        for key, here, there in _spread(low, size):
+            cells = self._tile(key)
+            if cells is not None:
+                cells.views[here] += change * mask[there].astype(np.int32)
+
+    def _hull(self, grid: Grid) -> tuple[Bool, Bool]:
+        """Cells within what was flown, and its core, as CoverageGrid has them."""
+        places = list(self._footprints.values())
+        middles = np.array([p.centre_m for p in places])
+        width = np.array([np.linalg.norm(p.corners_m[1] - p.corners_m[0]) for p in places])
+        height = np.array([np.linalg.norm(p.corners_m[2] - p.corners_m[1]) for p in places])
+        around = 0.25 * float(np.median(np.minimum(width, height))) / self.cell_m
+        mask = np.zeros(grid.shape, np.uint8)
+        spots = np.rint(grid.pixels(middles)).astype(np.int32)
+        cv2.fillConvexPoly(mask, cv2.convexHull(spots[:, None]), 1)
+        far = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5)
+        return np.asarray(far <= around), mask > 0
+
+    # ---- surface ---------------------------------------------------------------------------
+
+    def _points(self, depth: DepthMap) -> tuple[Array, F32, F32]:
+        """(N, 2) cells, (N,) heights and (N,) sigmas of a keyframe's points."""
+        known = np.isfinite(depth.depth_m)
+        v, u = np.nonzero(known)
+        d = depth.depth_m[known].astype(np.float64)
+        xyz = se3.transform(
+            depth.T_world_camera, rays(depth.K, np.column_stack([u, v])) * d[:, None]
+        )
+        cells = np.floor(xyz[:, :2] / self.cell_m).astype(np.int64)
+        sigma = np.nan_to_num(depth.sigma_m[known], nan=1e3, posinf=1e3)
+        return cells, xyz[:, 2].astype(np.float32), np.maximum(sigma, 1e-4).astype(np.float32)
+
+    @staticmethod
+    def _tiles_of(cells: Array) -> set[Tile]:
+        tile = cells // TILE
+        low, high = tile.min(axis=0), tile.max(axis=0)
+        if np.prod(high - low + 1) > 1 << 20:  # a stray point far away
+            return {(int(i), int(j)) for i, j in np.unique(tile, axis=0)}
+        rows = int(high[1] - low[1]) + 1
+        there = np.flatnonzero(np.bincount((tile[:, 0] - low[0]) * rows + tile[:, 1] - low[1]))
+        return {(int(low[0]) + int(k) // rows, int(low[1]) + int(k) % rows) for k in there}
+
+    def _add_surface(self, seq: int, depth: DepthMap, only: set[Tile] | None) -> set[Tile]:
+        """Merge a keyframe's points into its tiles (``only`` these); the tiles touched."""
+        cells, height, sigma = self._points(depth)
+        touched = self._tiles_of(cells)
+        tile = cells // TILE
+        when = np.float32(self._seen_s[seq])
+        for key in touched if only is None else touched & only:
+            held = self._tile(key)
+            if held is None:
+                continue
+            here = (tile[:, 0] == key[0]) & (tile[:, 1] == key[1])
+            local = cells[here] - np.array(key) * TILE
+            _merge(local, height[here], sigma[here], when, held.sigma, held.height, held.weight,
+                   held.seen_s)  # fmt: skip
+        return touched
+
+    def _tile(self, key: Tile) -> _Cells | None:
+        """The tile of a key, made when missing; None when there are too many."""
+        found = self._tiles.get(key)
+        if found is None:
+            if len(self._tiles) >= MOST_TILES:
+                self.refused += 1
+                return None
+            found = self._tiles[key] = _Cells()
+        return found
+
+
+def _spread(
+    low: Array, size: Array
+) -> Iterable[tuple[Tile, tuple[slice, slice], tuple[slice, slice]]]:
+    """The tiles that a window of cells spans, each with its part of the tile and the window.
+
+    Rows of tiles count north.
+    """
+    first, last = low // TILE, (low + size - 1) // TILE
+    for i in range(int(first[0]), int(last[0]) + 1):
+        for j in range(int(first[1]), int(last[1]) + 1):
+            corner = np.array([i, j]) * TILE
+            a, b = np.maximum(low, corner), np.minimum(low + size, corner + TILE)
+            here, there = a - corner, a - low
+            n = b - a
+            yield (
+                (i, j),
+                (slice(here[1], here[1] + n[1]), slice(here[0], here[0] + n[0])),
+                (slice(there[1], there[1] + n[1]), slice(there[0], there[0] + n[0])),
+            )
+
+
+def _box(used: Bool) -> tuple[slice, slice]:
+    """The rows and columns that hold anything, or one cell."""
+    rows, cols = np.flatnonzero(used.any(axis=1)), np.flatnonzero(used.any(axis=0))
+    if not len(rows):
+        return slice(0, 1), slice(0, 1)
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
+
+
+@njit(cache=True, nogil=True)
+def _merge(
+    cells: Array, z: F32, sigma: F32, when: float, best: F32, mean: F32, weight: F32, last: F32
+) -> None:
+    """Take points into a tile: least sigma, weighted mean height, latest time."""
+    for p in range(len(z)):
+        col, row = cells[p, 0], cells[p, 1]
+        w = 1.0 / (sigma[p] * sigma[p])
+        weight[row, col] += w
+        mean[row, col] += (z[p] - mean[row, col]) * w / weight[row, col]
+        best[row, col] = min(best[row, col], sigma[p])
+        last[row, col] = max(last[row, col], when)

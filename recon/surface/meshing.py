@@ -1,0 +1,201 @@
+"""Triangle meshes of the surveyed surface: 2.5D from a raster, or Poisson from a cloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.surface.raster import Raster
+from recon.types import F32, F64, U8, Bool, PointCloud
+
+I32 = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """Triangles in metres, z up; seen from outside their corners run counter-clockwise."""
+
+    vertices_m: F64  # (V, 3)
+    faces: I32  # (F, 3)
+    uv: F32 | None = None  # (V, 2) texture coordinates from the picture's upper left corner
+    rgb: U8 | None = None  # (V, 3)
+
+
+def height_mesh(raster: Raster, largest_faces: int = 400_000) -> Mesh:
+    """The raster's surface as one sheet, with texture coordinates into the raster.
+
+    A vertex per known cell, two triangles per four known cells. Above ``largest_faces`` flat
+    parts are merged (quadric error, Open3D). Walls are steep triangles, undersides are not
+    there: meant for surveys flown looking down. Raises ValueError without two triangles.
+    """
+    known = raster.known
+    index = np.full(known.shape, -1, np.int64)
+    index[known] = np.arange(int(known.sum()))
+    a, b = index[:-1, :-1], index[:-1, 1:]
+    c, d = index[1:, :-1], index[1:, 1:]
+    whole = (a >= 0) & (b >= 0) & (c >= 0) & (d >= 0)
+    if not whole.any():
+        raise ValueError("the surface has no four known cells side by side")
+    z = np.where(known, raster.height_m, 0.0)
+    flat_diagonal = np.abs(z[:-1, :-1] - z[1:, 1:]) <= np.abs(z[:-1, 1:] - z[1:, :-1])
+    first, second = whole & flat_diagonal, whole & ~flat_diagonal
+    faces = np.concatenate(
+        [
+            np.column_stack([a[first], c[first], d[first]]),
+            np.column_stack([a[first], d[first], b[first]]),
+            np.column_stack([a[second], c[second], b[second]]),
+            np.column_stack([b[second], c[second], d[second]]),
+        ]
+    ).astype(np.int32)
+    rows, cols = np.nonzero(known)
+    grid = raster.grid
+    x = grid.west_m + (cols + 0.5) * grid.cell_m
+    y = grid.north_m - (rows + 0.5) * grid.cell_m
+    vertices = np.column_stack([x, y, raster.height_m[known].astype(np.float64)])
+    vertices, faces = _without_lone_vertices(vertices, faces)
+    if len(faces) > largest_faces:
+        vertices, faces = _simplified(vertices, faces, largest_faces)
+    return Mesh(vertices, faces, _planar_uv(vertices, raster))
+
+
+def poisson_mesh(
+    cloud: PointCloud,
+    towards_m: F64,
+    spacing_m: float,
+    largest_faces: int = 400_000,
+    trim_share: float = 0.03,
+) -> Mesh:
+    """A closed-form surface through an oriented cloud, with colours per vertex.
+
+    Screened Poisson (Kazhdan and Hoppe 2013, doi:10.1145/2487228.2487237) by Open3D; the
+    ``trim_share`` of vertices with the least support is cut away, and so is what lies
+    farther than a few spacings from every point. Above ``largest_faces`` flat parts are merged.
+
+    Args:
+        towards_m: (N, 3) a place that each point was seen from.
+        spacing_m: distance between neighbouring points; the finest cell is about twice it.
+
+    Raises ValueError when there are too few points for a surface.
+    """
+    import open3d as o3d
+
+    if len(cloud) < 100:
+        raise ValueError(f"{len(cloud)} points are too few for a surface")
+    points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.xyz_m.astype(np.float64)))
+    points.colors = o3d.utility.Vector3dVector(cloud.rgb / 255.0)
+    points.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(6.0 * spacing_m, 30))
+    normals = np.asarray(points.normals)
+    away = np.einsum("ij,ij->i", normals, towards_m - cloud.xyz_m) < 0.0
+    normals[away] *= -1.0
+    points.normals = o3d.utility.Vector3dVector(normals)
+    side = float(np.ptp(cloud.xyz_m, axis=0).max())
+    depth = int(np.clip(np.ceil(np.log2(1.1 * side / (2.0 * spacing_m))), 5, 11))
+    mesh, support = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(points, depth=depth)
+    density: F64 = np.asarray(support)
+    far = _distance(np.asarray(mesh.vertices), cloud.xyz_m) > 4.0 * spacing_m
+    loose = (density < np.quantile(density, trim_share)) | far
+    mesh.remove_vertices_by_mask(loose.tolist())
+    if len(mesh.triangles) > largest_faces:
+        mesh = _reduced(mesh, largest_faces)
+    colours = np.clip(np.rint(255.0 * np.asarray(mesh.vertex_colors)), 0, 255).astype(np.uint8)
+    return Mesh(
+        np.asarray(mesh.vertices).copy(), np.asarray(mesh.triangles, np.int32).copy(), None, colours
+    )
+
+
+def _distance(places: F64, points: F32) -> F64:
+    """(P,) distance from each place to the nearest point."""
+    from scipy.spatial import cKDTree
+
+    return np.asarray(cKDTree(points).query(places, workers=-1)[0])
+
+
+def _planar_uv(vertices: F64, raster: Raster) -> F32:
+    """(V, 2) places in the raster's picture, seen from above."""
+    rows, cols = raster.grid.shape
+    px = raster.grid.pixels(vertices[:, :2]) + 0.5
+    return np.asarray(px / np.array([cols, rows]), np.float32)
+
+
+def _without_lone_vertices(vertices: F64, faces: I32) -> tuple[F64, I32]:
+    used: Bool = np.zeros(len(vertices), np.bool_)
+    used[faces.ravel()] = True
+    number = np.cumsum(used) - 1
+    return vertices[used], number[faces].astype(np.int32)
+
+
+def _simplified(vertices: F64, faces: I32, largest_faces: int) -> tuple[F64, I32]:
+    """About ``largest_faces`` triangles of the same surface."""
+    import open3d as o3d
+
+    mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces)
+    )
+    small = _reduced(mesh, largest_faces)
+    return np.asarray(small.vertices).copy(), np.asarray(small.triangles, np.int32).copy()
+
+
+def _reduced(mesh: Any, largest_faces: int) -> Any:
+    """An Open3D mesh reduced by quadric error (Garland and Heckbert 1997); colours stay."""
+    small = mesh.simplify_quadric_decimation(largest_faces, boundary_weight=10.0)
+    small.remove_degenerate_triangles()
+    small.remove_unreferenced_vertices()
+    return small
+
+
+def cut(mesh: Mesh, box: tuple[float, float, float, float]) -> Mesh:
+    """The part of an untextured mesh inside (west, south, east, north), cut at its borders.
+
+    Triangles across a border are divided along it, so that tiles cut at the same border meet.
+    Infinite borders cut nothing.
+    """
+    for axis, side, limit in ((0, 1, box[0]), (1, 1, box[1]), (0, -1, box[2]), (1, -1, box[3])):
+        if np.isfinite(limit) and len(mesh.faces):
+            mesh = _half(mesh, side * (mesh.vertices_m[:, axis] - limit))
+    return mesh
+
+
+def _half(mesh: Mesh, inside_m: F64) -> Mesh:
+    """The part where ``inside_m`` (V,), linear over each triangle, is not negative."""
+    keep = inside_m >= 0.0
+    count = keep[mesh.faces].sum(axis=1)
+    parts = [mesh.faces[count == 3]]
+    # Turn the triangles so that the corner that differs from the two others comes first.
+    mixed = mesh.faces[(count == 1) | (count == 2)]
+    one = keep[mixed].sum(axis=1) == 1
+    first = np.argmax(keep[mixed] == one[:, None], axis=1)
+    mixed = np.take_along_axis(mixed, (first[:, None] + np.arange(3)) % 3, 1)
+    edges = np.concatenate([mixed[:, [0, 1]], mixed[:, [0, 2]]]).astype(np.int64)
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    total = len(mesh.vertices_m)
+    key, number = np.unique(low * total + high, return_inverse=True)
+    a, b = key // total, key % total
+    share = inside_m[a] / (inside_m[a] - inside_m[b])
+    vertices = [mesh.vertices_m, _between(mesh.vertices_m[a], mesh.vertices_m[b], share)]
+    new = number.reshape(2, -1) + total
+    parts.append(np.column_stack([mixed[one, 0], new[0, one], new[1, one]]))
+    two = ~one
+    parts.append(np.column_stack([new[0, two], mixed[two, 1], mixed[two, 2]]))
+    parts.append(np.column_stack([new[0, two], mixed[two, 2], new[1, two]]))
+    faces = np.concatenate(parts).astype(np.int32)
+    rgb = None
+    if mesh.rgb is not None:
+        mean = _between(mesh.rgb[a].astype(np.float64), mesh.rgb[b].astype(np.float64), share)
+        rgb = np.concatenate([mesh.rgb, np.rint(mean).astype(np.uint8)])
+    used: Bool = np.zeros(total + len(key), np.bool_)
+    used[faces.ravel()] = True
+    number = np.cumsum(used) - 1
+    return Mesh(
+        np.concatenate(vertices)[used],
+        number[faces].astype(np.int32),
+        None,
+        None if rgb is None else rgb[used],
+    )
+
+
+def _between(a: F64, b: F64, share: F64) -> F64:
+    """(N, 3) places at ``share`` of the way from ``a`` to ``b``."""
+    return np.asarray(a + share[:, None] * (b - a))

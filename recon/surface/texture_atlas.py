@@ -1,0 +1,328 @@
+"""Charts of one view each, packed into one picture and painted from the views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from recon.surface.meshing import Mesh
+from recon.surface.texture_views import Sightings, TextureView
+from recon.types import F32, F64, U8, Bool
+
+I32 = npt.NDArray[np.int32]
+I64 = npt.NDArray[np.int64]
+
+BORDER_PX = 2
+"""Texels around a chart that carry its colours on, for filtering and the first mip levels."""
+
+MOST_SCALE = 2.0
+CELL_PX = 4
+"""Side of the square that holds a triangle which no view sees."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layout:
+    """Where each corner of each triangle lies in the atlas."""
+
+    uv_px: F64  # (F, 3, 2) texels from the upper left corner; a texel's centre is at .5
+    chart: I32  # (F,)
+    size_px: tuple[int, int]  # (w, h)
+    scale: float  # texels per pixel of the pictures
+
+
+def lay_out(
+    mesh: Mesh, views: Sequence[TextureView], label: I32, neighbours: I32, largest_px: int
+) -> Layout:
+    """The atlas of triangles labelled with their view (-1: none), no side above ``largest_px``.
+
+    A chart is a connected piece of one label, laid as the view sees it. Charts are packed in
+    shelves by height; when they do not fit, all are made smaller alike.
+    """
+    chart = _charts(label, neighbours)
+    uv = _seen_uv(mesh, views, label)
+    lone = np.flatnonzero(label < 0)
+    scale = _scale_for(uv[label >= 0])
+    while True:
+        low, size = _boxes(uv * scale, chart)
+        columns = max(1, int(np.sqrt(len(lone))))
+        block = np.array([[columns, -(-len(lone) // columns)]], np.int64) * CELL_PX
+        place, (w, h) = pack(np.concatenate([size, block]))
+        if max(w, h) <= largest_px:
+            break
+        scale *= 0.98 * largest_px / max(w, h)
+    out = uv * scale
+    seen = label >= 0
+    shift = place[:-1] + BORDER_PX - low
+    out[seen] += shift[chart[seen], None]
+    n = np.arange(len(lone))
+    cell = place[-1] + CELL_PX * np.column_stack([n % columns, n // columns])
+    out[lone] = cell[:, None] + np.array([[0.5, 0.5], [3.5, 0.5], [0.5, 3.5]])
+    number = chart.copy()
+    number[lone] = len(size) + n
+    return Layout(out, number.astype(np.int32), (int(w), int(h)), scale)
+
+
+def _scale_for(uv: F64) -> float:
+    """1, or up to MOST_SCALE where a middling triangle would cover fewer than four texels."""
+    if not len(uv):
+        return 1.0
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    area = 0.5 * float(np.median(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])))
+    return float(np.clip(np.sqrt(4.0 / max(area, 1e-9)), 1.0, MOST_SCALE))
+
+
+def _charts(label: I32, neighbours: I32) -> I32:
+    """(F,) number of the connected piece of one label; -1 for triangles without a view."""
+    f, e = np.nonzero(neighbours >= 0)
+    g = neighbours[f, e]
+    same = (label[f] == label[g]) & (label[f] >= 0)
+    count = len(label)
+    graph = sparse.csr_matrix(
+        (np.ones(int(same.sum()), np.int8), (f[same], g[same])), shape=(count, count)
+    )
+    piece = csgraph.connected_components(graph, directed=False)[1]
+    out = np.full(count, -1, np.int32)
+    seen = label >= 0
+    if seen.any():
+        out[seen] = np.unique(piece[seen], return_inverse=True)[1]
+    return out
+
+
+def _seen_uv(mesh: Mesh, views: Sequence[TextureView], label: I32) -> F64:
+    """(F, 3, 2) corners in the picture of each triangle's view, in pixels from its corner."""
+    out = np.zeros((len(label), 3, 2))
+    for number in np.unique(label[label >= 0]):
+        view, faces = views[number], np.flatnonzero(label == number)
+        T = view.T_world_camera
+        local = (mesh.vertices_m[mesh.faces[faces]] - T[:3, 3]) @ T[:3, :3]
+        px = local[..., :2] / local[..., 2:] * view.K[[0, 1], [0, 1]] + view.K[:2, 2]
+        out[faces] = px + 0.5
+    return out
+
+
+def _boxes(uv: F64, chart: I32) -> tuple[F64, I64]:
+    """Whole upper left corner (C, 2) of each chart and its size (C, 2) with border."""
+    count = int(chart.max(initial=-1)) + 1
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    seen = chart >= 0
+    for corner in range(3):
+        np.minimum.at(low, chart[seen], uv[seen, corner])
+        np.maximum.at(high, chart[seen], uv[seen, corner])
+    low = np.floor(low)
+    return low, (np.ceil(high) - low).astype(np.int64) + 2 * BORDER_PX
+
+
+def pack(size: I64) -> tuple[F64, tuple[int, int]]:
+    """Upper left corners (C, 2) of (C, 2) rectangles in shelves, and the (w, h) of the whole."""
+    area = float((size[:, 0] * size[:, 1]).sum())
+    width = int(max(np.ceil(np.sqrt(1.1 * area)), size[:, 0].max(initial=1)))
+    place = np.zeros((len(size), 2))
+    x = y = shelf = 0
+    for n in np.argsort(-size[:, 1], kind="stable"):
+        w, h = int(size[n, 0]), int(size[n, 1])
+        if x + w > width:
+            x, y, shelf = 0, y + shelf, 0
+        place[n] = x, y
+        x, shelf = x + w, max(shelf, h)
+    return place, (max(width, 1), max(y + shelf, 1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Palette:
+    """What the texels are mixed from."""
+
+    views: Sequence[TextureView]
+    levels: F32  # (views, 3, 2) gain and offset, BGR
+    fade_view: I32  # (V, B)
+    fade_share: F32  # (V, B)
+    rgb: U8  # (V, 3) where no view has colour
+
+
+def paint(mesh: Mesh, layout: Layout, found: Sightings, label: I32, palette: Palette) -> U8:
+    """(h, w, 3) RGB atlas: each texel the mix of the views that fade there."""
+    w, h = layout.size_px
+    picture = np.zeros((h, w, 3), np.uint8)
+    done = np.zeros((h, w), np.bool_)
+    views = palette.views
+    pixels, start, sides = _flat(views)
+    empty = np.zeros((0, 3, 3))
+    _paint(
+        np.ascontiguousarray(mesh.vertices_m, np.float64), mesh.faces, layout.uv_px, label,
+        found.view, palette.fade_view, palette.fade_share, palette.rgb, pixels, start, sides,
+        np.array([v.K for v in views]) if views else empty,
+        np.array([np.linalg.inv(v.T_world_camera)[:3] for v in views]) if views
+        else np.zeros((0, 3, 4)),
+        palette.levels, picture, done,
+    )  # fmt: skip
+    return _bordered(picture, done)
+
+
+def _flat(views: Sequence[TextureView]) -> tuple[U8, I64, I64]:
+    """All pictures in one array, where each begins, and their (h, w)."""
+    sides = np.array([v.bgra.shape[:2] for v in views], np.int64).reshape(-1, 2)
+    start = np.concatenate([[0], np.cumsum(4 * sides[:, 0] * sides[:, 1])]).astype(np.int64)
+    pixels = np.empty(int(start[-1]), np.uint8)
+    for n, view in enumerate(views):
+        pixels[start[n] : start[n + 1]] = view.bgra.ravel()
+    return pixels, start, sides
+
+
+def _bordered(picture: U8, done: Bool) -> U8:
+    """The charts' colours carried a few texels past their edges."""
+    reached = done.copy()
+    out = picture.astype(np.float32)
+    for _ in range(BORDER_PX + 1):
+        weight = reached.astype(np.float32)
+        total = cv2.boxFilter(weight, -1, (3, 3), normalize=False)
+        new = ~reached & (total > 0.5)
+        sums = cv2.boxFilter(out * weight[..., None], -1, (3, 3), normalize=False)
+        out[new] = sums[new] / total[new, None]
+        reached |= new
+    return np.clip(np.rint(out), 0, 255).astype(np.uint8)
+
+
+@njit(cache=True, nogil=True)
+def _sample(
+    pixels: U8, start: int, h: int, w: int, u: float, v: float, out: F64
+) -> float:  # pragma: no cover - compiled
+    """Bilinear colour into ``out`` (3,), weighted by alpha; the alpha 0 to 1 found there."""
+    out[0] = out[1] = out[2] = 0.0
+    if not (0.0 <= u <= w - 1.0 and 0.0 <= v <= h - 1.0):
+        return 0.0
+    i, j = min(int(v), h - 2), min(int(u), w - 2)
+    a, b = v - i, u - j
+    alpha = 0.0
+    for di in range(2):
+        for dj in range(2):
+            at = start + 4 * ((i + di) * w + j + dj)
+            share = (a if di else 1.0 - a) * (b if dj else 1.0 - b) * pixels[at + 3] / 255.0
+            alpha += share
+            for c in range(3):
+                out[c] += share * pixels[at + c]
+    if alpha > 1e-3:
+        for c in range(3):
+            out[c] /= alpha
+    return alpha
+
+
+@njit(cache=True, nogil=True)
+def _mix(
+    x: float, y: float, z: float, ids: I32, shares: F64, seen: I32, pixels: U8, start: I64,
+    sides: I64, K: F64, T: F64, levels: F32, colour: F64, out: F64,
+) -> float:  # fmt: skip  # pragma: no cover - compiled
+    """Add the views' colours of a place, weighted, into ``out`` (3,); the weight added."""
+    total = 0.0
+    for n in range(len(ids)):
+        v = ids[n]
+        if v < 0 or shares[n] < 0.01:
+            continue
+        visible = False
+        for k in range(len(seen)):
+            visible |= seen[k] == v
+        if not visible:
+            continue
+        cz = T[v, 2, 0] * x + T[v, 2, 1] * y + T[v, 2, 2] * z + T[v, 2, 3]
+        if cz <= 1e-6:
+            continue
+        cx = T[v, 0, 0] * x + T[v, 0, 1] * y + T[v, 0, 2] * z + T[v, 0, 3]
+        cy = T[v, 1, 0] * x + T[v, 1, 1] * y + T[v, 1, 2] * z + T[v, 1, 3]
+        px, py = K[v, 0, 0] * cx / cz + K[v, 0, 2], K[v, 1, 1] * cy / cz + K[v, 1, 2]
+        alpha = _sample(pixels, start[v], sides[v, 0], sides[v, 1], px, py, colour)
+        weight = shares[n] * alpha
+        total += weight
+        for c in range(3):
+            out[c] += weight * (levels[v, c, 0] * colour[c] + levels[v, c, 1])
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _texel(
+    f: int, a: float, b: float, c: float, vertices: F64, faces: I32, seen: I32, fade_share: F32,
+    rgb: U8, pixels: U8, start: I64, sides: I64, K: F64, T: F64, levels: F32, ids: I32,
+    shares: F64, colour: F64, mixed: F64, out: U8,
+) -> None:  # fmt: skip  # pragma: no cover - compiled
+    """The colour of the place with weights a, b, c of the corners of triangle ``f``."""
+    blended = fade_share.shape[1]
+    p, q, r = faces[f, 0], faces[f, 1], faces[f, 2]
+    for j in range(blended):
+        shares[j] = a * fade_share[p, j]
+        shares[blended + j] = b * fade_share[q, j]
+        shares[2 * blended + j] = c * fade_share[r, j]
+    shares[3 * blended] = 1e-2  # the own view, should no other show anything
+    x = a * vertices[p, 0] + b * vertices[q, 0] + c * vertices[r, 0]
+    y = a * vertices[p, 1] + b * vertices[q, 1] + c * vertices[r, 1]
+    z = a * vertices[p, 2] + b * vertices[q, 2] + c * vertices[r, 2]
+    mixed[0] = mixed[1] = mixed[2] = 0.0
+    total = _mix(x, y, z, ids, shares, seen[f], pixels, start, sides, K, T, levels, colour, mixed)
+    for k in range(3):
+        if total > 1e-3:
+            value = mixed[2 - k] / total
+        else:
+            value = a * rgb[p, k] + b * rgb[q, k] + c * rgb[r, k]
+        out[k] = np.uint8(min(max(value + 0.5, 0.0), 255.0))
+
+
+@njit(cache=True, nogil=True)
+def _paint(
+    vertices: F64, faces: I32, uv: F64, label: I32, seen: I32, fade_view: I32, fade_share: F32,
+    rgb: U8, pixels: U8, start: I64, sides: I64, K: F64, T: F64, levels: F32, picture: U8,
+    done: Bool,
+) -> None:  # fmt: skip  # pragma: no cover - compiled
+    """Fill the texels whose centres lie in a triangle; of a smaller one, its middle's texel."""
+    height, width = done.shape
+    blended = fade_view.shape[1]
+    ids = np.empty(3 * blended + 1, np.int32)
+    shares = np.empty(3 * blended + 1)
+    mixed, colour, depth = np.empty(3), np.empty(3), np.empty(3)
+    for f in range(len(faces)):
+        ax, ay, bx, by = uv[f, 0, 0], uv[f, 0, 1], uv[f, 1, 0], uv[f, 1, 1]
+        cx, cy = uv[f, 2, 0], uv[f, 2, 1]
+        area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+        own = label[f]
+        for k in range(3):  # depths in the own view, for a true perspective inside
+            p = faces[f, k]
+            depth[k] = 1.0
+            if own >= 0:
+                depth[k] = T[own, 2, 3]
+                for d in range(3):
+                    depth[k] += T[own, 2, d] * vertices[p, d]
+            for j in range(blended):
+                ids[k * blended + j] = fade_view[p, j]
+        ids[3 * blended] = own
+        slack = 0.0 if own >= 0 else 0.5  # squares of unseen triangles are filled whole
+        y0 = max(0, int(np.ceil(min(ay, by, cy) - 0.5)))
+        y1 = min(height - 1, int(np.floor(max(ay, by, cy) - 0.5)))
+        x0 = max(0, int(np.ceil(min(ax, bx, cx) - 0.5)))
+        x1 = min(width - 1, int(np.floor(max(ax, bx, cx) - 0.5)))
+        filled = False
+        for row in range(y0, y1 + 1 if area != 0.0 else y0):
+            for col in range(x0, x1 + 1):
+                px, py = col + 0.5 - ax, row + 0.5 - ay
+                b = (px * (cy - ay) - (cx - ax) * py) / area
+                c = ((bx - ax) * py - px * (by - ay)) / area
+                a = 1.0 - b - c
+                if min(a, b, c) < -1e-9 - slack:
+                    continue
+                a, b, c = a / depth[0], b / depth[1], c / depth[2]
+                whole = a + b + c
+                _texel(
+                    f, a / whole, b / whole, c / whole, vertices, faces, seen, fade_share, rgb,
+                    pixels, start, sides, K, T, levels, ids, shares, colour, mixed,
+                    picture[row, col],
+                )  # fmt: skip
+                done[row, col] = filled = True
+        row, col = int((ay + by + cy) / 3.0), int((ax + bx + cx) / 3.0)
+        if not filled and not done[row, col]:
+            third = 1.0 / 3.0
+            _texel(
+                f, third, third, third, vertices, faces, seen, fade_share, rgb, pixels, start,
+                sides, K, T, levels, ids, shares, colour, mixed, picture[row, col],
+            )  # fmt: skip
+            done[row, col] = True

@@ -1,0 +1,200 @@
+"""Which pictures see which triangles of a mesh, how finely, and in what colour.
+
+The first two steps of texturing: visibility by ray casting, and the data term, after
+Waechter, Moehrle and Goesele 2014 (doi:10.1007/978-3-319-10602-1_54, sections 3.1 and 4.1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from recon.surface.meshing import Mesh
+from recon.types import F32, F64, U8, Bool
+
+I32 = npt.NDArray[np.int32]
+I64 = npt.NDArray[np.int64]
+
+CANDIDATES = 6
+"""Views kept per triangle, the finest."""
+
+LEAST_COSINE = 0.1
+"""Flatter than this a view says nothing of a triangle."""
+
+EDGE_PX = 1.0
+OUTLIER_LEVELS = 25.0
+"""A view's colour of a triangle may differ from the others' median by this, and by
+OUTLIER_SPREADS of their spread: beyond, something else stood before it (a car, a person)."""
+
+OUTLIER_SPREADS = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TextureView:
+    """One picture of the surface, without distortion; ``alpha`` 0 where it holds nothing."""
+
+    bgra: U8  # (h, w, 4)
+    K: F64  # (3, 3) px of this picture
+    T_world_camera: F64  # (4, 4)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """The views of each triangle, the finest first; view -1 fills up the rows."""
+
+    view: I32  # (F, CANDIDATES)
+    px_per_m: F32  # (F, CANDIDATES) geometric mean resolution on the triangle
+    bgr: F32  # (F, CANDIDATES, 3) mean colour of corners and middle
+
+
+def look(
+    mesh: Mesh, views: Sequence[TextureView], progress: Callable[[float], None] = lambda _: None
+) -> Sightings:
+    """The sightings of every triangle of ``mesh``.
+
+    A view sees a triangle when no surface stands before its corners and its middle, it faces
+    the camera, and at least half of those four places have colour. ``progress`` is told the
+    share done.
+    """
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    vertices = np.asarray(mesh.vertices_m, np.float64)
+    tensor: Any = o3d.core.Tensor
+    scene.add_triangles(
+        tensor(np.ascontiguousarray(vertices, np.float32)),
+        tensor(np.ascontiguousarray(mesh.faces, np.uint32)),
+    )
+    corners = vertices[mesh.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = 0.5 * np.linalg.norm(normal, axis=1)
+    tolerance = 0.3 * float(np.sqrt(2.0 * np.median(area))) if len(area) else 0.0
+    middle = corners.mean(axis=1)
+    count = len(mesh.faces)
+    out = Sightings(
+        np.full((count, CANDIDATES), -1, np.int32),
+        np.zeros((count, CANDIDATES), np.float32),
+        np.zeros((count, CANDIDATES, 3), np.float32),
+    )
+    for number, view in enumerate(views):
+        progress(number / len(views))
+        px, depth = _projected(view, vertices)
+        inside = _inside(px, depth, view)
+        inside[inside] = _free(scene, view, vertices[inside], tolerance)
+        faces = np.flatnonzero(inside[mesh.faces].all(axis=1))
+        towards = view.T_world_camera[:3, 3] - middle[faces]
+        facing = np.einsum("ij,ij->i", normal[faces], towards)
+        faces = faces[facing > LEAST_COSINE * 2.0 * area[faces] * np.linalg.norm(towards, axis=1)]
+        faces = faces[_free(scene, view, middle[faces], tolerance)]
+        middle_px = _projected(view, middle[faces])[0]
+        resolution = np.sqrt(_doubled_area(px[mesh.faces[faces]]) / (2.0 * area[faces]))
+        places = np.concatenate([px[mesh.faces[faces]], middle_px[:, None]], axis=1)
+        colour, seen = _mean_colour(view.bgra, places)
+        good = seen & np.isfinite(resolution)
+        _insert(
+            out.view, out.px_per_m, out.bgr, faces[good], number,
+            resolution[good].astype(np.float32), colour[good],
+        )  # fmt: skip
+    progress(1.0)
+    return out
+
+
+def consistent(found: Sightings) -> Sightings:
+    """``found`` without the views whose colour differs from that of most others.
+
+    Needs four views of a triangle at least; the rest of its row moves up.
+    """
+    view, px, bgr = found.view.copy(), found.px_per_m.copy(), found.bgr.copy()
+    there = view >= 0
+    rows = np.flatnonzero(there.sum(axis=1) >= 4)
+    colour = np.where(there[rows, :, None], bgr[rows], np.nan)
+    middle = np.nanmedian(colour, axis=1, keepdims=True)
+    off = np.abs(colour - middle).max(axis=2)
+    spread = np.nanmedian(off, axis=1, keepdims=True)
+    wrong = np.nan_to_num(off) > OUTLIER_LEVELS + OUTLIER_SPREADS * spread
+    view[rows] = np.where(wrong, -1, view[rows])
+    order = np.argsort(view < 0, axis=1, kind="stable")
+    return Sightings(
+        np.take_along_axis(view, order, 1),
+        np.take_along_axis(px, order, 1),
+        np.take_along_axis(bgr, order[..., None], 1),
+    )
+
+
+def _projected(view: TextureView, xyz: F64) -> tuple[F64, F64]:
+    """(N, 2) pixels, whole numbers at pixel centres, and (N,) depth; NaN behind the camera."""
+    R, t = view.T_world_camera[:3, :3], view.T_world_camera[:3, 3]
+    local = (xyz - t) @ R
+    z = np.where(local[:, 2] > 1e-6, local[:, 2], np.nan)
+    px = local[:, :2] / z[:, None] * view.K[[0, 1], [0, 1]] + view.K[:2, 2]
+    return px, z
+
+
+def _inside(px: F64, depth: F64, view: TextureView) -> Bool:
+    """(N,) places that fall into the picture, a pixel away from its border."""
+    h, w = view.bgra.shape[:2]
+    with np.errstate(invalid="ignore"):
+        u = (px[:, 0] >= EDGE_PX) & (px[:, 0] <= w - 1 - EDGE_PX)
+        v = (px[:, 1] >= EDGE_PX) & (px[:, 1] <= h - 1 - EDGE_PX)
+    return np.asarray(u & v & np.isfinite(depth))
+
+
+def _free(scene: Any, view: TextureView, xyz: F64, tolerance_m: float) -> Bool:
+    """(N,) places with no surface between them and the camera, but for ``tolerance_m``."""
+    if not len(xyz):
+        return np.zeros(0, np.bool_)
+    eye = view.T_world_camera[:3, 3]
+    ray = xyz - eye
+    distance = np.linalg.norm(ray, axis=1)
+    rays = np.empty((len(xyz), 6), np.float32)
+    rays[:, :3] = eye
+    rays[:, 3:] = ray / distance[:, None]
+    hit = scene.cast_rays(rays)["t_hit"].numpy()
+    return np.asarray(hit > distance - tolerance_m - 1e-4 * distance)
+
+
+def _doubled_area(px: F64) -> F64:
+    """(N,) twice the area of (N, 3, 2) triangles."""
+    a, b = px[:, 1] - px[:, 0], px[:, 2] - px[:, 0]
+    return np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
+def _mean_colour(bgra: U8, px: F64) -> tuple[F32, Bool]:
+    """Mean colour (N, 3) of (N, P, 2) places by nearest pixel, and where half had colour."""
+    if not len(px):
+        return np.zeros((0, 3), np.float32), np.zeros(0, np.bool_)
+    h, w = bgra.shape[:2]
+    at = np.rint(px).astype(np.int64)
+    samples = bgra[np.clip(at[..., 1], 0, h - 1), np.clip(at[..., 0], 0, w - 1)]
+    known = samples[..., 3] > 0
+    count = known.sum(axis=1)
+    total = (samples[..., :3] * known[..., None]).sum(axis=1, dtype=np.float32)
+    colour = (total / np.maximum(count, 1)[:, None]).astype(np.float32)
+    return colour, 2 * count >= px.shape[1]
+
+
+@njit(cache=True, nogil=True)
+def _insert(
+    view: I32, px: F32, bgr: F32, faces: I64, number: int, resolution: F32, colour: F32
+) -> None:
+    """Put one view's sightings into the rows, which stay sorted from fine to coarse."""
+    slots = view.shape[1]
+    for n in range(len(faces)):
+        f = faces[n]
+        k = slots
+        while k > 0 and (view[f, k - 1] < 0 or px[f, k - 1] < resolution[n]):
+            k -= 1
+        if k == slots:
+            continue
+        for j in range(slots - 1, k, -1):
+            view[f, j], px[f, j] = view[f, j - 1], px[f, j - 1]
+            for c in range(3):
+                bgr[f, j, c] = bgr[f, j - 1, c]
+        view[f, k], px[f, k] = number, resolution[n]
+        for c in range(3):
+            bgr[f, k, c] = colour[n, c]

@@ -1,0 +1,145 @@
+"""The odometry's keyframes and their joint adjustment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon import se3
+from recon.tracking import bundle, matching, two_view
+from recon.tracking.landmarks import I64, Landmarks
+from recon.types import F64, U8, Bool, PosePrior
+
+
+@dataclass(slots=True, eq=False)
+class OdometryKeyframe:
+    """A keyframe inside the odometry; its pose is refined while it is in the window."""
+
+    seq: int
+    time_ns: int
+    segment: int
+    T_camera_odom: F64  # (4, 4)
+    covariance: F64  # (6, 6) left perturbation of T_camera_odom
+    prior: PosePrior
+    pyramid: matching.Pyramid
+    uv: F64  # (N, 2) corners
+    landmark: I64  # (N,) number in ``map``, -1 none yet
+    map: Landmarks  # of its segment, in the odometry's frame
+
+    @property
+    def T_odom_camera(self) -> F64:
+        return se3.inverse(self.T_camera_odom)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Incoming:
+    """A new frame on its way in."""
+
+    grey: U8  # (H, W) undistorted
+    pyramid: matching.Pyramid
+    seq: int
+    time_ns: int
+    prior: PosePrior
+    mask: U8 | None  # (H, W) non-zero where the picture is valid
+    blurred: bool
+
+
+def landmarks(key: OdometryKeyframe) -> tuple[F64, F64]:
+    """(N, 3) points in the keyframe's camera and (N,) their depths, in odometry units."""
+    points = key.map[key.landmark[key.map.known(key.landmark)]]
+    P = se3.transform(key.T_camera_odom, points)
+    P = P[P[:, 2] > 0]
+    return P, P[:, 2]
+
+
+def triangulate(
+    key: OdometryKeyframe,
+    T_camera_odom: F64,
+    uv: F64,
+    ok: Bool,
+    K: F64,
+    least_parallax_rad: float,
+    loose_px: float,
+) -> None:
+    """Landmarks for the keyframe's corners that were matched (``ok``) at ``uv`` and have none.
+
+    Matches whose rays miss each other are taken out of ``ok``.
+    """
+    rows = np.flatnonzero(ok & (key.landmark < 0))
+    if rows.size == 0:
+        return
+    points, angle = bundle.triangulate(key.T_camera_odom, T_camera_odom, K, key.uv[rows], uv[rows])
+    error = np.maximum(
+        two_view.reprojection_error(key.T_camera_odom, points, K, key.uv[rows]),
+        two_view.reprojection_error(T_camera_odom, points, K, uv[rows]),
+    )
+    gate_px = max(1.5, 2.0 * float(np.median(error)))
+    good = (error < min(gate_px, loose_px)) & (angle > least_parallax_rad)
+    key.landmark[rows[good]] = key.map.add(points[good])
+    ok[rows[error >= gate_px]] = False
+
+
+def adjust_window(window: list[OdometryKeyframe], K: F64) -> None:
+    """Bundle-adjust the keyframes; the two oldest of them hold the frame and scale."""
+    fixed = 1 if len(window) == 2 else 2
+    cam, pt, uv = [], [], []
+    for c, key in enumerate(window):
+        rows = np.flatnonzero(key.map.known(key.landmark))
+        cam.append(np.full(rows.size, c, np.int64))
+        pt.append(key.landmark[rows])
+        uv.append(key.uv[rows])
+    point = np.concatenate(pt)
+    ids, index, counts = np.unique(point, return_inverse=True, return_counts=True)
+    use = counts[index] >= 2
+    ids, index = np.unique(point[use], return_inverse=True)
+    base, table = _baseline(window), window[0].map
+    free = np.arange(len(window)) >= fixed
+    result = bundle.adjust(
+        np.stack([k.T_camera_odom for k in window]),
+        table[ids],
+        np.concatenate(cam)[use],
+        index.astype(np.int64),
+        np.concatenate(uv)[use],
+        K,
+        free,
+    )
+    for c in np.flatnonzero(free):
+        window[c].T_camera_odom = result.T_camera_world[c]
+        window[c].covariance = result.covariance[c]
+    table[ids] = result.points_m
+    _drop_outliers(window, ids, index, np.concatenate(cam)[use], result.residual_px)
+    if len(window) == 2:
+        _restore_baseline(window, base)
+
+
+def _baseline(window: list[OdometryKeyframe]) -> float:
+    moved = window[1].T_camera_odom @ window[0].T_odom_camera
+    return float(np.linalg.norm(moved[:3, 3]))
+
+
+def _restore_baseline(window: list[OdometryKeyframe], base: float) -> None:
+    """Two views leave the scale open; put it back to where it was."""
+    factor = base / max(_baseline(window), 1e-9)
+    origin = window[0].T_odom_camera[:3, 3]
+    window[0].map.scale_about(origin, factor)
+    T = window[1].T_odom_camera
+    T[:3, 3] = origin + (T[:3, 3] - origin) * factor
+    window[1].T_camera_odom = se3.inverse(T)
+
+
+def _drop_outliers(
+    window: list[OdometryKeyframe],
+    ids: I64,
+    index: I64,
+    cam: I64,
+    residual_px: F64,
+) -> None:
+    """Remove observations far off; a landmark left with one view is dropped."""
+    bad = residual_px > max(2.5, 4.0 * float(np.median(residual_px)))
+    for c in np.unique(cam[bad]):
+        gone = ids[index[bad & (cam == c)]]
+        key = window[c]
+        key.landmark[np.isin(key.landmark, gone)] = -1
+    good = np.bincount(index[~bad], minlength=len(ids))
+    window[0].map[ids[good < 2]] = np.nan

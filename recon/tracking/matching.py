@@ -1,0 +1,326 @@
+"""Corners and their partners in another picture (paper section 2.3, Eq. 4-5).
+
+Harris corners, the best of each cell of a 30x30 grid; zero-mean SSD of patches, coarse to
+fine through an image pyramid, all corners in one compiled call; sub-pixel at the end. Pixel
+centres are at integers; level ``l`` of a pyramid holds the pixel (u, v) at (u, v) / 2^l.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from recon.tracking import harris, patch_search
+from recon.tracking.affine_trend import affine_trend
+from recon.tracking.phase_correlation import GlobalShift, global_shift
+from recon.types import F32, F64, U8, Bool
+
+__all__ = [
+    "Corners",
+    "GlobalShift",
+    "Matches",
+    "MatchingConfig",
+    "Pyramid",
+    "global_shift",
+    "harris_grid",
+    "match",
+]
+
+FAR = 1e6
+"""px; stands for a prediction that is not a number."""
+
+
+@dataclass(frozen=True, slots=True)
+class MatchingConfig:
+    """Parameters of corner detection and matching."""
+
+    grid: int = 30  # cells along each side; one corner per cell (paper: 30 x 30)
+    harris_k: float = 0.04  # k of Eq. 5
+    min_response: float = 4.0  # threshold of R, grey levels to the fourth
+    patch_radius_px: int = 5  # the patch is (2 r + 1) squared
+    search_levels: int = 5  # pyramid levels that a search may use, at most
+    coarse_reach_px: int = 8  # search radius that decides on the level to start at
+    min_contrast: float = 2.0  # standard deviation of a patch, grey levels
+    max_zssd: float = 0.4  # of patches made unit: 2 (1 - correlation)
+    ambiguity: float = 0.8  # best zssd over that of the next separate peak, at most
+    max_return_px: float = 0.5  # forward and backward match may differ by this
+    refine_iterations: int = 6
+
+    def __post_init__(self) -> None:
+        """Raise ValueError when a parameter makes no sense."""
+        if not 1 <= self.grid <= 200:
+            raise ValueError(f"grid must be 1 to 200 cells, got {self.grid}")
+        if not 2 <= self.patch_radius_px <= 15:
+            raise ValueError(f"patch_radius_px must be 2 to 15, got {self.patch_radius_px}")
+        if not 2 <= self.coarse_reach_px <= 32:
+            raise ValueError(f"coarse_reach_px must be 2 to 32, got {self.coarse_reach_px}")
+        if self.search_levels < 1 or self.refine_iterations < 1:
+            raise ValueError("search_levels and refine_iterations must be at least 1")
+        if not (0 < self.max_zssd <= 2 and 0 < self.ambiguity <= 1 and self.max_return_px > 0):
+            raise ValueError("max_zssd must be in (0, 2], ambiguity in (0, 1], max_return_px > 0")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corners:
+    """Corners of one picture, in no particular order."""
+
+    uv_px: F32  # (N, 2)
+    response: F32  # (N,) R of Eq. 5
+
+    def __len__(self) -> int:
+        return int(self.uv_px.shape[0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matches:
+    """Where each point of image a was found in image b."""
+
+    uv_px: F32  # (N, 2) in image b; the prediction where nothing was found
+    zssd: F32  # (N,) zero-mean SSD of the unit patches, 0 to 4; 4 where nothing was found
+    ok: Bool  # (N,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pyramid:
+    """A grey picture and its halvings, each (ceil(H / 2^l), ceil(W / 2^l)) uint8."""
+
+    levels: tuple[U8, ...]
+    held: object = None  # the same where the matcher that made it keeps them
+
+    @staticmethod
+    def build(gray: U8, levels: int = 5) -> Pyramid:
+        """The pyramid of ``gray`` (H, W) uint8; levels under 40 px are left out."""
+        _check_gray(gray)
+        stack = [np.ascontiguousarray(gray)]
+        while len(stack) < levels and min(stack[-1].shape) >= 80:
+            stack.append(np.asarray(cv2.pyrDown(stack[-1]), dtype=np.uint8))
+        return Pyramid(tuple(stack))
+
+
+def _check_gray(gray: U8) -> None:
+    if gray.ndim != 2 or gray.dtype != np.uint8 or min(gray.shape) < 16:
+        raise ValueError(f"image must be (H, W) uint8 of 16 px or more, got {gray.shape}")
+
+
+def harris_grid(gray: U8, config: MatchingConfig, mask: U8 | None = None) -> Corners:
+    """The strongest Harris corner of each grid cell of ``gray`` (H, W), Eq. 4-5.
+
+    ``mask`` (H, W) is zero where the picture holds nothing; patches stay clear of it.
+    """
+    _check_gray(gray)
+    margin = config.patch_radius_px + 3
+    allowed = np.zeros((0, 0), np.uint8)
+    if mask is not None:
+        if mask.shape != gray.shape:
+            raise ValueError(f"mask {mask.shape} and image {gray.shape} differ")
+        if not mask.all():
+            side = 2 * margin + 1
+            allowed = np.asarray(cv2.erode(mask, np.ones((side, side), np.uint8)), np.uint8)
+    cells = np.zeros((config.grid, config.grid, 3), np.float32)
+    harris.harris_cells(
+        np.ascontiguousarray(gray),
+        allowed,
+        config.grid,
+        config.grid,
+        margin,
+        config.harris_k,
+        cells,
+    )
+    best = cells.reshape(-1, 3)
+    best = best[best[:, 2] > config.min_response]
+    return Corners(np.ascontiguousarray(best[:, :2]), np.ascontiguousarray(best[:, 2]))
+
+
+def checked_points(uv_px: npt.ArrayLike, name: str, count: int | None = None) -> F64:
+    """(N, 2) points, those that are not finite far away; ValueError for another shape."""
+    uv = np.array(uv_px, dtype=np.float64)
+    if uv.ndim != 2 or uv.shape[1] != 2 or (count is not None and uv.shape[0] != count):
+        raise ValueError(f"{name} must be (N, 2), got {uv.shape}")
+    uv[~np.isfinite(uv).all(axis=1)] = -FAR
+    return np.clip(uv, -FAR, FAR)
+
+
+def checked_warps(warp: npt.ArrayLike | None, count: int) -> tuple[F64, F64]:
+    """Forward and inverse warps as (N, 4) rows; a singular warp becomes the identity."""
+    matrices = np.eye(2) if warp is None else np.asarray(warp, dtype=np.float64)
+    if matrices.shape not in ((2, 2), (count, 2, 2)):
+        raise ValueError(f"warp must be (2, 2) or ({count}, 2, 2), got {matrices.shape}")
+    matrices = np.array(np.broadcast_to(matrices, (count, 2, 2)))
+    determinant = matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0]
+    usable = np.isfinite(matrices).all(axis=(1, 2)) & (np.abs(determinant) > 1e-3)
+    matrices[~usable] = np.eye(2)
+    a, b, c, d = matrices.reshape(count, 4).T
+    inverse = np.stack([d, -b, -c, a], axis=1) / (a * d - b * c)[:, None]
+    return matrices.reshape(count, 4), np.ascontiguousarray(inverse)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    """The answer of one search on one level."""
+
+    uv: F64  # (N, 2) full-size px
+    score: F64  # (N,) correlation, NO_SCORE where nothing could be compared
+    second: F64  # (N,) correlation of the next separate peak
+    contrast: F64  # (N,) of the patch of a, grey levels
+
+    def distinct(self, ratio: float) -> Bool:
+        """(N,) True where the best place is that much better than any other."""
+        return np.asarray(1.0 - self.score <= ratio * (1.0 - self.second))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Refined:
+    """The answer at the full size, sub-pixel."""
+
+    uv: F64  # (N, 2) px
+    score: F64  # (N,) correlation, NO_SCORE where there is none
+    contrast_a: F64  # (N,) grey levels, of the patch in a
+    contrast_b: F64  # (N,) and where it was found
+
+
+@dataclass(slots=True, eq=False)
+class _Search:
+    """One direction of matching: the state of every point on its way down the pyramid."""
+
+    a: tuple[U8, ...]
+    b: tuple[U8, ...]
+    uv_a: F64
+    inverse_warp: F64
+    config: MatchingConfig
+
+    def at(self, level: int, uv_b: F64, active: Bool, reach: int) -> _Found:
+        """Best places in b within ``reach`` px of ``level`` about ``uv_b`` (full-size px)."""
+        N = len(uv_b)
+        uv, score, second, contrast = uv_b / 2.0**level, np.empty(N), np.empty(N), np.empty(N)
+        patch_search.search(
+            self.a[level], self.b[level], self.uv_a / 2.0**level, uv.copy(),
+            self.inverse_warp, active, reach, self.config.patch_radius_px,
+            self.config.min_contrast, uv, score, second, contrast,
+        )  # fmt: skip
+        return _Found(uv * 2.0**level, score, second, contrast)
+
+    def refined(self, uv_b: F64, active: Bool) -> _Refined:
+        """Sub-pixel places in b from starts within about a pixel."""
+        N = len(uv_b)
+        uv, score, contrast_a, contrast_b = uv_b.copy(), np.empty(N), np.empty(N), np.empty(N)
+        patch_search.refine(
+            self.a[0], self.b[0], self.uv_a, self.inverse_warp, active,
+            self.config.patch_radius_px, self.config.refine_iterations, uv, score, contrast_a,
+            contrast_b,
+        )  # fmt: skip
+        return _Refined(uv, score, contrast_a, contrast_b)
+
+
+def _consensus(uv: F64, residual: F64, good: Bool, tolerance_px: float) -> F64 | None:
+    """(N, 2) affine trend of ``residual`` over ``uv`` seen by most good points, else None."""
+    if np.count_nonzero(good) < 12:
+        return None
+    x, y = uv[good], residual[good]
+    trend = np.empty((3, 2))
+    affine_trend(x, y, np.median(y, axis=0), tolerance_px, trend)
+    everywhere = trend[0] + uv @ (trend[1:] / 1000.0)
+    agree = np.hypot(*(y - everywhere[good]).T) < 2 * tolerance_px
+    if np.count_nonzero(agree) < max(12, 0.4 * len(y)):
+        return None
+    return np.asarray(everywhere)
+
+
+def start_level(radius_px: float, levels: int, config: MatchingConfig) -> tuple[int, int]:
+    """Level to start at and the search radius in its pixels."""
+    level = 0
+    usable = min(levels, config.search_levels)
+    while level + 1 < usable and radius_px / 2.0**level > config.coarse_reach_px:
+        level += 1
+    return level, min(max(2, int(np.ceil(radius_px / 2.0**level))), 64)
+
+
+def match(
+    pyramid_a: Pyramid,
+    uv_a: npt.ArrayLike,
+    pyramid_b: Pyramid,
+    uv_b_predicted: npt.ArrayLike,
+    radius_px: float,
+    warp: npt.ArrayLike | None = None,
+    config: MatchingConfig | None = None,
+) -> Matches:
+    """Where the points ``uv_a`` (N, 2) of image a lie in image b.
+
+    Each is searched within ``radius_px`` of ``uv_b_predicted`` (N, 2). ``warp`` ((2, 2) or
+    (N, 2, 2)) takes an offset in a to the offset in b: rotation, scale, a linearised
+    homography. Not ok: nothing alike, a second place as good, no texture, a backward match
+    that ends elsewhere, a patch outside the picture. A change of brightness or contrast does
+    no harm. On a coarse level, points without an answer of their own follow the trend of the
+    others. Points that are not finite are not ok. Raises ValueError on wrong shapes.
+    """
+    config = config or MatchingConfig()
+    a = checked_points(uv_a, "uv_a")
+    predicted = checked_points(uv_b_predicted, "uv_b_predicted", len(a))
+    if not (np.isfinite(radius_px) and radius_px > 0):
+        raise ValueError(f"radius_px must be positive, got {radius_px}")
+    forward_warp, inverse_warp = checked_warps(warp, len(a))
+    forward = _Search(pyramid_a.levels, pyramid_b.levels, a, inverse_warp, config)
+    level, reach = start_level(radius_px, min(len(pyramid_a.levels), len(pyramid_b.levels)), config)
+
+    everyone: Bool = np.abs(np.hstack([a, predicted])).max(axis=1, initial=0.0) < FAR
+    coarse = forward.at(level, predicted, everyone, reach)
+    uv = coarse.uv
+    # A coarse pixel blurs; the fine patches have the last word on likeness.
+    active = coarse.distinct(config.ambiguity) & (1.0 - coarse.score <= config.max_zssd)
+    back_a = _Search(pyramid_b.levels, pyramid_a.levels, uv, forward_warp, config)
+    doubtful = active & ~coarse.distinct(0.4 * config.ambiguity)
+    returned = back_a.at(level, a, doubtful, min(reach, 4)).uv
+    active &= np.abs(returned - a).max(axis=1, initial=0.0) <= 1.6 * 2**level
+    start = level
+    if level > 0:
+        stray_px = max(0.5 * radius_px, 4.0 * 2**level)
+        uv, active = _follow_others(a, uv, predicted, active, everyone, 2.0 * 2**level, stray_px)
+    while level > 1:
+        finer = max(level - 2, 1)
+        found = forward.at(finer, uv, active, 1 + level - finer)
+        uv, level = found.uv, finer
+        active = active & (found.score > 0)
+    fine = forward.refined(uv, active)
+    uv = fine.uv
+    ok = active & (2.0 * (1.0 - fine.score) <= config.max_zssd)
+    ok &= fine.contrast_b >= config.min_contrast
+    if start > 0:
+        ok &= ~_repeats(forward, uv, ok, coarse.contrast, fine.contrast_a)
+
+    back = _Search(pyramid_b.levels, pyramid_a.levels, uv, forward_warp, config)
+    home = back.refined(a, ok)
+    ok &= (home.score > 0) & (np.linalg.norm(home.uv - a, axis=1) <= config.max_return_px)
+    score = fine.score
+    uv = np.where(ok[:, None], uv, predicted)
+    zssd = np.where(score > patch_search.NO_SCORE, 2.0 * (1.0 - score), 4.0)
+    return Matches(uv.astype(np.float32), zssd.astype(np.float32), ok)
+
+
+def _follow_others(
+    a: F64, uv: F64, predicted: F64, active: Bool, everyone: Bool, tolerance_px: float,
+    stray_px: float,
+) -> tuple[F64, Bool]:  # fmt: skip
+    """Places and who takes part, after points without an answer got one from the trend.
+
+    So did those further than ``stray_px`` from it: relief moves points, but not that far.
+    """
+    trend = _consensus(a, uv - predicted, active, tolerance_px)
+    if trend is None:
+        return uv, active
+    expected = predicted + trend
+    own = active & (np.linalg.norm(uv - expected, axis=1) <= stray_px)
+    return np.where(own[:, None], uv, expected), everyone.copy()
+
+
+def _repeats(search: _Search, uv: F64, ok: Bool, coarse: F64, fine: F64) -> Bool:
+    """(N,) True for places in a texture that repeats.
+
+    It may vanish on the coarse level, whose little contrast then decides by chance; such
+    points must be distinct on a level that shows the repetition.
+    """
+    vague = ok & (coarse < 0.3 * fine)
+    if not vague.any():
+        return vague
+    return np.asarray(vague & ~search.at(1, uv, vague, 8).distinct(search.config.ambiguity))

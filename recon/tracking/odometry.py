@@ -1,0 +1,306 @@
+"""Where the camera is: Harris + ZSSD tracks, EPnP against landmarks, a window refined.
+
+Section 2.3 of the paper: corners of two earlier views (the left and right image of the
+virtual stereo camera) are found again in the new frame, each view gives a pose by EPnP
+(Eq. 6-7) and the two are averaged. Between the frames that become keyframes, landmarks are
+triangulated and the last keyframes are adjusted together (:mod:`recon.tracking.keyframe_window`).
+
+The odometry works in a frame of its own that starts at the first telemetry pose; scale,
+heading and position are corrected afterwards by :mod:`recon.graph.alignment`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon import se3
+from recon.tracking import matching, prediction, two_view
+from recon.tracking.first_views import FirstViews
+from recon.tracking.keyframe_window import (
+    Incoming,
+    OdometryKeyframe,
+    adjust_window,
+    landmarks,
+    triangulate,
+)
+from recon.tracking.landmarks import I64, Landmarks
+from recon.tracking.localisation import Localiser, Located
+from recon.tracking.matcher import HostMatcher, Matcher
+from recon.tracking.motion import Motion
+from recon.tracking.odometry_config import OdometryConfig
+from recon.types import F64, U8, Bool, Camera, PosePrior
+
+OVERDUE = 1.3
+"""A blurred frame becomes a keyframe when the last is this many steps away."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """What one frame gave."""
+
+    state: str  # "started", "waiting", "tracked", "keyframe" or "lost"
+    segment: int
+    T_odom_camera: F64 | None = None  # (4, 4)
+    covariance: F64 | None = None  # (6, 6) left perturbation of the camera-from-odom pose
+    tracks: int = 0
+    base_to_height: float = 0.0  # against the last keyframe
+    reason: str = ""
+
+
+class Odometry:
+    """Follows one camera without distortion; feed it every frame in order."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: OdometryConfig | None = None,
+        matcher: Matcher | None = None,
+    ) -> None:
+        """``camera`` has no distortion and the size of the frames to come.
+
+        ``matcher`` finds and follows corners; None: the processor does.
+        """
+        self._matcher = matcher or HostMatcher()
+        self.camera = camera
+        self.K = camera.K
+        self.config = config or OdometryConfig()
+        self.keyframes: list[OdometryKeyframe] = []  # of the current segment
+        self.segment = -1
+        self._metric = False  # the current segment has landmarks
+        self._lost = 0
+        self._motion: Motion | None = None
+        self._localiser = Localiser(camera, self.config, self._matcher)
+        self._first_views = FirstViews(
+            camera,
+            self.config.matching,
+            self.config.wide_search_share * camera.size_px[0],
+            self.config.least_shift_confidence,
+            self._matcher,
+        )
+        self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
+
+    # ---- one frame -------------------------------------------------------------------
+
+    def track(
+        self,
+        grey: U8,
+        seq: int,
+        time_ns: int,
+        prior: PosePrior,
+        mask: U8 | None = None,
+        blurred: bool = False,
+    ) -> Tracked:
+        """Pose of a new frame, or why there is none.
+
+        Args:
+            grey: (H, W) undistorted picture.
+            prior: telemetry's word on this frame; parts may be missing.
+            mask: (H, W) non-zero where the picture is valid.
+            blurred: a later frame makes a better keyframe, if it comes soon.
+        """
+        pyramid = self._matcher.pyramid(grey, self.config.matching.search_levels)
+        new = Incoming(grey, pyramid, seq, time_ns, prior, mask, blurred)
+        self._gap_ns, self._frame_ns = time_ns - self._frame_ns, time_ns
+        if not self.keyframes:
+            return self._start(new)
+        if not self._metric:
+            return self._second_view(new)
+        found = self._localiser.locate(
+            new, self.keyframes, self._moving, self._still, lost=self._lost > 0
+        )
+        if isinstance(found, str):
+            return self._missed(new, found)
+        return self._accept(new, found)
+
+    @property
+    def _still(self) -> bool:
+        """Too long since the frame before for a motion model to hold."""
+        return self._gap_ns > 1e9 * self.config.still_gap_s
+
+    @property
+    def _moving(self) -> Motion:
+        """The motion since the segment's first frame."""
+        assert self._motion is not None
+        return self._motion
+
+    def _missed(
+        self,
+        new: Incoming,
+        reason: str,
+    ) -> Tracked:
+        """Count a frame without a pose; after too many, or at a still, begin a new segment."""
+        self._lost += 1
+        if self._lost >= (2 if self._still else self.config.lost_after):
+            self._start(new)
+        return Tracked("lost", self.segment, reason=reason)
+
+    def _start(
+        self,
+        new: Incoming,
+    ) -> Tracked:
+        """Begin a segment at this frame."""
+        uv = self._corners(new)
+        if len(uv) < 2 * self.config.min_tracks:
+            return Tracked("lost", self.segment, reason="too little texture")
+        self.segment += 1
+        self._metric, self._lost = False, 0
+        self._first_views.begin()
+        R = (
+            new.prior.R_world_camera
+            if new.prior.R_world_camera is not None
+            else np.diag([1.0, -1, -1])
+        )
+        t = new.prior.position_m if new.prior.position_m is not None else np.zeros(3)
+        T_odom_camera = se3.compose(R, t)
+        self.keyframes = [
+            OdometryKeyframe(
+                new.seq,
+                new.time_ns,
+                self.segment,
+                se3.inverse(T_odom_camera),
+                np.zeros((6, 6)),
+                new.prior,
+                new.pyramid,
+                uv,
+                np.full(len(uv), -1, np.int64),
+                Landmarks(),
+            )
+        ]
+        self._motion = Motion(new.time_ns, T_odom_camera, new.prior)
+        return Tracked("started", self.segment, T_odom_camera, np.zeros((6, 6)))
+
+    def _corners(self, new: Incoming) -> F64:
+        """(N, 2) Harris corners of the frame, Eq. 4-5."""
+        found = self._matcher.corners(new.pyramid, self.config.matching, new.mask)
+        return found.uv_px.astype(np.float64)
+
+    # ---- the second view --------------------------------------------------------------
+
+    def _second_view(
+        self,
+        new: Incoming,
+    ) -> Tracked:
+        """Wait until the camera has moved enough, then make the first landmarks."""
+        first = self.keyframes[0]
+        R_b_a = prediction.relative_rotation(first.prior, new.prior)
+        uv, ok = self._first_views.match(new, first, R_b_a, self._still)
+        if ok.sum() < 2 * self.config.min_tracks:
+            return self._missed(new, "too few matches with the first frame")
+        self._lost = 0
+        if (
+            prediction.base_to_height(first.uv[ok], uv[ok], self.K, R_b_a)
+            < 0.7 * self.config.base_to_height
+        ):
+            return Tracked(
+                "waiting", self.segment, tracks=int(ok.sum()), reason="too little motion"
+            )
+        up_a = first.T_camera_odom[:3, 2]
+        turn = 0.12 if R_b_a is not None else np.pi
+        view = two_view.solve(first.uv[ok], uv[ok], self.K, R_b_a, turn, up_a)
+        if view is None or view.parallax_rad < self.config.least_base_to_height:
+            return self._missed(new, "no certain motion between two frames")
+        matched = np.flatnonzero(ok)
+        ok[matched[~view.inliers]] = False
+        scale = self._first_landmarks(view, matched[view.inliers], new.prior)
+        second = se3.compose(view.T_b_a[:3, :3], view.T_b_a[:3, 3] * scale)
+        T_camera_odom = second @ first.T_camera_odom
+        self._metric = True
+        self._add_keyframe(new, T_camera_odom, uv, ok)
+        self._moving.update(new.time_ns, self.keyframes[-1].T_odom_camera, new.prior)
+        return Tracked(
+            "keyframe",
+            self.segment,
+            self.keyframes[-1].T_odom_camera,
+            self.keyframes[-1].covariance,
+            int(ok.sum()),
+            view.parallax_rad,
+        )
+
+    def _first_landmarks(self, view: two_view.TwoView, rows: I64, prior: PosePrior) -> float:
+        """Enter the two-view points into the table; return metres per unit of the baseline."""
+        first = self.keyframes[0]
+        T_odom_a = first.T_odom_camera
+        scale = prediction.metric_scale(view, first.prior, prior, T_odom_a)
+        points = se3.transform(T_odom_a, view.points[view.inliers] * scale)
+        first.landmark[rows] = first.map.add(points)
+        return scale
+
+    # ---- keyframes ---------------------------------------------------------------------
+
+    def _accept(
+        self,
+        new: Incoming,
+        found: Located,
+    ) -> Tracked:
+        """Keep the pose; make the frame a keyframe when it has moved enough."""
+        key = self.keyframes[-1]
+        T_camera_odom, covariance = found.pose.T_camera_points, found.pose.covariance
+        moved = T_camera_odom @ key.T_odom_camera
+        depth = self.median_depth(key)
+        base = float(np.linalg.norm(moved[:3, 3])) / max(depth, 1e-6)
+        tracks = int(found.ok.sum())
+        turned = float(np.linalg.norm(se3.so3_log(moved[:3, :3])))
+        T_odom_camera = se3.inverse(T_camera_odom)
+        self._moving.update(new.time_ns, T_odom_camera, new.prior)
+        self._lost = 0
+        due = self.config.base_to_height * (OVERDUE if new.blurred else 1.0)
+        if base < due and found.share > 0.45 and turned < 0.25:
+            return Tracked("tracked", self.segment, T_odom_camera, covariance, tracks, base)
+        share = 0.5 * self.config.search_share
+        whole = self._localiser.pose_from(
+            key, new.pyramid, T_camera_odom, share, self.config.min_tracks
+        )
+        found = found if isinstance(whole, str) else whole
+        self._add_keyframe(new, found.pose.T_camera_points, found.uv, found.ok)
+        last, tracks = self.keyframes[-1], int(found.ok.sum())
+        self._moving.correct(last.T_odom_camera)
+        return Tracked("keyframe", self.segment, last.T_odom_camera, last.covariance, tracks, base)
+
+    def _add_keyframe(
+        self,
+        new: Incoming,
+        T_camera_odom: F64,
+        uv: F64,
+        ok: Bool,
+    ) -> None:
+        """Append a keyframe: tracked corners, new landmarks, fresh corners; adjust the window."""
+        key = self.keyframes[-1]
+        least = 0.5 * self.config.least_base_to_height
+        triangulate(key, T_camera_odom, uv, ok, self.K, least, self.config.loose_px)
+        kept = np.flatnonzero(ok)
+        fresh = prediction.fresh_corners(
+            self._corners(new), uv[kept], self.camera.size_px, self.config.matching.grid
+        )
+        key_new = OdometryKeyframe(
+            new.seq,
+            new.time_ns,
+            self.segment,
+            T_camera_odom,
+            np.zeros((6, 6)),
+            new.prior,
+            new.pyramid,
+            np.vstack([uv[kept], fresh]),
+            np.concatenate([key.landmark[kept], np.full(len(fresh), -1, np.int64)]),
+            key.map,
+        )
+        self.keyframes.append(key_new)
+        adjust_window(self.keyframes[-self.config.window - 2 :], self.K)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Let go of what left the window: pictures, corners, and landmarks nobody sees."""
+        window = self.keyframes[-self.config.window - 2 :]
+        for old in self.keyframes[: -len(window)]:
+            old.pyramid = matching.Pyramid(())
+            old.uv, old.landmark = np.zeros((0, 2)), np.zeros(0, np.int64)
+        self.keyframes = window
+        seen = np.concatenate([k.landmark for k in window])
+        if (seen >= 0).any():
+            window[0].map.forget_before(int(seen[seen >= 0].min()))
+
+    def median_depth(self, key: OdometryKeyframe) -> float:
+        """Median depth of the keyframe's landmarks, in odometry units; NaN without any."""
+        _, depth = landmarks(key)
+        return float(np.median(depth)) if depth.size else float("nan")

@@ -1,0 +1,128 @@
+"""Where a keyframe's corners should be in a new frame, and how two frames differ."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from recon import se3
+from recon.camera_model import rays
+from recon.tracking import two_view
+from recon.tracking.keyframe_window import OdometryKeyframe
+from recon.types import F64, Bool, PosePrior
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    uv: F64  # (N, 2) where the corners should be
+    warp: F64  # (N, 2, 2) or (2, 2) offsets in the keyframe to offsets in the frame
+    radius_px: float
+
+
+def by_homography(H: F64, uv: F64, radius_px: float) -> Prediction:
+    there = cv2.perspectiveTransform(uv[:, None], H)[:, 0].astype(np.float64)
+    return Prediction(there, _local_affine(H, uv, there), radius_px)
+
+
+def common_affine(uv: F64, there: F64) -> F64:
+    """(3, 3) affine motion of pixels ``uv`` (N, 2) to ``there`` (N, 2), robust."""
+    A, _ = cv2.estimateAffine2D(uv, there, ransacReprojThreshold=8.0)
+    H = np.eye(3)
+    if A is not None:
+        H[:2] = A
+    return H
+
+
+def on_landmarks(
+    key: OdometryKeyframe, K: F64, size_px: tuple[int, int], T_camera_odom: F64, radius_px: float
+) -> tuple[Prediction, Bool]:
+    """Where the keyframe's corners fall for a start pose; corners without a landmark
+    are taken to lie on the plane through the landmarks."""
+    T_new_key = T_camera_odom @ key.T_odom_camera
+    known = key.map.known(key.landmark)
+    P_key = se3.transform(key.T_camera_odom, key.map[key.landmark[known]])
+    plane = _inverse_depth_plane(K, P_key)
+    H = K @ (T_new_key[:3, :3] + np.outer(T_new_key[:3, 3], plane)) @ np.linalg.inv(K)
+    uv = cv2.perspectiveTransform(key.uv[:, None], H)[:, 0].astype(np.float64)
+    warp = _local_affine(H, key.uv, uv)
+    P_new = se3.transform(T_new_key, P_key)
+    uv[known] = P_new[:, :2] / P_new[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]
+    W, Hh = size_px
+    visible = np.all((uv > 8) & (uv < [W - 8, Hh - 8]), axis=1) & np.isfinite(uv[:, 0])
+    return Prediction(uv, warp, radius_px), visible
+
+
+def relative_rotation(a: PosePrior, b: PosePrior) -> F64 | None:
+    """R_b_a from two attitudes; None when one is missing or only assumed from the mount."""
+    if a.R_world_camera is None or b.R_world_camera is None:
+        return None
+    if max(a.sigma_yaw_rad, b.sigma_yaw_rad) > 1.0:
+        return None
+    return np.asarray(b.R_world_camera.T @ a.R_world_camera)
+
+
+def base_to_height(uv_a: F64, uv_b: F64, K: F64, R_b_a: F64 | None) -> float:
+    """Median motion of the matches in focal lengths, with the turn taken out when known.
+
+    Without an attitude the turn about the optical axis and the mean shift that a tilt would
+    give cannot be told from motion; the shift is then counted as motion.
+    """
+    a, b = rays(K, uv_a), rays(K, uv_b)
+    if R_b_a is not None:
+        a = a @ R_b_a.T
+        a = a / a[:, 2:]
+        return float(np.median(np.linalg.norm(b - a, axis=1)))
+    A, _ = cv2.estimateAffinePartial2D(
+        np.ascontiguousarray(a[:, :2]), np.ascontiguousarray(b[:, :2]), ransacReprojThreshold=0.01
+    )
+    return float(np.linalg.norm(A[:, 2])) if A is not None else 0.0
+
+
+def metric_scale(
+    view: two_view.TwoView, first: PosePrior, second: PosePrior, T_odom_a: F64
+) -> float:
+    """Metres per baseline: from the height above ground, else from the distance flown."""
+    if first.agl_m is not None and first.agl_m > 0:
+        up_a = T_odom_a[:3, :3].T[:, 2]
+        height = -float(np.median(view.points[view.inliers] @ up_a))
+        if height > 0:
+            return first.agl_m / height
+    if first.position_m is not None and second.position_m is not None:
+        flown = float(np.linalg.norm(second.position_m - first.position_m))
+        if flown > 0:
+            return flown
+    return 1.0
+
+
+def _local_affine(H: F64, uv: F64, there: F64) -> F64:
+    """(N, 2, 2) Jacobian of the homography at each pixel."""
+    w = uv @ H[2, :2] + H[2, 2]
+    return np.asarray((H[None, :2, :2] - there[:, :, None] * H[2, :2]) / w[:, None, None])
+
+
+def _inverse_depth_plane(K: F64, P: F64) -> F64:
+    """(3,) q with ``1 / z = q . ray`` for the plane through camera points (N, 3)."""
+    if len(P) < 3:
+        return np.array([0.0, 0.0, 1.0 / max(float(np.median(P[:, 2])) if len(P) else 1.0, 1e-6)])
+    ray = P / P[:, 2:]
+    target = 1.0 / P[:, 2]
+    weights = np.ones(len(P))
+    q = np.zeros(3)
+    for _ in range(5):
+        A = ray * weights[:, None]
+        q = np.linalg.solve(A.T @ ray + 1e-9 * np.eye(3), A.T @ target)
+        error = np.abs(ray @ q - target)
+        scale = max(1.4826 * float(np.median(error)), 1e-9)
+        weights = 1.0 / (1.0 + (error / (2 * scale)) ** 2)
+    return np.asarray(q)
+
+
+def fresh_corners(corners: F64, kept: F64, size_px: tuple[int, int], grid: int) -> F64:
+    """(N, 2) of the ``corners`` in cells of the ``grid`` that no kept track occupies."""
+    taken = np.zeros((grid, grid), np.bool_)
+    cell = (kept / size_px * grid).astype(np.int64).clip(0, grid - 1)
+    taken[cell[:, 1], cell[:, 0]] = True
+    cell = (corners / size_px * grid).astype(np.int64).clip(0, grid - 1)
+    return np.asarray(corners[~taken[cell[:, 1], cell[:, 0]]])

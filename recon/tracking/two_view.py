@@ -1,0 +1,177 @@
+"""The first two frames: relative pose without a map, and the first landmarks.
+
+A nearly flat ground makes the essential matrix ambiguous, so several candidates are refined
+and compared: the attitude prior's rotation with the best translation direction, the
+five-point essential matrix (Nister 2004, doi:10.1109/TPAMI.2004.17) and the homography's
+decomposition (Malis and Vargas 2007, INRIA RR-6303).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from recon import se3
+from recon.tracking import bundle
+from recon.types import F64, Bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TwoView:
+    """Relative pose with a baseline of length one, and the points it gives."""
+
+    T_b_a: F64  # (4, 4), |t| = 1
+    points: F64  # (N, 3) in camera a, NaN for outliers
+    inliers: Bool  # (N,)
+    parallax_rad: float  # median over the inliers
+
+
+def translation_direction(rays_a: F64, rays_b: F64, R_b_a: F64, rounds: int = 10) -> F64:
+    """(3,) unit translation t of ``x_b ~ R x_a + t / depth`` for a known rotation.
+
+    Every match says that t lies in the plane of its two rays; the least-squares normal is
+    re-weighted (Cauchy) against outliers. The sign is the one that puts most points in front.
+    """
+    normals = np.cross(rays_b, rays_a @ R_b_a.T)
+    weights = np.ones(len(normals))
+    t = np.zeros(3)
+    for _ in range(rounds):
+        _, vectors = np.linalg.eigh((normals * weights[:, None]).T @ normals)
+        t = vectors[:, 0]
+        error = np.abs(normals @ t)
+        scale = max(1.4826 * float(np.median(error)), 1e-9)
+        weights = 1.0 / (1.0 + (error / (2.0 * scale)) ** 2)
+    moved = rays_b - (rays_a @ R_b_a.T) * (rays_b[:, 2:] / (rays_a @ R_b_a.T)[:, 2:])
+    return np.asarray(t if float(np.median(moved @ t)) >= 0 else -t)
+
+
+def _candidates(
+    uv_a: F64, uv_b: F64, rays_a: F64, rays_b: F64, K: F64, R_b_a: F64 | None
+) -> list[tuple[F64, F64]]:
+    out: list[tuple[F64, F64]] = []
+    if R_b_a is not None:
+        out.append((R_b_a, translation_direction(rays_a, rays_b, R_b_a)))
+    E, mask = cv2.findEssentialMat(
+        uv_a, uv_b, K, method=cv2.USAC_MAGSAC, prob=0.9999, threshold=1.0
+    )
+    if E is not None and E.shape == (3, 3):
+        count, R, t, _ = cv2.recoverPose(E, uv_a, uv_b, K, mask=mask)
+        if count > 8:
+            out.append((np.asarray(R, np.float64), np.asarray(t, np.float64).ravel()))
+    H, _ = cv2.findHomography(uv_a, uv_b, cv2.USAC_MAGSAC, 3.0)
+    if H is not None:
+        _, Rs, ts, _ = cv2.decomposeHomographyMat(H, K)
+        for R, t in zip(Rs, ts, strict=True):
+            length = float(np.linalg.norm(t))
+            if length > 1e-3:
+                out.append((np.asarray(R, np.float64), np.asarray(t, np.float64).ravel() / length))
+    return out
+
+
+def _refine(R: F64, t: F64, uv_a: F64, uv_b: F64, K: F64, max_error_px: float) -> TwoView | None:
+    """Bundle-adjusted candidate with the baseline set back to one, or None."""
+    T_b_a = se3.compose(R, t)
+    for _ in range(2):
+        points, angle = bundle.triangulate(np.eye(4), T_b_a, K, uv_a, uv_b)
+        use = np.flatnonzero(np.isfinite(points[:, 0]) & (angle > 2e-3))
+        if use.size < 20:
+            return None
+        index = np.arange(use.size)
+        result = bundle.adjust(
+            np.stack([np.eye(4), T_b_a]),
+            points[use],
+            np.concatenate([np.zeros_like(index), np.ones_like(index)]),
+            np.concatenate([index, index]),
+            np.concatenate([uv_a[use], uv_b[use]]),
+            K,
+            np.array([False, True]),
+            iterations=20,
+        )
+        T_b_a = result.T_camera_world[1].copy()
+        length = float(np.linalg.norm(T_b_a[:3, 3]))
+        if not 1e-6 < length < 1e6:
+            return None
+        T_b_a[:3, 3] /= length
+    points, angle = bundle.triangulate(np.eye(4), T_b_a, K, uv_a, uv_b)
+    error = np.maximum(
+        reprojection_error(np.eye(4), points, K, uv_a), reprojection_error(T_b_a, points, K, uv_b)
+    )
+    inliers = (error < max_error_px) & (angle > 2e-3)
+    if inliers.sum() < 20:
+        return None
+    points[~inliers] = np.nan
+    return TwoView(T_b_a, points, inliers, float(np.median(angle[inliers])))
+
+
+def reprojection_error(T_camera_world: F64, points_m: F64, K: F64, uv_px: F64) -> F64:
+    """(N,) distance in pixels; inf for points behind the camera or NaN."""
+    P = se3.transform(T_camera_world, points_m)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        uv = P[:, :2] / P[:, 2:] * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
+        error = np.linalg.norm(uv - uv_px, axis=1)
+    return np.asarray(np.where((P[:, 2] > 0) & np.isfinite(error), error, np.inf))
+
+
+def ground_normal(points: F64) -> F64:
+    """(3,) unit normal of the plane through most of the (N, 3) points, z component < 0.
+
+    In a camera frame (z forward) that normal points back at the camera. Re-weighted total
+    least squares; good for relief that is small beside the distance.
+    """
+    weights = np.ones(len(points))
+    normal = np.array([0.0, 0.0, -1.0])
+    for _ in range(8):
+        mean = np.average(points, axis=0, weights=weights)
+        d = points - mean
+        _, vectors = np.linalg.eigh((d * weights[:, None]).T @ d)
+        normal = vectors[:, 0]
+        error = np.abs(d @ normal)
+        scale = max(1.4826 * float(np.median(error)), 1e-9)
+        weights = 1.0 / (1.0 + (error / (2.0 * scale)) ** 2)
+    return np.asarray(-normal if normal[2] > 0 else normal)
+
+
+def solve(
+    uv_a: F64,
+    uv_b: F64,
+    K: F64,
+    R_b_a: F64 | None,
+    max_turn_rad: float,
+    up_a: F64,
+    max_error_px: float = 1.5,
+) -> TwoView | None:
+    """The relative pose of two frames and their points, or None when it is not certain.
+
+    Args:
+        uv_a, uv_b: (N, 2) matched undistorted pixels.
+        R_b_a: (3, 3) rotation that telemetry gives, or None.
+        max_turn_rad: largest believable difference from ``R_b_a``.
+        up_a: (3,) where up is expected in camera a (telemetry or the mount); among solutions
+            that explain the pixels alike, the one whose ground is most level is taken.
+    """
+    if uv_a.shape[0] < 30:
+        return None
+    K_inv = np.linalg.inv(K)
+    one = np.ones((uv_a.shape[0], 1))
+    rays_a = np.hstack([uv_a, one]) @ K_inv.T
+    rays_b = np.hstack([uv_b, one]) @ K_inv.T
+    found: list[tuple[TwoView, float]] = []
+    for R, t in _candidates(uv_a, uv_b, rays_a, rays_b, K, R_b_a):
+        view = _refine(R, t, uv_a, uv_b, K, max_error_px)
+        if view is None:
+            continue
+        if R_b_a is not None:
+            turn = float(np.linalg.norm(se3.so3_log(view.T_b_a[:3, :3] @ R_b_a.T)))
+            if turn > max_turn_rad:
+                continue
+        level = float(ground_normal(view.points[view.inliers]) @ up_a)
+        found.append((view, level))
+    if not found:
+        return None
+    most = max(int(view.inliers.sum()) for view, _ in found)
+    if most < 0.5 * uv_a.shape[0]:
+        return None
+    good = [(view, level) for view, level in found if view.inliers.sum() > 0.92 * most]
+    return max(good, key=lambda item: item[1])[0]
