@@ -33,6 +33,7 @@ ROWS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "white": ("all, GNSS of 1 m in each fix", ("--gnss-noise", "white"), ()),
     "exact": ("all, exact", ("--gnss-noise", "exact"), ()),
     "boresight": ("all, camera 2 degrees off", ("--boresight-deg", "1.2:1.6"), ()),
+    "noaltitude": ("no altitude, no rangefinder", (), HEIGHT),
     "noattitude": ("no attitude", (), ATTITUDE),
     "nogravity": ("GNSS alone", (), (*ATTITUDE, *HEIGHT)),
     "nognss": ("no GNSS", (), GNSS),
