@@ -95,6 +95,7 @@ class LiveSource:
         self.warnings: list[str] = []
         self.losses = 0
         self.misfits = 0  # pictures of another size, dropped
+        self._fits = True  # the last picture did
         self.epoch_unix_ns: int | None = time.time_ns()
         self._start_ns = time.monotonic_ns()
         self.start_monotonic_ns: int | None = self._start_ns
@@ -115,6 +116,7 @@ class LiveSource:
             if (image.shape[1], image.shape[0]) != self.size_px:
                 self._tell_misfit(image)
                 continue
+            self._fits = True
             if time_ns > last_ns:
                 yield CameraFrame(image, time_ns, seq, None, f"frame {seq}")
                 seq += 1
@@ -155,7 +157,7 @@ class LiveSource:
                 return
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
-            rate = stream.average_rate or stream.guessed_rate
+            rate = stream.average_rate  # as the camera says; it is not measured
             self.fps = float(rate) if rate else None
             log.info("%s: connected", self.description)
             yield from self._watch(decoded_pictures(container, stream, self._tell, self._damage))
@@ -188,12 +190,13 @@ class LiveSource:
         log.debug("%s: packet dropped: %s", self.description, error)
 
     def _tell_misfit(self, image: U8) -> None:
-        if self.misfits == 0:
+        if self._fits:
             self._tell(
                 f"now gives {image.shape[1]}x{image.shape[0]} pictures instead of "
                 f"{self.size_px[0]}x{self.size_px[1]}; they are dropped: the camera model does "
                 "not fit them"
             )
+        self._fits = False
         self.misfits += 1
 
     def _tell(self, text: str) -> None:

@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 
 V4L2_OPTIONS = ("video_size", "framerate", "input_format")
 OPEN_S = 10.0
-LIVE_OPTIONS = {"fflags": "nobuffer", "flags": "low_delay"}
+LIVE_OPTIONS = {"fflags": "nobuffer", "flags": "low_delay", "fpsprobesize": "0"}
+"""The last: the stream is opened at once, not when its rate is known some twenty pictures later."""
+
 GST_TAIL = "videoconvert ! video/x-raw,format=I420 ! y4menc ! fdsink fd=1"
 
 
