@@ -28,7 +28,7 @@ from trial_rig import WHOLE, Chunk, Row, Service, stored, stream_to
 
 pytestmark = [pytest.mark.trial, pytest.mark.timeout(9000 if WHOLE else 280)]
 
-MINUTES = float(os.environ.get("SKYRELIEF_SOAK_MINUTES", "60" if WHOLE else "0.3"))
+MINUTES = float(os.environ.get("SKYRELIEF_SOAK_MINUTES", "60" if WHOLE else "0.1"))
 FLIGHTS = 12 if MINUTES >= 6 else 2
 WARM_SHARE = 0.3
 """Of the flights, before memory is watched: caches, pools and budgets fill."""
@@ -48,7 +48,7 @@ def there_and_back(folder: Path) -> tuple[Path, Path]:
     flight = Path(os.environ.get("SKYRELIEF_SOAK_FLIGHT", folder / "flight"))
     if not flight.is_dir():
         simulate = [sys.executable, "-m", "service.cli", "simulate", "--out", str(flight)]
-        size = ["--size", "480x270", "--duration-s", "24" if WHOLE else "6", "--fps", "10"]
+        size = ["--size", "480x270", "--duration-s", "24" if WHOLE else "4", "--fps", "10"]
         subprocess.run(
             [*simulate, *size, "--speed-m-s", "8"], check=True, capture_output=True, timeout=900
         )
