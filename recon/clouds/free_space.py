@@ -86,6 +86,19 @@ def open_above(places_m: F64, heights_m: Sequence[float], views: Iterable[DepthM
 
 
 @njit(cache=True, nogil=True)
+def _pixel(x: float, y: float, z: float, K: F64, T: F64) -> tuple[int, int, float]:
+    """The pixel (u, v) of a place in the world and its depth; (-1, -1) behind the camera."""
+    cz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+    if cz <= 0.1:
+        return -1, -1, cz
+    cx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+    cy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+    u = int(np.floor(K[0, 0] * cx / cz + K[0, 2] + 0.5))
+    v = int(np.floor(K[1, 1] * cy / cz + K[1, 2] + 0.5))
+    return u, v, cz
+
+
+@njit(cache=True, nogil=True)
 def _look_above(
     xyz: F32, up_m: F64, depth: F32, depth_sigma: F32, K: F64, T: F64, seen: U8
 ) -> None:
@@ -96,13 +109,7 @@ def _look_above(
             if seen[p] & (1 << j):
                 continue
             x, y, z = float(xyz[p, 0]), float(xyz[p, 1]), float(xyz[p, 2]) + up_m[j]
-            cz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-            if cz <= 0.1:
-                continue
-            cx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-            cy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-            u = int(np.floor(K[0, 0] * cx / cz + K[0, 2] + 0.5))
-            v = int(np.floor(K[1, 1] * cy / cz + K[1, 2] + 0.5))
+            u, v, cz = _pixel(x, y, z, K, T)
             if not (0 <= u < w and 0 <= v < h):
                 continue
             if depth[v, u] - cz > AGREES_SIGMAS * float(depth_sigma[v, u]):
@@ -140,13 +147,7 @@ def _vote(
     least = KNOWN_SHARE * (2 * WINDOW_PX + 1) ** 2
     for p in range(xyz.shape[0]):
         x, y, z = float(xyz[p, 0]), float(xyz[p, 1]), float(xyz[p, 2])
-        cz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-        if cz <= 0.1:
-            continue
-        cx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-        cy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-        u = int(np.floor(K[0, 0] * cx / cz + K[0, 2] + 0.5))
-        v = int(np.floor(K[1, 1] * cy / cz + K[1, 2] + 0.5))
+        u, v, cz = _pixel(x, y, z, K, T)
         if not (WINDOW_PX <= u < w - WINDOW_PX and WINDOW_PX <= v < h - WINDOW_PX):
             continue
         here = depth[v, u]
