@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,10 +14,12 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 pytest.importorskip("websockets")
 
+from browsing import NEEDS, TOKEN, browser
+from loopback import free_port
+
 from mavlink.rehearsal import RehearsalVehicle
-from service.bench.browser import Browser, chromium
+from service.bench.browser import Browser
 from service.exports.view import ExportOptions, ScanView, export
-from service.ground.http import PAGE
 from service.ground.portal import Portal, PortalConfig
 from service.ground.vehicle import Vehicle
 from service.scans.folder import write_deliverables
@@ -29,18 +30,8 @@ from service.stream.store import ScanStore
 if TYPE_CHECKING:
     from conftest import HouseFlight
 
-pytestmark = [
-    pytest.mark.skipif(not chromium(), reason="needs Chromium"),
-    pytest.mark.skipif(not (PAGE / "index.html").is_file(), reason="needs the built page"),
-]
-TOKEN = "a-token-of-enough-letters"
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    one = Browser(tmp_path_factory.mktemp("chromium"))
-    yield one
-    one.close()
+pytestmark = NEEDS
+__all__ = ["browser"]  # the fixture
 
 
 @pytest.fixture
@@ -141,9 +132,7 @@ def test_the_latest_picture_is_shown(browser: Browser, portal: Portal) -> None:
 
 def test_the_buttons_reach_the_vehicle_and_show_its_answer(browser: Browser, scans: Path) -> None:
     pytest.importorskip("mavsdk")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     vehicle = Vehicle(f"udpin://127.0.0.1:{port}")
     one = Portal(PortalConfig(scans, port=0, token=TOKEN), vehicle=vehicle)
     one.start()

@@ -6,7 +6,6 @@ One browser and one portal serve all tests of this file.
 from __future__ import annotations
 
 import base64
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,11 +18,13 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 pytest.importorskip("websockets")
 
+from browsing import NEEDS, TOKEN, browser
+from loopback import free_port
+
 from mavlink.control import Answer, Result
 from mavlink.rehearsal import RehearsalVehicle
 from recon.types import U8
-from service.bench.browser import Browser, Page, chromium
-from service.ground.http import PAGE
+from service.bench.browser import Browser, Page
 from service.ground.portal import Portal, PortalConfig
 from service.ground.vehicle import Vehicle
 from service.scans.folder import write_deliverables
@@ -31,11 +32,8 @@ from service.scans.folder import write_deliverables
 if TYPE_CHECKING:
     from conftest import HouseFlight
 
-pytestmark = [
-    pytest.mark.skipif(not chromium(), reason="needs Chromium"),
-    pytest.mark.skipif(not (PAGE / "index.html").is_file(), reason="needs the built page"),
-]
-TOKEN = "a-token-of-enough-letters"
+pytestmark = NEEDS
+__all__ = ["browser"]  # the fixture
 
 FAKE_HEADSET = """
 window.headset = { asked: [], frames: 0, ended: null };
@@ -74,13 +72,6 @@ Object.defineProperty(navigator, 'xr', { configurable: true, value: {
 """
 TOLD = " field.dispatchEvent(new Event('input', { bubbles: true }))"
 PICTURE = "document.querySelector('.stage canvas').toDataURL('image/png').split(',')[1]"
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    one = Browser(tmp_path_factory.mktemp("chromium"))
-    yield one
-    one.close()
 
 
 @pytest.fixture(scope="module")
@@ -223,9 +214,7 @@ def test_of_two_people_renaming_at_once_the_second_is_told(
 def test_a_refused_stop_shows_the_companions_own_words(browser: Browser, store: Path) -> None:
     """Over MAVLink between the portal's client and the companion's link, both ours and real."""
     pytest.importorskip("mavsdk")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     vehicle = Vehicle(f"udpin://127.0.0.1:{port}")
     one = Portal(PortalConfig(store, port=0, token=TOKEN), vehicle=vehicle)
     one.start()
