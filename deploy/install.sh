@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Installs, upgrades or removes skyrelief on a drone's computer or a ground station: Jetson
 # (JetPack 6) or any Debian or Ubuntu machine with Python 3.10 to 3.13. May be run again at any
-# time. Each version has its own folder; the switch is one rename, and is undone when the new
-# version does not come up healthy.
+# time. Each version has its own folder; the switch is one rename, made when the new version has
+# compiled its kernels, and undone when it does not come up healthy.
 #
 #   sudo deploy/install.sh                      from this clone, with pip's package index
 #   sudo deploy/install.sh --bundle DIR         offline, from what 'make bundle' prepared
@@ -48,6 +48,7 @@ home=$root/opt/skyrelief
 versions=$home/versions
 current=$home/current
 etc=$root/etc/skyrelief
+cache=$root/var/cache/skyrelief
 
 [[ -n $root || $(id -u) -eq 0 ]] || die "run it as root: sudo $0"
 
@@ -105,13 +106,23 @@ build_version() {
   grep -rlIZ --fixed-strings "$part" "$part/bin" "$part/pyvenv.cfg" |
     xargs -0 -r sed -i "s|$part|${target#"$root"}|g"
   "$part/bin/python" -c 'import service.cli, recon, mavlink' || die "the new version does not start"
+  install -D -m 0644 -t "$part/share/skyrelief" "${bundle:-$here}"/systemd/*.service
   mv "$part" "$target"
 }
 
-# Points 'current' at $1 by one rename.
+# Points 'current' at $1 by one rename, and gives systemd that version's unit.
 switch_to() {
+  local own=$versions/$1/share/skyrelief/$unit.service
+  [[ ! -r $own ]] || install -D -m 0644 -t "$root/etc/systemd/system" "$own"
   ln -sfn "versions/$1" "$home/current.new"
   mv -T "$home/current.new" "$current"
+  if live; then systemctl daemon-reload; fi
+}
+
+# Makes $1 (versions/NAME) the version before; none when it is empty.
+remember() {
+  rm -f "$home/previous"
+  [[ -z $1 ]] || ln -s "$1" "$home/previous"
 }
 
 # The profile of this board: by its device tree, else by its processor.
@@ -129,10 +140,9 @@ board() {
 
 version_now() { [[ -L $current ]] && basename "$(readlink "$current")" || true; }
 
+# Users, folders and device rules; and the configuration, by version $1, when there is none.
 install_files() {
-  local from=$here
-  [[ -n $bundle ]] && from=$bundle
-  install -D -m 0644 -t "$root/etc/systemd/system" "$from/systemd/$unit.service"
+  local from=${bundle:-$here}
   install -D -m 0644 "$from/systemd/skyrelief.sysusers" "$root/usr/lib/sysusers.d/skyrelief.conf"
   install -D -m 0644 "$from/systemd/skyrelief.tmpfiles" "$root/usr/lib/tmpfiles.d/skyrelief.conf"
   install -D -m 0644 "$from/deploy/60-skyrelief.rules" "$root/etc/udev/rules.d/60-skyrelief.rules"
@@ -143,7 +153,7 @@ install_files() {
   local settings=()
   [[ -n $profile ]] || profile=$(board)
   [[ -z $profile ]] || settings=("$from/deploy/profiles/$profile.toml")
-  "$current/bin/python" -m service.cli config default "${settings[@]}" >"$etc/skyrelief.toml.new"
+  "$versions/$1/bin/python" -m service.cli config default "${settings[@]}" >"$etc/skyrelief.toml.new"
   mv "$etc/skyrelief.toml.new" "$etc/skyrelief.toml"
   say "wrote $etc/skyrelief.toml${profile:+ with the settings of $profile}:" \
     "set camera.source, camera.model, mavlink.links, datalink.connect"
@@ -158,16 +168,14 @@ prepare_machine() {
     systemctl disable --now nvgetty.service >/dev/null 2>&1 || true
   fi
   udevadm control --reload 2>/dev/null || true
-  systemctl daemon-reload
-  systemctl enable "$unit.service" >/dev/null
 }
 
-# Compiles the kernels as the service's user, so that no flight waits for that.
+# Compiles the kernels of version $1 as the service's user, so that no flight waits for that.
 warm_up() {
   live && [[ $unit == skyrelief ]] || return 0
   say "warming up: the kernels are compiled, some minutes on a small board"
-  runuser -u skyrelief -- env NUMBA_CACHE_DIR=/var/cache/skyrelief HOME=/var/lib/skyrelief \
-    "$current/bin/skyrelief" warm-up --config "$etc/skyrelief.toml" ||
+  runuser -u skyrelief -- env NUMBA_CACHE_DIR="$cache" HOME=/var/lib/skyrelief \
+    "$versions/$1/bin/skyrelief" warm-up --config "$etc/skyrelief.toml" ||
     say "it did not warm up; the first scan will take longer to begin"
 }
 
@@ -184,10 +192,29 @@ healthy() {
   systemctl is-active --quiet "$unit.service"
 }
 
+# True when the configuration names what the service cannot start without.
+is_configured() {
+  [[ $unit == skyrelief ]] || return 0
+  "$current/bin/python" - "$etc/skyrelief.toml" <<'PY' 2>/dev/null
+import sys
+from pathlib import Path
+from service.config import load_config
+camera = load_config(Path(sys.argv[1])).camera
+sys.exit(not (camera.source and camera.model))
+PY
+}
+
+# Starts version $2; when that fails, $1 is put back with $3 as the one before it.
 start_or_roll_back() {
-  local old=$1 new=$2
+  local old=$1 new=$2 before=$3
   if ! live || ((!start)); then
     say "not started: run 'systemctl enable --now $unit' when the configuration is right"
+    return 0
+  fi
+  systemctl enable "$unit.service" >/dev/null
+  if ! is_configured; then
+    say "installed, not started: set camera.source and camera.model in $etc/skyrelief.toml," \
+      "look with $current/bin/skyrelief doctor, then systemctl restart $unit"
     return 0
   fi
   say "starting $unit; watching it for $health_s s"
@@ -195,6 +222,7 @@ start_or_roll_back() {
     say "$unit $new is up"
   elif [[ -n $old && $old != "$new" ]]; then
     switch_to "$old"
+    remember "$before"
     systemctl restart "$unit.service" || true
     die "$new did not come up; $old is back in place (journalctl -u $unit)"
   else
@@ -209,12 +237,16 @@ prune() {
     while read -r old; do
       [[ $(readlink "$home/previous") == "versions/$old" ]] || rm -rf "${versions:?}/$old"
     done
+  [[ -d $cache ]] || return 0
+  # Kernels compiled before the oldest version that is left was made are of none that is.
+  local oldest
+  oldest=$(find "$versions" -mindepth 1 -maxdepth 1 -type d -printf '%T@ %p\n' | sort -n |
+    head -n 1 | cut -d ' ' -f 2-)
+  find "$cache" -mindepth 1 -maxdepth 1 -type d -name '*_*' ! -newer "$oldest" -exec rm -rf {} +
 }
 
 version_to_install() {
-  local from=$here
-  [[ -n $bundle ]] && from=$bundle
-  local release stamp
+  local from=${bundle:-$here} release stamp
   release=$(sed -n 's/^version = "\(.*\)"/\1/p' "$from/pyproject.toml" | head -n 1)
   stamp=$(cd "$from" && find pyproject.toml service recon mavlink systemd wheels -type f \
     ! -name '*.pyc' ! -name '*.nb[ic]' -print0 2>/dev/null |
@@ -229,20 +261,21 @@ do_install() {
     die "no profile $profile; there are $(cd "${bundle:-$here}/deploy/profiles" && echo ./*.toml)"
   check_python
   check_openmp
-  local new old
+  local new old before
   new=$(version_to_install)
   old=$(version_now)
+  before=$(readlink "$home/previous" || true)
   if [[ -x $versions/$new/bin/skyrelief ]]; then
     say "version $new is already there"
   else
     build_version "$new"
   fi
-  [[ $old == "$new" ]] || { [[ -z $old ]] || ln -sfn "versions/$old" "$home/previous"; }
-  switch_to "$new"
-  install_files
+  install_files "$new"
   prepare_machine
-  warm_up
-  start_or_roll_back "$old" "$new"
+  warm_up "$new"
+  [[ -z $old || $old == "$new" ]] || remember "versions/$old"
+  switch_to "$new"
+  start_or_roll_back "$old" "$new" "$before"
   prune
 }
 
@@ -253,7 +286,7 @@ do_rollback() {
   previous=$(basename "$(readlink "$home/previous")")
   [[ -x $versions/$previous/bin/skyrelief ]] || die "version $previous is gone"
   switch_to "$previous"
-  ln -sfn "versions/$now" "$home/previous"
+  remember "versions/$now"
   if live; then systemctl restart "$unit.service"; fi
   say "version $previous is in place, $now is the one before"
 }
@@ -262,7 +295,7 @@ do_uninstall() {
   if live; then
     systemctl disable --now skyrelief.service skyrelief-ground.service 2>/dev/null || true
   fi
-  rm -rf "$home"
+  rm -rf "$home" "$cache"
   rm -f "$root"/etc/systemd/system/skyrelief{,-ground}.service \
     "$root"/usr/lib/{sysusers.d,tmpfiles.d}/skyrelief.conf \
     "$root/etc/udev/rules.d/60-skyrelief.rules" "$root/etc/polkit-1/rules.d/50-skyrelief.rules"

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from loopback import free_port
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 
 from service.config import load_config
@@ -19,19 +20,15 @@ from service.daemon.diagnosis import BAD, GOOD, NOTE, examine
 DEMO = Path(__file__).resolve().parents[1] / "demo" / "caliterra"
 
 
-def free_udp_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def findings(*overrides: str, listen_s: float = 0.1) -> dict[str, tuple[str, str]]:
-    found = examine(load_config(None, ["compute.backend=cpu", *overrides]), listen_s)
+    found = examine(
+        load_config(None, ["compute.backend=cpu", "health.http=", *overrides]), listen_s
+    )
     return {f.what: (f.verdict, f.text) for f in found}
 
 
 def test_everything_in_order(tmp_path: Path) -> None:
-    port = free_udp_port()
+    port = free_port()
     ended = threading.Event()
 
     def autopilot() -> None:
@@ -66,8 +63,8 @@ def test_what_is_missing_is_told(tmp_path: Path) -> None:
         f"scan.folder={tmp_path}",
         f"camera.source={tmp_path / 'none.mp4'}",
         f"camera.model={tmp_path / 'none.yaml'}",
-        f"mavlink.links=udpin:127.0.0.1:{free_udp_port()}",
-        f"datalink.connect=tcp/127.0.0.1:{free_udp_port()}",
+        f"mavlink.links=udpin:127.0.0.1:{free_port()}",
+        f"datalink.connect=tcp/127.0.0.1:{free_port()}",
     )
     assert found["camera"] == (BAD, f"no such file or folder: {tmp_path / 'none.mp4'}")
     assert found["camera model"][0] == BAD
@@ -157,3 +154,34 @@ def test_threads_and_kernels_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> N
     found = findings()
     assert found["threads"] == (BAD, "no OpenMP: half as fast, one core idle; apt install libgomp1")
     assert found["kernels"][0] == GOOD
+
+
+def test_what_a_running_service_holds_is_asked_of_it(tmp_path: Path) -> None:
+    from service.daemon.health import HealthServer
+
+    status = {
+        "ok": True,
+        "software": "skyrelief 9.9",
+        "state": "scanning",
+        "frames": 1234,
+        "mavlink": {"links_up": 1, "packets": 77},
+    }
+    server = HealthServer("127.0.0.1:0", lambda: status)
+    given = [
+        f"scan.folder={tmp_path}",
+        f"health.http=127.0.0.1:{server.port}",
+        f"mavlink.links=udpin:127.0.0.1:{free_port()}",
+        f"camera.source={tmp_path / 'held'}",
+    ]
+    try:
+        found = findings(*given)
+        status |= {"ok": False, "fault": "no picture", "mavlink": {}}
+        worse = findings(*given)
+    finally:
+        server.close()
+    assert found["mavlink"] == (GOOD, "held by the running service: 1 open, 77 messages heard")
+    assert found["camera"] == (GOOD, "in the running scan: 1234 pictures so far")
+    assert found["service"] == (GOOD, "skyrelief 9.9 runs here: scanning")
+    assert worse["mavlink"][0] == NOTE
+    assert worse["service"] == (BAD, "skyrelief 9.9 runs here: no picture")
+    assert "service" not in findings(*given)  # it ended

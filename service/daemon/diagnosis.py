@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from service.compute.threading_layer import REMEDY, kernels_may_overlap
 from service.config import Config
+from service.daemon.running import running_service
 from service.daemon.warm_up import is_warm
 from service.errors import InputError, SkyreliefError
 
@@ -43,16 +44,18 @@ class Finding:
 
 def examine(config: Config, listen_s: float) -> Iterator[Finding]:
     """Every finding, as soon as it is there."""
+    running = running_service(config.health.http) if config.health.http else None
     checks: tuple[Callable[[], Iterator[Finding]], ...] = (
         _software,
         lambda: _machine(config),
         _clock,
         lambda: _folder(Path(config.scan.folder)),
         lambda: _compute(config),
-        lambda: _camera(config),
-        lambda: _mavlink(config, listen_s),
+        lambda: _camera(config, running),
+        lambda: _mavlink(config, listen_s, running),
         lambda: _datalink(config),
         lambda: _to_fly(config),
+        lambda: _service(running),
     )
     for check in checks:
         yield from check()
@@ -172,7 +175,7 @@ def _compute(config: Config) -> Iterator[Finding]:
         yield Finding("kernels", NOTE, f"the first scan may have to compile; {WARM_UP}")
 
 
-def _camera(config: Config) -> Iterator[Finding]:
+def _camera(config: Config, running: dict[str, Any] | None) -> Iterator[Finding]:
     from service.cameras import open_camera
 
     model = None
@@ -183,6 +186,9 @@ def _camera(config: Config) -> Iterator[Finding]:
         yield Finding("camera model", NOTE, "none; 'skyrelief calibrate' makes one")
     if not config.camera.source:
         yield Finding("camera", NOTE, "camera.source is not set")
+        return
+    if running is not None and "frames" in running:
+        yield Finding("camera", GOOD, f"in the running scan: {running['frames']} pictures so far")
         return
     try:
         source = open_camera(config.camera.source)
@@ -209,9 +215,15 @@ def _model(config: Config) -> tuple[Camera | None, Finding]:
     return model, Finding("camera model", GOOD, text)
 
 
-def _mavlink(config: Config, listen_s: float) -> Iterator[Finding]:
+def _mavlink(config: Config, listen_s: float, running: dict[str, Any] | None) -> Iterator[Finding]:
     if not config.mavlink.links:
         yield Finding("mavlink", NOTE, "mavlink.links is empty: no telemetry, no commands")
+    elif running is not None:
+        heard = running.get("mavlink", {})
+        up, packets = heard.get("links_up", 0), heard.get("packets", 0)
+        text = f"held by the running service: {up} open, {packets} messages heard"
+        yield Finding("mavlink", GOOD if packets else NOTE, text)
+        return
     for text in config.mavlink.links:
         yield _one_link(text, listen_s)
 
@@ -242,6 +254,14 @@ def _one_link(text: str, listen_s: float) -> Finding:
         return Finding("mavlink", GOOD, f"{spec.name}: {heard}")
     reason = "silent: is the autopilot on, its port set to MAVLink 2?" if up else "does not open"
     return Finding("mavlink", BAD, f"{spec.name}: {reason}")
+
+
+def _service(running: dict[str, Any] | None) -> Iterator[Finding]:
+    if running is None:
+        return
+    fault = str(running.get("fault", ""))
+    text = f"{running['software']} runs here: {fault or running.get('state', 'unknown')}"
+    yield Finding("service", GOOD if running.get("ok") else BAD, text)
 
 
 def _datalink(config: Config) -> Iterator[Finding]:

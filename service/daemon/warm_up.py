@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +29,7 @@ FOCAL_PX = 300.0
 STEP_PX = 10
 FRAMES = 40
 MARKER = "warm"
+INSTALLED, SERVICE_CACHE = "/opt/skyrelief", "/var/cache/skyrelief"
 
 
 class MadeUpGround:
@@ -101,8 +103,8 @@ def warm_up(config: Config) -> tuple[float, int]:
 
 
 def is_warm() -> bool:
-    """True when this version was warmed up with the cache that is in use."""
-    marker = _marker()
+    """True when this version was warmed up with the cache that it uses, or the service does."""
+    marker = _marker(os.environ.get("NUMBA_CACHE_DIR", "") or _services_cache())
     try:
         return marker is not None and marker.read_text(encoding="utf-8") == software()
     except OSError:
@@ -110,7 +112,7 @@ def is_warm() -> bool:
 
 
 def _mark() -> None:
-    marker = _marker()
+    marker = _marker(os.environ.get("NUMBA_CACHE_DIR", ""))
     if marker is None:
         return
     try:
@@ -120,7 +122,14 @@ def _mark() -> None:
         log.warning("%s cannot be written: %s", marker, error.strerror)
 
 
-def _marker() -> Path | None:
-    """Beside the kernels; None when they lie with the sources, where no version is told apart."""
-    folder = os.environ.get("NUMBA_CACHE_DIR", "")
-    return Path(folder) / MARKER if folder else None
+def _services_cache() -> str:
+    """Where an installed service keeps its kernels; empty for any other installation."""
+    return SERVICE_CACHE if Path(sys.prefix).is_relative_to(INSTALLED) else ""
+
+
+def _marker(folder: str) -> Path | None:
+    """Beside the kernels, one for each installation: a version's kernels are its own.
+
+    None when they lie with the sources, where no version is told apart.
+    """
+    return Path(folder) / f"{MARKER}-{Path(sys.prefix).name}" if folder else None
