@@ -213,10 +213,14 @@ class FusionConfig:
     loop_views: int = key(
         400, "keyframes remembered for that, 0.1 MB each; of more, every second old one goes"
     )
+    graph_keyframes: int = key(
+        1500, "keyframes in the pose graph, 0.04 MB each; of more, older ones ride on neighbours"
+    )
 
     def __post_init__(self) -> None:
         """Check ranges."""
         _within("fusion.loop_views", self.loop_views, 2, 100_000)
+        _within("fusion.graph_keyframes", self.graph_keyframes, 50, 100_000)
 
 
 @dataclass(frozen=True, slots=True)

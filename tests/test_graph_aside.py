@@ -48,11 +48,14 @@ def _flight(count: int) -> tuple[list[F64], list[F64], list[PosePrior]]:
 TRUTH, ODOM, PRIORS = _flight(40)
 
 
-def _add(graph: PoseGraph | GraphAside, first: int, last: int) -> None:
+def _add(graph: PoseGraph | GraphAside | Trajectory, first: int, last: int) -> None:
     units = np.array([1.0] * 3 + [1.0 / SCALE] * 3)
+    covariance, height = MOTION * np.outer(units, units), (HEIGHT_M / SCALE, 0.0)
     for i in range(first, last):
-        covariance = MOTION * np.outer(units, units)
-        graph.add_keyframe(i, i * 10**9, 0, ODOM[i], covariance, PRIORS[i], (HEIGHT_M / SCALE, 0.0))
+        if isinstance(graph, Trajectory):
+            graph.add(i, 0, ODOM[i], PRIORS[i], height, i * 10**9, covariance)
+        else:
+            graph.add_keyframe(i, i * 10**9, 0, ODOM[i], covariance, PRIORS[i], height)
 
 
 def _close_loops(graph: PoseGraph | GraphAside) -> None:
@@ -95,11 +98,11 @@ def test_its_result_is_that_of_the_graph_itself(aside: GraphAside) -> None:
 
 def test_while_it_is_busy_vision_carries_on_and_corrections_follow(aside: GraphAside) -> None:
     trajectory = Trajectory(graph=aside)
-    _add(aside, 0, 20)
+    _add(trajectory, 0, 20)
     aside.residuals()  # waits until all is weighed
     os.kill(aside.pid, signal.SIGSTOP)
     try:
-        _add(aside, 20, 40)
+        _add(trajectory, 20, 40)
         for i in range(40):
             trajectory.tell(trajectory.place(i))
         assert aside.behind == 20

@@ -125,6 +125,7 @@ def test_accepted_loops_come_back_with_motion_and_covariance() -> None:
     class Fixed:
         """A graph of known records."""
 
+        entered = 2
         loops: tuple[Any, ...] = ()
         counts: dict[str, int] = {"loop waits": 1}  # noqa: RUF012
 

@@ -30,24 +30,43 @@ class KeyframeGraph(Protocol):
         """Weigh everything once more; returns when that is done."""
         ...
 
-    def __len__(self) -> int: ...
+    def __len__(self) -> int:
+        """How many nodes there are."""
+        ...
 
-    def __contains__(self, seq: int) -> bool: ...
+    def __contains__(self, seq: int) -> bool:
+        """True of a node."""
+        ...
+
+    @property
+    def entered(self) -> int:
+        """Keyframes that were added, also those that are nodes no more."""
+        ...
+
+    @property
+    def generation(self) -> int:
+        """How often nodes were thinned out."""
+        ...
+
+    @property
+    def seqs(self) -> list[int]:
+        """Numbers of the nodes, in order."""
+        ...
 
     def node(self, seq: int) -> Node:
-        """What is known of a keyframe."""
+        """What is known of a node. Raises KeyError for another keyframe."""
         ...
 
     def pose(self, seq: int) -> Pose:
-        """A keyframe's pose with its covariance and sources."""
+        """A node's pose with its covariance and sources."""
         ...
 
     def scale(self, seq: int) -> float:
-        """Metres per unit of the odometry at a keyframe."""
+        """Metres per unit of the odometry at a node."""
         ...
 
     def pose_array(self) -> F64:
-        """(N, 4, 4) T_world_camera in the order of the keyframes."""
+        """(N, 4, 4) T_world_camera in the order of the nodes."""
         ...
 
     def scales(self) -> F64:
@@ -55,7 +74,7 @@ class KeyframeGraph(Protocol):
         ...
 
     def sources(self, seq: int) -> tuple[str, ...]:
-        """What a keyframe rests on."""
+        """What a node rests on."""
         ...
 
     def similarity(self, segment: int) -> Similarity | None:

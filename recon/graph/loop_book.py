@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from recon import se3
 from recon.graph.records import Loop, Node, PoseGraphConfig, loops_agree
+from recon.graph.thinning import Ridden, moved_loops
 from recon.types import F64
 
 CHI2_LIMIT = 22.5
@@ -53,29 +55,34 @@ class LoopBook:
 
     def __init__(self, config: PoseGraphConfig, track: Track) -> None:
         self.taken: list[Loop] = []
+        self.pending: list[Loop] = []  # none that agrees was found yet
         self.counts: Counter[str] = Counter()
         self._config, self._track = config, track
-        self._pending: list[Loop] = []
 
     def offer(self, loop: Loop) -> list[Loop]:
         """The loops that are believed from now on; empty while this one waits or is refused."""
         if not self._is_possible(loop):
             self.counts["loop impossible"] += 1
             return []
-        support = [other for other in self._pending + self.taken if self._agree(loop, other)]
+        support = [other for other in self.pending + self.taken if self._agree(loop, other)]
         if not support:
-            self._pending = [*self._pending, loop][-MOST_PENDING:]
+            self.pending = [*self.pending, loop][-MOST_PENDING:]
             self.counts["loop waits"] += 1
             return []
-        fresh = [loop, *(other for other in support if other in self._pending)]
-        self._pending = [other for other in self._pending if other not in support]
+        fresh = [loop, *(other for other in support if other in self.pending)]
+        self.pending = [other for other in self.pending if other not in support]
         self.taken += fresh
         return fresh
+
+    def thin(self, ridden: Mapping[int, Ridden], most: int) -> None:
+        """Move the ends that are nodes no more; at most ``most`` loops stay."""
+        self.taken = moved_loops(self.taken, ridden, most)
+        self.pending = moved_loops(self.pending, ridden, most)
 
     def edges(self) -> list[Edge]:
         """All loops that were offered and not refused."""
         found = [Edge(loop.a, loop.b, True) for loop in self.taken]
-        return found + [Edge(loop.a, loop.b, False) for loop in self._pending]
+        return found + [Edge(loop.a, loop.b, False) for loop in self.pending]
 
     def into(self, segment: int) -> list[Loop]:
         """Believed loops from an earlier segment into this one."""

@@ -15,17 +15,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from recon import se3
 from recon.graph import factors as graph_factors
 from recon.graph.alignment import Scale, Similarity
-from recon.graph.dead_reckoning import carried
 from recon.graph.factors import pose3
+from recon.graph.graph_memory import GraphMemory
 from recon.graph.loop_book import Edge, LoopBook
-from recon.graph.readings import BLOCK, Readings
+from recon.graph.motions import Motions
+from recon.graph.readings import Readings, is_frozen
 from recon.graph.records import Loop, Node, PoseGraphConfig
 from recon.graph.segment_frames import SegmentFrames
 from recon.graph.sensor_offsets import Constants
-from recon.graph.smoother import ROUNDS, SCALAR, Smoother, moved_covariance
+from recon.graph.smoother import ROUNDS, Smoother, moved_covariance
+from recon.graph.thinning import GONE_SHARE, Ridden, moved_loop, surplus, thinned
 from recon.types import F64, Pose, PosePrior
 
 __all__ = ["Edge", "PoseGraph", "PoseGraphConfig"]
@@ -44,6 +45,10 @@ class PoseGraph:
         self.config = config or PoseGraphConfig()
         self._kept_counts: Counter[str] = Counter()  # of what happens once, whatever is rebuilt
         self._nodes: dict[int, Node] = {}  # by keyframe number, in order of time
+        self._ridden: dict[int, Ridden] = {}  # that were nodes until the last thinning
+        self._thin_at = self.config.most_nodes
+        self.entered = 0  # keyframes, whether they are nodes or not
+        self.generation = 0  # how often nodes were thinned out
         self._segments = SegmentFrames(
             self.config.least_anchors, self.config.fix_s, self.config.attitude_s
         )
@@ -80,6 +85,9 @@ class PoseGraph:
     ) -> Pose:
         """The new keyframe's pose after all that is known.
 
+        Of more than ``most_nodes`` some older ones stop being nodes: their motions are those of
+        the nodes beside them (:mod:`recon.graph.thinning`), and all is built anew.
+
         Args:
             seq: number of the keyframe; greater than those before.
             segment: stretch of unbroken vision; each has an odometry frame of its own.
@@ -100,7 +108,10 @@ class PoseGraph:
         )  # fmt: skip
         last = self._newest() if self._nodes else None
         self._keep(node)
-        if self._segments.refit(segment, self._smoother.pose):
+        is_refitted = self._segments.refit(segment, self._smoother.pose)
+        if len(self) >= self._thin_at:
+            self._thin()
+        elif is_refitted:
             self.rebuild()
         else:
             self._insert(node, last)
@@ -115,15 +126,16 @@ class PoseGraph:
         must be multiplied by to fit a's. One loop alone is not believed: a repeated texture
         gives perfect matches at the wrong place. A second one nearby must close the same circle.
         """
-        if a not in self._nodes or b not in self._nodes or a == b:
+        if not all(end in self._nodes or end in self._ridden for end in (a, b)) or a == b:
             raise ValueError(f"keyframes {a} and {b} are not two of the graph")
         if a > b:
             a, b, growth = b, a, 1.0 / growth
             T_a_b, covariance = graph_factors.reversed_motion(T_a_b, covariance)
-        scale = self.scale(a)
-        ratio = growth * self.scale(b) / scale
+        scale = self.scale(self.carrier(a))
+        ratio = growth * self.scale(self.carrier(b)) / scale
         loop = Loop(a, b, T_a_b, covariance, ratio).scaled(1.0 / scale)
-        fresh = self._book.offer(loop)
+        loop = moved_loop(loop, self._ridden)
+        fresh = self._book.offer(loop) if loop.a < loop.b else []
         if not fresh:
             return False
         if self._tie(loop):
@@ -160,6 +172,36 @@ class PoseGraph:
     def loops(self) -> list[Edge]:
         """All loops that were offered."""
         return self._book.edges()
+
+    def carrier(self, seq: int) -> int:
+        """The node that keyframe ``seq`` is, or hangs on since the last thinning."""
+        return self._ridden[seq].node if seq in self._ridden else seq
+
+    @property
+    def seqs(self) -> list[int]:
+        """Numbers of the nodes, in order."""
+        return list(self._nodes)
+
+    def memory(self) -> GraphMemory:
+        """All from which :meth:`restored` makes the same graph."""
+        return GraphMemory(
+            self.config, list(self._nodes.values()), dict(self._ridden), self._segments,
+            list(self._book.taken), list(self._book.pending), Counter(self._book.counts),
+            Counter(self._kept_counts), self.entered, self.generation, self._thin_at,
+        )  # fmt: skip
+
+    @classmethod
+    def restored(cls, memory: GraphMemory) -> PoseGraph:
+        """The graph that :meth:`memory` was taken of, built anew."""
+        graph = cls(memory.config)
+        graph._nodes = {node.seq: node for node in memory.nodes}
+        graph._ridden, graph._segments = dict(memory.ridden), memory.segments
+        book, graph._kept_counts = graph._book, Counter(memory.kept_counts)
+        book.taken, book.pending = list(memory.taken), list(memory.pending)
+        book.counts, graph._thin_at = Counter(memory.book_counts), memory.thin_at
+        graph.entered, graph.generation = memory.entered, memory.generation
+        graph.rebuild()
+        return graph
 
     def records(self) -> tuple[list[Node], list[Loop]]:
         """Keyframes and accepted loops, from which :meth:`batch` makes the same graph."""
@@ -208,11 +250,13 @@ class PoseGraph:
     def scale(self, seq: int) -> float:
         """Metres per unit of the odometry at keyframe ``seq``."""
         node = self._nodes[seq]
-        key = self._scale_of[node.key]
-        return self._frame(node).scale * float(np.exp(self._smoother.scalar(key) if key else 0.0))
+        key = self._motions.scale_of[node.key]
+        return self._segments.frame(node.segment).scale * float(
+            np.exp(self._smoother.scalar(key) if key else 0.0)
+        )
 
     def poses(self) -> dict[int, F64]:
-        """(4, 4) T_world_camera of every keyframe."""
+        """(4, 4) T_world_camera of every node."""
         return dict(zip(self._nodes, self._smoother.poses(), strict=True))
 
     @property
@@ -231,9 +275,12 @@ class PoseGraph:
 
     def scales(self) -> F64:
         """(N,) metres per unit of the odometry, in the order of the keyframes."""
-        blocks, block = np.unique(np.array(self._scale_of, np.int64), return_inverse=True)
+        blocks, block = np.unique(np.array(self._motions.scale_of, np.int64), return_inverse=True)
         drift = np.array([self._smoother.scalar(int(key)) if key else 0.0 for key in blocks])
-        frames = [np.full(len(n), self._frame(n[0]).scale) for n in self._segments.nodes.values()]
+        frames = [
+            np.full(len(nodes), self._segments.frame(segment).scale)
+            for segment, nodes in self._segments.nodes.items()
+        ]
         return np.asarray(np.concatenate(frames) * np.exp(drift[block]))
 
     def residuals(self) -> dict[str, F64]:
@@ -261,10 +308,9 @@ class PoseGraph:
             self.config, self._smoother, self._left_out, len(times), span_s,
             self._segments.altitude_offset(),
         )  # fmt: skip
+        self._motions = Motions(self.config, self._smoother, self._segments, self._left_out)
         self._sources: list[set[str]] = []
-        self._scale_of: list[int] = []  # key of each keyframe's scale; 0 while it has none
         self._path: list[float] = []  # m flown up to each keyframe
-        self._blocks: dict[int, tuple[list[int], int]] = {}  # keys of scales, keyframe of the last
 
     def rebuild(self) -> None:
         """Make the whole graph anew from all readings and the segments' present frames."""
@@ -277,130 +323,49 @@ class PoseGraph:
             self._add_loop_factor(loop)
         self._smoother.update(now=True, rounds=ROUNDS)
 
+    def _thin(self) -> None:
+        """Let some of the older keyframes ride on their neighbours, and build anew."""
+        before = list(self._nodes.values())
+        nodes, self._ridden = thinned(before, surplus(before))
+        self._nodes = {node.seq: node for node in nodes}
+        self._segments.thin(nodes)
+        self._book.thin(self._ridden, len(nodes))
+        self._thin_at = max(self.config.most_nodes, int(len(nodes) * (1.0 + GONE_SHARE)))
+        self.generation += 1
+        self.rebuild()
+
     def _keep(self, node: Node) -> None:
+        self.entered += 1
         self._nodes[node.seq] = node
         self._segments.keep(node)
 
     def _insert(self, node: Node, last: Node | None) -> None:
-        self._sources.append(set())
-        self._scale_of.append(0)
+        is_seen = last is None or last.segment == node.segment
+        self._sources.append({"vision" if is_seen else "dead reckoning"})
+        self._motions.scale_of.append(0)
         self._path.append(self._path[-1] if self._path else 0.0)
         if last is None:
-            T, spread = self._first(node)
+            T, spread = self._motions.first(node)
         else:
             T_last, spread_last = self._smoother.state(last.key)
-            motion, covariance = self._motion(node, last, T_last)
+            motion, covariance = self._motions.add(node, last, T_last)
             T = T_last @ motion
             self._path[-1] += float(np.linalg.norm(motion[:3, 3]))
             spread = moved_covariance(spread_last, T_last, covariance)
-            self._connect(node, last, motion, covariance)
         self._smoother.add_pose(node.key, T, spread)
         frame = self._segments.known(node.segment)
         drift_m = None if frame is None else self.config.frame_drift * self._path[node.key]
         node = self._segments.freed(node)
         used = self._readings.add(node, T, spread, drift_m)
-        if frame is not None and self._readings.height(node, self._scale_key(node), frame.scale):
+        if frame is not None and self._readings.height(
+            node, self._motions.scale_key(node), frame.scale
+        ):
             used.add("altitude")
         self._sources[node.key] |= used
 
-    def _first(self, node: Node) -> tuple[F64, F64]:
-        """Pose and covariance of the first keyframe: loose where readings will tell.
-
-        The gauge that no reading ever fixes is held at the start.
-        """
-        T = self._frame(node).pose(node.T_odom_camera)
-        sigma_t = 50.0 if "gnss" in self._frame(node).sources else 0.01
-        sigma_r = 1.0 if node.prior.R_world_camera is not None else 0.01
-        sigma = np.array([sigma_r] * 3 + [sigma_t] * 3)
-        noise = self._gtsam.noiseModel.Diagonal.Sigmas(sigma)
-        self._smoother.add(self._gtsam.PriorFactorPose3(node.key, pose3(T), noise), "prior")
-        self._sources[node.key].add("vision")
-        return T, graph_factors.left_covariance(T, np.diag(sigma**2))
-
-    def _connect(self, node: Node, last: Node, motion: F64, covariance: F64) -> None:
-        """The motion between two keyframes; of an aligned segment, with its scale left open."""
-        gtsam = self._gtsam
-        noise = gtsam.noiseModel.Gaussian.Covariance(
-            graph_factors.right_covariance(motion, covariance)
-        )
-        if node.segment != last.segment or self._segments.known(node.segment) is None:
-            kind = "vision" if node.segment == last.segment else "link"
-            factor = gtsam.BetweenFactorPose3(last.key, node.key, pose3(motion), noise)
-            self._smoother.add(factor, kind)
-            return
-        keys = [last.key, node.key, self._scale_key(node)]
-        error = graph_factors.scaled_motion_error(motion)
-        self._smoother.add(gtsam.CustomFactor(noise, keys, error), "vision")
-
-    def _scale_key(self, node: Node) -> int:
-        """Key of the node's scale, a new one every twenty keyframes; made when missing.
-
-        Blocks keep the smoother incremental: one variable for the whole flight would tie every
-        keyframe to the newest reading.
-        """
-        gtsam = self._gtsam
-        keys, since = self._blocks.get(node.segment, ([], 0))
-        if keys and node.key - since < BLOCK:
-            self._scale_of[node.key] = keys[-1]
-            return keys[-1]
-        key = int(gtsam.symbol(SCALAR, len(keys) + 1_000_000 * node.segment))
-        one = gtsam.noiseModel.Isotropic
-        if keys:
-            value, walk = self._smoother.scalar(keys[-1]), self.config.sigma_scale_walk
-            hold = gtsam.BetweenFactorVector(keys[-1], key, np.zeros(1), one.Sigma(1, walk))
-        else:
-            value, sigma = 0.0, self.config.sigma_scale
-            hold = gtsam.PriorFactorVector(key, np.zeros(1), one.Sigma(1, sigma))
-        self._smoother.add(hold, "scale")
-        self._smoother.add_scalar(key, value)
-        self._blocks[node.segment] = ([*keys, key], node.key)
-        self._scale_of[node.key] = key
-        return key
-
-    def _frame(self, node: Node) -> Similarity:
-        return self._segments.frame(node.segment)
-
-    def _motion(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
-        """T_last_node in metres and its (6, 6) covariance, left, in last's frame."""
-        if node.segment != last.segment:
-            return self._link(node, last, T_last)
-        frame = self._frame(node)
-        motion = se3.inverse(frame.pose(last.T_odom_camera)) @ frame.pose(node.T_odom_camera)
-        units = np.array([1.0] * 3 + [frame.scale] * 3)
-        covariance = node.covariance * np.outer(units, units) + np.diag([1e-10] * 3 + [1e-6] * 3)
-        covariance[3:, 3:] += self.config.sigma_step**2 * np.outer(motion[:3, 3], motion[:3, 3])
-        self._sources[node.key].add("vision")
-        return motion, covariance
-
-    def _link(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
-        """Dead reckoning where vision was lost: telemetry's motion, else the last one's, wide."""
-        self._left_out["stretch without vision"] += 1
-        passed_s = (node.time_ns - last.time_ns) * 1e-9
-        frame = self._segments.known(node.segment)
-        if frame is not None:  # already placed, by telemetry or by a loop
-            T = frame.pose(node.T_odom_camera)
-        else:
-            priors = self._segments.at_camera(last), self._segments.at_camera(node)
-            T = carried(*priors, T_last, self._velocity(last, T_last), passed_s)
-        sigma_r = self.config.sigma_link_rad if node.prior.sigma_yaw_rad < 1.0 else 1.5
-        sigma = np.array([sigma_r] * 3 + [self.config.sigma_link_m * max(passed_s, 1.0) + 5.0] * 3)
-        self._sources[node.key].add("dead reckoning")
-        return se3.inverse(T_last) @ T, np.diag(sigma**2)
-
-    def _velocity(self, last: Node, T_last: F64) -> F64 | None:
-        """(3,) m/s between a segment's keyframe and the one before it; None at its start."""
-        before = [n for n in self._segments.nodes[last.segment] if n.key == last.key - 1]
-        if not before or last.time_ns <= before[0].time_ns:
-            return None
-        step = T_last[:3, 3] - self._smoother.pose(before[0].key)[:3, 3]
-        return np.asarray(step / ((last.time_ns - before[0].time_ns) * 1e-9))
-
     def _fresh(self, prior: PosePrior) -> PosePrior:
         """The prior without its position when the receiver repeats its last one."""
-        if not self._nodes or prior.position_m is None:
-            return prior
-        before = self._newest().prior.position_m
-        if before is None or np.abs(before - prior.position_m).max() > 1e-6:
+        if not self._nodes or not is_frozen(prior, self._newest().prior):
             return prior
         self._kept_counts["position frozen"] += 1
         return replace(prior, sigma_position_m=None)

@@ -16,7 +16,7 @@ from recon import se3
 from recon.graph.alignment import Anchor, height_ratio
 from recon.graph.records import Node, PoseGraphConfig
 from recon.graph.smoother import Smoother
-from recon.types import F64
+from recon.types import F64, PosePrior
 
 PRECISE_M = 0.3
 """Fixes of a smaller sigma are RTK's or PPK's."""
@@ -153,6 +153,13 @@ class Readings:
     def _robust(self, noise: Any) -> Any:
         model = self._gtsam.noiseModel
         return model.Robust.Create(model.mEstimator.Huber.Create(self._config.huber_sigmas), noise)
+
+
+def is_frozen(prior: PosePrior, before: PosePrior) -> bool:
+    """True when the receiver only repeats the position that it gave before."""
+    if prior.position_m is None or before.position_m is None:
+        return False
+    return float(np.abs(before.position_m - prior.position_m).max()) <= 1e-6
 
 
 def _turn(R: F64, R_measured: F64, heading: bool) -> F64:

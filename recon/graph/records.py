@@ -10,6 +10,9 @@ import numpy as np
 from recon import se3
 from recon.types import F64, PosePrior
 
+LEAST_NODES = 50
+"""Of a pose graph's keyframes, what its bound may not go below."""
+
 
 @dataclass(frozen=True, slots=True)
 class PoseGraphConfig:
@@ -34,6 +37,7 @@ class PoseGraphConfig:
     loop_slack_m: float = 2.0  # and this
     loop_turn_rad: float = 0.5
     loop_window: int = 15  # keyframes within which two loops support each other
+    most_nodes: int = 100_000  # keyframes in the graph; of more, some ride on their neighbours
 
     def __post_init__(self) -> None:
         """Raise ValueError when a parameter makes no sense."""
@@ -43,6 +47,8 @@ class PoseGraphConfig:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         if min(self.fix_s, self.precise_fix_s, self.attitude_s, self.altitude_s) < 0:
             raise ValueError("time constants must not be negative")
+        if self.most_nodes < LEAST_NODES:
+            raise ValueError(f"most_nodes must be at least {LEAST_NODES}, got {self.most_nodes}")
         if self.loop_window < 1 or self.least_anchors < 2:
             raise ValueError("loop_window must be at least 1, least_anchors at least 2")
 
@@ -60,6 +66,7 @@ class Node:
     prior: PosePrior
     height: float | None = None  # above the ground that it sees, in odometry units
     lean: float = 0.0  # 1 - cosine of how far off the vertical that ground is seen
+    weight: int = 1  # keyframes since the node before, this one among them
 
 
 @dataclass(frozen=True, slots=True, eq=False)

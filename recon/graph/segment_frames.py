@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -36,12 +37,20 @@ class SegmentFrames:
         self._constants: dict[int, Constants] = {}  # that the frame was fitted with
         self._frames: dict[int, Similarity] = {}
         self._offsets: dict[int, Offsets] = {}
-        self._fitted: dict[int, int] = {}  # keyframes that the frame was fitted to
+        self._seen: Counter[int] = Counter()  # keyframes of each segment, kept or not
+        self._fitted: dict[int, int] = {}  # of which the frame was fitted
         self._tied: set[int] = set()  # placed by a loop
 
     def keep(self, node: Node) -> None:
         """Take a keyframe."""
         self.nodes.setdefault(node.segment, []).append(node)
+        self._seen[node.segment] += 1
+
+    def thin(self, nodes: Iterable[Node]) -> None:
+        """Keep these keyframes alone. What is known of the segments stays."""
+        self.nodes = {}
+        for node in nodes:
+            self.nodes.setdefault(node.segment, []).append(node)
 
     def known(self, segment: int) -> Similarity | None:
         """The segment's similarity; None before telemetry or a loop tells it."""
@@ -104,9 +113,10 @@ class SegmentFrames:
         """
         nodes, fitted = self.nodes[segment], self._fitted.get(segment, 0)
         growth = REFIT_GROWTH if fitted < SETTLED else SETTLED_GROWTH
-        if len(nodes) < max(self._least, int(growth * fitted)) or segment in self._tied:
+        seen = self._seen[segment]
+        if seen < max(self._least, int(growth * fitted)) or segment in self._tied:
             return False
-        self._fitted[segment] = len(nodes)
+        self._fitted[segment] = seen
         fresh = self._newest_constants()
         anchors = self._anchors(segment, fresh)
         found = alignment.fit(anchors)
@@ -115,7 +125,7 @@ class SegmentFrames:
         if "gnss" not in found.sources and nodes[0].key > 0:
             found = _kept_in_place(found, nodes[0], pose(nodes[0].key))
         before = self._frames.get(segment)
-        is_settled = len(nodes) >= SETTLED and not fresh.differ(self.constants(segment))
+        is_settled = seen >= SETTLED and not fresh.differ(self.constants(segment))
         if before is not None and is_settled and not _differ(before, found, nodes):
             return False  # the graph itself follows such small changes
         self._frames[segment], self._constants[segment] = found, fresh

@@ -10,13 +10,14 @@ import struct
 import tempfile
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from recon.graph.ledger import Ledger, MemoryLedger
 from recon.types import F64
 from service.errors import OutsideError
 
@@ -71,34 +72,78 @@ class Anchorage:
 UNMOVED = np.eye(4)
 
 
-class Carriers:
-    """Views on the chain of keyframes by segment, in order; frames are carried along by them."""
+VIEW = np.dtype([("seq", np.int64), ("segment", np.int64), ("odom", np.float64, (4, 4))])
+"""A row of the ledger of views that no longer change."""
 
-    def __init__(self) -> None:
-        self._views: dict[int, list[Anchorage]] = {}
-        self._fresh: deque[tuple[list[Anchorage], int]] = deque()  # may still be refined
+
+class Carriers:
+    """Views on the chain of keyframes, in order; frames of their segment are carried by them."""
+
+    def __init__(self, ledger: Ledger | None = None) -> None:
+        """``ledger`` takes rows of :data:`VIEW`, those that no longer change; memory when left
+        out."""
+        self._settled: Ledger = MemoryLedger(VIEW) if ledger is None else ledger
+        self._newest: Anchorage | None = None  # of those settled
+        self._fresh: deque[Anchorage] = deque()  # may still be refined
 
     def add(self, view: Anchorage) -> None:
-        """Take a segment's next view."""
-        views = self._views.setdefault(view.key.segment, [])
-        self._fresh.append((views, len(views)))
-        views.append(view)
+        """Take the next view."""
+        self._fresh.append(view)
 
     def settle(self, is_settled: Callable[[Key], bool]) -> None:
         """Let go of the keyframes that no longer change."""
-        while self._fresh:
-            views, i = self._fresh[0]
-            if not is_settled(views[i].key):
-                return
-            views[i] = views[i].settled()
-            self._fresh.popleft()
+        while self._fresh and is_settled(self._fresh[0].key):
+            self._newest = view = self._fresh.popleft().settled()
+            row = np.zeros(1, VIEW)
+            row["seq"], row["segment"] = view.seq, view.key.segment
+            row["odom"] = view.T_odom_camera
+            self._settled.append(row)
 
     def of(self, frame: Anchorage) -> Anchorage | None:
         """The view at or before a frame, or its segment's first; None without any."""
-        views = self._views.get(frame.key.segment)
-        if not views:
-            return None
-        return views[max(bisect_right(views, frame.seq, key=lambda v: v.seq) - 1, 0)]
+        segment = frame.key.segment
+        at = self._before(frame.seq)
+        for i in (at, at + 1):
+            view = self._view(i)
+            if view is not None and view.key.segment == segment:
+                return view
+        return None
+
+    def _before(self, seq: int) -> int:
+        """Place of the last view whose number is ``seq`` or smaller; -1 without any."""
+        held = len(self._settled)
+        if self._newest is not None and seq < self._newest.seq:
+            return bisect_right(_Seqs(self._settled), seq) - 1
+        return held - 1 + bisect_right(self._fresh, seq, key=lambda view: view.seq)
+
+    def _view(self, i: int) -> Anchorage | None:
+        """The view at a place; None where there is none."""
+        held = len(self._settled)
+        if i == held - 1:
+            return self._newest
+        if not 0 <= i < held:
+            return self._fresh[i - held] if 0 <= i - held < len(self._fresh) else None
+        row = self._settled.read(i, i + 1)[0]
+        seq = int(row["seq"])
+        key = SettledKey(seq, int(row["segment"]), row["odom"])
+        return Anchorage(seq, key, UNMOVED)
+
+    def close(self) -> None:
+        """Let go of the ledger."""
+        self._settled.close()
+
+
+class _Seqs(Sequence[int]):
+    """The numbers of a ledger's rows, for a search."""
+
+    def __init__(self, ledger: Ledger) -> None:
+        self._ledger = ledger
+
+    def __len__(self) -> int:
+        return len(self._ledger)
+
+    def __getitem__(self, i: Any) -> Any:
+        return int(self._ledger.read(i, i + 1)["seq"][0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

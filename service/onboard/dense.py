@@ -17,6 +17,8 @@ from recon.camera_model import scaled_K
 from recon.clouds.registration import IcpConfig
 from recon.clouds.voxel_map import VoxelMap, VoxelMapConfig
 from recon.graph.alignment import height_above, height_below
+from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.graph.riders import KEYFRAME
 from recon.graph.trajectory import Trajectory
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.depth_fusion import FusionConfig, fuse
@@ -43,6 +45,7 @@ from recon.types import (
 )
 from service.compute.stopwatch import Stopwatch
 from service.config import ComputeConfig, Config
+from service.onboard.file_ledger import FileLedger
 from service.onboard.graph_aside import GraphAside
 from service.onboard.loops import LoopSearch
 from service.onboard.map_pages import PagedMap
@@ -76,19 +79,22 @@ class Dense:
         pages: Path | None = None,
         aside: bool = False,
     ) -> None:
-        """``pages`` is a folder for the parts of the map flown long ago; None: forget them.
+        """``pages`` is a folder for the parts of the map flown long ago, beside which keyframes
+        are kept; None: forget the map's, and keep keyframes in memory.
 
         ``aside`` gives the pose graph a process of its own, so that nobody waits for it.
         """
         compute = config.compute
-        self._aside = GraphAside() if aside else None
-        self.trajectory = Trajectory(graph=self._aside)
+        most = config.fusion.graph_keyframes
+        self._aside = GraphAside(most_nodes=most) if aside else None
+        self._ledger = None if pages is None else FileLedger(KEYFRAME, pages.parent)
+        graph = self._aside or PoseGraph(PoseGraphConfig(most_nodes=most))
+        self.trajectory = Trajectory(graph=graph, ledger=self._ledger)
         self.lock = threading.Lock()
         self.stopwatch = Stopwatch()
         self.refusals: Counter[str] = Counter()
         self.registrations: Counter[str] = Counter()
         self.pairs = 0
-        self.encoded_scale: dict[int, float] = {}  # keyframe to the scale its depth was made with
         self.debug: dict[str, Array] = {}
         self.stereo = VirtualStereoConfig(
             least_base_to_height=least_base_to_height,
@@ -114,12 +120,14 @@ class Dense:
 
     @property
     def held(self) -> dict[str, int]:
-        """What memory holds of this scan: the map's voxels, its tiles on disk, views for loops."""
+        """What memory holds of this scan: the map's voxels, its tiles on disk, views for loops,
+        and keyframes in the pose graph."""
         paged = self._map if isinstance(self._map, PagedMap) else None
         return {
             "map_voxels": 0 if self._map is None else len(self._map),
             "map_tiles_on_disk": 0 if paged is None else paged.tiles_on_disk,
             "loop_views": 0 if self.loops is None else len(self.loops),
+            "graph_keyframes": len(self.trajectory.graph),
         }
 
     def forget_map(self) -> None:
@@ -129,9 +137,11 @@ class Dense:
         self._map = None
 
     def close(self) -> None:
-        """End what runs beside; call it last. The trajectory stays readable."""
+        """End what runs beside; call it last. The graph stays readable."""
         if self._aside is not None:
             self._aside.close()
+        if self._ledger is not None:
+            self._ledger.close()
 
     def set_least_base_to_height(self, least: float) -> None:
         """Accept baselines as short as ``least`` of the distance."""
@@ -253,7 +263,6 @@ class Dense:
         with self.lock:
             placed = self.trajectory.place(seq)
             self.trajectory.tell(placed)
-        self.encoded_scale[seq] = placed.scale
         h, w = depth.depth_m.shape
         metric = DepthMap(
             depth.depth_m * np.float32(placed.scale),

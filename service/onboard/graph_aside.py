@@ -8,16 +8,11 @@ process that dies is started again and given everything once more.
 from __future__ import annotations
 
 import logging
-import os
-import pickle
-import queue
-import subprocess
 import sys
-import threading
 import time
 import weakref
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,10 +23,11 @@ from recon.graph.dead_reckoning import carried
 from recon.graph.fix_average import at_camera
 from recon.graph.loop_book import Edge
 from recon.graph.pose_graph import SOURCES
-from recon.graph.records import Loop, Node
+from recon.graph.records import Loop, Node, PoseGraphConfig
 from recon.graph.sensor_offsets import Constants
 from recon.graph.smoother import moved_covariance
 from recon.types import F64, Pose, PosePrior
+from service.onboard.graph_process import GraphProcess
 from service.onboard.graph_server import GraphState, Order, Watched
 
 log = logging.getLogger(__name__)
@@ -42,102 +38,15 @@ WAIT_S = 0.01
 AGAIN_S = 5.0
 """From one start of the process to the next, at least."""
 
+MOST_NODES = PoseGraphConfig().most_nodes
+NOT_SENT = sys.maxsize
+"""Number of an order that the process's successor will get."""
+
 ATTEMPTS = 2
 """Of an order that must be answered; then it is obeyed in this process."""
 
 LOST = np.diag([0.3**2] * 3 + [5.0**2] * 3)
 """Covariance that a step without vision adds until the graph has weighed it."""
-
-_CHILD = (
-    "import sys; sys.path[:] = sys.argv[1:]; "
-    "from service.onboard.graph_server import main; main()"
-)  # fmt: skip
-
-
-class _Process:
-    """The graph's process and the newest of what it said. Neither way ever blocks the caller."""
-
-    def __init__(self) -> None:
-        self._child = subprocess.Popen(
-            [sys.executable, "-c", _CHILD, *(p or os.getcwd() for p in sys.path)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        )  # fmt: skip
-        self._orders: queue.SimpleQueue[Order | None] = queue.SimpleQueue()
-        self._news = threading.Condition()
-        self._sent, self._done = 0, -1
-        self._value: Any = None
-        self._state: GraphState | None = None
-        self.is_dead = False
-        threading.Thread(target=self._write, name="graph orders", daemon=True).start()
-        threading.Thread(target=self._read, name="graph answers", daemon=True).start()
-
-    @property
-    def pid(self) -> int:
-        """Of the process."""
-        return self._child.pid
-
-    @property
-    def behind(self) -> int:
-        """Orders sent and not obeyed yet."""
-        with self._news:
-            return self._sent - max(self._done, 0)
-
-    def close(self) -> None:
-        """End the process and wait for it."""
-        _end(self._child, self._orders)
-
-    def send(self, order: Order) -> None:
-        """Put an order into the queue."""
-        self._sent += 1
-        self._orders.put(order)
-
-    def wait(self, seconds: float | None) -> tuple[bool, Any]:
-        """True and the last order's value once it was obeyed; False after ``seconds``, or when
-        the process is dead."""
-        with self._news:
-            self._news.wait_for(lambda: self._done >= self._sent or self.is_dead, seconds)
-            return self._done >= self._sent, self._value
-
-    def news(self) -> GraphState | None:
-        """The newest state, once; None when there is none newer than that asked for before."""
-        with self._news:
-            state, self._state = self._state, None
-            return state
-
-    def _write(self) -> None:
-        pipe = self._child.stdin
-        assert pipe is not None
-        try:
-            while (order := self._orders.get()) is not None:
-                pickle.dump(order, pipe, protocol=5)
-                pipe.flush()
-            pipe.close()
-        except OSError:
-            pass  # it is dead; the other thread says so
-
-    def _read(self) -> None:
-        pipe = self._child.stdout
-        assert pipe is not None
-        try:
-            while True:
-                done, value, state = pickle.load(pipe)
-                with self._news:
-                    self._done, self._value = done, value
-                    self._state = state if state is not None else self._state
-                    self._news.notify_all()
-        except (EOFError, OSError, pickle.UnpicklingError):
-            with self._news:
-                self.is_dead = True
-                self._news.notify_all()
-
-
-def _end(child: subprocess.Popen[bytes], orders: queue.SimpleQueue[Order | None]) -> None:
-    orders.put(None)
-    try:
-        child.wait(0.5)
-    except subprocess.TimeoutExpired:
-        child.kill()  # it is solving, and nobody waits for that any more
-        child.wait()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,13 +66,18 @@ class GraphAside:
     :meth:`add_loop`, :meth:`solve` and :attr:`version`.
     """
 
-    def __init__(self, wait_s: float = WAIT_S, again_s: float = AGAIN_S) -> None:
+    def __init__(
+        self, wait_s: float = WAIT_S, again_s: float = AGAIN_S, most_nodes: int = MOST_NODES
+    ) -> None:
         """Starts the process; a new keyframe waits ``wait_s`` at most for it. One that died is
-        started again ``again_s`` after its start at the earliest."""
-        self._wait_s, self._again_s = wait_s, again_s
-        self._nodes: dict[int, Node] = {}
-        self._seqs: list[int] = []
-        self._orders: list[Order] = []  # everything that made the graph
+        started again ``again_s`` after its start at the earliest. Of more than ``most_nodes``
+        keyframes some stop being nodes."""
+        self._wait_s, self._again_s, self._most_nodes = wait_s, again_s, most_nodes
+        self.entered = self.generation = 0
+        self._nodes: dict[int, Node] = {}  # what the graph holds, and what came since
+        self._seqs: list[int] = []  # of those, in order
+        self._memory: bytes | None = None  # the graph as it was once, and
+        self._orders: list[tuple[int, Order]] = []  # what made it since, by number in the process
         self._state: GraphState | None = None
         self._spread: dict[int, F64] = {}  # by keyframe, as it was last told
         self._carried: list[_Carried] = []  # keyframes after those of the state
@@ -198,6 +112,7 @@ class GraphAside:
             raise ValueError("T_odom_camera must be (4, 4) and covariance (6, 6)")
         above, lean = height if height is not None else (None, 0.0)
         T, spread = np.array(T_odom_camera, np.float64), np.array(covariance, np.float64)
+        self.entered += 1
         node = Node(seq, len(self._seqs), time_ns, segment, T, spread, prior, above, lean)
         self._give(("keyframe", seq, time_ns, segment, T, spread, prior, height))
         self._nodes[seq] = node
@@ -229,6 +144,11 @@ class GraphAside:
 
     def __len__(self) -> int:
         return len(self._seqs)
+
+    @property
+    def seqs(self) -> list[int]:
+        """Numbers of the nodes, in order."""
+        return self._seqs
 
     def __contains__(self, seq: int) -> bool:
         return seq in self._nodes
@@ -306,20 +226,22 @@ class GraphAside:
 
     # ---- the process ---------------------------------------------------------------------------
 
-    def _begin(self) -> _Process:
+    def _begin(self) -> GraphProcess:
         """A process that ends with this object, also when nobody closes it."""
-        process = _Process()
+        process = GraphProcess(self._most_nodes)
         weakref.finalize(self, process.close)
         return process
 
     def _give(self, order: Order) -> None:
-        self._orders.append(order)
         if self._here is not None:
             self._here.obey(order)
-        elif self._process.is_dead:
+            return
+        self._remember()
+        if self._process.is_dead:
+            self._orders.append((NOT_SENT, order))
             self._again()
         else:
-            self._process.send(order)
+            self._orders.append((self._process.send(order), order))
 
     def _again(self, wait: bool = False) -> None:
         """Start a process in place of the dead one, not too soon after that one's start."""
@@ -328,10 +250,19 @@ class GraphAside:
             return
         time.sleep(max(left_s, 0.0))
         log.warning("the pose graph's process ended; it is started again with all that it knew")
+        self._remember()
         self._process.close()
         self._process, self._started = self._begin(), time.monotonic()
-        for order in self._orders:
-            self._process.send(order)
+        if self._memory is not None:
+            self._process.send(("remember", self._memory))
+        self._orders = [(self._process.send(order), order) for _, order in self._orders]
+
+    def _remember(self) -> None:
+        """Forget the orders that the process's newest memory stands for."""
+        found = self._process.memory()
+        if found is not None:
+            done, self._memory = found
+            self._orders = [one for one in self._orders if one[0] > done]
 
     def _wait(self, seconds: float) -> tuple[bool, Any]:
         """True and the value of the last order when it was obeyed in time."""
@@ -354,24 +285,47 @@ class GraphAside:
                 return value
         if self._here is None:
             log.warning("no process can hold the pose graph; it is built here")
-            self._here = Watched()
-            for one in self._orders:
+            self._remember()
+            self._here = Watched(self._most_nodes)
+            if self._memory is not None:
+                self._here.obey(("remember", self._memory))
+            for _, one in self._orders:
                 self._here.obey(one)
+            self._memory, self._orders = None, []
         return self._here.obey(order)
 
     def _take(self) -> None:
         state = self._process.news()
-        if state is not None and len(state) >= len(self) - len(self._carried):
+        if state is not None and self._is_newer(state):
             self._put(state)
+
+    def _is_newer(self, state: GraphState) -> bool:
+        """False of what a process tells that is not where the one before it was."""
+        before = self._state
+        if before is None or not len(before):
+            return True
+        return len(state) > 0 and state.seqs[-1] >= before.seqs[-1]
 
     def _put(self, state: GraphState) -> None:
         """Take a state; the keyframes that it lacks are carried on from it."""
         self._state = state
+        if state.generation != self.generation:
+            self._thin(state)
         self._spread.update(state.spread)
         self._version += 1
         self._carried = []
         for seq in self._seqs[len(state) :]:
             self._carried.append(self._carry(self._nodes[seq]))
+
+    def _thin(self, state: GraphState) -> None:
+        """Let go of the keyframes that are nodes no more."""
+        self.generation = state.generation
+        last = int(state.seqs[-1])
+        self._seqs = state.seqs.tolist() + [seq for seq in self._seqs if seq > last]
+        self._nodes = {
+            seq: replace(self._nodes[seq], key=key) for key, seq in enumerate(self._seqs)
+        }
+        self._spread = {seq: one for seq, one in self._spread.items() if seq in self._nodes}
 
     # ---- keyframes ahead of the graph ----------------------------------------------------------
 

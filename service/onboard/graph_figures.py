@@ -17,6 +17,7 @@ MOST_LOOPS = 300
 def graph_figures(graph: KeyframeGraph) -> dict[str, Any] | None:
     """Residuals by kind of factor, loops and readings left out, fit for JSON; None when empty.
 
+    ``nodes`` of the ``keyframes`` are in the graph; the others ride on them.
     ``loops.motions`` are the accepted loops as refinement takes them: two keyframes, seven
     numbers of the motion and 21 of its covariance.
     """
@@ -26,6 +27,8 @@ def graph_figures(graph: KeyframeGraph) -> dict[str, Any] | None:
     step = max(1, -(-len(accepted) // MOST_LOOPS))
     edges = graph.loops
     return {
+        "keyframes": graph.entered,
+        "nodes": len(graph),
         "residuals": {
             kind: {
                 "count": len(rows),

@@ -22,8 +22,10 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.graph.alignment import Scale, Similarity
+from recon.graph.graph_memory import GraphMemory
 from recon.graph.loop_book import Edge
 from recon.graph.pose_graph import SOURCES, PoseGraph
+from recon.graph.records import PoseGraphConfig
 from recon.types import F64
 
 Order = tuple[Any, ...]
@@ -40,10 +42,12 @@ NICE = 5
 class GraphState:
     """All that others read of a pose graph, at one moment."""
 
+    seqs: npt.NDArray[np.int64]  # (N,) numbers of the nodes
+    generation: int  # how often nodes were thinned out
     poses: F64  # (N, 4, 4) T_world_camera
     scales: F64  # (N,) metres per unit of the odometry
     sources: npt.NDArray[np.uint8]  # (N,) a bit for each of SOURCES
-    spread: dict[int, F64]  # (6, 6) left covariances by keyframe: the newest's, or all
+    spread: dict[int, F64]  # (6, 6) left covariances by node: the newest's, or all
     frames: dict[int, Similarity]  # by segment
     tied: frozenset[int]  # segments
     counts: Counter[str]
@@ -54,13 +58,17 @@ class GraphState:
         return len(self.poses)
 
 
+Answer = tuple[int, Any, "GraphState | None", "bytes | None"]
+"""Number of orders done, the last one's value, a state and a memory when there are new ones."""
+
+
 class Watched:
     """A pose graph, and how its state was told last."""
 
-    def __init__(self) -> None:
-        self.graph = PoseGraph()
-        self._seqs: list[int] = []
+    def __init__(self, most_nodes: int) -> None:
+        self.graph = PoseGraph(PoseGraphConfig(most_nodes=most_nodes))
         self._segments: list[int] = []
+        self._remembered = 0  # generation of the graph in the last memory
         self._told = -1  # version of the graph in the last state
         self._bits: list[int] = []
         self._looked = 0
@@ -76,12 +84,17 @@ class Watched:
         name, *rest = order
         if name == "keyframe":
             seq, _, segment = rest[:3]
-            self._seqs.append(seq)
             if segment not in self._segments:
                 self._segments.append(segment)
             return self.graph.add_keyframe(*rest), self.graph.scale(seq)
         if name == "loop":
             return self._loop(*rest)
+        if name == "remember":
+            memory: GraphMemory = pickle.loads(rest[0])
+            self.graph = PoseGraph.restored(memory)
+            self._segments = list(memory.segments.nodes)
+            self._remembered = self.graph.generation
+            return None
         if name == "solve":
             self.graph.solve()
             return self.state(True)
@@ -94,27 +107,30 @@ class Watched:
         scales: tuple[float, float],
     ) -> bool:  # fmt: skip
         """``scales`` are those at both ends by which the loop was measured in metres."""
-        first = self.graph.scale(a) / scales[0]
+        ends = self.graph.carrier(a), self.graph.carrier(b)
+        first = self.graph.scale(ends[0]) / scales[0]
         units = np.array([1.0] * 3 + [first] * 3)
         T = T_a_b.copy()
         T[:3, 3] *= first
-        growth *= first * scales[1] / self.graph.scale(b)
+        growth *= first * scales[1] / self.graph.scale(ends[1])
         self._bits = []  # the loop's end rests on it now
         return self.graph.add_loop(a, b, T, covariance * np.outer(units, units), growth)
 
     def state(self, final: bool = False) -> GraphState:
         """The state now; with all covariances when it is ``final``."""
-        graph, seqs = self.graph, self._seqs
+        graph, seqs = self.graph, self.graph.seqs
         if final or graph.version // 1_000_000 != self._told // 1_000_000:
             self._bits = []  # it was built anew
         self._told = graph.version
-        if final or len(seqs) >= LOOK_GROWTH * self._looked:
-            self._looked, self._scales = len(seqs), graph.newest_scales()
+        if final or graph.entered >= LOOK_GROWTH * self._looked:
+            self._looked, self._scales = graph.entered, graph.newest_scales()
         frames = {k: found for k in self._segments if (found := graph.similarity(k)) is not None}
         return GraphState(
+            np.array(seqs, np.int64),
+            graph.generation,
             graph.pose_array() if seqs else np.zeros((0, 4, 4)),
             graph.scales() if seqs else np.zeros(0),
-            np.array(self._sources(), np.uint8),
+            np.array(self._sources(seqs), np.uint8),
             {seq: graph.pose(seq).covariance for seq in (seqs if final else seqs[-1:])},
             frames,
             frozenset(k for k in self._segments if graph.is_tied(k)),
@@ -123,27 +139,36 @@ class Watched:
             self._scales,
         )  # fmt: skip
 
-    def _sources(self) -> list[int]:
-        """A number per keyframe with a bit for each of its SOURCES."""
-        for seq in self._seqs[len(self._bits) :]:
+    def memory(self) -> bytes | None:
+        """A pickle to remember after nodes were thinned out, once; it replaces all orders before.
+        None while there is no news."""
+        if self.graph.generation == self._remembered:
+            return None
+        self._remembered = self.graph.generation
+        return pickle.dumps(self.graph.memory(), protocol=5)
+
+    def _sources(self, seqs: list[int]) -> list[int]:
+        """A number per node with a bit for each of its SOURCES."""
+        for seq in seqs[len(self._bits) :]:
             self._bits.append(sum(1 << SOURCES.index(s) for s in self.graph.sources(seq)))
         return self._bits
 
 
-def serve(orders: BinaryIO, answers: BinaryIO) -> None:
-    """Obey until the input ends. Each answer is (number of orders done, value, state or None).
+def serve(orders: BinaryIO, answers: BinaryIO, most_nodes: int) -> None:
+    """Obey until the input ends. Each answer is an :data:`Answer`.
 
     A state goes out when no order waits and it brings something new.
     """
     waiting: queue.SimpleQueue[Order | None] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(orders, waiting), daemon=True).start()
-    watched, done = Watched(), 0
-    _answer(answers, (0, None, None))
+    watched, done = Watched(most_nodes), 0
+    _answer(answers, (0, None, None, None))
     while (order := waiting.get()) is not None:
         value = watched.obey(order)
         done += 1
         is_due = waiting.empty() and watched.has_news
-        _answer(answers, (done, value, watched.state() if is_due else None))
+        state = watched.state() if is_due else None
+        _answer(answers, (done, value, state, watched.memory()))
 
 
 def _read(orders: BinaryIO, waiting: queue.SimpleQueue[Order | None]) -> None:
@@ -154,17 +179,20 @@ def _read(orders: BinaryIO, waiting: queue.SimpleQueue[Order | None]) -> None:
         waiting.put(None)
 
 
-def _answer(answers: BinaryIO, answer: tuple[int, Any, GraphState | None]) -> None:
+def _answer(answers: BinaryIO, answer: Answer) -> None:
     pickle.dump(answer, answers, protocol=5)
     answers.flush()
 
 
-def main() -> None:
-    """Serve the parent process; what anything prints goes to standard error."""
+def main(most_nodes: int) -> None:
+    """Serve the parent process a graph of ``most_nodes`` keyframes at most.
+
+    What anything prints goes to standard error.
+    """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     os.nice(NICE)
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     with contextlib.suppress(BrokenPipeError):  # the parent is gone
-        serve(sys.stdin.buffer, answers)
+        serve(sys.stdin.buffer, answers, most_nodes)

@@ -39,9 +39,9 @@ class GraphWatch:
 
     def look(self) -> None:
         """Look again when enough keyframes have come since the last time."""
-        if len(self._graph) < max(LEAST, LOOK_GROWTH * self._seen):
+        if self._graph.entered < max(LEAST, LOOK_GROWTH * self._seen):
             return
-        self._seen = len(self._graph)
+        self._seen = self._graph.entered
         for kind, sentence in self._findings().items():
             if kind not in self._told:
                 self._told.add(kind)

@@ -40,6 +40,7 @@ class _Kept:
     """A keyframe packed for later."""
 
     seq: int
+    ordinal: int  # among all keyframes
     segment: int
     picture: U8  # JPEG, grey
     K: F64  # (3, 3) px of that picture
@@ -62,7 +63,7 @@ class _Kept:
         )  # fmt: skip
 
 
-def _packed(seq: int, segment: int, grey: U8, K: F64, depth: DepthMap) -> _Kept:
+def _packed(seq: int, ordinal: int, segment: int, grey: U8, K: F64, depth: DepthMap) -> _Kept:
     H, W = grey.shape
     size = (min(WIDTH_PX, W), round(min(WIDTH_PX, W) * H / W))
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
@@ -74,7 +75,7 @@ def _packed(seq: int, segment: int, grey: U8, K: F64, depth: DepthMap) -> _Kept:
     far = float(z[known].max()) if known.any() else 1.0
     share = np.where(known, np.maximum(np.rint(z * (65535.0 / far)), 1), 0)
     return _Kept(
-        seq, segment, np.asarray(picture, np.uint8), scaled_K(K, size[0] / W, size[1] / H),
+        seq, ordinal, segment, np.asarray(picture, np.uint8), scaled_K(K, size[0] / W, size[1] / H),
         share.astype(np.uint16), far, sigma.astype(np.float16), depth_K, size,
     )  # fmt: skip
 
@@ -112,7 +113,7 @@ class LoopSearch:
             grey: (H, W) picture without distortion, ``K`` (3, 3) px of it.
             depth: of the same camera, in units of its segment's odometry.
         """
-        new = _packed(seq, segment, grey, K, depth)
+        new = _packed(seq, self.trajectory.graph.entered - 1, segment, grey, K, depth)
         self._kept[seq] = new
         if self._rest > 0:
             self._rest -= 1
@@ -123,13 +124,13 @@ class LoopSearch:
 
     def _search(self, new: _Kept) -> None:
         with self._lock:
-            view = new.unpacked(self.trajectory.graph.scale(new.seq))
+            view = new.unpacked(self.trajectory.scale(new.seq))
             likely = self._likely(new, view)
         for seq in likely:
             self.counts["tried"] += 1
             with self._lock:
                 guess = self.trajectory.step_between(seq, new.seq)
-                scale = self.trajectory.graph.scale(seq)
+                scale = self.trajectory.scale(seq)
             found = verify(self._kept[seq].unpacked(scale), view, guess, self._config)
             if found is not None and self._tell(seq, new, found):
                 self._rest = PAUSE
@@ -139,7 +140,7 @@ class LoopSearch:
         """True when the graph believes the loop."""
         self.counts["verified"] += 1
         with self._lock:
-            taken = self.trajectory.graph.add_loop(
+            taken = self.trajectory.add_loop(
                 seq, new.seq, found.T_a_b, found.covariance, found.growth
             )
         self.counts["taken"] += taken
@@ -150,19 +151,16 @@ class LoopSearch:
         depth_m = float(np.nanmedian(view.depth.depth_m))
         if not depth_m > 0:
             return []
-        graph = self.trajectory.graph
-        seqs = [seq for seq in self._kept if self._is_apart(seq, new.seq)]
+        seqs = [seq for seq, kept in self._kept.items() if self._is_apart(kept, new)]
         if not seqs:
             return []
         W, H = new.size_px
         reach = depth_m * float(np.hypot(W, H)) / new.K[0, 0]
-        poses = graph.pose_array()
-        here = poses[graph.node(new.seq).key]
-        there = poses[[graph.node(seq).key for seq in seqs]]
-        ahead = there[:, :3, 3] + depth_m * there[:, :3, 2]
+        *there, here = self.trajectory.places([*seqs, new.seq])
+        centres, ways = (np.array(there)[:, :3, k] for k in (3, 2))
+        ahead = centres + depth_m * ways
         apart = np.linalg.norm(ahead - (here[:3, 3] + depth_m * here[:3, 2]), axis=1)
-        near = [seqs[i] for i in np.argsort(apart)[:8] if apart[i] < reach]
-        some = {seq: poses[graph.node(seq).key] for seq in near}
+        some = {seqs[i]: there[i] for i in np.argsort(apart)[:8] if apart[i] < reach}
         some[new.seq] = here
         config = self._config.without_gap()
         ground = ground_seen(view.depth)
@@ -179,10 +177,10 @@ class LoopSearch:
         self._turn += 1
         return [earlier[-1 - (self._turn - 1) % len(earlier)]]
 
-    def _is_apart(self, seq: int, new: int) -> bool:
+    def _is_apart(self, one: _Kept, two: _Kept) -> bool:
         """True when two keyframes are not neighbours on one chain."""
-        one, two = self.trajectory.graph.node(seq), self.trajectory.graph.node(new)
-        return two.key - one.key >= self._config.least_gap or one.segment != two.segment
+        gap = two.ordinal - one.ordinal
+        return gap >= self._config.least_gap or one.segment != two.segment
 
     def _thin(self) -> None:
         """Forget every second keyframe of the older half."""

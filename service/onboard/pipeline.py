@@ -30,8 +30,9 @@ from recon.types import U8, Camera, Frame, Keyframe, PosePrior
 from service.cameras.source import GeoTag
 from service.compute.side_by_side import SideBySide
 from service.config import ComputeConfig, Config, ScanConfig
-from service.onboard.anchorage import Anchorage, Carriers, Key
+from service.onboard.anchorage import VIEW, Anchorage, Carriers, Key
 from service.onboard.dense import Dense, Job
+from service.onboard.file_ledger import FileLedger
 from service.onboard.rig import Rig
 from service.onboard.viewpoints import Offer, Viewpoint, Viewpoints
 
@@ -67,7 +68,8 @@ class Pipeline:
     ) -> None:
         """Raises ValueError for an unusable camera model.
 
-        ``pages`` is a folder that the parts of the map flown long ago may go to.
+        ``pages`` is a folder that the parts of the map flown long ago may go to; beside it what
+        is remembered of every view lies in files without a name.
         """
         self.config = config
         self.rig = Rig(config.camera, config.scan, config.fusion)
@@ -93,7 +95,7 @@ class Pipeline:
         self._waiting: deque[Viewpoint] = deque()
         self._asked: deque[Viewpoint] = deque(maxlen=8)  # whose reconstruction was asked for
         self._views: dict[int, Viewpoint] = {}  # asked for and not done yet
-        self._carriers = Carriers()
+        self._carriers = Carriers(None if pages is None else FileLedger(VIEW, pages.parent))
         self._segment = self.odometry.segment
         self._fixes = FixAverage()
         self._priors: dict[int, PosePrior] = {}  # of the views that wait

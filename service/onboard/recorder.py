@@ -44,7 +44,6 @@ class Recorder:
         self._offset_ns = clock_offset_ns
         self._codec = CodecConfig()
         self._told = ToldFrames(store.path.parent)
-        self._revision: Counter[int] = Counter()
         self._last: tuple[int, F64] | None = None  # unix ns and T_world_camera of the last pose
         self._origin_written = False
 
@@ -145,18 +144,16 @@ class Recorder:
                 self._on_keyframe(keyframe)
         if self.pipeline.dense.debug and step.keyframes:
             save_debug(self.store.path.parent, step.keyframes[-1].seq, self.pipeline.dense.debug)
-        moved = [self._repose(p) for p in step.moved if p.seq in self.pipeline.dense.encoded_scale]
+        with self.pipeline.dense.lock:
+            moved = [self._repose(placed) for placed in step.moved]
         if moved:
             self.store.add_reposes(moved)
 
     def _repose(self, placed: Placed) -> Repose:
-        self._revision[placed.seq] += 1
+        """The correction of a keyframe, whose depth was made with the scale first told."""
+        told, scale = self.pipeline.dense.trajectory.telling(placed.seq)
         return Repose(
-            placed.seq,
-            self._revision[placed.seq],
-            placed.T_world_camera,
-            placed.scale / self.pipeline.dense.encoded_scale[placed.seq],
-            placed.covariance,
+            placed.seq, told - 1, placed.T_world_camera, placed.scale / scale, placed.covariance
         )
 
     def _record(self, told: Told, placed: Placed) -> PoseRecord:

@@ -1,0 +1,163 @@
+"""A pose graph's keyframes thinned out: fewer nodes over the same track.
+
+A keyframe that stops being a node hands its motion to the next one: motions are composed, and
+so are their covariances (Barfoot, State Estimation for Robotics, 2017, section 7.3). Loops that
+ended at it end at the node before it, moved there by vision. Its fix goes into the mean of the
+next node's; other readings of it go. Readings are weighed by how many of them there are in the
+time flown (:mod:`recon.graph.readings`), so those that stay then weigh more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from recon import se3
+from recon.graph.factors import reversed_motion
+from recon.graph.records import Loop, Node
+from recon.types import F64, PosePrior
+
+NEWEST_SHARE = 0.25
+"""Of the nodes, the newest, which always stay: vision's next motions and loops hang on them."""
+
+GONE_SHARE = 0.25
+"""Of the nodes, how many go at once, so that building anew is seldom due."""
+
+MOST_WORSE = 2.0
+"""A fix whose sigma is so many times that of another spoils their mean."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ridden:
+    """A keyframe that hangs on the node before it."""
+
+    node: int  # number of that node
+    T_node_camera: F64  # (4, 4) in units of the odometry
+    covariance: F64  # (6, 6) of that motion, left, in the node's frame
+
+
+def surplus(nodes: Sequence[Node]) -> set[int]:
+    """Numbers of those that can go: from where nodes stand closest, never two neighbours.
+
+    The first and the last of each segment stay, and so do the newest.
+    """
+    found = []
+    for i in range(1, len(nodes) - max(2, int(NEWEST_SHARE * len(nodes)))):
+        before, node, after = nodes[i - 1 : i + 2]
+        if before.segment == node.segment == after.segment:
+            found.append((node.weight + after.weight, i))
+    gone: set[int] = set()
+    for _, i in sorted(found):
+        if len(gone) >= GONE_SHARE * len(nodes):
+            break
+        if i - 1 not in gone and i + 1 not in gone:
+            gone.add(i)
+    return {nodes[i].seq for i in gone}
+
+
+def thinned(nodes: Sequence[Node], gone: set[int]) -> tuple[list[Node], dict[int, Ridden]]:
+    """The nodes that stay, with keys that follow each other, and where the others hang."""
+    kept: list[Node] = []
+    ridden: dict[int, Ridden] = {}
+    left: Node | None = None
+    for node in nodes:
+        if node.seq in gone:
+            last = kept[-1]
+            T = se3.inverse(last.T_odom_camera) @ node.T_odom_camera
+            ridden[node.seq] = Ridden(last.seq, T, node.covariance)
+            left = node
+            continue
+        if left is not None:
+            node = _joined(ridden[left.seq], left, node)
+        kept.append(replace(node, key=len(kept)))
+        left = None
+    return kept, ridden
+
+
+def moved_loops(loops: Sequence[Loop], ridden: Mapping[int, Ridden], most: int) -> list[Loop]:
+    """The loops between nodes that stay: the surest of several between the same two, and of
+    more than ``most`` every second of the older half."""
+    best: dict[tuple[int, int], Loop] = {}
+    for loop in loops:
+        moved = moved_loop(loop, ridden)
+        if moved.a >= moved.b:
+            continue
+        known = best.get(moved.ends)
+        if known is None or _spread(moved) < _spread(known):
+            best[moved.ends] = moved
+    out = list(best.values())
+    while len(out) > most:
+        half = len(out) // 2
+        out = out[:half:2] + out[half:]
+    return out
+
+
+def moved_loop(loop: Loop, ridden: Mapping[int, Ridden]) -> Loop:
+    """The loop with its ends at the nodes that they hang on."""
+    if (one := ridden.get(loop.a)) is not None:
+        A = se3.adjoint(one.T_node_camera)
+        covariance = one.covariance + A @ loop.covariance @ A.T
+        loop = replace(
+            loop, a=one.node, T_a_b=one.T_node_camera @ loop.T_a_b, covariance=covariance
+        )
+    if (other := ridden.get(loop.b)) is not None:
+        units = np.array([1.0] * 3 + [loop.ratio] * 3)
+        T, covariance = reversed_motion(other.T_node_camera, other.covariance)
+        T[:3, 3] *= loop.ratio
+        A = se3.adjoint(loop.T_a_b)
+        covariance = loop.covariance + A @ (covariance * np.outer(units, units)) @ A.T
+        loop = replace(loop, b=other.node, T_a_b=loop.T_a_b @ T, covariance=covariance)
+    return loop
+
+
+def _joined(ridden: Ridden, left: Node, node: Node) -> Node:
+    """The node with the motion over ``left``, which goes, and with the mean of both's fixes."""
+    A = se3.adjoint(ridden.T_node_camera)
+    return replace(
+        node,
+        covariance=left.covariance + A @ node.covariance @ A.T,
+        prior=_with_altitudes(_with_fix(node, left), left.prior),
+        weight=left.weight + node.weight,
+    )
+
+
+def _with_fix(node: Node, left: Node) -> PosePrior:
+    """The node's prior with the mean of both fixes, which is the fix of the mean place."""
+    one, other = node.prior, left.prior
+    if one.position_m is None or other.position_m is None:
+        return one
+    if one.sigma_position_m is None or other.sigma_position_m is None:
+        return one
+    if np.any(other.sigma_position_m > MOST_WORSE * one.sigma_position_m):
+        return one
+    share = left.weight / (left.weight + node.weight)
+    places = [_place_of_fix(n) for n in (node, left)]
+    place = places[0] + share * (places[1] - places[0])
+    return replace(
+        one,
+        position_m=one.position_m + share * (other.position_m - one.position_m),
+        fix_offset=se3.transform(se3.inverse(node.T_odom_camera), place[None])[0],
+    )
+
+
+def _place_of_fix(node: Node) -> F64:
+    """(3,) in the segment's odometry."""
+    offset = np.zeros(3) if node.prior.fix_offset is None else node.prior.fix_offset
+    return np.asarray(se3.transform(node.T_odom_camera, offset[None])[0])
+
+
+def _with_altitudes(prior: PosePrior, left: PosePrior) -> PosePrior:
+    """The prior with both means of the receiver's own altitude, weighed by their fixes."""
+    if left.above_m is None or left.above_fixes == 0 or left.sigma_position_m is None:
+        return prior
+    if prior.above_m is None or prior.sigma_position_m is None:
+        return prior
+    fixes = prior.above_fixes + left.above_fixes
+    mean = (prior.above_m * prior.above_fixes + left.above_m * left.above_fixes) / fixes
+    return replace(prior, above_m=mean, above_fixes=fixes)
+
+
+def _spread(loop: Loop) -> float:
+    return float(np.trace(loop.covariance))

@@ -1,0 +1,224 @@
+"""A pose graph with a bound: fewer nodes, the same track, and riders that follow it."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.graph.records import Loop, Node
+from recon.graph.riders import KEYFRAME
+from recon.graph.thinning import moved_loop, surplus, thinned
+from recon.graph.trajectory import Trajectory
+from recon.types import F64, PosePrior
+from service.onboard.file_ledger import FileLedger
+from service.onboard.graph_aside import GraphAside
+
+COUNT, MOST, LEG = 200, 60, 50
+STEP_M, HEIGHT_M, SCALE = 5.0, 60.0, 1.3
+SPREAD = np.diag([3e-4**2] * 3 + [0.02**2] * 3)  # of a motion, in metres
+LOOP = np.diag([5e-4**2] * 3 + [0.03**2] * 3)
+UNITS = np.outer([1.0] * 3 + [1.0 / SCALE] * 3, [1.0] * 3 + [1.0 / SCALE] * 3)
+
+
+@cache
+def flight() -> tuple[list[F64], list[F64], list[PosePrior]]:
+    """Truth of legs to and fro, an odometry of another scale that drifts, and priors."""
+    rng = np.random.default_rng(7)
+    truth = []
+    for i in range(COUNT):
+        leg, along = divmod(i, LEG)
+        x = STEP_M * (along if leg % 2 == 0 else LEG - 1 - along)
+        turn = se3.so3_exp(np.array([0.0, 0.0, np.pi * (leg % 2)]))
+        wobble = se3.so3_exp(rng.normal(size=3) * 0.02)
+        place = np.array([x, 20.0 * leg, HEIGHT_M]) + rng.normal(size=3) * 0.2
+        truth.append(se3.compose(turn @ np.diag([1.0, -1.0, -1.0]) @ wobble, place))
+    odom = [np.eye(4)]
+    for a, b in pairwise(truth):
+        step = se3.exp(rng.multivariate_normal(np.zeros(6), SPREAD)) @ se3.inverse(a) @ b
+        step[:3, 3] /= SCALE
+        odom.append(odom[-1] @ step)
+    priors = [
+        PosePrior(T[:3, :3], 0.01, 0.02, T[:3, 3] + rng.normal(size=3), np.ones(3)) for T in truth
+    ]
+    return truth, odom, priors
+
+
+def bounded(most: int = MOST) -> PoseGraph:
+    return PoseGraph(PoseGraphConfig(most_nodes=most))
+
+
+def fly(trajectory: Trajectory, count: int = COUNT, first: int = 0) -> None:
+    """Every keyframe entered and told, with loops between neighbouring legs."""
+    truth, odom, priors = flight()
+    for i in range(first, count):
+        height = (HEIGHT_M / SCALE, 0.0)
+        trajectory.add(i, 0, odom[i], priors[i], height, i * 10**9, SPREAD * UNITS)
+        leg, along = divmod(i, LEG)
+        if leg and 10 < along < LEG - 10 and i % 4 == 0:
+            other = leg * LEG - 1 - along
+            trajectory.add_loop(other, i, se3.inverse(truth[other]) @ truth[i], LOOP)
+        trajectory.tell(trajectory.place(i))
+        for placed in trajectory.moved():
+            trajectory.tell(placed)
+
+
+def landed(trajectory: Trajectory) -> F64:
+    """(COUNT, 4, 4) where all keyframes are after the last correction."""
+    for placed in trajectory.moved(final=True):
+        trajectory.tell(placed)
+    return np.array([trajectory.place(i).T_world_camera for i in range(COUNT)])
+
+
+def rms_m(poses: F64) -> float:
+    apart = poses[:, :3, 3] - np.array(flight()[0])[:, :3, 3]
+    return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+
+
+@cache
+def whole() -> F64:
+    trajectory = Trajectory(graph=PoseGraph())
+    fly(trajectory)
+    return landed(trajectory)
+
+
+def test_a_thinned_graph_is_as_near_to_the_truth_as_the_whole_one(tmp_path: Path) -> None:
+    ledger = FileLedger(KEYFRAME, tmp_path)
+    trajectory = Trajectory(graph=bounded(), ledger=ledger)
+    fly(trajectory)
+    graph = trajectory.graph
+    assert graph.generation > 5
+    assert graph.entered == COUNT == len(ledger) and len(graph) <= MOST
+    poses = landed(trajectory)
+    assert rms_m(poses) < 1.2 * rms_m(whole()) + 0.05 < 0.6
+    apart = np.linalg.norm((poses - whole())[:, :3, 3], axis=1)
+    assert apart.max() < 0.6 and np.sqrt(np.mean(apart**2)) < 0.25
+    turned = np.linalg.norm((poses - whole())[:, :3, :3], axis=(1, 2))
+    assert turned.max() < 0.01
+    assert len(graph.loops) <= MOST and sum(edge.accepted for edge in graph.loops) > 5
+
+
+def test_nodes_stand_evenly_and_the_newest_all_stay() -> None:
+    trajectory = Trajectory(graph=bounded())
+    fly(trajectory)
+    seqs = np.array(trajectory.graph.seqs)
+    assert seqs[0] == 0 and seqs[-1] == COUNT - 1
+    assert np.all(np.diff(seqs[-MOST // 5 :]) == 1)
+    assert np.diff(seqs).max() <= 5 * COUNT / MOST
+
+
+def test_riders_lie_between_their_nodes_as_vision_saw_them() -> None:
+    """By closed form: seen from the node before, the miss at the node after shared out."""
+    trajectory = Trajectory(graph=bounded())
+    fly(trajectory)
+    graph, odom = trajectory.graph, flight()[1]
+    a, b = next((a, b) for a, b in pairwise(graph.seqs) if b - a >= 4)
+    T_a, T_b = graph.pose(a).T_world_camera, graph.pose(b).T_world_camera
+
+    def by_vision(i: int) -> F64:
+        step = se3.inverse(odom[a]) @ odom[i]
+        step[:3, 3] *= graph.scale(a)
+        return np.asarray(T_a @ step)
+
+    miss = se3.log(T_b @ se3.inverse(by_vision(b)))
+    for i in range(a + 1, b):
+        expected = se3.exp((i - a) / (b - a) * miss) @ by_vision(i)
+        found = trajectory.place(i)
+        np.testing.assert_allclose(found.T_world_camera, expected, atol=1e-9)
+        assert min(graph.scale(a), graph.scale(b)) <= found.scale + 1e-12
+        np.testing.assert_allclose(trajectory.map_pose(i), odom[i])
+    np.testing.assert_allclose(trajectory.places([a, a + 1])[0], T_a)
+    with pytest.raises(KeyError):
+        trajectory.place(COUNT)
+
+
+def test_everything_told_is_corrected_at_the_end_and_counted() -> None:
+    trajectory = Trajectory(graph=bounded())
+    fly(trajectory)
+    told = {i: trajectory.place(i) for i in range(0, COUNT, 3)}
+    poses = landed(trajectory)
+    assert trajectory.moved(final=True) == []
+    for i, before in told.items():
+        times, first_scale = trajectory.telling(i)
+        assert times >= 1 and first_scale > 0
+        if np.linalg.norm(before.T_world_camera[:3, 3] - poses[i, :3, 3]) > 0.01:
+            assert times >= 2
+
+
+def test_composed_motions_and_moved_loops_have_the_spread_of_many_trials() -> None:
+    """Monte Carlo: perturb each motion, look at the composed one and at the moved loop."""
+    rng = np.random.default_rng(3)
+    steps = [se3.exp(rng.normal(size=6)) for _ in range(3)]
+    spreads = [np.diag(rng.uniform(0.5, 2.0, 6) * 1e-3) ** 2 for _ in range(3)]
+    chain = [np.eye(4)]
+    for step in steps:
+        chain.append(chain[-1] @ step)
+    nodes = [Node(i, i, i, 0, T, spreads[max(i - 1, 0)], PosePrior()) for i, T in enumerate(chain)]
+    kept, ridden = thinned(nodes, {1})
+    assert [n.key for n in kept] == [0, 1, 2] and kept[1].weight == 2
+    noise = [rng.multivariate_normal(np.zeros(6), S, 4000) for S in spreads]
+    whole_step = se3.inverse(steps[0] @ steps[1])
+    errors = [
+        se3.log(se3.exp(a) @ steps[0] @ se3.exp(b) @ steps[1] @ whole_step)
+        for a, b in zip(noise[0], noise[1], strict=True)
+    ]
+    found = np.cov(np.array(errors).T)
+    scale = np.sqrt(np.outer(np.diag(found), np.diag(found)))
+    np.testing.assert_allclose(kept[1].covariance / scale, found / scale, atol=0.08)
+    loop = Loop(1, 3, steps[1] @ steps[2], spreads[2], 1.0)
+    moved = moved_loop(loop, ridden)
+    assert moved.ends == (0, 3)
+    np.testing.assert_allclose(moved.T_a_b, chain[3], atol=1e-12)
+    errors = [
+        se3.log(se3.exp(a) @ steps[0] @ se3.exp(c) @ loop.T_a_b @ se3.inverse(chain[3]))
+        for a, c in zip(noise[0], noise[2], strict=True)
+    ]
+    found = np.cov(np.array(errors).T)
+    scale = np.sqrt(np.outer(np.diag(found), np.diag(found)))
+    np.testing.assert_allclose(moved.covariance / scale, found / scale, atol=0.08)
+    back = moved_loop(Loop(0, 1, steps[0], spreads[0], 1.0), ridden)
+    assert back.ends == (0, 0)
+
+
+def test_ends_of_segments_stay() -> None:
+    nodes = [
+        Node(i, i, i, i // 7, np.eye(4), np.eye(6), PosePrior()) for i in range(70)
+    ]  # fmt: skip
+    for _ in range(5):
+        gone = surplus(nodes)
+        assert not gone & {7 * k for k in range(10)} and not gone & {7 * k + 6 for k in range(10)}
+        nodes, _ = thinned(nodes, gone)
+
+
+@contextmanager
+def beside(most: int = MOST) -> Iterator[GraphAside]:
+    graph = GraphAside(wait_s=5.0, again_s=0.0, most_nodes=most)
+    yield graph
+    graph.close()
+
+
+def test_aside_it_is_the_same_also_after_its_process_died() -> None:
+    """What is kept to make the graph anew is bounded, and makes the same graph."""
+    here = Trajectory(graph=bounded())
+    fly(here, 150)
+    with beside() as graph:
+        there = Trajectory(graph=graph)
+        fly(there, 150)
+        graph.residuals()
+        assert graph.generation == here.graph.generation and graph.seqs == here.graph.seqs
+        assert len(graph._orders) < MOST and len(graph._nodes) == len(graph._spread) <= MOST
+        os.kill(graph.pid, signal.SIGKILL)
+        fly(there, COUNT, 150)
+        fly(here, COUNT, 150)
+        poses = landed(there)
+    assert graph.seqs == here.graph.seqs
+    np.testing.assert_allclose(poses, landed(here), atol=2e-3)
