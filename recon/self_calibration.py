@@ -1,8 +1,12 @@
-"""The camera's focal length, centre and radial terms from a flight itself, by bundle adjustment.
+"""The camera's focal length, centre and distortion from a flight itself, by bundle adjustment.
 
 Poses, landmarks and one shared camera are adjusted at once (Levenberg-Marquardt of GTSAM, pixels
 with a robust loss). What the flight's geometry tells of the camera is in the covariance: seen
 straight down from one height, a longer focal length looks like a greater height.
+
+Tangential terms (Brown, Decentering Distortion of Lenses, 1966) are found with the others: a lens
+off its axis tilts the surface of each view its own way, and views of the same ground that are
+turned to each other disagree. They and the centre nearly trade places, so neither is sure alone.
 """
 
 from __future__ import annotations
@@ -35,6 +39,7 @@ class SelfCalibrationConfig:
     sigma_aspect: float = 5e-4  # of height over width of a pixel: one focal length holds for both
     sigma_centre: float = 0.015  # of the centre, as a share of the width
     sigma_k: float = 0.1  # of k1 and of k2
+    sigma_p: float = 0.005  # of p1 and of p2
     most_sigma_focal: float = 0.003  # a focal length less sure than this is not told
     most_sigmas: float = 3.0  # from the model given; a camera further off is not believed
     pixel_sigma: float = 0.5
@@ -45,7 +50,8 @@ class SelfCalibrationConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError when a parameter makes no sense."""
-        for name in ("sigma_focal", "sigma_centre", "sigma_k", "most_sigma_focal", "pixel_sigma"):
+        positive = ("sigma_focal", "sigma_centre", "sigma_k", "sigma_p", "most_sigma_focal")
+        for name in (*positive, "pixel_sigma"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 
@@ -67,6 +73,7 @@ class SelfCalibrated:
     sigma_focal: float  # as a share
     sigma_centre_px: float
     sigma_k: tuple[float, float]
+    sigma_p: tuple[float, float]
     rms_before_px: float  # of the sightings' robust middle, with the camera given
     rms_after_px: float
     errors_px: F64  # (M,) of the sightings that took part, robust loss applied
@@ -147,6 +154,7 @@ class _Bundle:
         focal = float(max(sigma[0], sigma[1]) / model[0])
         return SelfCalibrated(
             camera, focal, float(max(sigma[3], sigma[4])), (float(sigma[5]), float(sigma[6])),
+            (float(sigma[7]), float(sigma[8])),
             _middle(self._errors_px(self._start)), _middle(self._errors_px(found)),
             self._errors_px(found),
             np.array([matrix(found.atPose3(key)) for key in range(self._count)]),
@@ -165,8 +173,8 @@ class _Bundle:
         off = abs(camera.K[0, 0] / self._given.K[0, 0] - 1.0) / c.sigma_focal
         shift = np.abs(camera.K[:2, 2] - self._given.K[:2, 2]).max()
         off = max(off, float(shift) / (c.sigma_centre * self._given.size_px[0]))
-        off = max(off, float(np.abs(camera.distortion[:2] - self._given.distortion[:2]).max())
-                  / c.sigma_k)  # fmt: skip
+        bent = np.abs(camera.distortion[:4] - self._given.distortion[:4])
+        off = max(off, float((bent / [c.sigma_k, c.sigma_k, c.sigma_p, c.sigma_p]).max()))
         if off > c.most_sigmas:
             return "the camera found is too far from the model given; calibrate with a chessboard"
         return ""
@@ -175,7 +183,7 @@ class _Bundle:
         """The camera of (fx, fy, skew, u0, v0, k1, k2, p1, p2)."""
         K = np.array([[model[0], 0.0, model[3]], [0.0, model[1], model[4]], [0.0, 0.0, 1.0]])
         distortion = self._given.distortion.copy()
-        distortion[:2] = model[5:7]
+        distortion[:4] = model[5:9]
         return Camera(K, distortion, self._given.size_px)
 
     def _errors_px(self, values: Any) -> F64:
@@ -192,8 +200,8 @@ class _Bundle:
         model = gtsam.Cal3DS2(K[0, 0], K[1, 1], 0.0, K[0, 2], K[1, 2], d[0], d[1], d[2], d[3])
         self._start.insert(self._key, model)
         f, centre = c.sigma_focal * K[0, 0], c.sigma_centre * given.size_px[0]
-        held = 1e-6  # skew and tangential terms stay
-        sigma = np.array([f, f, held, centre, centre, c.sigma_k, c.sigma_k, held, held])
+        held = 1e-6  # skew stays
+        sigma = np.array([f, f, held, centre, centre, c.sigma_k, c.sigma_k, c.sigma_p, c.sigma_p])
         spread = np.diag(sigma**2)
         spread[0, 1] = spread[1, 0] = f * f - 0.5 * (c.sigma_aspect * K[0, 0]) ** 2
         noise = gtsam.noiseModel.Gaussian.Covariance(spread)

@@ -17,6 +17,9 @@ import laspy
 import numpy as np
 import pytest
 
+from recon.camera_model import scaled
+from service.cameras.camera_file import load_camera, save_camera
+
 DEMO = Path(__file__).resolve().parents[1] / "demo" / "caliterra"
 CPU = ("--set", "compute.backend=cpu")
 NAMES = [f"IMG_{n}.jpg" for n in range(9365, 9370)]
@@ -91,10 +94,7 @@ def test_piped_video_gives_the_cloud_of_the_file(tmp_path: Path) -> None:
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
     model = tmp_path / "camera.yaml"
-    text = (DEMO / "camera.yaml").read_text().replace("1600", "800").replace("1200", "600")
-    model.write_text(
-        text.replace("1161.8", "580.9").replace("799.5", "399.5").replace("599.5", "299.5")
-    )
+    save_camera(model, scaled(load_camera(DEMO / "camera.yaml"), (800, 600)))
     common = ["--camera-model", str(model), "--video-epoch", "1413742874"]
     common += ["--set", "scan.assumed_agl_m=60", "--set", "compute.guide_width=640", "--json", *CPU]
     by_file = skyrelief("replay", str(video), "--out", str(tmp_path / "file"), *common)

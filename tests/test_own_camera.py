@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import scipy.ndimage as ndi
@@ -15,7 +16,7 @@ from recon.camera_model import rays
 from recon.types import F64, U8, Camera
 from service.cli import app
 from service.errors import InputError
-from service.refine.own_camera import FILE, found_camera, sightings, write
+from service.refine.own_camera import FILE, found_camera, pictures_at, sightings, write
 
 SIZE = (480, 270)
 TRUE = Camera(
@@ -88,6 +89,30 @@ def test_the_pictures_of_an_oblique_turn_tell_the_focal_length(tmp_path: Path) -
     kept = yaml.safe_load((tmp_path / FILE).read_text(encoding="utf-8"))
     assert kept["camera_matrix"]["data"][0] == pytest.approx(found.camera.K[0, 0])
     assert figures["focal_px"] == [367.2, pytest.approx(360.0, abs=1.1)]
+
+
+def test_a_leg_flown_back_ties_its_pictures_to_those_of_the_first() -> None:
+    """Only views turned to each other show a lens off its axis."""
+    out = [_pose(0.0, 9.0 * k, 0.0, 0.0) for k in range(5)]
+    back = [_pose(10.0, 36.0 - 9.0 * k, np.pi, 0.0) for k in range(5)]
+    poses = np.array([*out, *back])
+    pictures = {k: _picture(T, k) for k, T in enumerate(poses)}
+    landmarks, seen = sightings(pictures, TRUE, poses, 0.0)
+    of = [set(seen.landmark[seen.view == k]) for k in range(10)]
+    assert len(of[0] & of[9]) > 20 and len(of[1] & of[7]) > 20
+    shared = np.isin(seen.landmark, list(of[0] & of[9])) & (seen.view == 9)
+    ahead = se3.transform(se3.inverse(poses[9]), landmarks[seen.landmark[shared]])
+    there = ahead[:, :2] / ahead[:, 2:] @ TRUE.K[:2, :2].T + TRUE.K[:2, 2]
+    off = np.linalg.norm(there - seen.uv_px[shared], axis=1)
+    assert np.median(off) < 8.0  # the ground's relief of 2 m at 60
+
+
+def test_a_folder_of_stills_is_a_recording_too(tmp_path: Path) -> None:
+    for k in range(4):
+        assert cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((60, 80, 3), 40 * k, np.uint8))
+    times = [int(2e18) + k * 10**9 for k in range(4)]
+    found = pictures_at(tmp_path, times[0], times)
+    assert [int(found[k].mean()) for k in range(4)] == [0, 40, 80, 120]
 
 
 def test_a_straight_line_looking_down_is_refused_in_one_line() -> None:

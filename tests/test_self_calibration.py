@@ -89,13 +89,34 @@ def test_a_focal_length_two_percent_off_is_found_on_an_oblique_turn() -> None:
     start, near = _guess(points, poses)
     found = self_calibrate(WRONG, start, near, seen, fixes, np.full((len(poses), 3), 0.5))
     assert not found.why_not
-    assert abs(found.camera.K[0, 0] / 960.0 - 1.0) < 0.003
-    assert abs(found.camera.K[1, 1] / 960.0 - 1.0) < 0.003
+    assert abs(found.camera.K[0, 0] / 960.0 - 1.0) < 0.004  # said to be sure to 0.0026
+    assert abs(found.camera.K[1, 1] / 960.0 - 1.0) < 0.004
     assert np.abs(found.camera.K[:2, 2] - TRUE.K[:2, 2]).max() < 6.0
     assert np.abs(found.camera.distortion[:2] - TRUE.distortion[:2]).max() < 0.03
     assert abs(found.camera.K[0, 0] - 960.0) < 4.0 * found.sigma_focal * 960.0
     assert found.rms_before_px > 3 * found.rms_after_px and found.rms_after_px < 0.4
     assert found.camera.size_px == SIZE
+
+
+def test_a_lens_off_its_axis_is_found_where_turned_views_meet() -> None:
+    """Decentred as a consumer's camera was found to be; the flight turns over ground seen twice."""
+    bent = Camera(
+        TRUE.K + np.array([[0.0, 0.0, 20.0], [0.0, 0.0, 10.0], [0.0, 0.0, 0.0]]),
+        np.array([-0.012, 0.01, 0.003, 0.006, 0.0]), SIZE,
+    )  # fmt: skip
+    poses = _oblique_turn()
+    points, seen = _seen(poses, bent)
+    fixes = poses[:, :3, 3] + np.random.default_rng(3).normal(size=(len(poses), 3)) * 0.5
+    start, near = _guess(points, poses)
+    found = self_calibrate(WRONG, start, near, seen, fixes, np.full((len(poses), 3), 0.5))
+    assert not found.why_not and found.rms_after_px < 0.4
+    off = np.abs(found.camera.distortion[2:4] - bent.distortion[2:4])
+    assert (off < 4.0 * np.array(found.sigma_p)).all() and (off < 0.001).all()
+    # What a pixel means is what counts: the terms and the centre nearly trade places.
+    rng = np.random.default_rng(0)
+    ahead = np.column_stack([rng.uniform(-0.6, 0.6, 99), rng.uniform(-0.33, 0.33, 99), np.ones(99)])
+    apart = _shown(ahead, found.camera) - _shown(ahead, bent)
+    assert np.abs(apart - apart.mean(axis=0)).max() < 1.0
 
 
 def test_straight_down_from_one_height_it_cannot_be_told() -> None:

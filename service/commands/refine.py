@@ -25,7 +25,8 @@ def refine(
         bool, typer.Option("--intrinsics", help="find the camera's model; takes --video")
     ] = False,
     video: Annotated[
-        Path | None, typer.Option(help="the flight's recording, for --intrinsics")
+        Path | None,
+        typer.Option(help="the flight's recording or folder of stills, for --intrinsics"),
     ] = None,
     undo: Annotated[
         bool, typer.Option("--undo", help="bring back the scan as it was flown")
@@ -63,10 +64,12 @@ def refine(
 def _camera_lines(figures: dict[str, Any]) -> list[str]:
     (f_old, f_new), (c_old, c_new) = figures["focal_px"], figures["centre_px"]
     (k_old, k_new), (before, after) = figures["k1_k2"], figures["rms_px"]
+    p_old, p_new = figures["p1_p2"]
     return [
         f"focal length {f_old:.1f} -> {f_new:.1f} px (+- {figures['sigma_focal_percent']:.2f} %), "
         f"centre {c_old[0]:.1f} {c_old[1]:.1f} -> {c_new[0]:.1f} {c_new[1]:.1f}, "
-        f"k1 k2 {k_old[0]:.4f} {k_old[1]:.4f} -> {k_new[0]:.4f} {k_new[1]:.4f}; "
+        f"k1 k2 {k_old[0]:.4f} {k_old[1]:.4f} -> {k_new[0]:.4f} {k_new[1]:.4f}, "
+        f"p1 p2 {p_old[0]:.4f} {p_old[1]:.4f} -> {p_new[0]:.4f} {p_new[1]:.4f}; "
         f"pixels off by {before:.2f} -> {after:.2f} (rms)",
         f"written to {figures['camera_file']}; the scan is as it was: replay the flight with "
         "--camera-model and that file",

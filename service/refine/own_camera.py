@@ -1,7 +1,8 @@
 """The camera's model from the flight's own video: ``refine --intrinsics --video FILE``.
 
-Corners of each keyframe's picture are found again in its neighbours' (undistorted by the model
-given, ZSSD), and :mod:`recon.self_calibration` adjusts poses, landmarks and the camera at once.
+Corners of each keyframe's picture are found again in its neighbours' and in those of other legs
+that show the same ground (undistorted by the model given, ZSSD), and
+:mod:`recon.self_calibration` adjusts poses, landmarks and the camera at once.
 What comes out is a camera file to replay the flight with: depth images that were made with
 another focal length cannot be bent to this one. The scan and its own model stay as they are.
 """
@@ -23,6 +24,7 @@ from recon.tracking import matching
 from recon.types import F64, U8, Camera
 from service.cameras.camera_file import save_camera
 from service.cameras.file import open_file
+from service.cameras.images import open_images
 from service.errors import InputError
 from service.stream.records import ScanHeader
 
@@ -32,6 +34,12 @@ WITHIN_S = 0.02
 
 REACH = 3
 """A keyframe's corners are looked for in so many before and after it."""
+
+ACROSS = 8
+"""And in so many others that show the same ground, those that are turned most to it."""
+
+LEAST_SHOWN = 0.3
+"""Of a picture's ground, that such another picture shows."""
 
 SEARCH_SHARE = 0.05
 """Of the picture's width about the predicted place."""
@@ -51,10 +59,14 @@ def camera_of(header: ScanHeader) -> Camera:
 
 
 def pictures_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dict[int, U8]:
-    """Grey pictures of the video by the position of the moment in ``times_ns`` they show."""
+    """Grey pictures by the position of the moment in ``times_ns`` they show.
+
+    ``video`` is a recording or a folder of stills.
+    """
     wanted = np.array(times_ns, np.int64)
     found: dict[int, U8] = {}
-    with closing(open_file(str(video), {})) as source:
+    opened = open_images if video.is_dir() else open_file
+    with closing(opened(str(video), {})) as source:
         for frame in source:
             apart = np.abs(wanted - (start_unix_ns + frame.time_ns))
             k = int(np.argmin(apart))
@@ -81,17 +93,15 @@ def sightings(
     stacks = {k: matching.Pyramid.build(flat.image(pictures[k])) for k in views}
     landmarks: list[F64] = []
     rows: list[tuple[int, int, F64]] = []
-    for position, k in enumerate(views):
+    overlap = _overlapping(views, camera, poses, ground_m)
+    for k in views:
         uv = matching.harris_grid(stacks[k].levels[0], CORNERS, flat.valid).uv_px.astype(np.float64)
-        ways = rays(camera.K, uv) @ poses[k][:3, :3].T
-        far = (ground_m - poses[k][2, 3]) / np.where(ways[:, 2] < -0.1, ways[:, 2], np.nan)
-        near = np.isfinite(far)
-        uv, points = uv[near], poses[k][:3, 3] + ways[near] * far[near, None]
+        points = _on_ground(poses[k], rays(camera.K, uv), ground_m)
+        near = np.isfinite(points[:, 2])
+        uv, points = uv[near], points[near]
         first = len(landmarks)
         seen = np.zeros(len(uv), bool)
-        for other in views[max(position - REACH, 0) : position + REACH + 1]:
-            if other == k:
-                continue
+        for other in overlap[k]:
             at, ok = _matched(stacks, camera, poses, (k, other), uv, points, SEARCH_SHARE * W)
             rows += [(other, first + int(i), at[i]) for i in np.flatnonzero(ok)]
             seen |= ok
@@ -102,6 +112,40 @@ def sightings(
     at = _distorted(camera, np.array([row[2] for row in rows]))
     seen_in = np.array([row[0] for row in rows], np.int64)
     return np.array(landmarks), Sightings(seen_in, np.array([row[1] for row in rows]), at)
+
+
+def _overlapping(
+    views: Sequence[int], camera: Camera, poses: F64, ground_m: float
+) -> dict[int, list[int]]:
+    """For each view those beside it in time, and of all that show its ground those turned most."""
+    W, H = camera.size_px
+    v, u = np.mgrid[0.1:0.9:4j, 0.1:0.9:4j]
+    grid = rays(camera.K, np.column_stack([u.ravel() * W, v.ravel() * H]))
+    grounds = np.array([_on_ground(poses[k], grid, ground_m) for k in views])  # (V, 16, 3)
+    middle = grounds.mean(axis=1)
+    reach = np.linalg.norm(grounds - middle[:, None], axis=2).max(axis=1)
+    out = {}
+    for position, k in enumerate(views):
+        beside = views[max(position - REACH, 0) : position + REACH + 1]
+        near = np.linalg.norm(middle - middle[position], axis=1) < reach[position]
+        turned = []
+        for other in (views[i] for i in np.flatnonzero(near)):
+            there = se3.transform(se3.inverse(poses[other]), grounds[position])
+            uv = project(camera.K, there)
+            shown = (there[:, 2] > 0) & (uv >= 0).all(axis=1) & (uv < (W, H)).all(axis=1)
+            if other not in beside and shown.mean() >= LEAST_SHOWN:
+                R = poses[k][:3, :3].T @ poses[other][:3, :3]
+                turned.append((-float(np.linalg.norm(se3.so3_log(R))), other))
+        across = [other for _, other in sorted(turned)[:ACROSS]]
+        out[k] = [other for other in (*beside, *across) if other != k]
+    return out
+
+
+def _on_ground(T: F64, ways: F64, ground_m: float) -> F64:
+    """(N, 3) where rays (N, 3) of a camera meet the ground; NaN above the horizon."""
+    there = ways @ T[:3, :3].T
+    far = (ground_m - T[2, 3]) / np.where(there[:, 2] < -0.1, there[:, 2], np.nan)
+    return np.asarray(T[:3, 3] + there * far[:, None])
 
 
 def _matched(
@@ -162,5 +206,6 @@ def write(found: SelfCalibrated, given: Camera, folder: Path) -> dict[str, Any]:
         "sigma_focal_percent": round(100.0 * found.sigma_focal, 3),
         "centre_px": [[round(float(v), 1) for v in c.K[:2, 2]] for c in (old, new)],
         "k1_k2": [[round(float(v), 4) for v in c.distortion[:2]] for c in (old, new)],
+        "p1_p2": [[round(float(v), 4) for v in c.distortion[2:4]] for c in (old, new)],
         "rms_px": [round(found.rms_before_px, 2), round(found.rms_after_px, 2)],
     }

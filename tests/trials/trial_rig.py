@@ -22,6 +22,9 @@ from typing import Any, Protocol
 
 from loopback import free_port
 
+from recon.camera_model import scaled
+from service.cameras.camera_file import load_camera, save_camera
+
 DEMO = Path(__file__).resolve().parents[2] / "demo" / "caliterra"
 WHOLE = os.environ.get("SKYRELIEF_TRIALS") == "whole"
 PATIENCE_S = 120.0
@@ -236,14 +239,8 @@ def burn(processes: int) -> list[subprocess.Popen[bytes]]:
 
 def small_model(folder: Path, width: int = 320) -> Path:
     """The demo's camera model for pictures of ``width`` pixels."""
-    scale = width / 1600
-    text = (DEMO / "camera.yaml").read_text()
-    for value in ("1600", "1200"):
-        text = text.replace(value, str(round(int(value) * scale)))
-    for value in ("1161.8", "799.5", "599.5"):
-        text = text.replace(value, f"{float(value) * scale:.2f}")
     path = folder / "camera.yaml"
-    path.write_text(text)
+    save_camera(path, scaled(load_camera(DEMO / "camera.yaml"), (width, width * 3 // 4)))
     return path
 
 
