@@ -10,6 +10,12 @@ from service.stream.ranges import RangeSet
 
 Listener = Callable[[str, int], None]
 
+_IN_FORCE = """
+SELECT id FROM reposes one WHERE NOT EXISTS (
+    SELECT 1 FROM reposes other WHERE other.seq = one.seq
+    AND (other.revision, other.id) > (one.revision, one.id))
+"""
+
 
 class Inventory:
     """The numbers of the items of one scan; guarded by the database's lock.
@@ -23,13 +29,13 @@ class Inventory:
         self._listeners: list[Listener] = []
         self._numbers = {kind: RangeSet() for kind in ("header", "summary", "pose", "repose")}
         self._reposes = RangeSet()
-        self._in_force: dict[int, tuple[int, int]] = {}  # keyframe to revision, number
+        self._database = database
         self._load(database)
 
     def _load(self, database: Database) -> None:
         self._numbers["pose"] = RangeSet.of(r[0] for r in database.all("SELECT id FROM poses"))
-        for number, seq, revision in database.all("SELECT id, seq, revision FROM reposes"):
-            self.note_repose(number, seq, revision)
+        self._numbers["repose"] = RangeSet.of(row[0] for row in database.all(_IN_FORCE))
+        self._reposes = RangeSet.of(r[0] for r in database.all("SELECT id FROM reposes"))
         for kind in ("header", "summary"):
             text = database.get(kind)
             if text is not None:
@@ -62,14 +68,15 @@ class Inventory:
         self.note(kind, zlib.crc32(data))
 
     def note_repose(self, number: int, seq: int, revision: int) -> None:
-        """Take in a re-pose; the highest revision, then the highest number, is in force."""
+        """Take in a re-pose that was stored; the highest revision, then the highest number, is in
+        force."""
         self._reposes.add(number)
-        before = self._in_force.get(seq)
+        sql = "SELECT revision, id FROM reposes WHERE seq = ? AND id != ? ORDER BY 1 DESC, 2 DESC"
+        before = self._database.one(f"{sql} LIMIT 1", (seq, number))
         if before is not None:
-            if before > (revision, number):
+            if (before[0], before[1]) > (revision, number):
                 return
             self._numbers["repose"].discard(before[1])
-        self._in_force[seq] = (revision, number)
         self.note("repose", number)
 
     def listen(self, listener: Listener) -> None:

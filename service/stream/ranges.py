@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from array import array
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
+from itertools import chain
 from typing import Any
 
 MAX_RANGES = 4096
@@ -14,16 +16,21 @@ Pairs = list[tuple[int, int]]
 
 
 class RangeSet:
-    """A set of numbers, kept as sorted ranges that neither overlap nor touch."""
+    """A set of numbers up to :data:`MAX_NUMBER`, as sorted ranges that neither overlap nor touch.
+
+    Eight bytes each: a scan of hours has one for every keyframe.
+    """
+
+    __slots__ = ("_firsts", "_lasts")
 
     def __init__(self, pairs: Iterable[tuple[int, int]] = ()) -> None:
-        self._pairs: Pairs = []
+        self._firsts, self._lasts = array("I"), array("I")
         for first, last in sorted(pairs):
-            if self._pairs and first <= self._pairs[-1][1] + 1:
-                first, last = self._pairs[-1][0], max(last, self._pairs[-1][1])
-                self._pairs[-1] = (first, last)
+            if self._lasts and first <= self._lasts[-1] + 1:
+                self._lasts[-1] = max(last, self._lasts[-1])
             else:
-                self._pairs.append((first, last))
+                self._firsts.append(first)
+                self._lasts.append(last)
 
     @classmethod
     def of(cls, numbers: Iterable[int]) -> RangeSet:
@@ -32,86 +39,102 @@ class RangeSet:
 
     def add(self, number: int) -> None:
         """Put ``number`` into the set."""
-        at = bisect_right(self._pairs, (number, MAX_NUMBER + 1))
-        if at and self._pairs[at - 1][1] >= number:
+        at = bisect_right(self._firsts, number)
+        if at and self._lasts[at - 1] >= number:
             return
-        first = last = number
-        end = at
-        if at and self._pairs[at - 1][1] == number - 1:
-            at -= 1
-            first = self._pairs[at][0]
-        if end < len(self._pairs) and self._pairs[end][0] == number + 1:
-            last = self._pairs[end][1]
-            end += 1
-        self._pairs[at:end] = [(first, last)]
+        touches_before = at > 0 and self._lasts[at - 1] == number - 1
+        touches_after = at < len(self._firsts) and self._firsts[at] == number + 1
+        if touches_before and touches_after:
+            self._lasts[at - 1] = self._lasts.pop(at)
+            self._firsts.pop(at)
+        elif touches_before:
+            self._lasts[at - 1] = number
+        elif touches_after:
+            self._firsts[at] = number
+        else:
+            self._firsts.insert(at, number)
+            self._lasts.insert(at, number)
 
     def discard(self, number: int) -> None:
         """Take ``number`` out of the set if it is there."""
-        at = bisect_right(self._pairs, (number, MAX_NUMBER + 1)) - 1
-        if at < 0 or self._pairs[at][1] < number:
+        at = bisect_right(self._firsts, number) - 1
+        if at < 0 or self._lasts[at] < number:
             return
-        first, last = self._pairs[at]
-        rest = [(first, number - 1), (number + 1, last)]
-        self._pairs[at : at + 1] = [(a, b) for a, b in rest if a <= b]
+        first, last = self._firsts[at], self._lasts[at]
+        rest = [(a, b) for a, b in ((first, number - 1), (number + 1, last)) if a <= b]
+        self._firsts[at : at + 1] = array("I", [a for a, _ in rest])
+        self._lasts[at : at + 1] = array("I", [b for _, b in rest])
 
     def __contains__(self, number: int) -> bool:
-        at = bisect_right(self._pairs, (number, MAX_NUMBER + 1))
-        return at > 0 and self._pairs[at - 1][1] >= number
+        at = bisect_right(self._firsts, number)
+        return at > 0 and self._lasts[at - 1] >= number
 
     def __len__(self) -> int:
-        return sum(last - first + 1 for first, last in self._pairs)
+        return sum(self._lasts) - sum(self._firsts) + len(self._firsts)
 
     def __bool__(self) -> bool:
-        return bool(self._pairs)
+        return bool(self._firsts)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, RangeSet) and self._pairs == other._pairs
+        return (
+            isinstance(other, RangeSet)
+            and self._firsts == other._firsts
+            and self._lasts == other._lasts
+        )
 
     def __repr__(self) -> str:
-        return f"RangeSet({self._pairs})"
+        return f"RangeSet({list(self._ranges())})"
+
+    def _ranges(self) -> Iterator[tuple[int, int]]:
+        return zip(self._firsts, self._lasts, strict=True)
 
     def __iter__(self) -> Iterator[int]:
-        for first, last in self._pairs:
+        for first, last in self._ranges():
             yield from range(first, last + 1)
 
     def newest_first(self) -> Iterator[int]:
         """The numbers, largest first."""
-        for first, last in reversed(self._pairs):
+        for first, last in zip(reversed(self._firsts), reversed(self._lasts), strict=True):
             yield from range(last, first - 1, -1)
 
     def __sub__(self, other: RangeSet) -> RangeSet:
         """The numbers that are not in ``other``."""
-        out: Pairs = []
-        taken = iter([*other._pairs, (MAX_NUMBER + 2, MAX_NUMBER + 2)])
+        out = RangeSet()
+        taken = chain(other._ranges(), [(MAX_NUMBER + 2, MAX_NUMBER + 2)])
         a, b = next(taken)
-        for low, last in self._pairs:
+        for low, last in self._ranges():
             first = low
             while b < first:
                 a, b = next(taken)
             while a <= last:
                 if first < a:
-                    out.append((first, a - 1))
+                    out._put(first, a - 1)
                 first = b + 1
                 if b > last:
                     break
                 a, b = next(taken)
             if first <= last:
-                out.append((first, last))
-        return RangeSet(out)
+                out._put(first, last)
+        return out
+
+    def _put(self, first: int, last: int) -> None:
+        """Put a range after all others."""
+        self._firsts.append(first)
+        self._lasts.append(last)
 
     def copy(self) -> RangeSet:
         """A set of its own with the same numbers."""
         same = RangeSet()
-        same._pairs = list(self._pairs)
+        same._firsts, same._lasts = self._firsts[:], self._lasts[:]
         return same
 
     def pairs(self) -> Pairs:
         """The ranges (first, last), in order; at most the newest MAX_RANGES."""
-        return self._pairs[-MAX_RANGES:]
+        return list(zip(self._firsts[-MAX_RANGES:], self._lasts[-MAX_RANGES:], strict=True))
 
     def text(self) -> str:
         """The ranges as ``1-5,7``, for a key expression."""
-        return ",".join(str(a) if a == b else f"{a}-{b}" for a, b in self._pairs)
+        return ",".join(str(a) if a == b else f"{a}-{b}" for a, b in self._ranges())
 
 
 def ranges_from_text(text: str) -> RangeSet | None:
