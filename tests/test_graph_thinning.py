@@ -20,7 +20,7 @@ from recon.graph.riders import KEYFRAME
 from recon.graph.thinning import moved_loop, surplus, thinned
 from recon.graph.trajectory import Trajectory
 from recon.types import F64, PosePrior
-from service.onboard.file_ledger import FileLedger
+from service.scans.file_ledger import FileLedger
 from service.onboard.graph_aside import GraphAside
 
 COUNT, MOST, LEG = 200, 60, 50

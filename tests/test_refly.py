@@ -14,7 +14,8 @@ from loopback import free_port
 from pymavlink import mavutil, mavwp  # type: ignore[import-untyped]
 from typer.testing import CliRunner
 
-from recon.surface.coverage import CoverageMap, Footprint
+from recon.surface.coverage import CoverageMap
+from recon.surface.footprints import Footprint
 from recon.types import F64, DepthMap
 from service.cli import app
 from service.errors import InputError
@@ -56,7 +57,7 @@ def covered(depths: list[DepthMap], frame: LocalFrame | None = FRAME) -> Coverag
         layer.put(seq, seq * 10**9, depth)
     grid = layer.grid()
     assert grid is not None
-    return Coverage(grid, frame, tuple(layer.footprints.values()), Limits(3, 0.3))
+    return Coverage(grid, frame, layer.places(), Limits(3, 0.3))
 
 
 def two_lines(apart_m: float = 130.0, forward: float = 0.0) -> list[DepthMap]:

@@ -9,6 +9,8 @@ again from the keyframes that touch them.
 
 from __future__ import annotations
 
+from array import array
+from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -18,17 +20,16 @@ from numba import njit
 
 from recon import se3
 from recon.camera_model import rays
+from recon.graph.ledger import Ledger, MemoryLedger, Rows
+from recon.surface.footprints import PLACE, Footprint, footprint, footprint_of
 from recon.surface.raster import Grid
-from recon.types import F32, F64, Array, Bool, DepthMap
+from recon.types import F32, Array, Bool, DepthMap
 
 TILE = 64
 """Cells along a tile's side."""
 
 CELL_SAMPLES = 4.0
 """A cell is about so many pixels of a keyframe wide on the ground."""
-
-FARTHEST = 3.0
-"""Pictures count as seeing the ground out to this many times their median depth."""
 
 MOST_TILES = 5_000
 """Tiles at most (20 million cells, 400 MB); what lies beyond them is counted."""
@@ -51,15 +52,6 @@ class _Cells:
         self.weight.fill(0.0)
         self.height.fill(0.0)
         self.seen_s.fill(-np.inf)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Footprint:
-    """What a keyframe's picture covers on level ground at its median height."""
-
-    corners_m: F64  # (4, 2) east and north, around the picture
-    centre_m: F64  # (2,) where the middle of the picture looks
-    camera_m: F64  # (3,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,48 +101,31 @@ def usual_cell_m(depth: DepthMap) -> float | None:
     return float(min((power * m for m in (1, 2, 5, 10)), key=lambda c: abs(np.log(c / target))))
 
 
-def footprint(depth: DepthMap) -> Footprint | None:
-    """Where a keyframe's picture meets level ground; None without any depth."""
-    known = np.isfinite(depth.depth_m)
-    if not known.any():
-        return None
-    h, w = depth.depth_m.shape
-    T = depth.T_world_camera
-    middle_m = float(np.median(depth.depth_m[known]))
-    edge = np.array([[-0.5, -0.5], [w - 0.5, -0.5], [w - 0.5, h - 0.5], [-0.5, h - 0.5]])
-    spots = np.vstack([edge, [[(w - 1) / 2, (h - 1) / 2]]])
-    ways = rays(depth.K, spots) @ T[:3, :3].T
-    drop_m = -float(middle_m * ways[4, 2])  # from the camera to the ground in its middle
-    with np.errstate(divide="ignore"):
-        reach = np.where(ways[:, 2] < 0, -max(drop_m, 0.0) / ways[:, 2], np.inf)
-    reach = np.minimum(reach, FARTHEST * middle_m)
-    ground = T[:2, 3] + reach[:, None] * ways[:, :2]
-    return Footprint(ground[:4], ground[4], T[:3, 3].copy())
-
-
 class CoverageMap:
     """The layer of one scan. Not safe between threads."""
 
-    def __init__(self, cell_m: float) -> None:
-        """Raises ValueError unless ``cell_m`` is positive."""
+    def __init__(self, cell_m: float, ledger: Ledger | None = None) -> None:
+        """Raises ValueError unless ``cell_m`` is positive.
+
+        ``ledger`` takes rows of :data:`PLACE`, a keyframe each; memory when left out.
+        """
         if not (np.isfinite(cell_m) and cell_m > 0):
             raise ValueError(f"cell_m is {cell_m}, must be positive")
         self.cell_m = float(cell_m)
         self.refused = 0  # tiles that were not made, because there are MOST_TILES
         self._tiles: dict[Tile, _Cells] = {}
-        self._footprints: dict[int, Footprint] = {}
-        self._seen_s: dict[int, float] = {}
-        self._touches: dict[int, set[Tile]] = {}  # keyframe to the tiles with surface of it
+        self._ledger: Ledger = MemoryLedger(PLACE) if ledger is None else ledger
+        self._seqs, self._rows = array("q"), array("q")  # keyframes in order, and their rows
         self._stale: set[Tile] = set()
         self._first_ns: int | None = None
 
     def __contains__(self, seq: int) -> bool:
-        return seq in self._footprints
+        return self._row(seq) is not None
 
-    @property
-    def footprints(self) -> dict[int, Footprint]:
-        """Keyframe to what its picture covers; not to be changed."""
-        return self._footprints
+    def places(self) -> Rows:
+        """Rows of :data:`PLACE` of all keyframes, in order of their number."""
+        rows = self._ledger.read(0, len(self._ledger))
+        return np.asarray(rows[np.frombuffer(self._rows, np.int64)])
 
     @property
     def tiles(self) -> int:
@@ -168,24 +143,56 @@ class CoverageMap:
             return
         if self._first_ns is None:
             self._first_ns = time_ns
-        before = self._footprints.get(seq)
+        at = self._row(seq)
+        before = None if at is None else self._ledger.read(at, at + 1)[0]
         if before is not None:
-            if not finer and self._same(before, place):
+            if not finer and self._same(footprint_of(before), place):
                 return
-            self._count(before, -1)
-            self._stale |= self._touches[seq]
+            self._count(footprint_of(before), -1)
+            self._stale |= self._within(before)
         self._count(place, +1)
-        self._footprints[seq] = place
-        self._seen_s[seq] = (time_ns - self._first_ns) * 1e-9
-        if before is None:
-            self._touches[seq] = self._add_surface(seq, depth, None)
+        row = np.zeros(1, PLACE)
+        row["seq"], row["seen_s"] = seq, (time_ns - self._first_ns) * 1e-9
+        row["corners_m"], row["centre_m"] = place.corners_m, place.centre_m
+        row["camera_m"] = place.camera_m
+        if at is None:
+            touched = self._add_surface(row[0], depth, None)
         else:
-            self._touches[seq] = self._tiles_of(self._points(depth)[0])
-            self._stale |= self._touches[seq]
+            touched = self._tiles_of(self._points(depth)[0])
+            self._stale |= touched
+        tiles = np.array(sorted(touched))
+        row["low"], row["high"] = tiles.min(axis=0), tiles.max(axis=0)
+        self._keep(at, row)
+
+    def _row(self, seq: int) -> int | None:
+        """Place of a keyframe's row; None when there is none."""
+        i = bisect_left(self._seqs, seq)
+        return self._rows[i] if i < len(self._seqs) and self._seqs[i] == seq else None
+
+    def _keep(self, at: int | None, row: Rows) -> None:
+        if at is not None:
+            self._ledger.amend(at, row)
+            return
+        seq = int(row["seq"][0])
+        i = bisect_left(self._seqs, seq)
+        self._seqs.insert(i, seq)
+        self._rows.insert(i, len(self._ledger))
+        self._ledger.append(row)
+
+    def _within(self, place: np.void) -> set[Tile]:
+        """The tiles where a keyframe may have surface."""
+        (left, low), (right, high) = place["low"].tolist(), place["high"].tolist()
+        return {(i, j) for i, j in self._tiles if left <= i <= right and low <= j <= high}
 
     def stale(self) -> list[int]:
-        """Keyframes whose depth :meth:`refill` needs, because they touch a stale tile."""
-        return [seq for seq, tiles in self._touches.items() if tiles & self._stale]
+        """Keyframes whose depth :meth:`refill` needs: they may have surface in a stale tile."""
+        if not self._stale:
+            return []
+        rows = self._ledger.read(0, len(self._ledger))
+        due = np.zeros(len(rows), np.bool_)
+        for tile in self._stale:
+            due |= np.all((rows["low"] <= tile) & (tile <= rows["high"]), axis=1)
+        return [int(seq) for seq in rows["seq"][due]]
 
     def refill(self, depths: Iterable[tuple[int, DepthMap]]) -> None:
         """Sum up the surface of the stale tiles anew, from the keyframes of :meth:`stale`."""
@@ -193,7 +200,9 @@ class CoverageMap:
             if key in self._tiles:
                 self._tiles[key].forget_surface()
         for seq, depth in depths:
-            self._touches[seq] = self._add_surface(seq, depth, self._stale)
+            at = self._row(seq)
+            if at is not None:
+                self._add_surface(self._ledger.read(at, at + 1)[0], depth, self._stale)
         self._stale = set()
 
     def grid(self) -> CoverageGrid | None:
@@ -248,10 +257,10 @@ class CoverageMap:
 
     def _hull(self, grid: Grid) -> tuple[Bool, Bool]:
         """Cells within what was flown, and its core, as CoverageGrid has them."""
-        places = list(self._footprints.values())
-        middles = np.array([p.centre_m for p in places])
-        width = np.array([np.linalg.norm(p.corners_m[1] - p.corners_m[0]) for p in places])
-        height = np.array([np.linalg.norm(p.corners_m[2] - p.corners_m[1]) for p in places])
+        places = self._ledger.read(0, len(self._ledger))
+        middles, corners = places["centre_m"], places["corners_m"]
+        width = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
+        height = np.linalg.norm(corners[:, 2] - corners[:, 1], axis=1)
         around = 0.25 * float(np.median(np.minimum(width, height))) / self.cell_m
         mask = np.zeros(grid.shape, np.uint8)
         spots = np.rint(grid.pixels(middles)).astype(np.int32)
@@ -283,12 +292,12 @@ class CoverageMap:
         there = np.flatnonzero(np.bincount((tile[:, 0] - low[0]) * rows + tile[:, 1] - low[1]))
         return {(int(low[0]) + int(k) // rows, int(low[1]) + int(k) % rows) for k in there}
 
-    def _add_surface(self, seq: int, depth: DepthMap, only: set[Tile] | None) -> set[Tile]:
+    def _add_surface(self, place: np.void, depth: DepthMap, only: set[Tile] | None) -> set[Tile]:
         """Merge a keyframe's points into its tiles (``only`` these); the tiles touched."""
         cells, height, sigma = self._points(depth)
         touched = self._tiles_of(cells)
         tile = cells // TILE
-        when = np.float32(self._seen_s[seq])
+        when = np.float32(place["seen_s"])
         for key in touched if only is None else touched & only:
             held = self._tile(key)
             if held is None:

@@ -45,10 +45,10 @@ from recon.types import (
 )
 from service.compute.stopwatch import Stopwatch
 from service.config import ComputeConfig, Config
-from service.onboard.file_ledger import FileLedger
 from service.onboard.graph_aside import GraphAside
 from service.onboard.loops import LoopSearch
 from service.onboard.map_pages import PagedMap
+from service.scans.file_ledger import FileLedger
 
 
 @dataclass(frozen=True, slots=True, eq=False)

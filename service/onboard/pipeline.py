@@ -32,9 +32,9 @@ from service.compute.side_by_side import SideBySide
 from service.config import ComputeConfig, Config, ScanConfig
 from service.onboard.anchorage import VIEW, Anchorage, Carriers, Key
 from service.onboard.dense import Dense, Job
-from service.onboard.file_ledger import FileLedger
 from service.onboard.rig import Rig
 from service.onboard.viewpoints import Offer, Viewpoint, Viewpoints
+from service.scans.file_ledger import FileLedger
 
 
 @dataclass(frozen=True, slots=True, eq=False)

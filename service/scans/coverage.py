@@ -10,6 +10,7 @@ import json
 import logging
 import threading
 import time
+from array import array
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,12 +21,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.surface.coverage import CoverageGrid, CoverageMap, Footprint, usual_cell_m
+from recon.graph.ledger import Ledger, Rows
+from recon.surface.coverage import CoverageGrid, CoverageMap, usual_cell_m
+from recon.surface.footprints import PLACE, Footprint, footprint_of
 from recon.types import U8, Array, DepthMap
 from service.errors import OutsideError
 from service.georeference import LocalFrame
+from service.scans.file_ledger import FileLedger
 from service.scans.track import local_frame
 from service.scans.writing import writing
+from service.stream.ranges import RangeSet
 from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
@@ -64,8 +69,13 @@ class Coverage:
 
     layer: CoverageGrid
     frame: LocalFrame | None
-    footprints: tuple[Footprint, ...]  # of the keyframes, in order of their number
+    places: Rows  # of PLACE, of the keyframes, in order of their number
     limits: Limits
+
+    @cached_property
+    def footprints(self) -> tuple[Footprint, ...]:
+        """Of the keyframes, in order of their number."""
+        return tuple(footprint_of(place) for place in self.places)
 
     @cached_property
     def weak(self) -> Array:
@@ -96,7 +106,7 @@ class Coverage:
             "cell_m": layer.grid.cell_m,
             "bounds_m": [round(v, 3) for v in self.bounds_m],
             "corners_lat_lon": self.corners_lat_lon(),
-            "keyframes": len(self.footprints),
+            "keyframes": len(self.places),
             "measured_m2": round(float(known.sum()) * area, 1),
             "flown_m2": round(float(inside.sum()) * area, 1),
             "gaps_m2": round(float(layer.gaps.sum()) * area, 1),
@@ -142,32 +152,50 @@ class Coverage:
 class LiveCoverage:
     """The layer of an open store, brought up to date by :meth:`refresh`."""
 
-    def __init__(self, store: ScanStore, cell_m: float | None = None) -> None:
+    def __init__(
+        self, store: ScanStore, cell_m: float | None = None, ledger: Ledger | None = None
+    ) -> None:
+        """``ledger`` takes rows of :data:`recon.surface.footprints.PLACE`; memory when left out."""
         self._store = store
-        self._cell_m = cell_m
+        self._cell_m, self._ledger = cell_m, ledger
         self._map: CoverageMap | None = None
-        self._state: dict[int, tuple[bool, int]] = {}  # seq to (fine layer there, revision)
+        self._seqs = array("q")  # keyframes taken in, in order; and of each
+        self._fine = array("b")  # whether its fine layer was there
+        self._revisions = array("q")  # of its pose
+        self._reposes = RangeSet()  # re-poses in force then
 
     def refresh(self) -> Coverage | None:
         """The layer as the store has it now; None while it holds no surface."""
 
-        fine = self._store.numbers_of("k1")
-        for seq in self._store.seqs():
-            repose = self._store.repose(seq)
-            state = (seq in fine, 0 if repose is None else repose.revision)
-            before = self._state.get(seq)
-            if before != state:
-                self._put(seq, finer=before is not None and before[0] != state[0])
-                self._state[seq] = state
+        numbers = self._store.numbers()
+        fine, reposes = (numbers.get(kind, RangeSet()) for kind in ("k1", "repose"))
+        is_moved = reposes != self._reposes
+        self._reposes = reposes
+        for i, seq in enumerate(self._store.seqs()):
+            if i == len(self._seqs) or self._seqs[i] != seq:
+                self._seqs.insert(i, seq)
+                self._fine.insert(i, seq in fine)
+                self._revisions.insert(i, self._revision(seq))
+                self._put(seq, finer=False)
+                continue
+            revision = self._revision(seq) if is_moved else self._revisions[i]
+            finer = (seq in fine) != self._fine[i]
+            if finer or revision != self._revisions[i]:
+                self._fine[i], self._revisions[i] = seq in fine, revision
+                self._put(seq, finer)
         if self._map is None:
             return None
         self._map.refill(self._depths(self._map.stale()))
         layer = self._map.grid()
         if layer is None or not layer.known.any():
             return None
-        places = tuple(place for _, place in sorted(self._map.footprints.items()))
+        places = self._map.places()
         limits = Limits(LEAST_VIEWS, MOST_SIGMAS * float(np.median(layer.sigma_m[layer.known])))
         return Coverage(layer, local_frame(self._store.header), places, limits)
+
+    def _revision(self, seq: int) -> int:
+        repose = self._store.repose(seq)
+        return 0 if repose is None else repose.revision
 
     def _put(self, seq: int, finer: bool) -> None:
         keyframe = self._store.keyframe(seq)
@@ -177,7 +205,7 @@ class LiveCoverage:
             cell = self._cell_m or usual_cell_m(keyframe.depth)
             if cell is None:
                 return
-            self._map = CoverageMap(cell)
+            self._map = CoverageMap(cell, self._ledger)
         self._map.put(seq, keyframe.time_ns, keyframe.depth, finer)
 
     def _depths(self, seqs: list[int]) -> Iterator[tuple[int, DepthMap]]:
@@ -218,7 +246,9 @@ class CoverageWriter:
     """
 
     def __init__(self, store: ScanStore, every_s: float = WRITE_EVERY_S) -> None:
-        self._live, self._folder = LiveCoverage(store), store.path.parent
+        self._folder = store.path.parent
+        self._ledger = FileLedger(PLACE, self._folder)
+        self._live = LiveCoverage(store, ledger=self._ledger)
         self._every_s = every_s
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._work, name="coverage", daemon=True)
@@ -230,6 +260,7 @@ class CoverageWriter:
     def __exit__(self, *_: object) -> None:
         self._stop.set()
         self._thread.join()
+        self._ledger.close()
 
     def _work(self) -> None:
         while not self._stop.wait(self._every_s):
