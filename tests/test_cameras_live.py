@@ -285,6 +285,42 @@ def test_gstreamer_pipeline_is_run_and_ended(
     assert not Path(f"/proc/{pid}").exists()
 
 
+def has_gstreamer(*elements: str) -> bool:
+    """True when the system's GStreamer has all these elements."""
+    inspect = shutil.which("gst-inspect-1.0")
+    return inspect is not None and all(
+        subprocess.run([inspect, "--exists", name], check=False).returncode == 0
+        for name in ("y4menc", "videoconvert", *elements)
+    )
+
+
+@needs_ffmpeg
+@pytest.mark.skipif(
+    not has_gstreamer("qtdemux", "h264parse", "avdec_h264"), reason="needs GStreamer's decoders"
+)
+def test_a_gstreamer_decoder_with_padded_pictures_is_read(tmp_path: Path) -> None:
+    """A height that is no multiple of sixteen: the decoder's buffers are larger than pictures."""
+    clip, made = tmp_path / "clip.mp4", "testsrc2=size=80x70:rate=20:duration=2"
+    command = f"ffmpeg -v error -f lavfi -i {made} -pix_fmt yuv420p -c:v libx264 {clip}"
+    subprocess.run(shlex.split(command), check=True)
+    pipeline = f"filesrc location={clip} ! qtdemux ! h264parse ! avdec_h264 ! identity sync=true"
+    source = open_camera(f"gst:{pipeline}")
+    frames = iter(source)
+    shown = [next(frames).image for _ in range(5)]
+    source.close()
+    with av.open(str(clip)) as container:
+        truth = next(container.decode(video=0)).to_ndarray(format="bgr24")
+    assert shown[0].shape == (70, 80, 3)
+    apart = [np.abs(image.astype(int) - truth).mean() for image in shown]
+    assert min(apart) < 12.0  # chroma apart; another stride would shear the picture
+
+
+@pytest.mark.skipif(not has_gstreamer(), reason="needs GStreamer")
+def test_what_gstreamer_complains_about_is_told() -> None:
+    with pytest.raises(OutsideError, match='no element "nosuchsource"'):
+        open_camera("gst:nosuchsource ! queue")
+
+
 @needs_ffmpeg
 def test_rtsp_camera_is_read(tmp_path: Path) -> None:
     """A small RTSP server of our own serves one H.264 stream over TCP to FFmpeg's client."""

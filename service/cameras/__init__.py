@@ -24,7 +24,7 @@ CAMERAS: dict[str, str] = {
     "pipe": "service.cameras.pipe:open_pipe",
     "rtsp": "service.cameras.stream:open_rtsp",
     "v4l2": "service.cameras.stream:open_v4l2",
-    "gst": "service.cameras.stream:open_gst",
+    "gst": "service.cameras.gstreamer:open_gst",
     "stream": "service.cameras.stream:open_stream",
 }
 """Word to ``module:function(rest, options) -> CameraSource``; imported on first use."""

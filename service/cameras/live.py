@@ -104,7 +104,10 @@ class LiveSource:
         self._pictures = self._connect()
         first = next(self._pictures, None)
         if first is None:
-            raise OutsideError(f"{description}: gives no picture; is the camera on and streaming?")
+            why = f" ({self.warnings[-1]})" if self.warnings else ""
+            raise OutsideError(
+                f"{description}: gives no picture; is the camera on and streaming?{why}"
+            )
         self.size_px = (first[0].shape[1], first[0].shape[0])
         self._first = first
 

@@ -1,0 +1,122 @@
+"""Live video out of a GStreamer pipeline: CSI cameras and hardware decoders of a Jetson.
+
+``gst:nvarguscamerasrc ! video/x-raw(memory:NVMM),width=1280 ! nvvidconv``. The pipeline is run by
+the system's own ``gst-launch-1.0``, because OpenCV and PyAV from PyPI come without GStreamer.
+"""
+
+from __future__ import annotations
+
+import logging
+import shlex
+import shutil
+import subprocess
+import threading
+from collections.abc import Mapping
+from typing import IO, Any
+
+from service.cameras import reject_options
+from service.cameras.live import LiveSource
+from service.cameras.pace import paced
+from service.cameras.source import CameraSource
+from service.cameras.stream import OPEN_S
+from service.errors import InputError, OutsideError
+
+log = logging.getLogger(__name__)
+
+TAIL = (
+    "videoconvert ! video/x-raw,format=NV12 ! videoconvert ! video/x-raw,format=I420 "
+    "! y4menc ! fdsink fd=1"
+)
+"""By way of NV12, so that the last step always copies: y4menc writes the padding of a decoder's
+buffers into the stream (GStreamer 1.22), which then cannot be read."""
+
+
+def open_gst(rest: str, options: Mapping[str, str]) -> CameraSource:
+    """What the GStreamer pipeline ``rest`` puts out.
+
+    The pipeline ends in raw video in system memory. Time stamps are those of arrival.
+    """
+    reject_options("gst", options)
+    launcher = shutil.which("gst-launch-1.0")
+    if launcher is None:
+        raise OutsideError("gst: gst-launch-1.0 is not installed (apt install gstreamer1.0-tools)")
+    try:
+        command = [launcher, "-q", *shlex.split(rest), "!", *shlex.split(TAIL)]
+    except ValueError as error:
+        raise InputError(f"gst: the pipeline cannot be read: {error}") from error
+    return paced(LiveSource(lambda stall_s: _open_command(command, stall_s), f"gst:{rest}"))
+
+
+class _Complaints:
+    """What a command says on standard error: to the log, the first complaint kept."""
+
+    def __init__(self, pipe: IO[bytes]) -> None:
+        self.first = ""
+        self._pipe = pipe
+        self._thread = threading.Thread(target=self._read, name="gst complaints", daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        with self._pipe:
+            while line := self._pipe.readline(1000):
+                text = line.decode(errors="replace").strip()
+                is_complaint = text.startswith(("ERROR", "WARNING"))
+                self.first = self.first or (text if is_complaint else "")
+                log.log(logging.WARNING if is_complaint else logging.DEBUG, "gst: %s", text)
+
+    def wait(self) -> str:
+        """The first complaint of a command that has ended; empty when it had none."""
+        self._thread.join(1.0)
+        return self.first
+
+
+def _open_command(command: list[str], stall_s: float) -> Any:
+    """A container of what ``command`` writes; closing it ends the command.
+
+    Raises OSError with the command's own complaint when it writes no video.
+    """
+    import av
+
+    process = subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    complaints = _Complaints(process.stderr)
+    try:
+        container = av.open(f"pipe:{process.stdout.fileno()}", timeout=(OPEN_S, stall_s))
+    except Exception as error:
+        _end(process)
+        if complaint := complaints.wait():
+            raise OSError(complaint) from error
+        raise
+    return _CommandContainer(container, process)
+
+
+class _CommandContainer:
+    """An open container together with the process that feeds it."""
+
+    def __init__(self, container: Any, process: subprocess.Popen[bytes]) -> None:
+        self._container = container
+        self._process = process
+        self.streams = container.streams
+
+    def demux(self, stream: Any) -> Any:
+        """The packets of ``stream``."""
+        return self._container.demux(stream)
+
+    def close(self) -> None:
+        """End the process, then the container."""
+        _end(self._process)
+        self._container.close()
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(timeout=2.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    if process.stdout is not None:
+        process.stdout.close()
