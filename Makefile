@@ -34,13 +34,14 @@ bench: $(STAMP)
 	$(BIN)/skyrelief bench $(ARGS)
 
 # Over an hour: fifty kills, the fuzzers, and beside them an hour of flights (MINUTES=6 is
-# shorter), which is their load. Writes docs/trials.md.
+# shorter), which is their load. As root with systemd-container and debootstrap it also installs
+# into a bare Debian and boots that. Writes docs/trials.md and docs/boot-log.md.
 MINUTES ?= 60
 SOAK := tests/trials/test_trial_soak.py
 trials: $(STAMP)
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[$(EXTRAS),trials]'
 	@export SKYRELIEF_TRIALS=whole SKYRELIEF_SOAK_MINUTES=$(MINUTES); \
-	  export SKYRELIEF_TRIALS_TABLE=docs/trials.md; \
+	  export SKYRELIEF_TRIALS_TABLE=docs/trials.md SKYRELIEF_BOOT_LOG=docs/boot-log.md; \
 	  $(BIN)/python -m pytest -m trial $(SOAK) $(ARGS) & soak=$$!; \
 	  $(BIN)/python -m pytest -m trial tests/trials --ignore=$(SOAK) $(ARGS); rest=$$?; \
 	  wait $$soak; soak=$$?; cat docs/trials.md; \
