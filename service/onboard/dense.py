@@ -14,6 +14,7 @@ import numpy as np
 from recon import se3
 from recon.backends import Backend, DenseStages, PathBackend
 from recon.camera_model import scaled_K
+from recon.clouds.disagreement import Disagreement
 from recon.clouds.registration import IcpConfig
 from recon.clouds.voxel_map import VoxelMap, VoxelMapConfig
 from recon.graph.alignment import height_above, height_below
@@ -113,6 +114,7 @@ class Dense:
         self._resolution_m = config.scan.resolution_m
         self._before: tuple[int, DepthMap | None, F64] | None = None  # seq, depth, T_map_camera
         self._relief = (0.0, 0.0)
+        self._disagreement = (-1, Disagreement())  # of a segment
         self._map_voxels = compute.map_voxels
         self.loops: LoopSearch | None = None
         if config.fusion.loops:
@@ -250,6 +252,10 @@ class Dense:
         with self.stopwatch("map"):
             T_map = self.trajectory.map_pose(seq)
             in_map = DepthMap(depth.depth_m, depth.sigma_m, depth.views, depth.K, T_map)
+            if job.segment != self._disagreement[0]:
+                self._disagreement = (job.segment, Disagreement())
+            wider = np.float32(self._disagreement[1].take(in_map))
+            in_map = replace(in_map, sigma_m=in_map.sigma_m * wider)
             if self._map is None:
                 ground_m = float(np.nanmedian(depth.depth_m)) / depth.K[0, 0]
                 voxel_m = max(2.0 * ground_m, self._resolution_m, 1e-3)
@@ -266,7 +272,7 @@ class Dense:
         h, w = depth.depth_m.shape
         metric = DepthMap(
             depth.depth_m * np.float32(placed.scale),
-            depth.sigma_m * np.float32(placed.scale),
+            in_map.sigma_m * np.float32(placed.scale),
             depth.views,
             depth.K,
             placed.T_world_camera,

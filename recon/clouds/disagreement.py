@@ -1,0 +1,104 @@
+"""By how much depth images that show the same ground disagree, over what their sigmas say.
+
+Stereo knows its own noise. That a lens is not quite as its model says, or that the poses a depth
+image was made with were off, tilts and bows the whole image; only other images of the same ground
+show it. What they disagree by is the square root of the adjustment's variance factor (Mikhail and
+Ackermann, Observations and Least Squares, 1976), and sigmas are widened by it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon import se3
+from recon.camera_model import project, rays
+from recon.types import F32, F64, DepthMap
+
+NORMAL_MEDIAN = 0.6745
+"""Median of the absolute value of a normal variable of unit sigma."""
+
+
+@dataclass(frozen=True, slots=True)
+class DisagreementConfig:
+    """What is compared, and how far sigmas may be widened."""
+
+    images: int = 32  # the last ones are remembered
+    samples: int = 40  # rows of samples of each
+    least_common: int = 100  # samples of two images that show the same ground
+    largest: float = 5.0  # factor; more is a pose gone wrong and not a wider sigma
+
+    def __post_init__(self) -> None:
+        """Raise ValueError when a parameter makes no sense."""
+        if min(self.images, self.samples, self.least_common) < 1 or self.largest < 1.0:
+            raise ValueError(f"all must be at least 1, got {self}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Samples:
+    """Some surface of an earlier depth image."""
+
+    points: F32  # (N, 3) m, world
+    sigma_m: F32  # (N,) along its own z
+
+
+class Disagreement:
+    """Compares each new depth image with the last ones; all in one world."""
+
+    def __init__(self, config: DisagreementConfig | None = None) -> None:
+        self.config = config or DisagreementConfig()
+        self._earlier: deque[_Samples] = deque(maxlen=self.config.images)
+
+    def forget(self) -> None:
+        """Compare with nothing before: the world is another one now."""
+        self._earlier.clear()
+
+    def take(self, depth: DepthMap) -> float:
+        """The factor, 1 or more, that the new image's sigmas fall short by; it is remembered.
+
+        1 where nothing earlier shows its ground. Sigmas of the image and of those before it
+        count as equally short: it is the root mean square over the earlier images of the robust
+        normalised difference. Points that one pair alone saw take no part.
+        """
+        found = [self._apart(depth, one) for one in self._earlier]
+        ratios = [ratio for ratio in found if ratio is not None]
+        samples = _samples(depth, self.config.samples)
+        if len(samples.sigma_m):
+            self._earlier.append(samples)
+        if not ratios:
+            return 1.0
+        factor = float(np.sqrt(np.mean(np.square(ratios))))
+        return float(np.clip(factor, 1.0, self.config.largest))
+
+    def _apart(self, depth: DepthMap, one: _Samples) -> float | None:
+        """Robust normalised difference along z; None with too little in common."""
+        h, w = depth.depth_m.shape
+        here = se3.transform(se3.inverse(depth.T_world_camera), one.points.astype(np.float64))
+        ahead = here[:, 2] > 1e-3
+        if np.count_nonzero(ahead) < self.config.least_common:
+            return None
+        uv = np.rint(project(depth.K, here[ahead]))
+        inside = (uv[:, 0] >= 0) & (uv[:, 1] >= 0) & (uv[:, 0] < w) & (uv[:, 1] < h)
+        if np.count_nonzero(inside) < self.config.least_common:
+            return None
+        u, v = uv[inside].astype(np.int64).T
+        z = depth.depth_m[v, u]
+        known = np.isfinite(z) & (depth.views[v, u] >= 2)
+        if np.count_nonzero(known) < self.config.least_common:
+            return None
+        there, sigma = here[ahead][inside][known, 2], one.sigma_m[ahead][inside][known]
+        off = np.abs(there - z[known]) / np.hypot(sigma, depth.sigma_m[v, u][known])
+        return float(np.median(off)) / NORMAL_MEDIAN
+
+
+def _samples(depth: DepthMap, rows: int) -> _Samples:
+    """Surface that two pairs or more saw, every so many pixels."""
+    step = max(1, depth.depth_m.shape[0] // rows)
+    z, sigma = depth.depth_m[::step, ::step], depth.sigma_m[::step, ::step]
+    v, u = np.nonzero(np.isfinite(z) & (depth.views[::step, ::step] >= 2))
+    uv = np.column_stack([u, v]).astype(np.float64) * step
+    camera: F64 = rays(depth.K, uv) * z[v, u, None].astype(np.float64)
+    world = se3.transform(depth.T_world_camera, camera)
+    return _Samples(world.astype(np.float32), np.asarray(sigma[v, u], np.float32))
