@@ -128,7 +128,7 @@ def flown(
     hours = (time.monotonic() - begin_s) / 3600.0
     (folder,) = set(service.scans.glob("*")) - scans
     assert (folder / "cloud.laz").is_file()
-    keyframes = int(json.loads((folder / "scan.json").read_text())["keyframes"])
+    keyframes = int(json.loads((folder / "scan.json").read_text())["counts"]["keyframes"])
     landed = replace(out[-1], aloft_s=LANDED, hours=hours, memory_mib=mib, files=files)
     return [*out, replace(landed, keyframes=keyframes)]
 
