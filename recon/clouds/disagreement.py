@@ -26,8 +26,8 @@ class DisagreementConfig:
     """What is compared, and how far sigmas may be widened."""
 
     images: int = 32  # the last ones are remembered
-    samples: int = 40  # rows of samples of each
-    least_common: int = 100  # samples of two images that show the same ground
+    samples: int = 24  # rows of samples of each
+    least_common: int = 60  # samples of two images that show the same ground
     largest: float = 5.0  # factor; more is a pose gone wrong and not a wider sigma
 
     def __post_init__(self) -> None:
