@@ -20,8 +20,8 @@ from recon.graph.riders import KEYFRAME
 from recon.graph.thinning import moved_loop, surplus, thinned
 from recon.graph.trajectory import Trajectory
 from recon.types import F64, PosePrior
-from service.scans.file_ledger import FileLedger
 from service.onboard.graph_aside import GraphAside
+from service.scans.file_ledger import FileLedger
 
 COUNT, MOST, LEG = 200, 60, 50
 STEP_M, HEIGHT_M, SCALE = 5.0, 60.0, 1.3
