@@ -33,19 +33,20 @@ check: lint types test
 bench: $(STAMP)
 	$(BIN)/skyrelief bench $(ARGS)
 
-# Over an hour: fifty kills, the fuzzers, and beside them an hour of flights (MINUTES=6 is
-# shorter), which is their load. As root with systemd-container and debootstrap it also installs
-# into a bare Debian and boots that. Writes docs/trials.md and docs/boot-log.md.
+# Over an hour: fifty kills, the fuzzers, and beside them an hour of flights and a scan of an hour
+# (MINUTES=6 is shorter), which are their load. As root with systemd-container and debootstrap it
+# also installs into a bare Debian and boots that. Writes docs/trials.md and docs/boot-log.md.
 MINUTES ?= 60
 SOAK := tests/trials/test_trial_soak.py
 trials: $(STAMP)
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[$(EXTRAS),trials]'
 	@export SKYRELIEF_TRIALS=whole SKYRELIEF_SOAK_MINUTES=$(MINUTES); \
 	  export SKYRELIEF_TRIALS_TABLE=docs/trials.md SKYRELIEF_BOOT_LOG=docs/boot-log.md; \
-	  $(BIN)/python -m pytest -m trial $(SOAK) $(ARGS) & soak=$$!; \
+	  $(BIN)/python -m pytest -m trial $(SOAK) -k flights $(ARGS) & flights=$$!; \
+	  $(BIN)/python -m pytest -m trial $(SOAK) -k scan $(ARGS) & scan=$$!; \
 	  $(BIN)/python -m pytest -m trial tests/trials --ignore=$(SOAK) $(ARGS); rest=$$?; \
-	  wait $$soak; soak=$$?; cat docs/trials.md; \
-	  for rc in $$rest $$soak; do case $$rc in 0|5) ;; *) exit $$rc;; esac; done  # 5: no such trial
+	  wait $$flights; flights=$$?; wait $$scan; scan=$$?; cat docs/trials.md; \
+	  for rc in $$rest $$flights $$scan; do case $$rc in 0|5) ;; *) exit $$rc;; esac; done  # 5: none
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
