@@ -6,19 +6,21 @@ import http.client
 import json
 import shutil
 import socket
+import threading
 import urllib.error
 import urllib.request
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 
 from service.config import Config, load_config, reload
 from service.daemon.health import HealthServer, Notifier, metrics_text
 from service.daemon.health_api import STATUS
 from service.daemon.machine import CoreLoad, Machine, computer_load, read_machine
 from service.daemon.runtime import Daemon
-from service.errors import OutsideError
+from service.errors import InputError, OutsideError
 from service.scans.retention import close_open_scans, make_room
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
@@ -106,6 +108,46 @@ def test_http_survives_hostile_bytes(hostile: bytes) -> None:
         assert fetch(server.port, "/healthz")[0] == 200
     finally:
         server.close()
+
+
+def test_why_it_cannot_start_is_told_before_it_is_started_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.daemon.runtime.TOLD_S", 60.0)
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    said: dict[str, Any] = {}
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(str(tmp_path / "notify"))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as radio:
+            radio.bind(("127.0.0.1", 0))
+            radio.settimeout(30.0)
+            link = f"udpout:127.0.0.1:{radio.getsockname()[1]}"
+            given = [f"scan.folder={tmp_path}", "health.http=", f"mavlink.links={link}"]
+            daemon = Daemon(load_config(None, given))
+
+            def hear() -> None:
+                heard = dialect.MAVLink(None)
+                while "text" not in said or said.get("state") != dialect.MAV_STATE_CRITICAL:
+                    for message in heard.parse_buffer(radio.recv(2048)) or []:
+                        if message.get_type() == "HEARTBEAT":
+                            said["state"] = message.system_status
+                        elif message.get_type() == "STATUSTEXT":
+                            said.setdefault("text", message.text)  # its first part
+                said["ok"] = daemon.snapshot()["ok"]
+                daemon.quit()
+
+            operator = threading.Thread(target=hear, daemon=True)
+            operator.start()
+            with pytest.raises(InputError, match=r"camera\.source is not set"):
+                daemon.run()
+            operator.join()
+        told = [listener.recv(200).decode() for _ in range(2)]
+    assert said["text"].startswith("Not ready: camera.source is not set")
+    assert said["ok"] is False
+    assert told == [
+        "STATUS=camera.source is not set; give it in the configuration file",
+        "STOPPING=1",
+    ]
 
 
 def test_metric_names_are_plain() -> None:

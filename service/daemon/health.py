@@ -35,6 +35,15 @@ class Notifier:
         self._address = "\0" + address[1:] if address.startswith("@") else address
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) if address else None
 
+    @property
+    def is_heard(self) -> bool:
+        """True when an init system listens."""
+        return self._socket is not None
+
+    def status(self, text: str) -> None:
+        """A line for ``systemctl status``."""
+        self._send(f"STATUS={text}")
+
     def ready(self) -> None:
         """The service is up."""
         self._send("READY=1")

@@ -17,6 +17,7 @@ from typing import Any
 from mavlink.control import Phase
 from mavlink.first_beat import FirstBeats
 from mavlink.presence import Health
+from mavlink.status import CRITICAL
 from mavlink.vehicle import VehicleLink
 from service.compute.threading_layer import kernels_may_overlap
 from service.config import Config, reload
@@ -28,7 +29,7 @@ from service.daemon.memory import give_back
 from service.daemon.scanning import Scanning
 from service.daemon.tuning import TUNABLES, parameters_of
 from service.daemon.vehicle_config import vehicle_config
-from service.errors import OutsideError
+from service.errors import OutsideError, SkyreliefError
 from service.scans.retention import close_open_scans, make_room
 from service.version import software
 
@@ -48,6 +49,9 @@ TIDY_S = 2.0
 
 COMPILING_S = 180.0
 """The same before anything was compiled, where nobody ran ``skyrelief warm-up``."""
+
+TOLD_S = 10.0
+"""For so long the operator is told why the service cannot start, before it is started again."""
 
 
 class Daemon:
@@ -76,7 +80,7 @@ class Daemon:
         self.vehicle.start()
         http = self._serve_health()
         try:
-            self.scanning.load()
+            self._load(notifier)
             self.actions.is_ready = True
             notifier.ready()
             self._begin(self._tidy)
@@ -93,6 +97,21 @@ class Daemon:
             self.vehicle.stop()
             if http is not None:
                 http.close()
+
+    def _load(self, notifier: Notifier) -> None:
+        """The heavy part of the start. Where the init system starts us again after a fault, the
+        operator is told of it for :data:`TOLD_S` first: nobody reads a journal on a field."""
+        try:
+            self.scanning.load()
+        except SkyreliefError as error:
+            if notifier.is_heard:
+                self.scanning.fault = str(error)
+                self.vehicle.set_health(Health.CRITICAL)
+                self.vehicle.statustext(f"Not ready: {error}", CRITICAL)
+                notifier.status(str(error))
+                log.error("%s; started again in %g s", error, TOLD_S)
+                self._quit.wait(TOLD_S)
+            raise
 
     def _begin(self, work: Callable[[], None]) -> None:
         threading.Thread(target=work, name=work.__name__[1:], daemon=True).start()
@@ -203,10 +222,10 @@ class Daemon:
             give_back()
 
     def _health(self) -> Health:
-        if not self.actions.is_ready:
-            return Health.BOOT
         if self.scanning.fault:
             return Health.CRITICAL
+        if not self.actions.is_ready:
+            return Health.BOOT
         if (
             self.scanning.phase is Phase.SCANNING
             and time.monotonic() - self.scanning.progress_s > STUCK_S
