@@ -170,7 +170,7 @@ def test_install_and_first_start(aircraft: Aircraft, record: Row) -> None:
                                           "exit ${PIPESTATUS[0]}")  # fmt: skip
     shutil.copy(small_model(machine.root / "tmp"), machine.root / "etc/skyrelief/camera.yaml")
     aircraft.configure()
-    machine.transcript.append("(camera.source, camera.model, scan.start and health.http are set)")
+    machine.transcript.append("(camera, camera.model, mavlink.links, scan.start, health.http: set)")
     start = time.monotonic()
     machine.run("systemctl restart skyrelief")
     first_s = aircraft.until_scanning(start)
