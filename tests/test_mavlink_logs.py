@@ -586,3 +586,11 @@ def test_settings_of_the_history_reach_it() -> None:
     log = load_telemetry(TURN, config)
     state = log.history.state_at(log.first_ns + 10**9)
     assert state is not None and state.sigma_attitude_rad == pytest.approx(0.2, rel=0.01)
+
+
+def test_a_ulg_that_breaks_off_within_a_damaged_message_ends(tmp_path: Path) -> None:
+    """pyulog would step back and read these three bytes for ever."""
+    path = tmp_path / "flight.ulg"
+    path.write_bytes(b"ULog\x01\x12\x35\x01" + bytes(8) + b"\x01\x00\x00")
+    with pytest.raises(ValueError, match="breaks off within a damaged message"):
+        load_telemetry(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 from collections import Counter
 from collections.abc import Callable
@@ -73,13 +74,33 @@ def _topics(path: Path) -> tuple[dict[str, Columns], Counter[str], list[str]]:
             f"{path}: reading .ulg needs pyulog; pip install 'skyrelief[logs]'"
         ) from error
     try:
-        log = ULog(str(path), list(TABLE))
+        with _Bounded(path) as file:
+            log = ULog(file, list(TABLE))
     except (*BROKEN, ULogException) as error:
         raise ValueError(f"{path}: the .ulg log cannot be read ({error})") from error
     counts = Counter({d.name: len(d.data["timestamp"]) for d in log.data_list if not d.multi_id})
     topics = {d.name: d.data for d in log.data_list if d.multi_id == 0}
     dropouts = len(log.dropouts)
     return topics, counts, [f"{dropouts} dropouts while logging"] if dropouts else []
+
+
+class _Bounded(io.BufferedReader):
+    """A file that may be read only as often as reading it once can take.
+
+    pyulog steps back over a message that is damaged; where the file breaks off within it, it
+    steps back too far and would read the same bytes for ever.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self._left = 2 * path.stat().st_size + 10_000
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """As of any file; raises OSError when the reader goes round in circles."""
+        self._left -= 1
+        if self._left < 0:
+            raise OSError("it breaks off within a damaged message")
+        return super().read(size)
 
 
 def _unix_offset_us(topics: dict[str, Columns]) -> int | None:

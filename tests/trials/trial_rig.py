@@ -162,12 +162,12 @@ class Service:
         """Of the scan that runs; 0 when none does."""
         return int(self.get().get("frames", 0))
 
-    def until(self, reached: Callable[[], Any], what: str) -> float:
+    def until(self, reached: Callable[[], Any], what: str, limit_s: float = PATIENCE_S) -> float:
         """Seconds until ``reached``; fails with the log when the process ends or time runs out."""
         start = time.monotonic()
         while not reached():
             alive = self.process.poll() is None
-            late = time.monotonic() > start + PATIENCE_S
+            late = time.monotonic() > start + limit_s
             assert alive and not late, f"{what}:\n{self.log.read_text()[-3000:]}"
             time.sleep(0.05)
         return time.monotonic() - start
