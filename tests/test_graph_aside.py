@@ -8,10 +8,10 @@ import signal
 import time
 from collections.abc import Iterator
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
+from flown_track import sensed
 
 from recon import se3
 from recon.graph.pose_graph import PoseGraph
@@ -34,15 +34,7 @@ def _flight(count: int) -> tuple[list[F64], list[F64], list[PosePrior]]:
         turn = se3.so3_exp(np.array([0.0, 0.0, np.pi * (i >= half)]))
         place = np.array([x, 0.0 if i < half else 20.0, HEIGHT_M]) + rng.normal(size=3) * 0.1
         truth.append(se3.compose(turn @ np.diag([1.0, -1.0, -1.0]), place))
-    odom = [np.eye(4)]
-    for a, b in pairwise(truth):
-        step = se3.exp(rng.multivariate_normal(np.zeros(6), MOTION)) @ se3.inverse(a) @ b
-        step[:3, 3] /= SCALE
-        odom.append(odom[-1] @ step)
-    priors = [
-        PosePrior(T[:3, :3], 0.01, 0.02, T[:3, 3] + rng.normal(size=3), np.ones(3)) for T in truth
-    ]
-    return truth, odom, priors
+    return truth, *sensed(rng, truth, MOTION, SCALE)
 
 
 TRUTH, ODOM, PRIORS = _flight(40)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from flown_track import sensed
 
 from recon import se3
 from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
@@ -20,11 +21,12 @@ from recon.graph.riders import KEYFRAME
 from recon.graph.thinning import moved_loop, surplus, thinned
 from recon.graph.trajectory import Trajectory
 from recon.types import F64, PosePrior
+from service.bench.graph import HEIGHT_M, legs
 from service.onboard.graph_aside import GraphAside
 from service.scans.file_ledger import FileLedger
 
 COUNT, MOST, LEG = 200, 60, 50
-STEP_M, HEIGHT_M, SCALE = 5.0, 60.0, 1.3
+STEP_M, SCALE = 5.0, 1.3
 SPREAD = np.diag([3e-4**2] * 3 + [0.02**2] * 3)  # of a motion, in metres
 LOOP = np.diag([5e-4**2] * 3 + [0.03**2] * 3)
 UNITS = np.outer([1.0] * 3 + [1.0 / SCALE] * 3, [1.0] * 3 + [1.0 / SCALE] * 3)
@@ -34,23 +36,8 @@ UNITS = np.outer([1.0] * 3 + [1.0 / SCALE] * 3, [1.0] * 3 + [1.0 / SCALE] * 3)
 def flight() -> tuple[list[F64], list[F64], list[PosePrior]]:
     """Truth of legs to and fro, an odometry of another scale that drifts, and priors."""
     rng = np.random.default_rng(7)
-    truth = []
-    for i in range(COUNT):
-        leg, along = divmod(i, LEG)
-        x = STEP_M * (along if leg % 2 == 0 else LEG - 1 - along)
-        turn = se3.so3_exp(np.array([0.0, 0.0, np.pi * (leg % 2)]))
-        wobble = se3.so3_exp(rng.normal(size=3) * 0.02)
-        place = np.array([x, 20.0 * leg, HEIGHT_M]) + rng.normal(size=3) * 0.2
-        truth.append(se3.compose(turn @ np.diag([1.0, -1.0, -1.0]) @ wobble, place))
-    odom = [np.eye(4)]
-    for a, b in pairwise(truth):
-        step = se3.exp(rng.multivariate_normal(np.zeros(6), SPREAD)) @ se3.inverse(a) @ b
-        step[:3, 3] /= SCALE
-        odom.append(odom[-1] @ step)
-    priors = [
-        PosePrior(T[:3, :3], 0.01, 0.02, T[:3, 3] + rng.normal(size=3), np.ones(3)) for T in truth
-    ]
-    return truth, odom, priors
+    truth = legs(rng, COUNT, LEG, STEP_M)
+    return truth, *sensed(rng, truth, SPREAD, SCALE)
 
 
 def bounded(most: int = MOST) -> PoseGraph:

@@ -149,17 +149,23 @@ def _opposite(i: int) -> int | None:
     return (leg - 1) * LEG + LEG - 1 - along
 
 
-def _flight() -> _Flight:
-    """Legs to and fro with wandering sensors and an odometry of another scale that drifts."""
-    rng = np.random.default_rng(1)
+def legs(rng: np.random.Generator, count: int, leg_count: int, step_m: float) -> list[F64]:
+    """(4, 4) T_world_camera of so many keyframes, ``leg_count`` a leg, flown to and fro at 60 m."""
     truth = []
-    for i in range(KEYFRAMES):
-        leg, along = divmod(i, LEG)
-        x = STEP_M * (along if leg % 2 == 0 else LEG - 1 - along)
+    for i in range(count):
+        leg, along = divmod(i, leg_count)
+        x = step_m * (along if leg % 2 == 0 else leg_count - 1 - along)
         turn = se3.so3_exp(np.array([0.0, 0.0, np.pi * (leg % 2)]))
         wobble = se3.so3_exp(rng.normal(size=3) * 0.02)
         place = np.array([x, 20.0 * leg, HEIGHT_M]) + rng.normal(size=3) * 0.2
         truth.append(se3.compose(turn @ np.diag([1.0, -1.0, -1.0]) @ wobble, place))
+    return truth
+
+
+def _flight() -> _Flight:
+    """Legs to and fro with wandering sensors and an odometry of another scale that drifts."""
+    rng = np.random.default_rng(1)
+    truth = legs(rng, KEYFRAMES, LEG, STEP_M)
     covariance = np.diag([1e-4**2] * 3 + [0.01**2] * 3)
     noise = rng.multivariate_normal(np.zeros(6), covariance, KEYFRAMES)
     odometry = [np.eye(4)]

@@ -114,7 +114,7 @@ class Dense:
         self._resolution_m = config.scan.resolution_m
         self._before: tuple[int, DepthMap | None, F64] | None = None  # seq, depth, T_map_camera
         self._relief = (0.0, 0.0)
-        self._disagreement = (-1, Disagreement())  # of a segment
+        self._disagreement, self._compared = Disagreement(), -1  # within that segment
         self._map_voxels = compute.map_voxels
         self.loops: LoopSearch | None = None
         if config.fusion.loops:
@@ -252,9 +252,10 @@ class Dense:
         with self.stopwatch("map"):
             T_map = self.trajectory.map_pose(seq)
             in_map = DepthMap(depth.depth_m, depth.sigma_m, depth.views, depth.K, T_map)
-            if job.segment != self._disagreement[0]:
-                self._disagreement = (job.segment, Disagreement())
-            wider = np.float32(self._disagreement[1].take(in_map))
+            if job.segment != self._compared:
+                self._disagreement.forget()
+                self._compared = job.segment
+            wider = np.float32(self._disagreement.take(in_map))
             in_map = replace(in_map, sigma_m=in_map.sigma_m * wider)
             if self._map is None:
                 ground_m = float(np.nanmedian(depth.depth_m)) / depth.K[0, 0]

@@ -1,0 +1,28 @@
+"""What a camera and an autopilot say of a known track, for the tests of the pose graph."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from recon import se3
+from recon.types import F64, PosePrior
+
+
+def sensed(
+    rng: np.random.Generator, truth: list[F64], spread: F64, scale: float
+) -> tuple[list[F64], list[PosePrior]]:
+    """An odometry that drifts, in units of ``scale`` metres, and priors with fixes off by 1 m.
+
+    ``truth`` are poses (4, 4), ``spread`` (6, 6) is of one motion, left, in metres.
+    """
+    odom = [np.eye(4)]
+    for a, b in pairwise(truth):
+        step = se3.exp(rng.multivariate_normal(np.zeros(6), spread)) @ se3.inverse(a) @ b
+        step[:3, 3] /= scale
+        odom.append(odom[-1] @ step)
+    priors = [
+        PosePrior(T[:3, :3], 0.01, 0.02, T[:3, 3] + rng.normal(size=3), np.ones(3)) for T in truth
+    ]
+    return odom, priors
