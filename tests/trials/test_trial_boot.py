@@ -6,14 +6,11 @@ Only in the whole form; it needs root, systemd-nspawn and debootstrap.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
 import socket
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -23,7 +20,7 @@ from typing import Any
 import pytest
 from loopback import free_port
 from trial_machine import Machine, another_release, lacking, make_bundle
-from trial_rig import BACK_S, WHOLE, Chunk, Row, small_model, stored, stream_to
+from trial_rig import BACK_S, WHOLE, Chunk, Row, answer, small_model, stored, stream_to
 
 pytestmark = [
     pytest.mark.trial,
@@ -64,10 +61,7 @@ class Aircraft:
 
     def status(self) -> dict[str, Any]:
         """What the service says; empty while nobody answers."""
-        with suppress(OSError, ValueError, urllib.error.HTTPError):
-            page = urllib.request.urlopen(f"http://127.0.0.1:{self.health}/status", timeout=2)
-            return dict(json.loads(page.read()))
-        return {}
+        return answer(self.health)
 
     def until_scanning(self, since_s: float, limit_s: float = 90.0) -> float:
         """Seconds from ``since_s`` until a frame of a running scan is done."""

@@ -102,6 +102,18 @@ def _write(page: Path, kept: Path, lines: list[Line]) -> None:
     )
 
 
+def answer(port: int, path: str = "/status") -> dict[str, Any]:
+    """The JSON answer of a health page; empty while nobody answers."""
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=5) as page:
+            return dict(json.loads(page.read()))
+    except urllib.error.HTTPError as error:
+        with error:
+            return dict(json.loads(error.read()))
+    except (OSError, ValueError):
+        return {}
+
+
 class Service:
     """The daemon as a process of its own, looking at the demo flight as its camera."""
 
@@ -148,14 +160,7 @@ class Service:
 
     def get(self, path: str = "/status") -> dict[str, Any]:
         """The JSON answer of the health page; empty while nobody answers."""
-        try:
-            with urllib.request.urlopen(f"http://127.0.0.1:{self.port}{path}", timeout=5) as page:
-                return dict(json.loads(page.read()))
-        except urllib.error.HTTPError as error:
-            with error:
-                return dict(json.loads(error.read()))
-        except (OSError, ValueError):
-            return {}
+        return answer(self.port, path)
 
     @property
     def frames(self) -> int:
