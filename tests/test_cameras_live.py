@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import itertools
 import shlex
@@ -19,7 +20,7 @@ import av
 import numpy as np
 import pytest
 
-from service.cameras import CameraFrame, open_camera
+from service.cameras import CameraFrame, CameraSource, open_camera
 from service.cameras.live import LiveConfig, LiveSource, StampFilter
 from service.cameras.pace import paced
 from service.cameras.stream import _without_password
@@ -65,6 +66,7 @@ class RealTime:
     def __init__(self, container: Any) -> None:
         self.streams = container.streams
         self._container = container
+        self.is_open = True
 
     def demux(self, stream: Any) -> Iterator[Any]:
         due = time.monotonic()
@@ -74,6 +76,7 @@ class RealTime:
             yield packet
 
     def close(self) -> None:
+        self.is_open = False
         self._container.close()
 
 
@@ -171,6 +174,37 @@ def test_waiting_for_a_dead_camera_can_be_ended() -> None:
     threading.Timer(0.5, paces.close).start()
     assert len(list(frames)) < 6
     paces.close()
+
+
+@pytest.mark.parametrize("taken", [0, 1, 5])
+@pytest.mark.parametrize("pace", [paced, lambda source: source], ids=["paced", "direct"])
+def test_an_ended_stream_is_let_go_at_once(
+    pace: Callable[[CameraSource], CameraSource], taken: int, no_collector: None
+) -> None:
+    """Its port or device must be free for the next scan, not when the collector comes round."""
+    opened: list[RealTime] = []
+
+    def open_container(stall_s: float) -> Any:
+        opened.append(opener(clip(500))(stall_s))
+        return opened[-1]
+
+    source = pace(LiveSource(open_container, "test", QUICK))
+    for _ in itertools.islice(source, taken):
+        pass
+    assert len(opened) == 1
+    source.close()
+    late_s = time.monotonic() + 10.0
+    while opened[0].is_open and time.monotonic() < late_s:
+        time.sleep(0.01)
+    assert not opened[0].is_open
+
+
+@pytest.fixture
+def no_collector() -> Iterator[None]:
+    """What refers to itself is not freed meanwhile."""
+    gc.disable()
+    yield
+    gc.enable()
 
 
 def test_a_paced_recording_can_be_ended(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import itertools
 import logging
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from threading import Event
 from typing import TYPE_CHECKING
@@ -101,6 +101,7 @@ class LiveSource:
         self.start_monotonic_ns: int | None = self._start_ns
         self._open_container = open_container
         self._closed = Event()
+        self._iterated = False
         self._pictures = self._connect()
         first = next(self._pictures, None)
         if first is None:
@@ -112,7 +113,20 @@ class LiveSource:
         self._first = first
 
     def __iter__(self) -> Iterator[CameraFrame]:
-        """Yield pictures until :meth:`close`."""
+        """Yield pictures until :meth:`close`; then, or when dropped, let go of the stream."""
+        self._iterated = True
+        try:
+            yield from self._frames()
+        finally:
+            self._pictures.close()
+
+    def close(self) -> None:
+        """End the iteration at the next picture, and the waiting for a lost camera at once."""
+        self._closed.set()
+        if not self._iterated:
+            self._pictures.close()
+
+    def _frames(self) -> Iterator[CameraFrame]:
         seq = 0
         last_ns = -1
         for image, time_ns in itertools.chain((self._first,), self._endless()):
@@ -124,10 +138,6 @@ class LiveSource:
                 yield CameraFrame(image, time_ns, seq, None, f"frame {seq}")
                 seq += 1
                 last_ns = time_ns
-
-    def close(self) -> None:
-        """End the iteration at the next picture, and the waiting for a lost camera at once."""
-        self._closed.set()
 
     def _endless(self) -> Iterator[tuple[U8, int]]:
         """Every (picture, time) of every connection, with pauses that grow between failures."""
@@ -145,7 +155,7 @@ class LiveSource:
             retry_s = min(2.0 * retry_s, self.config.longest_retry_s)
             self._pictures = self._connect()
 
-    def _connect(self) -> Iterator[tuple[U8, int]]:
+    def _connect(self) -> Generator[tuple[U8, int], None, None]:
         """The (picture, time) of one connection; ends, with a log line, when it is lost."""
         import av.error
 
