@@ -14,7 +14,7 @@ from mavlink.control import Phase
 from service.config import load_config
 from service.daemon import runtime
 from service.daemon.closing import ClosingWatch, sizes
-from service.daemon.memory import few_pools, give_back
+from service.daemon.memory import one_pool, give_back
 from service.daemon.runtime import Daemon
 from service.daemon.scanning import Scanning
 from service.stream.records import ScanHeader
@@ -126,6 +126,6 @@ def test_systemd_is_asked_to_wait_only_while_closing_gets_on(
 
 
 def test_memory_settings_are_taken_where_the_library_has_them() -> None:
-    assert few_pools()
+    assert one_pool()
     assert give_back() in (True, False)
     assert give_back(collect=True) in (True, False)

@@ -1,7 +1,8 @@
-"""Invented points go, true ones stay: over flat ground with known roofs."""
+"""Invented points go, true ones stay: over flat ground with known roofs; tiles in view."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 
 from recon.clouds.cloud_fusion import cloud_of
-from recon.clouds.free_space import open_above, seen_through
-from recon.types import DepthMap, PointCloud
+from recon.clouds.free_space import MOST_VIEWS, open_above, seen_through, spread
+from recon.clouds.tiles import Tiles
+from recon.types import F64, DepthMap, PointCloud
 
 if TYPE_CHECKING:
     from conftest import HouseFlight
@@ -68,6 +70,34 @@ def test_points_that_nobody_looks_at_are_kept(house: HouseFlight) -> None:
     assert not seen_through(blob, []).any()
 
 
+def test_the_first_keyframes_asked_decide(house: HouseFlight) -> None:
+    """A camera that hovers is asked a limited number of times."""
+    blob = flyers(50, 5.0)
+    seer = house.keyframe(0, 22.0).depth
+    inventor = replace(seer, depth_m=np.full_like(seer.depth_m, 35.0))
+    asked = [0]
+
+    def views(*numbers: int) -> Iterator[DepthMap]:
+        for view, number in zip((seer, inventor), numbers, strict=True):
+            for _ in range(number):
+                asked[0] += 1
+                yield view
+
+    assert seen_through(blob, views(MOST_VIEWS, 3 * MOST_VIEWS)).all()
+    assert asked == [4 * MOST_VIEWS]
+    assert not seen_through(blob, views(MOST_VIEWS // 2 - 1, MOST_VIEWS)).any()
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 1000])
+def test_views_are_spread_over_the_flight(count: int) -> None:
+    order = spread(range(count))
+    assert sorted(order) == list(range(count))
+    for asked in (10, 64):
+        if count > 10 * asked:
+            gaps = np.diff(np.sort([*order[:asked], 0, count]))
+            assert gaps.max() < 3 * count / asked  # of evenly spread ones, 1
+
+
 def test_unknown_surroundings_are_no_evidence(house: HouseFlight) -> None:
     blob = flyers(50, 5.0)
     sparse = house.keyframe(0, 22.0).depth
@@ -100,3 +130,54 @@ def test_ground_below_an_eave_is_not_open(house: HouseFlight) -> None:
     assert not open_above(below, (2.0,), []).any()
     with pytest.raises(ValueError, match="1 to 8 heights"):
         open_above(below, (), [flat])
+
+
+def ground(n: int, seed: int = 0) -> F64:
+    """Places in a landscape, one of them far away."""
+    rng = np.random.default_rng(seed)
+    out: F64 = rng.uniform([-300.0, -200.0, -3.0], [300.0, 200.0, 12.0], (n, 3))
+    out[0] = [9e3, -7e3, 0.0]
+    return out
+
+
+def test_tiles_keep_every_place_once_and_neighbours_together() -> None:
+    places = ground(40_000)
+    tiles = Tiles(places)
+    assert 10 < len(tiles) < 200
+    assert sorted(tiles.order) == list(range(len(places)))
+    assert np.array_equal(tiles.xyz_m, places[tiles.order].astype(np.float32))
+    assert tiles.first[0] == 0 and tiles.first[-1] == len(places)
+    parts = np.split(tiles.xyz_m, tiles.first[1:-1])
+    widest = [np.ptp(part[:, :2], axis=0).max() for part in parts]
+    assert max(widest) < 0.25 * 600.0
+    assert len(Tiles(places[:0])) == 0 and len(Tiles(places[:1])) == 1
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 35.0, 60.0])
+@pytest.mark.parametrize("up_m", [0.0, 8.0])
+def test_every_place_in_the_picture_lies_in_a_tile_in_view(
+    house: HouseFlight, tilt_deg: float, up_m: float
+) -> None:
+    """Against the projection of each place by itself."""
+    tiles = Tiles(ground(300_000))
+    level = house.keyframe(0, 20.0).depth
+    c, s = np.cos(np.radians(tilt_deg)), np.sin(np.radians(tilt_deg))
+    T = level.T_world_camera.copy()
+    T[:3, :3] = T[:3, :3] @ [[1, 0, 0], [0, c, -s], [0, s, c]]
+    depth = replace(level, T_world_camera=T)
+    far_m = float(np.nanmax(depth.depth_m)) + 5.0
+    xyz = tiles.xyz_m + np.array([0.0, 0.0, up_m], np.float32)
+    inside = (xyz - T[:3, 3]) @ T[:3, :3]
+    uv = inside @ depth.K.T
+    h, w = depth.depth_m.shape
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = uv[:, 0] / uv[:, 2], uv[:, 1] / uv[:, 2]
+    seen = (inside[:, 2] > 0) & (inside[:, 2] < far_m) & (abs(u - w / 2) < w / 2)
+    seen &= abs(v - h / 2) < h / 2
+    assert seen.sum() > 100
+    found = tiles.in_view(depth, slack_m=5.0, up_m=up_m)
+    tile_of = np.repeat(np.arange(len(tiles)), np.diff(tiles.first))
+    assert set(tile_of[seen]) <= set(found)
+    assert len(found) < 0.5 * len(tiles)  # and most of the others are left out
+    blank = replace(depth, depth_m=np.full((h, w), np.nan, np.float32))
+    assert len(tiles.in_view(blank)) == 0

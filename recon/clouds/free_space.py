@@ -8,11 +8,13 @@ be, says that the point's place is empty. One that sees surface at the point con
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from recon.clouds.tiles import I64, Tiles
 from recon.types import F32, F64, U8, Bool, DepthMap, PointCloud
 
 I32 = npt.NDArray[np.int32]
@@ -24,34 +26,56 @@ WINDOW_PX = 2
 
 KNOWN_SHARE = 0.5
 
+MOST_VIEWS = 100
+"""Keyframes asked about a point at most: a camera that stays over one place has thousands."""
+
+GOLDEN = 0.5 * (5.0**0.5 - 1.0)
+T = TypeVar("T")
+
+
+def spread(views: Sequence[T]) -> list[T]:
+    """The same views in an order of which every beginning is spread evenly over the whole.
+
+    By the golden ratio: Weyl's sequence of low discrepancy.
+    """
+    turns = (np.arange(len(views)) * GOLDEN) % 1.0
+    return [views[i] for i in np.argsort(turns, kind="stable").argsort(kind="stable")]
+
 
 def seen_through(cloud: PointCloud, views: Iterable[DepthMap]) -> Bool:
     """(N,) points that more stereo pairs see through than see.
 
     A keyframe counts with the number of pairs that agree at its pixel. Points that no
-    keyframe sees at all are kept.
+    keyframe sees at all are kept. The first MOST_VIEWS keyframes with a point's place in the
+    picture decide; where there may be more of them, give the views as :func:`spread` orders them.
     """
-    through = np.zeros(len(cloud), np.int32)
-    confirmed = np.zeros(len(cloud), np.int32)
-    order = np.argsort(cloud.xyz_m[:, 0], kind="stable")
-    xyz = np.ascontiguousarray(cloud.xyz_m[order], np.float32)
-    sigma = np.ascontiguousarray(cloud.sigma_m[order], np.float32)
+    tiles = Tiles(cloud.xyz_m)
+    sigma = np.ascontiguousarray(cloud.sigma_m[tiles.order], np.float32)
+    through, confirmed = np.zeros(len(sigma), np.int32), np.zeros(len(sigma), np.int32)
+    asked, is_decided = np.zeros(len(sigma), np.uint8), np.zeros(len(tiles), np.bool_)
+    largest_m = float(sigma.max(initial=0.0))
     for depth in views:
-        first, last = np.searchsorted(xyz[:, 0], _reach_east(depth))
-        if last > first:
+        slack_m = AGREES_SIGMAS * (largest_m + float(np.nanmax(depth.sigma_m, initial=0.0)))
+        reached = tiles.in_view(depth, slack_m)
+        reached = reached[~is_decided[reached]]
+        if len(reached):
             _vote(
-                xyz[first:last],
-                sigma[first:last],
+                reached,
+                tiles.first,
+                tiles.xyz_m,
+                sigma,
                 np.ascontiguousarray(depth.depth_m, np.float32),
                 np.ascontiguousarray(depth.sigma_m, np.float32),
                 np.ascontiguousarray(depth.views, np.uint8),
                 np.ascontiguousarray(depth.K, np.float64),
                 np.linalg.inv(depth.T_world_camera),
-                through[first:last],
-                confirmed[first:last],
+                through,
+                confirmed,
+                asked,
+                is_decided,
             )
     out: Bool = np.zeros(len(cloud), np.bool_)
-    out[order] = through > confirmed
+    out[tiles.order] = through > confirmed
     return out
 
 
@@ -64,24 +88,27 @@ def open_above(places_m: F64, heights_m: Sequence[float], views: Iterable[DepthM
     """
     if not 0 < len(heights_m) <= 8:
         raise ValueError(f"give 1 to 8 heights, not {len(heights_m)}")
-    order = np.argsort(places_m[:, 0], kind="stable")
-    xyz = np.ascontiguousarray(places_m[order], np.float32)
+    tiles = Tiles(places_m)
     up = np.asarray(heights_m, np.float64)
-    seen = np.zeros(len(xyz), np.uint8)
+    seen, is_decided = np.zeros(len(places_m), np.uint8), np.zeros(len(tiles), np.bool_)
     for depth in views:
-        first, last = np.searchsorted(xyz[:, 0], _reach_east(depth))
-        if last > first:
+        reached = tiles.in_view(depth, up_m=float(up.max()))
+        reached = reached[~is_decided[reached]]
+        if len(reached):
             _look_above(
-                xyz[first:last],
+                reached,
+                tiles.first,
+                tiles.xyz_m,
                 up,
                 np.ascontiguousarray(depth.depth_m, np.float32),
                 np.ascontiguousarray(depth.sigma_m, np.float32),
                 np.ascontiguousarray(depth.K, np.float64),
                 np.linalg.inv(depth.T_world_camera),
-                seen[first:last],
+                seen,
+                is_decided,
             )
-    out: Bool = np.zeros(len(xyz), np.bool_)
-    out[order] = seen == (1 << len(up)) - 1
+    out: Bool = np.zeros(len(places_m), np.bool_)
+    out[tiles.order] = seen == (1 << len(up)) - 1
     return out
 
 
@@ -100,38 +127,40 @@ def _pixel(x: float, y: float, z: float, K: F64, T: F64) -> tuple[int, int, floa
 
 @njit(cache=True, nogil=True)
 def _look_above(
-    xyz: F32, up_m: F64, depth: F32, depth_sigma: F32, K: F64, T: F64, seen: U8
+    tiles: I64,
+    first: I64,
+    xyz: F32,
+    up_m: F64,
+    depth: F32,
+    depth_sigma: F32,
+    K: F64,
+    T: F64,
+    seen: U8,
+    is_decided: Bool,
 ) -> None:
     """Set bit j of ``seen`` where a keyframe sees through the place ``up_m[j]`` higher."""
     h, w = depth.shape
-    for p in range(xyz.shape[0]):
-        for j in range(up_m.shape[0]):
-            if seen[p] & (1 << j):
-                continue
-            x, y, z = float(xyz[p, 0]), float(xyz[p, 1]), float(xyz[p, 2]) + up_m[j]
-            u, v, cz = _pixel(x, y, z, K, T)
-            if not (0 <= u < w and 0 <= v < h):
-                continue
-            if depth[v, u] - cz > AGREES_SIGMAS * float(depth_sigma[v, u]):
-                seen[p] |= np.uint8(1 << j)
-
-
-def _reach_east(depth: DepthMap) -> tuple[float, float]:
-    """The least and greatest x in the world of what the depth map holds, and of its camera."""
-    h, w = depth.depth_m.shape
-    known = np.isfinite(depth.depth_m)
-    eye = float(depth.T_world_camera[0, 3])
-    if not known.any():
-        return eye, eye
-    far = float(depth.depth_m[known].max())
-    u, v = np.array([0, w - 1, 0, w - 1.0]), np.array([0, 0, h - 1, h - 1.0])
-    a, b = (u - depth.K[0, 2]) / depth.K[0, 0], (v - depth.K[1, 2]) / depth.K[1, 1]
-    x = far * (depth.T_world_camera[0, :3] @ np.stack([a, b, np.ones(4)])) + eye
-    return min(eye, float(x.min())), max(eye, float(x.max()))
+    everything = (1 << up_m.shape[0]) - 1
+    for tile in tiles:
+        left = 0
+        for p in range(first[tile], first[tile + 1]):
+            for j in range(up_m.shape[0]):
+                if seen[p] & (1 << j):
+                    continue
+                x, y, z = float(xyz[p, 0]), float(xyz[p, 1]), float(xyz[p, 2]) + up_m[j]
+                u, v, cz = _pixel(x, y, z, K, T)
+                if not (0 <= u < w and 0 <= v < h):
+                    continue
+                if depth[v, u] - cz > AGREES_SIGMAS * float(depth_sigma[v, u]):
+                    seen[p] |= np.uint8(1 << j)
+            left += seen[p] != everything
+        is_decided[tile] = left == 0
 
 
 @njit(cache=True, nogil=True)
 def _vote(
+    tiles: I64,
+    first: I64,
     xyz: F32,
     sigma: F32,
     depth: F32,
@@ -141,38 +170,54 @@ def _vote(
     T: F64,
     through: I32,
     confirmed: I32,
+    asked: U8,
+    is_decided: Bool,
 ) -> None:
-    """Add one keyframe's votes; ``T`` is T_camera_world."""
+    """Add one keyframe's votes on the points of ``tiles``; ``T`` is T_camera_world."""
     h, w = depth.shape
-    least = KNOWN_SHARE * (2 * WINDOW_PX + 1) ** 2
-    for p in range(xyz.shape[0]):
-        x, y, z = float(xyz[p, 0]), float(xyz[p, 1]), float(xyz[p, 2])
-        u, v, cz = _pixel(x, y, z, K, T)
-        if not (WINDOW_PX <= u < w - WINDOW_PX and WINDOW_PX <= v < h - WINDOW_PX):
-            continue
-        here = depth[v, u]
-        if abs(here - cz) <= AGREES_SIGMAS * (float(sigma[p]) + float(depth_sigma[v, u])):
-            confirmed[p] += max(views[v, u], 1)
-            continue
-        known = 0
-        behind = 0
-        agrees = False
-        most = 0
-        for dv in range(-WINDOW_PX, WINDOW_PX + 1):
-            for du in range(-WINDOW_PX, WINDOW_PX + 1):
-                d = depth[v + dv, u + du]
-                if not d > 0.0:
-                    continue
-                s = float(sigma[p]) + float(depth_sigma[v + dv, u + du])
-                known += 1
-                if d - cz > BEHIND_SIGMAS * s:
-                    behind += 1
-                near = abs(du) <= 1 and abs(dv) <= 1
-                if near and abs(d - cz) <= AGREES_SIGMAS * s:
-                    agrees = True
-                if near and views[v + dv, u + du] > most:
-                    most = views[v + dv, u + du]
-        if agrees:
-            confirmed[p] += max(most, 1)
-        elif known >= least and behind == known:
-            through[p] += max(most, 1)
+    for tile in tiles:
+        left = 0
+        for p in range(first[tile], first[tile + 1]):
+            if asked[p] == MOST_VIEWS:
+                continue
+            left += 1
+            x, y, z = float(xyz[p, 0]), float(xyz[p, 1]), float(xyz[p, 2])
+            u, v, cz = _pixel(x, y, z, K, T)
+            if not (WINDOW_PX <= u < w - WINDOW_PX and WINDOW_PX <= v < h - WINDOW_PX):
+                continue
+            asked[p] += 1
+            vote = _judgement(u, v, cz, float(sigma[p]), depth, depth_sigma, views)
+            through[p] += max(-vote, 0)
+            confirmed[p] += max(vote, 0)
+        is_decided[tile] = left == 0
+
+
+@njit(cache=True, nogil=True)
+def _judgement(
+    u: int, v: int, cz: float, sigma: float, depth: F32, depth_sigma: F32, views: U8
+) -> int:
+    """The pairs that see a point at pixel (u, v) and depth ``cz``; negative: see through it."""
+    here = depth[v, u]
+    if abs(here - cz) <= AGREES_SIGMAS * (sigma + float(depth_sigma[v, u])):
+        return max(int(views[v, u]), 1)
+    known = 0
+    most = 1
+    agrees = False
+    behind = 0
+    for dv in range(-WINDOW_PX, WINDOW_PX + 1):
+        for du in range(-WINDOW_PX, WINDOW_PX + 1):
+            d = depth[v + dv, u + du]
+            if not d > 0.0:
+                continue
+            s = sigma + float(depth_sigma[v + dv, u + du])
+            known += 1
+            if d - cz > BEHIND_SIGMAS * s:
+                behind += 1
+            if abs(du) <= 1 and abs(dv) <= 1:
+                agrees = agrees or abs(d - cz) <= AGREES_SIGMAS * s
+                most = max(most, int(views[v + dv, u + du]))
+    if agrees:
+        return most
+    if known >= KNOWN_SHARE * (2 * WINDOW_PX + 1) ** 2 and behind == known:
+        return -most
+    return 0

@@ -28,9 +28,9 @@ def run(
     A HUP signal reads the configuration again; a broken one changes nothing.
     """
     from service.config import load_config
-    from service.daemon.memory import few_pools
+    from service.daemon.memory import one_pool
 
-    few_pools()  # before there are threads
+    one_pool()  # before there are threads
     chosen = load_config(config, set_ or [])
     first = _first_beats(chosen)
     from service.daemon.runtime import Daemon

@@ -1,7 +1,8 @@
 """Keeps a long-lived process from holding memory that nothing uses.
 
 The C library gives threads pools of their own, and keeps what was freed in them. Pictures are
-taken and freed on several threads, so that each pool would grow to the largest need of all.
+taken and freed on several threads, so that each pool would grow to the largest need of all; and
+what is free at the end of a pool is given back for the first one only.
 """
 
 from __future__ import annotations
@@ -10,13 +11,12 @@ import ctypes
 import gc
 
 M_ARENA_MAX = -8  # mallopt(3)
-POOLS = 2
 
 
-def few_pools() -> bool:
-    """True when the C library keeps to two pools from now on; threads that run have theirs."""
+def one_pool() -> bool:
+    """True when the C library keeps to one pool from now on; threads that run have theirs."""
     libc = _libc("mallopt")
-    return libc is not None and libc.mallopt(M_ARENA_MAX, POOLS) == 1
+    return libc is not None and libc.mallopt(M_ARENA_MAX, 1) == 1
 
 
 def give_back(collect: bool = False) -> bool:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from recon.clouds.cloud_fusion import cloud_of, fuse, without
-from recon.clouds.free_space import seen_through
+from recon.clouds.free_space import seen_through, spread
 from recon.clouds.voxel_map import ground_sample_m
 from recon.surface.meshing import Mesh, cut, height_mesh, poisson_mesh
 from recon.surface.raster import Raster, fill_holes, grid_over, rasterise, smoothed
@@ -203,7 +203,7 @@ def _fused(keyframes: Sequence[Keyframe], box: tuple[Any, ...], voxel_m: float) 
     cloud = fuse(inside(), voxel_m)
     if not len(cloud):
         return cloud
-    return without(cloud, seen_through(cloud, (k.depth for k in keyframes)))
+    return without(cloud, seen_through(cloud, (k.depth for k in spread(keyframes))))
 
 
 def _surface(

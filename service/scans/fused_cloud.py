@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from recon.clouds.cloud_fusion import cloud_of, fuse_strips, without
-from recon.clouds.free_space import seen_through
+from recon.clouds.free_space import seen_through, spread
 from recon.clouds.voxel_map import ground_sample_m
 from recon.types import F64, PointCloud
 from service.stream.store import ScanStore
@@ -66,7 +66,7 @@ def fused_cloud(store: ScanStore, voxel_m: float | None = None) -> FusedCloud:
     cloud = fuse_strips(strips, edges, size)
     if len(cloud):
         seqs = [e.seq for e in extents]
-        depths = (k.depth for seq in seqs if (k := store.keyframe(seq)) is not None)
+        depths = (k.depth for seq in spread(seqs) if (k := store.keyframe(seq)) is not None)
         cloud = without(cloud, seen_through(cloud, depths))
     return FusedCloud(cloud, size, sample, len(extents), points, notes)
 

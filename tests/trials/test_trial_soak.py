@@ -141,7 +141,7 @@ def flown(
     autopilot.armed.clear()
     limit_s = max(PATIENCE_S, long_s)  # closing a long scan takes minutes beside other work
     service.until(lambda: service.get().get("state") == "idle", "landing", limit_s)
-    time.sleep(2.0)  # until what the scan held is given back
+    time.sleep(5.0)  # until what the scan held is given back
     mib, files, _ = held(service.process.pid)
     hours = (time.monotonic() - begin_s) / 3600.0
     (folder,) = set(service.scans.glob("*")) - scans
