@@ -14,7 +14,7 @@ from mavlink.control import Phase
 from service.config import load_config
 from service.daemon import runtime
 from service.daemon.closing import ClosingWatch, sizes
-from service.daemon.memory import one_pool, give_back
+from service.daemon.memory import give_back, one_pool
 from service.daemon.runtime import Daemon
 from service.daemon.scanning import Scanning
 from service.stream.records import ScanHeader
