@@ -253,14 +253,18 @@ class Config:
         return plain
 
 
-def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
+def load_config(path: Path | None = None, overrides: Sequence[str] = (), only: str = "") -> Config:
     """The configuration of ``path`` (None: defaults) with ``section.key=value`` overrides.
 
-    Raises InputError, in one line, for a file that cannot be read, is not TOML, or holds a
-    key, type or value that is not known.
+    ``only`` names a section: whatever the others hold, they stay at their defaults. Raises
+    InputError, in one line, for a file that cannot be read, is not TOML, or holds a key, type
+    or value that is not known.
     """
     data = _read(path) if path is not None else {}
     where = str(path) if path is not None else "configuration"
+    if only:
+        data = {name: value for name, value in data.items() if name == only}
+        overrides = [text for text in overrides if text.startswith(f"{only}.")]
     _check_keys(data, where)
     config = _convert(data, where)
     for override in overrides:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import http.client
 import json
+import os
 import shutil
 import socket
+import subprocess
+import sys
 import threading
 import urllib.error
 import urllib.request
@@ -148,6 +151,52 @@ def test_why_it_cannot_start_is_told_before_it_is_started_again(
         "STATUS=camera.source is not set; give it in the configuration file",
         "STOPPING=1",
     ]
+
+
+@pytest.mark.parametrize(
+    ("broken", "complaint"),
+    [
+        ("[scan]\nfolde = '/tmp'\n", "no key scan.folde; did you mean"),
+        ("[mavlink]\nlinks = [\n", "is not TOML"),
+    ],
+)
+def test_a_broken_configuration_is_told_before_it_is_tried_again(
+    tmp_path: Path, broken: str, complaint: str
+) -> None:
+    """By systemd's status, and by MAVLink where the section of the links is whole."""
+    with (
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as init,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as radio,
+    ):
+        init.bind(str(tmp_path / "notify"))
+        radio.bind(("127.0.0.1", 0))
+        init.settimeout(60.0)
+        radio.settimeout(60.0)
+        file = tmp_path / "skyrelief.toml"
+        link = f"[mavlink]\nlinks = ['udpout:127.0.0.1:{radio.getsockname()[1]}']\n"
+        is_heard = "[mavlink]" not in broken
+        file.write_text(broken + (link if is_heard else ""))
+        command = [sys.executable, "-m", "service.cli", "run", "--config", str(file)]
+        environment = os.environ | {"NOTIFY_SOCKET": str(tmp_path / "notify")}
+        with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE) as service:
+            try:
+                status = init.recv(500).decode()
+                told = "" if not is_heard else _first_text(radio)
+                service.terminate()
+                assert service.wait(timeout=60.0) == 2
+            finally:
+                service.kill()
+    assert status.startswith(f"STATUS={file}") and complaint in status
+    assert told == ("Not ready: " + status[7:])[: len(told)] and bool(told) == is_heard
+
+
+def _first_text(radio: socket.socket) -> str:
+    """The first part of the first STATUSTEXT that comes."""
+    heard = dialect.MAVLink(None)
+    while True:
+        for message in heard.parse_buffer(radio.recv(2048)) or []:
+            if message.get_type() == "STATUSTEXT":
+                return str(message.text)
 
 
 def test_metric_names_are_plain() -> None:

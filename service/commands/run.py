@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from mavlink.first_beat import FirstBeats
     from service.config import Config
     from service.daemon.runtime import Daemon
+    from service.errors import InputError
 
 log = logging.getLogger(__name__)
 
@@ -27,19 +28,40 @@ def run(
 
     A HUP signal reads the configuration again; a broken one changes nothing.
     """
-    from service.config import load_config
     from service.daemon.memory import one_pool
 
     one_pool()  # before there are threads
-    chosen = load_config(config, set_ or [])
+    chosen, fault = _configuration(config, set_ or [])
     first = _first_beats(chosen)
     from service.daemon.runtime import Daemon
 
-    daemon = Daemon(chosen, first)
+    daemon = Daemon(chosen, first, fault)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: daemon.quit())
     signal.signal(signal.SIGHUP, lambda *_: _reload(daemon, config, set_ or []))
     daemon.run()
+
+
+def _configuration(path: Path | None, overrides: list[str]) -> tuple[Config, InputError | None]:
+    """The configuration, and why it cannot be used: then only its links are right, if they are.
+
+    Raises that fault where no init system would start us again: somebody reads it on a screen.
+    """
+    from service.config import Config, load_config
+    from service.errors import InputError
+
+    try:
+        return load_config(path, overrides), None
+    except InputError as error:
+        from service.daemon.health import Notifier
+
+        if not Notifier().is_heard:
+            raise
+        fault = error
+    try:
+        return load_config(path, overrides, only="mavlink"), fault
+    except InputError:
+        return Config(), fault
 
 
 def _first_beats(config: Config) -> FirstBeats | None:

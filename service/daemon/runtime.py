@@ -29,7 +29,7 @@ from service.daemon.memory import give_back
 from service.daemon.scanning import Scanning
 from service.daemon.tuning import TUNABLES, parameters_of
 from service.daemon.vehicle_config import vehicle_config
-from service.errors import OutsideError, SkyreliefError
+from service.errors import InputError, OutsideError, SkyreliefError
 from service.scans.retention import close_open_scans, make_room
 from service.version import software
 
@@ -57,11 +57,15 @@ TOLD_S = 10.0
 class Daemon:
     """The service on the aircraft."""
 
-    def __init__(self, config: Config, first: FirstBeats | None = None) -> None:
-        """``first`` speaks on the MAVLink links already."""
+    def __init__(
+        self, config: Config, first: FirstBeats | None = None, fault: InputError | None = None
+    ) -> None:
+        """``first`` speaks on the MAVLink links already. With a ``fault`` of the configuration
+        all that is done is to tell of it."""
         self._started_s = time.time()
         self._wanted = config  # as it was asked for last; operators may have tuned it since
         self._quit = threading.Event()
+        self._fault = fault
         self.scanning = Scanning(config)
         self.load_control = LoadControl(self.scanning)
         self.actions = ControlActions(self.scanning, self.quit)
@@ -102,6 +106,8 @@ class Daemon:
         """The heavy part of the start. Where the init system starts us again after a fault, the
         operator is told of it for :data:`TOLD_S` first: nobody reads a journal on a field."""
         try:
+            if self._fault is not None:
+                raise self._fault
             self.scanning.load()
         except SkyreliefError as error:
             if notifier.is_heard:
