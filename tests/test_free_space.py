@@ -151,6 +151,8 @@ def test_tiles_keep_every_place_once_and_neighbours_together() -> None:
     widest = [np.ptp(part[:, :2], axis=0).max() for part in parts]
     assert max(widest) < 0.25 * 600.0
     assert len(Tiles(places[:0])) == 0 and len(Tiles(places[:1])) == 1
+    in_line = places * [1.0, 0.0, 0.0]  # without an area
+    assert 10 < len(Tiles(in_line)) < 2000
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 35.0, 60.0])

@@ -17,7 +17,7 @@ from numba import njit
 from recon.clouds.tiles import I64, Tiles
 from recon.types import F32, F64, U8, Bool, DepthMap, PointCloud
 
-I32 = npt.NDArray[np.int32]
+I16 = npt.NDArray[np.int16]
 
 AGREES_SIGMAS = 2.5
 BEHIND_SIGMAS = 4.0
@@ -27,7 +27,8 @@ WINDOW_PX = 2
 KNOWN_SHARE = 0.5
 
 MOST_VIEWS = 100
-"""Keyframes asked about a point at most: a camera that stays over one place has thousands."""
+"""Keyframes asked about a point at most: a camera that stays over one place has thousands.
+Their pairs, 255 at most each, are counted in 16 bits."""
 
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 T = TypeVar("T")
@@ -51,7 +52,7 @@ def seen_through(cloud: PointCloud, views: Iterable[DepthMap]) -> Bool:
     """
     tiles = Tiles(cloud.xyz_m)
     sigma = np.ascontiguousarray(cloud.sigma_m[tiles.order], np.float32)
-    through, confirmed = np.zeros(len(sigma), np.int32), np.zeros(len(sigma), np.int32)
+    through, confirmed = np.zeros(len(sigma), np.int16), np.zeros(len(sigma), np.int16)
     asked, is_decided = np.zeros(len(sigma), np.uint8), np.zeros(len(tiles), np.bool_)
     largest_m = float(sigma.max(initial=0.0))
     for depth in views:
@@ -168,8 +169,8 @@ def _vote(
     views: U8,
     K: F64,
     T: F64,
-    through: I32,
-    confirmed: I32,
+    through: I16,
+    confirmed: I16,
     asked: U8,
     is_decided: Bool,
 ) -> None:

@@ -5,15 +5,24 @@ A long scan has millions of points and a thousand keyframes, of which each sees 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
 from recon.types import F32, F64, DepthMap
 
 I64 = npt.NDArray[np.int64]
+U32 = npt.NDArray[np.uint32]
 
 PLACES = 2048
 """In a tile, about."""
+
+SAMPLED = 100_000
+"""Places that tell how large a tile is."""
+
+HALF = 1 << 15
+"""Rows and columns of tiles to either side; what lies farther off shares the last."""
 
 
 class Tiles:
@@ -23,10 +32,11 @@ class Tiles:
 
     def __init__(self, xyz_m: F32 | F64) -> None:
         """Sort (N, 3) places in the world."""
-        key = _keys(np.asarray(xyz_m[:, :2], np.float64))
+        key = _keys(xyz_m)
         self.order: I64 = np.argsort(key, kind="stable")
         self.xyz_m: F32 = np.ascontiguousarray(xyz_m[self.order], np.float32)
-        edges = np.flatnonzero(np.diff(key[self.order])) + 1
+        key = key[self.order]
+        edges = np.flatnonzero(key[1:] != key[:-1]) + 1
         self.first: I64 = np.concatenate([[0], edges, [len(key)]]) if len(key) else np.zeros(1, int)
         low, high = self._ends(np.minimum), self._ends(np.maximum)
         self._middle, self._half = 0.5 * (low + high), 0.5 * (high - low)
@@ -54,15 +64,20 @@ class Tiles:
         return np.flatnonzero((reach >= 0.0).all(axis=1))
 
 
-def _keys(xy: F64) -> I64:
-    """(N,) the same number for places of one tile."""
-    if not len(xy):
-        return np.zeros(0, np.int64)
-    low, high = np.percentile(xy, [5.0, 95.0], axis=0)  # a stray point enlarges no tile
-    side = max(float(np.sqrt(np.prod(high - low) / 0.81 / len(xy) * PLACES)), 1e-3)
-    column, row = (np.floor((xy - xy.min(axis=0)) / side)).astype(np.int64).T
-    keys: I64 = column * (int(row.max()) + 1) + row
-    return keys
+def _keys(xyz_m: F32 | F64) -> U32:
+    """(N,) the same number for places of one tile; columns of memory are few: N is large."""
+    if not len(xyz_m):
+        return np.zeros(0, np.uint32)
+    some = np.asarray(xyz_m[:: max(1, len(xyz_m) // SAMPLED), :2], np.float64)
+    low, high = np.percentile(some, [5.0, 95.0], axis=0)  # a stray point enlarges no tile
+    area = float(np.prod(high - low)) / 0.81
+    side = max(math.sqrt(area / len(xyz_m) * PLACES), float((high - low).max()) / 1024, 1e-3)
+    key = np.zeros(len(xyz_m), np.uint32)
+    for axis in (0, 1):
+        number = (xyz_m[:, axis] - float(low[axis])) / side + HALF
+        key <<= np.uint32(16)
+        key |= np.clip(number, 0, 2 * HALF - 1).astype(np.uint32)
+    return key
 
 
 def _planes(depth: DepthMap, slack_m: float) -> F64 | None:
