@@ -38,6 +38,7 @@ from service.daemon.runtime import Daemon
 
 pytestmark = [pytest.mark.trial, pytest.mark.timeout(1800 if WHOLE else 280)]
 
+PICTURES = f"{DEMO}/frames/*.jpg"
 MOST_HOGS = 64
 """Per core, before it is said that nothing makes the service late."""
 
@@ -54,50 +55,59 @@ def hogs(processes: int) -> Iterator[None]:
             process.wait()
 
 
-@pytest.mark.skipif(not WHOLE, reason="minutes: only in the whole trials")
-@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
-def test_lag_is_relieved_and_passes(tmp_path: Path, record: Row) -> None:
-    """Real lag: processes that take the cores, more of them until the service is late."""
+@contextlib.contextmanager
+def aircraft(
+    folder: Path, start: str = "on-boot", compute: str = ""
+) -> Iterator[tuple[Service, Autopilot]]:
+    """The service with a camera that streams the demo's pictures, and an autopilot."""
     port, link = free_port(), free_port()
     autopilot = Autopilot(link, attitude=False)
     autopilot.start()
     sender = stream_to(port, "640:480", "-framerate 8 -pattern_type glob -i " + PICTURES)
-    camera, model = f"stream:udp://127.0.0.1:{port}", small_model(tmp_path, 640)
+    camera, model = f"stream:udp://127.0.0.1:{port}", small_model(folder, 640)
     more = f'[mavlink]\nlinks = ["udpin:127.0.0.1:{link}"]\n'
-    steps: list[str] = []
     try:
-        with Service(tmp_path, camera=camera, model=model, more=more) as service:
-
-            def step() -> str:
-                name = str(service.get().get("load", {}).get("name", ""))
-                if name and (not steps or steps[-1] != name):
-                    steps.append(name)
-                return name
-
-            service.until(lambda: service.frames > 20, "frames")
-            cores, count = os.cpu_count() or 1, 4
-            while count <= MOST_HOGS and step() in ("full", ""):
-                with hogs(count * cores), contextlib.suppress(TimeoutError):
-                    deadline = time.monotonic() + 40.0
-                    while step() in ("full", "") and time.monotonic() < deadline:
-                        time.sleep(0.3)
-                    if step() != "full":
-                        time.sleep(15.0)  # further down, if that did not help
-                        step()
-                count *= 2
-            start = time.monotonic()
-            down = len(steps)
-            while step() != "full" and time.monotonic() < start + 10.0 * PATIENCE_S:
-                assert service.process.poll() is None
-                time.sleep(0.3)
-            calm_s = time.monotonic() - start
-            back_s = service.until_more_frames("frames")
-            (folder,) = service.scans.iterdir()
-            assert service.stop() == 0
+        with Service(folder, start, None, camera, model, more=more, compute=compute) as service:
+            yield service, autopilot
     finally:
         autopilot.ended.set()
         sender.kill()
         sender.wait()
+
+
+@pytest.mark.skipif(not WHOLE, reason="minutes: only in the whole trials")
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
+def test_lag_is_relieved_and_passes(tmp_path: Path, record: Row) -> None:
+    """Real lag: processes that take the cores, more of them until the service is late."""
+    steps: list[str] = []
+    with aircraft(tmp_path) as (service, autopilot):
+
+        def step() -> str:
+            name = str(service.get().get("load", {}).get("name", ""))
+            if name and (not steps or steps[-1] != name):
+                steps.append(name)
+            return name
+
+        service.until(lambda: service.frames > 20, "frames")
+        cores, count = os.cpu_count() or 1, 4
+        while count <= MOST_HOGS and step() in ("full", ""):
+            with hogs(count * cores), contextlib.suppress(TimeoutError):
+                deadline = time.monotonic() + 40.0
+                while step() in ("full", "") and time.monotonic() < deadline:
+                    time.sleep(0.3)
+                if step() != "full":
+                    time.sleep(15.0)  # further down, if that did not help
+                    step()
+            count *= 2
+        start = time.monotonic()
+        down = len(steps)
+        while step() != "full" and time.monotonic() < start + 10.0 * PATIENCE_S:
+            assert service.process.poll() is None
+            time.sleep(0.3)
+        calm_s = time.monotonic() - start
+        back_s = service.until_more_frames("frames")
+        (folder,) = service.scans.iterdir()
+        assert service.stop() == 0
     told = [text for text in autopilot.texts if text.startswith("Load:")]
     record(
         f"lag: {count // 2 * cores} processes that take the cores",
@@ -114,7 +124,34 @@ def test_lag_is_relieved_and_passes(tmp_path: Path, record: Row) -> None:
     assert (folder / "cloud.laz").is_file()
 
 
-PICTURES = f"{DEMO}/frames/*.jpg"
+@pytest.mark.skipif(not WHOLE, reason="a minute: only in the whole trials")
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
+def test_a_camera_is_there_again_after_landing_under_load(tmp_path: Path, record: Row) -> None:
+    """Its reader is slow to end then, and must not keep the port from the next scan."""
+    longest_s, times = 0.0, 8
+    with aircraft(tmp_path, "on-arm", "relief = false\n") as (service, autopilot):
+        service.until_up()
+        for _ in range(times):
+            autopilot.armed.set()
+            longest_s = max(longest_s, service.until(lambda: service.frames > 0, "take-off"))
+            service.until(lambda: service.frames > 20, "frames")
+            with hogs(8 * (os.cpu_count() or 1)):
+                time.sleep(4.0)
+                autopilot.armed.clear()
+                service.until(lambda: service.get().get("state") == "idle", "landing")
+        assert len(list(service.scans.iterdir())) == times
+        acknowledged = stored(service.scans)
+        assert service.stop() == 0
+    lost = acknowledged - stored(service.scans)
+    record(
+        f"landing while {8 * (os.cpu_count() or 1)} processes take the cores, then taking off",
+        times,
+        "a new scan each time",
+        f"{len(lost)} of {len(acknowledged)} chunks",
+        longest_s,
+    )
+    assert acknowledged and not lost
+    assert longest_s < BACK_S
 
 
 def test_memory_short_is_relieved(tmp_path: Path, record: Row) -> None:
