@@ -81,7 +81,7 @@ class CameraComponent:
         self._boot_ms = boot_ms
         self._now = now
         self._count = 0
-        self._kept: deque[tuple[int, object]] = deque(maxlen=KEPT)
+        self._kept: deque[tuple[int, int, KeyframeReport]] = deque(maxlen=KEPT)  # index, boot ms
         self._shots: deque[tuple[Address, float]] = deque(maxlen=64)
         self._waiting: deque[int] = deque()  # times at which shots are given up
         self._series: tuple[float, int] | None = None  # interval in s, how many are left (0: any)
@@ -135,9 +135,9 @@ class CameraComponent:
         """Tell everyone of a keyframe; its index comes back."""
         index = self._count
         self._count += 1
-        message = self._image_captured(index, keyframe)
-        self._kept.append((index, message))
-        self._outbox.put(CAMERA, message)
+        boot_ms = self._boot_ms()
+        self._kept.append((index, boot_ms, keyframe))
+        self._outbox.put(CAMERA, self._image_captured(index, boot_ms, keyframe))
         if self._waiting:
             self._waiting.popleft()
             self.send_capture_status()
@@ -147,8 +147,8 @@ class CameraComponent:
         """Take the next shot of a series; give up shots that never came."""
         while self._waiting and now_ns >= self._waiting[0]:
             self._waiting.popleft()
-            failed = self._image_captured(self._count, KeyframeReport(ok=False))
-            self._outbox.put(CAMERA, failed)
+            failed = KeyframeReport(ok=False)
+            self._outbox.put(CAMERA, self._image_captured(self._count, self._boot_ms(), failed))
             self.send_capture_status()
         if self._series is None or now_ns < self._next_shot_ns:
             return
@@ -171,7 +171,8 @@ class CameraComponent:
     def message(self, number: int, index: int) -> object | None:
         """The message asked for by its number; None when we have no such message."""
         if number == 263:
-            return next((m for i, m in self._kept if i == index), None)
+            kept = next((kept for kept in self._kept if kept[0] == index), None)
+            return None if kept is None else self._image_captured(*kept)
         if number in (269, 270) and not self.config.stream_uri:
             return None
         maker = self._MAKERS.get(number)
@@ -246,9 +247,9 @@ class CameraComponent:
         c = self.config
         return dialect.MAVLink_video_stream_status_message(1, 1, c.stream_hz, *c.size_px, 0, 0, 0)
 
-    def _image_captured(self, index: int, k: KeyframeReport) -> object:
+    def _image_captured(self, index: int, boot_ms: int, k: KeyframeReport) -> object:
         return dialect.MAVLink_camera_image_captured_message(
-            self._boot_ms(),
+            boot_ms,
             max(0, k.unix_us),
             0,
             _scaled(k.lat_deg, 1e7),

@@ -9,12 +9,18 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import os
 
 M_ARENA_MAX = -8  # mallopt(3)
 
 
 def one_pool() -> bool:
-    """True when the C library keeps to one pool from now on; threads that run have theirs."""
+    """True when the C library keeps to one pool from now on; threads that run have theirs.
+
+    Before NumPy is imported: it would ask for huge pages (2 MiB) wherever a large array lay in
+    that pool, for whatever little comes there next.
+    """
+    os.environ.setdefault("NUMPY_MADVISE_HUGEPAGE", "0")
     libc = _libc("mallopt")
     return libc is not None and libc.mallopt(M_ARENA_MAX, 1) == 1
 
