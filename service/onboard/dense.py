@@ -89,7 +89,7 @@ class Dense:
         most = config.fusion.graph_keyframes
         self._aside = GraphAside(most_nodes=most) if aside else None
         self._ledger = None if pages is None else FileLedger(KEYFRAME, pages.parent)
-        graph = self._aside or PoseGraph(PoseGraphConfig(most_nodes=most))
+        graph = PoseGraph(PoseGraphConfig(most_nodes=most)) if self._aside is None else self._aside
         self.trajectory = Trajectory(graph=graph, ledger=self._ledger)
         self.lock = threading.Lock()
         self.stopwatch = Stopwatch()
