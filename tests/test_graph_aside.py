@@ -14,9 +14,12 @@ import pytest
 from flown_track import sensed
 
 from recon import se3
+from recon.backends.cpu import CpuBackend
 from recon.graph.pose_graph import PoseGraph
 from recon.graph.trajectory import Trajectory
 from recon.types import F64, PosePrior
+from service.config import Config
+from service.onboard.dense import Dense
 from service.onboard.graph_aside import GraphAside
 from service.onboard.graph_figures import graph_figures
 
@@ -70,6 +73,15 @@ def _same_in_one_process() -> PoseGraph:
     _close_loops(graph)
     graph.solve()
     return graph
+
+
+@pytest.mark.parametrize("is_live", [True, False])
+def test_a_live_flight_has_it_and_a_replay_has_not(is_live: bool) -> None:
+    dense = Dense(Config(), CpuBackend(), 0.05, aside=is_live)
+    try:
+        assert isinstance(dense.trajectory.graph, GraphAside if is_live else PoseGraph)
+    finally:
+        dense.close()
 
 
 def test_its_result_is_that_of_the_graph_itself(aside: GraphAside) -> None:
