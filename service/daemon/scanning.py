@@ -17,7 +17,7 @@ from mavlink.vehicle import VehicleLink
 from service.config import Config
 from service.daemon.closing import ClosingWatch, sizes
 from service.daemon.degradation import Level, lowered
-from service.daemon.memory import give_back
+from service.daemon.memory import fill_small_caches, give_back
 from service.daemon.warm_up import is_warm
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.onboard.datalink import DaemonLink
@@ -85,6 +85,7 @@ class Scanning:
             )
         self._camera = load_camera(Path(self.config.camera.model))
         self._backend = open_backend(self.config.compute, self._camera.size_px)
+        fill_small_caches()
         log.info("ready: backend %s", self._backend.name)
 
     # ---- what may be asked of it -----------------------------------------------------------
