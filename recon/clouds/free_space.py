@@ -52,13 +52,11 @@ def seen_through(cloud: PointCloud, views: Iterable[DepthMap]) -> Bool:
     """
     tiles = Tiles(cloud.xyz_m)
     sigma = np.ascontiguousarray(cloud.sigma_m[tiles.order], np.float32)
-    through, confirmed = np.zeros(len(sigma), np.int16), np.zeros(len(sigma), np.int16)
-    asked, is_decided = np.zeros(len(sigma), np.uint8), np.zeros(len(tiles), np.bool_)
+    seers, asked = np.zeros(len(sigma), np.int16), np.zeros(len(sigma), np.uint8)
     largest_m = float(sigma.max(initial=0.0))
     for depth in views:
         slack_m = AGREES_SIGMAS * (largest_m + float(np.nanmax(depth.sigma_m, initial=0.0)))
         reached = tiles.in_view(depth, slack_m)
-        reached = reached[~is_decided[reached]]
         if len(reached):
             _vote(
                 reached,
@@ -70,13 +68,12 @@ def seen_through(cloud: PointCloud, views: Iterable[DepthMap]) -> Bool:
                 np.ascontiguousarray(depth.views, np.uint8),
                 np.ascontiguousarray(depth.K, np.float64),
                 np.linalg.inv(depth.T_world_camera),
-                through,
-                confirmed,
+                seers,
                 asked,
-                is_decided,
+                tiles.is_decided,
             )
     out: Bool = np.zeros(len(cloud), np.bool_)
-    out[tiles.order] = through > confirmed
+    out[tiles.order] = seers < 0
     return out
 
 
@@ -91,10 +88,9 @@ def open_above(places_m: F64, heights_m: Sequence[float], views: Iterable[DepthM
         raise ValueError(f"give 1 to 8 heights, not {len(heights_m)}")
     tiles = Tiles(places_m)
     up = np.asarray(heights_m, np.float64)
-    seen, is_decided = np.zeros(len(places_m), np.uint8), np.zeros(len(tiles), np.bool_)
+    seen = np.zeros(len(places_m), np.uint8)
     for depth in views:
         reached = tiles.in_view(depth, up_m=float(up.max()))
-        reached = reached[~is_decided[reached]]
         if len(reached):
             _look_above(
                 reached,
@@ -106,7 +102,7 @@ def open_above(places_m: F64, heights_m: Sequence[float], views: Iterable[DepthM
                 np.ascontiguousarray(depth.K, np.float64),
                 np.linalg.inv(depth.T_world_camera),
                 seen,
-                is_decided,
+                tiles.is_decided,
             )
     out: Bool = np.zeros(len(places_m), np.bool_)
     out[tiles.order] = seen == (1 << len(up)) - 1
@@ -169,12 +165,12 @@ def _vote(
     views: U8,
     K: F64,
     T: F64,
-    through: I16,
-    confirmed: I16,
+    seers: I16,
     asked: U8,
     is_decided: Bool,
 ) -> None:
-    """Add one keyframe's votes on the points of ``tiles``; ``T`` is T_camera_world."""
+    """Add one keyframe's votes on the points of ``tiles`` to ``seers``, pairs that see less pairs
+    that see through; ``T`` is T_camera_world."""
     h, w = depth.shape
     for tile in tiles:
         left = 0
@@ -187,9 +183,7 @@ def _vote(
             if not (WINDOW_PX <= u < w - WINDOW_PX and WINDOW_PX <= v < h - WINDOW_PX):
                 continue
             asked[p] += 1
-            vote = _judgement(u, v, cz, float(sigma[p]), depth, depth_sigma, views)
-            through[p] += max(-vote, 0)
-            confirmed[p] += max(vote, 0)
+            seers[p] += _judgement(u, v, cz, float(sigma[p]), depth, depth_sigma, views)
         is_decided[tile] = left == 0
 
 

@@ -10,7 +10,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from recon.types import F32, F64, DepthMap
+from recon.types import F32, F64, Bool, DepthMap
 
 I64 = npt.NDArray[np.int64]
 U32 = npt.NDArray[np.uint32]
@@ -27,7 +27,8 @@ HALF = 1 << 15
 
 class Tiles:
     """``xyz_m`` (N, 3) float32 are the places in the order of their tiles, ``order`` (N,) where
-    they were; tile ``t`` holds those from ``first[t]`` to ``first[t + 1]``.
+    they were; tile ``t`` holds those from ``first[t]`` to ``first[t + 1]``. Who has no more to
+    ask about a tile sets ``is_decided[t]``.
     """
 
     def __init__(self, xyz_m: F32 | F64) -> None:
@@ -38,6 +39,7 @@ class Tiles:
         key = key[self.order]
         edges = np.flatnonzero(key[1:] != key[:-1]) + 1
         self.first: I64 = np.concatenate([[0], edges, [len(key)]]) if len(key) else np.zeros(1, int)
+        self.is_decided: Bool = np.zeros(len(self), np.bool_)
         low, high = self._ends(np.minimum), self._ends(np.maximum)
         self._middle, self._half = 0.5 * (low + high), 0.5 * (high - low)
 
@@ -52,8 +54,8 @@ class Tiles:
         return len(self.first) - 1
 
     def in_view(self, depth: DepthMap, slack_m: float = 0.0, up_m: float = 0.0) -> I64:
-        """(M,) tiles that may hold a place in the picture, no more than ``slack_m`` behind the
-        farthest surface in it; or one that is raised by up to ``up_m``.
+        """(M,) undecided tiles that may hold a place in the picture, no more than ``slack_m``
+        behind the farthest surface in it; or one that is raised by up to ``up_m``.
         """
         planes = _planes(depth, slack_m)
         if planes is None:
@@ -61,7 +63,7 @@ class Tiles:
         up = np.array([0.0, 0.0, 0.5 * up_m])
         middle, half = self._middle + up, self._half + up
         reach = middle @ planes[:, :3].T + half @ np.abs(planes[:, :3]).T + planes[:, 3]
-        return np.flatnonzero((reach >= 0.0).all(axis=1))
+        return np.flatnonzero((reach >= 0.0).all(axis=1) & ~self.is_decided)
 
 
 def _keys(xyz_m: F32 | F64) -> U32:

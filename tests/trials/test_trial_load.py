@@ -13,8 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from loopback import free_port
-from trial_autopilot import Autopilot
+from trial_autopilot import aircraft
 from trial_rig import (
     BACK_S,
     DEMO,
@@ -25,7 +24,6 @@ from trial_rig import (
     burn,
     small_model,
     stored,
-    stream_to,
 )
 
 from recon.backends.cpu import CpuBackend
@@ -38,7 +36,7 @@ from service.daemon.runtime import Daemon
 
 pytestmark = [pytest.mark.trial, pytest.mark.timeout(1800 if WHOLE else 280)]
 
-PICTURES = f"{DEMO}/frames/*.jpg"
+STREAMED = "640:480", f"-framerate 8 -pattern_type glob -i {DEMO}/frames/*.jpg"
 MOST_HOGS = 64
 """Per core, before it is said that nothing makes the service late."""
 
@@ -55,32 +53,12 @@ def hogs(processes: int) -> Iterator[None]:
             process.wait()
 
 
-@contextlib.contextmanager
-def aircraft(
-    folder: Path, start: str = "on-boot", compute: str = ""
-) -> Iterator[tuple[Service, Autopilot]]:
-    """The service with a camera that streams the demo's pictures, and an autopilot."""
-    port, link = free_port(), free_port()
-    autopilot = Autopilot(link, attitude=False)
-    autopilot.start()
-    sender = stream_to(port, "640:480", "-framerate 8 -pattern_type glob -i " + PICTURES)
-    camera, model = f"stream:udp://127.0.0.1:{port}", small_model(folder, 640)
-    more = f'[mavlink]\nlinks = ["udpin:127.0.0.1:{link}"]\n'
-    try:
-        with Service(folder, start, None, camera, model, more=more, compute=compute) as service:
-            yield service, autopilot
-    finally:
-        autopilot.ended.set()
-        sender.kill()
-        sender.wait()
-
-
 @pytest.mark.skipif(not WHOLE, reason="minutes: only in the whole trials")
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
 def test_lag_is_relieved_and_passes(tmp_path: Path, record: Row) -> None:
     """Real lag: processes that take the cores, more of them until the service is late."""
     steps: list[str] = []
-    with aircraft(tmp_path) as (service, autopilot):
+    with aircraft(tmp_path, STREAMED, small_model(tmp_path, 640)) as (service, autopilot, _):
 
         def step() -> str:
             name = str(service.get().get("load", {}).get("name", ""))
@@ -128,14 +106,15 @@ def test_lag_is_relieved_and_passes(tmp_path: Path, record: Row) -> None:
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
 def test_a_camera_is_there_again_after_landing_under_load(tmp_path: Path, record: Row) -> None:
     """Its reader is slow to end then, and must not keep the port from the next scan."""
-    longest_s, times = 0.0, 8
-    with aircraft(tmp_path, "on-arm", "relief = false\n") as (service, autopilot):
+    longest_s, times, others = 0.0, 8, 8 * (os.cpu_count() or 1)
+    model, calm = small_model(tmp_path, 640), "relief = false\n"
+    with aircraft(tmp_path, STREAMED, model, "on-arm", calm) as (service, autopilot, _):
         service.until_up()
         for _ in range(times):
             autopilot.armed.set()
             longest_s = max(longest_s, service.until(lambda: service.frames > 0, "take-off"))
             service.until(lambda: service.frames > 20, "frames")
-            with hogs(8 * (os.cpu_count() or 1)):
+            with hogs(others):
                 time.sleep(4.0)
                 autopilot.armed.clear()
                 service.until(lambda: service.get().get("state") == "idle", "landing")
@@ -144,7 +123,7 @@ def test_a_camera_is_there_again_after_landing_under_load(tmp_path: Path, record
         assert service.stop() == 0
     lost = acknowledged - stored(service.scans)
     record(
-        f"landing while {8 * (os.cpu_count() or 1)} processes take the cores, then taking off",
+        f"landing while {others} processes take the cores, then taking off",
         times,
         "a new scan each time",
         f"{len(lost)} of {len(acknowledged)} chunks",

@@ -24,10 +24,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from loopback import free_port
 from scipy.stats import theilslopes
-from trial_autopilot import Autopilot
-from trial_rig import PATIENCE_S, WHOLE, Chunk, Row, Service, stored, stream_to
+from trial_autopilot import Autopilot, aircraft
+from trial_rig import PATIENCE_S, WHOLE, Chunk, Row, Service, stored
 
 pytestmark = [pytest.mark.trial, pytest.mark.timeout(9000 if WHOLE else 280)]
 
@@ -243,19 +242,9 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
     if WHOLE:  # as the installer does: who compiles keeps the compiler's memory
         warm_up = [sys.executable, "-m", "service.cli", "warm-up"]
         subprocess.run(warm_up, check=True, capture_output=True, timeout=900)
-    port, link = free_port(), free_port()
-    autopilot = Autopilot(link, attitude=False)
-    autopilot.start()
-    sender = stream_to(port, "480:270", f"-i {video}")
-    more = f'{LOOPS}[mavlink]\nlinks = ["udpin:127.0.0.1:{link}"]\n'
-    camera = f"stream:udp://127.0.0.1:{port}"
-    try:
-        with Service(tmp_path, "on-arm", None, camera, model, more=more, compute=MAP) as service:
-            yield Bench(service, autopilot, sender, tmp_path)
-    finally:
-        autopilot.ended.set()
-        sender.kill()
-        sender.wait()
+    streamed = "480:270", f"-i {video}"
+    with aircraft(tmp_path, streamed, model, "on-arm", MAP, LOOPS) as (service, autopilot, sender):
+        yield Bench(service, autopilot, sender, tmp_path)
 
 
 @needs_ffmpeg

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import subprocess
 import threading
 import time
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
+from loopback import free_port
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
+from trial_rig import Service, stream_to
 
 ARMED, CUSTOM = 128, 1
 
@@ -51,3 +56,27 @@ class Autopilot(threading.Thread):
                 for message in link.parse_buffer(port.recv(4096)) or []:
                     if message.get_type() == "STATUSTEXT":
                         self.texts.append(message.text)
+
+
+@contextlib.contextmanager
+def aircraft(
+    folder: Path, streamed: tuple[str, str], model: Path, start: str = "on-boot",
+    compute: str = "", more: str = "",
+) -> Iterator[tuple[Service, Autopilot, subprocess.Popen[bytes]]]:  # fmt: skip
+    """The service, an autopilot that only beats and arms, and the camera: FFmpeg.
+
+    ``streamed`` is the pictures' size and source, as :func:`trial_rig.stream_to` takes them.
+    """
+    port, link = free_port(), free_port()
+    autopilot = Autopilot(link, attitude=False)
+    autopilot.start()
+    sender = stream_to(port, *streamed)
+    camera = f"stream:udp://127.0.0.1:{port}"
+    more += f'[mavlink]\nlinks = ["udpin:127.0.0.1:{link}"]\n'
+    try:
+        with Service(folder, start, None, camera, model, more=more, compute=compute) as service:
+            yield service, autopilot, sender
+    finally:
+        autopilot.ended.set()
+        sender.kill()
+        sender.wait()
