@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -91,20 +92,37 @@ class Sample:
     keyframes: int  # in flight clouds, of which a keyframe has some
     budgets: tuple[int, ...]  # voxels in memory, tiles on disk, views for loops, nodes
     graph_mib: float = 0.0  # of that memory, the pose graph's process
+    own_mib: float = 0.0  # of that memory, what is in no file
     still: bool = False  # nothing came from the camera
 
 
-def held(pid: int) -> tuple[float, int, float]:
-    """(MiB resident, open files) of a process and its children, and (MiB) of these alone."""
-    text = Path(f"/proc/{pid}/status").read_text()
-    rows = [line.split() for line in text.splitlines() if line.startswith("VmRSS:")]
-    mib, files, below = float(rows[0][1]) / 1024.0, len(os.listdir(f"/proc/{pid}/fd")), 0.0
+class Held(NamedTuple):
+    """What a process and its children hold. Of the resident memory, ``below_mib`` is that of the
+    children; ``own_mib`` leaves out pages of files (libraries), which the kernel takes away and
+    reads again as it likes.
+    """
+
+    mib: float
+    own_mib: float
+    below_mib: float
+    files: int
+
+
+def held(pid: int) -> Held:
+    """What it holds now."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    kib = {line.split(":")[0]: float(line.split()[1]) for line in lines if line.endswith(" kB")}
+    children: list[Held] = []
     for thread in Path(f"/proc/{pid}/task").iterdir():
-        with contextlib.suppress(OSError, IndexError):  # the thread or the child has ended
-            for child in (thread / "children").read_text().split():
-                more = held(int(child))
-                below, files = below + more[0], files + more[1]
-    return mib + below, files, below
+        with contextlib.suppress(OSError, KeyError):  # the thread or the child has ended
+            children += [held(int(child)) for child in (thread / "children").read_text().split()]
+    below = sum(child.mib for child in children)
+    return Held(
+        kib["VmRSS"] / 1024.0 + below,
+        (kib["RssAnon"] + kib["RssShmem"]) / 1024.0 + sum(child.own_mib for child in children),
+        below,
+        len(os.listdir(f"/proc/{pid}/fd")) + sum(child.files for child in children),
+    )
 
 
 def flown(
@@ -127,11 +145,12 @@ def flown(
             camera.send_signal(signal.SIGSTOP)
             time.sleep(STILL_S)
         status = service.get()
-        mib, files, graph = held(service.process.pid)
+        now = held(service.process.pid)
         hours = (time.monotonic() - begin_s) / 3600.0
         frames, clouds, *budgets = (int(status.get(name, 0)) for name in COUNTS)
-        counts = (files, frames, clouds, tuple(budgets))
-        out.append(Sample(number, aloft_s, hours, mib, *counts, graph, is_still))
+        counts = (now.files, frames, clouds, tuple(budgets))
+        memory = (now.below_mib, now.own_mib)
+        out.append(Sample(number, aloft_s, hours, now.mib, *counts, *memory, is_still))
         if camera is not None and is_still:
             camera.send_signal(signal.SIGCONT)
         assert service.process.poll() is None
@@ -141,13 +160,13 @@ def flown(
     limit_s = max(PATIENCE_S, long_s)  # closing a long scan takes minutes beside other work
     service.until(lambda: service.get().get("state") == "idle", "landing", limit_s)
     time.sleep(5.0)  # until what the scan held is given back
-    mib, files, _ = held(service.process.pid)
+    now = held(service.process.pid)
     hours = (time.monotonic() - begin_s) / 3600.0
     (folder,) = set(service.scans.glob("*")) - scans
     assert (folder / "cloud.laz").is_file()
     keyframes = int(json.loads((folder / "scan.json").read_text())["counts"]["keyframes"])
-    landed = replace(out[-1], aloft_s=LANDED, hours=hours, memory_mib=mib, files=files)
-    return [*out, replace(landed, keyframes=keyframes)]
+    landed = replace(out[-1], aloft_s=LANDED, hours=hours, keyframes=keyframes, files=now.files)
+    return [*out, replace(landed, memory_mib=now.mib, own_mib=now.own_mib)]
 
 
 def slope_mib_per_h(samples: list[Sample]) -> float:
@@ -168,11 +187,11 @@ Slope = tuple[float, float, float]
 """MiB/h and the ends of its interval of 90 %."""
 
 
-def slope_at_rest(samples: list[Sample]) -> Slope:
-    """MiB/h after the landings by Theil and Sen, and the ends of its interval of 90 %."""
+def slope_at_rest(samples: list[Sample], memory: Callable[[Sample], float]) -> Slope:
+    """MiB/h of ``memory`` after the landings by Theil and Sen, and the ends of its interval of
+    90 %."""
     rest = [s for s in samples if s.aloft_s == LANDED]
-    x, y = [s.hours for s in rest], [s.memory_mib for s in rest]
-    found = theilslopes(y, x, 0.9)
+    found = theilslopes([memory(s) for s in rest], [s.hours for s in rest], 0.9)
     return float(found[0]), float(found[2]), float(found[3])
 
 
@@ -267,7 +286,8 @@ def tell_flights(samples: list[Sample], record: Row, lost: str) -> bool:
     warm = max(1, round(WARM_SHARE * FLIGHTS)) if FLIGHTS > 2 else 0
     late = [s for s in samples if s.flight >= warm]
     slope, files = slope_mib_per_h([s for s in late if s.aloft_s != LANDED]), late[-1].files
-    rest = slope_at_rest(late)
+    rest = slope_at_rest(late, lambda s: s.memory_mib)
+    own = slope_at_rest(late, lambda s: s.own_mib)
     ends = [[s for s in samples if s.flight == n][-1] for n in range(FLIGHTS)]
     growth = files - ends[warm].files
     voxels, tiles, views, nodes = (
@@ -279,7 +299,8 @@ def tell_flights(samples: list[Sample], record: Row, lost: str) -> bool:
         FLIGHTS,
         f"of {SHORT_S:.0f} s each, {sum(e.frames for e in ends)} frames, "
         f"{sum(e.keyframes for e in ends)} keyframes; after "
-        f"the first {warm} flights: at rest {ends[-1].memory_mib:.0f} MiB, slope {in_words(rest)}; "
+        f"the first {warm} flights: at rest {ends[-1].memory_mib:.0f} MiB, slope {in_words(rest)}, "
+        f"without pages of files {ends[-1].own_mib:.0f} MiB, slope {in_words(own)}; "
         f"aloft up to {aloft:.0f} MiB, slope {slope:+.1f} "
         f"MiB/h; within a flight {kib_per_keyframe(late):+.1f} KiB a keyframe, the map at {voxels} "
         f"voxels and {tiles} tiles on disk, {views} views for loops, {nodes} keyframes in the pose "
