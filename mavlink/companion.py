@@ -33,16 +33,18 @@ from mavlink.status import ComputerLoad, StatusTexts, computer_status, motion_va
 from mavlink.streams import Streams
 from mavlink.telemetry import TelemetryDecoder
 from mavlink.timesync import TimesyncFilter
+from mavlink.wall_time import WallTime
 from mavlink.wire import COMMAND_CANCEL, dialect, numbers_of
 
 S = 1_000_000_000
 MS = 1_000_000
 COMPONENTS = (ONBOARD, CAMERA)
-HEARTBEAT, FILE_TRANSFER, TIMESYNC = 0, 110, 111
+HEARTBEAT, SYSTEM_TIME, FILE_TRANSFER, TIMESYNC = 0, 2, 110, 111
 LOAD_STATUS, MOTION = 390, 251
 LOST_NS = 5 * S
 SERVED = (
     "HEARTBEAT",
+    "SYSTEM_TIME",
     "COMMAND_LONG",
     "COMMAND_INT",
     "FILE_TRANSFER_PROTOCOL",
@@ -94,7 +96,7 @@ class Companion:
         self._outbox = Outbox()
         self._decoder, self._telemetry = Decoder(), TelemetryDecoder(READERS)
         self._clocks: dict[int, BootClock] = {}  # component of our system to its boot clock
-        self.timesync = TimesyncFilter()
+        self.timesync, self.wall_time = TimesyncFilter(), WallTime()
         self.rates = RateKeeper(config.wanted_hz)
         self.streams = Streams(self._outbox)
         self.texts = StatusTexts(self._outbox)
@@ -145,6 +147,8 @@ class Companion:
             self._hear_command(message, link, now_ns)
         elif name.startswith("PARAM_"):
             self._hear_parameter(message, name)
+        elif packet.message_id == SYSTEM_TIME:
+            self._hear_system_time(message, packet, now_ns)
         elif packet.message_id == FILE_TRANSFER:
             self._hear_file_request(message, link)
         elif packet.message_id == TIMESYNC:
@@ -237,6 +241,11 @@ class Companion:
     def _set_yaw_frame(self, value: float) -> None:
         gimbal = replace(self.history.config.gimbal, yaw_frame=YAW_FRAMES[round(value)])
         self.history.set_gimbal(gimbal)
+
+    def _hear_system_time(self, message: Any, packet: Packet, now_ns: int) -> None:
+        if (packet.system, packet.component) == self.presence.autopilot:
+            self.rates.heard("SYSTEM_TIME")
+            self.wall_time.hear(message.time_unix_usec, now_ns)
 
     def _hear_timesync(self, message: Any, packet: Packet, link: int, now_ns: int) -> None:
         if message.tc1 == 0:  # a question; we answer with our own time since boot

@@ -20,6 +20,7 @@ WANTED_HZ: Mapping[str, float] = {
     "DISTANCE_SENSOR": 10.0,
     "GPS_RAW_INT": 2.0,
     "TERRAIN_REPORT": 2.0,
+    "SYSTEM_TIME": 1.0,
 }
 NUMBERS = {kind.msgname: number for number, kind in dialect.mavlink_map.items()}
 LOOK_NS = 10 * S

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from pathlib import Path
 from typing import BinaryIO
 
@@ -20,17 +19,17 @@ class Recorder:
         self._unix_minus_monotonic_ns = 0
         self.packets = 0
 
-    def open(self, path: Path) -> None:
+    def open(self, path: Path, unix_offset_ns: int) -> None:
         """Start a log (OSError when it cannot be made); one that is open is closed first.
 
-        The stamps are unix time as it was at this moment, carried on by the monotonic clock,
-        so that setting the clock in flight does not tear the log.
+        The stamps are the monotonic clock's times with ``unix_offset_ns`` added, so that setting
+        the clock in flight does not tear the log.
         """
         file = path.open("ab")
         with self._lock:
             self._close()
             self._file = file
-            self._unix_minus_monotonic_ns = time.time_ns() - time.monotonic_ns()
+            self._unix_minus_monotonic_ns = unix_offset_ns
 
     def close(self) -> None:
         """End the log, if one is open."""

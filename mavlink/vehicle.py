@@ -39,6 +39,7 @@ from mavlink.presence import Health, Presence, PresenceConfig
 from mavlink.recorder import Recorder
 from mavlink.signing import Signing, read_key
 from mavlink.status import ComputerLoad
+from mavlink.wall_time import computer_offset_ns
 from mavlink.wire import dialect, numbers_of
 
 log = logging.getLogger(__name__)
@@ -124,7 +125,7 @@ class VehicleLink:
             self.history,
             now_ns,
             self._memory.parameters,
-            lambda: time.time_ns() // 1000,
+            lambda: (time.monotonic_ns() + self.unix_offset_ns()) // 1000,
         )
         self._inbox: Inbox[tuple[int, Packet, int]] = Inbox(BACKLOG)
         self._heard = set(HEARD)  # numbers of messages; nothing is done with others
@@ -220,12 +221,19 @@ class VehicleLink:
         """Let these hold, as the configuration says by now, and tell ground stations."""
         self._do(lambda: self._companion.parameters.adopt(values))
 
-    def record(self, path: Path | None) -> None:
-        """Keep a .tlog of all links in a file from now on; None ends it."""
+    def record(self, path: Path | None, unix_offset_ns: int | None = None) -> None:
+        """Keep a .tlog of all links in a file from now on, stamped with the monotonic clock plus
+        ``unix_offset_ns`` (None: :meth:`unix_offset_ns`); a path of None ends it."""
         if path is None:
             self.recorder.close()
         else:
-            self.recorder.open(path)
+            offset_ns = self.unix_offset_ns() if unix_offset_ns is None else unix_offset_ns
+            self.recorder.open(path, offset_ns)
+
+    def unix_offset_ns(self) -> int:
+        """Unix time less our monotonic clock: this computer's, or the autopilot's where the two
+        clocks do not agree."""
+        return self._companion.wall_time.correct(computer_offset_ns())
 
     def boot_time_us(self, time_ns: int) -> int | None:
         """The autopilot's boot clock in us at one of our monotonic times; None when unknown."""

@@ -127,6 +127,46 @@ def test_systemd_is_asked_to_wait_only_while_closing_gets_on(
     hung.store.close()
 
 
+def test_an_arming_while_the_last_scan_is_closed_is_followed_then(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = [f"scan.folder={tmp_path}", "scan.start=on-arm", "health.http="]
+    daemon, told = Daemon(load_config(None, given)), []
+    scanning, hung = daemon.scanning, Hung(daemon.scanning, tmp_path)
+    monkeypatch.setattr(scanning, "_scan_once", hung.scan_once)
+    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, _: told.append(text))
+    daemon.actions.is_ready = True
+    armed, was = False, False
+
+    def look(arming: bool) -> bool:
+        nonlocal armed, was
+        armed = arming
+        was = daemon._follow_arming(was)
+        return was
+
+    monkeypatch.setattr(type(daemon.vehicle.presence), "is_armed", property(lambda _: armed))
+    assert look(True)
+    until(lambda: scanning.scan is not None)
+    assert not look(False)
+    assert scanning.is_closing
+    for _ in range(3):
+        assert not look(True)  # waits
+    assert told == ["Armed: scanning once the last scan is closed"]
+    hung.step.set()
+    hung.end.set()
+    until(lambda: not scanning.is_running)
+    hung.end.clear()
+    assert look(True)
+    until(lambda: scanning.is_running and scanning.phase is Phase.SCANNING)
+    daemon.actions.stop_scan()  # by command, in the air
+    assert look(True)
+    hung.end.set()
+    until(lambda: not scanning.is_running)
+    assert look(True)
+    assert not scanning.is_running  # the operator's stop holds until the next take-off
+    hung.store.close()
+
+
 class _Mallinfo(ctypes.Structure):
     """mallinfo2(3)."""
 

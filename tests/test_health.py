@@ -24,11 +24,10 @@ from service.daemon.health_api import STATUS
 from service.daemon.machine import CoreLoad, Machine, computer_load, read_machine
 from service.daemon.runtime import Daemon
 from service.errors import InputError, OutsideError
+from service.scans.claim import Claim
 from service.scans.retention import close_open_scans, make_room
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
-
-FAR_FUTURE_S = 4e9
 
 
 def fetch(port: int, path: str) -> tuple[int, str]:
@@ -324,8 +323,8 @@ def test_open_scans_are_closed_after_a_crash(tmp_path: Path) -> None:
     half = scan(tmp_path, "20260103T000000Z", finished=True)  # killed before its files were there
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "scan.db").write_bytes(b"no database")
-    assert close_open_scans(tmp_path, before_unix_s=0.0) == []  # written since: in use
-    assert close_open_scans(tmp_path, FAR_FUTURE_S) == [left.name, half.name]
+    assert close_open_scans(tmp_path, {left.name, half.name}) == []  # in the making
+    assert close_open_scans(tmp_path, ()) == [left.name, half.name]
     with ScanStore.open(left / "scan.db") as store:
         assert store.finished
         assert store.summary == {"interrupted": True}
@@ -334,7 +333,32 @@ def test_open_scans_are_closed_after_a_crash(tmp_path: Path) -> None:
     with ScanStore.open(half / "scan.db") as store:
         assert store.summary == {"frames": 1}
     assert (half / "cloud.laz").is_file()
-    assert close_open_scans(tmp_path, FAR_FUTURE_S) == []
+    assert close_open_scans(tmp_path, ()) == []
+
+
+def test_a_scan_left_open_is_found_whatever_the_clock_says(tmp_path: Path) -> None:
+    left = scan(tmp_path, "20990101T000000Z", finished=False)
+    os.utime(left / "scan.db", (4e9, 4e9))  # the clock is behind that since the power cut
+    assert close_open_scans(tmp_path, ()) == [left.name]
+
+
+def test_a_second_service_leaves_the_scans_of_the_first_alone(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    running = scan(tmp_path, "20260101T000000Z", finished=False)
+    first, second = Claim(), Daemon(load_config(None, [f"scan.folder={tmp_path}"]))
+    assert first.take(tmp_path)
+    assert not Claim().take(tmp_path)
+    second._recover()
+    assert "another service" in caplog.text
+    with ScanStore.open(running / "scan.db") as store:
+        assert not store.finished
+    first.give_up()
+    second._recover()
+    with ScanStore.open(running / "scan.db") as store:
+        assert store.finished
+    assert Claim().take(tmp_path / "new") and (tmp_path / "new").is_dir()
+    assert Claim().take(Path("/proc/no-such-place"))  # nobody makes scans there
 
 
 class Usage(NamedTuple):

@@ -20,6 +20,7 @@ from mavlink.framing import Framer
 from mavlink.recorder import Recorder
 from mavlink.rehearsal import RehearsalVehicle
 from mavlink.signing import timestamp_of
+from mavlink.wall_time import computer_offset_ns
 from mavlink.wire import dialect
 
 REPEATS = 20
@@ -213,7 +214,7 @@ def test_steps_of_the_clock_tear_neither_the_log_nor_the_telemetry(
     peer: Peer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recorder, now = Recorder(), time.time_ns()
-    recorder.open(tmp_path / "link.tlog")
+    recorder.open(tmp_path / "link.tlog", computer_offset_ns())
     recorder.write(b"a" * 12, time.monotonic_ns())
     peer.works()
     peer.beat(1)

@@ -124,7 +124,7 @@ def test_a_full_disk_ends_the_log_and_nothing_else(caplog: pytest.LogCaptureFixt
     if not full.exists():
         pytest.skip("no /dev/full here")
     recorder = Recorder()
-    recorder.open(full)
+    recorder.open(full, 0)
     for k in range(3000):
         recorder.write(bytes(40), k)
     recorder.close()

@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mavlink.wall_time import EARLIEST_UNIX_S
 from service.compute.threading_layer import REMEDY, kernels_may_overlap
 from service.config import Config
 from service.daemon.running import running_service
@@ -30,7 +31,6 @@ WARM_UP = (
     "sudo -u skyrelief env NUMBA_CACHE_DIR=/var/cache/skyrelief "
     "/opt/skyrelief/current/bin/skyrelief warm-up"
 )
-EARLIEST_UNIX_S = 1_735_689_600  # 2025-01-01: a clock before this was never set
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +135,8 @@ def _to_fly(config: Config) -> Iterator[Finding]:
 def _clock() -> Iterator[Finding]:
     text = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
     if time.time() < EARLIEST_UNIX_S:
-        yield Finding("clock", NOTE, f"{text} was never set; scans get wrong names and times")
+        hint = "was never set; scans get wrong names and times until the autopilot tells the time"
+        yield Finding("clock", NOTE, f"{text} {hint}")
     else:
         yield Finding("clock", GOOD, text)
 

@@ -17,7 +17,7 @@ from typing import Any
 from mavlink.control import Phase
 from mavlink.first_beat import FirstBeats
 from mavlink.presence import Health
-from mavlink.status import CRITICAL
+from mavlink.status import CRITICAL, WARNING
 from mavlink.vehicle import VehicleLink
 from service.compute.threading_layer import kernels_may_overlap
 from service.config import Config, reload
@@ -30,6 +30,7 @@ from service.daemon.scanning import Scanning
 from service.daemon.tuning import TUNABLES, parameters_of
 from service.daemon.vehicle_config import vehicle_config
 from service.errors import InputError, OutsideError, SkyreliefError
+from service.scans.claim import Claim
 from service.scans.retention import close_open_scans, make_room
 from service.version import software
 
@@ -62,10 +63,11 @@ class Daemon:
     ) -> None:
         """``first`` speaks on the MAVLink links already. With a ``fault`` of the configuration
         all that is done is to tell of it."""
-        self._started_s = time.time()
         self._wanted = config  # as it was asked for last; operators may have tuned it since
         self._quit = threading.Event()
         self._fault = fault
+        self._claim = Claim()
+        self._waits = False  # armed while the last scan is being closed
         self.scanning = Scanning(config)
         self.load_control = LoadControl(self.scanning)
         self.actions = ControlActions(self.scanning, self.quit)
@@ -101,6 +103,7 @@ class Daemon:
             self.vehicle.stop()
             if http is not None:
                 http.close()
+            self._claim.give_up()
 
     def _load(self, notifier: Notifier) -> None:
         """The heavy part of the start. Where the init system starts us again after a fault, the
@@ -212,7 +215,11 @@ class Daemon:
 
     def _recover(self) -> None:
         """Close what a crash or a power cut left open; then offer what the ground lacks."""
-        close_open_scans(Path(self.config.scan.folder), self._started_s)
+        folder = Path(self.config.scan.folder)
+        if self._claim.take(folder):
+            close_open_scans(folder, self.scanning.made)
+        else:
+            log.warning("%s: another service scans to it; open scans are left alone", folder)
         self.scanning.offer_backlog()
 
     def _tidy(self) -> None:
@@ -220,12 +227,15 @@ class Daemon:
         folder = Path(self.config.scan.folder)
         cores = CoreLoad()
         while not self._quit.wait(TIDY_S):
-            keep_free_mib = self.config.scan.keep_free_mib
-            machine = read_machine(folder)
-            self.vehicle.set_load(computer_load(machine, cores.percent(), keep_free_mib))
-            self.load_control.look(machine)
-            make_room(folder, keep_free_mib, self.scanning.scan_id)
-            give_back()
+            try:
+                keep_free_mib = self.config.scan.keep_free_mib
+                machine = read_machine(folder)
+                self.vehicle.set_load(computer_load(machine, cores.percent(), keep_free_mib))
+                self.load_control.look(machine)
+                make_room(folder, keep_free_mib, self.scanning.scan_id)
+                give_back()
+            except Exception:  # a disk that fails must not end the watch over all the rest
+                log.exception("a fault while looking after the machine")
 
     def _health(self) -> Health:
         if self.scanning.fault:
@@ -240,10 +250,17 @@ class Daemon:
         return Health.ACTIVE if self.scanning.phase is not Phase.IDLE else Health.STANDBY
 
     def _follow_arming(self, was_armed: bool) -> bool:
+        """The arming that was followed; one that finds the last scan being closed has to wait."""
         is_armed = self.vehicle.report().is_armed
-        if self.config.scan.start == "on-arm" and is_armed != was_armed:
-            if is_armed:
-                self.actions.start_scan()
-            else:
-                self.actions.stop_scan()
+        if self.config.scan.start != "on-arm" or is_armed == was_armed:
+            self._waits = False
+        elif not is_armed:
+            self.actions.stop_scan()
+        elif self.scanning.is_closing:
+            if not self._waits:
+                self.vehicle.statustext("Armed: scanning once the last scan is closed", WARNING)
+            self._waits = True
+            return was_armed
+        else:
+            self.actions.start_scan()
         return is_armed

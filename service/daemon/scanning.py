@@ -18,6 +18,7 @@ from service.config import Config
 from service.daemon.closing import ClosingWatch, sizes
 from service.daemon.degradation import Level, lowered
 from service.daemon.memory import fill_small_caches, give_back
+from service.daemon.scan_time import disagreement, set_since
 from service.daemon.warm_up import is_warm
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.onboard.datalink import DaemonLink
@@ -71,6 +72,7 @@ class Scanning:
         self._retry_s = FIRST_RETRY_S
         self._latency_ms: float | None = None  # of the camera, as the last scan found it
         self.link = DaemonLink()
+        self.made: set[str] = set()  # names of the scans of this process
 
     def load(self) -> None:
         """The heavy part of the start: camera model and backend; InputError without them."""
@@ -163,10 +165,11 @@ class Scanning:
 
         To be asked often: progress is what has changed since it was asked last.
         """
-        return self._watch.look(self._closing_marks() if self._is_closing else None)
+        return self._watch.look(self._closing_marks() if self.is_closing else None)
 
     @property
-    def _is_closing(self) -> bool:
+    def is_closing(self) -> bool:
+        """True from the end of a scan until its files are written."""
         return self.is_running and (self._stop.is_set() or self.phase is Phase.FINALISING)
 
     def _closing_marks(self) -> tuple[Any, ...]:
@@ -253,17 +256,24 @@ class Scanning:
 
     def _scan_once(self) -> None:
         """Open the camera, scan until stopped or the recording ends, close the scan."""
+        source = self._open_camera()
+        if source is not None:
+            try:
+                self._scan(source)
+            finally:
+                source.close()
+
+    def _scan(self, source: CameraSource) -> None:
         from service.daemon.frame_gate import FrameGate
         from service.onboard.scan import Scan, ScanInputs, create_store
         from service.scans.folder import write_deliverables
 
         assert self._camera is not None and self._backend is not None
-        source = self._open_camera()
-        if source is None:
-            return
-        scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        zero_ns, offset = _zero_ns(source), self.vehicle.unix_offset_ns()
+        unix_s = 1e-9 * (time.monotonic_ns() + offset)
+        scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(unix_s))
         folder = Path(self.config.scan.folder) / scan_id
-        zero_ns, offset = _zero_ns(source), time.time_ns() - time.monotonic_ns()
+        self.made.add(scan_id)
         gate = FrameGate(source, folder / LATER, zero_ns + offset, self._alive, self._paused)
         inputs = ScanInputs(
             gate,
@@ -282,7 +292,8 @@ class Scanning:
             on_keyframe=self._on_keyframe,
         )
         store = create_store(inputs)
-        self.vehicle.record(folder / "link.tlog")
+        self._tell_of_clock(gate, offset)
+        self.vehicle.record(folder / "link.tlog", offset)
         self.link.take_off(store, self.config, self.vehicle)
         self.scan, self.gate, self._store = Scan(inputs, store), gate, store
         self.set_level(self.level)
@@ -294,11 +305,18 @@ class Scanning:
             self.phase = Phase.FINALISING
             self.vehicle.record(None)
             try:
+                gate.warnings += set_since(offset, self.vehicle.unix_offset_ns())
                 self._close_scan(self.scan, store)
             finally:
                 write_deliverables(folder, store, {})
                 self.link.land(self.config)
                 store.close()
+
+    def _tell_of_clock(self, gate: FrameGate, offset_ns: int) -> None:
+        """Say that the scan has the autopilot's time instead of this computer's."""
+        for text in disagreement(offset_ns):
+            gate.warnings.append(text)
+            self.vehicle.statustext(text, WARNING)
 
     def _odometry_report(self) -> Callable[[Step, VehicleState | None, int], None] | None:
         """What tells the autopilot how it moves, where that is wanted."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 import sqlite3
+from collections.abc import Container
 from pathlib import Path
 
 from service.errors import SkyreliefError
@@ -17,20 +18,20 @@ PAGES = "map-pages"
 """Folder of the map inside a scan's folder; gone when the scan is closed."""
 
 
-def close_open_scans(folder: Path, before_unix_s: float) -> list[str]:
+def close_open_scans(folder: Path, ours: Container[str]) -> list[str]:
     """Finish the scans in ``folder`` that a crash or a power cut left open; their names.
 
-    Only stores that were not written since ``before_unix_s`` are touched. What they hold is
-    kept and their files are written, with ``interrupted`` in the summary. One that cannot be
-    read is left as it is, with a warning.
+    Those called as in ``ours`` are left alone: they are being made. No clock is asked, which a
+    power cut may have set back. What the scans hold is kept and their files are written, with
+    ``interrupted`` in the summary. One that cannot be read is left as it is, with a warning.
     """
     from service.scans.folder import SUMMARY, write_deliverables
     from service.stream.store import ScanStore
 
     closed = []
     for path in sorted(folder.glob("*/scan.db")):
-        if _written_unix_s(path) >= before_unix_s:
-            continue  # the scan that is being made
+        if path.parent.name in ours:
+            continue
         try:
             with ScanStore.open(path) as store:
                 if store.finished and (path.parent / SUMMARY).is_file():  # its last file
@@ -45,12 +46,6 @@ def close_open_scans(folder: Path, before_unix_s: float) -> list[str]:
         closed.append(path.parent.name)
         log.info("%s was left open; it is closed and kept", path.parent)
     return closed
-
-
-def _written_unix_s(path: Path) -> float:
-    """When the store at ``path`` was last written, its write-ahead log included."""
-    files = [path, path.with_name(path.name + "-wal")]
-    return max(file.stat().st_mtime for file in files if file.exists())
 
 
 def make_room(folder: Path, keep_free_mib: float, keep: str = "") -> list[str]:

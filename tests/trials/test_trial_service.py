@@ -215,6 +215,39 @@ time.time_ns = lambda: _time_ns() + int(_offset() * 1e9)
 """
 
 
+def test_clock_set_back_by_a_power_cut(tmp_path: Path, record: Row) -> None:
+    """The scan that lies open seems to be written in the future; the autopilot knows the time."""
+    with Service(tmp_path) as service:
+        service.until(lambda: stored(service.scans), "a chunk")
+        acknowledged = stored(service.scans)
+    (before,) = service.scans.iterdir()
+    (tmp_path / "clock").write_text("-2592000")
+    environment = with_site(tmp_path, CLOCK) | {"TRIAL_CLOCK": str(tmp_path / "clock")}
+    link = free_port()
+    autopilot, more = Autopilot(link), f'[mavlink]\nlinks = ["udpin:127.0.0.1:{link}"]\n'
+    autopilot.start()
+    with Service(tmp_path, environment=environment, more=more) as again:
+        back_s = again.until(lambda: again.frames > 0, "frames")
+        again.until((before / "scan.json").is_file, "the files of the scan that lay open")
+        assert again.stop() == 0
+    autopilot.ended.set()
+    (after,) = set(again.scans.iterdir()) - {before}
+    lost = acknowledged - stored(again.scans)
+    record(
+        "power cut that sets the clock back by a month",
+        1,
+        "the scan is closed, kept; the next has the autopilot's time",
+        f"{len(lost)} of {len(acknowledged)} chunks",
+        back_s,
+    )
+    assert not lost
+    assert json.loads((before / "scan.json").read_text())["finished"] is True
+    assert after.name > before.name
+    summary = json.loads((after / "scan.json").read_text())
+    assert "autopilot's" in json.dumps(summary)
+    assert any("clock is 30 days behind" in text for text in autopilot.texts)
+
+
 def test_wall_clock_steps(tmp_path: Path, record: Row) -> None:
     steps = [3600.0, -86400.0, 8e8] if WHOLE else [3600.0, -86400.0]
     clock = tmp_path / "clock"

@@ -1,4 +1,4 @@
-"""An autopilot for the trials: heartbeats, attitude, arming; it hears the status texts."""
+"""An autopilot for the trials: heartbeats, time, attitude, arming; it hears the status texts."""
 
 from __future__ import annotations
 
@@ -44,9 +44,12 @@ class Autopilot(threading.Thread):
 
     def _due(self) -> list[Any]:
         mode = CUSTOM | (ARMED if self.armed.is_set() else 0)
-        out = [dialect.MAVLink_heartbeat_message(2, 3, mode, 0, 4, 3)]
+        boot_ms = int(1e3 * (time.monotonic() - self.boot_s))
+        out = [
+            dialect.MAVLink_heartbeat_message(2, 3, mode, 0, 4, 3),
+            dialect.MAVLink_system_time_message(int(1e6 * time.time()), boot_ms),
+        ]
         if self.attitude:
-            boot_ms = int(1e3 * (time.monotonic() - self.boot_s))
             out.append(dialect.MAVLink_attitude_message(boot_ms, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0))
         return out
 
