@@ -30,7 +30,6 @@ from service.daemon.scanning import Scanning
 from service.daemon.tuning import TUNABLES, parameters_of
 from service.daemon.vehicle_config import vehicle_config
 from service.errors import InputError, OutsideError, SkyreliefError
-from service.scans.claim import Claim
 from service.scans.retention import close_open_scans, make_room
 from service.version import software
 
@@ -66,7 +65,6 @@ class Daemon:
         self._wanted = config  # as it was asked for last; operators may have tuned it since
         self._quit = threading.Event()
         self._fault = fault
-        self._claim = Claim()
         self._waits = False  # armed while the last scan is being closed
         self.scanning = Scanning(config)
         self.load_control = LoadControl(self.scanning)
@@ -103,7 +101,7 @@ class Daemon:
             self.vehicle.stop()
             if http is not None:
                 http.close()
-            self._claim.give_up()
+            self.scanning.claim.give_up()
 
     def _load(self, notifier: Notifier) -> None:
         """The heavy part of the start. Where the init system starts us again after a fault, the
@@ -216,10 +214,10 @@ class Daemon:
     def _recover(self) -> None:
         """Close what a crash or a power cut left open; then offer what the ground lacks."""
         folder = Path(self.config.scan.folder)
-        if self._claim.take(folder):
+        if self.scanning.claim.take(folder):
             close_open_scans(folder, self.scanning.made)
         else:
-            log.warning("%s: another service scans to it; open scans are left alone", folder)
+            log.warning("%s: another service scans to it; earlier scans are left alone", folder)
         self.scanning.offer_backlog()
 
     def _tidy(self) -> None:

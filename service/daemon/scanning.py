@@ -22,6 +22,7 @@ from service.daemon.scan_time import disagreement, set_since
 from service.daemon.warm_up import is_warm
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.onboard.datalink import DaemonLink
+from service.scans.claim import Claim
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -73,6 +74,7 @@ class Scanning:
         self._latency_ms: float | None = None  # of the camera, as the last scan found it
         self.link = DaemonLink()
         self.made: set[str] = set()  # names of the scans of this process
+        self.claim = Claim()  # to the folder of scans: whoever has it looks after earlier ones
 
     def load(self) -> None:
         """The heavy part of the start: camera model and backend; InputError without them."""
@@ -241,9 +243,10 @@ class Scanning:
 
     def offer_backlog(self) -> None:
         """Send earlier scans that the ground lacks while none is flown."""
-        self.link.offer_backlog(
-            self.config, lambda: self.phase is Phase.IDLE and not self._ended.is_set()
-        )
+        if self.claim.is_ours:
+            self.link.offer_backlog(
+                self.config, lambda: self.phase is Phase.IDLE and not self._ended.is_set()
+            )
 
     def _fail(self, text: str) -> None:
         self.fault = text

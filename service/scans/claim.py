@@ -14,6 +14,7 @@ class Claim:
     """That this process, and no other, makes scans in a folder; ends with it, however it ends."""
 
     def __init__(self) -> None:
+        self.is_ours = False
         self._held: int | None = None
 
     def take(self, folder: Path) -> bool:
@@ -26,6 +27,7 @@ class Claim:
             held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         except OSError as error:  # told when a scan is to be made in it
             log.debug("%s cannot be claimed: %s", folder, error.strerror)
+            self.is_ours = True
             return True
         try:
             fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -34,11 +36,11 @@ class Claim:
             return False
         except OSError as error:
             log.debug("%s cannot be locked: %s", folder, error.strerror)
-        self._held = held
+        self._held, self.is_ours = held, True
         return True
 
     def give_up(self) -> None:
         """Let others have it."""
         if self._held is not None:
             os.close(self._held)
-        self._held = None
+        self._held, self.is_ours = None, False
