@@ -92,9 +92,9 @@ def _replay(
     realtime: bool,
     as_json: bool,
 ) -> dict[str, Any]:
+    from service.cameras.camera_file import check_size
     from service.cameras.pace import paced
     from service.compute.opening import open_backend
-    from service.errors import InputError
     from service.onboard.datalink import open_datalink
     from service.onboard.scan import Scan, ScanInputs, create_store
     from service.scans.folder import write_deliverables
@@ -102,12 +102,8 @@ def _replay(
     notes: list[str] = []
     if camera is None:
         camera = _assumed_camera(source, notes)
-    elif camera.size_px != source.size_px:
-        W, H = source.size_px
-        raise InputError(
-            f"the camera model is for {camera.size_px[0]}x{camera.size_px[1]} pictures, "
-            f"{source.description} has {W}x{H}; calibrate at that size"
-        )
+    else:
+        check_size(camera, source.size_px, source.description)
     epoch_ns = _epoch(source, log, video_epoch, notes)
     scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(epoch_ns / 1e9))
     folder = out or Path(f"scan-{scan_id}")

@@ -127,12 +127,15 @@ class ControlActions:
 
     def _test(self, work: Work) -> None:
         from service.cameras import open_camera
+        from service.cameras.camera_file import check_size
 
         config, vehicle = self._scanning.config, self._scanning.vehicle
         try:
             source = open_camera(config.camera.source)
             work.report(0.5)
             source.close()
+            if self._scanning.camera is not None:
+                check_size(self._scanning.camera, source.size_px, source.description)
             folder = _existing(Path(config.scan.folder))
             free_mib = shutil.disk_usage(folder).free / 2**20
             if free_mib < LEAST_FREE_MIB:

@@ -62,10 +62,11 @@ class Scanning:
         self.is_warm = is_warm()  # nothing is left to compile
         self.started_s = self.progress_s = time.monotonic()
         self._backend: Backend | None = None
-        self._camera: Camera | None = None
+        self.camera: Camera | None = None  # the model; None before it is loaded
         self._stop, self._ended = threading.Event(), threading.Event()
         self._paused = threading.Event()
         self._worker: threading.Thread | None = None
+        self._starting = threading.Lock()  # by a command, by arming, or again after a fault
         self._closing: Work | None = None
         self._watch = ClosingWatch()
         self._store: ScanStore | None = None  # of the scan that runs
@@ -87,8 +88,8 @@ class Scanning:
             raise InputError(
                 "camera.model is not set; make one with 'skyrelief calibrate' and name it"
             )
-        self._camera = load_camera(Path(self.config.camera.model))
-        self._backend = open_backend(self.config.compute, self._camera.size_px)
+        self.camera = load_camera(Path(self.config.camera.model))
+        self._backend = open_backend(self.config.compute, self.camera.size_px)
         fill_small_caches()
         log.info("ready: backend %s", self._backend.name)
 
@@ -106,15 +107,18 @@ class Scanning:
         return scan.inputs.scan_id if scan is not None else ""
 
     def start(self) -> None:
-        """Start a scan; to be asked while none is running."""
-        self.fault = ""
-        self._retry_at_s = None
-        self._stop.clear()
-        self._paused.clear()
-        self.phase = Phase.SCANNING
-        self.started_s = self.progress_s = time.monotonic()
-        self._worker = threading.Thread(target=self._work, name="scan", daemon=True)
-        self._worker.start()
+        """Start a scan; nothing happens while one is running."""
+        with self._starting:
+            if self.is_running:
+                return
+            self.fault = ""
+            self._retry_at_s = None
+            self._stop.clear()
+            self._paused.clear()
+            self.phase = Phase.SCANNING
+            self.started_s = self.progress_s = time.monotonic()
+            self._worker = threading.Thread(target=self._work, name="scan", daemon=True)
+            self._worker.start()
 
     def stop(self) -> None:
         """Close the running scan, also where it waits for a dead camera, and start no other."""
@@ -267,11 +271,13 @@ class Scanning:
                 source.close()
 
     def _scan(self, source: CameraSource) -> None:
+        from service.cameras.camera_file import check_size
         from service.daemon.frame_gate import FrameGate
         from service.onboard.scan import Scan, ScanInputs, create_store
         from service.scans.folder import write_deliverables
 
-        assert self._camera is not None and self._backend is not None
+        assert self.camera is not None and self._backend is not None
+        check_size(self.camera, source.size_px, source.description)
         zero_ns, offset = _zero_ns(source), self.vehicle.unix_offset_ns()
         unix_s = 1e-9 * (time.monotonic_ns() + offset)
         scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(unix_s))
@@ -280,7 +286,7 @@ class Scanning:
         gate = FrameGate(source, folder / LATER, zero_ns + offset, self._alive, self._paused)
         inputs = ScanInputs(
             gate,
-            self._camera,
+            self.camera,
             self.config,
             self._backend,
             folder,
