@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import shutil
 import socket
 import stat
 import time
@@ -10,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from service.config import DatalinkConfig
+from service.config import DatalinkConfig, load_config
+from service.daemon.diagnosis import BAD, GOOD, NOTE, _certificate
 from service.errors import InputError, OutsideError
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
@@ -37,10 +40,11 @@ def session_config(home: Path, **more: object) -> SessionConfig:
     return SessionConfig(tls_ca=ca, tls_certificate=certificate, tls_key=key, **more)  # type: ignore[arg-type]
 
 
-@pytest.fixture
-def ground(
-    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@contextlib.contextmanager
+def served(
+    fleet: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[tuple[Receiver, str]]:
+    """A ground station of the fleet, and where it listens."""
     monkeypatch.setattr(receiver_module, "deliver", lambda _: None)
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -48,10 +52,20 @@ def ground(
     config = session_config(
         fleet / "ground" / "base", mode="router", listen=(endpoint,), fleet_rights=True
     )
-    receiver = Receiver(ReceiverConfig(tmp_path / "ground", config))
+    receiver = Receiver(ReceiverConfig(folder / "ground", config))
     receiver.start()
-    yield receiver, endpoint
-    receiver.close()
+    try:
+        yield receiver, endpoint
+    finally:
+        receiver.close()
+
+
+@pytest.fixture
+def ground(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[Receiver, str]]:
+    with served(fleet, tmp_path, monkeypatch) as both:
+        yield both
 
 
 def sender(fleet: Path, folder: Path, member: str, claims: str, endpoint: str) -> DatalinkSender:
@@ -142,6 +156,37 @@ def test_who_is_not_of_the_fleet_does_not_get_in(
         return
     with pytest.raises(OutsideError):
         open_session(config)
+
+
+def test_a_clock_that_is_behind_does_not_keep_a_drone_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Keys made a month from now stand for a computer here whose clock is a month behind."""
+    fleet, members = tmp_path / "fleet", {"drone": ["red"], "ground": ["base"]}
+    make_keys(fleet, members, now=time.time() + 30 * 86400)
+    with served(fleet, tmp_path, monkeypatch) as (_, endpoint):
+        link = sender(fleet, tmp_path, "drone/red", "red", endpoint)
+        try:
+            assert link.drain(15.0)
+        finally:
+            link.close()
+
+
+def test_doctor_tells_how_long_a_certificate_holds(tmp_path: Path) -> None:
+    def found(days: float, path: str = "certificate.pem") -> tuple[str, str]:
+        shutil.rmtree(tmp_path / "fleet", ignore_errors=True)
+        now = time.time() + (days - 10.0) * 86400
+        make_keys(tmp_path / "fleet", {"drone": ["red"]}, days=10, now=now)
+        chosen = tmp_path / "fleet" / "drone" / "red" / path
+        config = load_config(None, [f"datalink.tls_certificate={chosen}"])
+        (finding,) = _certificate(config)
+        return finding.verdict, finding.text
+
+    assert found(90.5)[0] == GOOD and "holds for 90 days" in found(90.5)[1]
+    assert found(5.5)[0] == NOTE
+    assert found(-5.5)[0] == BAD and "expired" in found(-5.5)[1]
+    assert found(90.0, "key.pem")[0] == BAD
+    assert not list(_certificate(load_config(None, [])))
 
 
 def test_keys_are_private_and_stay(fleet: Path) -> None:

@@ -32,6 +32,8 @@ WARM_UP = (
     "/opt/skyrelief/current/bin/skyrelief warm-up"
 )
 
+SOON_DAYS = 30  # a certificate that ends before needs thinking of
+
 
 @dataclass(frozen=True, slots=True)
 class Finding:
@@ -54,6 +56,7 @@ def examine(config: Config, listen_s: float) -> Iterator[Finding]:
         lambda: _camera(config, running),
         lambda: _mavlink(config, listen_s, running),
         lambda: _datalink(config),
+        lambda: _certificate(config),
         lambda: _to_fly(config),
         lambda: _service(running),
     )
@@ -263,6 +266,25 @@ def _service(running: dict[str, Any] | None) -> Iterator[Finding]:
     fault = str(running.get("fault", ""))
     text = f"{running['software']} runs here: {fault or running.get('state', 'unknown')}"
     yield Finding("service", GOOD if running.get("ok") else BAD, text)
+
+
+def _certificate(config: Config) -> Iterator[Finding]:
+    from service.stream.keys import expiry_unix_s
+
+    path = config.datalink.tls_certificate
+    if not path:
+        return
+    try:
+        left_days = (expiry_unix_s(Path(path)) - time.time()) / 86_400
+    except SkyreliefError as error:
+        yield Finding("certificate", BAD if isinstance(error, InputError) else NOTE, str(error))
+        return
+    if left_days < 0:
+        text = f"{path} expired {-left_days:.0f} days ago; make new keys with 'skyrelief keys'"
+        yield Finding("certificate", BAD, text)
+    else:
+        verdict = GOOD if left_days > SOON_DAYS else NOTE
+        yield Finding("certificate", verdict, f"{path} holds for {left_days:.0f} days more")
 
 
 def _datalink(config: Config) -> Iterator[Finding]:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
 CA_DAYS = 3650
+EVER = datetime.datetime(1970, 1, 1, tzinfo=datetime.timezone.utc)
+"""Certificates hold from then on: an aircraft's clock may be at its very beginning."""
 
 
 def tls_files(folder: Path) -> tuple[str, str, str]:
@@ -33,6 +35,22 @@ def tls_files(folder: Path) -> tuple[str, str, str]:
         if not path.is_file():
             raise InputError(f"{path} does not exist; make it with 'skyrelief keys'")
     return str(paths[0]), str(paths[1]), str(paths[2])
+
+
+def expiry_unix_s(certificate: Path) -> float:
+    """Until when a certificate (PEM) holds; InputError for a file that is none.
+
+    Raises OutsideError without the ``cryptography`` package.
+    """
+    try:
+        from cryptography import x509
+    except ImportError as error:
+        raise OutsideError("reading certificates needs the package 'cryptography'") from error
+    try:
+        read = x509.load_pem_x509_certificate(certificate.read_bytes())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{certificate} is no certificate ({error})") from error
+    return read.not_valid_after_utc.timestamp()
 
 
 def make_keys(
@@ -99,7 +117,7 @@ def _authority(
         .issuer_name(name)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(start - datetime.timedelta(days=1))
+        .not_valid_before(EVER)
         .not_valid_after(start + datetime.timedelta(days=CA_DAYS))
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .sign(key, hashes.SHA256())
@@ -133,7 +151,7 @@ def _member(
         .issuer_name(authority[0].subject)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(start - datetime.timedelta(days=1))
+        .not_valid_before(EVER)
         .not_valid_after(start + datetime.timedelta(days=days))
         .add_extension(x509.SubjectAlternativeName([x509.DNSName(common_name)]), critical=False)
         .add_extension(x509.ExtendedKeyUsage(usages), critical=False)

@@ -232,7 +232,7 @@ class DatalinkSender:
             try:
                 session = open_session(replace(self._session_config, open_timeout_s=patience))
             except OutsideError as error:
-                log.debug("%s", error)
+                log.log(logging.WARNING if attempt == 1 else logging.DEBUG, "%s", error)
                 pause = max(RETRY_S / 10, RETRY_S - (time.monotonic() - began))
                 self._stop.wait(pause)
                 continue
