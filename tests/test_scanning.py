@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from loopback import until
 
+from mavlink.control import Phase
 from recon.backends.cpu import CpuBackend
 from service.cameras.camera_file import load_camera
 from service.config import load_config
@@ -41,6 +42,20 @@ def test_pictures_that_the_camera_model_does_not_fit_are_refused(
     assert closed.is_set()
     assert not list(tmp_path.iterdir())
     scanning.stop()
+
+
+def test_a_scan_that_was_stopped_counts_as_closing_at_once(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A camera that hangs holds its scan for seconds: a start then is refused, not swallowed."""
+    end = threading.Event()
+    monkeypatch.setattr(Scanning, "_scan_once", lambda self: end.wait(60.0))
+    daemon.scanning.start()
+    assert daemon.actions.status().phase is Phase.SCANNING
+    daemon.actions.stop_scan()
+    assert daemon.actions.status().phase is Phase.FINALISING
+    end.set()
+    until(lambda: daemon.actions.status().phase is Phase.IDLE)
 
 
 def test_a_scan_is_started_once(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:

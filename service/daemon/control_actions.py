@@ -36,7 +36,7 @@ class ControlActions:
         latency = scan.check.latency if scan is not None else None
         recording = scanning.phase in (Phase.SCANNING, Phase.PAUSED)
         return ScanStatus(
-            phase=scanning.phase,
+            phase=Phase.FINALISING if scanning.is_closing else scanning.phase,
             scan_id=scanning.scan_id,
             recording_ms=int(1e3 * (time.monotonic() - scanning.started_s)) if recording else 0,
             storage_total_mib=disk.total / 2**20,
