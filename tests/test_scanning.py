@@ -14,6 +14,7 @@ from mavlink.control import Phase
 from recon.backends.cpu import CpuBackend
 from service.cameras.camera_file import load_camera
 from service.config import load_config
+from service.daemon import resumption
 from service.daemon.runtime import Daemon
 from service.daemon.scanning import Scanning
 
@@ -40,7 +41,7 @@ def test_pictures_that_the_camera_model_does_not_fit_are_refused(
     assert told == [f"Scan failed: {scanning.fault}"]
     assert "for 1600x1200 pictures, gimbal has 320x240" in scanning.fault
     assert closed.is_set()
-    assert not list(tmp_path.iterdir())
+    assert not [path for path in tmp_path.iterdir() if path.is_dir()]
     scanning.stop()
 
 
@@ -56,6 +57,83 @@ def test_a_scan_that_was_stopped_counts_as_closing_at_once(
     assert daemon.actions.status().phase is Phase.FINALISING
     end.set()
     until(lambda: daemon.actions.status().phase is Phase.IDLE)
+
+
+@pytest.mark.parametrize(
+    ("boot", "heard", "armed", "goes_on"),
+    [
+        ("this", False, False, True),  # the service was killed: nobody need say more
+        ("another", False, False, False),  # power cut: wait for the autopilot
+        ("another", True, True, True),
+        ("another", True, False, False),
+        ("", True, True, True),
+        ("none", True, True, False),
+    ],
+)
+def test_a_scan_by_command_goes_on_after_a_fall(
+    boot: str, heard: bool, armed: bool, goes_on: bool, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    (tmp_path / "boot").write_text("this")
+    monkeypatch.setattr(resumption, "BOOT", tmp_path / "boot")
+    if boot != "none":
+        (tmp_path / "scans").mkdir()
+        (tmp_path / "scans" / resumption.MARK).write_text(boot)
+    begun, end = threading.Event(), threading.Event()
+
+    def scan(self: Scanning) -> None:
+        begun.set()
+        end.wait(60.0)
+
+    monkeypatch.setattr(Scanning, "_scan_once", scan)
+    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}/scans", "health.http="]))
+    presence = type(daemon.vehicle.presence)
+    monkeypatch.setattr(presence, "is_armed", property(lambda _: armed))
+    monkeypatch.setattr(presence, "autopilot", property(lambda _: (1, 1) if heard else None))
+    daemon.actions.is_ready = True
+    for _ in range(3):
+        daemon._resume()
+    assert begun.wait(10.0 if goes_on else 0.2) == goes_on
+    mark = tmp_path / "scans" / resumption.MARK
+    if goes_on:
+        assert mark.read_text() == "this"
+        daemon.actions.stop_scan()
+        end.set()
+        until(lambda: not daemon.scanning.is_running)
+    if heard:
+        assert not mark.exists()  # landed, or stopped
+
+
+def test_only_a_scan_that_nobody_ended_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def next_life(start: str = "on-command") -> Daemon:
+        return Daemon(
+            load_config(None, [f"scan.folder={tmp_path}", f"scan.start={start}", "health.http="])
+        )
+
+    def left(daemon: Daemon) -> resumption.Left:
+        return daemon.scanning.resumption.left
+
+    end = threading.Event()
+    monkeypatch.setattr(Scanning, "_scan_once", lambda self: end.wait(60.0))
+    killed = next_life()
+    killed.scanning.start()
+    assert left(next_life()) is resumption.Left.BY_SERVICE
+    killed.scanning.stop()
+    assert left(next_life()) is resumption.Left.NOTHING
+    end.set()
+    until(lambda: not killed.scanning.is_running)
+    killed.scanning.start()  # the recording ends by itself
+    until(lambda: not killed.scanning.is_running)
+    assert left(next_life()) is resumption.Left.NOTHING
+    by_itself = next_life("on-boot")
+    by_itself.scanning.start()
+    assert left(next_life()) is resumption.Left.NOTHING
+    (tmp_path / resumption.MARK).write_text("of a configuration that was on-command")
+    by_itself = next_life("on-boot")
+    by_itself._resume()
+    assert not by_itself.scanning.is_running
 
 
 def test_a_scan_is_started_once(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:

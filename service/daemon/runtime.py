@@ -129,6 +129,7 @@ class Daemon:
         while not self._quit.wait(0.25):
             self.vehicle.set_health(self._health())
             was_armed = self._follow_arming(was_armed)
+            self._resume()
             scanning.retry()
             if self.is_progressing:
                 notifier.alive(scanning.phase.value)
@@ -246,6 +247,15 @@ class Daemon:
         ):
             return Health.CRITICAL
         return Health.ACTIVE if self.scanning.phase is not Phase.IDLE else Health.STANDBY
+
+    def _resume(self) -> None:
+        """Go on scanning where a fault of the service, or of its power, ended a flight's scan."""
+        if self.config.scan.start != "on-command":
+            return
+        report, resumption = self.vehicle.report(), self.scanning.resumption
+        if resumption.is_due(report.autopilot is not None, report.is_armed):
+            self.vehicle.statustext("Scanning again after a restart", WARNING)
+            self.actions.start_scan()
 
     def _follow_arming(self, was_armed: bool) -> bool:
         """The arming that was followed; one that finds the last scan being closed has to wait."""

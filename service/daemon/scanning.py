@@ -18,6 +18,7 @@ from service.config import Config
 from service.daemon.closing import ClosingWatch, sizes
 from service.daemon.degradation import Level, lowered
 from service.daemon.memory import fill_small_caches, give_back
+from service.daemon.resumption import Resumption
 from service.daemon.scan_time import disagreement, set_since
 from service.daemon.warm_up import is_warm
 from service.errors import InputError, OutsideError, SkyreliefError
@@ -75,6 +76,7 @@ class Scanning:
         self._latency_ms: float | None = None  # of the camera, as the last scan found it
         self.link = DaemonLink()
         self.made: set[str] = set()  # names of the scans of this process
+        self.resumption = Resumption(Path(config.scan.folder))
         self.claim = Claim()  # to the folder of scans: whoever has it looks after earlier ones
 
     def load(self) -> None:
@@ -115,6 +117,8 @@ class Scanning:
             self._retry_at_s = None
             self._stop.clear()
             self._paused.clear()
+            if self.config.scan.start == "on-command":  # else it starts by itself anyway
+                self.resumption.note()
             self.phase = Phase.SCANNING
             self.started_s = self.progress_s = time.monotonic()
             self._worker = threading.Thread(target=self._work, name="scan", daemon=True)
@@ -127,6 +131,7 @@ class Scanning:
 
     def _stop_feeding(self) -> None:
         self._stop.set()
+        self.resumption.forget()
         scan = self.scan
         if scan is not None:
             scan.source.close()
@@ -229,6 +234,7 @@ class Scanning:
     def _work(self) -> None:
         try:
             self._scan_once()
+            self.resumption.forget()
         except SkyreliefError as error:
             self._fail(str(error))
         except Exception as error:

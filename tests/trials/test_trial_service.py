@@ -19,6 +19,7 @@ from pathlib import Path
 
 import pytest
 from loopback import free_port
+from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 from trial_autopilot import Autopilot
 from trial_rig import (
     BACK_S,
@@ -88,6 +89,43 @@ def test_kill_9_loses_nothing_that_was_stored(tmp_path: Path, record: Row) -> No
     for folder in scans.iterdir():
         assert json.loads((folder / "scan.json").read_text())["finished"] is True
         assert (folder / "cloud.laz").stat().st_size > 0
+
+
+def test_kill_9_of_a_scan_started_by_command(tmp_path: Path, record: Row) -> None:
+    link, times, back_s = free_port(), 5 if WHOLE else 1, 0.0
+    autopilot, more = Autopilot(link), f'[mavlink]\nlinks = ["udpin:127.0.0.1:{link}"]\n'
+    autopilot.start()
+    for k in range(times + 1):
+        with Service(tmp_path, "on-command", more=more) as service:
+            if k == 0:
+                service.until_up()
+                autopilot.asked.append(
+                    dialect.MAVLink_command_long_message(1, 100, 2500, 0, 0, 0, 0, 0, 0, 0, 0)
+                )
+            service.until(lambda s=service: s.frames > 0, "frames")  # type: ignore[misc]
+            if k > 0:
+                back_s = max(back_s, time.monotonic() - service.began_s)
+            service.until(lambda k=k: len({c[0] for c in stored(service.scans)}) > k, "a chunk")  # type: ignore[misc]
+            acknowledged = stored(service.scans)
+            if k == times:
+                assert service.stop() == 0
+        time.sleep(1.0)
+    autopilot.ended.set()
+    with Service(tmp_path, "on-command", more=more) as service:
+        service.until_up()
+        time.sleep(1.0)
+        assert service.get()["state"] == "idle"  # the last one was closed, not killed
+        assert service.stop() == 0
+    lost = acknowledged - stored(service.scans)
+    record(
+        "kill -9 of a scan that was started by command",
+        times,
+        "a new scan each time; none after a stop",
+        f"{len(lost)} of {len(acknowledged)} chunks",
+        back_s,
+    )
+    assert not lost
+    assert any("Scanning again after a restart" in text for text in autopilot.texts)
 
 
 @pytest.mark.parametrize("fault", ["dies", "stalls", "changes size"])

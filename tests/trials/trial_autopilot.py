@@ -28,6 +28,7 @@ class Autopilot(threading.Thread):
         self.ended, self.silent, self.armed = (threading.Event() for _ in range(3))
         self.boot_s = time.monotonic() - 1000.0
         self.texts: list[str] = []  # STATUSTEXT that came back
+        self.asked: list[Any] = []  # messages to send once
 
     def run(self) -> None:
         """Send until :attr:`ended`."""
@@ -49,6 +50,7 @@ class Autopilot(threading.Thread):
             dialect.MAVLink_heartbeat_message(2, 3, mode, 0, 4, 3),
             dialect.MAVLink_system_time_message(int(1e6 * time.time()), boot_ms),
         ]
+        out += [self.asked.pop() for _ in self.asked[:]]
         if self.attitude:
             out.append(dialect.MAVLink_attitude_message(boot_ms, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0))
         return out
