@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -57,6 +58,31 @@ def test_a_scan_that_was_stopped_counts_as_closing_at_once(
     assert daemon.actions.status().phase is Phase.FINALISING
     end.set()
     until(lambda: daemon.actions.status().phase is Phase.IDLE)
+
+
+def test_a_camera_that_fails_is_told(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    told, gate = [], SimpleNamespace(warnings=["told when it was opened"])
+    scanning: Any = daemon.scanning
+    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, _: told.append(text))
+    daemon._tell_of_camera()
+    scanning.gate, scanning._news_told, scanning.phase = gate, 1, Phase.SCANNING
+    gate.warnings.append("the picture is frozen since 8 s")
+    for silent_s in (0.0, 9.0, 11.0, 300.0):
+        scanning.progress_s = time.monotonic() - silent_s
+        daemon._tell_of_camera()
+        daemon._tell_of_camera()
+    scanning.progress_s = time.monotonic()
+    daemon._tell_of_camera()
+    assert told == [
+        "Camera: the picture is frozen since 8 s",
+        "No picture for 10 s: nothing is scanned",
+        "Pictures again",
+    ]
+    scanning.progress_s = time.monotonic() - 60.0
+    daemon._tell_of_camera()
+    scanning.phase = Phase.IDLE  # stopped meanwhile
+    daemon._tell_of_camera()
+    assert told[3:] == ["No picture for 10 s: nothing is scanned"]
 
 
 @pytest.mark.parametrize(

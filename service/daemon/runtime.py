@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import math
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 from mavlink.control import Phase
 from mavlink.first_beat import FirstBeats
 from mavlink.presence import Health
-from mavlink.status import CRITICAL, WARNING
+from mavlink.status import CRITICAL, NOTICE, WARNING
 from mavlink.vehicle import VehicleLink
 from service.compute.threading_layer import kernels_may_overlap
 from service.config import Config, reload
@@ -65,6 +64,7 @@ class Daemon:
         self._wanted = config  # as it was asked for last; operators may have tuned it since
         self._quit = threading.Event()
         self._fault = fault
+        self._is_silent = False  # no picture comes, and that was said
         self._waits = False  # armed while the last scan is being closed
         self.scanning = Scanning(config)
         self.load_control = LoadControl(self.scanning)
@@ -130,6 +130,7 @@ class Daemon:
             self.vehicle.set_health(self._health())
             was_armed = self._follow_arming(was_armed)
             self._resume()
+            self._tell_of_camera()
             scanning.retry()
             if self.is_progressing:
                 notifier.alive(scanning.phase.value)
@@ -241,12 +242,19 @@ class Daemon:
             return Health.CRITICAL
         if not self.actions.is_ready:
             return Health.BOOT
-        if (
-            self.scanning.phase is Phase.SCANNING
-            and time.monotonic() - self.scanning.progress_s > STUCK_S
-        ):
+        if self.scanning.silent_s > STUCK_S:
             return Health.CRITICAL
         return Health.ACTIVE if self.scanning.phase is not Phase.IDLE else Health.STANDBY
+
+    def _tell_of_camera(self) -> None:
+        """Say why the scan does not grow, and when it does again."""
+        for text in self.scanning.camera_news():
+            self.vehicle.statustext(f"Camera: {text}", WARNING)
+        was_silent, self._is_silent = self._is_silent, self.scanning.silent_s > STUCK_S
+        if self._is_silent and not was_silent:
+            self.vehicle.statustext(f"No picture for {STUCK_S:.0f} s: nothing is scanned", CRITICAL)
+        elif was_silent and not self._is_silent and self.scanning.phase is Phase.SCANNING:
+            self.vehicle.statustext("Pictures again", NOTICE)
 
     def _resume(self) -> None:
         """Go on scanning where a fault of the service, or of its power, ended a flight's scan."""

@@ -19,6 +19,7 @@ from service.daemon.closing import ClosingWatch, sizes
 from service.daemon.degradation import Level, lowered
 from service.daemon.memory import fill_small_caches, give_back
 from service.daemon.resumption import Resumption
+from service.daemon.scan_reports import odometry_reporter, tell_keyframe
 from service.daemon.scan_time import disagreement, set_since
 from service.daemon.warm_up import is_warm
 from service.errors import InputError, OutsideError, SkyreliefError
@@ -28,12 +29,10 @@ from service.scans.claim import Claim
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from mavlink.state import VehicleState
     from recon.backends import Backend
     from recon.types import Camera, Keyframe
     from service.cameras.source import CameraSource
     from service.daemon.frame_gate import FrameGate
-    from service.onboard.pipeline import Step
     from service.onboard.scan import Scan
     from service.stream.store import ScanStore
 
@@ -76,6 +75,7 @@ class Scanning:
         self._latency_ms: float | None = None  # of the camera, as the last scan found it
         self.link = DaemonLink()
         self.made: set[str] = set()  # names of the scans of this process
+        self._news_told = 0  # of the camera's warnings
         self.resumption = Resumption(Path(config.scan.folder))
         self.claim = Claim()  # to the folder of scans: whoever has it looks after earlier ones
 
@@ -169,6 +169,21 @@ class Scanning:
         if scan is None or gate is None or self.phase is not Phase.SCANNING:
             return 0.0
         return max(gate.busy_s, scan.pipeline.busy_s)
+
+    def camera_news(self) -> list[str]:
+        """What has gone wrong with the camera of a running scan since this was asked last."""
+        gate = self.gate
+        if gate is None or self.phase is not Phase.SCANNING:
+            return []
+        fresh = gate.warnings[self._news_told :]
+        self._news_told += len(fresh)
+        return fresh
+
+    @property
+    def silent_s(self) -> float:
+        """Seconds since a frame was done; 0 while no scan runs or it is paused."""
+        is_scanning = self.phase is Phase.SCANNING
+        return time.monotonic() - self.progress_s if is_scanning else 0.0
 
     @property
     def idle_closing_s(self) -> float:
@@ -303,11 +318,12 @@ class Scanning:
             extra={"backend": self._backend.name, "source": source.description},
             latency_ms=self._latency_ms,
             tell=lambda text: self.vehicle.statustext(text, WARNING),
-            on_step=self._odometry_report(),
+            on_step=odometry_reporter(self.config, self.vehicle),
             on_keyframe=self._on_keyframe,
         )
         store = create_store(inputs)
         self._tell_of_clock(gate, offset)
+        self._news_told = len(gate.warnings)
         self.vehicle.record(folder / "link.tlog", offset)
         self.link.take_off(store, self.config, self.vehicle)
         self.scan, self.gate, self._store = Scan(inputs, store), gate, store
@@ -332,14 +348,6 @@ class Scanning:
         for text in disagreement(offset_ns):
             gate.warnings.append(text)
             self.vehicle.statustext(text, WARNING)
-
-    def _odometry_report(self) -> Callable[[Step, VehicleState | None, int], None] | None:
-        """What tells the autopilot how it moves, where that is wanted."""
-        if not self.config.mavlink.odometry:
-            return None
-        from service.onboard.odometry_report import OdometryReport
-
-        return OdometryReport(self.config.camera, self.vehicle.report_odometry).tell
 
     def _close_scan(self, scan: Scan, store: ScanStore) -> None:
         """Finish the scan; when the pipeline cannot, what is stored is kept as interrupted."""
@@ -381,17 +389,9 @@ class Scanning:
             self._retry_s = FIRST_RETRY_S
 
     def _on_keyframe(self, keyframe: Keyframe) -> None:
-        """Tell ground stations of a keyframe, at the pose that it has now."""
-        from service.onboard.keyframe_report import keyframe_report
-
         scan = self.scan
         if scan is not None:
-            frame, inputs = scan.pipeline.rig.frame, scan.inputs
-            state = self.vehicle.history.state_at(keyframe.time_ns)
-            agl_m = None if state is None else state.alt_agl_m
-            time_ns = keyframe.time_ns + inputs.unix_offset_ns
-            T = keyframe.pose.T_world_camera
-            self.vehicle.report_keyframe(keyframe_report(time_ns, T, frame, agl_m))
+            tell_keyframe(self.vehicle, scan, keyframe)
 
 
 def _zero_ns(source: CameraSource) -> int:
