@@ -26,6 +26,7 @@ from service.onboard.pipeline import Pipeline, Step
 from service.onboard.recorder import Recorder
 from service.onboard.rig import ASSUMED_AGL_M
 from service.onboard.telemetry_check import TelemetryCheck
+from service.onboard.tracking_watch import TrackingWatch
 from service.scans.coverage import CoverageWriter
 from service.scans.retention import PAGES
 from service.stream.records import ScanHeader
@@ -121,6 +122,7 @@ class Scan:
         )
         dense = self.pipeline.dense
         self.watch = GraphWatch(dense.trajectory.graph, dense.lock, inputs.tell)
+        self.tracking = TrackingWatch(inputs.tell)
         self.tags = FrameTags(inputs.folder / TAGS) if inputs.history is not None else None
         self.tagged = self.odd_sized = self.heights = 0
         self._started = time.monotonic()
@@ -145,6 +147,7 @@ class Scan:
             Frame(frame.image, exposed_ns, frame.seq, inputs.camera), state, frame.geotag
         )
         self.check.add(time_ns, step.tracked)
+        self.tracking.look(step.tracked, time_ns)
         if step.keyframes:
             self.watch.look()
         self.recorder.write(step, exposed_ns, state.alt_agl_m if state is not None else None)

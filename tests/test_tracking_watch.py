@@ -1,0 +1,35 @@
+"""The operator hears that nothing is reconstructed while pictures come."""
+
+from __future__ import annotations
+
+from recon.tracking.odometry import Tracked
+from service.onboard.tracking_watch import TrackingWatch
+
+S = 1_000_000_000
+
+
+def flown(*states: str) -> list[str]:
+    """What is said of a flight of so many states, one each half second."""
+    told: list[str] = []
+    watch = TrackingWatch(told.append)
+    for k, state in enumerate(states):
+        reason = {"lost": "too little texture", "waiting": "too little motion"}.get(state, "")
+        watch.look(Tracked(state, 0, reason=reason), 100 * S + k * S // 2)
+    return told
+
+
+def test_a_long_loss_is_told_once_with_its_reason_and_its_end() -> None:
+    lost = "Vision is lost for 10 s (too little texture): nothing is scanned"
+    assert flown("started", "keyframe", *["lost"] * 300) == [lost]
+    once = ["keyframe", *["lost"] * 30, "tracked", "tracked"]
+    assert flown(*once) == [lost, "Vision has its way again"]
+    assert flown(*once, *once) == 2 * [lost, "Vision has its way again"]
+    assert flown(*["lost"] * 30) == [lost]  # nothing to see from the first picture on
+    assert len(flown("keyframe", *(["lost"] * 12 + ["started", "waiting"]) * 9)) == 1
+
+
+def test_short_losses_and_a_hover_are_not_told() -> None:
+    assert flown("keyframe", *["lost"] * 19, "keyframe", *["lost"] * 19, "tracked") == []
+    assert flown("started", *["waiting"] * 500) == []
+    assert flown("keyframe", *["tracked"] * 500) == []
+    assert flown("keyframe", *["lost"] * 9, "started", *["waiting"] * 100, "keyframe") == []
