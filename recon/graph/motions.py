@@ -120,14 +120,17 @@ class Motions:
         self._counts["stretch without vision"] += 1
         passed_s = (node.time_ns - last.time_ns) * 1e-9
         frame = self._segments.known(node.segment)
-        if frame is not None:  # already placed, by telemetry or by a loop
+        if frame is not None and self._segments.is_tied(node.segment):
             T = frame.pose(node.T_odom_camera)
         else:
             priors = self._segments.at_camera(last), self._segments.at_camera(node)
             T = carried(*priors, T_last, self._velocity(last, T_last), passed_s)
         sigma_r = self._config.sigma_link_rad if node.prior.sigma_yaw_rad < 1.0 else 1.5
         sigma_m = self._config.sigma_link_m * max(passed_s, 1.0) + 5.0
-        return se3.inverse(T_last) @ T, np.diag(np.square([sigma_r] * 3 + [sigma_m] * 3))
+        motion = se3.inverse(T_last) @ T
+        # Where it went and how it turned are told apart: the one does not swing by the other.
+        apart = np.diag(np.square([sigma_r] * 3 + [sigma_m] * 3))
+        return motion, graph_factors.left_covariance(motion, apart)
 
     def _velocity(self, last: Node, T_last: F64) -> F64 | None:
         """(3,) m/s between a segment's keyframe and the one before it; None at its start."""
