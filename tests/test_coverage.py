@@ -178,6 +178,19 @@ def test_memory_follows_the_area_and_not_the_number_of_keyframes() -> None:
     assert found is not None and found.views.max() == 300
 
 
+def test_a_keyframe_gone_astray_does_not_ask_for_a_grid_to_the_moon() -> None:
+    layer = CoverageMap(0.5)
+    for k in range(5):
+        layer.put(k, k, looking_down(10.0 * k, 0.0))
+    whole = layer.grid()
+    for k, far_m in enumerate((5e4, -3e6, 4e8)):
+        layer.put(10 + k, 10 + k, looking_down(far_m, 0.3 * far_m))
+    cut = layer.grid()
+    assert whole is not None and cut is not None
+    assert cut.grid == whole.grid
+    np.testing.assert_array_equal(cut.height_m, whole.height_m)
+
+
 def test_an_empty_keyframe_and_a_bad_cell_are_refused() -> None:
     empty = looking_down(0.0, 0.0)
     nothing = np.full(SIZE, np.nan, np.float32)

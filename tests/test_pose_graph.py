@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from recon import se3
 from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.graph.smoother import Smoother
 from recon.graph.track_alignment import mean_rotation, umeyama
 from recon.types import F64, Pose, PosePrior
 
@@ -334,6 +335,61 @@ def test_without_fixes_a_gap_is_bridged_at_the_last_velocity() -> None:
     assert "dead reckoning" in pose.sources
     assert np.linalg.norm(moved - turn @ true) < 0.35 * np.linalg.norm(true)
     assert np.sqrt(np.trace(pose.covariance[3:, 3:])) > 5.0
+
+
+def to_and_fro(breaks: int, seed: int) -> PoseGraph:
+    """A level track over one strip at 50 m, vision lost again and again; only a mount that is
+    about level tells the tilt, and nobody the heading."""
+    rng, graph, down = np.random.default_rng(seed), PoseGraph(), np.diag([1.0, -1.0, -1.0])
+    covariance, n, time_ns = np.diag([2e-6] * 3 + [1e-4] * 3), 0, 0
+    for segment in range(breaks + 1):
+        start_m = 0.0
+        for j in range(40):
+            y_m = 5.5 * min(n % 48, 48 - n % 48)
+            start_m = y_m if j == 0 else start_m
+            R = se3.so3_exp(rng.normal(0, 0.01, 3)) @ down
+            mount = se3.so3_exp(rng.normal(0, 0.02, 3)) @ down
+            prior = PosePrior(mount, 0.1, 3.0, None, None, 50.0, 25.0)
+            T = se3.compose(R, np.array([0.0, y_m - start_m, 0.0]))
+            height = (50.0 + rng.normal(0, 0.3), 0.0)
+            graph.add_keyframe(8 * n, time_ns, segment, T, covariance, prior, height)
+            n, time_ns = n + 1, time_ns + 800_000_000
+        n, time_ns = n + 8, time_ns + 6_400_000_000
+    return graph
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_breaks_in_vision_do_not_swing_the_track(seed: int) -> None:
+    """A turn that nobody knows at the break must not become a way at the end of its lever."""
+    z_m = to_and_fro(5, seed).pose_array()[:, 2, 3]
+    assert np.abs(z_m).max() < 1.5
+
+
+def test_a_graph_that_full_steps_cannot_solve_is_solved_with_careful_ones(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole, is_careful = Smoother.update, []
+    make = Smoother.__init__
+
+    def init(self: Smoother, careful: bool = False) -> None:
+        make(self, careful)
+        is_careful.append(careful)
+
+    def update(self: Smoother, now: bool = False, rounds: int = 0) -> bool:
+        if not is_careful[-1] and len(self) > 20:
+            raise RuntimeError("\nIndeterminate linear system detected while working")
+        return whole(self, now, rounds)
+
+    f = flight(30)
+    plain, _ = fly(f)
+    monkeypatch.setattr(Smoother, "__init__", init)
+    monkeypatch.setattr(Smoother, "update", update)
+    careful, _ = fly(f)
+    assert is_careful[-1]
+    assert careful.counts["solved again"] > 0
+    assert "solved again, carefully: Indeterminate linear system" in caplog.text
+    apart = careful.pose_array()[:, :3, 3] - plain.pose_array()[:, :3, 3]
+    assert np.abs(apart).max() < 0.1
 
 
 def circle(drift_sigma: float = 0.01) -> Flight:

@@ -9,6 +9,7 @@ with its own wander, and the loops outweigh vision.
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,6 +31,8 @@ from recon.graph.thinning import GONE_SHARE, Ridden, moved_loop, surplus, thinne
 from recon.types import F64, Pose, PosePrior
 
 __all__ = ["Edge", "PoseGraph", "PoseGraphConfig"]
+
+log = logging.getLogger(__name__)
 
 SOURCES = ("vision", "attitude", "altitude", "gnss", "loop", "dead reckoning")
 
@@ -114,8 +117,11 @@ class PoseGraph:
         elif is_refitted:
             self.rebuild()
         else:
-            self._insert(node, last)
-            self._smoother.update()
+            try:
+                self._insert(node, last)
+                self._smoother.update()
+            except RuntimeError:
+                self.rebuild()
         return self.pose(seq)
 
     def add_loop(self, a: int, b: int, T_a_b: F64, covariance: F64, growth: float = 1.0) -> bool:
@@ -141,9 +147,12 @@ class PoseGraph:
         if self._tie(loop):
             self.rebuild()
             return True
-        for item in fresh:
-            self._add_loop_factor(item)
-        self._smoother.update(now=True, rounds=ROUNDS)
+        try:
+            for item in fresh:
+                self._add_loop_factor(item)
+            self._smoother.update(now=True, rounds=ROUNDS)
+        except RuntimeError:
+            self.rebuild()
         return True
 
     def solve(self) -> None:
@@ -295,12 +304,12 @@ class PoseGraph:
 
     # ---- building ------------------------------------------------------------------------------
 
-    def _start(self) -> None:
+    def _start(self, careful: bool = False) -> None:
         import gtsam
 
         self._gtsam = gtsam
         self._built += 1
-        self._smoother = Smoother()
+        self._smoother = Smoother(careful)
         self._left_out: Counter[str] = Counter()
         times = [n.time_ns for n in self._nodes.values()]
         span_s = (times[-1] - times[0]) * 1e-9 if times else 0.0
@@ -313,8 +322,19 @@ class PoseGraph:
         self._path: list[float] = []  # m flown up to each keyframe
 
     def rebuild(self) -> None:
-        """Make the whole graph anew from all readings and the segments' present frames."""
-        self._start()
+        """Make the whole graph anew from all readings and the segments' present frames.
+
+        Where full steps lead nowhere it is made once more with careful ones.
+        """
+        try:
+            self._make()
+        except RuntimeError as error:  # GTSAM: an indeterminate system, by steps gone wild
+            log.warning("the pose graph is solved again, carefully: %s", _in_short(error))
+            self._kept_counts["solved again"] += 1
+            self._make(careful=True)
+
+    def _make(self, careful: bool = False) -> None:
+        self._start(careful)
         last: Node | None = None
         for node in self._nodes.values():
             self._insert(node, last)
@@ -397,3 +417,7 @@ class PoseGraph:
 
     def _newest(self) -> Node:
         return next(reversed(self._nodes.values()))
+
+
+def _in_short(error: Exception) -> str:
+    return " ".join(str(error).split()[:9])

@@ -36,12 +36,13 @@ ROUNDS = 3
 class Smoother:
     """Poses by key 0, 1, 2 …; scalars by symbols of the letter :data:`SCALAR`."""
 
-    def __init__(self) -> None:
+    def __init__(self, careful: bool = False) -> None:
+        """``careful`` steps (Powell's dog leg, in a region of trust) are shorter and slower."""
         import gtsam
 
         self._gtsam = gtsam
         parameters = gtsam.ISAM2Params()
-        solver = gtsam.ISAM2GaussNewtonParams()
+        solver = gtsam.ISAM2DoglegParams() if careful else gtsam.ISAM2GaussNewtonParams()
         solver.setWildfireThreshold(WILDFIRE)
         parameters.setOptimizationParams(solver)
         thresholds = gtsam.ISAM2ThresholdMap()

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 from recon import se3
@@ -34,6 +35,10 @@ CELL_SAMPLES = 4.0
 MOST_TILES = 5_000
 """Tiles at most (20 million cells, 400 MB); what lies beyond them is counted."""
 
+MOST_CELLS = 25_000_000
+"""Of the rectangle about all tiles (500 MB); of a larger one only its middle is shown."""
+
+I64 = npt.NDArray[np.int64]
 Tile = tuple[int, int]
 
 
@@ -99,6 +104,18 @@ def usual_cell_m(depth: DepthMap) -> float | None:
     target = CELL_SAMPLES * float(np.median(depth.depth_m[known])) / float(depth.K[0, 0])
     power = 10.0 ** np.floor(np.log10(target))
     return float(min((power * m for m in (1, 2, 5, 10)), key=lambda c: abs(np.log(c / target))))
+
+
+def _near(keys: I64) -> I64:
+    """The (N, 2) tiles whose rectangle has at most MOST_CELLS: all, or those about the middle.
+
+    A track that went astray must not ask for a grid from here to the moon.
+    """
+    if float(np.prod((np.ptp(keys, axis=0) + 1.0) * TILE)) <= MOST_CELLS:
+        return keys
+    half = (int(np.sqrt(MOST_CELLS)) // TILE - 1) // 2
+    middle = keys[np.abs(keys - np.median(keys, axis=0)).sum(axis=1).argmin()]
+    return np.asarray(keys[np.all(np.abs(keys - middle) <= half, axis=1)])
 
 
 class CoverageMap:
@@ -209,12 +226,13 @@ class CoverageMap:
         """All tiles on one grid, cut to what was seen; None while there is nothing."""
         if not self._tiles:
             return None
-        keys = np.array(list(self._tiles))
+        keys = _near(np.array(list(self._tiles)))
         (west, south), (east, north) = keys.min(axis=0), keys.max(axis=0) + 1
         shape = (int(north - south) * TILE, int(east - west) * TILE)
         names = ("views", "sigma", "height", "seen_s", "weight")
         full = {n: np.zeros(shape, getattr(_Cells(), n).dtype) for n in names}
-        for (i, j), cells in self._tiles.items():
+        for i, j in keys.tolist():
+            cells = self._tiles[i, j]
             row, col = (j - south) * TILE, (i - west) * TILE
             for name in names:
                 full[name][row : row + TILE, col : col + TILE] = getattr(cells, name)

@@ -51,6 +51,9 @@ from service.onboard.loops import LoopSearch
 from service.onboard.map_pages import PagedMap
 from service.scans.file_ledger import FileLedger
 
+FARTHEST_M = 1e6
+"""From the scan's origin."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Job:
@@ -246,8 +249,9 @@ class Dense:
         self.registrations[found.verdict] += 1
         return found
 
-    def _keyframe(self, job: Job, depth: DepthMap) -> Keyframe:
-        """The keyframe in the world, in metres, with what is new in it marked."""
+    def _keyframe(self, job: Job, depth: DepthMap) -> Keyframe | None:
+        """The keyframe in the world, in metres, with what is new in it marked; None where the
+        graph puts it to where nobody flies."""
         seq = job.view.seq
         with self.stopwatch("map"):
             T_map = self.trajectory.map_pose(seq)
@@ -270,6 +274,9 @@ class Dense:
         with self.lock:
             placed = self.trajectory.place(seq)
             self.trajectory.tell(placed)
+        if not np.abs(placed.T_world_camera[:3, 3]).max() < FARTHEST_M:
+            self.refusals["placed beyond all reach"] += 1
+            return None
         h, w = depth.depth_m.shape
         metric = DepthMap(
             depth.depth_m * np.float32(placed.scale),
