@@ -19,6 +19,9 @@ from recon.graph.segment_frames import SegmentFrames
 from recon.graph.smoother import SCALAR, Smoother
 from recon.types import F64
 
+VELOCITY_S = 1.0
+FASTEST_M_S = 100.0
+
 
 class Motions:
     """Adds the motions of one graph to its smoother, and knows which scale each keyframe has."""
@@ -133,9 +136,11 @@ class Motions:
         return motion, graph_factors.left_covariance(motion, apart)
 
     def _velocity(self, last: Node, T_last: F64) -> F64 | None:
-        """(3,) m/s between a segment's keyframe and the one before it; None at its start."""
-        before = [n for n in self._segments.nodes[last.segment] if n.key == last.key - 1]
-        if not before or last.time_ns <= before[0].time_ns:
-            return None
-        step = T_last[:3, 3] - self._smoother.pose(before[0].key)[:3, 3]
-        return np.asarray(step / ((last.time_ns - before[0].time_ns) * 1e-9))
+        """(3,) m/s at a segment's keyframe, over a second or more; None at its start, and where
+        no aircraft is so fast: a camera about to fail stamps pictures anyhow."""
+        for node in reversed(self._segments.nodes[last.segment]):
+            passed_s = (last.time_ns - node.time_ns) * 1e-9
+            if node.key < last.key and passed_s >= VELOCITY_S:
+                velocity = (T_last[:3, 3] - self._smoother.pose(node.key)[:3, 3]) / passed_s
+                return velocity if np.linalg.norm(velocity) < FASTEST_M_S else None
+        return None
