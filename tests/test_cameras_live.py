@@ -123,6 +123,22 @@ def test_stamps_begin_again_on_a_new_time_line() -> None:
     assert stamps.time_ns(10**15, 950_000_000) is None  # or jumped far ahead
 
 
+def test_a_picture_that_lost_its_time_is_dropped_where_others_have_one() -> None:
+    """A decoder gives up its last pictures when the stream has broken off, seconds late."""
+    source = LiveSource(opener(clip(50)), "test", QUICK)
+
+    def pictures(*stamps: int | None) -> Iterator[Any]:
+        for pts in stamps:
+            frame = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="bgr24")
+            frame.pts, frame.time_base = pts, Fraction(1, 50)
+            time.sleep(0.02)
+            yield frame
+
+    assert len(list(source._watch(pictures(0, 1, 2, None, None)))) == 2  # the first sets the clock
+    assert len(list(source._watch(pictures(*[None] * 5)))) == 5
+    source.close()
+
+
 def test_one_time_axis_through_losses() -> None:
     source = LiveSource(opener(clip(6), OSError("gone"), OSError("gone"), clip(6)), "test", QUICK)
     assert source.is_live

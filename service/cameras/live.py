@@ -62,6 +62,11 @@ class StampFilter:
         self._offset_ns: float | None = None
         self._last_pts_ns = 0
 
+    @property
+    def is_set(self) -> bool:
+        """True once a picture had a presentation time."""
+        return self._offset_ns is not None
+
     def time_ns(self, pts_ns: int, arrival_ns: int) -> int | None:
         """The picture's time, on the clock of its arrival; None while catching up."""
         step_ns = pts_ns - self._last_pts_ns
@@ -196,6 +201,8 @@ class LiveSource:
             if picture.pts is not None and picture.time_base is not None:
                 pts_ns = round(picture.pts * picture.time_base * 1_000_000_000)
                 time_ns = stamps.time_ns(pts_ns, arrival_ns)
+            elif stamps.is_set:  # left in the decoder when the stream broke off, seconds ago
+                time_ns = None
             if time_ns is not None:
                 yield image, time_ns - self._start_ns
 
