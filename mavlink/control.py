@@ -125,7 +125,7 @@ class ScanControl(Protocol):
         """A snapshot."""
 
     def start_scan(self) -> Handled:
-        """Start a scan; asked only while none runs."""
+        """Start a scan; asked only while none runs, though the last may still be being closed."""
 
     def stop_scan(self) -> Handled:
         """Close the running scan."""

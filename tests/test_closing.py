@@ -149,20 +149,24 @@ def test_an_arming_while_the_last_scan_is_closed_is_followed_then(
     until(lambda: scanning.scan is not None)
     assert not look(False)
     assert scanning.is_closing
-    for _ in range(3):
-        assert not look(True)  # waits
-    assert told == ["Armed: scanning once the last scan is closed"]
+    assert look(True)
+    assert told == ["Scanning once the last scan is closed"]
+    assert not look(False)  # and off again
     hung.step.set()
+    assert look(True)
+    scanning.retry()
+    assert scanning.is_closing  # waits
     hung.end.set()
     until(lambda: not scanning.is_running)
     hung.end.clear()
-    assert look(True)
+    scanning.retry()
     until(lambda: scanning.is_running and scanning.phase is Phase.SCANNING)
     daemon.actions.stop_scan()  # by command, in the air
     assert look(True)
     hung.end.set()
     until(lambda: not scanning.is_running)
     assert look(True)
+    scanning.retry()
     assert not scanning.is_running  # the operator's stop holds until the next take-off
     hung.store.close()
 

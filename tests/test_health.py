@@ -380,9 +380,9 @@ def test_oldest_finished_scans_make_room(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr("service.scans.retention.shutil.disk_usage", usage)
     assert make_room(tmp_path, 0.0) == []
     assert make_room(tmp_path, 50.0) == []
-    assert make_room(tmp_path, 300.0, keep=names[2]) == [names[0], names[3]]
+    assert make_room(tmp_path, 300.0, keep={names[2]}) == [names[0], names[3]]
     assert (tmp_path / names[1]).is_dir()  # still open
-    assert make_room(tmp_path, 1e6, keep=names[5]) == [names[2], names[4]]
+    assert make_room(tmp_path, 1e6, keep={names[5]}) == [names[2], names[4]]
     assert sorted(p.name for p in tmp_path.iterdir()) == [names[1], names[5]]
     assert make_room(tmp_path / "none", 100.0) == []
 

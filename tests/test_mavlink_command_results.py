@@ -150,11 +150,12 @@ SCANNING = Phase.SCANNING
 
 CASES: dict[int, dict[Result, list[Asked]]] = {
     2500: {
-        ACCEPTED: [plain(2500, CAMERA), during(SCANNING, plain(2500, CAMERA))],
-        REJECTED: [
+        ACCEPTED: [
+            plain(2500, CAMERA),
+            during(SCANNING, plain(2500, CAMERA)),
             during(Phase.FINALISING, plain(2500, CAMERA)),
-            refused("start_scan", REJECTED, plain(2500, CAMERA)),
         ],
+        REJECTED: [refused("start_scan", REJECTED, plain(2500, CAMERA))],
     },
     2501: {ACCEPTED: [plain(2501, CAMERA), during(SCANNING, plain(2501, CAMERA))]},
     2000: {
@@ -174,7 +175,7 @@ CASES: dict[int, dict[Result, list[Asked]]] = {
     },
     200: {
         ACCEPTED: [plain(200, CAMERA, 0, 0, 0, 1), plain(200, CAMERA, 0, 0, 0, 0)],
-        REJECTED: [during(Phase.FINALISING, plain(200, CAMERA, 0, 0, 0, 1))],
+        REJECTED: [refused("start_scan", REJECTED, plain(200, CAMERA, 0, 0, 0, 1))],
         DENIED: [plain(200, CAMERA, 0, 0, 0, 9)],
     },
     526: {

@@ -181,11 +181,13 @@ def test_start_stop_start_within_the_window_starts_again(ends: Ends) -> None:
     assert ends.control.asked == ["start_scan", "stop_scan", "start_scan"]
 
 
-def test_start_waits_for_the_last_scan_and_passes_on_refusals(ends: Ends) -> None:
+def test_start_while_the_last_scan_is_closed_is_passed_on(ends: Ends) -> None:
     ends.control.state = replace(ends.control.state, phase=Phase.FINALISING)
-    assert ends.command(2500, 100) == [BUSY]
-    assert any("still being written" in text for text in ends.texts())
-    ends.control.state = replace(ends.control.state, phase=Phase.IDLE)
+    assert ends.command(2500, 100) == [ACCEPTED]
+    assert ends.control.asked == ["start_scan"]
+
+
+def test_start_passes_on_refusals(ends: Ends) -> None:
     for result in (Result.DENIED, Result.FAILED, Result.TEMPORARILY_REJECTED):
         ends.pass_time(5.0)
         ends.control.answers["start_scan"] = Answer(result, f"no camera {result}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mavlink.control import ACCEPTED, Answer, Handled, Phase, Result
+from mavlink.control import ACCEPTED, Handled, Phase
 from mavlink.messages import CAMERA
 
 if TYPE_CHECKING:
@@ -24,8 +24,6 @@ def handle(call: Call, host: Companion) -> Handled | None:
 def start(host: Companion, status_hz: float = 0.0) -> Handled:
     """Start a scan unless one runs, and send the camera's status at a rate."""
     phase = host.control.status().phase
-    if phase is Phase.FINALISING:
-        return Answer(Result.TEMPORARILY_REJECTED, "the last scan is still being written")
     host.camera.stream_status(status_hz)
     handled = ACCEPTED if phase in (Phase.SCANNING, Phase.PAUSED) else host.control.start_scan()
     host.camera.send_capture_status()

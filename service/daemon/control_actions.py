@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mavlink.control import ACCEPTED, Answer, Handled, Phase, Power, Result, ScanStatus, Work
-from mavlink.status import INFO, WARNING
+from mavlink.status import INFO, NOTICE, WARNING
 from service.daemon.scanning import Scanning
 from service.daemon.tuning import with_parameter
 from service.errors import InputError, OutsideError, SkyreliefError
@@ -49,9 +49,13 @@ class ControlActions:
         )
 
     def start_scan(self) -> Handled:
-        """Start a scan."""
+        """Start a scan; where the last one is being closed, as soon as that lets it."""
         if not self.is_ready:
             return Answer(Result.TEMPORARILY_REJECTED, "still starting")
+        if self._scanning.is_closing:
+            self._scanning.start_next()
+            self._scanning.vehicle.statustext("Scanning once the last scan is closed", NOTICE)
+            return ACCEPTED
         if self._scanning.is_running:
             return Answer(Result.TEMPORARILY_REJECTED, f"a scan is {self._scanning.phase.value}")
         self._scanning.start()
@@ -147,7 +151,8 @@ class ControlActions:
             vehicle.statustext(f"Self-test: {error}", WARNING)
 
     def _erase(self, work: Work) -> None:
-        folders = [p.parent for p in Path(self._scanning.config.scan.folder).glob("*/scan.db")]
+        found = [p.parent for p in Path(self._scanning.config.scan.folder).glob("*/scan.db")]
+        folders = [path for path in found if path.name not in self._scanning.in_the_making]
         try:
             for i, folder in enumerate(folders):
                 shutil.rmtree(folder)

@@ -65,7 +65,6 @@ class Daemon:
         self._quit = threading.Event()
         self._fault = fault
         self._is_silent = False  # no picture comes, and that was said
-        self._waits = False  # armed while the last scan is being closed
         self.scanning = Scanning(config)
         self.load_control = LoadControl(self.scanning)
         self.actions = ControlActions(self.scanning, self.quit)
@@ -232,7 +231,7 @@ class Daemon:
                 machine = read_machine(folder)
                 self.vehicle.set_load(computer_load(machine, cores.percent(), keep_free_mib))
                 self.load_control.look(machine)
-                make_room(folder, keep_free_mib, self.scanning.scan_id)
+                make_room(folder, keep_free_mib, self.scanning.in_the_making)
                 give_back()
             except Exception:  # a disk that fails must not end the watch over all the rest
                 log.exception("a fault while looking after the machine")
@@ -266,17 +265,8 @@ class Daemon:
             self.actions.start_scan()
 
     def _follow_arming(self, was_armed: bool) -> bool:
-        """The arming that was followed; one that finds the last scan being closed has to wait."""
+        """Start and stop a scan with the motors, if so configured; whether they are on."""
         is_armed = self.vehicle.report().is_armed
-        if self.config.scan.start != "on-arm" or is_armed == was_armed:
-            self._waits = False
-        elif not is_armed:
-            self.actions.stop_scan()
-        elif self.scanning.is_closing:
-            if not self._waits:
-                self.vehicle.statustext("Armed: scanning once the last scan is closed", WARNING)
-            self._waits = True
-            return was_armed
-        else:
-            self.actions.start_scan()
+        if self.config.scan.start == "on-arm" and is_armed != was_armed:
+            (self.actions.start_scan if is_armed else self.actions.stop_scan)()
         return is_armed

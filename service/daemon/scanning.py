@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,13 +16,14 @@ from mavlink.control import ACCEPTED, Answer, Phase, Result, Work
 from mavlink.status import CRITICAL, WARNING
 from mavlink.vehicle import VehicleLink
 from service.config import Config
-from service.daemon.closing import ClosingWatch, sizes
+from service.daemon.closing import ClosingWatch
 from service.daemon.degradation import Level, lowered
 from service.daemon.memory import fill_small_caches, give_back
 from service.daemon.resumption import Resumption
 from service.daemon.scan_reports import odometry_reporter, tell_keyframe
 from service.daemon.scan_time import disagreement, set_since
 from service.daemon.warm_up import is_warm
+from service.daemon.writing import Writings
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.onboard.datalink import DaemonLink
 from service.scans.claim import Claim
@@ -67,6 +69,8 @@ class Scanning:
         self._paused = threading.Event()
         self._worker: threading.Thread | None = None
         self._starting = threading.Lock()  # by a command, by arming, or again after a fault
+        self._in_haste = threading.Event()  # another scan is to begin
+        self._writings = Writings(lambda text: self.vehicle.statustext(text, WARNING))
         self._closing: Work | None = None
         self._watch = ClosingWatch()
         self._store: ScanStore | None = None  # of the scan that runs
@@ -117,6 +121,7 @@ class Scanning:
             self._retry_at_s = None
             self._stop.clear()
             self._paused.clear()
+            self._in_haste.clear()
             if self.config.scan.start == "on-command":  # else it starts by itself anyway
                 self.resumption.note()
             self.phase = Phase.SCANNING
@@ -124,9 +129,19 @@ class Scanning:
             self._worker = threading.Thread(target=self._work, name="scan", daemon=True)
             self._worker.start()
 
+    def start_next(self) -> None:
+        """Start a scan as soon as the one that is being closed is safe in its store.
+
+        Its files are written beside the new scan, where this computer's kernels can run on two
+        threads at once; else the new scan waits for them.
+        """
+        self._retry_at_s = time.monotonic()
+        self._in_haste.set()
+
     def stop(self) -> None:
         """Close the running scan, also where it waits for a dead camera, and start no other."""
         self._retry_at_s = None
+        self._in_haste.clear()
         self._stop_feeding()
 
     def _stop_feeding(self) -> None:
@@ -138,9 +153,9 @@ class Scanning:
 
     def finalise(self) -> Work:
         """Close the running scan; done when everything is written out."""
-        self._closing = Work()
+        work = self._closing = self._closing or Work()
         self._stop_feeding()
-        return self._closing
+        return work
 
     def pause(self) -> None:
         """Take no frames until :meth:`resume`."""
@@ -191,7 +206,8 @@ class Scanning:
 
         To be asked often: progress is what has changed since it was asked last.
         """
-        return self._watch.look(self._closing_marks() if self.is_closing else None)
+        is_waited_for = self.is_closing or (self._ended.is_set() and len(self._writings) > 0)
+        return self._watch.look(self._closing_marks() if is_waited_for else None)
 
     @property
     def is_closing(self) -> bool:
@@ -201,10 +217,16 @@ class Scanning:
     def _closing_marks(self) -> tuple[Any, ...]:
         """What changes when closing gets on: uses of the store, bytes of files, keyframes."""
         scan, store, worker = self.scan, self._store, self._worker
+        marks = (self.phase, *self._writings.marks())
         if scan is None or store is None or worker is None:
-            return (self.phase,)
-        folder = scan.inputs.folder
-        return (self.phase, store.uses(worker.ident or 0), scan.recorder.keyframes, sizes(folder))
+            return marks
+        return (*marks, store.uses(worker.ident or 0), scan.recorder.keyframes)
+
+    @property
+    def in_the_making(self) -> set[str]:
+        """Names of the scans that nobody may delete: the one that runs, and those whose files are
+        being written."""
+        return {self.scan_id, *self._writings.names}
 
     def set_level(self, level: Level) -> None:
         """Do less with the pictures, or more again, in this scan and in the next."""
@@ -231,17 +253,18 @@ class Scanning:
             self.start()
 
     def end(self, alive: Callable[[], None] = lambda: None) -> None:
-        """Close the running scan, wait for its files, and start no other.
+        """Close the running scan, wait for all files, and start no other.
 
         ``alive`` is called every second while closing gets on.
         """
         self._ended.set()
+        self._in_haste.clear()
         self._stop_feeding()
-        worker = self._worker
-        while worker is not None and worker.is_alive():
+        while (worker := self._worker) is not None and (worker.is_alive() or self._writings):
             if self.idle_closing_s < 1.5:
                 alive()
             worker.join(1.0)
+            self._writings.wait(1.0)
         self.link.rest()
 
     # ---- the scan's thread ------------------------------------------------------------------
@@ -295,7 +318,6 @@ class Scanning:
         from service.cameras.camera_file import check_size
         from service.daemon.frame_gate import FrameGate
         from service.onboard.scan import Scan, ScanInputs, create_store
-        from service.scans.folder import write_deliverables
 
         assert self.camera is not None and self._backend is not None
         check_size(self.camera, source.size_px, source.description)
@@ -331,6 +353,10 @@ class Scanning:
         self.vehicle.statustext(f"Scan {scan_id} started")
         try:
             self.scan.run(self._stop, self._on_frame, self._paused)
+        except Exception:
+            if not self._stop.is_set():
+                self._in_haste.set()  # it is tried again at once
+            raise
         finally:
             source.close()
             self.phase = Phase.FINALISING
@@ -339,9 +365,14 @@ class Scanning:
                 gate.warnings += set_since(offset, self.vehicle.unix_offset_ns())
                 self._close_scan(self.scan, store)
             finally:
-                write_deliverables(folder, store, {})
-                self.link.land(self.config)
-                store.close()
+                land = partial(self.link.land, self.config)
+                self._writings.write(folder, store, self._in_haste, land, self._hand_over)
+
+    def _hand_over(self) -> Work | None:
+        """Have done with a scan whose files are still being written; what ends with them."""
+        self.link.land(self.config, in_haste=True)
+        work, self._closing = self._closing, None
+        return work
 
     def _tell_of_clock(self, gate: FrameGate, offset_ns: int) -> None:
         """Say that the scan has the autopilot's time instead of this computer's."""

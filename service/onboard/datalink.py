@@ -86,13 +86,13 @@ class DaemonLink:
             self._radio = VehicleRadio(vehicle)
         self.flying = open_datalink(store, config, self._radio)
 
-    def land(self, config: Config) -> None:
+    def land(self, config: Config, in_haste: bool = False) -> None:
         """End the scan's sender. What it could not send the backlog will; by radio alone there
-        is none, and the rest is waited for."""
+        is none, and the rest is waited for unless the next scan is ``in_haste``."""
         sender, self.flying = self.flying, None
         if sender is None:
             return
-        if not (config.datalink.connect or config.datalink.listen):
+        if not (in_haste or config.datalink.connect or config.datalink.listen):
             sender.drain(config.datalink.drain_s)
         sender.close()
 

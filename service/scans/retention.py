@@ -48,15 +48,15 @@ def close_open_scans(folder: Path, ours: Container[str]) -> list[str]:
     return closed
 
 
-def make_room(folder: Path, keep_free_mib: float, keep: str = "") -> list[str]:
+def make_room(folder: Path, keep_free_mib: float, keep: Container[str] = ()) -> list[str]:
     """Delete the oldest finished scans until ``keep_free_mib`` are free; names of the deleted.
 
-    The scan called ``keep`` and scans that are still open stay.
+    Those called as in ``keep`` and those that are still open stay.
     """
     deleted: list[str] = []
     if keep_free_mib <= 0 or not folder.is_dir():
         return deleted
-    candidates = [path.parent for path in folder.glob("*/scan.db") if path.parent.name != keep]
+    candidates = [path.parent for path in folder.glob("*/scan.db") if path.parent.name not in keep]
     for scan in sorted(candidates, key=lambda p: p.name):  # names are times
         if shutil.disk_usage(folder).free >= keep_free_mib * MIB:
             break

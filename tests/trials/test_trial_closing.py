@@ -120,3 +120,50 @@ def test_closing_that_hangs_ends_in_a_restart(tmp_path: Path, record: Row) -> No
     assert json.loads((scan / "scan.json").read_text())["finished"] is True
     assert (scan / "cloud.laz").stat().st_size > 0
     assert back_s < BACK_S
+
+
+def _state(service: Service) -> tuple[str, bool]:
+    """The service's, and whether the scan has keyframes."""
+    status = service.get()
+    return str(status.get("state")), status.get("clouds", 0) > 0
+
+
+def test_taking_off_while_files_are_written(tmp_path: Path, record: Row) -> None:
+    """The next flight does not wait for them, however long they take."""
+    hangs, link = tmp_path / "hangs", free_port()
+    hangs.touch()
+    more = f'[datalink]\ndrain_s = 0\n[mavlink]\nlinks = ["udpin:127.0.0.1:{link}"]\n'
+    environment = with_site(tmp_path, HANGS) | {"TRIAL_HANGS": str(hangs)}
+    autopilot = Autopilot(link, attitude=False)
+    autopilot.start()
+    with Service(tmp_path, "on-arm", environment, more=more) as service:
+        service.until_up()
+        autopilot.armed.set()
+        service.until(lambda: stored(service.scans), "a chunk")
+        (first,) = service.scans.iterdir()
+        autopilot.armed.clear()
+        service.until(lambda: service.get().get("state") == "finalising", "landing")
+        autopilot.armed.set()
+        again = ("scanning", True)
+        back_s = service.until(lambda: _state(service) == again, "take-off")
+        assert service.get()["scan"] != first.name
+        assert not (first / "scan.json").exists()
+        acknowledged = stored(service.scans)
+        hangs.unlink()
+        service.until((first / "scan.json").is_file, "the files of the first flight")
+        assert service.stop() == 0
+        autopilot.ended.set()
+    lost = acknowledged - stored(service.scans)
+    record(
+        "take-off while the last flight's files are written",
+        1,
+        "scanning beside that; both scans have their files",
+        f"{len(lost)} of {len(acknowledged)} chunks",
+        back_s,
+    )
+    assert not lost
+    for folder in service.scans.iterdir():
+        assert json.loads((folder / "scan.json").read_text())["finished"] is True
+        assert (folder / "cloud.laz").is_file()
+    assert "Scanning once the last scan is closed" in autopilot.texts
+    assert back_s < BACK_S

@@ -1,0 +1,131 @@
+"""The files of a scan that has ended, written on a thread of their own.
+
+They take half a minute after a flight of five; a flight that begins meanwhile need not wait for
+them. What is stored is safe by then, and the next start writes what this one could not.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mavlink.control import ACCEPTED, Answer, Result, Work
+from service.compute.threading_layer import kernels_may_overlap
+from service.daemon.closing import sizes
+
+if TYPE_CHECKING:
+    from service.stream.store import ScanStore
+
+log = logging.getLogger(__name__)
+
+Ended = Callable[["Writing"], None]
+
+
+class Writing:
+    """Writes a finished scan's files, from its making on."""
+
+    def __init__(self, folder: Path, store: ScanStore) -> None:
+        """``store`` is closed by whoever waits for the end; see :meth:`leave`."""
+        self.name = folder.name
+        self.error: Exception | None = None
+        self._folder, self._store = folder, store
+        self._lock, self._done = threading.Lock(), threading.Event()
+        self._ended: Ended | None = None
+        self._thread = threading.Thread(target=self._write, name="files", daemon=True)
+        self._thread.start()
+
+    def wait(self, seconds: float) -> bool:
+        """True when it is done, well or not."""
+        return self._done.wait(seconds)
+
+    def leave(self, hand_over: Callable[[], Ended]) -> bool:
+        """Wait for it no longer: it closes the store, and calls what ``hand_over`` gives at its
+        end. False when it is done already, and nothing of that happens.
+        """
+        with self._lock:
+            if self._done.is_set():
+                return False
+            self._ended = hand_over()
+            return True
+
+    def marks(self) -> tuple[Any, ...]:
+        """What changes when it gets on: uses of the store, bytes of files."""
+        return (self._store.uses(self._thread.ident or 0), sizes(self._folder))
+
+    def _write(self) -> None:
+        from service.scans.folder import write_deliverables
+
+        try:
+            write_deliverables(self._folder, self._store, {})
+        except Exception as error:
+            self.error = error
+        finally:
+            with self._lock:
+                self._done.set()
+            if self._ended is not None:
+                self._store.close()
+                self._ended(self)
+
+
+class Writings:
+    """All files that are being written, of the last scan and of those before it."""
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        """``tell`` gets what the operator should know of files that no scan waited for."""
+        self._tell = tell
+        self._all: list[Writing] = []
+
+    def __len__(self) -> int:
+        return len(self._all)
+
+    @property
+    def names(self) -> set[str]:
+        """Of the scans."""
+        return {writing.name for writing in tuple(self._all)}
+
+    def marks(self) -> tuple[Any, ...]:
+        """What changes when one of them gets on."""
+        return tuple(writing.marks() for writing in tuple(self._all))
+
+    def wait(self, seconds: float) -> None:
+        """Until the oldest is done, but no longer."""
+        for writing in tuple(self._all)[:1]:
+            writing.wait(seconds)
+
+    def write(
+        self, folder: Path, store: ScanStore, in_haste: threading.Event,
+        land: Callable[[], None], hand_over: Callable[[], Work | None],
+    ) -> None:  # fmt: skip
+        """Write a scan's files, then ``land`` its sender and close its store.
+
+        When another scan comes ``in_haste``, and kernels may run on two threads at once, the
+        files are written beside that one: ``hand_over`` ends the sender, and the work that it
+        gives is finished with the files. Raises what writing them raised.
+        """
+        writing = Writing(folder, store)
+        self._all.append(writing)
+        while not writing.wait(0.1):
+            is_left = in_haste.is_set() and kernels_may_overlap()
+            if is_left and writing.leave(lambda: partial(self._written, hand_over())):
+                return
+        self._all.remove(writing)
+        land()
+        store.close()
+        if writing.error is not None:
+            raise writing.error
+
+    def _written(self, work: Work | None, writing: Writing) -> None:
+        """The files are there that no scan waited for, or never will be in this life."""
+        self._all.remove(writing)
+        answer = ACCEPTED
+        if writing.error is not None:
+            text = f"Scan {writing.name} is kept, its files are not written: {writing.error}"
+            log.error("%s", text, exc_info=writing.error)
+            self._tell(text)
+            answer = Answer(Result.FAILED, str(writing.error))
+        if work is not None:
+            work.finish(answer)

@@ -1,0 +1,146 @@
+"""The files of a scan that has ended: waited for, unless another scan is to begin."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+from loopback import until
+
+from mavlink.control import Result, Work
+from service.daemon import writing
+from service.daemon.writing import Writings
+from service.errors import OutsideError
+from service.stream.records import ScanHeader
+from service.stream.store import ScanStore
+
+
+class Slow:
+    """Files that are written once they may, or not at all."""
+
+    def __init__(self) -> None:
+        self.may_end = threading.Event()
+        self.error: Exception | None = None
+        self.written: list[str] = []
+
+    def __call__(self, folder: Path, store: ScanStore, extra: object) -> None:
+        self.may_end.wait(30.0)
+        if self.error is not None:
+            raise self.error
+        store.seqs()  # it is still open
+        self.written.append(folder.name)
+
+
+class Landing:
+    """A flight that has ended, and what is asked of it then."""
+
+    def __init__(self, folder: Path) -> None:
+        header = ScanHeader("s", "d", 1, camera={}, configuration={}, software="test")
+        self.store = ScanStore.create(folder / "s" / "scan.db", header)
+        self.told: list[str] = []
+        self.asked: list[str] = []
+        self.work = Work()
+        self.in_haste = threading.Event()
+        self.writings = Writings(self.told.append)
+
+    def write(self) -> None:
+        self.writings.write(
+            self.store.path.parent, self.store, self.in_haste, self._land, self._hand_over
+        )
+
+    def _land(self) -> None:
+        self.asked.append("land")
+
+    def _hand_over(self) -> Work:
+        self.asked.append("hand over")
+        return self.work
+
+    @property
+    def is_open(self) -> bool:
+        """True until its store is closed."""
+        try:
+            self.store.seqs()
+        except OutsideError:
+            return False
+        return True
+
+
+@pytest.fixture
+def slow(monkeypatch: pytest.MonkeyPatch) -> Slow:
+    files = Slow()
+    monkeypatch.setattr("service.scans.folder.write_deliverables", files)
+    monkeypatch.setattr(writing, "kernels_may_overlap", lambda: True)
+    return files
+
+
+@pytest.fixture
+def landing(tmp_path: Path) -> Landing:
+    return Landing(tmp_path)
+
+
+def test_the_files_are_waited_for(slow: Slow, landing: Landing) -> None:
+    waiting = threading.Thread(target=landing.write)
+    waiting.start()
+    until(lambda: landing.writings.names == {"s"})
+    before = landing.writings.marks()
+    assert landing.writings.marks() == before
+    assert not landing.asked
+    slow.may_end.set()
+    waiting.join()
+    assert slow.written == ["s"]
+    assert landing.asked == ["land"]
+    assert not landing.is_open
+    assert len(landing.writings) == 0
+    assert landing.work.answer is None
+
+
+def test_what_went_wrong_with_them_is_raised(slow: Slow, landing: Landing) -> None:
+    slow.error = OutsideError("the disk is full")
+    slow.may_end.set()
+    with pytest.raises(OutsideError, match="the disk is full"):
+        landing.write()
+    assert landing.asked == ["land"]
+    assert not landing.is_open
+    assert not landing.told
+
+
+def test_another_scan_does_not_wait_for_them(slow: Slow, landing: Landing) -> None:
+    landing.in_haste.set()
+    landing.write()
+    assert landing.asked == ["hand over"]
+    assert landing.is_open
+    assert landing.writings.names == {"s"}
+    assert landing.work.answer is None
+    slow.may_end.set()
+    until(lambda: len(landing.writings) == 0)
+    assert slow.written == ["s"]
+    until(lambda: landing.work.answer)
+    assert landing.work.answer is not None and landing.work.answer.result is Result.ACCEPTED
+    assert not landing.is_open
+    assert not landing.told
+
+
+def test_what_went_wrong_beside_another_scan_is_told(slow: Slow, landing: Landing) -> None:
+    slow.error = OutsideError("the disk is full")
+    landing.in_haste.set()
+    landing.write()
+    slow.may_end.set()
+    until(lambda: landing.work.answer)
+    assert landing.told == ["Scan s is kept, its files are not written: the disk is full"]
+    assert landing.work.answer is not None and landing.work.answer.result is Result.FAILED
+    assert not landing.is_open
+
+
+def test_kernels_that_may_not_overlap_make_it_wait(
+    slow: Slow, landing: Landing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writing, "kernels_may_overlap", lambda: False)
+    landing.in_haste.set()
+    waiting = threading.Thread(target=landing.write)
+    waiting.start()
+    waiting.join(0.5)
+    assert waiting.is_alive()
+    slow.may_end.set()
+    waiting.join()
+    assert landing.asked == ["land"]
