@@ -68,6 +68,16 @@ def inverse(T: F64) -> F64:
     return out
 
 
+def tidied(T: F64) -> F64:
+    """(4, 4) motion with the rotation nearest to what stands in ``T``, whose rounding errors are
+    gone (polar decomposition; Higham 1986, doi:10.1137/0907079).
+
+    Where a pose is made of the one before it and of its inverse, they would double each time.
+    """
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    return compose(U @ Vt, T[:3, 3])
+
+
 def compose(R: F64, t: F64) -> F64:
     """(4, 4) motion with rotation ``R`` (3, 3) and translation ``t`` (3,)."""
     T = np.eye(4)

@@ -17,6 +17,7 @@ class GraphMemory:
     config: PoseGraphConfig
     nodes: list[Node]
     ridden: dict[int, Ridden]
+    let_go: set[int]
     segments: SegmentFrames
     taken: list[Loop]
     pending: list[Loop]

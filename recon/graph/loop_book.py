@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -74,10 +74,11 @@ class LoopBook:
         self.taken += fresh
         return fresh
 
-    def thin(self, ridden: Mapping[int, Ridden], most: int) -> None:
-        """Move the ends that are nodes no more; at most ``most`` loops stay."""
-        self.taken = moved_loops(self.taken, ridden, most)
-        self.pending = moved_loops(self.pending, ridden, most)
+    def thin(self, ridden: Mapping[int, Ridden], let_go: Collection[int], most: int) -> None:
+        """Move the ends that are nodes no more; loops of those let go end, and at most ``most``
+        stay."""
+        self.taken = moved_loops(self.taken, ridden, let_go, most)
+        self.pending = moved_loops(self.pending, ridden, let_go, most)
 
     def edges(self) -> list[Edge]:
         """All loops that were offered and not refused."""

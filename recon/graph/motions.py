@@ -125,6 +125,8 @@ class Motions:
         frame = self._segments.known(node.segment)
         if frame is not None and self._segments.is_tied(node.segment):
             T = frame.pose(node.T_odom_camera)
+        elif node.over is not None:
+            T = T_last @ node.over
         else:
             priors = self._segments.at_camera(last), self._segments.at_camera(node)
             T = carried(*priors, T_last, self._velocity(last, T_last), passed_s)

@@ -16,6 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from recon import se3
 from recon.graph import factors as graph_factors
 from recon.graph.alignment import Scale, Similarity
 from recon.graph.factors import pose3
@@ -27,7 +28,7 @@ from recon.graph.records import Loop, Node, PoseGraphConfig
 from recon.graph.segment_frames import SegmentFrames
 from recon.graph.sensor_offsets import Constants
 from recon.graph.smoother import ROUNDS, Smoother, moved_covariance
-from recon.graph.thinning import GONE_SHARE, Ridden, moved_loop, surplus, thinned
+from recon.graph.thinning import GONE_SHARE, Ridden, moved_loop, over_gaps, surplus, thinned
 from recon.types import F64, Pose, PosePrior
 
 __all__ = ["Edge", "PoseGraph", "PoseGraphConfig"]
@@ -49,6 +50,7 @@ class PoseGraph:
         self._kept_counts: Counter[str] = Counter()  # of what happens once, whatever is rebuilt
         self._nodes: dict[int, Node] = {}  # by keyframe number, in order of time
         self._ridden: dict[int, Ridden] = {}  # that were nodes until the last thinning
+        self._let_go: set[int] = set()  # with their segments, by that thinning
         self._thin_at = self.config.most_nodes
         self.entered = 0  # keyframes, whether they are nodes or not
         self.generation = 0  # how often nodes were thinned out
@@ -132,6 +134,8 @@ class PoseGraph:
         must be multiplied by to fit a's. One loop alone is not believed: a repeated texture
         gives perfect matches at the wrong place. A second one nearby must close the same circle.
         """
+        if self.is_let_go(a) or self.is_let_go(b):
+            return False
         if not all(end in self._nodes or end in self._ridden for end in (a, b)) or a == b:
             raise ValueError(f"keyframes {a} and {b} are not two of the graph")
         if a > b:
@@ -186,6 +190,10 @@ class PoseGraph:
         """The node that keyframe ``seq`` is, or hangs on since the last thinning."""
         return self._ridden[seq].node if seq in self._ridden else seq
 
+    def is_let_go(self, seq: int) -> bool:
+        """True of a keyframe that the last thinning let go with its whole segment."""
+        return seq in self._let_go
+
     @property
     def seqs(self) -> list[int]:
         """Numbers of the nodes, in order."""
@@ -194,9 +202,10 @@ class PoseGraph:
     def memory(self) -> GraphMemory:
         """All from which :meth:`restored` makes the same graph."""
         return GraphMemory(
-            self.config, list(self._nodes.values()), dict(self._ridden), self._segments,
-            list(self._book.taken), list(self._book.pending), Counter(self._book.counts),
-            Counter(self._kept_counts), self.entered, self.generation, self._thin_at,
+            self.config, list(self._nodes.values()), dict(self._ridden), set(self._let_go),
+            self._segments, list(self._book.taken), list(self._book.pending),
+            Counter(self._book.counts), Counter(self._kept_counts), self.entered,
+            self.generation, self._thin_at,
         )  # fmt: skip
 
     @classmethod
@@ -205,6 +214,7 @@ class PoseGraph:
         graph = cls(memory.config)
         graph._nodes = {node.seq: node for node in memory.nodes}
         graph._ridden, graph._segments = dict(memory.ridden), memory.segments
+        graph._let_go = set(memory.let_go)
         book, graph._kept_counts = graph._book, Counter(memory.kept_counts)
         book.taken, book.pending = list(memory.taken), list(memory.pending)
         book.counts, graph._thin_at = Counter(memory.book_counts), memory.thin_at
@@ -346,10 +356,15 @@ class PoseGraph:
     def _thin(self) -> None:
         """Let some of the older keyframes ride on their neighbours, and build anew."""
         before = list(self._nodes.values())
-        nodes, self._ridden = thinned(before, surplus(before))
+        gone = surplus(before)
+        nodes, self._ridden = thinned(before, gone)
+        self._let_go = gone - self._ridden.keys()
+        self._kept_counts["keyframe let go"] += len(self._let_go)
+        poses = dict(zip(self._nodes, self._smoother.poses(), strict=False))  # but the newest
+        nodes = over_gaps(nodes, poses)
         self._nodes = {node.seq: node for node in nodes}
         self._segments.thin(nodes)
-        self._book.thin(self._ridden, len(nodes))
+        self._book.thin(self._ridden, self._let_go, len(nodes))
         self._thin_at = max(self.config.most_nodes, int(len(nodes) * (1.0 + GONE_SHARE)))
         self.generation += 1
         self.rebuild()
@@ -369,7 +384,7 @@ class PoseGraph:
         else:
             T_last, spread_last = self._smoother.state(last.key)
             motion, covariance = self._motions.add(node, last, T_last)
-            T = T_last @ motion
+            T = se3.tidied(T_last @ motion)
             self._path[-1] += float(np.linalg.norm(motion[:3, 3]))
             spread = moved_covariance(spread_last, T_last, covariance)
         self._smoother.add_pose(node.key, T, spread)

@@ -2,7 +2,8 @@
 
 From the node before it a keyframe goes on by vision. What vision then misses the next node by
 is spread evenly over the keyframes between, as a screw motion. Both nodes belong to the
-keyframe's segment, whose first and last keyframes are always nodes.
+keyframe's segment, whose first and last keyframes are nodes. Where no node of its segment is
+left it stays as it was published last.
 """
 
 from __future__ import annotations
@@ -52,6 +53,14 @@ def ridden(rows: Rows, first: int, before: Carrier, after: Carrier) -> tuple[F64
     share = (first - before.row + np.arange(len(rows))) / (after.row - before.row)
     mended = np.array([se3.exp(s * miss) for s in share]).reshape(-1, 4, 4)
     return mended @ poses, before.scale * (after.scale / before.scale) ** share
+
+
+def left(rows: Rows, before: Carrier) -> tuple[F64, F64]:
+    """(N, 4, 4) poses and (N,) scales of the ledger's rows that no node carries: as published,
+    and in the place of the node ``before`` them if they never were."""
+    told = rows["told"] > 0
+    poses = np.where(told[:, None, None], whole(rows["pose"]), before.T_world_camera)
+    return poses, np.where(told, rows["scale"], before.scale)
 
 
 def whole(parts: F64) -> F64:

@@ -47,10 +47,13 @@ class SegmentFrames:
         self._seen[node.segment] += 1
 
     def thin(self, nodes: Iterable[Node]) -> None:
-        """Keep these keyframes alone. What is known of the segments stays."""
-        self.nodes = {}
+        """Keep these keyframes alone, and what is known of their segments."""
+        before, self.nodes = self.nodes, {}
         for node in nodes:
             self.nodes.setdefault(node.segment, []).append(node)
+        for segment in before.keys() - self.nodes.keys():
+            self._unplace(segment)
+            self._seen.pop(segment)
 
     def known(self, segment: int) -> Similarity | None:
         """The segment's similarity; None before telemetry or a loop tells it."""
@@ -101,10 +104,13 @@ class SegmentFrames:
 
     def forget(self, segment: int) -> bool:
         """Count the segment as not placed; True when no fix can place it again."""
+        self._unplace(segment)
+        return all(n.prior.sigma_position_m is None for n in self.nodes[segment])
+
+    def _unplace(self, segment: int) -> None:
         for known in (self._frames, self._offsets, self._fitted, self._constants):
             known.pop(segment, None)
         self._tied.discard(segment)
-        return all(n.prior.sigma_position_m is None for n in self.nodes[segment])
 
     def refit(self, segment: int, pose: Callable[[int], F64]) -> bool:
         """True when the segment's frame was fitted anew, which is due as the segment grows.

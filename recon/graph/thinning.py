@@ -5,12 +5,17 @@ so are their covariances (Barfoot, State Estimation for Robotics, 2017, section 
 ended at it end at the node before it, moved there by vision. Its fix goes into the mean of the
 next node's; other readings of it go. Readings are weighed by how many of them there are in the
 time flown (:mod:`recon.graph.readings`), so those that stay then weigh more.
+
+Where segments are so many and short that this finds too few, whole segments are let go, those
+first that leave the smallest holes. Their keyframes stay where they were told to be; their
+readings and loops are gone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby, pairwise
 
 import numpy as np
 
@@ -41,30 +46,42 @@ class Ridden:
 def surplus(nodes: Sequence[Node]) -> set[int]:
     """Numbers of those that can go: from where nodes stand closest, never two neighbours.
 
-    The first and the last of each segment stay, and so do the newest.
+    The first and the last of each segment stay, and so do the newest. When those are too many,
+    whole segments go.
     """
-    found = []
-    for i in range(1, len(nodes) - max(2, int(NEWEST_SHARE * len(nodes)))):
+    found, wanted = [], GONE_SHARE * len(nodes)
+    old = len(nodes) - max(2, int(NEWEST_SHARE * len(nodes)))
+    for i in range(1, old):
         before, node, after = nodes[i - 1 : i + 2]
         if before.segment == node.segment == after.segment:
             found.append((node.weight + after.weight, i))
     gone: set[int] = set()
     for _, i in sorted(found):
-        if len(gone) >= GONE_SHARE * len(nodes):
+        if len(gone) >= wanted:
             break
         if i - 1 not in gone and i + 1 not in gone:
             gone.add(i)
+    for segment in _smallest_holes_first(nodes, old):
+        if len(gone) >= wanted:
+            break
+        if segment[0] - 1 not in gone and segment[-1] + 1 not in gone:
+            gone.update(segment)
     return {nodes[i].seq for i in gone}
 
 
 def thinned(nodes: Sequence[Node], gone: set[int]) -> tuple[list[Node], dict[int, Ridden]]:
-    """The nodes that stay, with keys that follow each other, and where the others hang."""
+    """The nodes that stay, with keys that follow each other, and where the others hang.
+
+    Those of segments of which nothing stays hang nowhere.
+    """
     kept: list[Node] = []
     ridden: dict[int, Ridden] = {}
     left: Node | None = None
     for node in nodes:
         if node.seq in gone:
             last = kept[-1]
+            if node.segment != last.segment:
+                continue
             T = se3.inverse(last.T_odom_camera) @ node.T_odom_camera
             ridden[node.seq] = Ridden(last.seq, T, node.covariance)
             left = node
@@ -76,11 +93,26 @@ def thinned(nodes: Sequence[Node], gone: set[int]) -> tuple[list[Node], dict[int
     return kept, ridden
 
 
-def moved_loops(loops: Sequence[Loop], ridden: Mapping[int, Ridden], most: int) -> list[Loop]:
-    """The loops between nodes that stay: the surest of several between the same two, and of
-    more than ``most`` every second of the older half."""
+def over_gaps(nodes: Sequence[Node], poses: Mapping[int, F64]) -> list[Node]:
+    """The nodes, those that begin a segment with the motion since the node before as the
+    ``poses`` (4, 4) have it: from now on it rests on nothing that may be thinned out."""
+    out = list(nodes[:1])
+    for last, node in pairwise(nodes):
+        if node.segment != last.segment and node.seq in poses:
+            node = replace(node, over=se3.inverse(poses[last.seq]) @ poses[node.seq])
+        out.append(node)
+    return out
+
+
+def moved_loops(
+    loops: Sequence[Loop], ridden: Mapping[int, Ridden], let_go: Collection[int], most: int
+) -> list[Loop]:
+    """The loops between nodes that stay, or that others hang on: the surest of several between
+    the same two, and of more than ``most`` every second of the older half."""
     best: dict[tuple[int, int], Loop] = {}
     for loop in loops:
+        if loop.a in let_go or loop.b in let_go:
+            continue
         moved = moved_loop(loop, ridden)
         if moved.a >= moved.b:
             continue
@@ -110,6 +142,15 @@ def moved_loop(loop: Loop, ridden: Mapping[int, Ridden]) -> Loop:
         covariance = loop.covariance + A @ (covariance * np.outer(units, units)) @ A.T
         loop = replace(loop, b=other.node, T_a_b=loop.T_a_b @ T, covariance=covariance)
     return loop
+
+
+def _smallest_holes_first(nodes: Sequence[Node], old: int) -> list[list[int]]:
+    """Indices of the segments among the first ``old`` nodes that may go whole; the first segment,
+    from which all is carried on, may not."""
+    groups = [list(group) for _, group in groupby(range(old), lambda i: nodes[i].segment)]
+    if groups and nodes[old].segment == nodes[old - 1].segment:
+        groups.pop()
+    return sorted(groups[1:], key=lambda group: nodes[group[-1] + 1].seq - nodes[group[0] - 1].seq)
 
 
 def _joined(ridden: Ridden, left: Node, node: Node) -> Node:

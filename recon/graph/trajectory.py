@@ -20,7 +20,7 @@ from recon.graph.alignment import Similarity
 from recon.graph.keyframe_graph import KeyframeGraph
 from recon.graph.ledger import Ledger, MemoryLedger, Rows
 from recon.graph.pose_graph import PoseGraph
-from recon.graph.riders import KEYFRAME, Carrier, change, moved_m, ridden, whole
+from recon.graph.riders import KEYFRAME, Carrier, change, left, moved_m, ridden, whole
 from recon.types import F64, PosePrior
 
 AT_ONCE = 200
@@ -203,10 +203,13 @@ class Trajectory:
 
     def add_loop(self, a: int, b: int, T_a_b: F64, covariance: F64, growth: float = 1.0) -> bool:
         """As :meth:`recon.graph.pose_graph.PoseGraph.add_loop`; ``a`` need not be a node, and
-        then the loop is moved to the node before it."""
+        then the loop is moved to the node before it; False where that is of another
+        segment."""
         self._follow()
         if a not in self.graph:
             before, after = self._beside(a)
+            if not self._same_segment(before, after):
+                return False  # no node carries it
             T = self.step_between(before, a)
             node, rows = self.graph.node(after), self._row[after] - self._row[before]
             units = np.array([1.0] * 3 + [self.graph.scale(before)] * 3)
@@ -315,6 +318,9 @@ class Trajectory:
         self._told.thin({seq: key for key, seq in enumerate(self._nodes)})
         self._owed = deque(seq for seq in self._owed if seq in self._row)
 
+    def _same_segment(self, a: int, b: int) -> bool:
+        return self.graph.node(a).segment == self.graph.node(b).segment
+
     def _beside(self, seq: int) -> tuple[int, int]:
         """The nodes before and after a keyframe that is none."""
         i = bisect_left(self._nodes, seq)
@@ -349,7 +355,10 @@ class Trajectory:
                     p.scale)
             for p in (held, self.place(after))
         ]  # fmt: skip
-        T, scales = ridden(rows, first, *ends)
+        if self._same_segment(before, after):
+            T, scales = ridden(rows, first, *ends)
+        else:
+            T, scales = left(rows, ends[0])
         return [
             Placed(int(row["seq"]), T[i], float(scales[i]), held.covariance, held.sources)
             for i, row in enumerate(rows)

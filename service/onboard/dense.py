@@ -253,6 +253,12 @@ class Dense:
         """The keyframe in the world, in metres, with what is new in it marked; None where the
         graph puts it to where nobody flies."""
         seq = job.view.seq
+        with self.lock:
+            placed = self.trajectory.place(seq)
+            if not np.abs(placed.T_world_camera[:3, 3]).max() < FARTHEST_M:
+                self.refusals["placed beyond all reach"] += 1
+                return None
+            self.trajectory.tell(placed)
         with self.stopwatch("map"):
             T_map = self.trajectory.map_pose(seq)
             in_map = DepthMap(depth.depth_m, depth.sigma_m, depth.views, depth.K, T_map)
@@ -271,12 +277,6 @@ class Dense:
                 )
             fresh = self._map.fresh(in_map)
             self._map.insert(in_map, fresh)
-        with self.lock:
-            placed = self.trajectory.place(seq)
-            self.trajectory.tell(placed)
-        if not np.abs(placed.T_world_camera[:3, 3]).max() < FARTHEST_M:
-            self.refusals["placed beyond all reach"] += 1
-            return None
         h, w = depth.depth_m.shape
         metric = DepthMap(
             depth.depth_m * np.float32(placed.scale),

@@ -107,6 +107,8 @@ class Watched:
         scales: tuple[float, float],
     ) -> bool:  # fmt: skip
         """``scales`` are those at both ends by which the loop was measured in metres."""
+        if self.graph.is_let_go(a) or self.graph.is_let_go(b):
+            return False
         ends = self.graph.carrier(a), self.graph.carrier(b)
         first = self.graph.scale(ends[0]) / scales[0]
         units = np.array([1.0] * 3 + [first] * 3)

@@ -1,0 +1,174 @@
+"""A pose graph with a bound, where vision breaks so often that whole segments must go."""
+
+from __future__ import annotations
+
+import os
+import signal
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+from flown_track import sensed
+
+from recon import se3
+from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.graph.records import Loop, Node
+from recon.graph.riders import KEYFRAME, Carrier, left
+from recon.graph.thinning import moved_loops, over_gaps, surplus, thinned
+from recon.graph.trajectory import Trajectory
+from recon.types import F64, PosePrior
+from service.bench.graph import HEIGHT_M, legs
+from service.onboard.graph_aside import GraphAside
+
+COUNT, MOST, EACH = 250, 50, 5
+STEP_M, SCALE = 5.0, 1.3
+SPREAD = np.diag([3e-4**2] * 3 + [0.02**2] * 3)  # of a motion, in metres
+UNITS = np.outer([1.0] * 3 + [1.0 / SCALE] * 3, [1.0] * 3 + [1.0 / SCALE] * 3)
+
+
+@cache
+def flight() -> tuple[list[F64], list[F64], list[PosePrior]]:
+    rng = np.random.default_rng(11)
+    truth = legs(rng, COUNT, 50, STEP_M)
+    return truth, *sensed(rng, truth, SPREAD, SCALE)
+
+
+def fly(trajectory: Trajectory, first: int = 0, count: int = COUNT, fixes: bool = True) -> int:
+    """Keyframes in segments of :data:`EACH`, each in a frame of its own; the most nodes seen."""
+    _, odom, priors = flight()
+    most = 0
+    for i in range(first, count):
+        segment = i // EACH
+        T = se3.inverse(odom[EACH * segment]) @ odom[i]
+        prior = priors[i] if fixes else PosePrior()
+        height = (HEIGHT_M / SCALE, 0.0) if fixes else None
+        trajectory.add(i, segment, T, prior, height, i * 10**9, SPREAD * UNITS)
+        trajectory.tell(trajectory.place(i))
+        for placed in trajectory.moved():
+            trajectory.tell(placed)
+        most = max(most, len(trajectory.graph))
+    return most
+
+
+def bounded() -> PoseGraph:
+    return PoseGraph(PoseGraphConfig(most_nodes=MOST))
+
+
+def landed(trajectory: Trajectory) -> F64:
+    """(COUNT, 4, 4) where all keyframes are after the last correction."""
+    for placed in trajectory.moved(final=True):
+        trajectory.tell(placed)
+    return np.array([trajectory.place(i).T_world_camera for i in range(COUNT)])
+
+
+def test_many_short_segments_keep_to_the_bound_and_near_the_truth() -> None:
+    whole = Trajectory(graph=PoseGraph())
+    assert fly(whole) == COUNT
+    trajectory = Trajectory(graph=bounded())
+    assert fly(trajectory) <= MOST
+    assert trajectory.graph.counts["keyframe let go"] > COUNT // 4
+    apart = [
+        np.linalg.norm((poses - np.array(flight()[0]))[:, :3, 3], axis=1)
+        for poses in (landed(trajectory), landed(whole))
+    ]
+    rms = [float(np.sqrt(np.mean(a**2))) for a in apart]
+    assert rms[0] < 1.5 * rms[1] < 1.5
+    scales = [trajectory.place(i).scale for i in range(COUNT)]
+    assert np.median(np.abs(np.array(scales) / SCALE - 1.0)) < 0.05
+    assert trajectory.moved(final=True) == []
+    for i in range(0, COUNT, 7):
+        assert trajectory.telling(i)[0] >= 1
+
+
+def test_without_fixes_nothing_jumps_when_segments_go() -> None:
+    """Dead reckoning over a gap is told once: what stays, stays where it was."""
+    trajectory, worst = Trajectory(graph=bounded()), 0.0
+    for i in range(COUNT):
+        before = {seq: trajectory.place(seq).T_world_camera for seq in range(max(0, i - 30), i)}
+        was = trajectory.graph.generation
+        fly(trajectory, i, i + 1, fixes=False)
+        if trajectory.graph.generation > was:
+            shifts = [
+                np.linalg.norm((trajectory.place(seq).T_world_camera - T)[:3, 3])
+                for seq, T in before.items()
+            ]
+            worst = max(worst, *map(float, shifts))
+    assert trajectory.graph.generation > 10
+    assert trajectory.graph.counts["keyframe let go"] > 0
+    assert worst < 0.01
+
+
+def test_what_was_let_go_stays_as_it_was_told() -> None:
+    trajectory = Trajectory(graph=bounded())
+    fly(trajectory)
+    graph = trajectory.graph
+    before, after = next((a, b) for a, b in pairwise(graph.seqs) if b - a > EACH)
+    assert graph.node(after).segment > graph.node(before).segment + 1
+    told = trajectory.place(before + 1)
+    apart = np.linalg.norm((told.T_world_camera - flight()[0][before + 1])[:3, 3])
+    assert 0.0 < apart < 5.0
+    assert not trajectory.add_loop(before + 1, COUNT - 1, np.eye(4), SPREAD)
+    landed(trajectory)
+    assert graph.seqs[0] == 0
+    found = trajectory.place(before + 1)
+    np.testing.assert_array_equal(found.T_world_camera, told.T_world_camera)
+    assert found.scale == told.scale
+
+
+def test_aside_it_is_the_same_also_after_its_process_died() -> None:
+    here = Trajectory(graph=bounded())
+    fly(here)
+    graph = GraphAside(wait_s=5.0, again_s=0.0, most_nodes=MOST)
+    there = Trajectory(graph=graph)
+    fly(there, 0, 150)
+    graph.residuals()
+    os.kill(graph.pid, signal.SIGKILL)
+    fly(there, 150)
+    poses = landed(there)
+    assert graph.seqs == here.graph.seqs
+    graph.close()
+    np.testing.assert_allclose(poses, landed(here), atol=2e-2)
+
+
+def nodes_of(sizes: list[int]) -> list[Node]:
+    """Nodes a metre apart along x, in segments of these sizes."""
+    segments = [segment for segment, size in enumerate(sizes) for _ in range(size)]
+    return [
+        Node(i, i, i, segment, se3.compose(np.eye(3), np.array([i, 0.0, 0.0])), np.eye(6),
+             PosePrior())
+        for i, segment in enumerate(segments)
+    ]  # fmt: skip
+
+
+def test_segments_go_whole_but_neither_the_first_nor_the_newest() -> None:
+    nodes = nodes_of([2, 3, 2, 1, 2, 2, 2, 2, 2])
+    gone = surplus(nodes)
+    assert gone == {2, 3, 4, 7, 10, 11}  # inside the second; the one of one, and no two neighbours
+    kept, ridden = thinned(nodes, gone)
+    assert not ridden
+    assert [n.key for n in kept] == list(range(len(kept)))
+    poses = {n.seq: n.T_odom_camera for n in nodes}
+    loops = [Loop(0, 7, np.eye(4), SPREAD, 1.0), Loop(0, 9, np.eye(4), SPREAD, 1.0)]
+    assert [one.ends for one in moved_loops(loops, ridden, gone - ridden.keys(), 9)] == [(0, 9)]
+    told = {n.seq: n.over for n in over_gaps(kept, poses) if n.over is not None}
+    assert told.keys() == {5, 8, 12, 14, 16}
+    np.testing.assert_allclose(told[8][:3, 3], [2.0, 0.0, 0.0])  # over the seventh
+
+
+def test_of_what_was_never_told_the_node_before_tells() -> None:
+    rng = np.random.default_rng(5)
+    rows, poses = np.zeros(2, KEYFRAME), np.array([se3.exp(rng.normal(size=6)) for _ in range(2)])
+    rows["pose"], rows["scale"], rows["told"] = poses[:, :3], 3.0, [2, 0]
+    node = se3.exp(rng.normal(size=6))
+    T, scales = left(rows, Carrier(0, np.eye(4), node, 2.0))
+    np.testing.assert_array_equal(T, [poses[0], node])
+    assert scales.tolist() == [3.0, 2.0]
+
+
+def test_rounding_errors_do_not_grow_from_break_to_break() -> None:
+    """Each segment's pose is made of the last one's and of its inverse."""
+    trajectory = Trajectory(graph=PoseGraph())
+    fly(trajectory, count=COUNT, fixes=False)
+    R = trajectory.graph.pose_array()[:, :3, :3]
+    np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (COUNT, 1, 1)),
+                               atol=1e-9)  # fmt: skip
