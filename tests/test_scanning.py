@@ -49,7 +49,7 @@ def test_pictures_that_the_camera_model_does_not_fit_are_refused(
 def test_a_scan_that_was_stopped_counts_as_closing_at_once(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A camera that hangs holds its scan for seconds: a start then is refused, not swallowed."""
+    """A camera that hangs holds its scan for seconds: a start then waits, and is not swallowed."""
     end = threading.Event()
     monkeypatch.setattr(Scanning, "_scan_once", lambda self: end.wait(60.0))
     daemon.scanning.start()
