@@ -52,6 +52,9 @@ class Motions:
         T = frame.pose(node.T_odom_camera)
         sigma_t = 50.0 if "gnss" in frame.sources else 0.01
         sigma_r = 1.0 if node.prior.R_world_camera is not None else 0.01
+        if "gnss" in frame.sources:  # places along a line do not tell the roll about it
+            known = float(np.sqrt(np.linalg.eigvalsh(frame.covariance[:3, :3])[-1]))
+            sigma_r = max(sigma_r, min(known, 1.0))
         sigma = np.array([sigma_r] * 3 + [sigma_t] * 3)
         noise = self._gtsam.noiseModel.Diagonal.Sigmas(sigma)
         self._smoother.add(self._gtsam.PriorFactorPose3(node.key, pose3(T), noise), "prior")
@@ -130,7 +133,9 @@ class Motions:
         else:
             priors = self._segments.at_camera(last), self._segments.at_camera(node)
             T = carried(*priors, T_last, self._velocity(last, T_last), passed_s)
-        sigma_r = self._config.sigma_link_rad if node.prior.sigma_yaw_rad < 1.0 else 1.5
+        prior = node.prior
+        is_turn_known = prior.R_world_camera is not None and prior.sigma_yaw_rad < 1.0
+        sigma_r = self._config.sigma_link_rad if is_turn_known else 1.5
         sigma_m = self._config.sigma_link_m * max(passed_s, 1.0) + 5.0
         motion = se3.inverse(T_last) @ T
         # Where it went and how it turned are told apart: the one does not swing by the other.

@@ -28,7 +28,7 @@ from recon.graph.records import Loop, Node, PoseGraphConfig
 from recon.graph.segment_frames import SegmentFrames
 from recon.graph.sensor_offsets import Constants
 from recon.graph.smoother import ROUNDS, Smoother, moved_covariance
-from recon.graph.thinning import GONE_SHARE, Ridden, moved_loop, over_gaps, surplus, thinned
+from recon.graph.thinning import GONE_SHARE, Ridden, moved_loop, thin
 from recon.types import F64, Pose, PosePrior
 
 __all__ = ["Edge", "PoseGraph", "PoseGraphConfig"]
@@ -338,10 +338,16 @@ class PoseGraph:
         """
         try:
             self._make()
+            if self._smoother.is_sound():
+                return
+            why = "its scales went astray"
         except RuntimeError as error:  # GTSAM: an indeterminate system, by steps gone wild
-            log.warning("the pose graph is solved again, carefully: %s", _in_short(error))
-            self._kept_counts["solved again"] += 1
-            self._make(careful=True)
+            why = " ".join(str(error).split()[:9])
+        log.warning("the pose graph is solved again, carefully: %s", why)
+        self._kept_counts["solved again"] += 1
+        self._make(careful=True)
+        if not self._smoother.is_sound():
+            self._kept_counts["solved badly"] += 1
 
     def _make(self, careful: bool = False) -> None:
         self._start(careful)
@@ -355,19 +361,26 @@ class PoseGraph:
 
     def _thin(self) -> None:
         """Let some of the older keyframes ride on their neighbours, and build anew."""
-        before = list(self._nodes.values())
-        gone = surplus(before)
-        nodes, self._ridden = thinned(before, gone)
-        self._let_go = gone - self._ridden.keys()
-        self._kept_counts["keyframe let go"] += len(self._let_go)
         poses = dict(zip(self._nodes, self._smoother.poses(), strict=False))  # but the newest
-        nodes = over_gaps(nodes, poses)
+        done = thin(list(self._nodes.values()), self._refused(), poses)
+        nodes, self._ridden, self._let_go = done.nodes, done.ridden, done.let_go
+        self._kept_counts["keyframe let go"] += len(self._let_go)
         self._nodes = {node.seq: node for node in nodes}
         self._segments.thin(nodes)
         self._book.thin(self._ridden, self._let_go, len(nodes))
         self._thin_at = max(self.config.most_nodes, int(len(nodes) * (1.0 + GONE_SHARE)))
         self.generation += 1
         self.rebuild()
+
+    def _refused(self) -> set[int]:
+        """Nodes whose fix was left out when the graph was built last."""
+        return {
+            node.seq
+            for node, used in zip(self._nodes.values(), self._sources, strict=False)
+            if node.prior.sigma_position_m is not None
+            and "gnss" not in used
+            and self._segments.rests_on_fixes(node.segment)
+        }
 
     def _keep(self, node: Node) -> None:
         self.entered += 1
@@ -432,7 +445,3 @@ class PoseGraph:
 
     def _newest(self) -> Node:
         return next(reversed(self._nodes.values()))
-
-
-def _in_short(error: Exception) -> str:
-    return " ".join(str(error).split()[:9])

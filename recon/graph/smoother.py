@@ -29,6 +29,9 @@ poses bend with the angle and hardly with the place."""
 SCALAR = "s"
 """First letter of a scalar's key (``gtsam.symbol``); poses have plain numbers."""
 
+SOUND = 1.0
+"""What no scalar reaches: they are logarithms of scales, close to nought by their priors."""
+
 ROUNDS = 3
 """Updates after a change that moves many poses; each linearises again what moved."""
 
@@ -122,6 +125,11 @@ class Smoother:
         if self._values.exists(key):
             return float(self._values.atVector(key)[0])
         return float(self._isam.calculateEstimateVector(key)[0])
+
+    def is_sound(self) -> bool:
+        """False when a scalar has left :data:`SOUND`, as after steps that led nowhere."""
+        held = self._gtsam.utilities.extractVectors(self._isam.calculateEstimate(), SCALAR)
+        return bool(np.all(np.abs(np.asarray(held, np.float64)) < SOUND))
 
     def poses(self) -> F64:
         """(N, 4, 4) of all poses in the order of their keys."""

@@ -13,6 +13,7 @@ readings and loops are gone.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
@@ -41,6 +42,24 @@ class Ridden:
     node: int  # number of that node
     T_node_camera: F64  # (4, 4) in units of the odometry
     covariance: F64  # (6, 6) of that motion, left, in the node's frame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Thinned:
+    """A graph's nodes after it was thinned out."""
+
+    nodes: list[Node]  # that stay, with keys that follow each other
+    ridden: dict[int, Ridden]  # by number, those that hang on the node before them
+    let_go: set[int]  # numbers of those that went with their whole segment
+
+
+def thin(nodes: Sequence[Node], refused: Collection[int], poses: Mapping[int, F64]) -> Thinned:
+    """Thin out a graph in which nodes have these ``poses`` (4, 4) T_world_camera, the newest
+    perhaps none yet, and which leaves the fixes of the ``refused`` out."""
+    nodes = without(nodes, refused)
+    gone = surplus(nodes)
+    kept, ridden = thinned(nodes, gone)
+    return Thinned(over_gaps(kept, poses), ridden, gone - ridden.keys())
 
 
 def surplus(nodes: Sequence[Node]) -> set[int]:
@@ -153,6 +172,19 @@ def _smallest_holes_first(nodes: Sequence[Node], old: int) -> list[list[int]]:
     return sorted(groups[1:], key=lambda group: nodes[group[-1] + 1].seq - nodes[group[0] - 1].seq)
 
 
+def without(nodes: Sequence[Node], refused: Collection[int]) -> list[Node]:
+    """The nodes without the fixes that the graph refused, unless most of a segment's were: among
+    fewer nodes one that is far off would weigh too much."""
+    seen = Counter(n.segment for n in nodes)
+    off = Counter(n.segment for n in nodes if n.seq in refused)
+    return [
+        replace(n, prior=replace(n.prior, sigma_position_m=None))
+        if n.seq in refused and 2 * off[n.segment] <= seen[n.segment]
+        else n
+        for n in nodes
+    ]
+
+
 def _joined(ridden: Ridden, left: Node, node: Node) -> Node:
     """The node with the motion over ``left``, which goes, and with the mean of both's fixes."""
     A = se3.adjoint(ridden.T_node_camera)
@@ -165,20 +197,22 @@ def _joined(ridden: Ridden, left: Node, node: Node) -> Node:
 
 
 def _with_fix(node: Node, left: Node) -> PosePrior:
-    """The node's prior with the mean of both fixes, which is the fix of the mean place."""
+    """The node's prior with the mean of both fixes, which is the fix of the mean place; with
+    that of ``left`` where it has none."""
     one, other = node.prior, left.prior
-    if one.position_m is None or other.position_m is None:
+    if other.position_m is None or other.sigma_position_m is None:
         return one
-    if one.sigma_position_m is None or other.sigma_position_m is None:
+    share, position_m = left.weight / (left.weight + node.weight), one.position_m
+    if position_m is None or one.sigma_position_m is None:
+        one = replace(one, sigma_position_m=other.sigma_position_m, above_m=None, above_fixes=0)
+        share, position_m = 1.0, other.position_m
+    elif np.any(other.sigma_position_m > MOST_WORSE * one.sigma_position_m):
         return one
-    if np.any(other.sigma_position_m > MOST_WORSE * one.sigma_position_m):
-        return one
-    share = left.weight / (left.weight + node.weight)
     places = [_place_of_fix(n) for n in (node, left)]
     place = places[0] + share * (places[1] - places[0])
     return replace(
         one,
-        position_m=one.position_m + share * (other.position_m - one.position_m),
+        position_m=position_m + share * (other.position_m - position_m),
         fix_offset=se3.transform(se3.inverse(node.T_odom_camera), place[None])[0],
     )
 
