@@ -7,7 +7,11 @@ from itertools import pairwise
 import numpy as np
 
 from recon import se3
+from recon.graph.trajectory import Trajectory
 from recon.types import F64, PosePrior
+
+SPREAD = np.diag([3e-4**2] * 3 + [0.02**2] * 3)
+"""(6, 6) of a motion of the odometry, left, in metres."""
 
 
 def sensed(
@@ -26,3 +30,17 @@ def sensed(
         PosePrior(T[:3, :3], 0.01, 0.02, T[:3, 3] + rng.normal(size=3), np.ones(3)) for T in truth
     ]
     return odom, priors
+
+
+def tell(trajectory: Trajectory, seq: int) -> None:
+    """Publish a new keyframe, and those that have moved since they were."""
+    trajectory.tell(trajectory.place(seq))
+    for placed in trajectory.moved():
+        trajectory.tell(placed)
+
+
+def landed(trajectory: Trajectory, count: int) -> F64:
+    """(count, 4, 4) where all keyframes are after the last correction, which is published."""
+    for placed in trajectory.moved(final=True):
+        trajectory.tell(placed)
+    return np.array([trajectory.place(i).T_world_camera for i in range(count)])

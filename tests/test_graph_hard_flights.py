@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from flown_track import sensed
+from flown_track import SPREAD, landed, sensed, tell
 
 from recon import se3
 from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
@@ -42,10 +42,9 @@ class Hard:
 def flown(hard: Hard) -> tuple[list[F64], Trajectory]:
     """The truth and what became of it."""
     rng = np.random.default_rng(hard.seed)
-    spread = np.diag([3e-4**2] * 3 + [0.02**2] * 3)
     units = np.array([1.0] * 3 + [1.0 / hard.scale] * 3)
     truth = legs(rng, COUNT, hard.leg, hard.step_m)
-    odom, priors = sensed(rng, truth, spread, hard.scale)
+    odom, priors = sensed(rng, truth, SPREAD, hard.scale)
     trajectory = Trajectory(graph=PoseGraph(PoseGraphConfig(most_nodes=hard.nodes)))
     segment, start, time_ns = 0, 0, 0
     for i, prior in enumerate(heard(hard, rng, truth, priors)):
@@ -55,17 +54,13 @@ def flown(hard: Hard) -> tuple[list[F64], Trajectory]:
         time_ns += 10**9
         T = se3.inverse(odom[start]) @ odom[i]
         height = (HEIGHT_M / hard.scale, 0.0)
-        trajectory.add(i, segment, T, prior, height, time_ns, spread * np.outer(units, units))
+        trajectory.add(i, segment, T, prior, height, time_ns, SPREAD * np.outer(units, units))
         a = int(rng.integers(0, i - 20)) if i > 30 else -1
         if rng.random() < 0.15 and a in trajectory:
             T = se3.inverse(truth[a]) @ truth[i]
             T[:3, 3] *= trajectory.scale(a) / hard.scale  # it is seen in units of the odometry
             trajectory.add_loop(a, i, T, LOOP)
-        trajectory.tell(trajectory.place(i))
-        for placed in trajectory.moved():
-            trajectory.tell(placed)
-    for placed in trajectory.moved(final=True):
-        trajectory.tell(placed)
+        tell(trajectory, i)
     return truth, trajectory
 
 
@@ -105,7 +100,7 @@ FLIGHTS = {
 def test_the_track_keeps_to_the_truth(name: str) -> None:
     hard, most_m = FLIGHTS[name]
     truth, trajectory = flown(hard)
-    poses = np.array([trajectory.place(i).T_world_camera for i in range(COUNT)])
+    poses = landed(trajectory, COUNT)
     apart = np.linalg.norm((poses - np.array(truth))[:, :3, 3], axis=1)
     assert np.median(apart) < most_m
     assert apart.max() < 1000.0

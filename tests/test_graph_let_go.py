@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from flown_track import sensed
+from flown_track import SPREAD, landed, sensed, tell
 
 from recon import se3
 from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
@@ -23,7 +23,6 @@ from service.onboard.graph_aside import GraphAside
 
 COUNT, MOST, EACH = 250, 50, 5
 STEP_M, SCALE = 5.0, 1.3
-SPREAD = np.diag([3e-4**2] * 3 + [0.02**2] * 3)  # of a motion, in metres
 UNITS = np.outer([1.0] * 3 + [1.0 / SCALE] * 3, [1.0] * 3 + [1.0 / SCALE] * 3)
 
 
@@ -44,22 +43,13 @@ def fly(trajectory: Trajectory, first: int = 0, count: int = COUNT, fixes: bool 
         prior = priors[i] if fixes else PosePrior()
         height = (HEIGHT_M / SCALE, 0.0) if fixes else None
         trajectory.add(i, segment, T, prior, height, i * 10**9, SPREAD * UNITS)
-        trajectory.tell(trajectory.place(i))
-        for placed in trajectory.moved():
-            trajectory.tell(placed)
+        tell(trajectory, i)
         most = max(most, len(trajectory.graph))
     return most
 
 
 def bounded() -> PoseGraph:
     return PoseGraph(PoseGraphConfig(most_nodes=MOST))
-
-
-def landed(trajectory: Trajectory) -> F64:
-    """(COUNT, 4, 4) where all keyframes are after the last correction."""
-    for placed in trajectory.moved(final=True):
-        trajectory.tell(placed)
-    return np.array([trajectory.place(i).T_world_camera for i in range(COUNT)])
 
 
 def test_many_short_segments_keep_to_the_bound_and_near_the_truth() -> None:
@@ -70,7 +60,7 @@ def test_many_short_segments_keep_to_the_bound_and_near_the_truth() -> None:
     assert trajectory.graph.counts["keyframe let go"] > COUNT // 4
     apart = [
         np.linalg.norm((poses - np.array(flight()[0]))[:, :3, 3], axis=1)
-        for poses in (landed(trajectory), landed(whole))
+        for poses in (landed(trajectory, COUNT), landed(whole, COUNT))
     ]
     rms = [float(np.sqrt(np.mean(a**2))) for a in apart]
     assert rms[0] < 1.5 * rms[1] < 1.5
@@ -109,7 +99,7 @@ def test_what_was_let_go_stays_as_it_was_told() -> None:
     apart = np.linalg.norm((told.T_world_camera - flight()[0][before + 1])[:3, 3])
     assert 0.0 < apart < 5.0
     assert not trajectory.add_loop(before + 1, COUNT - 1, np.eye(4), SPREAD)
-    landed(trajectory)
+    landed(trajectory, COUNT)
     assert graph.seqs[0] == 0
     found = trajectory.place(before + 1)
     np.testing.assert_array_equal(found.T_world_camera, told.T_world_camera)
@@ -125,10 +115,10 @@ def test_aside_it_is_the_same_also_after_its_process_died() -> None:
     graph.residuals()
     os.kill(graph.pid, signal.SIGKILL)
     fly(there, 150)
-    poses = landed(there)
+    poses = landed(there, COUNT)
     assert graph.seqs == here.graph.seqs
     graph.close()
-    np.testing.assert_allclose(poses, landed(here), atol=2e-2)
+    np.testing.assert_allclose(poses, landed(here, COUNT), atol=2e-2)
 
 
 def nodes_of(sizes: list[int]) -> list[Node]:

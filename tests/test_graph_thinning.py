@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flown_track import sensed
+from flown_track import SPREAD, landed, sensed, tell
 
 from recon import se3
 from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
@@ -27,7 +27,6 @@ from service.scans.file_ledger import FileLedger
 
 COUNT, MOST, LEG = 200, 60, 50
 STEP_M, SCALE = 5.0, 1.3
-SPREAD = np.diag([3e-4**2] * 3 + [0.02**2] * 3)  # of a motion, in metres
 LOOP = np.diag([5e-4**2] * 3 + [0.03**2] * 3)
 UNITS = np.outer([1.0] * 3 + [1.0 / SCALE] * 3, [1.0] * 3 + [1.0 / SCALE] * 3)
 
@@ -54,16 +53,7 @@ def fly(trajectory: Trajectory, count: int = COUNT, first: int = 0) -> None:
         if leg and 10 < along < LEG - 10 and i % 4 == 0:
             other = leg * LEG - 1 - along
             trajectory.add_loop(other, i, se3.inverse(truth[other]) @ truth[i], LOOP)
-        trajectory.tell(trajectory.place(i))
-        for placed in trajectory.moved():
-            trajectory.tell(placed)
-
-
-def landed(trajectory: Trajectory) -> F64:
-    """(COUNT, 4, 4) where all keyframes are after the last correction."""
-    for placed in trajectory.moved(final=True):
-        trajectory.tell(placed)
-    return np.array([trajectory.place(i).T_world_camera for i in range(COUNT)])
+        tell(trajectory, i)
 
 
 def rms_m(poses: F64) -> float:
@@ -75,7 +65,7 @@ def rms_m(poses: F64) -> float:
 def whole() -> F64:
     trajectory = Trajectory(graph=PoseGraph())
     fly(trajectory)
-    return landed(trajectory)
+    return landed(trajectory, COUNT)
 
 
 def test_a_thinned_graph_is_as_near_to_the_truth_as_the_whole_one(tmp_path: Path) -> None:
@@ -85,7 +75,7 @@ def test_a_thinned_graph_is_as_near_to_the_truth_as_the_whole_one(tmp_path: Path
     graph = trajectory.graph
     assert graph.generation > 5
     assert graph.entered == COUNT == len(ledger) and len(graph) <= MOST
-    poses = landed(trajectory)
+    poses = landed(trajectory, COUNT)
     assert rms_m(poses) < 1.2 * rms_m(whole()) + 0.05 < 0.6
     apart = np.linalg.norm((poses - whole())[:, :3, 3], axis=1)
     assert apart.max() < 0.6 and np.sqrt(np.mean(apart**2)) < 0.25
@@ -132,7 +122,7 @@ def test_everything_told_is_corrected_at_the_end_and_counted() -> None:
     trajectory = Trajectory(graph=bounded())
     fly(trajectory)
     told = {i: trajectory.place(i) for i in range(0, COUNT, 3)}
-    poses = landed(trajectory)
+    poses = landed(trajectory, COUNT)
     assert trajectory.moved(final=True) == []
     for i, before in told.items():
         times, first_scale = trajectory.telling(i)
@@ -207,6 +197,6 @@ def test_aside_it_is_the_same_also_after_its_process_died() -> None:
         os.kill(graph.pid, signal.SIGKILL)
         fly(there, COUNT, 150)
         fly(here, COUNT, 150)
-        poses = landed(there)
+        poses = landed(there, COUNT)
     assert graph.seqs == here.graph.seqs
-    np.testing.assert_allclose(poses, landed(here), atol=2e-3)
+    np.testing.assert_allclose(poses, landed(here, COUNT), atol=2e-3)

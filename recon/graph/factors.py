@@ -37,8 +37,8 @@ def pose3(T: F64) -> Any:
     """The gtsam.Pose3 of ``T`` (4, 4), its rotation made exact."""
     import gtsam
 
-    U, _, Vt = np.linalg.svd(T[:3, :3])
-    return gtsam.Pose3(gtsam.Rot3(U @ Vt), T[:3, 3])
+    T = se3.tidied(T)
+    return gtsam.Pose3(gtsam.Rot3(T[:3, :3]), T[:3, 3])
 
 
 def matrix(pose: Any) -> F64:

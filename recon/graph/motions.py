@@ -50,11 +50,10 @@ class Motions:
         """
         frame = self._segments.frame(node.segment)
         T = frame.pose(node.T_odom_camera)
-        sigma_t = 50.0 if "gnss" in frame.sources else 0.01
-        sigma_r = 1.0 if node.prior.R_world_camera is not None else 0.01
+        sigma_t, sigma_r = 0.01, 1.0 if node.prior.R_world_camera is not None else 0.01
         if "gnss" in frame.sources:  # places along a line do not tell the roll about it
             known = float(np.sqrt(np.linalg.eigvalsh(frame.covariance[:3, :3])[-1]))
-            sigma_r = max(sigma_r, min(known, 1.0))
+            sigma_t, sigma_r = 50.0, max(sigma_r, min(known, 1.0))
         sigma = np.array([sigma_r] * 3 + [sigma_t] * 3)
         noise = self._gtsam.noiseModel.Diagonal.Sigmas(sigma)
         self._smoother.add(self._gtsam.PriorFactorPose3(node.key, pose3(T), noise), "prior")

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,19 +21,20 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-Ended = Callable[["Writing"], None]
-
 
 class Writing:
     """Writes a finished scan's files, from its making on."""
 
-    def __init__(self, folder: Path, store: ScanStore) -> None:
-        """``store`` is closed by whoever waits for the end; see :meth:`leave`."""
+    def __init__(self, folder: Path, store: ScanStore, left: Callable[[Writing], None]) -> None:
+        """Whoever waits for the end closes the ``store``; where nobody does, because of
+        :meth:`leave`, it is closed here and ``left`` is called.
+        """
         self.name = folder.name
         self.error: Exception | None = None
+        self.work: Work | None = None  # that ends with the files
         self._folder, self._store = folder, store
         self._lock, self._done = threading.Lock(), threading.Event()
-        self._ended: Ended | None = None
+        self._left, self._is_left = left, False
         self._thread = threading.Thread(target=self._write, name="files", daemon=True)
         self._thread.start()
 
@@ -42,14 +42,15 @@ class Writing:
         """True when it is done, well or not."""
         return self._done.wait(seconds)
 
-    def leave(self, hand_over: Callable[[], Ended]) -> bool:
-        """Wait for it no longer: it closes the store, and calls what ``hand_over`` gives at its
-        end. False when it is done already, and nothing of that happens.
+    def leave(self, hand_over: Callable[[], Work | None]) -> bool:
+        """Wait for it no longer, and take over the work that ``hand_over`` gives. False when it
+        is done already, and nothing of that happens.
         """
         with self._lock:
             if self._done.is_set():
                 return False
-            self._ended = hand_over()
+            self.work = hand_over()
+            self._is_left = True
             return True
 
     def marks(self) -> tuple[Any, ...]:
@@ -66,9 +67,9 @@ class Writing:
         finally:
             with self._lock:
                 self._done.set()
-            if self._ended is not None:
+            if self._is_left:
                 self._store.close()
-                self._ended(self)
+                self._left(self)
 
 
 class Writings:
@@ -106,11 +107,10 @@ class Writings:
         files are written beside that one: ``hand_over`` ends the sender, and the work that it
         gives is finished with the files. Raises what writing them raised.
         """
-        writing = Writing(folder, store)
+        writing = Writing(folder, store, self._written)
         self._all.append(writing)
         while not writing.wait(0.1):
-            is_left = in_haste.is_set() and kernels_may_overlap()
-            if is_left and writing.leave(lambda: partial(self._written, hand_over())):
+            if in_haste.is_set() and kernels_may_overlap() and writing.leave(hand_over):
                 return
         self._all.remove(writing)
         land()
@@ -118,7 +118,7 @@ class Writings:
         if writing.error is not None:
             raise writing.error
 
-    def _written(self, work: Work | None, writing: Writing) -> None:
+    def _written(self, writing: Writing) -> None:
         """The files are there that no scan waited for, or never will be in this life."""
         self._all.remove(writing)
         answer = ACCEPTED
@@ -127,5 +127,5 @@ class Writings:
             log.error("%s", text, exc_info=writing.error)
             self._tell(text)
             answer = Answer(Result.FAILED, str(writing.error))
-        if work is not None:
-            work.finish(answer)
+        if writing.work is not None:
+            writing.work.finish(answer)
