@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from recon.tracking.robust_geometry import attempt
 from recon.types import F32, F64, U8, Camera
 
 FEWEST_VIEWS = 4
@@ -156,12 +157,12 @@ def _fit(
     objects = [board.points_m()] * len(views)
     images = [view.corners_px.reshape(-1, 1, 2) for view in views]
     start, unbent = np.eye(3), np.zeros(5)
-    try:
-        rms, K, distortion, _, _, sigma, _, per_view = cv2.calibrateCameraExtended(
-            objects, images, size_px, start, unbent, flags=flags
-        )
-    except cv2.error:
+    found = attempt(
+        lambda: cv2.calibrateCameraExtended(objects, images, size_px, start, unbent, flags=flags)
+    )
+    if found is None:
         return None
+    rms, K, distortion, _, _, sigma, _, per_view = found
     distortion = np.asarray(distortion, np.float64).ravel()[:5]
     if not (np.isfinite(K).all() and np.isfinite(distortion).all() and K[0, 0] > 0 < K[1, 1]):
         return None

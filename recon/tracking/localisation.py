@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from recon import se3
-from recon.tracking import matching, pnp, prediction
+from recon.tracking import matching, pnp, prediction, robust_geometry
 from recon.tracking.keyframe_window import Incoming, OdometryKeyframe
 from recon.tracking.matcher import Matcher
 from recon.tracking.motion import Motion
@@ -106,13 +106,10 @@ class Localiser:
         inside = np.all((there > 0) & (there < [W, H]), axis=1)
         if inside.sum() < 12:
             return []
-        ok, rvec, tvec = cv2.solvePnP(
-            points[inside], there[inside], self.camera.K, np.zeros(5), flags=cv2.SOLVEPNP_SQPNP
+        T = robust_geometry.pose_from_points(
+            points[inside], there[inside], self.camera.K, cv2.SOLVEPNP_SQPNP
         )
-        if not ok:
-            return []
-        R = se3.so3_exp(np.asarray(rvec, np.float64).ravel())
-        return [(se3.compose(R, np.asarray(tvec, np.float64).ravel()), 0.07)]
+        return [] if T is None else [(T, 0.07)]
 
     def pose_from(
         self,

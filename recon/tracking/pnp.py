@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 
 from recon import se3
-from recon.types import F64, Array, Bool
+from recon.tracking import robust_geometry
+from recon.types import F64, Bool
 
 __all__ = ["PnpAverage", "PnpConfig", "PnpResult", "average_left_right", "solve"]
 
@@ -109,44 +110,17 @@ def _starts(points: F64, uv: F64, K: F64, prior: F64 | None, config: PnpConfig) 
     """Poses to start from: the prior, and EPnP's.
 
     Where the prior already explains most points to a few pixels, EPnP takes those; a random
-    draw could find nothing larger. Else RANSAC draws.
+    draw could find nothing larger. Else RANSAC draws. Eq. (6), (7).
     """
     if prior is not None:
         near = _errors(prior, points, uv, K) <= 3.0 * config.threshold_px
         if np.mean(near) >= config.prior_share:
-            direct = _epnp(points[near], uv[near], K)
+            direct = robust_geometry.pose_from_points(points[near], uv[near], K, cv2.SOLVEPNP_EPNP)
             return [prior] if direct is None else [prior, direct]
-    drawn = _ransac(points, uv, K, config)
-    return [T for T in (prior, drawn) if T is not None]
-
-
-def _epnp(points: F64, uv: F64, K: F64) -> F64 | None:
-    """(4, 4) EPnP pose of all points, or None. Eq. (6), (7)."""
-    found, rvec, tvec = cv2.solvePnP(points, uv, K, None, flags=cv2.SOLVEPNP_EPNP)
-    if not found or not (np.isfinite(rvec).all() and np.isfinite(tvec).all()):
-        return None
-    return _motion(rvec, tvec)
-
-
-def _ransac(points: F64, uv: F64, K: F64, config: PnpConfig) -> F64 | None:
-    """(4, 4) EPnP pose of the largest consensus, or None. Eq. (6), (7)."""
-    try:
-        found, rvec, tvec, _ = cv2.solvePnPRansac(
-            points, uv, K, None, flags=cv2.SOLVEPNP_EPNP,
-            reprojectionError=config.threshold_px, iterationsCount=config.iterations,
-            confidence=config.confidence,
-        )  # fmt: skip
-    except cv2.error:  # points on one line and the like
-        return None
-    if not found or not (np.isfinite(rvec).all() and np.isfinite(tvec).all()):
-        return None
-    return _motion(rvec, tvec)
-
-
-def _motion(rvec: Array, tvec: Array) -> F64:
-    return se3.compose(
-        se3.so3_exp(np.asarray(rvec, np.float64).ravel()), np.asarray(tvec, np.float64).ravel()
+    drawn = robust_geometry.consensus_pose(
+        points, uv, K, config.threshold_px, config.iterations, config.confidence
     )
+    return [T for T in (prior, drawn) if T is not None]
 
 
 def _errors(T: F64, points: F64, uv: F64, K: F64) -> F64:
@@ -173,20 +147,11 @@ def _best(starts: list[F64], points: F64, uv: F64, K: F64, config: PnpConfig) ->
         inliers = error <= gate * config.threshold_px
         if np.count_nonzero(inliers) < config.min_inliers:
             return None
-        refined = _refine(best, points[inliers], uv[inliers], K)
+        refined = robust_geometry.refined_pose(best, points[inliers], uv[inliers], K)
         if refined is None:
             return None
         best = refined
     return best
-
-
-def _refine(T: F64, points: F64, uv: F64, K: F64) -> F64 | None:
-    start = se3.so3_log(T[:3, :3]).reshape(3, 1), T[:3, 3].reshape(3, 1).copy()
-    until = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 1e-9)
-    rvec, tvec = cv2.solvePnPRefineLM(points, uv, K, None, *start, until)
-    if not (np.isfinite(rvec).all() and np.isfinite(tvec).all()):
-        return None
-    return _motion(rvec, tvec)
 
 
 def _judge(

@@ -9,7 +9,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import rays
-from recon.tracking import two_view
+from recon.tracking import robust_geometry, two_view
 from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.types import F64, Bool, PosePrior
 
@@ -28,7 +28,7 @@ def by_homography(H: F64, uv: F64, radius_px: float) -> Prediction:
 
 def common_affine(uv: F64, there: F64) -> F64:
     """(3, 3) affine motion of pixels ``uv`` (N, 2) to ``there`` (N, 2), robust."""
-    A, _ = cv2.estimateAffine2D(uv, there, ransacReprojThreshold=8.0)
+    A = robust_geometry.affine(uv, there, 8.0)
     H = np.eye(3)
     if A is not None:
         H[:2] = A
@@ -74,8 +74,8 @@ def base_to_height(uv_a: F64, uv_b: F64, K: F64, R_b_a: F64 | None) -> float:
         a = a @ R_b_a.T
         a = a / a[:, 2:]
         return float(np.median(np.linalg.norm(b - a, axis=1)))
-    A, _ = cv2.estimateAffinePartial2D(
-        np.ascontiguousarray(a[:, :2]), np.ascontiguousarray(b[:, :2]), ransacReprojThreshold=0.01
+    A = robust_geometry.affine(
+        np.ascontiguousarray(a[:, :2]), np.ascontiguousarray(b[:, :2]), 0.01, is_similarity=True
     )
     return float(np.linalg.norm(A[:, 2])) if A is not None else 0.0
 

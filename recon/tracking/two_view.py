@@ -10,11 +10,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from recon import se3
-from recon.tracking import bundle
+from recon.tracking import bundle, robust_geometry
 from recon.types import F64, Bool
 
 
@@ -53,20 +52,15 @@ def _candidates(
     out: list[tuple[F64, F64]] = []
     if R_b_a is not None:
         out.append((R_b_a, translation_direction(rays_a, rays_b, R_b_a)))
-    E, mask = cv2.findEssentialMat(
-        uv_a, uv_b, K, method=cv2.USAC_MAGSAC, prob=0.9999, threshold=1.0
-    )
-    if E is not None and E.shape == (3, 3):
-        count, R, t, _ = cv2.recoverPose(E, uv_a, uv_b, K, mask=mask)
-        if count > 8:
-            out.append((np.asarray(R, np.float64), np.asarray(t, np.float64).ravel()))
-    H, _ = cv2.findHomography(uv_a, uv_b, cv2.USAC_MAGSAC, 3.0)
-    if H is not None:
-        _, Rs, ts, _ = cv2.decomposeHomographyMat(H, K)
-        for R, t in zip(Rs, ts, strict=True):
+    by_essential = robust_geometry.relative_pose(uv_a, uv_b, K)
+    if by_essential is not None and by_essential[2] > 8:
+        out.append(by_essential[:2])
+    by_plane = robust_geometry.homography(uv_a, uv_b, 3.0)
+    if by_plane is not None:
+        for R, t in robust_geometry.homography_motions(by_plane[0], K):
             length = float(np.linalg.norm(t))
             if length > 1e-3:
-                out.append((np.asarray(R, np.float64), np.asarray(t, np.float64).ravel() / length))
+                out.append((R, t / length))
     return out
 
 
@@ -151,7 +145,7 @@ def solve(
         up_a: (3,) where up is expected in camera a (telemetry or the mount); among solutions
             that explain the pixels alike, the one whose ground is most level is taken.
     """
-    if uv_a.shape[0] < 30:
+    if uv_a.shape[0] < 30 or not robust_geometry.span_a_plane(uv_a, uv_b):
         return None
     K_inv = np.linalg.inv(K)
     one = np.ones((uv_a.shape[0], 1))

@@ -1,0 +1,169 @@
+"""OpenCV's geometry on measured points: a result, or None where the points determine none.
+
+OpenCV answers points that coincide, lie on one line, are too few or are not finite in three ways:
+with an exception, with NaN or with a pose of no meaning. Here each of them is None. Call no such
+function of OpenCV on measured points elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+
+from recon import se3
+from recon.types import F64, Array, Bool
+
+MIN_SPREAD = {2: 1e-5, 3: 1e-8}
+"""Least extent of pixels (2) and points (3) across their line, as a share of the extent along it.
+
+Pixels are float32, which limits them; points may have wild outliers along the line of sight.
+"""
+
+MIN_RESOLUTION = 1e-12
+"""Least extent of points as a share of their largest coordinate: less is rounding."""
+
+_T = TypeVar("_T")
+
+
+def attempt(call: Callable[[], _T]) -> _T | None:
+    """What ``call`` returns; None when OpenCV rejects its input."""
+    try:
+        return call()
+    except (cv2.error, np.linalg.LinAlgError):
+        return None
+
+
+def span_a_plane(*arrays: Array) -> bool:
+    """True when each (N, 2 or 3) array is finite, and neither one point nor one line."""
+    return all(_spans_a_plane(np.asarray(points, np.float64)) for points in arrays)
+
+
+def _spans_a_plane(points: F64) -> bool:
+    if len(points) < 3 or not np.isfinite(points).all():
+        return False
+    largest = float(np.abs(points).max())
+    if largest == 0.0:
+        return False
+    scaled = points / largest
+    offsets = scaled - scaled.mean(axis=0)
+    along, across = np.linalg.svd(offsets, compute_uv=False)[:2] / np.sqrt(len(points))
+    return bool(across > max(MIN_SPREAD[points.shape[1]] * along, MIN_RESOLUTION))
+
+
+def pose_from_points(points_m: F64, uv_px: F64, K: F64, flags: int) -> F64 | None:
+    """(4, 4) T_camera_points of (N, 3) points at (N, 2) pixels; N is 4 or more.
+
+    ``flags`` is one of OpenCV's SOLVEPNP methods, such as EPnP.
+    """
+    if len(points_m) < 4 or not span_a_plane(points_m, uv_px):
+        return None
+    found = attempt(lambda: cv2.solvePnP(points_m, uv_px, K, None, flags=flags))
+    return None if found is None or not found[0] else _motion(found[1], found[2])
+
+
+def consensus_pose(
+    points_m: F64, uv_px: F64, K: F64, threshold_px: float, iterations: int, confidence: float
+) -> F64 | None:
+    """(4, 4) T_camera_points by EPnP on the largest consensus of RANSAC."""
+    if len(points_m) < 5 or not span_a_plane(points_m, uv_px):
+        return None
+    found = attempt(
+        lambda: cv2.solvePnPRansac(
+            points_m,
+            uv_px,
+            K,
+            None,
+            flags=cv2.SOLVEPNP_EPNP,
+            reprojectionError=threshold_px,
+            iterationsCount=iterations,
+            confidence=confidence,
+        )
+    )
+    return None if found is None or not found[0] else _motion(found[1], found[2])
+
+
+def refined_pose(T_camera_points: F64, points_m: F64, uv_px: F64, K: F64) -> F64 | None:
+    """(4, 4) pose at the least squared reprojection error near the given one."""
+    if len(points_m) < 3 or not span_a_plane(points_m, uv_px):
+        return None
+    rvec = se3.so3_log(T_camera_points[:3, :3]).reshape(3, 1)
+    tvec = T_camera_points[:3, 3].reshape(3, 1).copy()
+    until = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 1e-9)
+    found = attempt(lambda: cv2.solvePnPRefineLM(points_m, uv_px, K, None, rvec, tvec, until))
+    return None if found is None else _motion(*found)
+
+
+def relative_pose(
+    uv_a: F64, uv_b: F64, K: F64, threshold_px: float = 1.0
+) -> tuple[F64, F64, int] | None:
+    """(R_b_a, unit t of T_b_a, points in front of both cameras) of (N, 2) matched pixels.
+
+    By the essential matrix. None also where no essential matrix explains the matches.
+    """
+    if len(uv_a) < 6 or not span_a_plane(uv_a, uv_b):
+        return None
+    found = attempt(
+        lambda: cv2.findEssentialMat(
+            uv_a, uv_b, K, method=cv2.USAC_MAGSAC, prob=0.9999, threshold=threshold_px
+        )
+    )
+    if found is None or found[0] is None or found[0].shape != (3, 3):
+        return None
+    E, mask = found
+    split = attempt(lambda: cv2.recoverPose(E, uv_a, uv_b, K, mask=mask))
+    if split is None or not _is_finite(split[1], split[2]):
+        return None
+    count, R, t, _ = split
+    return np.asarray(R, np.float64), np.asarray(t, np.float64).ravel(), int(count)
+
+
+def homography(uv_a: F64, uv_b: F64, threshold_px: float) -> tuple[F64, Bool] | None:
+    """((3, 3) H with uv_b ~ H uv_a, (N,) inliers) of (N, 2) matched pixels; H is invertible."""
+    if len(uv_a) < 4 or not span_a_plane(uv_a, uv_b):
+        return None
+    found = attempt(lambda: cv2.findHomography(uv_a, uv_b, cv2.USAC_MAGSAC, threshold_px))
+    if found is None or found[0] is None or not _is_finite(found[0]):
+        return None
+    H, mask = found
+    inliers = np.asarray(mask).ravel().astype(bool)
+    if np.linalg.matrix_rank(H) < 3 or not span_a_plane(uv_a[inliers], uv_b[inliers]):
+        return None
+    return np.asarray(H, np.float64), inliers
+
+
+def homography_motions(H: F64, K: F64) -> list[tuple[F64, F64]]:
+    """(R_b_a, t of T_b_a in units of the plane's distance) that ``H`` may stand for."""
+    found = attempt(lambda: cv2.decomposeHomographyMat(H, K))
+    if found is None:
+        return []
+    pairs = zip(found[1], found[2], strict=True)
+    return [
+        (np.asarray(R, np.float64), np.asarray(t, np.float64).ravel())
+        for R, t in pairs
+        if _is_finite(R, t)
+    ]
+
+
+def affine(a: F64, b: F64, threshold: float, is_similarity: bool = False) -> F64 | None:
+    """(2, 3) affine map, or similarity, of (N, 2) points ``a`` to ``b`` by RANSAC."""
+    if not span_a_plane(a, b):
+        return None
+    estimate: Any = cv2.estimateAffinePartial2D if is_similarity else cv2.estimateAffine2D
+    found = attempt(lambda: estimate(a, b, ransacReprojThreshold=threshold))
+    if found is None or found[0] is None or not _is_finite(found[0]):
+        return None
+    return np.asarray(found[0], np.float64)
+
+
+def _motion(rvec: Array, tvec: Array) -> F64 | None:
+    if not _is_finite(rvec, tvec):
+        return None
+    w, t = (np.asarray(v, np.float64).ravel() for v in (rvec, tvec))
+    return se3.compose(se3.so3_exp(w), t)
+
+
+def _is_finite(*arrays: Array) -> bool:
+    return all(bool(np.isfinite(a).all()) for a in arrays)
