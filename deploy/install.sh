@@ -154,6 +154,7 @@ install_files() {
   [[ -n $profile ]] || profile=$(board)
   [[ -z $profile ]] || settings=("$from/deploy/profiles/$profile.toml")
   "$versions/$1/bin/python" -m service.cli config default "${settings[@]}" >"$etc/skyrelief.toml.new"
+  chmod 0640 "$etc/skyrelief.toml.new"  # it may hold a password; tmpfiles gives it its group
   mv "$etc/skyrelief.toml.new" "$etc/skyrelief.toml"
   say "wrote $etc/skyrelief.toml${profile:+ with the settings of $profile}:" \
     "set camera.source, camera.model, mavlink.links, datalink.connect"

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from service.redaction import without_credentials
+
 
 class SkyreliefError(Exception):
-    """A failure that a person can act on; its text is one line: what, where, what to do."""
+    """A failure that a person can act on; its text is one line: what, where, what to do.
+
+    The text travels far (status, MAVLink, scan.json, logs), so credentials in it are hidden.
+    """
 
     exit_code = 1
+
+    def __init__(self, text: str = "") -> None:
+        super().__init__(without_credentials(text))
 
 
 class InputError(SkyreliefError):

@@ -12,6 +12,8 @@ import socket
 import struct
 import sys
 
+from service.redaction import without_credentials
+
 SOCKET = "/run/systemd/journal/socket"
 PRIORITIES = (
     (logging.CRITICAL, 2),
@@ -33,11 +35,11 @@ class JournalHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Send one record."""
+        text = self.format(record)
         try:
-            text = self.format(record)
             self._socket.sendto(packed(record, text), self._address)
         except OSError:
-            print(f"{record.levelname} {record.name}: {record.getMessage()}", file=sys.stderr)
+            print(f"{record.levelname} {record.name}: {text}", file=sys.stderr)
 
     def close(self) -> None:
         """Let go of the socket."""
@@ -67,14 +69,22 @@ def _field(name: str, value: str) -> bytes:
     return name.encode() + b"=" + data + b"\n"
 
 
+class PublicFormatter(logging.Formatter):
+    """Formats a record, traceback included, with the credentials in it hidden."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The text of one record."""
+        return without_credentials(super().format(record))
+
+
 def log_handler() -> logging.Handler:
     """The journal where it reads our standard error, else standard error itself."""
     if _journal_reads_us() and os.path.exists(SOCKET):
         handler: logging.Handler = JournalHandler()
-        handler.setFormatter(logging.Formatter("%(message)s"))
+        handler.setFormatter(PublicFormatter("%(message)s"))
         return handler
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
+    handler.setFormatter(PublicFormatter("%(levelname)s %(name)s: %(message)s"))
     return handler
 
 

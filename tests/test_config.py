@@ -55,7 +55,7 @@ def test_no_file_is_the_defaults() -> None:
 
 
 def test_printed_default_is_the_default(tmp_path: Path) -> None:
-    text = to_toml(Config(), documented=True)
+    text = to_toml(Config().to_dict(), documented=True)
     assert load_config(written(tmp_path, text)) == Config()
     for section, field in keys():
         assert field.metadata["doc"] in text, f"{section}.{field.name}"
@@ -72,7 +72,7 @@ def test_shown_configuration_loads_as_itself(tmp_path: Path) -> None:
             "fusion.gnss=false",
         ],
     )
-    assert load_config(written(tmp_path, to_toml(config))) == config
+    assert load_config(written(tmp_path, to_toml(config.to_dict()))) == config
     json.dumps(config.to_dict())
 
 

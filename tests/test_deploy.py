@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -102,6 +103,10 @@ def test_everything_lands_in_its_place(machine: Machine) -> None:
         "opt/skyrelief/current/bin/skyrelief",
     ):
         assert (machine.root / name).is_file(), name
+    configuration = machine.root / "etc/skyrelief/skyrelief.toml"
+    assert stat.S_IMODE(configuration.stat().st_mode) == 0o640  # the camera's password
+    rules = (machine.root / "usr/lib/tmpfiles.d/skyrelief.conf").read_text().splitlines()
+    assert "z /etc/skyrelief/skyrelief.toml 0640 root skyrelief -" in rules
     script = (machine.home / "current" / "bin" / "skyrelief").read_text()
     assert script == f"#!/opt/skyrelief/versions/{machine.current}/bin/python\n"
 
@@ -142,7 +147,9 @@ def test_profiles_are_configurations(profile: Path) -> None:
     chosen = load_config(profile)
     assert chosen != load_config(None)
     assert "# " in profile.read_text()
-    assert f"least_memory_mib = {chosen.compute.least_memory_mib}" in to_toml(chosen, True)
+    assert f"least_memory_mib = {chosen.compute.least_memory_mib}" in to_toml(
+        chosen.to_dict(), True
+    )
 
 
 def test_running_it_again_changes_nothing(machine: Machine) -> None:

@@ -20,6 +20,7 @@ from service.cameras.pace import paced
 from service.cameras.source import CameraSource
 from service.cameras.stream import OPEN_S
 from service.errors import InputError, OutsideError
+from service.redaction import without_credentials
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +45,8 @@ def open_gst(rest: str, options: Mapping[str, str]) -> CameraSource:
         command = [launcher, "-q", *shlex.split(rest), "!", *shlex.split(TAIL)]
     except ValueError as error:
         raise InputError(f"gst: the pipeline cannot be read: {error}") from error
-    return paced(LiveSource(lambda stall_s: _open_command(command, stall_s), f"gst:{rest}"))
+    description = without_credentials(f"gst:{rest}")
+    return paced(LiveSource(lambda stall_s: _open_command(command, stall_s), description))
 
 
 class _Complaints:

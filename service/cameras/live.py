@@ -20,6 +20,7 @@ from recon.types import U8
 from service.cameras.source import CameraFrame
 from service.cameras.video import decoded_pictures, picture_bgr
 from service.errors import OutsideError
+from service.redaction import without_credentials
 
 if TYPE_CHECKING:
     import av
@@ -220,6 +221,7 @@ class LiveSource:
         self.misfits += 1
 
     def _tell(self, text: str) -> None:
+        text = without_credentials(text)  # FFmpeg's errors name the address
         if not self._closed.is_set():
             if text not in self.warnings:
                 self.warnings.append(text)

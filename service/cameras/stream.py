@@ -16,6 +16,7 @@ from service.cameras.live import LiveSource
 from service.cameras.pace import paced
 from service.cameras.source import CameraSource
 from service.errors import InputError, OutsideError
+from service.redaction import without_credentials
 
 if TYPE_CHECKING:
     import av.container
@@ -55,11 +56,4 @@ def _live(url: str, demuxer: dict[str, str], format_: str | None = None) -> Came
 
         return av.open(url, format=format_, options=demuxer, timeout=(OPEN_S, stall_s))
 
-    return paced(LiveSource(open_container, _without_password(url)))
-
-
-def _without_password(url: str) -> str:
-    """``url`` as it may stand in a log."""
-    scheme, separator, rest = url.partition("://")
-    host, at, _ = rest.partition("@")
-    return f"{scheme}://…@{rest[len(host) + 1 :]}" if separator and at else url
+    return paced(LiveSource(open_container, without_credentials(url)))

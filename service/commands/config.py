@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from service.config import Config, keys, load_config
+from service.config import keys, load_config
 from service.errors import InputError
+from service.redaction import HIDDEN, public_configuration
 
 ACTIONS = ("check", "show", "default")
 
@@ -31,17 +33,21 @@ def config(
     if action == "check" and file is None:
         raise InputError("config check: name the file to check")
     chosen = load_config(file, set_ or [])
+    values = chosen.to_dict()
+    if action == "show":
+        values = public_configuration(values)
     if as_json:
-        print(json.dumps(chosen.to_dict()))
+        print(json.dumps(values))
     elif action == "check":
         print(f"{file}: good")
     else:
-        print(to_toml(chosen, documented=action == "default"), end="")
+        if values != chosen.to_dict():
+            print(f"# {HIDDEN}: a secret, which is not shown")
+        print(to_toml(values, documented=action == "default"), end="")
 
 
-def to_toml(chosen: Config, documented: bool = False) -> str:
-    """``chosen`` as TOML; a key that is not set stands as a comment."""
-    values = chosen.to_dict()
+def to_toml(values: Mapping[str, Mapping[str, Any]], documented: bool = False) -> str:
+    """A configuration's sections as TOML; a key that is not set stands as a comment."""
     lines: list[str] = []
     last = ""
     for section, field in keys():

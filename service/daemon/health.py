@@ -16,6 +16,7 @@ from typing import Any
 
 from service.daemon.health_api import DOCUMENT
 from service.errors import OutsideError
+from service.redaction import redacted
 
 log = logging.getLogger(__name__)
 
@@ -129,7 +130,7 @@ def _handler(snapshot: Snapshot) -> type[BaseHTTPRequestHandler]:
             if path == "/openapi.json":
                 self._answer(200, json.dumps(DOCUMENT), "application/json")
                 return
-            found = snapshot()
+            found = redacted(snapshot())
             if path == "/healthz":
                 ok = bool(found.get("ok"))
                 body = {"ok": ok, "state": found.get("state"), "fault": found.get("fault")}

@@ -27,6 +27,7 @@ from service.onboard.recorder import Recorder
 from service.onboard.rig import ASSUMED_AGL_M
 from service.onboard.telemetry_check import TelemetryCheck
 from service.onboard.tracking_watch import TrackingWatch
+from service.redaction import public_configuration, redacted
 from service.scans.coverage import CoverageWriter
 from service.scans.retention import PAGES
 from service.stream.records import ScanHeader
@@ -94,9 +95,9 @@ def create_store(inputs: ScanInputs) -> ScanStore:
             "K": inputs.camera.K.ravel().tolist(),
             "distortion": inputs.camera.distortion.tolist(),
         },
-        configuration=inputs.config.to_dict(),
+        configuration=public_configuration(inputs.config.to_dict()),
         software=software(),
-        notes=inputs.notes,
+        notes=redacted(inputs.notes),
     )
     return ScanStore.create(path, header)
 
@@ -191,7 +192,7 @@ class Scan:
             "seconds": round(elapsed, 2),
             "warnings": [*self.inputs.notes, *self.inputs.source.warnings, *self._doubts()],
         }
-        summary = self.recorder.close(extra | self.inputs.extra)
+        summary = self.recorder.close(redacted(extra | self.inputs.extra))
         self.pipeline.dense.close()
         summary["clouds_per_second"] = round(summary["clouds"] / elapsed, 2)
         self.store.finish(summary)

@@ -20,6 +20,7 @@ import numpy as np
 from recon.surface.raster import Raster, grid_over, rasterise
 from service.errors import OutsideError
 from service.georeference import LocalFrame
+from service.redaction import public_configuration, redacted
 from service.scans.coverage import write_coverage_files
 from service.scans.fused_cloud import FusedCloud, fused_cloud
 from service.scans.inspection import middle_keyframe, stages
@@ -150,7 +151,7 @@ def _summary(
         "heights": "metres above mean sea level" if frame else "metres above the scan's origin",
         "georeference": header.georeference,
         "camera": header.camera,
-        "configuration": header.configuration,
+        "configuration": public_configuration(header.configuration),
         "software": header.software,
         "counts": {
             "keyframes": fused.keyframes,
@@ -160,7 +161,7 @@ def _summary(
         },
         "quality": _quality(fused, raster, poses),
         "notes": notes,
-        "run": extra,
+        "run": redacted(extra),
     }
 
 
