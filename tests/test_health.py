@@ -19,11 +19,12 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 
 from service.config import Config, load_config, reload
-from service.daemon.health import HealthServer, Notifier, metrics_text
+from service.daemon.health import HealthServer, metrics_text
 from service.daemon.health_api import STATUS
 from service.daemon.machine import CoreLoad, Machine, computer_load, read_machine
 from service.daemon.runtime import Daemon
 from service.errors import InputError, OutsideError
+from service.init_system import Notifier
 from service.scans.claim import Claim
 from service.scans.retention import close_open_scans, make_room
 from service.stream.records import ScanHeader

@@ -53,7 +53,7 @@ def _configuration(path: Path | None, overrides: list[str]) -> tuple[Config, Inp
     try:
         return load_config(path, overrides), None
     except InputError as error:
-        from service.daemon.health import Notifier
+        from service.init_system import Notifier
 
         if not Notifier().is_heard:
             raise

@@ -1,14 +1,12 @@
-"""How it goes, for the init system and for whoever asks over HTTP on this machine.
+"""The state of the service, for whoever asks over HTTP on this machine.
 
-No packages: one datagram to systemd, and the standard library's HTTP server.
+No packages: the standard library's HTTP server.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-import os
-import socket
 import threading
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -22,52 +20,6 @@ log = logging.getLogger(__name__)
 
 Snapshot = Callable[[], dict[str, Any]]
 PREFIX = "skyrelief_"
-
-EXTENSION_US = 30_000_000
-"""Without progress for so long, systemd ends a service that is closing its scan."""
-
-
-class Notifier:
-    """The service's word to systemd (sd_notify(3)); silent where nobody listens."""
-
-    def __init__(self, address: str | None = None) -> None:
-        """Speak to ``address``, by default the one in NOTIFY_SOCKET."""
-        address = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
-        self._address = "\0" + address[1:] if address.startswith("@") else address
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) if address else None
-
-    @property
-    def is_heard(self) -> bool:
-        """True when an init system listens."""
-        return self._socket is not None
-
-    def status(self, text: str) -> None:
-        """A line for ``systemctl status``."""
-        self._send(f"STATUS={text}")
-
-    def ready(self) -> None:
-        """The service is up."""
-        self._send("READY=1")
-
-    def alive(self, status: str = "") -> None:
-        """Progress was made; feeds the watchdog."""
-        self._send("WATCHDOG=1" + (f"\nSTATUS={status}" if status else ""))
-
-    def closing(self) -> None:
-        """Closing gets on: systemd waits for another :data:`EXTENSION_US`."""
-        self._send(f"EXTEND_TIMEOUT_USEC={EXTENSION_US}")
-
-    def stopping(self) -> None:
-        """The service is on its way out."""
-        self._send("STOPPING=1")
-
-    def _send(self, text: str) -> None:
-        if self._socket is None:
-            return
-        try:
-            self._socket.sendto(text.encode(), self._address)
-        except OSError as error:
-            log.debug("systemd does not listen: %s", error)
 
 
 class HealthServer:

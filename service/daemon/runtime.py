@@ -21,7 +21,7 @@ from mavlink.vehicle import VehicleLink
 from service.compute.threading_layer import kernels_may_overlap
 from service.config import Config, reload
 from service.daemon.control_actions import ControlActions
-from service.daemon.health import HealthServer, Notifier
+from service.daemon.health import HealthServer
 from service.daemon.load_control import LoadControl
 from service.daemon.machine import CoreLoad, computer_load, read_machine
 from service.daemon.memory import give_back
@@ -29,6 +29,7 @@ from service.daemon.scanning import Scanning
 from service.daemon.tuning import TUNABLES, parameters_of
 from service.daemon.vehicle_config import vehicle_config
 from service.errors import InputError, OutsideError, SkyreliefError
+from service.init_system import Notifier
 from service.scans.retention import close_open_scans, make_room
 from service.version import software
 
