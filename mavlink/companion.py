@@ -122,6 +122,7 @@ class Companion:
         self.streams.add(ONBOARD, LOAD_STATUS, round(config.load_every_s * 1e6), self._send_load)
         self.streams.add(ONBOARD, MOTION, round(config.motion_every_s * 1e6), self._send_motion)
         self._lost = False
+        self._followed = (presence.system, presence.autopilot)
 
     # In.
 
@@ -129,6 +130,7 @@ class Companion:
         """Take in one packet that arrived on a link at ``now_ns`` (monotonic)."""
         self._now_ns = max(self._now_ns, now_ns)
         self.counts["packets"] += 1
+        self.presence.count(packet.system)
         if packet.message_id == COMMAND_CANCEL:
             self._cancel(packet, now_ns)
             return
@@ -141,6 +143,7 @@ class Companion:
             listener(message)
         if packet.message_id == HEARTBEAT:
             self.presence.hear(message, now_ns)
+            self._follow()
         elif name in READERS:
             self._hear_vehicle(name, message, packet, now_ns)
         elif name.startswith("COMMAND_"):
@@ -175,13 +178,25 @@ class Companion:
             self._rebooted(packet.component)
         self.history.add(sample, time_ns)
 
+    def _follow(self) -> None:
+        """Drop what another vehicle, or another component, said."""
+        (system, autopilot), before = self._followed, self._followed
+        self._followed = (self.presence.system, self.presence.autopilot)
+        if self._followed == before or (self._followed[0] == system and autopilot is None):
+            return
+        self._clocks.clear()
+        self._start_over()
+
+    def _start_over(self) -> None:
+        self.history.clear()
+        self.timesync.reset()
+        self.rates.restart()
+
     def _rebooted(self, component: int) -> None:
         autopilot = self.presence.autopilot
         if autopilot is None or component != autopilot[1]:
             return
-        self.history.clear()
-        self.timesync.reset()
-        self.rates.restart()
+        self._start_over()
         self.say(texts.WARNING, "Autopilot restarted; telemetry starts over")
 
     def _hear_command(self, message: Any, link: int, now_ns: int) -> None:
@@ -190,6 +205,11 @@ class Companion:
             return
         self.counts["commands"] += 1
         self.desk.receive(call, COMPONENTS, now_ns)
+
+    @property
+    def is_disarmed(self) -> bool:
+        """True only where the autopilot said so a moment ago."""
+        return self.presence.is_disarmed(self._now_ns)
 
     def _is_for_us(self, target: Address) -> bool:
         ours = target.system in (0, self.presence.system)
@@ -253,6 +273,9 @@ class Companion:
             if (packet.system, packet.component) == self.presence.autopilot:
                 self._outbox.put(ONBOARD, reply, link)
             return
+        round_trip_ns = self.timesync.round_trip_of(message.ts1, now_ns)
+        if round_trip_ns is not None:
+            self.presence.answered(packet.system, packet.component, round_trip_ns)
         if (packet.system, packet.component) != self.presence.autopilot:
             return
         if self.timesync.answer(message.tc1, message.ts1, now_ns):
@@ -268,6 +291,8 @@ class Companion:
     def tick(self, now_ns: int) -> None:
         """Do what time asks for."""
         self._now_ns = max(self._now_ns, now_ns)
+        self.presence.look(now_ns)
+        self._follow()
         for text in self.presence.take_news():
             self.say(texts.WARNING, text)
         self.camera.tick(now_ns)
@@ -279,6 +304,8 @@ class Companion:
     def _watch_autopilot(self, now_ns: int) -> None:
         autopilot, seen = self.presence.autopilot, self.presence.autopilot_seen_ns
         if autopilot is None or seen is None:
+            if self.presence.others(now_ns):  # the answers say which vehicle is ours
+                self._ask_time(now_ns)
             return
         lost = now_ns - seen > LOST_NS
         if lost and not self._lost:
@@ -291,6 +318,9 @@ class Companion:
             return
         for message in self.rates.tick(*autopilot, now_ns):
             self._outbox.put(ONBOARD, message)
+        self._ask_time(now_ns)
+
+    def _ask_time(self, now_ns: int) -> None:
         request = self.timesync.request(now_ns)
         if request is not None:
             self._outbox.put(ONBOARD, request)
@@ -302,6 +332,8 @@ class Companion:
             for t in (self.camera.next_timer(), self.desk.next_timer(), self.streams.next_timer())
             if t is not None
         ]
+        if self.presence.others(self._now_ns):
+            times.append(self.timesync.next_timer())
         if self.presence.autopilot is not None:
             times += [self.timesync.next_timer(), self.rates.next_timer()]
         return min([*times, self._now_ns + S])

@@ -1,7 +1,7 @@
 """Heartbeats of our two components, tied to the health of the service.
 
 Also who else is there: which system we belong to, whether it is armed, and whether another
-companion uses our ids. Called from a thread of its own, so it guards its state with a lock.
+companion uses our ids. Called from several threads, so it guards its state with a lock.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
+from mavlink.autopilots import Autopilots, is_autopilot
 from mavlink.first_beat import NO_AUTOPILOT, TYPES
 from mavlink.messages import CAMERA, ONBOARD, Outgoing
 from mavlink.wire import dialect
@@ -18,7 +19,7 @@ from mavlink.wire import dialect
 S = 1_000_000_000
 PERIOD_NS = S
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
-TYPE_GCS = 6
+RECENT_NS = 3 * S  # an armed state older than this is not known any more
 
 
 class Health(IntEnum):
@@ -34,8 +35,8 @@ class Health(IntEnum):
 class PresenceConfig:
     """Our place on the network."""
 
-    system: int | None = None  # None: the autopilot's, once heard
-    latch_s: float = 3.0  # several autopilots within this time after the first: none is ours
+    system: int | None = None  # None: that of the vehicle that we are connected to
+    latch_s: float = 3.0  # how long the vehicle of the last flight is waited for before others
     stale_s: float = 5.0  # health not confirmed for longer is CRITICAL
     dead_s: float = 20.0  # not confirmed for longer: no heartbeat any more
     boot_s: float = 120.0  # the same for a service that has not come up
@@ -51,44 +52,63 @@ class Presence:
     """What we say of ourselves every second, and what others say of themselves."""
 
     def __init__(
-        self, config: PresenceConfig, token: int, now_ns: int, first_ns: int | None = None
+        self,
+        config: PresenceConfig,
+        token: int,
+        now_ns: int,
+        first_ns: int | None = None,
+        remembered: int | None = None,
     ) -> None:
-        """The first heartbeat is due at ``first_ns``, or now."""
+        """The first heartbeat is due at ``first_ns``, or now; ``remembered``: the last system."""
         self.config = config
         self._token = token  # in custom_mode: tells our echo from another companion
         self._lock = threading.Lock()
         self._health = Health.BOOT
         self._confirmed_ns = now_ns
         self._next_ns = now_ns if first_ns is None else first_ns
-        self._system = config.system or 1
-        self._candidates: set[int] = set()
-        self._first_autopilot_ns: int | None = None
-        self._settled = config.system is not None
-        self._armed = False
-        self._autopilot: tuple[int, int] | None = None
-        self._autopilot_seen_ns: int | None = None
+        self._autopilots = Autopilots(config.system, remembered, config.latch_s)
         self._intruder = False
         self._news: list[str] = []
 
     @property
     def system(self) -> int:
         """The system id that we use."""
-        return self._system
+        return self._autopilots.system
+
+    @property
+    def proven_system(self) -> int | None:
+        """The system id to remember; None until the evidence speaks for one."""
+        autopilots = self._autopilots
+        return autopilots.system if autopilots.is_proven else None
 
     @property
     def autopilot(self) -> tuple[int, int] | None:
         """(system, component) of our autopilot; None before it was heard."""
-        return self._autopilot
+        followed = self._autopilots.followed
+        return None if followed is None else (followed.system, followed.component)
 
     @property
     def autopilot_seen_ns(self) -> int | None:
         """When the autopilot's heartbeat was heard last."""
-        return self._autopilot_seen_ns
+        followed = self._autopilots.followed
+        return None if followed is None else followed.seen_ns
 
     @property
     def is_armed(self) -> bool:
         """True while the autopilot says so."""
-        return self._armed
+        followed = self._autopilots.followed
+        return followed is not None and followed.is_armed
+
+    def is_disarmed(self, now_ns: int) -> bool:
+        """True only where our autopilot said so a moment ago; silence is not disarmed."""
+        followed = self._autopilots.followed
+        recent = followed is not None and now_ns - followed.seen_ns <= RECENT_NS
+        return recent and followed is not None and not followed.is_armed
+
+    def others(self, now_ns: int) -> list[int]:
+        """The systems of autopilots that are heard but not followed."""
+        with self._lock:
+            return self._autopilots.others(now_ns)
 
     def confirm(self, health: Health, now_ns: int) -> None:
         """The service is alive and this is its state; to be said again every few seconds."""
@@ -133,37 +153,26 @@ class Presence:
         """Take in anyone's heartbeat."""
         system, component = message.get_srcSystem(), message.get_srcComponent()
         with self._lock:
-            if message.autopilot != NO_AUTOPILOT and message.type != TYPE_GCS:
-                self._hear_autopilot(system, component, message.base_mode, now_ns)
-            elif system == self._system and component in TYPES:
+            if is_autopilot(component, message):
+                armed = bool(message.base_mode & ARMED)
+                self._autopilots.hear(system, component, armed, now_ns)
+            elif system == self.system and component in TYPES:
                 self._hear_namesake(component, message.custom_mode)
 
-    def _hear_autopilot(self, system: int, component: int, base_mode: int, now_ns: int) -> None:
-        if not self._settled:
-            self._latch(system, now_ns)
-        if system != self._system:
-            return
-        armed = bool(base_mode & ARMED)
-        self._armed = armed
-        self._autopilot = (system, component)
-        self._autopilot_seen_ns = now_ns
+    def count(self, system: int) -> None:
+        """Count a message of a system."""
+        with self._lock:
+            self._autopilots.count(system)
 
-    def _latch(self, system: int, now_ns: int) -> None:
-        if self._first_autopilot_ns is None:
-            self._first_autopilot_ns = now_ns
-        elif now_ns - self._first_autopilot_ns > self.config.latch_s * S:
-            self._settled = True
-            return
-        self._candidates.add(system)
-        if len(self._candidates) == 1:
-            self._system = system
-            return
-        self._system = 1
-        self._settled = True
-        self._autopilot = self._autopilot_seen_ns = None
-        self._armed = False
-        names = ", ".join(map(str, sorted(self._candidates)))
-        self._news.append(f"Several autopilots ({names}): using system 1, set mavlink.system")
+    def answered(self, system: int, component: int, round_trip_ns: int) -> None:
+        """Take in someone's answer to one of our TIMESYNC questions."""
+        with self._lock:
+            self._autopilots.answered(system, component, round_trip_ns)
+
+    def look(self, now_ns: int) -> None:
+        """Compare the autopilots that are heard, when it is time."""
+        with self._lock:
+            self._autopilots.look(now_ns)
 
     def _hear_namesake(self, component: int, token: int) -> None:
         if token == self._token or self._intruder:
@@ -172,7 +181,7 @@ class Presence:
         self._news.append(f"Another companion uses component {component} of this vehicle")
 
     def take_news(self) -> list[str]:
-        """What the operator must be told, each once."""
+        """What the operator must know, each once."""
         with self._lock:
             news, self._news = self._news, []
-        return news
+            return self._autopilots.take_news() + news

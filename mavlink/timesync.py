@@ -31,6 +31,7 @@ class TimesyncFilter:
 
     def __init__(self) -> None:
         self._sent: deque[int] = deque(maxlen=REMEMBER)
+        self._asked: deque[int] = deque(maxlen=REMEMBER)  # also those that were answered
         self._rounds: deque[int] = deque(maxlen=60)
         self._base_ns = 0
         self._offset_ns = 0.0
@@ -68,12 +69,17 @@ class TimesyncFilter:
         quick = self._count < USABLE_AT
         self._next_ns = now_ns + (FAST_REQUEST_NS if quick else REQUEST_EVERY_NS)
         self._sent.append(now_ns)
+        self._asked.append(now_ns)
         message: object = dialect.MAVLink_timesync_message(0, now_ns)
         return message
 
     def next_timer(self) -> int:
         """When the next request is due, in ns."""
         return self._next_ns
+
+    def round_trip_of(self, ts1: int, received_ns: int) -> int | None:
+        """How long ago we asked this question, in ns; None when it is not one of our last."""
+        return received_ns - ts1 if ts1 in self._asked and received_ns >= ts1 else None
 
     def answer(self, tc1: int, ts1: int, received_ns: int) -> bool:
         """Take an answer in; True when it was used. Answers to others are not ours."""

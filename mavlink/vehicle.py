@@ -63,7 +63,7 @@ class VehicleConfig:
     history: HistoryConfig = field(default_factory=lambda: HistoryConfig(keep_s=120.0))
     signing_key: Path | None = None  # 32 bytes, mode 600
     odometry: bool = False  # send our motion estimate to the autopilot
-    state_dir: Path | None = None  # where parameters and the signing time are kept
+    state_dir: Path | None = None  # keeps parameters, signing time and the vehicle's system id
 
     def __post_init__(self) -> None:
         for link in self.links:
@@ -117,6 +117,7 @@ class VehicleLink:
             new_token() if first is None else first.token,
             now_ns,
             None if first is None else round(first.next_s * S),
+            self._memory.system,
         )
         self._companion = Companion(
             config.companion,
@@ -313,7 +314,7 @@ class VehicleLink:
                 self._guard(partial(self._companion.tick, now_ns))
                 timer_ns = self._companion.next_timer()
             self._send(self._companion.take())
-            if now_ns >= save_ns or self._memory.is_stale(self._companion.parameters.revision):
+            if now_ns >= save_ns or self._is_stale():
                 save_ns = now_ns + SAVE_EVERY_NS
                 self._save()
         self._serve(0.0)
@@ -363,10 +364,15 @@ class VehicleLink:
                     link.write(data)
                     self.recorder.write(data, now_ns)
 
+    def _is_stale(self) -> bool:
+        revision = self._companion.parameters.revision
+        return self._memory.is_stale(revision, self.presence.proven_system)
+
     def _save(self) -> None:
         parameters = self._companion.parameters
         timestamp = 0 if self._signing is None else self._signing.timestamp
-        self._memory.save(parameters.kept(), parameters.revision, timestamp)
+        system = self.presence.proven_system
+        self._memory.save(parameters.kept(), parameters.revision, timestamp, system)
 
 
 def new_token() -> int:

@@ -67,14 +67,17 @@ class MavlinkConfig:
     links: tuple[str, ...] = key(
         (), "as pymavlink writes them: serial:/dev/…:921600, udpin:…, tcp:…"
     )
-    system_id: int = key(0, "the vehicle's system id; 0 takes the first autopilot that is heard")
+    system_id: int = key(
+        0, "the vehicle's system id; 0 takes that of the autopilot we are connected to"
+    )
     gimbal_yaw_frame: Literal["auto", "vehicle", "earth", "body", "servo"] = key(
         "auto", "what the gimbal's angles refer to; auto trusts its flags unless they cannot be"
     )
     signing_key: str = key("", "file with the 32-byte key of signed links, mode 600")
     odometry: bool = key(False, "send our motion estimate to the autopilot (ODOMETRY)")
     memory: str = key(
-        "", "folder that keeps tuned parameters and the signing time; empty: scan.folder"
+        "",
+        "folder that keeps tuned parameters, signing time and system id; empty: scan.folder",
     )
 
     def __post_init__(self) -> None:

@@ -41,6 +41,7 @@ class Vehicle:
         self.companion = Companion(config, self.control, self.presence, history, self.now_ns)
         self._packer, self._framer = Packer(0), Framer()
         self._ear, self._mouth = dialect.MAVLink(None), dialect.MAVLink(None, *STATION)
+        self.arm(False)
 
     def ask(self, number: int, component: int, *params: float) -> list[Result]:
         """Send it as a COMMAND_LONG; the results of the acknowledgements that come at once."""
@@ -73,8 +74,8 @@ class Vehicle:
     def be(self, phase: Phase) -> None:
         self.control.state = replace(self.control.state, phase=phase)
 
-    def arm(self) -> None:
-        beat = dialect.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3)
+    def arm(self, armed: bool = True) -> None:
+        beat = dialect.MAVLink_heartbeat_message(2, 3, 128 if armed else 0, 0, 4, 3)
         self.say(bytes(beat.pack(dialect.MAVLink(None, 1, 1))))
 
     def cancel(self, number: int, component: int) -> None:
@@ -110,6 +111,16 @@ def during(phase: Phase, asked: Asked) -> Asked:
 def armed(asked: Asked) -> Asked:
     def ask(v: Vehicle) -> list[Result]:
         v.arm()
+        return asked(v)
+
+    return ask
+
+
+def unheard(asked: Asked) -> Asked:
+    """Asked when the autopilot's heartbeats have stopped a while ago."""
+
+    def ask(v: Vehicle) -> list[Result]:
+        v.later(4.0)
         return asked(v)
 
     return ask
@@ -183,6 +194,8 @@ CASES: dict[int, dict[Result, list[Asked]]] = {
         RUNNING: [worked("erase_scans", "runs", 526, CAMERA, 1, 1)],
         REJECTED: [
             during(SCANNING, plain(526, CAMERA, 1, 1)),
+            armed(plain(526, CAMERA, 1, 1)),
+            unheard(plain(526, CAMERA, 1, 1)),
             busy("erase_scans", 526, CAMERA, 1, 1),
         ],
         DENIED: [plain(526, CAMERA, 2, 1), plain(526, CAMERA, 1, 0)],
@@ -222,7 +235,8 @@ CASES: dict[int, dict[Result, list[Asked]]] = {
     246: {
         ACCEPTED: [plain(246, ONBOARD, 0, k) for k in (1, 2)] + [plain(246, ONBOARD, 0, 0, 1, 191)],
         REJECTED: [armed(plain(246, ONBOARD, 0, k)) for k in (1, 2)]
-        + [armed(plain(246, ONBOARD, 0, 0, 1, 191))],
+        + [armed(plain(246, ONBOARD, 0, 0, 1, 191))]
+        + [unheard(plain(246, ONBOARD, 0, k)) for k in (1, 2)],
         DENIED: [plain(246, ONBOARD, 1, 0)],
         FAILED: [refused("power: reboot", FAILED, plain(246, ONBOARD, 0, 1))],
     },

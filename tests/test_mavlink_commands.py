@@ -352,6 +352,10 @@ def test_power_is_refused_while_armed(ends: Ends, params: tuple[float, ...], ask
     assert any("while armed" in text for text in ends.texts())
     ends.arm(False)
     ends.pass_time(4.0)
+    assert ends.command(246, 191, *params) == [BUSY]  # silence is not disarmed
+    assert any("no autopilot says" in text for text in ends.texts())
+    ends.pass_time(4.0)
+    ends.arm(False)
     assert ends.command(246, 191, *params) == [ACCEPTED]
     assert ends.control.asked == [f"power: {asked}"]
 
@@ -370,6 +374,10 @@ def test_erase(ends: Ends) -> None:
     assert ends.command(526, 100, 1, 1) == [BUSY]
     assert any("refused while scanning" in text for text in ends.texts())
     ends.command(2501, 100)
+    assert ends.command(526, 100, 1, 1, 0, 1) == [BUSY]  # nobody says that it is disarmed
+    ends.arm()
+    assert ends.command(526, 100, 1, 1, 0, 2) == [BUSY]
+    ends.arm(False)
     assert ends.command(526, 100, 1, 1, 1) == [ACCEPTED]
     assert ends.control.asked == ["start_scan", "stop_scan", "erase_scans"]
     status = ends.companion.camera.message(262, 0)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from loopback import free_port, until
 
 from mavlink.first_beat import FirstBeats, heartbeat_packet
 from mavlink.framing import Framer, Packet
-from mavlink.rehearsal import RehearsalControl
+from mavlink.memory import Memory, remembered_system
+from mavlink.rehearsal import RehearsalControl, RehearsalVehicle
 from mavlink.vehicle import VehicleConfig, VehicleLink
 from mavlink.wire import dialect
 
@@ -62,7 +65,8 @@ def test_the_vehicle_link_takes_over_port_token_and_numbers() -> None:
 
 def test_it_imports_neither_the_dialect_nor_arrays() -> None:
     program = (
-        "import sys, service.cli, service.commands.run, service.config, mavlink.first_beat\n"
+        "import sys, service.cli, service.commands.run, service.config, mavlink.first_beat"
+        ", mavlink.memory\n"
         "print(*sorted({'numpy', 'pymavlink', 'rich', 'zenoh', 'cv2'} & set(sys.modules)))"
     )
     root = Path(__file__).resolve().parents[1]
@@ -70,6 +74,46 @@ def test_it_imports_neither_the_dialect_nor_arrays() -> None:
         [sys.executable, "-c", program], capture_output=True, text=True, cwd=root, check=True
     )
     assert found.stdout.split() == []
+
+
+def test_the_first_heartbeat_has_the_system_of_the_last_run(tmp_path: Path) -> None:
+    """No 1/191 appears at the ground station until the vehicle is heard."""
+    kept = {"parameters": {}, "signing_timestamp": 0, "system": 42}
+    (tmp_path / "mavlink.json").write_text(json.dumps(kept))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear:
+        ear.bind(("127.0.0.1", 0))
+        ear.settimeout(30.0)
+        links = f"mavlink.links=udpout:127.0.0.1:{ear.getsockname()[1]}"
+        command = [sys.executable, "-m", "service.cli", "run", "--set", links, "--set"]
+        command += ["health.http=", "--set", f"scan.folder={tmp_path}"]
+        with subprocess.Popen(command, stderr=subprocess.PIPE) as run:
+            (packet,) = Framer().feed(ear.recv(65536))
+            run.communicate(timeout=60)
+    assert (packet.message_id, packet.system) == (0, 42)
+
+
+def test_the_vehicle_of_this_run_is_remembered(tmp_path: Path) -> None:
+    with RehearsalVehicle(f"udpin:127.0.0.1:{(port := free_port())}", state_dir=tmp_path):
+        mouth = dialect.MAVLink(None, 9, 1)
+        beat = dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
+            until(
+                lambda: (
+                    autopilot.sendto(bytes(beat.pack(mouth)), ("127.0.0.1", port)),
+                    remembered_system(tmp_path),
+                )[1]
+            )
+    assert remembered_system(tmp_path) == 9
+    later = VehicleLink(VehicleConfig(state_dir=tmp_path), RehearsalControl())
+    assert later.presence.system == 9 and later.presence.autopilot is None
+
+
+@pytest.mark.parametrize("system", [0, 256, -1, "7", 7.0, True, None, [], 10**30])
+def test_a_system_that_cannot_be_is_not_remembered(tmp_path: Path, system: object) -> None:
+    kept = {"parameters": {"SR_BASELINE_M": 2.0}, "signing_timestamp": 0, "system": system}
+    (tmp_path / "mavlink.json").write_text(json.dumps(kept))
+    assert remembered_system(tmp_path) is None
+    assert Memory(tmp_path).parameters == {"SR_BASELINE_M": 2.0}
 
 
 def test_the_daemon_speaks_before_it_finds_that_it_cannot_work() -> None:

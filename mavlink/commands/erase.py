@@ -1,4 +1,4 @@
-"""STORAGE_FORMAT: erase the finished scans; refused while one runs."""
+"""STORAGE_FORMAT: erase the finished scans; refused while one runs or unless disarmed."""
 
 from __future__ import annotations
 
@@ -22,6 +22,11 @@ def handle(call: Call, host: Companion) -> Handled | None:
         return Answer(Result.DENIED, "erase refused: storage 1 and param 2 = 1 are needed")
     if host.control.status().phase is not Phase.IDLE:
         return Answer(Result.TEMPORARILY_REJECTED, "erase refused while scanning")
+    if host.presence.is_armed:
+        return Answer(Result.TEMPORARILY_REJECTED, "erase refused while armed")
+    if not host.is_disarmed:
+        text = "erase refused: no autopilot says that it is disarmed"
+        return Answer(Result.TEMPORARILY_REJECTED, text)
     if call.param(3, 0.0) == 1.0:
         host.camera.reset_image_log()
     return host.control.erase_scans()

@@ -1,4 +1,4 @@
-"""PREFLIGHT_REBOOT_SHUTDOWN of the companion; refused while the vehicle is armed."""
+"""PREFLIGHT_REBOOT_SHUTDOWN of the companion; refused unless the vehicle is disarmed."""
 
 from __future__ import annotations
 
@@ -27,4 +27,7 @@ def handle(call: Call, host: Companion) -> Handled | None:
         return None  # for the autopilot or another component
     if host.presence.is_armed:
         return Answer(Result.TEMPORARILY_REJECTED, f"{action.value} refused while armed")
+    if not host.is_disarmed:
+        text = f"{action.value} refused: no autopilot says that it is disarmed"
+        return Answer(Result.TEMPORARILY_REJECTED, text)
     return host.control.power(action)

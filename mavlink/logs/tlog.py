@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
+from mavlink.autopilots import is_autopilot
 from mavlink.clock import BootCounter, BootFit, fit_boot
 from mavlink.decode import READERS, decode
 from mavlink.framing import Decoder, Packet, check_packet, packet_length
@@ -21,7 +22,6 @@ BLOCK = 1 << 16
 LATEST_USEC = 4_102_444_800 * 10**6  # the year 2100
 STEP_USEC = 3_600 * 10**6  # a longer way between two packets wants confirmation
 HEARTBEAT = 0
-NO_AUTOPILOT = 8
 
 WANTED = numbers_of(READERS)
 
@@ -120,7 +120,7 @@ def _collect(path: Path, counts: Counter[str]) -> tuple[dict[Key, _Stream], set[
                 continue
             sender = (packet.system, packet.component)
             if packet.message_id == HEARTBEAT:
-                if message.autopilot != NO_AUTOPILOT:
+                if is_autopilot(packet.component, message):
                     autopilots.add(sender)
                 continue
             sample = decode(message)

@@ -69,13 +69,16 @@ def _first_beats(config: Config) -> FirstBeats | None:
     import random
 
     from mavlink.first_beat import FirstBeats
+    from mavlink.memory import remembered_system
 
     mavlink = config.mavlink
     if mavlink.signing_key or not mavlink.links:
         return None
     try:
         token = random.getrandbits(32) or 1
-        first = FirstBeats(mavlink.links, mavlink.system_id or 1, token)
+        folder = Path(mavlink.memory or config.scan.folder)
+        system = mavlink.system_id or remembered_system(folder) or 1
+        first = FirstBeats(mavlink.links, system, token)
     except ValueError:
         return None  # said by the check of the whole configuration
     first.start()

@@ -1,0 +1,253 @@
+"""Whose vehicle we are on, and which components are never its autopilot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from autopilot import packed
+
+from mavlink.companion import Companion, CompanionConfig
+from mavlink.framing import Framer
+from mavlink.history import VehicleHistory
+from mavlink.presence import Presence, PresenceConfig
+from mavlink.rehearsal import RehearsalControl
+from mavlink.wire import dialect
+
+S = 1_000_000_000
+MS = 1_000_000
+GENERIC, ARDUPILOT = 0, 3
+QUADROTOR = 2
+
+
+class Vehicle:
+    """An autopilot elsewhere: what it says every tick, and how soon it answers TIMESYNC."""
+
+    def __init__(
+        self, system: int, round_trip_s: float | None = None, chatter: int = 0, armed: bool = False
+    ) -> None:
+        self.system, self.round_trip_s, self.chatter = system, round_trip_s, chatter
+        self.armed, self.is_on = armed, True
+
+
+class Net:
+    """A companion among vehicles; time passes in steps of 100 ms."""
+
+    def __init__(
+        self, *vehicles: Vehicle, given: int | None = None, remembered: int | None = None
+    ) -> None:
+        self.vehicles = vehicles
+        self.now_ns = 50 * S
+        self.presence = Presence(
+            PresenceConfig(system=given), 4711, self.now_ns, remembered=remembered
+        )
+        self.companion = Companion(
+            CompanionConfig(), RehearsalControl(), self.presence, VehicleHistory(), self.now_ns
+        )
+        self.framer = Framer()
+        self.texts: list[str] = []
+        self.systems: set[int] = set()
+        self._answers: list[tuple[int, int, bytes]] = []  # when, its place in the order, packet
+
+    def feed(self, message: Any, source: tuple[int, int]) -> None:
+        for packet in self.framer.feed(packed(message, source)):
+            self.companion.receive(0, packet, self.now_ns)
+
+    def beat(
+        self,
+        source: tuple[int, int],
+        kind: int = QUADROTOR,
+        autopilot: int = ARDUPILOT,
+        armed: bool = False,
+    ) -> None:
+        mode = 128 if armed else 0
+        self.feed(dialect.MAVLink_heartbeat_message(kind, autopilot, mode, 0, 4, 3), source)
+
+    def wait(self, seconds: float) -> None:
+        for step in range(round(seconds * 10)):
+            end_ns = self.now_ns + S // 10
+            for vehicle in self.vehicles:
+                self._speak(vehicle, step)
+            self._deliver(end_ns)
+            self.now_ns = end_ns
+            self.companion.tick(self.now_ns)
+            self.systems.add(self.presence.system)
+            for outgoing in self.companion.take():
+                self._hear(outgoing.message)
+
+    def _speak(self, vehicle: Vehicle, step: int) -> None:
+        if not vehicle.is_on:
+            return
+        if step % 10 == 0:
+            self.beat((vehicle.system, 1), armed=vehicle.armed)
+        for _ in range(vehicle.chatter):
+            message = dialect.MAVLink_attitude_message(step * 100, 0.0, 0.0, 0.0, 0, 0, 0)
+            self.feed(message, (vehicle.system, 1))
+
+    def _hear(self, message: Any) -> None:
+        if message.get_type() == "STATUSTEXT":
+            text = message.text
+            self.texts.append(text.decode() if isinstance(text, bytes) else text)
+        if message.get_type() != "TIMESYNC" or message.tc1:
+            return
+        for vehicle in self.vehicles:
+            if vehicle.is_on and vehicle.round_trip_s is not None:
+                at_ns = self.now_ns + round(vehicle.round_trip_s * S)
+                reply = dialect.MAVLink_timesync_message(at_ns - 7 * S, message.ts1)
+                data = packed(reply, (vehicle.system, 1))
+                self._answers.append((at_ns, len(self._answers), data))
+
+    def _deliver(self, until_ns: int) -> None:
+        due = sorted(a for a in self._answers if a[0] <= until_ns)
+        self._answers = [a for a in self._answers if a[0] > until_ns]
+        for at_ns, _, data in due:
+            for packet in self.framer.feed(data):
+                self.companion.receive(0, packet, at_ns)
+
+
+# Components that are no autopilots
+
+
+@pytest.mark.parametrize("kind", [5, 6, 18, 26, 27, 30, 34, 36, 39, 42])
+@pytest.mark.parametrize("component", [1, 25, 154])
+def test_a_companion_type_is_never_the_autopilot(kind: int, component: int) -> None:
+    net = Net()
+    net.beat((1, component), kind, GENERIC)
+    assert net.presence.autopilot is None and not net.presence.is_disarmed(net.now_ns)
+
+
+@pytest.mark.parametrize("component", [100, 154, 158, 191, 195, 220, 250])
+def test_a_device_that_calls_itself_a_vehicle_is_not_the_autopilot(component: int) -> None:
+    net = Net()
+    net.beat((1, component), QUADROTOR, GENERIC)
+    assert net.presence.autopilot is None
+    net.beat((1, 1), armed=True)
+    net.beat((1, component), QUADROTOR, GENERIC, armed=False)
+    assert net.presence.autopilot == (1, 1) and net.presence.is_armed
+
+
+def test_a_generic_autopilot_is_one() -> None:
+    net = Net()
+    net.beat((4, 1), QUADROTOR, GENERIC, armed=True)
+    assert net.presence.autopilot == (4, 1) and net.presence.is_armed
+
+
+def test_another_component_does_not_take_the_place_of_the_autopilot() -> None:
+    net = Net()
+    net.beat((1, 1), armed=True)
+    net.beat((1, 25), QUADROTOR, GENERIC, armed=False)
+    assert net.presence.autopilot == (1, 1) and net.presence.is_armed
+    later = Net()
+    later.beat((1, 25), QUADROTOR, GENERIC, armed=False)
+    later.beat((1, 1), armed=True)  # by its number the autopilot
+    assert later.presence.autopilot == (1, 1) and later.presence.is_armed
+
+
+def test_a_gimbal_in_flight_does_not_let_the_companion_reboot() -> None:
+    net = Net()
+    net.beat((1, 1), armed=True)
+    net.beat((1, 154), 26, GENERIC)
+    net.beat((1, 154), 0, GENERIC)
+    reboot = dialect.MAVLink_command_long_message(1, 191, 246, 0, 0, 1, 0, 0, 0, 0, 0)
+    net.feed(reboot, (255, 190))
+    acks = [o.message for o in net.companion.take() if o.message.get_type() == "COMMAND_ACK"]
+    assert [ack.result for ack in acks] == [1]
+    assert net.presence.is_armed
+
+
+def test_disarmed_is_known_only_for_a_moment() -> None:
+    net = Net()
+    assert not net.presence.is_disarmed(net.now_ns)
+    net.beat((1, 1))
+    assert net.presence.is_disarmed(net.now_ns + 3 * S)
+    assert not net.presence.is_disarmed(net.now_ns + 4 * S)
+
+
+# Which vehicle is ours
+
+
+def test_the_vehicle_that_answers_is_ours_though_another_was_heard_first() -> None:
+    net = Net(Vehicle(2, chatter=3), Vehicle(7, 0.002))
+    net.beat((2, 1))
+    assert net.presence.system == 2
+    net.wait(7.0)
+    assert net.presence.system == 7 and net.presence.autopilot == (7, 1)
+    assert net.presence.proven_system == 7
+    assert any("Following system 7, not 2" in text for text in net.texts)
+
+
+def test_the_nearer_of_two_that_answer_is_ours() -> None:
+    net = Net(Vehicle(2, 0.090), Vehicle(7, 0.002))
+    net.wait(7.0)
+    assert net.presence.autopilot == (7, 1)
+
+
+def test_the_one_that_says_most_is_ours_where_nobody_answers() -> None:
+    net = Net(Vehicle(2), Vehicle(7, chatter=5))
+    net.wait(7.0)
+    assert net.presence.autopilot == (7, 1)
+
+
+def test_telemetry_of_the_wrong_vehicle_is_dropped() -> None:
+    net = Net(Vehicle(2, chatter=1), Vehicle(7, 0.002))
+    net.wait(2.0)
+    assert net.companion.history.last_ns is not None and net.presence.system == 2
+    net.wait(5.0)
+    assert net.presence.system == 7
+    assert net.companion.history.last_ns is None
+    clock = net.companion.boot_clock()  # of system 7 alone: by TIMESYNC it started 7 s ago
+    assert clock is not None and clock.offset_ns == pytest.approx(7 * S, abs=2 * MS)
+
+
+def test_two_that_are_alike_are_asked_about_and_nobody_is_followed() -> None:
+    net = Net(Vehicle(5, 0.002), Vehicle(6, 0.002))
+    net.wait(10.0)
+    assert net.presence.autopilot is None and not net.presence.is_disarmed(net.now_ns)
+    assert [t for t in net.texts if "Several" in t] == [
+        "Several autopilots (5, 6): set mavlink.system_id"
+    ]
+    net.vehicles[0].is_on = False
+    net.wait(10.0)
+    assert net.presence.autopilot == (6, 1)
+
+
+def test_the_remembered_vehicle_decides_a_draw_and_is_waited_for() -> None:
+    net = Net(Vehicle(2, 0.002), Vehicle(7, 0.002), remembered=7)
+    net.beat((2, 1))
+    net.wait(10.0)
+    assert net.presence.autopilot == (7, 1) and net.systems == {7}
+    assert net.texts == []
+
+
+def test_a_companion_on_another_aircraft_leaves_the_remembered_vehicle() -> None:
+    net = Net(Vehicle(3, 0.002), remembered=7)
+    net.wait(10.0)
+    assert net.presence.autopilot == (3, 1) and net.presence.proven_system == 3
+
+
+def test_a_proven_vehicle_is_not_left_while_its_autopilot_restarts() -> None:
+    net = Net(Vehicle(2, 0.090), Vehicle(7, 0.002))
+    net.wait(7.0)
+    net.vehicles[1].is_on = False
+    net.wait(12.0)
+    net.vehicles[1].is_on = True
+    net.wait(12.0)
+    assert net.presence.autopilot == (7, 1) and net.systems <= {2, 7}
+    assert [t for t in net.texts if t == "Following system 2, not 7"] == []
+
+
+def test_a_wrong_vehicle_is_left_in_the_end_even_when_it_was_proven() -> None:
+    net = Net(Vehicle(2, 0.090), Vehicle(7, 0.002))
+    net.vehicles[1].is_on = False
+    net.wait(10.0)
+    assert net.presence.proven_system == 2
+    net.vehicles[1].is_on = True
+    net.wait(45.0)
+    assert net.presence.autopilot == (7, 1)
+
+
+def test_a_system_that_is_given_is_never_left() -> None:
+    net = Net(Vehicle(2, 0.002), given=12)
+    net.wait(20.0)
+    assert net.presence.system == 12 and net.presence.autopilot is None
+    assert net.presence.others(net.now_ns) == [2]
