@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from array import array
 from bisect import bisect_left
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import cv2
@@ -37,6 +37,11 @@ MOST_TILES = 5_000
 
 MOST_CELLS = 25_000_000
 """Of the rectangle about all tiles (500 MB); of a larger one only its middle is shown."""
+
+LONGEST_CELLS = 1 << 15
+"""Of a footprint along either axis: a picture is some hundred cells across."""
+
+SMALLEST_CELL_M, LARGEST_CELL_M = 1e-3, 1e3
 
 I64 = npt.NDArray[np.int64]
 Tile = tuple[int, int]
@@ -102,6 +107,7 @@ def usual_cell_m(depth: DepthMap) -> float | None:
     if not known.any():
         return None
     target = CELL_SAMPLES * float(np.median(depth.depth_m[known])) / float(depth.K[0, 0])
+    target = min(max(target, SMALLEST_CELL_M), LARGEST_CELL_M)
     power = 10.0 ** np.floor(np.log10(target))
     return float(min((power * m for m in (1, 2, 5, 10)), key=lambda c: abs(np.log(c / target))))
 
@@ -129,7 +135,7 @@ class CoverageMap:
         if not (np.isfinite(cell_m) and cell_m > 0):
             raise ValueError(f"cell_m is {cell_m}, must be positive")
         self.cell_m = float(cell_m)
-        self.refused = 0  # tiles that were not made, because there are MOST_TILES
+        self.refused = 0  # tiles beyond MOST_TILES, and footprints too large to be one
         self._tiles: dict[Tile, _Cells] = {}
         self._ledger: Ledger = MemoryLedger(PLACE) if ledger is None else ledger
         self._seqs, self._rows = array("q"), array("q")  # keyframes in order, and their rows
@@ -177,8 +183,11 @@ class CoverageMap:
         else:
             touched = self._tiles_of(self._points(depth)[0])
             self._stale |= touched
-        tiles = np.array(sorted(touched))
-        row["low"], row["high"] = tiles.min(axis=0), tiles.max(axis=0)
+        if touched:
+            tiles = np.array(sorted(touched))
+            row["low"], row["high"] = tiles.min(axis=0), tiles.max(axis=0)
+        else:
+            row["low"], row["high"] = 0, -1  # nowhere
         self._keep(at, row)
 
     def _row(self, seq: int) -> int | None:
@@ -264,6 +273,9 @@ class CoverageMap:
         corners = place.corners_m / self.cell_m - 0.5  # whole numbers at cell centres
         low = np.floor(corners.min(axis=0)).astype(int)
         size = np.ceil(corners.max(axis=0)).astype(int) - low + 1
+        if size.max() > LONGEST_CELLS or size[0] * size[1] > MOST_CELLS:
+            self.refused += 1
+            return
         mask = np.zeros((size[1], size[0]), np.uint8)
         shift = 8
         points = np.rint((corners - low) * (1 << shift)).astype(np.int32)
@@ -281,7 +293,8 @@ class CoverageMap:
         height = np.linalg.norm(corners[:, 2] - corners[:, 1], axis=1)
         around = 0.25 * float(np.median(np.minimum(width, height))) / self.cell_m
         mask = np.zeros(grid.shape, np.uint8)
-        spots = np.rint(grid.pixels(middles)).astype(np.int32)
+        far_away = float(1 << 24)  # what OpenCV draws without overflow
+        spots = np.rint(grid.pixels(middles).clip(-far_away, far_away)).astype(np.int32)
         cv2.fillConvexPoly(mask, cv2.convexHull(spots[:, None]), 1)
         far = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5)
         return np.asarray(far <= around), mask > 0
@@ -302,25 +315,29 @@ class CoverageMap:
 
     @staticmethod
     def _tiles_of(cells: Array) -> set[Tile]:
+        """The tiles with points; none where they are scattered over more than MOST_TILES."""
         tile = cells // TILE
         low, high = tile.min(axis=0), tile.max(axis=0)
-        if np.prod(high - low + 1) > 1 << 20:  # a stray point far away
-            return {(int(i), int(j)) for i, j in np.unique(tile, axis=0)}
+        if np.prod((high - low + 1).astype(np.float64)) > 1 << 20:  # a stray point far away
+            there = np.unique(tile, axis=0)
+            return set() if len(there) > MOST_TILES else {(int(i), int(j)) for i, j in there}
         rows = int(high[1] - low[1]) + 1
         there = np.flatnonzero(np.bincount((tile[:, 0] - low[0]) * rows + tile[:, 1] - low[1]))
+        if len(there) > MOST_TILES:
+            return set()
         return {(int(low[0]) + int(k) // rows, int(low[1]) + int(k) % rows) for k in there}
 
     def _add_surface(self, place: np.void, depth: DepthMap, only: set[Tile] | None) -> set[Tile]:
         """Merge a keyframe's points into its tiles (``only`` these); the tiles touched."""
         cells, height, sigma = self._points(depth)
         touched = self._tiles_of(cells)
-        tile = cells // TILE
+        self.refused += not touched
         when = np.float32(place["seen_s"])
-        for key in touched if only is None else touched & only:
+        wanted = touched if only is None else touched & only
+        for key, here in _by_tile(cells, wanted):
             held = self._tile(key)
             if held is None:
                 continue
-            here = (tile[:, 0] == key[0]) & (tile[:, 1] == key[1])
             local = cells[here] - np.array(key) * TILE
             _merge(local, height[here], sigma[here], when, held.sigma, held.height, held.weight,
                    held.seen_s)  # fmt: skip
@@ -335,6 +352,20 @@ class CoverageMap:
                 return None
             found = self._tiles[key] = _Cells()
         return found
+
+
+def _by_tile(cells: I64, wanted: set[Tile]) -> Iterator[tuple[Tile, I64]]:
+    """Each of the ``wanted`` tiles with the points (rows of ``cells``) in it, in their order."""
+    if not wanted:
+        return
+    tile = cells // TILE
+    order = np.lexsort((tile[:, 1], tile[:, 0]))  # stable
+    ordered = tile[order]
+    starts = np.flatnonzero(np.any(np.diff(ordered, axis=0) != 0, axis=1)) + 1
+    for points in np.split(order, starts):
+        key = (int(tile[points[0], 0]), int(tile[points[0], 1]))
+        if key in wanted:
+            yield key, points
 
 
 def _spread(

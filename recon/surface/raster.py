@@ -31,6 +31,10 @@ SPARSE_SHARE = 0.5
 
 LARGEST_CELLS = 200_000_000
 
+CELLS_PER_POINT, FEWEST_CELLS = 1000, 10_000_000
+"""A rectangle with more cells than the larger of the two is empty but for strays: points that lie
+anywhere must not choose how much memory is asked for."""
+
 
 @dataclass(frozen=True, slots=True)
 class Grid:
@@ -45,9 +49,7 @@ class Grid:
         if not (math.isfinite(self.cell_m) and self.cell_m > 0.0):
             raise ValueError(f"cell_m is {self.cell_m}, must be positive")
         if self.shape[0] * self.shape[1] > LARGEST_CELLS:
-            raise ValueError(
-                f"a grid of {self.shape[0]} x {self.shape[1]} cells is too large; take larger cells"
-            )
+            raise ValueError(_too_large(self.shape[0], self.shape[1]))
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -93,10 +95,18 @@ def grid_over(xy_m: F64, cell_m: float, margin_cells: int = 0) -> Grid:
     xy = np.asarray(xy_m, np.float64)
     if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
         raise ValueError(f"expected points of shape (N, 2) with N > 0, got {xy.shape}")
-    low = np.floor(xy.min(axis=0) / cell_m) - margin_cells
-    high = np.floor(xy.max(axis=0) / cell_m) + 1 + margin_cells
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        low = np.floor(xy.min(axis=0) / cell_m) - margin_cells
+        high = np.floor(xy.max(axis=0) / cell_m) + 1 + margin_cells
+        cells = float(np.prod(high - low))
+    if not cells <= min(LARGEST_CELLS, max(FEWEST_CELLS, CELLS_PER_POINT * len(xy))):
+        raise ValueError(_too_large(high[1] - low[1], high[0] - low[0]))
     cols, rows = (high - low).astype(int)
     return Grid(float(low[0] * cell_m), float(high[1] * cell_m), cell_m, (int(rows), int(cols)))
+
+
+def _too_large(rows: float, cols: float) -> str:
+    return f"a grid of {rows:.0f} x {cols:.0f} cells is too large; take larger cells"
 
 
 def rasterise(cloud: PointCloud, grid: Grid) -> Raster:

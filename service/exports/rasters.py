@@ -21,11 +21,14 @@ from recon.surface.raster import (
     without_cells,
 )
 from recon.types import F64, Array
+from service.errors import InputError
 from service.exports.view import ExportOptions, ScanView
 from service.scans.writing import writing
 
 NODATA_M = -9999.0
 SHORTEST_CONTOUR_CELLS = 12
+MOST_CONTOURS = 5000
+"""Heights at which contours are drawn: every metre up to the highest mountains."""
 OPEN_STEP_M = 2
 SIDEWAYS_DEG = 15.0
 MOST_OPEN_M, MOST_OPEN_SIDEWAYS_M = 4, 6
@@ -162,6 +165,11 @@ def contour_lines(raster: Raster, step_m: float) -> Iterator[tuple[float, F64]]:
     filled = np.where(known, raster.height_m, np.float32(np.nanmedian(raster.height_m)))
     smooth = cv2.GaussianBlur(filled.astype(np.float32), (0, 0), 1.5)
     low, high = float(smooth[known].min()), float(smooth[known].max())
+    if (high - low) / step_m > MOST_CONTOURS:
+        raise InputError(
+            f"contours every {step_m:g} m over {high - low:.0f} m of height are too many; "
+            "give a larger --contour-m"
+        )
     inner = cv2.erode(np.pad(known, 1).astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1]
     for n in range(math.ceil(low / step_m), math.floor(high / step_m) + 1):
         above = ((smooth >= n * step_m) & known).astype(np.uint8)

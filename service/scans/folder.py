@@ -37,6 +37,8 @@ log = logging.getLogger(__name__)
 CLOUD, TUM, CSV = "cloud.laz", "trajectory.tum", "trajectory.csv"
 SUMMARY, PREVIEW, REPORT = "scan.json", "preview.jpg", "report.html"
 PREVIEW_CELLS = 6e6
+MIN_VOXEL_M, MAX_VOXEL_M = 0.01, 100.0
+"""What a scan's own configuration may ask for."""
 NO_GEOREFERENCE = (
     "no georeference: coordinates are metres east, north and up of the scan's own origin"
 )
@@ -97,7 +99,9 @@ def _resolution_m(header: ScanHeader) -> float | None:
     """``scan.resolution_m`` of the scan's configuration; None when it leaves that open."""
     section = header.configuration.get("scan", {})
     value = section.get("resolution_m") if isinstance(section, dict) else None
-    return float(value) if isinstance(value, int | float) and value > 0.0 else None
+    if not isinstance(value, int | float) or not MIN_VOXEL_M <= value <= MAX_VOXEL_M:
+        return None
+    return float(value)
 
 
 def surface(fused: FusedCloud, most_cells: float = PREVIEW_CELLS) -> Raster | None:

@@ -17,6 +17,7 @@ from recon.types import DepthMap, Keyframe, Pose
 from service.stream import planes
 from service.stream.layer import MAX_PIXELS, MAX_SIDE_PX, LayerHead, pack, unpack
 from service.stream.records import pack_place
+from service.stream.validity import MAX_DEPTH_M, MIN_DEPTH_M
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +72,7 @@ def encode(
     h, w = depth.depth_m.shape
     _check(keyframe, w, h)
     with np.errstate(invalid="ignore"):
-        known = keyframe.fresh & (depth.depth_m > 1e-3) & (depth.depth_m < 1e5)
+        known = keyframe.fresh & (depth.depth_m > MIN_DEPTH_M) & (depth.depth_m < MAX_DEPTH_M)
     fine = planes.planes_of(depth, keyframe.bgr, known)
     factor = -(-w // config.coarse_width_px)
     fine_place = (0, 1, 1) if factor == 1 else (1, 2, 1)
@@ -179,6 +180,7 @@ def _open_planes(head: LayerHead, sections: Sequence[bytes]) -> planes.Planes | 
     bgr = planes.decode_colour(colour, w, h)
     if depth_m is None or sigma_m is None or count is None or bgr is None:
         return None
+    known &= depth_m >= 0.5 * np.float32(MIN_DEPTH_M)  # what no encoder writes, but for rounding
     return planes.Planes(depth_m, sigma_m, count, bgr, known)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from recon.camera_model import scaled_K
 from recon.types import F64
 from service.stream.records import PLACE_BYTES, pack_place, source_bits, sources_of, unpack_place
+from service.stream.validity import is_inverse_depth, is_pinhole
 
 MAX_SIDE_PX = 4096
 MAX_PIXELS = 1 << 22
@@ -128,7 +129,7 @@ def _head(fields: list[tuple[object, ...]]) -> LayerHead | None:
     w, h, factor, method, x, y, box_w, box_h = _ints(fields[1])
     optics = np.array(fields[2], np.float64)
     place = unpack_place(fields[3][0]) if isinstance(fields[3][0], bytes) else None
-    if place is None or not np.isfinite(optics).all() or not np.isfinite(place[1]).all():
+    if place is None or not np.isfinite(optics).all():
         return None
     fx, fy, cx, cy = optics[2:]
     return LayerHead(
@@ -159,9 +160,10 @@ def _plausible(head: LayerHead) -> bool:
         return False
     if not (head.factor >= 1 and head.layer < head.layers <= MAX_LAYERS):
         return False
-    if not (1e-3 < head.K[0, 0] < 1e6 and 1e-3 < head.K[1, 1] < 1e6):
+    K = head.K
+    if not is_pinhole((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), (w, h)):
         return False
     x, y, box_w, box_h = head.box
     if x + box_w > head.grid_px[0] or y + box_h > head.grid_px[1] or (box_w == 0) != (box_h == 0):
         return False
-    return box_w == 0 or (0 < head.inverse_min < 1e4 and 0 < head.inverse_step < 1e4)
+    return box_w == 0 or is_inverse_depth(head.inverse_min, head.inverse_step)

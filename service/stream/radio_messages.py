@@ -18,6 +18,7 @@ from recon import se3
 from recon.types import F32, F64, U8, Bool
 from service.stream.naming import NAME
 from service.stream.records import PoseRecord, ScanHeader, source_bits, sources_of
+from service.stream.validity import is_on_globe, is_pinhole
 
 U16 = npt.NDArray[np.uint16]
 
@@ -92,6 +93,8 @@ def unpack_announce(data: bytes) -> ScanHeader | None:
     drone, scan = names[:length], names[length:]
     if not (NAME.fullmatch(drone) and NAME.fullmatch(scan)) or tag_of(drone, scan) != tag:
         return None
+    if started < 0 or not is_on_globe(_finite(lat), _finite(lon), _finite(alt)):
+        return None
     return ScanHeader(
         scan,
         drone,
@@ -141,6 +144,8 @@ def unpack_pose(data: bytes) -> tuple[int, int, PoseRecord] | None:
         return None
     no_fix = f[11] == -(1 << 31)
     sigma = f[14] / _METRE_CM
+    if not no_fix and not is_on_globe(f[11] * 1e-7, f[12] * 1e-7, _finite(f[13])):
+        return None
     pose = PoseRecord(
         f[3],
         T,
@@ -204,17 +209,15 @@ def unpack_tile(data: bytes) -> tuple[int, Tile] | None:
         return None
     if index >= -(-w // CELLS) * -(-h // CELLS):
         return None
+    focal_px = f[14] / 8192 * w
+    cx, cy = f[15] / 65535 * w - 0.5, f[16] / 65535 * h - 0.5
+    if not is_pinhole((focal_px, focal_px, cx, cy), (w, h)):
+        return None
     packed = _from_ten_bits(data[_TILE.size :])
     codes = (packed & np.uint16(63)).reshape(CELLS, CELLS)
     low, high = 1.0 / (far * _DEPTH_UNIT_M), 1.0 / (near * _DEPTH_UNIT_M)
     depth = 1.0 / (low + (codes - 1.0) * (high - low) / _LEVELS)
-    K = np.array(
-        [
-            [f[14] / 8192 * w, 0.0, f[15] / 65535 * w - 0.5],
-            [0.0, f[14] / 8192 * w, f[16] / 65535 * h - 0.5],
-            [0.0, 0.0, 1.0],
-        ]
-    )
+    K = np.array([[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]])
     tile = Tile(
         seq=f[2],
         time_unix_ns=f[3] * 1_000_000_000,

@@ -19,9 +19,8 @@ import numpy as np
 
 from recon import se3
 from recon.types import F64, DepthMap, Keyframe, Pose
-
-MAX_HEADER_BYTES = 262_144
-"""A scan header larger than this is refused."""
+from service.stream import validity
+from service.stream.validity import MAX_DEPTH_M, MAX_HEADER_BYTES, MIN_DEPTH_M
 
 SOURCES = ("vision", "attitude", "altitude", "gnss", "exif", "loop", "dead reckoning")
 """Bit k of a ``sources`` byte on the wire stands for name k."""
@@ -31,18 +30,23 @@ SOURCES = ("vision", "attitude", "altitude", "gnss", "exif", "loop", "dead recko
 class ScanHeader:
     """What a scan is: who flew it, about which origin, with which camera and settings."""
 
-    scan_id: str
-    drone: str
-    started_unix_ns: int
-    origin_lat_deg: float | None = None
-    origin_lon_deg: float | None = None
-    origin_alt_amsl_m: float | None = None
-    epsg: int | None = None
+    scan_id: validity.Name
+    drone: validity.Name
+    started_unix_ns: validity.Time
+    origin_lat_deg: validity.Latitude | None = None
+    origin_lon_deg: validity.Longitude | None = None
+    origin_alt_amsl_m: validity.Altitude | None = None
+    epsg: validity.Epsg | None = None
     camera: dict[str, Any] = field(default_factory=dict)
     configuration: dict[str, Any] = field(default_factory=dict)
-    software: str = ""
-    georeference: str = "none"  # "gnss", "exif" or "none"
-    notes: tuple[str, ...] = ()
+    software: validity.Text = ""
+    georeference: validity.Text = "none"  # "gnss", "exif" or "none"
+    notes: validity.Notes = ()
+
+    @property
+    def name_parts(self) -> tuple[str, str]:
+        """What tells this scan from all others: it never changes."""
+        return self.drone, self.scan_id
 
     def to_json(self) -> bytes:
         """The header as a JSON object."""
@@ -50,13 +54,20 @@ class ScanHeader:
 
 
 def header_from_json(data: bytes) -> ScanHeader | None:
-    """The header in ``data``, or None when it is none or larger than MAX_HEADER_BYTES."""
+    """The header in ``data``, or None when it is none, too large, or says what cannot be."""
+    found = read_header(data)
+    return None if isinstance(found, str) else found
+
+
+def read_header(data: bytes) -> ScanHeader | str:
+    """The header in ``data``, or what is wrong with it."""
     if len(data) > MAX_HEADER_BYTES:
-        return None
+        return f"it has {len(data)} bytes, at most {MAX_HEADER_BYTES} are allowed"
     try:
-        return msgspec.json.decode(data, type=ScanHeader)
-    except (msgspec.DecodeError, msgspec.ValidationError, UnicodeDecodeError, RecursionError):
-        return None
+        header = msgspec.json.decode(data.decode("utf-8"), type=ScanHeader)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        return str(error)
+    return validity.fault_of_camera(header.camera) or header
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,12 +103,15 @@ class Repose:
     covariance: F64  # (6, 6) left perturbation in the world frame: rotation rad, translation m
 
     def applied_to(self, keyframe: Keyframe) -> Keyframe:
-        """The keyframe at this pose, its depth and sigma scaled."""
+        """The keyframe at this pose, its depth and sigma scaled; depth out of reach is NaN."""
         depth, scale = keyframe.depth, np.float32(self.scale)
         T = self.T_world_camera
+        scaled_m = depth.depth_m * scale
+        with np.errstate(invalid="ignore"):
+            scaled_m[(scaled_m < MIN_DEPTH_M) | (scaled_m > MAX_DEPTH_M)] = np.nan
         return replace(
             keyframe,
-            depth=DepthMap(depth.depth_m * scale, depth.sigma_m * scale, depth.views, depth.K, T),
+            depth=DepthMap(scaled_m, depth.sigma_m * scale, depth.views, depth.K, T),
             pose=Pose(T, self.covariance, keyframe.pose.sources),
         )
 
@@ -135,11 +149,9 @@ def pack_motion(T: F64) -> list[float]:
 
 
 def unpack_motion(seven: Sequence[float] | F64) -> F64 | None:
-    """(4, 4) motion of x y z, qw qx qy qz; None unless finite and with a real quaternion."""
+    """(4, 4) motion of x y z, qw qx qy qz; None unless within reach, with a real quaternion."""
     v = np.asarray(seven, np.float64)
-    if not np.isfinite(v).all() or np.abs(v[:3]).max() > 1e9:
-        return None
-    if not 0.5 < float(np.linalg.norm(v[3:])) < 2.0:
+    if not (validity.is_position(v[:3]) and validity.is_rotation(v[3:])):
         return None
     return se3.compose(se3.rotation_from_quaternion(v[3:]), v[:3])
 
@@ -156,7 +168,9 @@ def unpack_place(data: bytes) -> tuple[F64, F64] | None:
     """Motion and covariance of what :func:`pack_place` gave; None for what cannot be."""
     fields = _PLACE.unpack(data)
     motion = unpack_motion(fields[:7])
-    return None if motion is None else (motion, unpack_covariance(fields[7:]))
+    if motion is None or not all(map(math.isfinite, fields[7:])):
+        return None
+    return motion, unpack_covariance(fields[7:])
 
 
 PLACE_BYTES = _PLACE.size
@@ -238,15 +252,18 @@ def unpack_pose(data: bytes) -> PoseRecord | None:
     if found is None:
         return None
     (bits, time_unix_ns, seq), motion, covariance, last = found
-    lat, lon, alt, agl, roll, pitch, yaw, speed, distance, turn, sigma = last
+    lat, lon, alt, agl = map(_or_none, last[:4])
+    roll, pitch, yaw, speed, distance, turn, sigma = last[4:]
+    if not (validity.is_on_globe(lat, lon, alt, agl) and all(map(math.isfinite, last[4:]))):
+        return None
     return PoseRecord(
         time_unix_ns=time_unix_ns,
         T_world_camera=motion,
         covariance=covariance,
-        lat_deg=_or_none(lat),
-        lon_deg=_or_none(lon),
-        alt_amsl_m=_or_none(alt),
-        agl_m=_or_none(agl),
+        lat_deg=lat,
+        lon_deg=lon,
+        alt_amsl_m=alt,
+        agl_m=agl,
         roll_rad=roll,
         pitch_rad=pitch,
         yaw_rad=yaw,
@@ -272,4 +289,4 @@ def unpack_repose(data: bytes) -> Repose | None:
     if found is None:
         return None
     (_, seq, revision), motion, covariance, (scale,) = found
-    return Repose(seq, revision, motion, scale, covariance) if 1e-6 < scale < 1e6 else None
+    return Repose(seq, revision, motion, scale, covariance) if validity.is_scale(scale) else None

@@ -27,13 +27,14 @@ from service.stream.records import (
     PoseRecord,
     Repose,
     ScanHeader,
-    header_from_json,
     pack_pose,
     pack_repose,
+    read_header,
     unpack_pose,
     unpack_repose,
 )
 from service.stream.rescue import is_sound, rescue
+from service.stream.validity import summary_from_json
 
 
 class ScanStore:
@@ -119,7 +120,7 @@ class ScanStore:
     def summary(self) -> dict[str, Any] | None:
         """What :meth:`finish` was given; None while the scan goes on."""
         text = self._db.get("summary")
-        return None if text is None else dict(json.loads(text))
+        return None if text is None else summary_from_json(text.encode()) or {}
 
     @property
     def refinement(self) -> dict[str, Any] | None:
@@ -133,8 +134,14 @@ class ScanStore:
         return self._db.get("summary") is not None
 
     def finish(self, summary: dict[str, Any]) -> None:
-        """Close the scan with its ``summary`` (must be JSON)."""
-        data = json.dumps(summary, sort_keys=True).encode()
+        """Close the scan with its ``summary``, plain values; those that are not finite are null.
+
+        Raises ValueError for a summary that no receiver would take.
+        """
+        strict = json.loads(json.dumps(summary), parse_constant=lambda _: None)
+        data = json.dumps(strict, sort_keys=True).encode()
+        if summary_from_json(data) is None:
+            raise ValueError(f"no summary of a scan: {data[:200]!r}")
         self._set_whole("summary", data, self._header)
 
     # Chunks
@@ -194,7 +201,7 @@ class ScanStore:
         sql = "SELECT data FROM chunks WHERE seq = ? ORDER BY layer DESC"
         for (data,) in self._db.all(sql, (seq,)):
             decoded = codec.decode([bytes(data)])
-            if decoded is not None:
+            if decoded is not None and decoded.seq == seq:
                 break
         else:
             decoded = self._radio.keyframe(seq)
@@ -325,8 +332,10 @@ class ScanStore:
         with self._lock:
             if number in self._inventory.of(kind) or zlib.crc32(data) != number:
                 return False
-            header = header_from_json(data) if kind == "header" else self._header
-            if header is None or not _is_object(data):
+            header = read_header(data) if kind == "header" else self._header
+            if isinstance(header, str) or header.name_parts != self._header.name_parts:
+                return False
+            if kind == "summary" and summary_from_json(data) is None:
                 return False
             self._set_whole(kind, data, header)
             return True
@@ -374,11 +383,13 @@ class ScanStore:
     def _read_header(self) -> ScanHeader:
         text = self._db.get("header")
         schema = self._db.get("schema")
-        header = None if text is None else header_from_json(text.encode())
-        if header is None or schema is None:
+        if text is None or schema is None or not (schema.isdecimal() and len(schema) < 9):
             raise InputError(f"{self.path} holds no scan header; it is not a scan database")
         if int(schema) > SCHEMA_VERSION:
             raise InputError(f"{self.path} was written by a newer version; update skyrelief")
+        header = read_header(text.encode())
+        if isinstance(header, str):
+            raise InputError(f"{self.path}: the scan's header is not valid ({header})")
         return header
 
     def _next_id(self, table: str) -> int:
@@ -396,11 +407,3 @@ def _chunk_row(head: layer.LayerHead, data: bytes) -> tuple[Any, ...]:
         time.time_ns(),
         data,
     )
-
-
-def _is_object(data: bytes) -> bool:
-    """Whether ``data`` is a JSON object in UTF-8."""
-    try:
-        return isinstance(json.loads(data), dict)
-    except (ValueError, RecursionError):
-        return False
