@@ -73,6 +73,19 @@ check_openmp() {
   say "libgomp1 (OpenMP) is missing: it will run at half the speed; apt install libgomp1"
 }
 
+# What the packages of version folder $1 load from the system (service/packages.py has the list).
+check_libraries() {
+  [[ -z $root ]] || return 0
+  local missing
+  mapfile -t missing < <("$1/bin/python" -m service.packages)
+  ((${#missing[@]})) || return 0
+  if [[ -z $bundle ]] && command -v apt-get >/dev/null; then
+    say "installing ${missing[*]}"
+    apt-get install -y -q --no-install-recommends "${missing[@]}" >/dev/null && return 0
+  fi
+  say "missing: ${missing[*]} (skyrelief doctor says what for); apt install ${missing[*]}"
+}
+
 # NVIDIA's own builds of torch and onnxruntime live in the system's Python on a Jetson; a
 # virtual environment that sees them keeps them, PyPI's would lack the GPU.
 site_packages() {
@@ -106,6 +119,7 @@ build_version() {
   grep -rlIZ --fixed-strings "$part" "$part/bin" "$part/pyvenv.cfg" |
     xargs -0 -r sed -i "s|$part|${target#"$root"}|g"
   "$part/bin/python" -c 'import service.cli, recon, mavlink' || die "the new version does not start"
+  check_libraries "$part"
   install -D -m 0644 -t "$part/share/skyrelief" "${bundle:-$here}"/systemd/*.service
   mv "$part" "$target"
 }

@@ -13,6 +13,7 @@ import typer.main
 
 from service.errors import SkyreliefError
 from service.journal import log_handler
+from service.packages import needing
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("service.commands.demo:demo", "A real flight through both ends, here."),
@@ -88,7 +89,8 @@ def _root(
 def main() -> None:
     """Run the command line; exit codes: 0 done, 2 usage or input, 3 outside world, 1 ours."""
     try:
-        app(standalone_mode=True)
+        with needing("this command"):
+            app(standalone_mode=True)
     except SkyreliefError as error:
         print(f"skyrelief: {error}", file=sys.stderr)
         sys.exit(error.exit_code)

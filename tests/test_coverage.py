@@ -256,7 +256,7 @@ def test_a_fine_layer_that_comes_later_is_taken_in(tmp_path: Path, house: HouseF
 
 
 def test_picture_figures_and_geotiff(tmp_path: Path, house: HouseFlight) -> None:
-    rasterio = pytest.importorskip("rasterio")
+    rasterio = pytest.importorskip("rasterio", exc_type=ImportError)
     with house.flown(tmp_path) as store:
         write_deliverables(tmp_path, store, {})
         found = coverage_of(store)

@@ -55,7 +55,7 @@ def assert_is_the_house(enu: F64, house: HouseFlight, tolerance_m: float = 0.05)
 
 
 def test_ply_by_open3d(scan_dir: Path, house: HouseFlight) -> None:
-    o3d = pytest.importorskip("open3d")
+    o3d = pytest.importorskip("open3d", exc_type=ImportError)
     path = written(scan_dir, "ply")
     cloud = o3d.io.read_point_cloud(str(path))
     assert_is_the_house(to_enu(np.asarray(cloud.points), 32632, house), house)
@@ -107,7 +107,7 @@ def test_octree_holds_every_point_once_inside_its_node() -> None:
 
 
 def test_dsm_by_rasterio(scan_dir: Path, house: HouseFlight) -> None:
-    rasterio = pytest.importorskip("rasterio")
+    rasterio = pytest.importorskip("rasterio", exc_type=ImportError)
     path = written(scan_dir, "dsm", ExportOptions(cell_m=0.5))
     with rasterio.open(path) as image:
         assert image.crs.to_epsg() == 32632
@@ -126,7 +126,7 @@ def test_dsm_by_rasterio(scan_dir: Path, house: HouseFlight) -> None:
 
 
 def test_ortho_by_rasterio(scan_dir: Path, house: HouseFlight) -> None:
-    rasterio = pytest.importorskip("rasterio")
+    rasterio = pytest.importorskip("rasterio", exc_type=ImportError)
     with rasterio.open(written(scan_dir, "ortho")) as image:
         red, _, blue, opacity = image.read()
         assert image.crs.to_epsg() == 32632
@@ -221,7 +221,7 @@ def test_an_old_deliverable_stays_until_the_new_one_is_whole(scan_dir: Path) -> 
 def test_without_georeference_local_files_are_written_and_maps_refused(
     tmp_path: Path, house: HouseFlight
 ) -> None:
-    pytest.importorskip("rasterio")
+    pytest.importorskip("rasterio", exc_type=ImportError)
     house.flown(tmp_path / "s", georeferenced=False).close()
     for kind in ("ply", "laz", "dsm", "ortho", "colmap"):
         assert written(tmp_path / "s", kind).exists()

@@ -55,7 +55,7 @@ def test_unknown_cells_are_holes_and_lone_cells_are_gone() -> None:
 
 
 def test_many_faces_are_simplified_without_leaving_the_surface() -> None:
-    pytest.importorskip("open3d")
+    pytest.importorskip("open3d", exc_type=ImportError)
     rows, cols = np.mgrid[0:120, 0:120].astype(float)
     height = (2.0 * np.sin(cols / 20) * np.cos(rows / 25)).astype(np.float32)
     mesh = height_mesh(raster(height), largest_faces=3000)
@@ -79,7 +79,7 @@ def test_smoothing_takes_noise_and_keeps_steps() -> None:
 
 
 def test_poisson_finds_a_sphere() -> None:
-    pytest.importorskip("open3d")
+    pytest.importorskip("open3d", exc_type=ImportError)
     rng = np.random.default_rng(2)
     n = 20_000
     out = rng.normal(size=(n, 3))
@@ -115,7 +115,7 @@ def test_glb_is_read_by_trimesh(tmp_path: Path) -> None:
     coloured = Mesh(mesh.vertices_m, mesh.faces, None, np.full((len(mesh.vertices_m), 3), 128))
     (tmp_path / "b.glb").write_bytes(glb([(coloured, None)], {}))
     # 128 in sRGB is 0.2159 of full light.
-    o3d = pytest.importorskip("open3d")
+    o3d = pytest.importorskip("open3d", exc_type=ImportError)
     colours = np.asarray(o3d.io.read_triangle_mesh(str(tmp_path / "b.glb")).vertex_colors)
     np.testing.assert_allclose(colours, 0.2159, atol=2e-3)
 
@@ -123,7 +123,7 @@ def test_glb_is_read_by_trimesh(tmp_path: Path) -> None:
 @pytest.mark.parametrize("method", ["height", "poisson"])
 def test_the_command_meshes_the_house(tmp_path: Path, house: HouseFlight, method: str) -> None:
     trimesh = pytest.importorskip("trimesh")
-    pytest.importorskip("open3d")
+    pytest.importorskip("open3d", exc_type=ImportError)
     house.flown(tmp_path).close()
     done = CliRunner().invoke(app, ["mesh", str(tmp_path), "--method", method, "--json"])
     assert done.exit_code == 0, done.exception

@@ -97,7 +97,7 @@ def test_the_cloud_grows_and_moves_while_one_looks(
 
 
 def test_the_mesh_is_made_and_shown(browser: Browser, portal: Portal) -> None:
-    pytest.importorskip("open3d")
+    pytest.importorskip("open3d", exc_type=ImportError)
     browser.open(portal.url)
     browser.wait("document.querySelectorAll('article').length === 1")
     browser.open(f"{base(portal)}/#/view/drone-1/test-1")

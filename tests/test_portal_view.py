@@ -148,7 +148,7 @@ def test_settings_change_the_picture_and_go_back(browser: Browser, portal: Porta
 def test_tone_mapping_and_exposure_change_the_mesh(
     browser: Browser, portal: Portal, store: Path
 ) -> None:
-    pytest.importorskip("open3d")
+    pytest.importorskip("open3d", exc_type=ImportError)
     open_scan(browser, portal)
     browser.click("Mesh")
     browser.wait("document.body.dataset.mesh === 'shown'", 60)

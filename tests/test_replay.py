@@ -16,8 +16,6 @@ import laspy
 import numpy as np
 import pytest
 
-pytest.importorskip("open3d", reason="the simulator needs Open3D (extra 'ground')")
-
 EPOCH = 1777629600  # of the simulated video; a transport stream does not carry it
 
 Run = subprocess.CompletedProcess[str]

@@ -12,8 +12,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("open3d", reason="the simulator needs Open3D (extra 'ground')")
-
 NEEDS = {"torch": "torch", "onnx": "onnxruntime"}
 SMALL = ("compute.stereo_width=160", "compute.guide_width=320", "compute.pairs=1")
 

@@ -223,7 +223,7 @@ def test_missing_or_damaged_parts_are_named(
 
 def delivered(scan: Path, flight: Path, shift_east_m: float, shift_up_m: float) -> None:
     """Write a DSM, an orthophoto and a mesh made of the truth itself, shifted."""
-    rasterio = pytest.importorskip("rasterio")
+    rasterio = pytest.importorskip("rasterio", exc_type=ImportError)
     pytest.importorskip("trimesh")
     truth = read_truth(flight)
     shape, cell = (200, 240), 0.25
@@ -280,7 +280,7 @@ def test_files_are_measured_where_they_say_they_are(flight: Path, tmp_path: Path
 
 
 def test_a_file_that_is_none_is_named(flight: Path, tmp_path: Path) -> None:
-    pytest.importorskip("rasterio")
+    pytest.importorskip("rasterio", exc_type=ImportError)
     scan = write_scan(
         tmp_path / "scan", flight, true_cloud(flight), True, np.eye(3), np.zeros(3), 0.1
     )

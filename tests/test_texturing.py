@@ -61,7 +61,7 @@ def shown(textured: Mesh, atlas: U8) -> tuple[F64, F64]:
 
 
 def test_the_texture_shows_the_ground_where_it_is() -> None:
-    pytest.importorskip("open3d")
+    pytest.importorskip("open3d", exc_type=ImportError)
     mesh = sheet()
     views = [picture(np.array([x, y, 14.0])) for x in (-5.0, 5.0) for y in (-5.0, 5.0)]
     done = texture(mesh, views)
@@ -81,7 +81,7 @@ def edges(mesh: Mesh) -> tuple[F64, F64]:
 
 
 def test_differently_exposed_views_leave_no_step_at_their_seam() -> None:
-    pytest.importorskip("open3d")
+    pytest.importorskip("open3d", exc_type=ImportError)
     mesh = sheet()
     views = [picture(np.array([-4.0, 0, 14.0])), picture(np.array([4.0, 0, 14.0]), 0.7, 12.0)]
     done = texture(mesh, views)
@@ -94,7 +94,7 @@ def test_differently_exposed_views_leave_no_step_at_their_seam() -> None:
 
 
 def test_visibility_is_that_of_exact_rays() -> None:
-    pytest.importorskip("open3d")
+    pytest.importorskip("open3d", exc_type=ImportError)
     mesh = sheet(step_m=10.0)
     view = picture(np.array([6.0, 0.0, 30.0]))  # the step hides ground to its west
     found = look(mesh, [view])
@@ -115,7 +115,7 @@ def test_visibility_is_that_of_exact_rays() -> None:
 
 
 def test_resolution_falls_with_distance_and_slant() -> None:
-    pytest.importorskip("open3d")
+    pytest.importorskip("open3d", exc_type=ImportError)
     found = look(sheet(), [picture(np.array([0.0, 0.0, h])) for h in (28.0, 14.0)])
     row = int(np.argmin(np.abs(sheet().vertices_m[sheet().faces].mean(axis=1)).sum(axis=1)))
     assert found.view[row, :2].tolist() == [1, 0]  # the nearer first
@@ -222,7 +222,7 @@ def test_charts_do_not_overlap_and_fit() -> None:
 
 
 def test_what_no_view_sees_keeps_the_colours_of_the_vertices() -> None:
-    pytest.importorskip("open3d")
+    pytest.importorskip("open3d", exc_type=ImportError)
     done = texture(sheet(cells=6), [])
     assert done.seen_share == 0.0
     assert (shown(done.mesh, done.picture)[1] == 9).all()

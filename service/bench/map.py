@@ -100,7 +100,7 @@ def _fusion(
     name = f"fuse {KEYFRAMES} keyframes"
     try:
         import open3d as o3d
-    except ModuleNotFoundError:
+    except ImportError:  # not installed, or a library of the system is missing
         fusion = compare("map", name, lambda: fuse(clouds, 0.25), fewer)
     else:
         xyz = np.concatenate([c.xyz_m for c in clouds]).astype(np.float64)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.errors import OutsideError
+from service.packages import needing
 
 if TYPE_CHECKING:
     from service.ground.portal import Portal
@@ -135,13 +135,9 @@ def _open_portal(
     endpoint: str | None,
 ) -> Portal:
     """The portal, started; its address is printed."""
-    try:
+    with needing("the portal"):
         from service.ground.portal import open_portal
         from service.ground.vehicle import Vehicle
-    except ModuleNotFoundError as error:
-        raise OutsideError(
-            f"the portal needs the package {error.name}; pip install 'skyrelief[ground]'"
-        ) from error
     vehicle = None if endpoint is None else Vehicle(endpoint)
     page = open_portal(address, store, receiver.progress, token, tls, vehicle)
     if vehicle is not None:

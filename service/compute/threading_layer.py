@@ -7,10 +7,11 @@ the process when two threads call it at once, and it is what is left on a bare s
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import logging
 import sys
+
+from service.packages import loads
 
 log = logging.getLogger(__name__)
 
@@ -24,16 +25,8 @@ def kernels_may_overlap() -> bool:
     import numba
 
     if numba.config.THREADING_LAYER != "workqueue" and (
-        not sys.platform.startswith("linux") or any(map(_loads, LIBRARIES))
+        not sys.platform.startswith("linux") or any(map(loads, LIBRARIES))
     ):
         return True
     log.warning("no OpenMP on this system: tracking and stereo take turns; %s", REMEDY)
     return False
-
-
-def _loads(library: str) -> bool:
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        return False
-    return True

@@ -19,6 +19,7 @@ from service.config import Config
 from service.daemon.running import running_service
 from service.daemon.warm_up import is_warm
 from service.errors import InputError, SkyreliefError
+from service.packages import unusable_packages
 
 if TYPE_CHECKING:
     from recon.types import Camera
@@ -76,6 +77,9 @@ def _software() -> Iterator[Finding]:
         yield Finding("packages", BAD, f"not installed: {', '.join(missing)}; install again")
     else:
         yield Finding("packages", GOOD, ", ".join(found))
+    for name, debian in unusable_packages().items():
+        text = f"{name} cannot be loaded, what uses it is missing; apt install {' '.join(debian)}"
+        yield Finding("libraries", NOTE, text)
     parents = {_parent(name) for name in ("service", "recon", "mavlink")}
     if len(parents) > 1:
         where = ", ".join(sorted(parents))

@@ -28,6 +28,7 @@ from recon.surface.texturing import texture
 from recon.types import F64, U8, Keyframe, PointCloud
 from service.errors import OutsideError, SkyreliefError
 from service.exports.pictures import stored_pictures, video_pictures
+from service.packages import needing
 from service.scans.fused_cloud import fused_cloud
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
@@ -279,12 +280,8 @@ def _on_cluster(
     jobs: Sequence[TileJob], scheduler: str, progress: Callable[[str], None]
 ) -> Iterator[tuple[int, TilePart | None]]:
     """(number, part) of the tiles that the cluster delivers; ends early when it goes away."""
-    try:
+    with needing("a cluster"):
         from distributed import Client
-    except ModuleNotFoundError as error:
-        raise OutsideError(
-            f"a cluster needs the package {error.name}; pip install 'skyrelief[cluster]'"
-        ) from error
     try:
         client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:

@@ -13,9 +13,10 @@ import numpy as np
 
 from recon.surface.raster import Grid, Raster, grid_over, rasterise_points
 from recon.types import F64
-from service.errors import InputError, OutsideError
+from service.errors import InputError
 from service.exports import EXPORTERS
 from service.georeference import LocalFrame
+from service.packages import needing
 from service.scans.fused_cloud import FusedCloud, fused_cloud
 from service.scans.las import placed
 from service.scans.track import latest, local_frame
@@ -129,10 +130,6 @@ def export(view: ScanView, kind: str, out: Path | None, options: ExportOptions) 
     target, usual, _ = EXPORTERS[kind]
     path = out or view.folder / usual
     module, _, name = target.partition(":")
-    try:
+    with needing(f"export to {kind}"):
         getattr(import_module(module), name)(view, path, options)
-    except ModuleNotFoundError as error:
-        raise OutsideError(
-            f"export to {kind} needs the package {error.name}; pip install 'skyrelief[ground]'"
-        ) from error
     return path

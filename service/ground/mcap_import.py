@@ -20,7 +20,8 @@ import numpy as np
 
 from recon import se3
 from recon.types import F64, U8, DepthMap, Keyframe, Pose
-from service.errors import InputError, OutsideError
+from service.errors import InputError
+from service.packages import needing
 from service.stream import codec
 from service.stream.mcap_export import POINT
 from service.stream.records import PoseRecord, ScanHeader
@@ -84,14 +85,10 @@ def store_from_mcap(path: Path, out: Path) -> ScanStore:
 
 def _messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, Any]]:
     """(topic, time, decoded message) in order of time."""
-    try:
+    with needing("an MCAP"):
         from google.protobuf.message import DecodeError
         from mcap.exceptions import McapError
         from mcap.reader import make_reader
-    except ModuleNotFoundError as error:
-        raise OutsideError(
-            f"an MCAP needs the package {error.name}; pip install 'skyrelief[ground]'"
-        ) from error
     classes: dict[int, Any] = {}
     try:
         with open(path, "rb") as file:

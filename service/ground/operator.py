@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from service.errors import InputError, OutsideError
+from service.packages import needing
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +85,7 @@ class Operator:
     """A connection to one vehicle with our companion on it; use it in a ``with``."""
 
     def __init__(self, endpoint: str, system: int | None, timeout_s: float) -> None:
-        try:
+        with needing("ctl"):
             from mavsdk import (  # type: ignore[import-untyped, unused-ignore]
                 ComponentType,
                 Configuration,
@@ -93,8 +94,6 @@ class Operator:
             from mavsdk.plugins.mavlink_direct import (  # type: ignore[import-untyped, unused-ignore]
                 mavlink_direct,
             )
-        except ImportError as error:
-            raise OutsideError("ctl needs mavsdk; pip install 'skyrelief[ground]'") from error
         _quieten()
         self._direct_module = mavlink_direct
         kind = ComponentType.GROUND_STATION

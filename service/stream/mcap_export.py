@@ -16,7 +16,8 @@ import numpy as np
 
 from recon import se3
 from recon.types import F64, Keyframe
-from service.errors import InputError, OutsideError
+from service.errors import InputError
+from service.packages import needing
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
@@ -31,13 +32,9 @@ def export_mcap(store: ScanStore, out_path: Path) -> int:
     Raises OutsideError without the ``foxglove-sdk`` package, InputError when the file cannot
     be written.
     """
-    try:
+    with needing("an MCAP"):
         import foxglove
         from foxglove.mcap import MCAPWriteOptions
-    except ImportError as error:
-        raise OutsideError(
-            "an MCAP needs the package 'foxglove-sdk'; install skyrelief with the extra 'ground'"
-        ) from error
     context = foxglove.Context()
     options = MCAPWriteOptions(chunk_size=CHUNK_BYTES)
     try:
