@@ -22,7 +22,7 @@ from service.stream import link as link_module
 from service.stream.link import DatalinkSender
 from service.stream.records import PoseRecord, Repose, ScanHeader
 from service.stream.session import SessionConfig, open_session, zenoh_config
-from service.stream.store import ScanStore
+from service.stream.store import ScanStore, header_of
 
 pytest.importorskip("zenoh")
 
@@ -96,6 +96,41 @@ def written(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
 
 def fast(endpoint: str) -> DatalinkConfig:
     return DatalinkConfig(connect=(endpoint,), budget_kbit_s=100_000.0)
+
+
+def test_two_runs_of_one_time_stay_two_scans(tmp_path: Path, written: list[Path]) -> None:
+    endpoint = free_endpoint()
+    runs = []
+    for n, run_id in enumerate(("0f" * 16, "e1" * 16)):
+        header = ScanHeader("scan-1", "drone-a", 1, run_id=run_id)
+        runs.append(ScanStore.create(tmp_path / f"air-{n}" / "scan.db", header))
+    fly(runs[0], 0, 4)
+    fly(runs[1], 2, 9)  # numbers 2 and 3 are in both
+    for store in runs:
+        store.finish({"points": len(store.seqs())})
+    ground = start_ground(tmp_path / "ground", endpoint)
+    links = [DatalinkSender(store, fast(endpoint)) for store in runs]
+    try:
+        assert wait_for(lambda: [e["complete"] for e in ground.progress()] == [True, True], 60.0)
+        assert sorted(e["scan"] for e in ground.progress()) == ["scan-1", "scan-1-2"]
+    finally:
+        for link in links:
+            link.close()
+        ground.close()
+    folders = [tmp_path / "ground" / "drone-a" / name for name in ("scan-1", "scan-1-2")]
+    headers = [header_of(folder / "scan.db") for folder in folders]
+    by_run = {
+        header.run_id: folder for header, folder in zip(headers, folders, strict=True) if header
+    }
+    for store in runs:
+        assert_equal(store, by_run[store.header.run_id] / "scan.db")
+        store.close()
+    # The receiver that is started again finds each run's folder.
+    again = Receiver(ReceiverConfig(tmp_path / "ground"))
+    for store in runs:
+        assert again.folder("drone-a", store.header.name) == by_run[store.header.run_id]
+    assert again.folder("drone-a", "scan-1." + "2" * 32).name == "scan-1-3"
+    assert again.folder("drone-a", "scan-1").name == "scan-1-3"  # of a drone that tells no run
 
 
 def test_a_scan_arrives_whole_with_its_corrections(tmp_path: Path, written: list[Path]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,22 @@ def test_the_card_completes_what_the_radio_brought(
         assert ground.header == HEADER and ground.summary == {"points": 1}
         for a, b in zip(aircraft.keyframes(), ground.keyframes(), strict=True):
             np.testing.assert_array_equal(a.depth.depth_m, b.depth.depth_m)
+
+
+def test_two_cards_with_runs_of_one_time_are_kept_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(storage, "_deliver", lambda *_: None)
+    for n, run_id in enumerate(("a" * 32, "b" * 32)):
+        path = tmp_path / f"card-{n}" / "scan-1" / "scan.db"
+        with ScanStore.create(path, replace(HEADER, run_id=run_id)) as store:
+            for seq in range(n, n + 3):
+                store.add_keyframe(seq, codec.encode(keyframe(seq), seq))
+    taken = [take_in(tmp_path / "ground", tmp_path / f"card-{n}")[0] for n in (0, 1, 0)]
+    assert [path.name for path in taken] == ["scan-1", "scan-1-2", "scan-1"]
+    for n, path in enumerate(taken[:2]):
+        with ScanStore.open(path / "scan.db") as store:
+            assert store.seqs() == list(range(n, n + 3))
 
 
 def test_a_folder_without_scans_is_said(tmp_path: Path) -> None:

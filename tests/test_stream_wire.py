@@ -27,7 +27,13 @@ from service.stream.parts import Assembler, parse, split
 from service.stream.radio_messages import pack_announce, pack_tile, unpack_announce, unpack_tile
 from service.stream.radio_messages import pack_pose as pack_radio_pose
 from service.stream.radio_messages import unpack_pose as unpack_radio_pose
-from service.stream.records import pack_pose, pack_repose, unpack_pose, unpack_repose
+from service.stream.records import (
+    header_from_json,
+    pack_pose,
+    pack_repose,
+    unpack_pose,
+    unpack_repose,
+)
 
 VECTORS = json.loads((Path(__file__).parent / "data" / "wire_v1.json").read_text())
 LAYERS = VECTORS["layers"]
@@ -219,8 +225,9 @@ def test_what_stations_say() -> None:
     assert ask == {"v": 1, "peer": "base-1", "parts": [[2, 3], [7, 7]], "parts_of": 9}
 
 
-def test_announcement_and_pose_of_the_narrow_radio() -> None:
-    expected = VECTORS["announcement"]
+@pytest.mark.parametrize("name", ["announcement", "announcement_of_a_run"])
+def test_announcement(name: str) -> None:
+    expected = VECTORS[name]
     data = bytes.fromhex(expected["hex"])
     tag = zlib.crc32(f"{expected['drone']}/{expected['scan']}".encode())
     fields = struct.unpack_from("<BIqddfHB", data)
@@ -230,6 +237,12 @@ def test_announcement_and_pose_of_the_narrow_radio() -> None:
     assert data[36:].decode() == expected["drone"] + expected["scan"]
     header = unpack_announce(data)
     assert header is not None and pack_announce(header) == data
+    assert header.scan_id == expected.get("scan_id", expected["scan"])
+    assert header.run_id == expected.get("run_id", "")
+
+
+def test_pose_of_the_narrow_radio() -> None:
+    tag = zlib.crc32(b"drone-a/scan-1")
     expected = VECTORS["radio_pose"]
     data = bytes.fromhex(expected["hex"])
     fields = struct.unpack("<BIIq3i4h2ifHBH", data)
@@ -238,6 +251,17 @@ def test_announcement_and_pose_of_the_narrow_radio() -> None:
     assert fields[11:13] == (474_300_000, -85_500_000)
     found = unpack_radio_pose(data)
     assert found is not None and pack_radio_pose(*found) == data
+
+
+@pytest.mark.parametrize("vector", VECTORS["headers"], ids=["of-old", "of-a-run"])
+def test_a_header_names_its_keys(vector: dict[str, Any]) -> None:
+    text = vector["json"].encode()
+    plain = json.loads(text)
+    header = header_from_json(text)
+    assert header is not None and header.started_unix_ns == plain["started_unix_ns"]
+    assert header.notes == ("windy",) and header.run_id == plain.get("run_id", "")
+    assert vector["key"] == f"skyrelief/{plain['drone']}/{header.name}/head"
+    assert json.loads(header.to_json())["run_id"] == header.run_id
 
 
 def test_the_two_methods_carry_the_same_depth() -> None:

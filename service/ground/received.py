@@ -21,7 +21,7 @@ class ReceivedScan:
     """One scan of one drone; used by the receiver's thread alone, but for :meth:`progress`."""
 
     drone: str
-    scan_id: str
+    name: str  # on the datalink
     folder: Path
     intake: ScanIntake
     reported_at: float = -1e9
@@ -34,7 +34,7 @@ class ReceivedScan:
     @property
     def key(self) -> str:
         """Where its messages are."""
-        return f"{ROOT}/{self.drone}/{self.scan_id}"
+        return f"{ROOT}/{self.drone}/{self.name}"
 
     @property
     def idle(self) -> bool:
@@ -51,7 +51,7 @@ class ReceivedScan:
         }
         return {
             "drone": self.drone,
-            "scan": self.scan_id,
+            "scan": self.folder.name,
             "folder": str(self.folder),
             "held": {kind: len(n) for kind, n in intake.store.numbers().items()},
             "missing": {kind: len(n) for kind, n in intake.missing().items()},

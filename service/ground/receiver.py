@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, Any
 
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.ground.intake import FINE, SILENCE_S, SMALL, ScanIntake
+from service.ground.placing import scan_folder
 from service.ground.received import ReceivedScan, deliver
 from service.stream.messages import count, pack_ask, pack_held, unpack_head
-from service.stream.naming import ROOT, place_of, station_name
+from service.stream.naming import ROOT, place_of, split_scan_name, station_name
 from service.stream.radio_messages import RADIO_NOTE
 from service.stream.records import ScanHeader
 from service.stream.session import SessionConfig, check_endpoints, open_session
@@ -103,9 +104,9 @@ class Receiver:
         for scan in self._scans.values():
             scan.intake.store.close()
 
-    def folder(self, drone: str, scan_id: str) -> Path:
-        """Where a scan is kept."""
-        return self._config.store / drone / scan_id
+    def folder(self, drone: str, name: str) -> Path:
+        """Where a scan is kept that the datalink calls so."""
+        return scan_folder(self._config.store, drone, name)
 
     def add_radio(self, payload: bytes) -> None:
         """Take in a message of the narrow radio; from any thread."""
@@ -277,7 +278,7 @@ class Receiver:
 
     def _radio(self, payload: bytes, now: float) -> None:
         for header, kind, number, part, data in self._tunnel.receive(payload):
-            scan = self._scan(header.drone, header.scan_id)
+            scan = self._scan(header.drone, header.name)
             if scan is None:
                 continue
             store = scan.intake.store
@@ -301,28 +302,28 @@ class Receiver:
             if scan.unwritten and scan.idle:
                 self._write(scan)
 
-    def _scan(self, drone: str, scan_id: str) -> ReceivedScan | None:
-        found = self._scans.get((drone, scan_id))
+    def _scan(self, drone: str, name: str) -> ReceivedScan | None:
+        found = self._scans.get((drone, name))
         if found is not None:
             return found
         if len(self._scans) >= MAX_SCANS:
             self.dropped += 1
             return None
-        path = self.folder(drone, scan_id) / "scan.db"
+        scan_id, run_id = split_scan_name(name)
         try:
+            path = self.folder(drone, name) / "scan.db"
             if path.exists():
                 store = ScanStore.open(path, self._config.quota_bytes)
             else:
-                store = ScanStore.create(
-                    path, ScanHeader(scan_id, drone, 0), self._config.quota_bytes
-                )
+                header = ScanHeader(scan_id, drone, 0, run_id=run_id)
+                store = ScanStore.create(path, header, self._config.quota_bytes)
         except SkyreliefError as error:
             log.error("%s", error)
             self.dropped += 1
             return None
-        scan = self._scans[drone, scan_id] = ReceivedScan(
-            drone, scan_id, self.folder(drone, scan_id), ScanIntake(store, self._name)
+        scan = self._scans[drone, name] = ReceivedScan(
+            drone, name, path.parent, ScanIntake(store, self._name)
         )
         scan.unwritten = True
-        log.info("receiving %s/%s", drone, scan_id)
+        log.info("receiving %s/%s into %s", drone, name, path.parent)
         return scan

@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 
 from service.errors import InputError
+from service.ground.placing import scan_folder
 from service.stream.naming import check_name
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
@@ -39,8 +40,8 @@ def _take(store: Path, folder: Path) -> Path:
                 shutil.copyfile(folder / name, Path(place) / name)
         with ScanStore.open(Path(place) / FILES[0]) as source:
             header = source.header
-            drone, scan = check_name(header.drone, "drone"), check_name(header.scan_id, "scan")
-            path = store / drone / scan / FILES[0]
+            drone, scan = check_name(header.drone, "drone"), check_name(header.name, "scan")
+            path = scan_folder(store, drone, scan) / FILES[0]
             with _open(path, header) as target:
                 news = merge(source, target)
                 _deliver(path.parent, target)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import secrets
 import time
 from collections.abc import Callable
 from contextlib import closing, nullcontext
@@ -98,6 +99,7 @@ def create_store(inputs: ScanInputs) -> ScanStore:
         configuration=public_configuration(inputs.config.to_dict()),
         software=software(),
         notes=redacted(inputs.notes),
+        run_id=secrets.token_hex(16),
     )
     return ScanStore.create(path, header)
 

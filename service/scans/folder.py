@@ -143,6 +143,7 @@ def _summary(
     return {
         "schema": 1,
         "id": header.scan_id,
+        "run_id": header.run_id,
         "drone": header.drone,
         "times": {
             "started_unix_s": header.started_unix_ns / 1e9,

@@ -36,6 +36,20 @@ CREATE TABLE IF NOT EXISTS held (
 Statement = tuple[str, tuple[Any, ...]]
 
 
+def peek_meta(path: Path, key: str) -> str | None:
+    """A text of the meta table of a file that may be open elsewhere; None when there is none."""
+    try:
+        connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=10.0)
+        try:
+            row = connection.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
+        finally:
+            connection.close()
+    except (sqlite3.Error, OSError) as error:
+        log.debug("%s: %s", path, error)
+        return None
+    return row[0] if row is not None and isinstance(row[0], str) else None
+
+
 class Database:
     """A connection in write-ahead mode with full synchronisation, safe between threads.
 

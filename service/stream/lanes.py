@@ -83,7 +83,7 @@ class LiveLane:
             self._current = store, kind, number = self._queue.pop()
             topic = f"item/{kind}/{number}"
             for part in load(store, kind, number, part_bytes):
-                self._messages.append(Outgoing(store.header.scan_id, topic, part.pack()))
+                self._messages.append(Outgoing(store.header.name, topic, part.pack()))
         return self._messages[0]
 
     def pop(self) -> None:
@@ -136,7 +136,7 @@ class AskedLane:
             else:
                 self._messages.append(
                     Outgoing(
-                        request.store.header.scan_id,
+                        request.store.header.name,
                         request.topic,
                         b"",
                         token=request.token,
@@ -181,5 +181,5 @@ def _bundle(request: Request, parts: list[Part], part_bytes: int) -> list[Outgoi
             payloads[-1] += data
         else:
             payloads.append(data)
-    scan_id = request.store.header.scan_id
+    scan_id = request.store.header.name
     return [Outgoing(scan_id, request.topic, p, token=request.token) for p in payloads]

@@ -133,7 +133,7 @@ class DatalinkSender:
 
         An ``owned`` store is closed with the sender.
         """
-        scan_id = check_name(store.header.scan_id, "scan")
+        scan_id = check_name(store.header.name, "scan")
         if owned:
             self._owned.append(store)
 
@@ -149,7 +149,7 @@ class DatalinkSender:
     def remove(self, store: ScanStore) -> None:
         """Offer a scan no more; the store stays open."""
         with self._lock:
-            self._outbox.remove(store.header.scan_id)
+            self._outbox.remove(store.header.name)
         for entry in [entry for entry in self._stores if entry[0] is store]:
             store.unlisten(entry[1])
             self._stores.remove(entry)
@@ -167,7 +167,7 @@ class DatalinkSender:
             lacking: dict[str, int] = {}
             for store, _ in self._stores:
                 items += sum(map(len, store.numbers().values()))
-                for kind, numbers in self._outbox.lacking(store.header.scan_id).items():
+                for kind, numbers in self._outbox.lacking(store.header.name).items():
                     lacking[kind] = lacking.get(kind, 0) + len(numbers)
             return LinkProgress(
                 self._connected,
@@ -325,7 +325,7 @@ class DatalinkSender:
     def _heard(self, scan_id: str, peer: str, held: Held, now: float) -> None:
         """Take in a report; now and then it is kept in the scan's store."""
         self._outbox.held(scan_id, peer, held, now)
-        store = next((s for s, _ in self._stores if s.header.scan_id == scan_id), None)
+        store = next((s for s, _ in self._stores if s.header.name == scan_id), None)
         if store is None:
             return
         whole = not missing(store.numbers(), held.numbers)

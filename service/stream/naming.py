@@ -15,6 +15,20 @@ ROOT = "skyrelief"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 """What a drone, scan or station may be called."""
 
+RUN = re.compile(r"(.+)\.([0-9a-f]{32})")
+"""A scan as it is called on the datalink: its own name, a dot, and its run."""
+
+
+def scan_name(scan_id: str, run_id: str) -> str:
+    """What a scan is called on the datalink: two runs of the same time have different names."""
+    return f"{scan_id}.{run_id}" if run_id else scan_id
+
+
+def split_scan_name(name: str) -> tuple[str, str]:
+    """Scan and run of a name; the run is empty for drones that do not tell it."""
+    found = RUN.fullmatch(name)
+    return (found[1], found[2]) if found else (name, "")
+
 
 def check_name(name: str, what: str) -> str:
     """``name`` if it may be part of a key; raises InputError when not."""

@@ -60,7 +60,7 @@ class Outbox:
 
     def add(self, store: ScanStore, now: float) -> None:
         """Offer a scan; one with the same id takes the place of the former."""
-        self._feeds[store.header.scan_id] = _Feed(store, head_due=now)
+        self._feeds[store.header.name] = _Feed(store, head_due=now)
 
     def remove(self, scan_id: str) -> None:
         """Offer a scan no more."""

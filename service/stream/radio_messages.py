@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from recon import se3
 from recon.types import F32, F64, U8, Bool
-from service.stream.naming import NAME
+from service.stream.naming import NAME, split_scan_name
 from service.stream.records import PoseRecord, ScanHeader, source_bits, sources_of
 from service.stream.validity import is_on_globe, is_pinhole
 
@@ -54,21 +54,21 @@ class Tile:
     bgr: U8  # (8, 8, 3)
 
 
-def tag_of(drone: str, scan_id: str) -> int:
-    """The number that stands for a scan of a drone on the radio."""
-    return zlib.crc32(f"{drone}/{scan_id}".encode())
+def tag_of(drone: str, scan: str) -> int:
+    """The number that stands for a scan of a drone (:attr:`ScanHeader.name`) on the radio."""
+    return zlib.crc32(f"{drone}/{scan}".encode())
 
 
 def pack_announce(header: ScanHeader) -> bytes:
     """The announcement of a scan. Raises ValueError when the names are too long together."""
-    drone, scan = header.drone.encode(), header.scan_id.encode()
+    drone, scan = header.drone.encode(), header.name.encode()
     if _ANNOUNCE.size + len(drone) + len(scan) > MAX_BYTES:
-        raise ValueError(f"{header.drone}/{header.scan_id} is too long for the radio")
+        raise ValueError(f"{header.drone}/{header.name} is too long for the radio")
     nan = math.nan
     return (
         _ANNOUNCE.pack(
             ANNOUNCE,
-            tag_of(header.drone, header.scan_id),
+            tag_of(header.drone, header.name),
             header.started_unix_ns,
             nan if header.origin_lat_deg is None else header.origin_lat_deg,
             nan if header.origin_lon_deg is None else header.origin_lon_deg,
@@ -95,8 +95,9 @@ def unpack_announce(data: bytes) -> ScanHeader | None:
         return None
     if started < 0 or not is_on_globe(_finite(lat), _finite(lon), _finite(alt)):
         return None
+    scan_id, run_id = split_scan_name(scan)
     return ScanHeader(
-        scan,
+        scan_id,
         drone,
         started,
         origin_lat_deg=_finite(lat),
@@ -105,6 +106,7 @@ def unpack_announce(data: bytes) -> ScanHeader | None:
         epsg=epsg or None,
         georeference="none" if math.isnan(lat) else "gnss",
         notes=(RADIO_NOTE,),
+        run_id=run_id,
     )
 
 

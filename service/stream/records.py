@@ -20,6 +20,7 @@ import numpy as np
 from recon import se3
 from recon.types import F64, DepthMap, Keyframe, Pose
 from service.stream import validity
+from service.stream.naming import scan_name
 from service.stream.validity import MAX_DEPTH_M, MAX_HEADER_BYTES, MIN_DEPTH_M
 
 SOURCES = ("vision", "attitude", "altitude", "gnss", "exif", "loop", "dead reckoning")
@@ -42,11 +43,17 @@ class ScanHeader:
     software: validity.Text = ""
     georeference: validity.Text = "none"  # "gnss", "exif" or "none"
     notes: validity.Notes = ()
+    run_id: validity.RunId = ""  # 32 hexadecimal digits, drawn for each run; old scans have none
 
     @property
-    def name_parts(self) -> tuple[str, str]:
-        """What tells this scan from all others: it never changes."""
-        return self.drone, self.scan_id
+    def name(self) -> str:
+        """What the scan is called on the datalink and the radio."""
+        return scan_name(self.scan_id, self.run_id)
+
+    @property
+    def identity(self) -> tuple[str, str, str]:
+        """Drone, scan and run: what tells this scan from all others, and never changes."""
+        return self.drone, self.scan_id, self.run_id
 
     def to_json(self) -> bytes:
         """The header as a JSON object."""

@@ -19,7 +19,7 @@ from typing import Any
 from recon.types import Keyframe
 from service.errors import InputError
 from service.stream import codec, layer
-from service.stream.database import SCHEMA, SCHEMA_VERSION, Database
+from service.stream.database import SCHEMA, SCHEMA_VERSION, Database, peek_meta
 from service.stream.inventory import Inventory, Listener
 from service.stream.radio_store import RadioStore
 from service.stream.ranges import RangeSet
@@ -333,7 +333,7 @@ class ScanStore:
             if number in self._inventory.of(kind) or zlib.crc32(data) != number:
                 return False
             header = read_header(data) if kind == "header" else self._header
-            if isinstance(header, str) or header.name_parts != self._header.name_parts:
+            if isinstance(header, str) or header.identity != self._header.identity:
                 return False
             if kind == "summary" and summary_from_json(data) is None:
                 return False
@@ -395,6 +395,13 @@ class ScanStore:
     def _next_id(self, table: str) -> int:
         row = self._db.one(f"SELECT MAX(id) FROM {table}", ())
         return 1 if row is None or row[0] is None else int(row[0]) + 1
+
+
+def header_of(path: Path) -> ScanHeader | None:
+    """The header of a store that may be open elsewhere; None when it cannot be read."""
+    text = peek_meta(path, "header")
+    header = None if text is None else read_header(text.encode())
+    return header if isinstance(header, ScanHeader) else None
 
 
 def _chunk_row(head: layer.LayerHead, data: bytes) -> tuple[Any, ...]:

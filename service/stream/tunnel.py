@@ -66,7 +66,7 @@ class TunnelSender:
         self._announcement = pack_announce(store.header)
         self._tiles: deque[Tile] = deque(maxlen=MAX_WAITING)  # all that were ever made
         self._moved: dict[int, Repose] = {}  # keyframe to the correction last sent
-        self._tag = tag_of(store.header.drone, store.header.scan_id)
+        self._tag = tag_of(store.header.drone, store.header.name)
         self._factor = 1.0
         self._bucket = TokenBucket(config.radio_bytes_s * config.share, now)
         self._announce_at = now
@@ -199,7 +199,7 @@ class TunnelIntake:
         """What ``payload`` gives to store; nothing for foreign bytes."""
         header = unpack_announce(payload)
         if header is not None:
-            tag = tag_of(header.drone, header.scan_id)
+            tag = tag_of(header.drone, header.name)
             self.headers[tag] = header
             ready = [item[1:] for item in self.waiting if item[0] == tag]
             for item in [item for item in self.waiting if item[0] == tag]:
