@@ -6,10 +6,12 @@ import zlib
 from collections.abc import Sequence
 from xml.sax.saxutils import escape, quoteattr
 
+from mavlink.ftp import file_uri
+from mavlink.messages import CAMERA
 from mavlink.parameters import Parameter
 
 FILE = "camera.xml"
-URI = f"mftp://{FILE}"
+URI = file_uri(CAMERA, FILE)
 
 
 def camera_definition(vendor: str, model: str, table: Sequence[Parameter]) -> bytes:

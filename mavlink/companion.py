@@ -17,6 +17,8 @@ from mavlink.camera_definition import FILE, URI, camera_definition, definition_v
 from mavlink.clock import BootClock
 from mavlink.command_desk import CommandDesk, decode_call
 from mavlink.commands import load_commands
+from mavlink.component_metadata import NUMBER as METADATA
+from mavlink.component_metadata import ComponentMetadata
 from mavlink.control import Answer, Result, ScanControl
 from mavlink.decode import READERS, decode
 from mavlink.extended_parameters import ExtendedParameters
@@ -109,7 +111,8 @@ class Companion:
         self._extended = ExtendedParameters(self.parameters, self._outbox)
         table = self.parameters.table
         definition = camera_definition(config.camera.vendor, config.camera.model, table)
-        self._files = FileServer({FILE: definition})
+        self._metadata = ComponentMetadata(config.camera, table)
+        self._files = FileServer({FILE: definition, **self._metadata.files})
         self.camera = CameraComponent(
             _with_definition(config.camera, definition_version(table)),
             control,
@@ -238,12 +241,7 @@ class Companion:
         target = Address(message.target_system, message.target_component)
         if target.component == 0 or not self._is_for_us(target):
             return
-        source = Address(message.get_srcSystem(), message.get_srcComponent())
-        for payload in self._files.answer(bytes(message.payload), source):
-            reply = dialect.MAVLink_file_transfer_protocol_message(
-                0, source.system, source.component, list(payload)
-            )
-            self._outbox.put(target.component, reply, link)
+        self._files.serve(message, link, self._outbox)
 
     def _parameter_changed(self, name: str, value: float) -> Answer:
         answer = self.control.parameter_changed(name, value)
@@ -361,6 +359,8 @@ class Companion:
         """Send a message that was asked for; False when the component has no such message."""
         if component == CAMERA:
             message = self.camera.message(number, index)
+        elif number == METADATA:
+            message = self._metadata.message(self._boot_ms())
         elif number == LOAD_STATUS and self.load is not None:
             message = computer_status(self.load, self._unix_us(), self._boot_ms())
         else:

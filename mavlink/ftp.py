@@ -1,4 +1,4 @@
-"""MAVLink FTP, reading only: a few small files (the camera definition) out of memory.
+"""MAVLink FTP, reading only: a few small files (camera definition, metadata) out of memory.
 
 Payload of FILE_TRANSFER_PROTOCOL, little endian: u16 sequence, u8 session, u8 opcode, u8 size,
 u8 opcode answered, u8 burst complete, u8 padding, u32 offset, 239 bytes of data.
@@ -6,12 +6,15 @@ u8 opcode answered, u8 burst complete, u8 padding, u32 offset, 239 bytes of data
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
-from mavlink.messages import Address
+from mavlink.messages import Address, Outbox
+from mavlink.wire import dialect
 
 HEAD = struct.Struct("<HBBBBBBI")
 ROOM = 239
@@ -24,6 +27,21 @@ WRITING = frozenset({6, 7, 8, 9, 10, 11, 12, 13})
 MAX_SESSIONS = 8
 MAX_CLIENTS = 16
 BURST_PACKETS = 20
+SELECTOR = re.compile(r"^/?\[;comp=\d{1,3}\]")
+"""What an address has before the path; some clients send it along with the path."""
+
+
+def file_uri(component: int, name: str) -> str:
+    """The address of a file of one of our components, also for who heard of it from another.
+
+    An autopilot may pass on what we say as its own, so the component is always named.
+    """
+    return f"mftp://[;comp={component}]{name}"
+
+
+def file_crc(data: bytes) -> int:
+    """MAVLink's CRC32, which starts at zero and is not inverted at the end."""
+    return zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +85,15 @@ class FileServer:
             self._last[source] = (request.sequence, answers)
         return answers
 
+    def serve(self, message: Any, link: int, outbox: Outbox) -> None:
+        """Answer a FILE_TRANSFER_PROTOCOL message that is meant for one of our components."""
+        source = Address(message.get_srcSystem(), message.get_srcComponent())
+        for payload in self.answer(bytes(message.payload), source):
+            reply = dialect.MAVLink_file_transfer_protocol_message(
+                0, source.system, source.component, list(payload)
+            )
+            outbox.put(message.target_component, reply, link)
+
     def _serve(self, r: Request, source: Address) -> list[bytes]:
         if r.size > ROOM:
             return [_nak(r, BAD_SIZE)]
@@ -101,9 +128,7 @@ class FileServer:
         if file is None:
             return _nak(r, NOT_FOUND)
         if r.opcode == CRC32:
-            # MAVLink's CRC32 starts at zero and is not inverted at the end.
-            crc = zlib.crc32(file, 0xFFFFFFFF) ^ 0xFFFFFFFF
-            return _ack(r, crc.to_bytes(4, "little"))
+            return _ack(r, file_crc(file).to_bytes(4, "little"))
         free = next((n for n in range(MAX_SESSIONS) if n not in self._sessions), None)
         if free is None:
             return _nak(r, NO_SESSIONS)
@@ -130,7 +155,8 @@ class FileServer:
 
 
 def _name(r: Request) -> str:
-    return r.data[: r.size].partition(b"\0")[0].decode("ascii", "replace")
+    path = r.data[: r.size].partition(b"\0")[0].decode("ascii", "replace")
+    return SELECTOR.sub("", path)
 
 
 def _ack(

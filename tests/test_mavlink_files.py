@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import lzma
 import random
+import re
 import struct
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -10,8 +13,10 @@ from typing import Any
 
 import pytest
 
+from mavlink.camera import CameraConfig
 from mavlink.camera_definition import FILE, URI, camera_definition, definition_version
 from mavlink.companion import Companion, CompanionConfig
+from mavlink.component_metadata import ComponentMetadata, ComponentMetadataMessage
 from mavlink.framing import Framer
 from mavlink.ftp import (
     ACK,
@@ -34,7 +39,7 @@ from mavlink.messages import Address
 from mavlink.parameters import PARAMETERS
 from mavlink.presence import Presence, PresenceConfig
 from mavlink.rehearsal import RehearsalControl
-from mavlink.wire import dialect
+from mavlink.wire import dialect, x25crc
 
 STATION = Address(255, 190)
 CONTENT = random.Random(1).randbytes(20_000)
@@ -252,3 +257,92 @@ def test_settings_of_the_camera_are_the_same_parameters() -> None:
 def test_questions_for_unknown_settings_stay_without_answer(name: bytes) -> None:
     message = dialect.MAVLink_param_ext_request_read_message(1, 100, name, -1)
     assert Ends().say(message) == []
+
+
+# Addresses, and the metadata of the parameters
+
+
+def read_file(client: Client, name: bytes) -> bytes:
+    session, size = client.open(name)
+    got = b""
+    while len(got) < size:
+        ((code, _, _, data, _),) = client.ask(READ, session=session, offset=len(got), size=100)
+        assert code == ACK
+        got += data
+    client.ask(TERMINATE, session=session)
+    return got
+
+
+def place_of(uri: str, said_by: int) -> tuple[int, str]:
+    """Component and path, by the MAVLink FTP page: mftp://[;comp=ID]PATH, ID else the speaker."""
+    found = re.fullmatch(r"mftp://(?:\[;comp=(\d+)\])?(.+)", uri)
+    assert found is not None
+    return int(found[1] or said_by), found[2]
+
+
+def test_the_definition_is_found_when_the_autopilot_passes_it_on_as_its_own() -> None:
+    component, path = place_of(URI, said_by=1)
+    assert (component, path) == (100, FILE)
+
+
+def test_a_client_that_sends_the_whole_address_is_served() -> None:
+    client = Client(FileServer({"a.bin": CONTENT}))
+    for name in (b"[;comp=100]a.bin", b"/[;comp=191]/a.bin", b"a.bin"):
+        assert client.open(name)[1] == len(CONTENT)
+    ((code, _, _, data, _),) = client.ask(OPEN, b"[;comp=1000]a.bin")
+    assert (code, data[0]) == (NAK, NOT_FOUND)
+
+
+def test_the_metadata_describes_every_parameter() -> None:
+    metadata = ComponentMetadata(CameraConfig(), PARAMETERS)
+    client = Client(FileServer(metadata.files))
+    packet = bytes(metadata.message(1234).pack(dialect.MAVLink(None, 1, 191)))
+    payload = packet[10:-2].ljust(108, b"\0")
+    boot_ms, crc, raw = struct.unpack("<II100s", payload)
+    uri = raw.partition(b"\0")[0].decode()
+    assert boot_ms == 1234 and place_of(uri, 1) == (191, "general.json.xz")
+    general = read_file(client, uri.partition("]")[2].encode())
+    assert crc == mavlink_crc32(general)
+    described = json.loads(lzma.decompress(general))
+    (entry,) = described["metadataTypes"]
+    assert (described["version"], described["modelName"], entry["type"]) == (1, "3D scan", 1)
+    component, path = place_of(entry["uri"], 1)
+    packed = read_file(client, path.encode())
+    assert component == 191 and entry["fileCrc"] == mavlink_crc32(packed)
+    rows = json.loads(lzma.decompress(packed))["parameters"]
+    assert [row["name"] for row in rows] == [p.name for p in PARAMETERS]
+    for row, p in zip(rows, PARAMETERS, strict=True):
+        assert (row["min"], row["max"], row["default"]) == (p.low, p.high, p.default)
+        assert row["type"] == "Float" and row.get("units", "") == p.unit
+        named = {value["value"]: value["description"] for value in row.get("values", [])}
+        assert named == dict(enumerate(p.options))
+
+
+def mavlink_crc32(data: bytes) -> int:
+    """Bit by bit from the polynomial, as the MAVLink page on checksums has it."""
+    crc = 0
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xEDB88320 if crc & 1 else 0)
+    return crc
+
+
+def test_the_message_has_the_checksum_of_its_definition() -> None:
+    """CRC_EXTRA is made of the names and types of the fields."""
+    crc = x25crc(b"COMPONENT_METADATA uint32_t time_boot_ms uint32_t file_crc char uri ")
+    crc.accumulate(bytes((100,)))
+    message = ComponentMetadataMessage(0, 0, "")
+    assert (crc.crc & 0xFF) ^ (crc.crc >> 8) == message.crc_extra
+
+
+@pytest.mark.parametrize("component", [0, 191])
+def test_the_onboard_computer_sends_its_metadata_on_request(component: int) -> None:
+    presence = Presence(PresenceConfig(), 1, 0)
+    companion = Companion(CompanionConfig(), RehearsalControl(), presence, VehicleHistory(), 0)
+    mouth = dialect.MAVLink(None, 255, 190)
+    ask = dialect.MAVLink_command_long_message(1, component, 512, 0, 397, 0, 0, 0, 0, 0, 0)
+    for packet in Framer().feed(bytes(ask.pack(mouth))):
+        companion.receive(0, packet, 1)
+    sent = [(o.component, o.message.get_type()) for o in companion.take()]
+    assert sorted(sent) == [(191, "COMMAND_ACK"), (191, "COMPONENT_METADATA")]

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from forwarding_autopilot import ForwardingAutopilot
 from loopback import free_port, until
 
 from mavlink import quaternion
@@ -165,6 +166,51 @@ def test_mavsdk_downloads_the_definition_and_sets_settings(
         assert daemon.link.history.config.gimbal.yaw_frame == "body"
         camera.set_setting(100, Setting("SR_BASELINE_M", "", Option("2.5", ""), True))
         assert daemon.link.parameter("SR_BASELINE_M") == 2.5
+
+
+def test_behind_an_autopilot_mavsdk_reads_settings_and_metadata(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The autopilot repeats what our camera says as its own; the files are still ours."""
+    pytest.importorskip("mavsdk")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    from mavsdk.plugins.camera.camera import Camera
+    from mavsdk.plugins.component_metadata.component_metadata import (  # type: ignore[import-untyped]
+        ComponentMetadata,
+        MetadataType,
+    )
+
+    inner, outer = free_port(), free_port()
+    ground = Ground(outer)
+    with (
+        contextlib.closing(ground),
+        ForwardingAutopilot(inner, outer) as autopilot,
+        RehearsalVehicle(f"udpout:127.0.0.1:{inner}") as daemon,
+    ):
+        system = ground.find()
+        camera = ground.use(Camera(system))
+        until(lambda: autopilot.camera is not None)
+        until(lambda: 100 in [c.component_id for c in camera.camera_list().cameras])
+
+        def settings() -> Any:
+            with contextlib.suppress(Exception):
+                return {s.setting_id for s in camera.get_current_settings(100)}
+            return None
+
+        until(lambda: settings() == set(daemon.link.parameters()))  # they come one by one
+        copy = autopilot.camera.cam_definition_uri
+        assert copy == "mftp://[;comp=100]camera.xml"  # for whoever asks the autopilot
+        metadata = ground.use(ComponentMetadata(system))
+        metadata.request_component(191)
+
+        def described() -> Any:
+            with contextlib.suppress(Exception):
+                return metadata.get_metadata(191, MetadataType.PARAMETER).json_metadata
+            return None
+
+        rows = json.loads(until(described))["parameters"]
+        assert {row["name"] for row in rows} == set(daemon.link.parameters())
 
 
 def test_mavsdk_waits_for_work_and_survives_lost_answers() -> None:

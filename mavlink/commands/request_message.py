@@ -17,10 +17,13 @@ WINDOW_S = 0.0
 
 
 def handle(call: Call, host: Companion) -> Handled | None:
-    """Send it from the component asked; UNSUPPORTED when that one has no such message."""
-    component = CAMERA if call.is_broadcast else call.target.component
+    """Send it from the component asked; UNSUPPORTED when that one has no such message.
+
+    Where all are asked it comes from the first that has it.
+    """
+    asked = (CAMERA, ONBOARD) if call.is_broadcast else (call.target.component,)
     number = int(call.param(1, -1.0))
     index = int(max(-1.0, min(2.0**31, call.param(2, 0.0))))
-    if host.send_requested(component, number, index, call.link):
+    if any(host.send_requested(c, number, index, call.link) for c in asked):
         return ACCEPTED
     return None if call.is_broadcast else Answer(Result.UNSUPPORTED)
