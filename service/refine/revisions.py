@@ -13,12 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from recon.types import F64, DepthMap, Keyframe
 from service.errors import InputError
 from service.stream import layer
-from service.stream.database import Database, Statement
+from service.stream.database import Database, Statement, blob
 from service.stream.records import (
     PoseRecord,
     Repose,
@@ -29,13 +30,21 @@ from service.stream.records import (
     unpack_pose,
     unpack_repose,
 )
-from service.stream.store import ScanStore
+from service.stream.store import ScanStore, json_object
 
 REFINED = 1_000_000
 """Revisions of refinements begin here; a flight's own stay far below."""
 
 META = "refinement"
 META_HEADER = "unrefined_header"
+
+
+class _Note(msgspec.Struct):
+    """The fields of the refinement's note that are read."""
+
+    revision: int = 0
+    pose_rows: list[tuple[int, int]] = []
+    figures: dict[str, Any] = {}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +64,14 @@ class Revisions:
     def __init__(self, store: ScanStore) -> None:
         self._store = store
         self._db = Database(store.path)
-        self._note: dict[str, Any] = json.loads(self._db.get(META) or "{}")
+        self._note: dict[str, Any] = json_object(self._db.get(META))
+        try:
+            msgspec.convert(self._note, _Note)
+        except msgspec.ValidationError as error:
+            self._db.close()
+            raise InputError(
+                f"{store.path}: the note of its refinement is bad ({error})"
+            ) from error
 
     def close(self) -> None:
         """Give the connection back."""
@@ -118,7 +134,7 @@ class Revisions:
         for number, data in self._db.all("SELECT id, data FROM poses ORDER BY id"):
             if any(a <= number <= b for a, b in ranges):
                 continue
-            pose = unpack_pose(bytes(data))
+            pose = unpack_pose(blob(data))
             if pose is not None:
                 newest[pose.time_unix_ns] = pose
         return [newest[t] for t in sorted(newest)]
@@ -186,7 +202,7 @@ class Revisions:
             "ORDER BY revision DESC, id DESC LIMIT 1"
         )
         row = self._db.one(sql, (seq, REFINED))
-        return None if row is None else unpack_repose(bytes(row[0]))
+        return None if row is None else unpack_repose(blob(row[0]))
 
     def _next(self, table: str) -> int:
         row = self._db.one(f"SELECT MAX(id) FROM {table}")

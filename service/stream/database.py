@@ -1,4 +1,4 @@
-"""The SQLite file of a scan: schema, one connection for all threads, errors in one line."""
+"""The SQLite file of a scan: one connection for all threads, errors in one line."""
 
 from __future__ import annotations
 
@@ -10,63 +10,50 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import InputError, OutsideError
+from service.stream.schema import SCHEMA, as_error, can_write, check_schema, connect
 
 log = logging.getLogger(__name__)
-
-SCHEMA_VERSION = 1
-SCHEMA = """
-CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS chunks (
-    seq INTEGER NOT NULL, layer INTEGER NOT NULL, layers INTEGER NOT NULL,
-    time_unix_ns INTEGER NOT NULL, crc INTEGER NOT NULL, stored_unix_ns INTEGER NOT NULL,
-    data BLOB NOT NULL, PRIMARY KEY (seq, layer));
-CREATE TABLE IF NOT EXISTS poses (
-    id INTEGER PRIMARY KEY, time_unix_ns INTEGER NOT NULL, data BLOB NOT NULL);
-CREATE TABLE IF NOT EXISTS reposes (
-    id INTEGER PRIMARY KEY, seq INTEGER NOT NULL, revision INTEGER NOT NULL,
-    data BLOB NOT NULL);
-CREATE INDEX IF NOT EXISTS reposes_by_seq ON reposes (seq, revision);
-CREATE TABLE IF NOT EXISTS radio (
-    kind TEXT NOT NULL, number INTEGER NOT NULL, part INTEGER NOT NULL, data BLOB NOT NULL,
-    PRIMARY KEY (kind, number, part));
-CREATE TABLE IF NOT EXISTS held (
-    peer TEXT NOT NULL, kind TEXT NOT NULL, ranges TEXT NOT NULL, PRIMARY KEY (peer, kind));
-"""
 
 Statement = tuple[str, tuple[Any, ...]]
 
 
-def peek_meta(path: Path, key: str) -> str | None:
-    """A text of the meta table of a file that may be open elsewhere; None when there is none."""
-    try:
-        connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=10.0)
-        try:
-            row = connection.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
-        finally:
-            connection.close()
-    except (sqlite3.Error, OSError) as error:
-        log.debug("%s: %s", path, error)
-        return None
-    return row[0] if row is not None and isinstance(row[0], str) else None
+def blob(value: object) -> bytes:
+    """The bytes in a column; none when the file has something else there."""
+    return value if isinstance(value, bytes) else b""
 
 
 class Database:
     """A connection in write-ahead mode with full synchronisation, safe between threads.
 
-    Raises InputError when the file is no database of this kind.
+    With ``read_only``, or where the disk cannot be written, nothing in the file is changed.
+    Raises InputError when the file is no database of this kind, OutsideError when the disk fails.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, read_only: bool = False) -> None:
         self.path = path
         self.uses: Counter[int] = Counter()  # queries that came back, by thread
         self.lock = threading.RLock()
+        self.read_only = read_only or not can_write(path)
         try:
-            self._connection = sqlite3.connect(path, check_same_thread=False, timeout=10.0)
-            self._connection.execute("PRAGMA journal_mode=WAL")
-            self._connection.execute("PRAGMA synchronous=FULL")
-            self._connection.executescript(SCHEMA)
-        except sqlite3.Error as error:
-            raise InputError(f"{path} is not a scan database ({error})") from error
+            self._connection, self._deadline = connect(path, self.read_only)
+        except (sqlite3.Error, OSError) as error:
+            raise self._cannot_open(error) from error
+        try:
+            check_schema(self._connection, path)
+            if not self.read_only:
+                self._connection.execute("PRAGMA journal_mode=WAL")
+                self._connection.execute("PRAGMA synchronous=FULL")
+                self._connection.executescript(SCHEMA)
+        except BaseException as error:
+            self._connection.close()
+            if isinstance(error, sqlite3.Error):
+                raise self._cannot_open(error) from error
+            raise
+
+    def _cannot_open(self, error: sqlite3.Error | OSError) -> InputError | OutsideError:
+        if isinstance(error, OSError):
+            return OutsideError(f"{self.path} cannot be opened ({error.strerror or error})")
+        return as_error(self.path, error)
 
     def one(self, sql: str, values: tuple[Any, ...] = ()) -> tuple[Any, ...] | None:
         """The first row of a query."""
@@ -77,6 +64,7 @@ class Database:
         """All rows of a query. Raises OutsideError when the file cannot be read."""
         try:
             with self.lock:
+                self._deadline.start()
                 rows = self._connection.execute(sql, values).fetchall()
                 self.uses[threading.get_ident()] += 1
                 return rows
@@ -89,6 +77,7 @@ class Database:
         Raises OutsideError when the disk is full or fails; nothing is changed then.
         """
         with self.lock:
+            self._deadline.start()
             before = self._connection.total_changes
             try:
                 with self._connection:
@@ -114,7 +103,9 @@ class Database:
         """Fold the write-ahead log into the file and close it."""
         with self.lock:
             try:
-                self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+                self._deadline.start()
+                if not self.read_only:
+                    self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             except sqlite3.Error as error:
                 log.debug("no checkpoint of %s: %s", self.path, error)
             self._connection.close()

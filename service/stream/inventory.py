@@ -6,12 +6,13 @@ import zlib
 from collections.abc import Callable
 
 from service.stream.database import Database
-from service.stream.ranges import RangeSet
+from service.stream.layer import MAX_LAYERS
+from service.stream.ranges import RangeSet, is_number
 
 Listener = Callable[[str, int], None]
 
-_IN_FORCE = """
-SELECT id FROM reposes one WHERE NOT EXISTS (
+_IN_FORCE = f"""
+SELECT id FROM reposes one WHERE {is_number("one.id")} AND NOT EXISTS (
     SELECT 1 FROM reposes other WHERE other.seq = one.seq
     AND (other.revision, other.id) > (one.revision, one.id))
 """
@@ -33,14 +34,17 @@ class Inventory:
         self._load(database)
 
     def _load(self, database: Database) -> None:
-        self._numbers["pose"] = RangeSet.of(r[0] for r in database.all("SELECT id FROM poses"))
+        self._numbers["pose"] = _ids(database, "poses")
         self._numbers["repose"] = RangeSet.of(row[0] for row in database.all(_IN_FORCE))
-        self._reposes = RangeSet.of(r[0] for r in database.all("SELECT id FROM reposes"))
+        self._reposes = _ids(database, "reposes")
         for kind in ("header", "summary"):
             text = database.get(kind)
             if text is not None:
                 self.note_whole(kind, text.encode())
-        for seq, layer in database.all("SELECT seq, layer FROM chunks ORDER BY layer, seq"):
+        sql = f"SELECT seq, layer FROM chunks WHERE {is_number('seq')} ORDER BY layer, seq"
+        for seq, layer in database.all(sql):
+            if layer not in range(MAX_LAYERS):
+                continue
             self._numbers.setdefault(f"k{layer}", RangeSet()).add(seq)
 
     def all(self) -> dict[str, RangeSet]:
@@ -88,3 +92,9 @@ class Inventory:
         """End what :meth:`listen` began."""
         with self._lock:
             self._listeners.remove(listener)
+
+
+def _ids(database: Database, table: str) -> RangeSet:
+    return RangeSet.of(
+        row[0] for row in database.all(f"SELECT id FROM {table} WHERE {is_number('id')}")
+    )

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from recon.types import Keyframe
-from service.stream.database import Database
+from service.stream.database import Database, blob
 from service.stream.radio_messages import unpack_pose, unpack_tile
 from service.stream.radio_tiles import keyframe_of
+from service.stream.ranges import is_number
 from service.stream.records import PoseRecord
 
 
@@ -30,17 +31,17 @@ class RadioStore:
     def keyframe(self, seq: int) -> Keyframe | None:
         """The keyframe that its tiles show; None without any."""
         sql = "SELECT data FROM radio WHERE kind = 'tile' AND number = ? ORDER BY part"
-        tiles = [unpack_tile(bytes(row[0])) for row in self._db.all(sql, (seq,))]
+        tiles = [unpack_tile(blob(row[0])) for row in self._db.all(sql, (seq,))]
         return keyframe_of([tile[1] for tile in tiles if tile is not None])
 
     def seqs(self) -> set[int]:
         """Numbers of the keyframes of which there are tiles."""
-        sql = "SELECT DISTINCT number FROM radio WHERE kind = 'tile'"
+        sql = f"SELECT DISTINCT number FROM radio WHERE kind = 'tile' AND {is_number('number')}"
         return {row[0] for row in self._db.all(sql)}
 
     def poses(self) -> Iterator[PoseRecord]:
         """The poses in the order of their numbers."""
         for (data,) in self._db.all("SELECT data FROM radio WHERE kind = 'pose' ORDER BY number"):
-            found = unpack_pose(bytes(data))
+            found = unpack_pose(blob(data))
             if found is not None:
                 yield found[2]

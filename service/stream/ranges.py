@@ -15,6 +15,11 @@ MAX_NUMBER = (1 << 32) - 1
 Pairs = list[tuple[int, int]]
 
 
+def is_number(column: str) -> str:
+    """The SQL condition that a column holds a number of an item."""
+    return f"typeof({column}) = 'integer' AND {column} BETWEEN 0 AND {MAX_NUMBER}"
+
+
 class RangeSet:
     """A set of numbers up to :data:`MAX_NUMBER`, as sorted ranges that neither overlap nor touch.
 

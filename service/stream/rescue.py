@@ -7,6 +7,7 @@ import sqlite3
 from pathlib import Path
 
 from service.errors import InputError
+from service.stream.schema import can_write, check_schema, connect
 
 log = logging.getLogger(__name__)
 
@@ -14,10 +15,14 @@ TABLES = ("meta", "chunks", "poses", "reposes", "radio", "held")
 
 
 def is_sound(path: Path) -> bool:
-    """Whether SQLite finds no fault in the file; one that is merely busy counts as sound."""
+    """Whether SQLite finds no fault in the file; one that is merely busy counts as sound.
+
+    Raises InputError when its schema is not that of a scan.
+    """
     try:
-        connection = sqlite3.connect(path, timeout=10.0)
+        connection, _ = connect(path, read_only=not can_write(path))
         try:
+            check_schema(connection, path)
             return bool(connection.execute("PRAGMA quick_check(1)").fetchone()[0] == "ok")
         finally:
             connection.close()
@@ -35,8 +40,11 @@ def rescue(path: Path, schema: str) -> int:
     """
     fresh = path.with_name(path.name + ".rescued")
     fresh.unlink(missing_ok=True)
-    source, target = sqlite3.connect(path), sqlite3.connect(fresh)
+    source = target = None
     try:
+        source, _ = connect(path)
+        check_schema(source, path)
+        target = sqlite3.connect(fresh)
         target.executescript(schema)
         kept = sum(_copy(source, target, table) for table in TABLES)
         header = target.execute("SELECT 1 FROM meta WHERE key = 'header'").fetchone()
@@ -44,8 +52,9 @@ def rescue(path: Path, schema: str) -> int:
     except sqlite3.Error as error:
         raise InputError(f"{path} is not a scan database ({error})") from error
     finally:
-        source.close()
-        target.close()
+        for connection in (source, target):
+            if connection is not None:
+                connection.close()
     if header is None:
         fresh.unlink(missing_ok=True)
         raise InputError(f"{path} is damaged and its scan header is lost")

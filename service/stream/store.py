@@ -19,10 +19,10 @@ from typing import Any
 from recon.types import Keyframe
 from service.errors import InputError
 from service.stream import codec, layer
-from service.stream.database import SCHEMA, SCHEMA_VERSION, Database, peek_meta
+from service.stream.database import Database, blob
 from service.stream.inventory import Inventory, Listener
 from service.stream.radio_store import RadioStore
-from service.stream.ranges import RangeSet
+from service.stream.ranges import RangeSet, is_number, ranges_from_pairs
 from service.stream.records import (
     PoseRecord,
     Repose,
@@ -34,7 +34,11 @@ from service.stream.records import (
     unpack_repose,
 )
 from service.stream.rescue import is_sound, rescue
+from service.stream.schema import SCHEMA, SCHEMA_VERSION, can_write, peek_meta
 from service.stream.validity import summary_from_json
+
+_NOT_TOO_LARGE = f"LENGTH(data) <= {layer.MAX_LAYER_BYTES}"
+_IS_LAYER = f"typeof(layer) = 'integer' AND layer BETWEEN 0 AND {layer.MAX_LAYERS - 1}"
 
 
 class ScanStore:
@@ -44,11 +48,17 @@ class ScanStore:
     counts what was not stored. A full disk raises OutsideError and leaves the file sound.
     """
 
-    def __init__(self, path: Path, header: ScanHeader | None, quota_bytes: int | None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        header: ScanHeader | None,
+        quota_bytes: int | None,
+        read_only: bool = False,
+    ) -> None:
         self.path = path
         self.quota_bytes = quota_bytes
         self.refused = 0
-        self._db = Database(path)
+        self._db = Database(path, read_only)
         self._lock = self._db.lock
         if header is not None:
             self._db.set("schema", str(SCHEMA_VERSION))
@@ -74,17 +84,22 @@ class ScanStore:
         return cls(path, header, quota_bytes)
 
     @classmethod
-    def open(cls, path: Path | str, quota_bytes: int | None = None) -> ScanStore:
+    def open(
+        cls, path: Path | str, quota_bytes: int | None = None, read_only: bool = False
+    ) -> ScanStore:
         """An existing store, whatever state a crash left it in; what is sound is kept.
 
-        Raises InputError when there is no such file or it holds no scan.
+        With ``read_only`` nothing is written, and a damaged file is refused. Raises InputError
+        when there is no such file or it holds no scan, OutsideError when the disk fails.
         """
         path = Path(path)
         if not path.is_file():
             raise InputError(f"{path} does not exist; it should be a scan.db")
         if not is_sound(path):
+            if read_only or not can_write(path):
+                raise InputError(f"{path} is damaged; copy its folder where it can be repaired")
             rescue(path, SCHEMA)
-        return cls(path, None, quota_bytes)
+        return cls(path, None, quota_bytes, read_only)
 
     def close(self) -> None:
         """Fold the write-ahead log into the file and close it."""
@@ -125,8 +140,9 @@ class ScanStore:
     @property
     def refinement(self) -> dict[str, Any] | None:
         """The figures of the refinement in force (:mod:`service.refine.revisions`), or None."""
-        figures = json.loads(self._db.get("refinement") or "{}").get("figures", {})
-        return dict(figures) if figures and not figures.get("undone") else None
+        note = json_object(self._db.get("refinement"))
+        figures = note.get("figures")
+        return figures if isinstance(figures, dict) and not figures.get("undone") else None
 
     @property
     def finished(self) -> bool:
@@ -189,18 +205,18 @@ class ScanStore:
 
     def chunk(self, seq: int, number: int) -> bytes | None:
         """The coded layer ``number`` of keyframe ``seq``."""
-        sql = "SELECT data FROM chunks WHERE seq = ? AND layer = ?"
+        sql = f"SELECT data FROM chunks WHERE seq = ? AND layer = ? AND {_NOT_TOO_LARGE}"
         row = self._db.one(sql, (seq, number))
-        return None if row is None else bytes(row[0])
+        return None if row is None else blob(row[0])
 
     def keyframe(self, seq: int) -> Keyframe | None:
         """Keyframe ``seq`` at its finest stored layer, with the newest re-pose applied.
 
         What came only by the narrow radio stands in until a layer is stored.
         """
-        sql = "SELECT data FROM chunks WHERE seq = ? ORDER BY layer DESC"
-        for (data,) in self._db.all(sql, (seq,)):
-            decoded = codec.decode([bytes(data)])
+        sql = f"SELECT layer FROM chunks WHERE seq = ? AND {_IS_LAYER} ORDER BY layer DESC"
+        for (number,) in self._db.all(sql, (seq,)):
+            decoded = codec.decode([self.chunk(seq, number) or b""])
             if decoded is not None and decoded.seq == seq:
                 break
         else:
@@ -217,13 +233,14 @@ class ScanStore:
 
     def seqs(self) -> list[int]:
         """Numbers of the keyframes of which any layer is stored."""
-        stored = {row[0] for row in self._db.all("SELECT DISTINCT seq FROM chunks")}
+        sql = f"SELECT DISTINCT seq FROM chunks WHERE {is_number('seq')}"
+        stored = {row[0] for row in self._db.all(sql)}
         return sorted(stored | self._radio.seqs())
 
     @property
     def next_seq(self) -> int:
         """The number for the next keyframe, also after a restart."""
-        row = self._db.one("SELECT MAX(seq) FROM chunks", ())
+        row = self._db.one(f"SELECT MAX(seq) FROM chunks WHERE {is_number('seq')}")
         return 0 if row is None or row[0] is None else int(row[0]) + 1
 
     # Poses and re-poses
@@ -254,7 +271,7 @@ class ScanStore:
         for (data,) in self._db.all(
             f"SELECT data FROM poses WHERE id IN ({newest}) ORDER BY time_unix_ns"
         ):
-            pose = unpack_pose(bytes(data))
+            pose = unpack_pose(blob(data))
             if pose is not None:
                 yield pose
         if not self._inventory.of("pose"):
@@ -294,7 +311,7 @@ class ScanStore:
         """The newest re-pose of keyframe ``seq``."""
         sql = "SELECT data FROM reposes WHERE seq = ? ORDER BY revision DESC, id DESC LIMIT 1"
         row = self._db.one(sql, (seq,))
-        return None if row is None else unpack_repose(bytes(row[0]))
+        return None if row is None else unpack_repose(blob(row[0]))
 
     def add_radio(self, kind: str, number: int, part: int, data: bytes) -> bool:
         """Store a message of the narrow radio ("tile" or "pose"), the newest of its number;
@@ -316,7 +333,7 @@ class ScanStore:
             return self.chunk(number, int(kind[1:]))
         table = {"pose": "poses", "repose": "reposes"}[kind]
         row = self._db.one(f"SELECT data FROM {table} WHERE id = ?", (number,))
-        return None if row is None else bytes(row[0])
+        return None if row is None else blob(row[0])
 
     def put_record(self, kind: str, number: int, data: bytes) -> bool:
         """Store what :meth:`record` gave at the other end; False if unsound or no news."""
@@ -372,7 +389,9 @@ class ScanStore:
         """Peer to what it said it holds."""
         out: dict[str, dict[str, RangeSet]] = {}
         for peer, kind, text in self._db.all("SELECT peer, kind, ranges FROM held"):
-            out.setdefault(peer, {})[kind] = RangeSet((a, b) for a, b in json.loads(text))
+            ranges = ranges_from_pairs(json_value(text))
+            if ranges is not None:
+                out.setdefault(str(peer), {})[str(kind)] = ranges
         return out
 
     # SQL
@@ -393,8 +412,22 @@ class ScanStore:
         return header
 
     def _next_id(self, table: str) -> int:
-        row = self._db.one(f"SELECT MAX(id) FROM {table}", ())
+        row = self._db.one(f"SELECT MAX(id) FROM {table} WHERE {is_number('id')}")
         return 1 if row is None or row[0] is None else int(row[0]) + 1
+
+
+def json_value(text: object) -> Any:
+    """What a text of the file says; None unless it is JSON."""
+    try:
+        return json.loads(text) if isinstance(text, str) else None
+    except (ValueError, RecursionError):
+        return None
+
+
+def json_object(text: object) -> dict[str, Any]:
+    """The JSON object in a text of the file; empty when there is none."""
+    value = json_value(text)
+    return value if isinstance(value, dict) else {}
 
 
 def header_of(path: Path) -> ScanHeader | None:
