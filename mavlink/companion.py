@@ -12,38 +12,35 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from mavlink import status as texts
+from mavlink.autopilot_link import AutopilotLink
 from mavlink.camera import CAPTURE_STATUS, CameraComponent, CameraConfig, KeyframeReport
 from mavlink.camera_definition import FILE, URI, camera_definition, definition_version
-from mavlink.clock import BootClock
 from mavlink.command_desk import CommandDesk, decode_call
 from mavlink.commands import load_commands
 from mavlink.component_metadata import NUMBER as METADATA
 from mavlink.component_metadata import ComponentMetadata
 from mavlink.control import Answer, Result, ScanControl
-from mavlink.decode import READERS, decode
+from mavlink.decode import READERS
 from mavlink.extended_parameters import ExtendedParameters
 from mavlink.framing import Decoder, Packet
 from mavlink.ftp import FileServer
 from mavlink.gimbal import YAW_FRAMES
 from mavlink.history import VehicleHistory
+from mavlink.link_watch import LinkWatch, WatchConfig
 from mavlink.messages import CAMERA, ONBOARD, Address, Outbox, Outgoing
 from mavlink.parameters import YAW_FRAME, Parameters, with_defaults
 from mavlink.presence import Presence
-from mavlink.rates import WANTED_HZ, RateKeeper
-from mavlink.samples import OF_AUTOPILOT
+from mavlink.rates import WANTED_HZ
 from mavlink.status import ComputerLoad, StatusTexts, computer_status, motion_values
 from mavlink.streams import Streams
 from mavlink.telemetry import TelemetryDecoder
-from mavlink.timesync import TimesyncFilter
-from mavlink.wall_time import WallTime
-from mavlink.wire import COMMAND_CANCEL, dialect, numbers_of
+from mavlink.wire import COMMAND_CANCEL, numbers_of
 
 S = 1_000_000_000
 MS = 1_000_000
 COMPONENTS = (ONBOARD, CAMERA)
 HEARTBEAT, SYSTEM_TIME, FILE_TRANSFER, TIMESYNC = 0, 2, 110, 111
 LOAD_STATUS, MOTION = 390, 251
-LOST_NS = 5 * S
 SERVED = (
     "HEARTBEAT",
     "SYSTEM_TIME",
@@ -69,6 +66,7 @@ class CompanionConfig:
     camera: CameraConfig = field(default_factory=CameraConfig)
     parameters: Mapping[str, float] = field(default_factory=dict)  # defaults of this aircraft
     wanted_hz: Mapping[str, float] = field(default_factory=lambda: dict(WANTED_HZ))
+    watch: WatchConfig = field(default_factory=WatchConfig)
     load_every_s: float = 2.0
     motion_every_s: float = 1.0
 
@@ -97,9 +95,7 @@ class Companion:
         self._start_ns = self._now_ns = now_ns
         self._outbox = Outbox()
         self._decoder, self._telemetry = Decoder(), TelemetryDecoder(READERS)
-        self._clocks: dict[int, BootClock] = {}  # component of our system to its boot clock
-        self.timesync, self.wall_time = TimesyncFilter(), WallTime()
-        self.rates = RateKeeper(config.wanted_hz)
+        self.autopilot = AutopilotLink(presence, history, self._outbox, config.wanted_hz, self.say)
         self.streams = Streams(self._outbox)
         self.texts = StatusTexts(self._outbox)
         self.parameters = Parameters(
@@ -124,8 +120,8 @@ class Companion:
         self.desk = CommandDesk(load_commands(), self._outbox, self, self._warn)
         self.streams.add(ONBOARD, LOAD_STATUS, round(config.load_every_s * 1e6), self._send_load)
         self.streams.add(ONBOARD, MOTION, round(config.motion_every_s * 1e6), self._send_motion)
-        self._lost = False
-        self._followed = (presence.system, presence.autopilot)
+        self.watch = LinkWatch(config.watch, presence, now_ns)
+        self._is_recording, self._watch_ns = False, now_ns
 
     # In.
 
@@ -142,65 +138,24 @@ class Companion:
             self.counts["not understood"] += 1
             return
         name = message.get_type()
+        self.watch.hear(packet, message, now_ns)
         for listener in self._listeners.get(name, ()):
             listener(message)
         if packet.message_id == HEARTBEAT:
             self.presence.hear(message, now_ns)
-            self._follow()
+            self.autopilot.follow()
         elif name in READERS:
-            self._hear_vehicle(name, message, packet, now_ns)
+            self.autopilot.hear_telemetry(name, message, packet, now_ns)
         elif name.startswith("COMMAND_"):
             self._hear_command(message, link, now_ns)
         elif name.startswith("PARAM_"):
             self._hear_parameter(message, name)
         elif packet.message_id == SYSTEM_TIME:
-            self._hear_system_time(message, packet, now_ns)
+            self.autopilot.hear_system_time(message, packet, now_ns)
         elif packet.message_id == FILE_TRANSFER:
             self._hear_file_request(message, link)
         elif packet.message_id == TIMESYNC:
-            self._hear_timesync(message, packet, link, now_ns)
-
-    def _hear_vehicle(self, name: str, message: Any, packet: Packet, now_ns: int) -> None:
-        if packet.system != self.presence.system:
-            return
-        autopilot = self.presence.autopilot
-        if autopilot is not None and packet.component == autopilot[1]:
-            self.rates.heard(name)
-        sample = decode(message)
-        speaker = 1 if autopilot is None else autopilot[1]
-        if sample is None or (packet.component != speaker and isinstance(sample, OF_AUTOPILOT)):
-            return
-        self.counts["samples"] += 1
-        if sample.boot_ms is None:
-            self.history.add(sample, now_ns)
-            return
-        clock = self._clocks.setdefault(packet.component, BootClock())
-        reboots = clock.reboots
-        time_ns = clock.time_of(sample.boot_ms, now_ns)
-        if clock.reboots != reboots:
-            self._rebooted(packet.component)
-        self.history.add(sample, time_ns)
-
-    def _follow(self) -> None:
-        """Drop what another vehicle, or another component, said."""
-        (system, autopilot), before = self._followed, self._followed
-        self._followed = (self.presence.system, self.presence.autopilot)
-        if self._followed == before or (self._followed[0] == system and autopilot is None):
-            return
-        self._clocks.clear()
-        self._start_over()
-
-    def _start_over(self) -> None:
-        self.history.clear()
-        self.timesync.reset()
-        self.rates.restart()
-
-    def _rebooted(self, component: int) -> None:
-        autopilot = self.presence.autopilot
-        if autopilot is None or component != autopilot[1]:
-            return
-        self._start_over()
-        self.say(texts.WARNING, "Autopilot restarted; telemetry starts over")
+            self.autopilot.hear_timesync(message, packet, link, now_ns)
 
     def _hear_command(self, message: Any, link: int, now_ns: int) -> None:
         call = decode_call(message, link)
@@ -260,26 +215,6 @@ class Companion:
         gimbal = replace(self.history.config.gimbal, yaw_frame=YAW_FRAMES[round(value)])
         self.history.set_gimbal(gimbal)
 
-    def _hear_system_time(self, message: Any, packet: Packet, now_ns: int) -> None:
-        if (packet.system, packet.component) == self.presence.autopilot:
-            self.rates.heard("SYSTEM_TIME")
-            self.wall_time.hear(message.time_unix_usec, now_ns)
-
-    def _hear_timesync(self, message: Any, packet: Packet, link: int, now_ns: int) -> None:
-        if message.tc1 == 0:  # a question; we answer with our own time since boot
-            reply = dialect.MAVLink_timesync_message(now_ns, message.ts1)
-            if (packet.system, packet.component) == self.presence.autopilot:
-                self._outbox.put(ONBOARD, reply, link)
-            return
-        round_trip_ns = self.timesync.round_trip_of(message.ts1, now_ns)
-        if round_trip_ns is not None:
-            self.presence.answered(packet.system, packet.component, round_trip_ns)
-        if (packet.system, packet.component) != self.presence.autopilot:
-            return
-        if self.timesync.answer(message.tc1, message.ts1, now_ns):
-            clock = self._clocks.setdefault(packet.component, BootClock())
-            clock.set_timesync(self.timesync.offset_ns)
-
     # Out.
 
     def take(self) -> list[Outgoing]:
@@ -290,38 +225,24 @@ class Companion:
         """Do what time asks for."""
         self._now_ns = max(self._now_ns, now_ns)
         self.presence.look(now_ns)
-        self._follow()
+        self.autopilot.follow()
         for text in self.presence.take_news():
             self.say(texts.WARNING, text)
         self.camera.tick(now_ns)
         self.desk.tick(now_ns)
         self.streams.tick(now_ns)
         self.texts.tick(now_ns)
-        self._watch_autopilot(now_ns)
+        self.autopilot.tick(now_ns)
+        self._watch_links(now_ns)
 
-    def _watch_autopilot(self, now_ns: int) -> None:
-        autopilot, seen = self.presence.autopilot, self.presence.autopilot_seen_ns
-        if autopilot is None or seen is None:
-            if self.presence.others(now_ns):  # the answers say which vehicle is ours
-                self._ask_time(now_ns)
+    def _watch_links(self, now_ns: int) -> None:
+        if now_ns < self._watch_ns:
             return
-        lost = now_ns - seen > LOST_NS
-        if lost and not self._lost:
-            self.say(texts.WARNING, "Telemetry of the autopilot is lost")
-        elif self._lost and not lost:
-            self.rates.restart()
-            self.say(texts.NOTICE, "Telemetry of the autopilot is back")
-        self._lost = lost
-        if lost:
-            return
-        for message in self.rates.tick(*autopilot, now_ns):
-            self._outbox.put(ONBOARD, message)
-        self._ask_time(now_ns)
-
-    def _ask_time(self, now_ns: int) -> None:
-        request = self.timesync.request(now_ns)
-        if request is not None:
-            self._outbox.put(ONBOARD, request)
+        self._watch_ns = now_ns + S
+        was_recording, self._is_recording = self._is_recording, self.control.status().is_recording
+        for text in self.watch.news(now_ns, self._is_recording and not was_recording):
+            self.say(texts.WARNING, text)
+        self.presence.is_ready = not any(t.is_grave for t in self.watch.troubles(now_ns))
 
     def next_timer(self) -> int:
         """When :meth:`tick` should be called next, in ns."""
@@ -330,11 +251,7 @@ class Companion:
             for t in (self.camera.next_timer(), self.desk.next_timer(), self.streams.next_timer())
             if t is not None
         ]
-        if self.presence.others(self._now_ns):
-            times.append(self.timesync.next_timer())
-        if self.presence.autopilot is not None:
-            times += [self.timesync.next_timer(), self.rates.next_timer()]
-        return min([*times, self._now_ns + S])
+        return min([*times, *self.autopilot.next_timers(self._now_ns), self._now_ns + S])
 
     def say(self, severity: int, text: str) -> None:
         """Tell the operator."""
@@ -383,11 +300,6 @@ class Companion:
 
     def _boot_ms(self) -> int:
         return ((self._now_ns - self._start_ns) // MS) & 0xFFFFFFFF
-
-    def boot_clock(self) -> BootClock | None:
-        """The autopilot's clock; None before it was heard."""
-        autopilot = self.presence.autopilot
-        return None if autopilot is None else self._clocks.get(autopilot[1])
 
 
 def _with_definition(camera: CameraConfig, version: int) -> CameraConfig:

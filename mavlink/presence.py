@@ -26,6 +26,7 @@ class Health(IntEnum):
     """MAV_STATE of our components."""
 
     BOOT = 1
+    NOT_READY = 2  # MAV_STATE_CALIBRATING, "not flight-ready": the links lack something
     STANDBY = 3
     ACTIVE = 4
     CRITICAL = 5
@@ -68,6 +69,7 @@ class Presence:
         self._next_ns = now_ns if first_ns is None else first_ns
         self._autopilots = Autopilots(config.system, remembered, config.latch_s)
         self._intruder = False
+        self.is_ready = True  # the links have what a flight needs
         self._news: list[str] = []
 
     @property
@@ -126,7 +128,8 @@ class Presence:
         if self._health is Health.BOOT:
             return Health.BOOT if silent < self.config.boot_s else None
         if silent < self.config.stale_s:
-            return self._health
+            is_waiting = self._health is Health.STANDBY and not self.is_ready
+            return Health.NOT_READY if is_waiting else self._health
         return Health.CRITICAL if silent < self.config.dead_s else None
 
     def due(self, now_ns: int) -> list[Outgoing]:

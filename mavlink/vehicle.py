@@ -30,6 +30,7 @@ from mavlink.framing import Framer, Packet
 from mavlink.history import HistoryConfig
 from mavlink.inbox import Inbox, Job
 from mavlink.link import Link, parse_link
+from mavlink.link_watch import Trouble
 from mavlink.live_history import LiveHistory
 from mavlink.memory import Memory
 from mavlink.messages import Outgoing
@@ -96,6 +97,7 @@ class VehicleReport:
     timesync_round_trip_ms: float | None
     unverified: int  # packets refused for their signature
     dropped: int  # packets that the protocol's thread could not take in time
+    troubles: tuple[Trouble, ...]  # what is missing although the links are open
 
 
 class VehicleLink:
@@ -234,11 +236,11 @@ class VehicleLink:
     def unix_offset_ns(self) -> int:
         """Unix time less our monotonic clock: this computer's, or the autopilot's where the two
         clocks do not agree."""
-        return self._companion.wall_time.correct(computer_offset_ns())
+        return self._companion.autopilot.wall_time.correct(computer_offset_ns())
 
     def boot_time_us(self, time_ns: int) -> int | None:
         """The autopilot's boot clock in us at one of our monotonic times; None when unknown."""
-        clock = self._companion.boot_clock()
+        clock = self._companion.autopilot.boot_clock()
         offset = None if clock is None else clock.offset_ns
         return None if offset is None else (time_ns - offset) // 1000
 
@@ -250,7 +252,7 @@ class VehicleLink:
     def report(self) -> VehicleReport:
         """A snapshot for health pages and ``doctor``."""
         seen = self.presence.autopilot_seen_ns
-        round_trip = self._companion.timesync.round_trip_ns
+        round_trip = self._companion.autopilot.timesync.round_trip_ns
         return VehicleReport(
             tuple(
                 LinkReport(
@@ -272,6 +274,7 @@ class VehicleLink:
             None if round_trip is None else round_trip * 1e-6,
             0 if self._signing is None else self._signing.refused,
             self._inbox.dropped,
+            self._companion.watch.troubles(time.monotonic_ns()),
         )
 
     # Threads.

@@ -15,7 +15,8 @@ from loopback import free_port
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 
 from service.config import load_config
-from service.daemon.diagnosis import BAD, GOOD, NOTE, examine
+from service.daemon.diagnosis import examine
+from service.daemon.findings import BAD, GOOD, NOTE
 
 DEMO = Path(__file__).resolve().parents[1] / "demo" / "caliterra"
 

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from service.config import DatalinkConfig, load_config
-from service.daemon.diagnosis import BAD, GOOD, NOTE, _certificate
+from service.daemon.diagnosis import _certificate
+from service.daemon.findings import BAD, GOOD, NOTE
 from service.errors import InputError, OutsideError
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig

@@ -608,14 +608,18 @@ def test_texts_are_spaced_and_not_repeated(ends: Ends) -> None:
     heard = ends.pass_time(1.0)
     assert len(ends.texts()) in (3, 4)
     ends.pass_time(10.0)
-    assert sorted(ends.texts()) == [f"text {k}" for k in range(5)]
+
+    def ours() -> list[str]:
+        return sorted(text for text in ends.texts() if text.startswith("text"))
+
+    assert ours() == [f"text {k}" for k in range(5)]
     ends.companion.say(4, "text 1")
     ends.pass_time(1.0)
-    assert len(ends.texts()) == 5
+    assert len(ours()) == 5
     ends.pass_time(40.0, 1.0)
     ends.companion.say(4, "text 1")
     ends.pass_time(1.0)
-    assert len(ends.texts()) == 6 and heard is not None
+    assert len(ours()) == 6 and heard is not None
 
 
 def test_a_long_text_comes_in_chunks(ends: Ends) -> None:

@@ -22,11 +22,12 @@ def doctor(
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="section.key=value, may be repeated")
     ] = None,
-    listen_s: Annotated[float, typer.Option(help="seconds to listen on each MAVLink link")] = 3.0,
+    listen_s: Annotated[float, typer.Option(help="seconds to listen on the MAVLink links")] = 3.0,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
     """Say what works, what does not, and what to do. Exit code 3 when something is bad."""
-    from service.daemon.diagnosis import BAD, examine
+    from service.daemon.diagnosis import examine
+    from service.daemon.findings import BAD
 
     chosen = config or (INSTALLED if INSTALLED.is_file() else None)
     findings = []

@@ -7,7 +7,6 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 from mavlink.wall_time import EARLIEST_UNIX_S
 from service.compute.threading_layer import REMEDY, kernels_may_overlap
 from service.config import Config
+from service.daemon.findings import BAD, GOOD, NOTE, Finding
+from service.daemon.link_diagnosis import examine_links
 from service.daemon.running import running_service
 from service.daemon.warm_up import is_warm
 from service.errors import InputError, SkyreliefError
@@ -24,7 +25,6 @@ from service.packages import unusable_packages
 if TYPE_CHECKING:
     from recon.types import Camera
 
-GOOD, NOTE, BAD = "good", "note", "bad"
 CORE = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "pymavlink", "eclipse-zenoh")
 NEEDED_MIB = {"disk": 1000.0, "memory": 700.0}
 HOT_C = 85.0
@@ -34,15 +34,6 @@ WARM_UP = (
 )
 
 SOON_DAYS = 30  # a certificate that ends before needs thinking of
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing that was looked at."""
-
-    what: str
-    verdict: str  # GOOD, NOTE (flies, but know it) or BAD
-    text: str
 
 
 def examine(config: Config, listen_s: float) -> Iterator[Finding]:
@@ -55,7 +46,7 @@ def examine(config: Config, listen_s: float) -> Iterator[Finding]:
         lambda: _folder(Path(config.scan.folder)),
         lambda: _compute(config),
         lambda: _camera(config, running),
-        lambda: _mavlink(config, listen_s, running),
+        lambda: examine_links(config, listen_s, running),
         lambda: _datalink(config),
         lambda: _certificate(config),
         lambda: _to_fly(config),
@@ -221,47 +212,6 @@ def _model(config: Config) -> tuple[Camera | None, Finding]:
         return None, Finding("camera model", BAD, str(error))
     text = f"{config.camera.model}: {model.size_px[0]}x{model.size_px[1]}, fx {model.K[0, 0]:.0f}"
     return model, Finding("camera model", GOOD, text)
-
-
-def _mavlink(config: Config, listen_s: float, running: dict[str, Any] | None) -> Iterator[Finding]:
-    if not config.mavlink.links:
-        yield Finding("mavlink", NOTE, "mavlink.links is empty: no telemetry, no commands")
-    elif running is not None:
-        heard = running.get("mavlink", {})
-        up, packets = heard.get("links_up", 0), heard.get("packets", 0)
-        text = f"held by the running service: {up} open, {packets} messages heard"
-        yield Finding("mavlink", GOOD if packets else NOTE, text)
-        return
-    for text in config.mavlink.links:
-        yield _one_link(text, listen_s)
-
-
-def _one_link(text: str, listen_s: float) -> Finding:
-    """What is heard on a link within ``listen_s``."""
-    from mavlink.framing import Framer
-    from mavlink.link import Link, parse_link
-
-    try:
-        spec = parse_link(text)
-    except ValueError as error:
-        return Finding("mavlink", BAD, str(error))
-    framer = Framer()
-    systems: dict[int, int] = {}
-
-    def hear(data: bytes, _: int) -> None:
-        for packet in framer.feed(data):
-            systems[packet.system] = systems.get(packet.system, 0) + 1
-
-    link = Link(spec, hear)
-    link.start()
-    time.sleep(listen_s)
-    up = link.is_up
-    link.stop()
-    if systems:
-        heard = ", ".join(f"system {s}: {n / listen_s:.0f}/s" for s, n in sorted(systems.items()))
-        return Finding("mavlink", GOOD, f"{spec.name}: {heard}")
-    reason = "silent: is the autopilot on, its port set to MAVLink 2?" if up else "does not open"
-    return Finding("mavlink", BAD, f"{spec.name}: {reason}")
 
 
 def _service(running: dict[str, Any] | None) -> Iterator[Finding]:

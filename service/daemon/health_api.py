@@ -54,7 +54,10 @@ STATUS: dict[str, Any] = {
                 "pictures_lost": _COUNT,
             },
         },
-        "mavlink": {"type": "object", "description": "links, packets, age of the telemetry"},
+        "mavlink": {
+            "type": "object",
+            "description": "links, packets, age of the telemetry, what is missing (troubles)",
+        },
         "machine": {"type": "object", "description": "heat, power, memory, disk: what it tells"},
     },
 }

@@ -10,6 +10,7 @@ import logging
 import math
 import threading
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -199,6 +200,7 @@ class Daemon:
             "armed": report.is_armed,
             "autopilot_age_s": report.autopilot_age_s,
             "round_trip_ms": report.timesync_round_trip_ms,
+            "troubles": [asdict(trouble) for trouble in report.troubles],
         }
         return {key: value for key, value in figures.items() if value is not None}
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from mavlink.companion import CompanionConfig
 from mavlink.gimbal import GimbalConfig
 from mavlink.history import HistoryConfig
+from mavlink.link_watch import WatchConfig
 from mavlink.presence import PresenceConfig
 from mavlink.signing import read_key
 from mavlink.vehicle import VehicleConfig
@@ -28,7 +29,7 @@ def vehicle_config(config: Config) -> VehicleConfig:
         return VehicleConfig(
             links=mavlink.links,
             presence=PresenceConfig(system=mavlink.system_id or None),
-            companion=CompanionConfig(parameters=parameters_of(config)),
+            companion=CompanionConfig(parameters=parameters_of(config), watch=watch_config(config)),
             history=HistoryConfig(
                 keep_s=KEEP_S, gimbal=GimbalConfig(yaw_frame=mavlink.gimbal_yaw_frame)
             ),
@@ -38,3 +39,13 @@ def vehicle_config(config: Config) -> VehicleConfig:
         )
     except ValueError as error:
         raise InputError(f"[mavlink] {error}") from error
+
+
+def watch_config(
+    config: Config,
+    wait_s: float = WatchConfig.wait_s,
+    ground_wait_s: float = WatchConfig.ground_wait_s,
+) -> WatchConfig:
+    """What the links must carry for this camera, and how long it is waited for."""
+    gimbal = {"auto": None, "gimbal": True, "fixed": False}[config.camera.mount]
+    return WatchConfig(gimbal, wait_s, ground_wait_s)

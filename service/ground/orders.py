@@ -10,7 +10,7 @@ from typing import Any
 from service.errors import OutsideError
 from service.ground.operator import CAMERA, ONBOARD, ORDERS, Operator
 
-STATES = {1: "starting", 3: "ready", 4: "scanning", 5: "in trouble"}
+STATES = {1: "starting", 2: "not ready", 3: "ready", 4: "scanning", 5: "in trouble"}
 ANSWER_S = 2.0
 FIGURES = {
     "SR_SPEED": "speed_m_s",

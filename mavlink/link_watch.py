@@ -1,0 +1,133 @@
+"""What is missing on the links although they are open, each with the setting to change.
+
+ArduPilot does not forward a ground station's heartbeats to a port whose traffic stays private, so
+a ground station that is never heard is the sign that it does not hear us either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mavlink.framing import MAGIC_V1, Packet
+from mavlink.presence import Presence
+from mavlink.wire import numbers_of
+
+S = 1_000_000_000
+TYPE_GCS = 6
+GIMBAL = numbers_of(("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS"))
+ORDERS = numbers_of(("COMMAND_LONG", "COMMAND_INT", "PARAM_SET", "PARAM_EXT_SET"))
+
+SILENT = (
+    "No autopilot heard: check mavlink.links, SERIALn_PROTOCOL and SERIALn_BAUD (PX4: MAV_n_CONFIG)"
+)
+MAVLINK_1 = "The autopilot sends MAVLink 1: set SERIALn_PROTOCOL = 2 (PX4: MAV_PROTO_VER = 2)"
+NO_GIMBAL = (
+    "No gimbal angles: set up the mount (MNT1_TYPE; PX4: MNT_MODE_OUT), or camera.mount = fixed"
+)
+NO_GROUND = (
+    "No ground station is heard: SERIALn_OPTIONS must not hold 1024 (PX4: set MAV_n_FORWARD = 1)"
+)
+UNANSWERED = (
+    "Commands come, but our answers stay here: remove 1024 from SERIALn_OPTIONS"
+    " (PX4: set MAV_n_FORWARD = 1)"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """Something that a flight misses."""
+
+    what: str  # autopilot, mavlink 1, gimbal or ground station
+    text: str
+    is_known: bool = False  # another text has named it already
+    is_grave: bool = True  # we are not ready to fly with it
+
+
+@dataclass(frozen=True)
+class WatchConfig:
+    """What is expected on the links, and for how long it is waited for."""
+
+    gimbal: bool | None = None  # True: a flight needs its angles; None: they are welcome
+    wait_s: float = 10.0
+    ground_wait_s: float = 60.0  # ground stations come later, and go out of range
+
+
+class LinkWatch:
+    """Fed with every packet that is heard; ``presence`` says whose vehicle we are on."""
+
+    def __init__(self, config: WatchConfig, presence: Presence, now_ns: int) -> None:
+        self._config, self._presence = config, presence
+        self._first_autopilot_ns: int | None = None
+        self._modern_ns = self._old_ns = self._gimbal_ns = -(1 << 62)  # never
+        self._start_ns = self._ground_ns = self._order_ns = now_ns
+        self._is_ground_heard = self._is_ordered = False
+        self._announced: frozenset[str] = frozenset()
+
+    def hear(self, packet: Packet, message: Any, now_ns: int) -> None:
+        """Take in one packet and the message in it."""
+        system = self._presence.system
+        if (packet.system, packet.component) == self._presence.autopilot:
+            if self._first_autopilot_ns is None:
+                self._first_autopilot_ns = now_ns
+            if packet.data[0] == MAGIC_V1:
+                self._old_ns = now_ns
+            else:
+                self._modern_ns = now_ns
+        if packet.message_id in GIMBAL and packet.system == system:
+            self._gimbal_ns = now_ns
+        elif packet.message_id == 0 and message.type == TYPE_GCS:
+            self._is_ground_heard, self._ground_ns = True, now_ns
+        elif packet.message_id in ORDERS and packet.system != system:
+            self._is_ordered, self._order_ns = True, now_ns
+
+    def troubles(self, now_ns: int) -> tuple[Trouble, ...]:
+        """What is missing now, the gravest first."""
+        found = (self._autopilot(now_ns) or self._telemetry(now_ns), self._ground(now_ns))
+        return tuple(trouble for trouble in found if trouble is not None)
+
+    def _is_stale(self, since_ns: int, wait_s: float, now_ns: int) -> bool:
+        return now_ns - max(since_ns, self._start_ns) >= wait_s * S
+
+    def _autopilot(self, now_ns: int) -> Trouble | None:
+        seen_ns = self._presence.autopilot_seen_ns
+        since_ns = self._start_ns if seen_ns is None else seen_ns
+        if not self._is_stale(since_ns, self._config.wait_s, now_ns):
+            return None
+        others = self._presence.others(now_ns)
+        if not others:
+            return Trouble("autopilot", SILENT)
+        names = ", ".join(map(str, others))
+        given = self._presence.config.system
+        if given is None:
+            text = f"Several autopilots ({names}): set mavlink.system_id"
+            return Trouble("autopilot", text, is_known=True)
+        text = f"No autopilot of system {given}, but of {names}: correct mavlink.system_id"
+        return Trouble("autopilot", text)
+
+    def _telemetry(self, now_ns: int) -> Trouble | None:
+        """What the autopilot that is heard does not send."""
+        first_ns, wait_s = self._first_autopilot_ns, self._config.wait_s
+        if first_ns is None or not self._is_stale(first_ns, wait_s, now_ns):
+            return None
+        if self._old_ns > self._modern_ns and self._is_stale(self._modern_ns, wait_s, now_ns):
+            return Trouble("mavlink 1", MAVLINK_1)
+        if self._config.gimbal is False or not self._is_stale(self._gimbal_ns, wait_s, now_ns):
+            return None
+        return Trouble("gimbal", NO_GIMBAL, is_grave=bool(self._config.gimbal))
+
+    def _ground(self, now_ns: int) -> Trouble | None:
+        wait_s = self._config.ground_wait_s
+        if not self._is_stale(self._ground_ns, wait_s, now_ns):
+            return None
+        is_ordered = self._is_ordered and not self._is_stale(self._order_ns, wait_s, now_ns)
+        text = UNANSWERED if is_ordered and not self._is_ground_heard else NO_GROUND
+        return Trouble("ground station", text)
+
+    def news(self, now_ns: int, is_start: bool) -> Sequence[str]:
+        """Texts for the operator: each trouble when it begins, and all when a scan starts."""
+        troubles = self.troubles(now_ns)
+        before = frozenset() if is_start else self._announced
+        self._announced = frozenset(t.what for t in troubles)
+        return [t.text for t in troubles if t.what not in before and not t.is_known]
