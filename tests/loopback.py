@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+PAUSE_S = 0.02
+
 
 def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
     """A port of this machine that nobody uses."""
@@ -18,12 +20,19 @@ def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
         return port
 
 
-def until(done: Callable[[], Any], limit_s: float = 15.0) -> Any:
-    """What ``done`` gives once it is true; the test fails when that takes too long."""
-    deadline = time.monotonic() + limit_s
-    while time.monotonic() < deadline:
-        value = done()
-        if value:
-            return value
-        time.sleep(0.02)
-    pytest.fail(f"nothing came in {limit_s} s")
+def until(
+    done: Callable[[], Any], limit_s: float = 15.0, progress: Callable[[], object] = lambda: None
+) -> Any:
+    """Return what ``done`` gives once it is true; the test fails when progress stops.
+
+    ``limit_s`` is how long ``progress`` may stay the same. It counts pauses between calls of
+    ``done``, not the clock: a machine too busy to call it, or asleep, has that much longer.
+    """
+    seen, pauses = progress(), 0
+    while not (value := done()):
+        if pauses * PAUSE_S >= limit_s:
+            pytest.fail(f"no progress in {limit_s} s, last {seen}")
+        time.sleep(PAUSE_S)
+        now = progress()
+        seen, pauses = now, 0 if now != seen else pauses + 1
+    return value

@@ -19,6 +19,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from loopback import until
 
 from service.cameras import CameraFrame, CameraSource, open_camera
 from service.cameras.live import LiveConfig, LiveSource, StampFilter
@@ -208,10 +209,7 @@ def test_an_ended_stream_is_let_go_at_once(
         pass
     assert len(opened) == 1
     source.close()
-    late_s = time.monotonic() + 10.0
-    while opened[0].is_open and time.monotonic() < late_s:
-        time.sleep(0.01)
-    assert not opened[0].is_open
+    until(lambda: not opened[0].is_open)
 
 
 @pytest.fixture
@@ -323,10 +321,7 @@ def test_gstreamer_pipeline_is_run_and_ended(
     assert "nvarguscamerasrc ! nvvidconv ! videoconvert" in (tmp_path / "arguments").read_text()
     source.close()
     pid = int((tmp_path / "pid").read_text())
-    deadline = time.monotonic() + 20.0
-    while Path(f"/proc/{pid}").exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not Path(f"/proc/{pid}").exists()
+    until(lambda: not Path(f"/proc/{pid}").exists())
 
 
 def has_gstreamer(*elements: str) -> bool:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import socket
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from loopback import until
 
 from recon import se3
 from recon.types import DepthMap, Keyframe, Pose
@@ -58,15 +58,6 @@ def fly(store: ScanStore, first: int, last: int) -> None:
     for seq in range(first, last):
         store.add_keyframe(seq, codec.encode(keyframe(seq), seq))
         store.add_pose(PoseRecord(1000 * seq, np.eye(4), np.eye(6), keyframe_seq=seq))
-
-
-def wait_for(condition: Callable[[], bool], timeout_s: float = 20.0) -> bool:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.05)
-    return True
 
 
 def start_ground(folder: Path, endpoint: str, name: str = "") -> Receiver:
@@ -145,7 +136,7 @@ def test_a_scan_arrives_whole_with_its_corrections(tmp_path: Path, written: list
         onboard.finish({"points": 12})
         assert link.drain(20.0)
         folder = ground.folder("drone-a", "scan-1")
-        assert wait_for(lambda: folder in written)
+        until(lambda: folder in written)
         (entry,) = ground.progress()
         assert entry["complete"] and not entry["missing"]
     finally:
@@ -180,7 +171,7 @@ def test_both_ends_may_restart(tmp_path: Path) -> None:
     link = DatalinkSender(onboard, config)
     ground = start_ground(tmp_path / "ground", endpoint)
     fly(onboard, 0, 5)
-    assert wait_for(lambda: link.progress.complete)
+    until(lambda: link.progress.complete)
     ground.close()
     fly(onboard, 5, 10)
     ground = start_ground(tmp_path / "ground", endpoint)
@@ -216,7 +207,7 @@ def test_a_session_on_which_stations_fell_silent_is_opened_anew(
     ground = start_ground(tmp_path / "ground", endpoint)
     link = DatalinkSender(onboard, fast(endpoint))
     try:
-        assert wait_for(lambda: len(opened) >= 3)
+        until(lambda: len(opened) >= 3)
         fly(onboard, 0, 5)
         onboard.finish({})
         monkeypatch.setattr(link_module, "SILENCE_S", 5.0)
@@ -239,7 +230,7 @@ def test_a_router_between_them_may_restart(tmp_path: Path) -> None:
     link = DatalinkSender(onboard, fast(endpoint))
     try:
         fly(onboard, 0, 2)
-        assert wait_for(lambda: any(e["held"].get("k1") == 2 for e in ground.progress()))
+        until(lambda: any(e["held"].get("k1") == 2 for e in ground.progress()))
         router.close()
         fly(onboard, 2, 4)
         time.sleep(0.3)
@@ -291,8 +282,8 @@ def test_two_drones_with_the_same_scan_id_and_a_late_second_ground(tmp_path: Pat
     try:
         assert all(link.drain(20.0) for link in links)
         late.start()
-        assert wait_for(lambda: len(late.progress()) == 2)
-        assert wait_for(lambda: all(e["complete"] for e in late.progress()))
+        until(lambda: len(late.progress()) == 2)
+        until(lambda: all(e["complete"] for e in late.progress()))
     finally:
         for link in links:
             link.close()
@@ -314,7 +305,7 @@ def test_over_the_quota_the_ground_keeps_coarse_layers_and_says_so(tmp_path: Pat
     ground.start()
     link = DatalinkSender(onboard, fast(endpoint))
     try:
-        assert wait_for(lambda: any(e["complete"] for e in ground.progress()))
+        until(lambda: any(e["complete"] for e in ground.progress()))
         (entry,) = ground.progress()
         assert entry["held"]["k0"] == 6 and 0 < entry["refused"] < 6
         assert entry["held"].get("k1", 0) + entry["refused"] == 6

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from loopback import until
 
 from service.config import DatalinkConfig, load_config
 from service.daemon.diagnosis import _certificate
@@ -105,11 +106,12 @@ def test_a_viewer_reads_and_cannot_write(
     link = sender(fleet, tmp_path, "drone/red", "red", endpoint)
     try:
         assert link.drain(15.0)
-        deadline = time.monotonic() + 10
-        while not seen and time.monotonic() < deadline:
+
+        def told() -> bool:
             link._post(link._outbox.tell)
-            time.sleep(0.3)
-        assert "skyrelief/red/scan-1/head" in seen
+            return "skyrelief/red/scan-1/head" in seen
+
+        until(told)
         viewer.put("skyrelief/red/scan-9/head", b'{"v":1,"numbers":{},"live":{},"finished":false}')
         time.sleep(0.5)
         assert [entry["scan"] for entry in receiver.progress()] == ["scan-1"]

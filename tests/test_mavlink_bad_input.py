@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from loopback import until
 
 from mavlink.control import Phase
 from mavlink.framing import Framer
@@ -67,11 +68,12 @@ class Peer:
                 elif message is not None and message.get_type() == "COMMAND_ACK":
                     self.acks.append((message.command, message.result))
 
-    def until(self, done: Callable[[], bool], limit_s: float = 10.0) -> None:
-        end = time.monotonic() + limit_s
-        while not done():
-            assert time.monotonic() < end, (self.acks, self.texts)
+    def until(self, done: Callable[[], bool]) -> None:
+        def heard() -> bool:
             self.listen()
+            return done()
+
+        until(heard, progress=lambda: (len(self.acks), dict(self.texts)))
 
     def order(self, number: int, component: int, *params: float, system: int = 1) -> None:
         values = [*params, *[0.0] * (7 - len(params))]
@@ -252,9 +254,6 @@ def test_replayed_signed_packets_are_not_obeyed(tmp_path: Path) -> None:
             peer.works()
             for _ in range(REPEATS):
                 peer.send(recorded)  # older than what was heard since
-            deadline = time.monotonic() + 10.0
-            while vehicle.link.report().unverified < REPEATS and time.monotonic() < deadline:
-                time.sleep(0.01)
-            assert vehicle.link.report().unverified == REPEATS
+            until(lambda: vehicle.link.report().unverified == REPEATS)
             peer.works()
             assert vehicle.control.asked == ["start_scan"] and not peer.texts

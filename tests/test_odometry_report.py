@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from loopback import until
 from scipy.spatial.transform import Rotation
 
 from mavlink.framing import Framer
@@ -106,9 +107,7 @@ def test_it_reaches_the_autopilot_stamped_with_its_clock_only_when_wanted(wanted
                 dialect.MAVLink_attitude_message(50_000, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
             ):
                 autopilot.sendto(bytes(message.pack(mouth)), peer)
-            deadline = time.monotonic() + 10.0
-            while vehicle.link.boot_time_us(0) is None and time.monotonic() < deadline:
-                time.sleep(0.01)
+            until(lambda: vehicle.link.boot_time_us(0) is not None)
             now_ns = time.monotonic_ns()
             report = OdometryReport(CameraConfig(), vehicle.link.report_odometry)
             report.tell(step_at((1.0, 2.0, 30.0)), state(), now_ns)

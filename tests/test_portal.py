@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import struct
 import threading
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import pytest
+from loopback import until
 
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
@@ -328,10 +328,8 @@ def test_deliverables_are_made_on_request(client: Client) -> None:
     one = "/api/scans/drone-1/test-1"
     assert client.ask(one + "/exports", "POST", {"kind": "kml"})[0] == 202
     assert client.ask(one + "/exports", "POST", {"kind": "docx"})[0] == 400
-    deadline = time.monotonic() + 20
-    while (job := client.ask(one)[1]["jobs"][-1])["state"] in ("waiting", "running"):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    until(lambda: client.ask(one)[1]["jobs"][-1]["state"] not in ("waiting", "running"))
+    job = client.ask(one)[1]["jobs"][-1]
     assert job["state"] == "done" and job["file"] == "flight.kml"
     assert b"<kml" in client.ask(one + "/files/flight.kml")[1]
 
@@ -581,9 +579,7 @@ def test_orders_and_figures_of_the_vehicle(store: Path) -> None:
     vehicle.start()
     try:
         client = Client(portal)
-        deadline = time.monotonic() + 5
-        while not client.ask("/api/vehicle")[1]["connected"]:
-            assert time.monotonic() < deadline
+        until(lambda: client.ask("/api/vehicle")[1]["connected"])
         assert client.ask("/api/vehicle", "POST", {"action": "start"}, token=None)[0] == 401
         assert fake.commands == []
         status, answer, _ = client.ask("/api/vehicle", "POST", {"action": "start"})
@@ -630,9 +626,7 @@ def test_a_vehicle_that_is_not_there_says_so() -> None:
 
     vehicle = Vehicle("udpin://x", nobody)
     vehicle.start()
-    deadline = time.monotonic() + 5
-    while vehicle.figures()["trouble"] != "no companion heard":
-        assert time.monotonic() < deadline
+    until(lambda: vehicle.figures()["trouble"] == "no companion heard")
     with pytest.raises(OutsideError, match="no companion heard"):
         vehicle.order("start", None)
     vehicle.close()

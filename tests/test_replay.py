@@ -15,6 +15,7 @@ from typing import Any
 import laspy
 import numpy as np
 import pytest
+from loopback import until
 
 EPOCH = 1777629600  # of the simulated video; a transport stream does not carry it
 
@@ -138,9 +139,7 @@ def test_an_interrupt_closes_the_scan(flight: Path, tmp_path: Path) -> None:
         "--camera-model", str(flight / "camera.yaml"), "--out", str(out), "--realtime", "--json",
     ]  # fmt: skip
     running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60
-    while not (out / "scan.db").exists() and time.monotonic() < deadline:
-        time.sleep(0.1)
+    until((out / "scan.db").exists, 60.0)
     time.sleep(2.0)
     running.send_signal(signal.SIGINT)
     stdout, stderr = running.communicate(timeout=60)

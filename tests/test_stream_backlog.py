@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import socket
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from loopback import until
 
 from mavlink.rehearsal import RehearsalControl
 from mavlink.vehicle import VehicleConfig, VehicleLink
@@ -107,13 +107,9 @@ def test_the_daemon_offers_earlier_scans_between_flights(
     link = DaemonLink()
 
     def complete(scan_id: str) -> bool:
-        deadline = time.monotonic() + 15
-        while time.monotonic() < deadline:
-            done = {e["scan"] for e in ground.progress() if e["complete"]}
-            if scan_id in done:
-                return True
-            time.sleep(0.05)
-        return False
+        return bool(
+            until(lambda: scan_id in {e["scan"] for e in ground.progress() if e["complete"]})
+        )
 
     try:
         link.offer_backlog(config, lambda: False)
@@ -125,10 +121,8 @@ def test_the_daemon_offers_earlier_scans_between_flights(
         changed = dataclasses.replace(config.datalink, budget_kbit_s=123.0, share=0.5)
         link.follow(dataclasses.replace(config, datalink=changed))
         assert isinstance(link.flying, DatalinkSender)
-        deadline = time.monotonic() + 10
-        while link.flying.progress.rate_kbit_s != 61.5 and time.monotonic() < deadline:
-            time.sleep(0.05)
-        assert link.flying.progress.rate_kbit_s == 61.5
+        sender = link.flying
+        until(lambda: sender.progress.rate_kbit_s == 61.5)
         flown.add_pose(PoseRecord(1, np.eye(4), np.eye(6)))
         flown.finish({})
         link.land(config)  # at once: the ground cannot have everything yet

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from loopback import until
 
 from mavlink.framing import Framer
 from mavlink.presence import Health
@@ -275,12 +276,7 @@ def test_over_a_real_link_into_the_ground_station(
     sender = RadioSender(store, TunnelConfig(radio_bytes_s=50_000), carrier)
     try:
         store.add_keyframe(0, codec.encode(keyframe(0, 0.0), 0))
-        deadline = time.monotonic() + 15
-        while time.monotonic() < deadline:
-            entries = ground.progress()
-            if entries and entries[0]["radio_messages"] >= 15:
-                break
-            time.sleep(0.05)
+        until(lambda: any(e["radio_messages"] >= 15 for e in ground.progress()))
     finally:
         sender.close()
         radio.close()
