@@ -102,7 +102,7 @@ def test_two_runs_of_one_time_stay_two_scans(tmp_path: Path, written: list[Path]
     ground = start_ground(tmp_path / "ground", endpoint)
     links = [DatalinkSender(store, fast(endpoint)) for store in runs]
     try:
-        assert wait_for(lambda: [e["complete"] for e in ground.progress()] == [True, True], 60.0)
+        until(lambda: [e["complete"] for e in ground.progress()] == [True, True], 60.0)
         assert sorted(e["scan"] for e in ground.progress()) == ["scan-1", "scan-1-2"]
     finally:
         for link in links:
