@@ -20,7 +20,7 @@ def test_progress_gives_more_time_and_its_end_ends_the_wait(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     paused: list[float] = []
-    monkeypatch.setattr(loopback.time, "sleep", paused.append)
+    monkeypatch.setattr(time, "sleep", paused.append)
     with pytest.raises(pytest.fail.Exception, match=r"no progress in 2.0 s, last 7"):
         loopback.until(lambda: False, 2.0, lambda: min(len(paused) // 50, 7))
     assert sum(paused) == pytest.approx(7 * 50 * loopback.PAUSE_S + 2.0, abs=0.1)
