@@ -21,6 +21,7 @@ from service.errors import OutsideError
 from service.georeference import LocalFrame
 from service.scans.folder import CLOUD, CSV, PREVIEW, REPORT, SUMMARY, TUM, write_deliverables
 from service.scans.fused_cloud import _Extent, fused_cloud, strip_edges
+from service.scans.retention import close_open_scans
 from service.scans.track import latest
 from service.stream.records import Repose, ScanHeader
 from service.stream.store import ScanStore
@@ -224,3 +225,54 @@ def test_strips_hold_equal_shares() -> None:
     shares = np.histogram(x, [x.min() - 1, *edges[1:-1], x.max() + 1])[0]
     assert shares.max() < 9000
     assert strip_edges([], 10) == [-np.inf, np.inf]
+
+
+def test_a_file_that_cannot_be_made_costs_itself_only(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise OverflowError("cannot convert float infinity to integer\nand more")
+
+    monkeypatch.setattr("service.scans.folder.write_laz", broken)
+    with house.flown(tmp_path) as store:
+        summary = write_deliverables(tmp_path, store, {})
+    why = {CLOUD: "OverflowError: cannot convert float infinity to integer"}
+    assert summary["failed"] == json.loads((tmp_path / SUMMARY).read_text())["failed"] == why
+    assert not (tmp_path / CLOUD).exists()
+    assert all((tmp_path / name).stat().st_size for name in (TUM, CSV, PREVIEW, REPORT))
+    assert summary["counts"]["points"] > 0
+
+
+def test_without_a_cloud_the_track_is_still_written(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> None:
+        raise MemoryError("Unable to allocate 213 TiB")
+
+    monkeypatch.setattr("service.scans.folder.fused_cloud", broken)
+    monkeypatch.setattr("service.scans.folder.write_coverage_files", broken)
+    with house.flown(tmp_path) as store:
+        summary = write_deliverables(tmp_path, store, {})
+    assert set(summary["failed"]) == {CLOUD, "coverage.png"}
+    assert summary["counts"]["poses"] == 5
+    assert len((tmp_path / TUM).read_text().splitlines()) == 5
+    assert "Unable to allocate" in (tmp_path / SUMMARY).read_text()
+
+
+def test_a_file_that_the_disk_refused_is_tried_again_at_the_next_start(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    folder = tmp_path / "scan"
+    with house.flown(folder) as store:
+        store.finish({"points": 1})
+        (folder / PREVIEW / "in the way").mkdir(parents=True)
+        with pytest.raises(OutsideError, match=PREVIEW):
+            write_deliverables(folder, store, {})
+    assert list(json.loads((folder / SUMMARY).read_text())["failed"]) == [PREVIEW]
+    assert all((folder / name).stat().st_size for name in (CLOUD, TUM, CSV, REPORT))
+    (folder / PREVIEW / "in the way").rmdir()
+    (folder / PREVIEW).rmdir()
+    assert close_open_scans(tmp_path, ours=()) == ["scan"]
+    assert (folder / PREVIEW).is_file()
+    assert json.loads((folder / SUMMARY).read_text())["failed"] == {}
+    assert close_open_scans(tmp_path, ours=()) == []

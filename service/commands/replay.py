@@ -211,6 +211,8 @@ def _report(summary: dict[str, Any], as_json: bool) -> None:
         print(file=sys.stderr)
     for warning in summary["warnings"]:
         print(f"note: {warning}")
+    for name, why in summary["failed"].items():
+        print(f"not written: {name}: {why}")
     refused = ", ".join(f"{k} ({n})" for k, n in summary["refusals"].items()) or "none"
     print(
         f"{summary['scan_folder']}: {summary['frames']} frames, {summary['pairs']} pairs, "

@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from service.errors import SkyreliefError
+from service.errors import InputError, SkyreliefError
 from service.ground.intake import ScanIntake
 from service.stream.naming import ROOT
 
@@ -70,6 +70,9 @@ def deliver(scan: ReceivedScan) -> None:
     from service.scans.folder import write_deliverables
 
     try:
-        write_deliverables(scan.folder, scan.intake.store, {})
+        failed = write_deliverables(scan.folder, scan.intake.store, {})["failed"]
+        if failed:
+            why = "; ".join(f"{name} ({reason})" for name, reason in failed.items())
+            raise InputError(f"some could not be made: {why}")
     except (SkyreliefError, OSError) as error:
         log.error("deliverables of %s not written: %s", scan.folder, error)

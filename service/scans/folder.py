@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,13 @@ import cv2
 import numpy as np
 
 from recon.surface.raster import Raster, grid_over, rasterise
-from service.errors import OutsideError
+from recon.types import PointCloud
+from service.errors import OutsideError, SkyreliefError
 from service.georeference import LocalFrame
 from service.redaction import public_configuration, redacted
+from service.scans.coverage import PICTURE as COVERAGE
 from service.scans.coverage import write_coverage_files
-from service.scans.fused_cloud import FusedCloud, fused_cloud
+from service.scans.fused_cloud import DEFAULT_VOXEL_M, FusedCloud, fused_cloud
 from service.scans.inspection import middle_keyframe, stages
 from service.scans.las import write_laz
 from service.scans.preview import blank_preview, draw_preview
@@ -37,8 +40,22 @@ log = logging.getLogger(__name__)
 CLOUD, TUM, CSV = "cloud.laz", "trajectory.tum", "trajectory.csv"
 SUMMARY, PREVIEW, REPORT = "scan.json", "preview.jpg", "report.html"
 PREVIEW_CELLS = 6e6
+LONGEST_REASON = 500
 MIN_VOXEL_M, MAX_VOXEL_M = 0.01, 100.0
 """What a scan's own configuration may ask for."""
+NOTHING = FusedCloud(
+    PointCloud(
+        np.zeros((0, 3), np.float32),
+        np.zeros((0, 3), np.uint8),
+        np.zeros(0, np.float32),
+        np.zeros(0, np.uint8),
+    ),
+    DEFAULT_VOXEL_M,
+    None,
+    0,
+    0,
+)
+"""Stands for a cloud that could not be fused."""
 NO_GEOREFERENCE = (
     "no georeference: coordinates are metres east, north and up of the scan's own origin"
 )
@@ -55,34 +72,80 @@ def write_deliverables(
         voxel_m: size of the fused voxels; by default ``scan.resolution_m`` of the scan's own
             configuration, else the ground sample distance.
 
-    Raises OutsideError when the folder cannot be written.
+    A file that cannot be made is named under ``failed``, with the reason, and logged; the others
+    are written. Raises OutsideError, at the end, when the folder cannot be written.
     """
     header = store.header
+    failures = Failures(folder)
     frame = local_frame(header)
     poses = latest(store.poses())
-    fused = fused_cloud(store, voxel_m or _resolution_m(header))
-    raster = surface(fused)
+    fused, raster, coverage = NOTHING, None, None
+    with failures.noted(CLOUD):
+        fused = fused_cloud(store, voxel_m or _resolution_m(header))
+        with writing(folder / CLOUD) as part:
+            write_laz(part, fused.cloud, frame, header.started_unix_ns)
+    with failures.noted(TUM), writing(folder / TUM) as part:
+        part.write_text(tum_lines(poses), encoding="ascii")
+    with failures.noted(CSV), writing(folder / CSV) as part:
+        part.write_text(csv_table(poses), encoding="utf-8")
+    with failures.noted(PREVIEW):
+        raster = surface(fused)
     run = (store.summary or {}) | extra
     summary = _summary(header, frame, poses, fused, raster, run, store.finished)
-    with writing(folder / CLOUD) as part:
-        write_laz(part, fused.cloud, frame, header.started_unix_ns)
-    with writing(folder / TUM) as part:
-        part.write_text(tum_lines(poses), encoding="ascii")
-    with writing(folder / CSV) as part:
-        part.write_text(csv_table(poses), encoding="utf-8")
-    coverage = write_coverage_files(folder, store)
+    with failures.noted(COVERAGE):
+        coverage = write_coverage_files(folder, store)
     summary["coverage"] = None if coverage is None else coverage.figures()
     summary["refinement"] = store.refinement
-    preview = _preview(raster, poses, summary)
-    with writing(folder / PREVIEW) as part:
-        part.write_bytes(preview)
-    with writing(folder / REPORT) as part:
+    preview = b""
+    with failures.noted(PREVIEW):
+        preview = _preview(raster, poses, summary)
+        with writing(folder / PREVIEW) as part:
+            part.write_bytes(preview)
+    with failures.noted(REPORT), writing(folder / REPORT) as part:
         shown = _stages(folder, store)
         page = report_html(summary, poses, fused.cloud, raster, preview, coverage, shown)
         part.write_text(page, encoding="utf-8")
+    summary["failed"], summary["files_due"] = failures.why, failures.of_the_disk is not None
     with writing(folder / SUMMARY) as part:
         part.write_text(json.dumps(summary, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+    if failures.of_the_disk is not None:
+        raise failures.of_the_disk
     return summary
+
+
+class Failures:
+    """The files of a scan that could not be made, and why. Each costs itself only."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.why: dict[str, str] = {}
+        self.of_the_disk: OutsideError | None = None  # the first; worth another attempt
+
+    @contextmanager
+    def noted(self, name: str) -> Iterator[None]:
+        """A part of the work that makes the file ``name``; what it raises is noted."""
+        try:
+            yield
+        except Exception as error:  # whatever a stranger's scan holds, it must not stop the rest
+            if isinstance(error, OutsideError) and self.of_the_disk is None:
+                self.of_the_disk = error
+            first, *_ = str(error).strip().splitlines() or [""]
+            known = isinstance(error, SkyreliefError)
+            why = first if known else f"{type(error).__name__}: {first}"
+            self.why.setdefault(name, why[:LONGEST_REASON])
+            log.error("%s is not written: %s", self._folder / name, why, exc_info=not known)
+
+
+def files_due(folder: Path) -> bool:
+    """Whether the files of a finished scan are yet to be written, or to be tried again.
+
+    scan.json is the last of them; it says when the disk took another one not.
+    """
+    try:
+        document = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return True
+    return not isinstance(document, dict) or document.get("files_due") is True
 
 
 def _stages(folder: Path, store: ScanStore) -> bytes | None:

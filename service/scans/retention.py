@@ -25,7 +25,7 @@ def close_open_scans(folder: Path, ours: Container[str]) -> list[str]:
     power cut may have set back. What the scans hold is kept and their files are written, with
     ``interrupted`` in the summary. One that cannot be read is left as it is, with a warning.
     """
-    from service.scans.folder import SUMMARY, write_deliverables
+    from service.scans.folder import files_due, write_deliverables
     from service.stream.store import ScanStore
 
     closed = []
@@ -34,7 +34,7 @@ def close_open_scans(folder: Path, ours: Container[str]) -> list[str]:
             continue
         try:
             with ScanStore.open(path) as store:
-                if store.finished and (path.parent / SUMMARY).is_file():  # its last file
+                if store.finished and not files_due(path.parent):
                     continue
                 shutil.rmtree(path.parent / PAGES, ignore_errors=True)
                 if not store.finished:

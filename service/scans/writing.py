@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from service.errors import OutsideError
@@ -28,4 +28,5 @@ def writing(path: Path) -> Iterator[Path]:
             f"cannot write {path} ({error.strerror or error}); check the disk and its rights"
         ) from error
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):  # the disk that cannot be written cannot be tidied either
+            part.unlink(missing_ok=True)
