@@ -105,10 +105,10 @@ class Autopilots:
         expected = self.remembered in (None, system)
         return expected or now_ns - self._first_ns >= self._wait_ns
 
-    def count(self, system: int) -> None:
-        """Count a message of a system."""
+    def count(self, system: int, component: int) -> None:
+        """Count a message; only those of autopilots speak for a vehicle."""
         known = self._heard.get(system)
-        if known is not None:
+        if known is not None and known.component == component:
             known.messages += 1
 
     def answered(self, system: int, component: int, round_trip_ns: int) -> None:

@@ -129,7 +129,7 @@ class Companion:
         """Take in one packet that arrived on a link at ``now_ns`` (monotonic)."""
         self._now_ns = max(self._now_ns, now_ns)
         self.counts["packets"] += 1
-        self.presence.count(packet.system)
+        self.presence.count(packet.system, packet.component)
         if packet.message_id == COMMAND_CANCEL:
             self._cancel(packet, now_ns)
             return

@@ -115,7 +115,7 @@ class LinkProbe:
         message = self._decoder.message(packet)
         if message is None:
             return
-        self._presence.count(packet.system)
+        self._presence.count(packet.system, packet.component)
         self._watch.hear(packet, message, now_ns)
         if packet.message_id == HEARTBEAT:
             self._presence.hear(message, now_ns)

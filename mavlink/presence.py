@@ -162,10 +162,10 @@ class Presence:
             elif system == self.system and component in TYPES:
                 self._hear_namesake(component, message.custom_mode)
 
-    def count(self, system: int) -> None:
-        """Count a message of a system."""
+    def count(self, system: int, component: int) -> None:
+        """Count a message of someone."""
         with self._lock:
-            self._autopilots.count(system)
+            self._autopilots.count(system, component)
 
     def answered(self, system: int, component: int, round_trip_ns: int) -> None:
         """Take in someone's answer to one of our TIMESYNC questions."""

@@ -13,8 +13,9 @@ from autopilot import beat, packed
 from mavlink.framing import Decoder, Framer, Packet
 from mavlink.wire import dialect
 
-CAMERA_INFORMATION, LOAD_STATUS = 259, 390
-DROPPED = {LOAD_STATUS}  # messages that this firmware does not know
+CAMERA_INFORMATION, LOAD_STATUS, METADATA = 259, 390, 397
+ARDUPILOT_DROPS = frozenset({LOAD_STATUS, METADATA})
+"""Messages whose checksum ArduPilot 4.6 cannot verify."""
 UNSUPPORTED, ACCEPTED = 3, 0
 NAK, NOT_FOUND = 129, 10
 
@@ -25,8 +26,9 @@ class ForwardingAutopilot:
     What is meant for another component goes to the companion alone, broadcasts as well.
     """
 
-    def __init__(self, inner: int, outer: int) -> None:
+    def __init__(self, inner: int, outer: int, drops: frozenset[int] = ARDUPILOT_DROPS) -> None:
         """``inner``: the UDP port that the companion sends to; ``outer``: the ground station's."""
+        self._drops = drops
         self.asked: list[Any] = []  # what came for the autopilot itself
         self.camera: Any = None  # its CAMERA_INFORMATION
         self._inside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -87,7 +89,7 @@ class ForwardingAutopilot:
             self._companion = peer
             if packet.message_id == CAMERA_INFORMATION:
                 self.camera = self._decoder.message(packet)
-            if packet.message_id not in DROPPED:
+            if packet.message_id not in self._drops:
                 self._to_ground(packet.data)
 
     def _from_ground(self) -> None:

@@ -159,3 +159,14 @@ def test_a_system_that_is_given_is_never_left() -> None:
     net.wait(20.0)
     assert net.presence.system == 12 and net.presence.autopilot is None
     assert net.presence.others(net.now_ns) == [2]
+
+
+def test_answers_of_strangers_count_for_nobody() -> None:
+    """A system without an autopilot, or another component, may answer TIMESYNC as well."""
+    net = Net(Vehicle(2, chatter=3), Vehicle(7, chatter=3))
+    for _ in range(100):
+        net.wait(0.1)
+        for source in ((99, 1), (2, 191)):
+            for ts1 in list(net.companion.autopilot.timesync._asked):
+                net.feed(dialect.MAVLink_timesync_message(5 * S, ts1), source)
+    assert net.presence.autopilot is None  # 2 and 7 are still alike

@@ -95,6 +95,9 @@ def test_a_private_port_is_reported() -> None:
     net.wait(65)
     assert net.troubles() == ["ground station"] and net.state() is Health.NOT_READY
     assert "SERIALn_OPTIONS must not hold 1024" in net.said()
+    net.feed(dialect.MAVLink_timesync_message(0, 1), GCS)  # no order
+    assert "1024" in net.companion.watch.troubles(net.now_ns)[0].text
+    assert "answers" not in net.companion.watch.troubles(net.now_ns)[0].text
     order = dialect.MAVLink_command_long_message(1, 191, 512, 0, 390, 0, 0, 0, 0, 0, 0)
     net.feed(order, GCS)
     assert "answers stay here" in net.companion.watch.troubles(net.now_ns)[0].text

@@ -168,7 +168,7 @@ def test_mavsdk_downloads_the_definition_and_sets_settings(
         assert daemon.link.parameter("SR_BASELINE_M") == 2.5
 
 
-def test_behind_an_autopilot_mavsdk_reads_settings_and_metadata(
+def test_behind_an_autopilot_mavsdk_reads_the_settings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The autopilot repeats what our camera says as its own; the files are still ours."""
@@ -176,10 +176,6 @@ def test_behind_an_autopilot_mavsdk_reads_settings_and_metadata(
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     from mavsdk.plugins.camera.camera import Camera
-    from mavsdk.plugins.component_metadata.component_metadata import (  # type: ignore[import-untyped]
-        ComponentMetadata,
-        MetadataType,
-    )
 
     inner, outer = free_port(), free_port()
     ground = Ground(outer)
@@ -188,8 +184,7 @@ def test_behind_an_autopilot_mavsdk_reads_settings_and_metadata(
         ForwardingAutopilot(inner, outer) as autopilot,
         RehearsalVehicle(f"udpout:127.0.0.1:{inner}") as daemon,
     ):
-        system = ground.find()
-        camera = ground.use(Camera(system))
+        camera = ground.use(Camera(ground.find()))
         until(lambda: autopilot.camera is not None)
         until(lambda: 100 in [c.component_id for c in camera.camera_list().cameras])
 
@@ -201,7 +196,27 @@ def test_behind_an_autopilot_mavsdk_reads_settings_and_metadata(
         until(lambda: settings() == set(daemon.link.parameters()))  # they come one by one
         copy = autopilot.camera.cam_definition_uri
         assert copy == "mftp://[;comp=100]camera.xml"  # for whoever asks the autopilot
-        metadata = ground.use(ComponentMetadata(system))
+
+
+def test_behind_a_router_that_knows_it_mavsdk_reads_the_metadata(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("mavsdk")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    from mavsdk.plugins.component_metadata.component_metadata import (  # type: ignore[import-untyped]
+        ComponentMetadata,
+        MetadataType,
+    )
+
+    inner, outer = free_port(), free_port()
+    ground = Ground(outer)
+    with (
+        contextlib.closing(ground),
+        ForwardingAutopilot(inner, outer, drops=frozenset()),
+        RehearsalVehicle(f"udpout:127.0.0.1:{inner}") as daemon,
+    ):
+        metadata = ground.use(ComponentMetadata(ground.find()))
         metadata.request_component(191)
 
         def described() -> Any:
