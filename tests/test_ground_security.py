@@ -20,7 +20,7 @@ from service.errors import InputError, OutsideError
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream.fleet import access_control, load_fleet
-from service.stream.keys import make_keys, tls_files
+from service.stream.keys import make_keys, revoke, tls_files
 from service.stream.link import DatalinkSender
 from service.stream.records import ScanHeader
 from service.stream.session import SessionConfig, open_session
@@ -208,6 +208,83 @@ def test_rights_name_every_member_and_deny_the_rest(fleet: Path) -> None:
     assert rights["default_permission"] == "deny"
     names = {name for subject in rights["subjects"] for name in subject["cert_common_names"]}
     assert {"drone.red", "drone.blue", "ground.base", "viewer.eye"} <= names
+
+
+def test_a_revoked_drone_has_no_rights_and_its_successor_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet, stolen = tmp_path / "fleet", tmp_path / "stolen"
+    make_keys(fleet, {"drone": ["red", "blue"], "ground": ["base"]})
+    shutil.copytree(fleet / "drone" / "red", stolen / "drone" / "red")
+    assert revoke(fleet, "red") == [fleet / "ground" / "base" / "fleet.json"]
+    assert not (fleet / "drone" / "red").exists()
+    assert make_keys(fleet, {"drone": ["red"]}) == [fleet / "drone" / "red"]
+    (tmp_path / "old").mkdir()
+    with served(fleet, tmp_path, monkeypatch) as (receiver, endpoint), contextlib.ExitStack() as up:
+        old = sender(stolen, tmp_path / "old", "drone/red", "red", endpoint)
+        up.callback(old.close)
+        assert not old.drain(3.0) and receiver.progress() == []
+        for name in ("red", "blue"):
+            link = sender(fleet, tmp_path, f"drone/{name}", name, endpoint)
+            up.callback(link.close)
+            assert link.drain(15.0)
+        assert sorted(e["drone"] for e in receiver.progress()) == ["blue", "red"]
+
+
+def test_a_revoked_viewer_sees_nothing_and_its_successor_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet, stolen = tmp_path / "fleet", tmp_path / "stolen"
+    make_keys(fleet, {"drone": ["red"], "ground": ["base"], "viewer": ["eye"]})
+    shutil.copytree(fleet / "viewer" / "eye", stolen)
+    revoke(fleet, "eye")
+    make_keys(fleet, {"viewer": ["eye"]})
+    seen: list[str] = []
+    with served(fleet, tmp_path, monkeypatch) as (_, endpoint), contextlib.ExitStack() as up:
+        for who, home in (("old", stolen), ("new", fleet / "viewer" / "eye")):
+            session = up.enter_context(open_session(session_config(home, connect=(endpoint,))))
+            session.declare_subscriber("skyrelief/**", lambda _, who=who: seen.append(who))
+        link = sender(fleet, tmp_path, "drone/red", "red", endpoint)
+        up.callback(link.close)
+        assert link.drain(15.0)
+
+        def told() -> bool:
+            link._post(link._outbox.tell)
+            return "new" in seen
+
+        until(told)
+        assert "old" not in seen
+
+
+def test_a_revoked_ground_station_cannot_serve_and_the_others_have_new_keys(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet, stolen = tmp_path / "fleet", tmp_path / "stolen"
+    make_keys(fleet, {"drone": ["red"], "ground": ["base", "van"]})
+    shutil.copytree(fleet / "ground" / "van", stolen)
+    again = revoke(fleet, "ground.van")
+    assert set(again) == {fleet / "drone" / "red", fleet / "ground" / "base"}
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        false_endpoint = f"tls/127.0.0.1:{probe.getsockname()[1]}"
+    home = fleet / "drone" / "red"
+    impostor = open_session(session_config(stolen, mode="router", listen=(false_endpoint,)))
+    with impostor, pytest.raises(OutsideError):
+        open_session(session_config(home, connect=(false_endpoint,)))
+    with served(fleet, tmp_path, monkeypatch) as (_, endpoint), contextlib.ExitStack() as up:
+        link = sender(fleet, tmp_path, "drone/red", "red", endpoint)
+        up.callback(link.close)
+        assert link.drain(15.0)
+
+
+def test_revoking_nobody_or_several_is_said_in_one_line(tmp_path: Path) -> None:
+    make_keys(tmp_path, {"drone": ["red"], "ground": ["base"], "viewer": ["red"]})
+    with pytest.raises(InputError, match="nobody in this fleet is called 'green'"):
+        revoke(tmp_path, "green")
+    with pytest.raises(InputError, match=r"give drone.red or viewer.red"):
+        revoke(tmp_path, "red")
+    revoke(tmp_path, "viewer.red")
+    assert load_fleet(tmp_path / "fleet.json").members["drone"] == ("red",)
 
 
 def test_bad_names_and_missing_files_are_said_in_one_line(tmp_path: Path) -> None:

@@ -17,14 +17,32 @@ ROLES = ("drone", "ground", "viewer")
 
 @dataclass(frozen=True, slots=True)
 class Fleet:
-    """The members of a fleet by role."""
+    """The members of a fleet by role, and how many certificates of each subject are revoked."""
 
     members: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    revoked: dict[str, int] = field(default_factory=dict)  # by "<role>.<name>"
 
     def with_members(self, role: str, names: Sequence[str]) -> Fleet:
         """The fleet with more members of a role."""
         merged = tuple(sorted({*self.members.get(role, ()), *names}))
-        return Fleet({**self.members, role: merged})
+        return Fleet({**self.members, role: merged}, self.revoked)
+
+    def without(self, role: str, name: str) -> Fleet:
+        """The fleet without a member, whose certificate never has rights again."""
+        subject = f"{role}.{name}"
+        rest = tuple(other for other in self.members[role] if other != name)
+        revoked = {**self.revoked, subject: self.revoked.get(subject, 0) + 1}
+        return Fleet({**self.members, role: rest}, revoked)
+
+    def common_name(self, role: str, name: str) -> str:
+        """The common name of the only valid certificate of a member.
+
+        ``<role>.<name>``, and after a revocation ``<role>.<name>~2``, ``~3`` and so on: no name
+        holds a tilde, so an old certificate never matches again.
+        """
+        subject = f"{role}.{name}"
+        count = self.revoked.get(subject, 0)
+        return f"{subject}~{count + 1}" if count else subject
 
 
 def load_fleet(path: Path) -> Fleet:
@@ -32,19 +50,21 @@ def load_fleet(path: Path) -> Fleet:
     try:
         raw = json.loads(path.read_text(encoding="utf-8"))
         members = {role: tuple(map(str, raw[role])) for role in ROLES if role in raw}
-    except (OSError, ValueError, TypeError, KeyError) as error:
+        revoked = {str(key): int(count) for key, count in raw.get("revoked", {}).items()}
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise InputError(f"{path} names no fleet; make it with 'skyrelief keys'") from error
     for names in members.values():
         for name in names:
             check_name(name, "fleet member")
-    return Fleet(members)
+    return Fleet(members, revoked)
 
 
 def access_control(fleet: Fleet) -> dict[str, Any]:
     """Zenoh's access control for a ground station's router.
 
     A drone reaches only what lies under its own key. A viewer only reads. A ground station
-    reads, asks and reports. Whoever is not of the fleet may do nothing.
+    reads, asks and reports. Whoever is not of the fleet, or no longer, may do nothing: Zenoh
+    checks no revocation lists, so a revoked certificate still connects but has no rights.
     """
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
@@ -52,7 +72,8 @@ def access_control(fleet: Fleet) -> dict[str, Any]:
 
     def grant(role: str, name: str, *rights: tuple[str, Sequence[str], str]) -> None:
         subject = f"{role}.{name}"
-        subjects.append({"id": subject, "cert_common_names": [subject]})
+        names = [fleet.common_name(role, name)]
+        subjects.append({"id": subject, "cert_common_names": names})
         ids = []
         for k, (flow, messages, key) in enumerate(rights):
             ids.append(f"{subject}.{k}")

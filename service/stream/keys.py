@@ -2,7 +2,9 @@
 
 A certificate's common name is ``<role>.<name>``. Only ground stations may be called (server
 use), so a drone's stolen key cannot pose as a ground station. ``fleet.json`` in a ground
-station's folder names the members (:mod:`service.stream.fleet`).
+station's folder names the members (:mod:`service.stream.fleet`), and so takes the rights of a
+revoked drone or viewer. A drone trusts every ground station of its authority, so a ground
+station is revoked by a new authority.
 """
 
 from __future__ import annotations
@@ -69,28 +71,79 @@ def make_keys(
     )
     try:
         authority = _authority(folder / "authority", start)
+        path = folder / FLEET
+        fleet = load_fleet(path) if path.exists() else Fleet()
         made = []
         for role, names in members.items():
+            fleet = fleet.with_members(role, names)
             for name in names:
-                home = folder / role / name
+                home, common_name = folder / role / name, fleet.common_name(role, name)
                 if not (home / KEY).exists():
-                    _member(home, f"{role}.{name}", role == "ground", authority, start, days)
+                    _member(home, common_name, role == "ground", authority, start, days)
                     made.append(home)
-        _write_fleet(folder, members)
+        _write_fleet(folder, fleet)
     except OSError as error:
         raise InputError(f"cannot write keys in {folder}: {error.strerror}") from error
     return made
 
 
-def _write_fleet(folder: Path, members: Mapping[str, Sequence[str]]) -> None:
-    path = folder / FLEET
-    fleet = load_fleet(path) if path.exists() else Fleet()
-    for role, names in members.items():
-        fleet = fleet.with_members(role, names)
-    text = json.dumps(fleet.members, indent=2) + "\n"
-    for home in (folder, *(folder / "ground" / name for name in fleet.members.get("ground", ()))):
-        if home.is_dir():
-            (home / FLEET).write_text(text, encoding="utf-8")
+def revoke(folder: Path, member: str, days: int = 365, now: float | None = None) -> list[Path]:
+    """Revoke the certificate of ``member`` (a name, or ``<role>.<name>``); what to copy again.
+
+    A drone or viewer loses its rights with the ``fleet.json`` of every ground station. With a
+    ground station the authority ends: all other members get new keys under a new one. What was
+    valid is kept under ``folder/revoked``. Raises InputError for nobody's name.
+    """
+    fleet = load_fleet(folder / FLEET)
+    role, name = _named(fleet, member)
+    try:
+        rest = fleet.without(role, name)
+        if role != "ground":
+            stations = _write_fleet(folder, rest)
+            _put_away(folder, folder / role / name)
+            return stations
+        for other in (folder / r / n for r, names in fleet.members.items() for n in names):
+            _put_away(folder, other)
+        _put_away(folder, folder / "authority")
+        _write_fleet(folder, rest)
+    except OSError as error:
+        raise InputError(f"cannot write keys in {folder}: {error.strerror}") from error
+    return make_keys(folder, rest.members, days, now)
+
+
+def _named(fleet: Fleet, member: str) -> tuple[str, str]:
+    """Role and name of the one member called ``member``."""
+    everybody = [(role, name) for role, names in fleet.members.items() for name in names]
+    found = [both for both in everybody if member in (both[1], ".".join(both))]
+    if not found:
+        raise InputError(f"nobody in this fleet is called {member!r}")
+    if len(found) > 1:
+        names = " or ".join(".".join(both) for both in found)
+        raise InputError(f"{member!r} is the name of several: give {names}")
+    return found[0]
+
+
+def _put_away(folder: Path, home: Path) -> None:
+    """Move the keys of a member or the authority to ``folder/revoked``."""
+    if not home.is_dir():
+        return
+    kept = folder / "revoked"
+    kept.mkdir(mode=0o700, exist_ok=True)
+    stem = home.name if home.parent == folder else f"{home.parent.name}.{home.name}"
+    number = sum(1 for path in kept.iterdir() if path.name.startswith(f"{stem}~")) + 1
+    home.rename(kept / f"{stem}~{number}")
+
+
+def _write_fleet(folder: Path, fleet: Fleet) -> list[Path]:
+    """Write ``fleet.json`` for the folder and every ground station; the ground stations'."""
+    text = json.dumps({**fleet.members, "revoked": fleet.revoked}, indent=2) + "\n"
+    stations = [folder / "ground" / name for name in fleet.members.get("ground", ())]
+    told = [home / FLEET for home in stations if home.is_dir()]
+    for path in (folder / FLEET, *told):
+        part = path.with_suffix(".part")
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    return told
 
 
 def _authority(
