@@ -45,6 +45,7 @@ class Autopilot:
 
     system: int
     component: int
+    firmware: int = 0  # MAV_AUTOPILOT
     seen_ns: int = 0
     is_armed: bool = False
     messages: int = 0
@@ -80,7 +81,9 @@ class Autopilots:
             return self.followed.system
         return self.given or self.remembered or 1
 
-    def hear(self, system: int, component: int, is_armed: bool, now_ns: int) -> None:
+    def hear(
+        self, system: int, component: int, is_armed: bool, now_ns: int, firmware: int = 0
+    ) -> None:
         """Take in an autopilot's heartbeat; component 1 goes before others of its system."""
         known = self._heard.get(system)
         if known is None or (known.component != component and component == AUTOPILOT1):
@@ -90,7 +93,7 @@ class Autopilots:
             known = fresh
         elif known.component != component:
             return
-        known.seen_ns, known.is_armed = now_ns, is_armed
+        known.seen_ns, known.is_armed, known.firmware = now_ns, is_armed, firmware
         if self._first_ns is None:
             self._first_ns, self._look_ns = now_ns, now_ns + LOOK_NS
         if self.followed is None and self._may_follow(system, now_ns):

@@ -1,7 +1,8 @@
 """What is missing on the links although they are open, each with the setting to change.
 
 ArduPilot does not forward a ground station's heartbeats to a port whose traffic stays private, so
-a ground station that is never heard is the sign that it does not hear us either.
+a ground station that is never heard is the sign that it does not hear us either. PX4 decides for
+each direction alone; there the sign is that no ground station ever asks our camera anything.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from mavlink.first_beat import TYPES
 from mavlink.framing import MAGIC_V1, Packet
 from mavlink.presence import Presence
 from mavlink.wire import numbers_of
@@ -17,7 +19,22 @@ from mavlink.wire import numbers_of
 S = 1_000_000_000
 TYPE_GCS = 6
 GIMBAL = numbers_of(("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS"))
-ORDERS = numbers_of(("COMMAND_LONG", "COMMAND_INT", "PARAM_SET", "PARAM_EXT_SET"))
+TO_ONE = numbers_of(
+    (
+        "COMMAND_LONG",
+        "COMMAND_INT",
+        "FILE_TRANSFER_PROTOCOL",
+        "PARAM_REQUEST_LIST",
+        "PARAM_REQUEST_READ",
+        "PARAM_SET",
+        "PARAM_EXT_REQUEST_LIST",
+        "PARAM_EXT_REQUEST_READ",
+        "PARAM_EXT_SET",
+    )
+)
+"""Messages that name the component they are for."""
+ASK_WAIT_S = 60.0
+PX4 = 12  # MAV_AUTOPILOT
 
 SILENT = (
     "No autopilot heard: check mavlink.links, SERIALn_PROTOCOL and SERIALn_BAUD (PX4: MAV_n_CONFIG)"
@@ -32,6 +49,9 @@ NO_GROUND = (
 UNANSWERED = (
     "Commands come, but our answers stay here: remove 1024 from SERIALn_OPTIONS"
     " (PX4: set MAV_n_FORWARD = 1)"
+)
+NEVER_ASKED = (
+    "A ground station is heard but never asks our camera: set MAV_n_FORWARD = 1 for this port"
 )
 
 
@@ -61,8 +81,9 @@ class LinkWatch:
         self._config, self._presence = config, presence
         self._first_autopilot_ns: int | None = None
         self._modern_ns = self._old_ns = self._gimbal_ns = -(1 << 62)  # never
-        self._start_ns = self._ground_ns = self._order_ns = now_ns
-        self._is_ground_heard = self._is_ordered = False
+        self._start_ns = self._ground_ns = now_ns
+        self._asked_ns: int | None = None  # a ground station named one of our components
+        self._is_ground_heard = False
         self._announced: frozenset[str] = frozenset()
 
     def hear(self, packet: Packet, message: Any, now_ns: int) -> None:
@@ -79,8 +100,9 @@ class LinkWatch:
             self._gimbal_ns = now_ns
         elif packet.message_id == 0 and message.type == TYPE_GCS:
             self._is_ground_heard, self._ground_ns = True, now_ns
-        elif packet.message_id in ORDERS and packet.system != system:
-            self._is_ordered, self._order_ns = True, now_ns
+        elif packet.message_id in TO_ONE and packet.system != system:
+            is_ours = message.target_component in TYPES
+            self._asked_ns = now_ns if is_ours else self._asked_ns
 
     def troubles(self, now_ns: int) -> tuple[Trouble, ...]:
         """What is missing now, the gravest first."""
@@ -118,12 +140,15 @@ class LinkWatch:
         return Trouble("gimbal", NO_GIMBAL, is_grave=bool(self._config.gimbal))
 
     def _ground(self, now_ns: int) -> Trouble | None:
-        wait_s = self._config.ground_wait_s
-        if not self._is_stale(self._ground_ns, wait_s, now_ns):
-            return None
-        is_ordered = self._is_ordered and not self._is_stale(self._order_ns, wait_s, now_ns)
-        text = UNANSWERED if is_ordered and not self._is_ground_heard else NO_GROUND
-        return Trouble("ground station", text)
+        wait_s, asked_ns = self._config.ground_wait_s, self._asked_ns
+        if self._is_stale(self._ground_ns, wait_s, now_ns):
+            is_asked = asked_ns is not None and not self._is_stale(asked_ns, wait_s, now_ns)
+            text = UNANSWERED if is_asked and not self._is_ground_heard else NO_GROUND
+            return Trouble("ground station", text)
+        is_late = self._is_stale(self._start_ns, ASK_WAIT_S, now_ns)
+        if asked_ns is None and is_late and self._presence.firmware == PX4:
+            return Trouble("ground station", NEVER_ASKED, is_grave=False)
+        return None
 
     def news(self, now_ns: int, is_start: bool) -> Sequence[str]:
         """Texts for the operator: each trouble when it begins, and all when a scan starts."""

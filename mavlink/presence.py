@@ -90,6 +90,12 @@ class Presence:
         return None if followed is None else (followed.system, followed.component)
 
     @property
+    def firmware(self) -> int | None:
+        """MAV_AUTOPILOT of our autopilot; None before it was heard."""
+        followed = self._autopilots.followed
+        return None if followed is None else followed.firmware
+
+    @property
     def autopilot_seen_ns(self) -> int | None:
         """When the autopilot's heartbeat was heard last."""
         followed = self._autopilots.followed
@@ -158,7 +164,7 @@ class Presence:
         with self._lock:
             if is_autopilot(component, message):
                 armed = bool(message.base_mode & ARMED)
-                self._autopilots.hear(system, component, armed, now_ns)
+                self._autopilots.hear(system, component, armed, now_ns, message.autopilot)
             elif system == self.system and component in TYPES:
                 self._hear_namesake(component, message.custom_mode)
 

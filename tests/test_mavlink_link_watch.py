@@ -106,6 +106,21 @@ def test_a_private_port_is_reported() -> None:
     assert net.troubles() == [] and net.state() is Health.STANDBY
 
 
+@pytest.mark.parametrize(("firmware", "troubles"), [(12, ["ground station"]), (3, [])])
+def test_a_port_of_px4_that_forwards_in_one_direction_is_reported(
+    firmware: int, troubles: list[str]
+) -> None:
+    net = Watched(Vehicle(1, 0.002, firmware=firmware))
+    net.wait(65)
+    assert net.troubles() == troubles and net.state() is Health.STANDBY
+    assert ("MAV_n_FORWARD = 1 for this port" in net.said()) is bool(troubles)
+    elsewhere = dialect.MAVLink_command_long_message(1, 1, 512, 0, 259, 0, 0, 0, 0, 0, 0)
+    net.feed(elsewhere, GCS)
+    assert net.troubles() == troubles
+    net.feed(dialect.MAVLink_command_long_message(1, 100, 512, 0, 259, 0, 0, 0, 0, 0, 0), GCS)
+    assert net.troubles() == []
+
+
 @pytest.mark.parametrize(
     ("wanted", "troubles", "state"),
     [

@@ -23,10 +23,14 @@ class Vehicle:
     """An autopilot elsewhere: what it says every tick, and how soon it answers TIMESYNC."""
 
     def __init__(
-        self, system: int, round_trip_s: float | None = None, chatter: int = 0, armed: bool = False
+        self,
+        system: int,
+        round_trip_s: float | None = None,
+        chatter: int = 0,
+        firmware: int = ARDUPILOT,
     ) -> None:
         self.system, self.round_trip_s, self.chatter = system, round_trip_s, chatter
-        self.armed, self.is_on = armed, True
+        self.firmware, self.is_on = firmware, True
 
 
 class Net:
@@ -83,7 +87,7 @@ class Net:
         if not vehicle.is_on:
             return
         if step % 10 == 0:
-            self.beat((vehicle.system, 1), armed=vehicle.armed)
+            self.beat((vehicle.system, 1), autopilot=vehicle.firmware)
         for _ in range(vehicle.chatter):
             message = dialect.MAVLink_attitude_message(step * 100, 0.0, 0.0, 0.0, 0, 0, 0)
             self.feed(message, (vehicle.system, 1))
