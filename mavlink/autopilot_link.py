@@ -14,11 +14,11 @@ from mavlink.clock import BootClock
 from mavlink.decode import decode
 from mavlink.framing import Packet
 from mavlink.history import VehicleHistory
-from mavlink.messages import ONBOARD, Outbox
+from mavlink.messages import ONBOARD, Address, Outbox
 from mavlink.presence import Presence
 from mavlink.rates import RateKeeper
 from mavlink.samples import OF_AUTOPILOT
-from mavlink.timesync import TimesyncFilter
+from mavlink.timesync import EVERYONE, TimesyncFilter
 from mavlink.wall_time import WallTime
 from mavlink.wire import dialect
 
@@ -37,6 +37,7 @@ class AutopilotLink:
         wanted_hz: Mapping[str, float],
         say: Callable[[int, str], None],
     ) -> None:
+        self.link: int | None = None  # on which the autopilot was heard last
         self.samples = 0  # taken into the history
         self.timesync, self.wall_time = TimesyncFilter(), WallTime()
         self._presence, self._history, self._outbox, self._say = presence, history, outbox, say
@@ -117,7 +118,7 @@ class AutopilotLink:
         """Ask for the time and for messages that come too slowly; report a loss."""
         autopilot, seen = self._presence.autopilot, self._presence.autopilot_seen_ns
         if autopilot is None or seen is None:
-            if self._presence.others(now_ns):  # the answers say which vehicle is ours
+            if self._presence.others(now_ns):
                 self._ask_time(now_ns)
             return
         is_lost = now_ns - seen > LOST_NS
@@ -134,9 +135,14 @@ class AutopilotLink:
         self._ask_time(now_ns)
 
     def _ask_time(self, now_ns: int) -> None:
-        request = self.timesync.request(now_ns)
+        """Ask our autopilot; or every one, where the answers say which vehicle is ours."""
+        target, link = EVERYONE, None
+        autopilot = self._presence.autopilot
+        if autopilot is not None and not self._presence.others(now_ns):
+            target, link = Address(*autopilot), self.link
+        request = self.timesync.request(now_ns, target)
         if request is not None:
-            self._outbox.put(ONBOARD, request)
+            self._outbox.put(ONBOARD, request, link)
 
     def next_timers(self, now_ns: int) -> list[int]:
         """When :meth:`tick` has something to do, in ns."""

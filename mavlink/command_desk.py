@@ -3,8 +3,9 @@
 The rules are those of the MAVLink command service: an answer at once, IN_PROGRESS while
 bounded work runs and a final answer after it, TEMPORARILY_REJECTED for the same command while
 one runs, UNSUPPORTED for what is not known. Clients do not count their retransmissions
-reliably, so a repetition is known by its content: the last command carried out by a component
-is answered again, not carried out again, when it comes again within its window.
+reliably, so a repetition is known by its content: the last command carried out
+is answered again, not carried out again, when it comes again within its window. A stop is
+carried out every time, also while other work of the same command runs.
 """
 
 from __future__ import annotations
@@ -16,12 +17,14 @@ from typing import Any, Protocol
 
 from mavlink.control import Answer, Handled, Result, Work
 from mavlink.messages import Address, Outbox
+from mavlink.status import INFO, WARNING
 from mavlink.wire import dialect
 
 INT_UNSET = 0x7FFFFFFF
 PROGRESS_EVERY_NS = 500_000_000
 WORK_LIMIT_NS = 180_000_000_000
 S = 1_000_000_000
+BUSY = Answer(Result.TEMPORARILY_REJECTED, "busy")
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,14 +109,16 @@ class CommandDesk:
         commands: Mapping[int, Command],
         outbox: Outbox,
         host: Any,
-        tell: Callable[[str], None],
+        say: Callable[[int, str], None],
+        is_stop: Callable[[Call], bool],
     ) -> None:
-        self._commands = commands
+        """``say`` gets the severity and text of answers."""
+        self._commands, self._is_stop = commands, is_stop
         self._outbox = outbox
         self._host = host
-        self._tell = tell
+        self._say = say
         self._running: dict[tuple[int, int], _Running] = {}  # (component, number)
-        self._last: dict[int, _Done] = {}  # component to what it did last
+        self._last: _Done | None = None  # of either component: they act on one scan
 
     def receive(self, call: Call, components: tuple[int, ...], now_ns: int) -> None:
         """Carry out a call for one of our components (which the caller has checked)."""
@@ -131,20 +136,20 @@ class CommandDesk:
         self._carry_out(component, command, call, now_ns)
 
     def _carry_out(self, component: int, command: Command, call: Call, now_ns: int) -> None:
-        key = _key(call)
+        key = (component, *_key(call))
         running = self._running.get((component, call.number))
-        if running is not None:
-            if running.key == key:
-                self._progress(component, call, running.work)
-            else:
-                self._answer(component, call, Answer(Result.TEMPORARILY_REJECTED, "busy"))
+        is_stop = self._is_stop(call)
+        if running is not None and not is_stop:
+            self._answer_while(running, component, call, key)
             return
-        done = self._last.get(component)
-        if command.WINDOW_S and done is not None and done.key == key and now_ns < done.until_ns:
-            self._answer(component, call, Answer(done.answer.result))
+        last = self._last
+        if last is not None and not is_stop and last.key == key and now_ns < last.until_ns:
+            self._answer(component, call, Answer(last.answer.result))
             return
         handled = command.handle(call, self._host)
-        if handled is None:
+        if running is not None and isinstance(handled, Work):
+            self._answer_while(running, component, call, key)
+        elif handled is None:
             if not call.is_broadcast:
                 self._answer(component, call, Answer(Result.DENIED))
         elif isinstance(handled, Work):
@@ -154,18 +159,27 @@ class CommandDesk:
             self._start(component, running, now_ns)
         else:
             self._answer(component, call, handled)
-            self._remember(component, key, handled, now_ns, int(command.WINDOW_S * S))
+            self._remember(key, handled, now_ns, int(command.WINDOW_S * S))
+
+    def _answer_while(
+        self, running: _Running, component: int, call: Call, key: tuple[object, ...]
+    ) -> None:
+        """Answer by how the work of this command goes; the end of only one can be reported."""
+        if running.key == key:
+            self._progress(component, call, running.work)
+        else:
+            self._answer(component, call, BUSY)
 
     def _remember(
-        self, component: int, key: tuple[object, ...], answer: Answer, now_ns: int, window_ns: int
+        self, key: tuple[object, ...], answer: Answer, now_ns: int, window_ns: int
     ) -> None:
         """A question leaves no trace, so that it does not hide what was done before it."""
         if window_ns:
-            self._last[component] = _Done(key, answer, now_ns + window_ns)
+            self._last = _Done(key, answer, now_ns + window_ns)
 
     def _start(self, component: int, running: _Running, now_ns: int) -> None:
         call, work = running.call, running.work
-        self._last.pop(component, None)
+        self._last = None
         self._running[(component, call.number)] = running
         if work.answer is None:
             self._progress(component, call, work)
@@ -191,7 +205,7 @@ class CommandDesk:
                 if running.work.cancelled and answer.result is Result.ACCEPTED:
                     answer = Answer(Result.CANCELLED)
                 self._answer(component, running.call, answer)
-                self._remember(component, running.key, answer, now_ns, running.window_ns)
+                self._remember(running.key, answer, now_ns, running.window_ns)
             elif now_ns >= running.next_report_ns:
                 running.next_report_ns = now_ns + PROGRESS_EVERY_NS
                 self._progress(component, running.call, running.work)
@@ -207,7 +221,7 @@ class CommandDesk:
     def _answer(self, component: int, call: Call, answer: Answer) -> None:
         self._ack(component, call, answer.result, 255)
         if answer.text:
-            self._tell(answer.text)
+            self._say(INFO if answer.result is Result.ACCEPTED else WARNING, answer.text)
 
     def _ack(self, component: int, call: Call, result: Result, progress: int) -> None:
         message = dialect.MAVLink_command_ack_message(

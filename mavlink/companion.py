@@ -17,6 +17,7 @@ from mavlink.camera import CAPTURE_STATUS, CameraComponent, CameraConfig, Keyfra
 from mavlink.camera_definition import FILE, URI, camera_definition, definition_version
 from mavlink.command_desk import CommandDesk, decode_call
 from mavlink.commands import load_commands
+from mavlink.commands.stop_scan import is_stop
 from mavlink.component_metadata import NUMBER as METADATA
 from mavlink.component_metadata import ComponentMetadata
 from mavlink.control import Answer, Result, ScanControl
@@ -117,7 +118,7 @@ class Companion:
             self._boot_ms,
             lambda: self._now_ns,
         )
-        self.desk = CommandDesk(load_commands(), self._outbox, self, self._warn)
+        self.desk = CommandDesk(load_commands(), self._outbox, self, self._answer, is_stop)
         self.streams.add(ONBOARD, LOAD_STATUS, round(config.load_every_s * 1e6), self._send_load)
         self.streams.add(ONBOARD, MOTION, round(config.motion_every_s * 1e6), self._send_motion)
         self.watch = LinkWatch(config.watch, presence, now_ns)
@@ -144,6 +145,8 @@ class Companion:
         if packet.message_id == HEARTBEAT:
             self.presence.hear(message, now_ns)
             self.autopilot.follow()
+            if (packet.system, packet.component) == self.presence.autopilot:
+                self.autopilot.link = link
         elif name in READERS:
             self.autopilot.hear_telemetry(name, message, packet, now_ns)
         elif name.startswith("COMMAND_"):
@@ -190,7 +193,7 @@ class Companion:
             return
         answer = (self._extended if extended else self.parameters).receive(message)
         if isinstance(answer, Answer) and answer.text:
-            self._warn(answer.text)
+            self._answer(texts.WARNING, answer.text)
 
     def _hear_file_request(self, message: Any, link: int) -> None:
         target = Address(message.target_system, message.target_component)
@@ -253,12 +256,12 @@ class Companion:
         ]
         return min([*times, *self.autopilot.next_timers(self._now_ns), self._now_ns + S])
 
-    def say(self, severity: int, text: str) -> None:
-        """Tell the operator."""
-        self.texts.say(severity, text, self._now_ns)
+    def say(self, severity: int, text: str, is_answer: bool = False) -> None:
+        """Send a text to the operator; one that answers a command is never held back."""
+        self.texts.say(severity, text, self._now_ns, is_answer)
 
-    def _warn(self, text: str) -> None:
-        self.say(texts.WARNING, text)
+    def _answer(self, severity: int, text: str) -> None:
+        self.say(severity, text, is_answer=True)
 
     def report(self, keyframe: KeyframeReport) -> int:
         """Tell of a keyframe; its index comes back."""

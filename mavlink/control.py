@@ -22,7 +22,7 @@ class Result(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A command's final result; the text tells the operator why it was not accepted."""
+    """A command's final result; the text is for the operator and always sent."""
 
     result: Result = Result.ACCEPTED
     text: str = ""
@@ -84,6 +84,7 @@ class Phase(Enum):
     """What the scan is doing."""
 
     IDLE = "idle"
+    WAITING = "waiting"  # a scan is wanted and not running: it is tried again soon
     SCANNING = "scanning"
     PAUSED = "paused"
     FINALISING = "finalising"
@@ -114,8 +115,8 @@ class ScanStatus:
 
     @property
     def is_recording(self) -> bool:
-        """True from start to stop, pauses included."""
-        return self.phase in (Phase.SCANNING, Phase.PAUSED)
+        """True from start to stop, pauses and retries included."""
+        return self.phase in (Phase.WAITING, Phase.SCANNING, Phase.PAUSED)
 
 
 class ScanControl(Protocol):
@@ -125,10 +126,10 @@ class ScanControl(Protocol):
         """A snapshot."""
 
     def start_scan(self) -> Handled:
-        """Start a scan; asked only while none runs, though the last may still be being closed."""
+        """Start a scan, end a pause, or try again at once; a second start changes nothing."""
 
     def stop_scan(self) -> Handled:
-        """Close the running scan."""
+        """Want no scan: close the running one and drop every retry; always possible."""
 
     def capture_keyframe(self) -> Handled:
         """Make the next frame a keyframe and report it."""
@@ -143,7 +144,7 @@ class ScanControl(Protocol):
         """Forget the map of the running scan."""
 
     def finalise(self) -> Handled:
-        """Close the scan and write everything out."""
+        """Stop as :meth:`stop_scan` does, and answer when everything is written out."""
 
     def self_test(self) -> Handled:
         """Check camera, link, disk and compute."""

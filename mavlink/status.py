@@ -15,6 +15,7 @@ S = 1_000_000_000
 TEXT = 50  # bytes in one STATUSTEXT
 LONGEST = 200
 AGAIN_NS = 30 * S  # the same text is not said again within this time
+MAX_SAID = 100  # texts that are remembered; answers take at most half of the room
 SPACING_NS = S
 BURST = 3  # texts that may go out at once after a quiet time
 
@@ -22,7 +23,7 @@ EMERGENCY, ALERT, CRITICAL, ERROR, WARNING, NOTICE, INFO, DEBUG = range(8)
 
 
 class StatusTexts:
-    """Texts to the operator: at most one a second, the same one only now and then."""
+    """Texts to the operator: at most one a second, and no text again and again."""
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
@@ -32,12 +33,15 @@ class StatusTexts:
         self._last_ns: int | None = None
         self._next_id = 1
 
-    def say(self, severity: int, text: str, now_ns: int) -> None:
-        """Queue a text; it is dropped when it was said a moment ago."""
+    def say(self, severity: int, text: str, now_ns: int, is_answer: bool = False) -> None:
+        """Queue a text. It is dropped when it was sent within 30 s, unless it answers a command."""
         self._said = {t: at for t, at in self._said.items() if now_ns - at < AGAIN_NS}
-        if not text or text in self._said or len(self._said) > 100:
+        if not text or (severity, text) in self._waiting:
             return
-        self._said[text] = now_ns
+        if not is_answer and (text in self._said or len(self._said) >= MAX_SAID):
+            return
+        if len(self._said) < MAX_SAID // (2 if is_answer else 1):
+            self._said[text] = now_ns
         self._waiting.append((severity, text))
         self.tick(now_ns)
 

@@ -9,8 +9,11 @@ a slow radio still synchronises.
 
 from __future__ import annotations
 
+import struct
 from collections import deque
+from typing import Any
 
+from mavlink.messages import Address
 from mavlink.wire import dialect
 
 MS = 1_000_000
@@ -24,6 +27,26 @@ OUTLIERS_TO_RESET = 5
 GAIN_FIRST, GAIN_LAST = 0.05, 0.003
 CONVERGED_AT = 500
 USABLE_AT = 10
+EVERYONE = Address(0, 0)
+
+
+class TimesyncRequest(dialect.MAVLink_timesync_message):  # type: ignore[misc]
+    """A question to one component, so that routers need not pass it on to others.
+
+    Its target stands in common.xml, but not in pymavlink's dialect.
+    """
+
+    def __init__(self, ts1: int, target: Address) -> None:
+        super().__init__(0, ts1)
+        self.target = target
+
+    def pack(self, mav: Any, force_mavlink1: bool = False) -> bytes:
+        """The packet; pymavlink calls this."""
+        times = self.unpacker.pack(self.tc1, self.ts1)
+        target = struct.pack("<BB", self.target.system, self.target.component)
+        payload = times if force_mavlink1 else times + target
+        packet: bytes = self._pack(mav, self.crc_extra, payload, force_mavlink1)
+        return packet
 
 
 class TimesyncFilter:
@@ -62,7 +85,7 @@ class TimesyncFilter:
         self._sent.clear()
         self.resets += 1
 
-    def request(self, now_ns: int) -> object | None:
+    def request(self, now_ns: int, target: Address = EVERYONE) -> object | None:
         """The TIMESYNC to send now; None when it is not time."""
         if now_ns < self._next_ns:
             return None
@@ -70,8 +93,7 @@ class TimesyncFilter:
         self._next_ns = now_ns + (FAST_REQUEST_NS if quick else REQUEST_EVERY_NS)
         self._sent.append(now_ns)
         self._asked.append(now_ns)
-        message: object = dialect.MAVLink_timesync_message(0, now_ns)
-        return message
+        return TimesyncRequest(now_ns, target)
 
     def next_timer(self) -> int:
         """When the next request is due, in ns."""

@@ -180,9 +180,9 @@ class VehicleLink:
         """The companion's load, for the operator."""
         self._companion.load = load
 
-    def statustext(self, text: str, severity: int = texts.INFO) -> None:
-        """Tell the operator; repetitions and floods are held back."""
-        self._served(lambda: self._companion.say(severity, text))
+    def statustext(self, text: str, severity: int = texts.INFO, is_answer: bool = False) -> None:
+        """Send a text to the operator; repetitions are held back, except of answers."""
+        self._served(lambda: self._companion.say(severity, text, is_answer))
 
     def report_keyframe(self, keyframe: KeyframeReport) -> None:
         """Tell ground stations of a keyframe."""

@@ -56,6 +56,7 @@ class PosePrior:
     above_m: float | None = None  # altitude by the GNSS receiver alone less position_m's
     above_fixes: int = 0  # whose mean that is
     above_ns: int = 0  # time of the newest of them
+    is_at_rest: bool = False  # the vehicle stands on the ground: its position repeats rightly
 
 
 @dataclass(frozen=True, slots=True, eq=False)

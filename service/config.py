@@ -92,6 +92,11 @@ class ScanConfig:
     folder: str = key("/var/lib/skyrelief/scans", "each scan becomes a folder in here")
     drone: str = key("", "name of this aircraft in scans and on the datalink; empty: host name")
     start: Literal["on-command", "on-boot", "on-arm"] = key("on-command", "when a scan starts")
+    close_after_landing_s: float = key(
+        60.0,
+        "a scan by command that is not stopped is closed so long after disarming; 0: never",
+        live=True,
+    )
     baseline: float | str = key(
         "auto", "auto: by altitude; or metres; or 'n/m', frames as in the paper: '2/10'", live=True
     )
@@ -110,6 +115,7 @@ class ScanConfig:
     def __post_init__(self) -> None:
         """Check ranges and the notation of the baseline."""
         _within("scan.base_to_height", self.base_to_height, 0.005, 1.0)
+        _within("scan.close_after_landing_s", self.close_after_landing_s, 0, 86_400)
         _within("scan.keep_free_mib", self.keep_free_mib, 0, 1e9)
         if self.resolution_m != 0.0:
             _within("scan.resolution_m", self.resolution_m, 0.01, 100)

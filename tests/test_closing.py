@@ -18,6 +18,7 @@ from service.daemon import runtime
 from service.daemon.closing import ClosingWatch, sizes
 from service.daemon.memory import KEPT_EACH, fill_small_caches, give_back, one_pool
 from service.daemon.runtime import Daemon
+from service.daemon.scan_run import ScanRun
 from service.daemon.scanning import Scanning
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
@@ -57,16 +58,17 @@ class Hung:
         self.store = ScanStore.create(folder / "s" / "scan.db", header)
         self.scanning, self.step, self.end = scanning, threading.Event(), threading.Event()
 
-    def scan_once(self) -> None:
-        scanning: Any = self.scanning
-        scanning.scan = SimpleNamespace(
+    def carry_out(self, given: ScanRun) -> None:
+        run: Any = given
+        run._thread_id = threading.get_ident()
+        run.scan = SimpleNamespace(
             source=SimpleNamespace(close=lambda: None),
             inputs=SimpleNamespace(folder=self.store.path.parent, scan_id="s"),
             recorder=SimpleNamespace(keyframes=3),
         )
-        scanning._store = self.store
-        scanning._stop.wait(60.0)
-        scanning.phase = Phase.FINALISING
+        run._store = self.store
+        run.stop.wait(60.0)
+        run.is_closing = True
         self.step.wait(60.0)
         self.store.seqs()
         self.end.wait(60.0)
@@ -80,13 +82,13 @@ def test_a_closing_that_hangs_is_no_progress(
     monkeypatch.setattr(type(daemon.vehicle), "is_serving", True)
     scanning._watch = ClosingWatch(lambda: now_s)
     hung = Hung(scanning, tmp_path)
-    monkeypatch.setattr(scanning, "_scan_once", hung.scan_once)
+    monkeypatch.setattr(ScanRun, "carry_out", lambda run: hung.carry_out(run))
     limit_s = runtime.CLOSING_S + daemon.config.datalink.drain_s
     scanning.start()
     now_s = 10.0 * limit_s
     assert daemon.is_progressing  # scanning, not closing
     scanning.stop()
-    until(lambda: scanning.phase is Phase.FINALISING)
+    until(lambda: scanning._run is not None and scanning._run.is_closing)
     assert daemon.is_progressing
     now_s += 0.9 * limit_s
     assert daemon.is_progressing
@@ -110,7 +112,7 @@ def test_systemd_is_asked_to_wait_only_while_closing_gets_on(
     scanning, now_s, asked = daemon.scanning, 0.0, []
     scanning._watch = ClosingWatch(lambda: now_s)
     hung = Hung(scanning, tmp_path)
-    monkeypatch.setattr(scanning, "_scan_once", hung.scan_once)
+    monkeypatch.setattr(ScanRun, "carry_out", lambda run: hung.carry_out(run))
     scanning.start()
     until(lambda: scanning.scan is not None)
 
@@ -133,8 +135,8 @@ def test_an_arming_while_the_last_scan_is_closed_is_followed_then(
     given = [f"scan.folder={tmp_path}", "scan.start=on-arm", "health.http="]
     daemon, told = Daemon(load_config(None, given)), []
     scanning, hung = daemon.scanning, Hung(daemon.scanning, tmp_path)
-    monkeypatch.setattr(scanning, "_scan_once", hung.scan_once)
-    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, _: told.append(text))
+    monkeypatch.setattr(ScanRun, "carry_out", lambda run: hung.carry_out(run))
+    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_: told.append(text))
     daemon.actions.is_ready = True
     armed, was = False, False
 
@@ -154,19 +156,19 @@ def test_an_arming_while_the_last_scan_is_closed_is_followed_then(
     assert not look(False)  # and off again
     hung.step.set()
     assert look(True)
-    scanning.retry()
+    scanning.follow_intent()
     assert scanning.is_closing  # waits
     hung.end.set()
     until(lambda: not scanning.is_running)
     hung.end.clear()
-    scanning.retry()
+    scanning.follow_intent()
     until(lambda: scanning.is_running and scanning.phase is Phase.SCANNING)
     daemon.actions.stop_scan()  # by command, in the air
     assert look(True)
     hung.end.set()
     until(lambda: not scanning.is_running)
     assert look(True)
-    scanning.retry()
+    scanning.follow_intent()
     assert not scanning.is_running  # the operator's stop holds until the next take-off
     hung.store.close()
 

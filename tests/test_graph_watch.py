@@ -61,6 +61,14 @@ def test_a_jump_of_the_receiver_is_told() -> None:
     assert any(text.startswith("8 positions") for text in watch.sentences())
 
 
+def test_a_position_that_repeats_on_the_ground_is_no_news() -> None:
+    priors = [prior(T) for T in track(40)]
+    place = priors[19].position_m
+    priors[20:] = [replace(p, position_m=place, is_at_rest=True) for p in priors[20:]]
+    heard, watch = told(priors)
+    assert not any("frozen" in text for text in [*heard, *watch.sentences()])
+
+
 def test_a_frozen_receiver_is_told() -> None:
     priors = [prior(T) for T in track(40)]
     priors[20:] = [replace(p, position_m=priors[19].position_m) for p in priors[20:]]

@@ -166,9 +166,64 @@ def test_start_and_stop(ends: Ends, as_int: bool) -> None:
     assert status.video_status == 0
 
 
+STOPS = [(2501, 100, ()), (200, 100, (0, 0, 0, 0)), (31010, 191, (8,)), (31010, 191, (5,))]
+
+
+@pytest.mark.parametrize(("number", "component", "params"), STOPS)
+@pytest.mark.parametrize("phase", list(Phase))
+def test_every_stop_reaches_the_service_whatever_it_does(
+    ends: Ends, phase: Phase, number: int, component: int, params: tuple[float, ...]
+) -> None:
+    ends.command(2000, 100, 0, 1.0, 0)  # a series of keyframes
+    ends.control.state, ends.control.asked = replace(ends.control.state, phase=phase), []
+    assert ends.command(number, component, *params) == [ACCEPTED]
+    assert ends.control.asked == ["finalise" if params == (5,) else "stop_scan"]
+    assert ends.control.state.phase is Phase.IDLE
+    ends.pass_time(5.0)
+    assert len(ends.control.asked) == 1  # the series ends, too
+
+
+@pytest.mark.parametrize(("number", "component", "params"), STOPS)
+def test_a_stop_repeated_at_once_stops_what_started_meanwhile(
+    ends: Ends, number: int, component: int, params: tuple[float, ...]
+) -> None:
+    ends.command(number, component, *params)
+    ends.control.asked.clear()
+    ends.control.start_scan()  # by arming
+    assert ends.command(number, component, *params) == [ACCEPTED]
+    assert ends.control.asked == ["start_scan", "finalise" if params == (5,) else "stop_scan"]
+
+
+@pytest.mark.parametrize("stop", STOPS)
+def test_a_start_after_a_stop_by_another_component_starts(
+    ends: Ends, stop: tuple[int, int, tuple[float, ...]]
+) -> None:
+    number, component, params = stop
+    ends.command(2500, 100)
+    ends.command(number, component, *params)
+    ends.command(2500, 100)
+    assert ends.control.asked.count("start_scan") == 2
+
+
+def test_a_stop_does_not_wait_for_other_work(ends: Ends) -> None:
+    ends.control.works["finalise"] = Work()
+    assert ends.command(31010, 191, 5) == [RUNNING]
+    assert ends.command(2500, 100) == [ACCEPTED]  # the next scan
+    assert ends.command(31010, 191, 8) == [ACCEPTED]
+    assert ends.control.asked == ["finalise", "start_scan", "stop_scan"]
+
+
+def test_a_start_ends_a_pause_and_goes_before_the_next_attempt(ends: Ends) -> None:
+    for phase in (Phase.PAUSED, Phase.WAITING):
+        ends.pass_time(5.0)
+        ends.control.state = replace(ends.control.state, phase=phase)
+        assert ends.command(2500, 100) == [ACCEPTED]
+        assert ends.control.state.phase is Phase.SCANNING
+
+
 def test_starting_twice_is_one_start_and_stop_without_start_is_fine(ends: Ends) -> None:
     assert ends.command(2501, 100) == [ACCEPTED]
-    assert ends.control.asked == []
+    ends.control.asked.clear()
     assert ends.command(2500, 100) == [ACCEPTED]
     ends.pass_time(5.0)
     assert ends.command(2500, 100) == [ACCEPTED]
@@ -411,7 +466,7 @@ def test_work_reports_progress_and_ends(ends: Ends) -> None:
     acks = [m for m in ends.pass_time(0.1) if m.get_type() == "COMMAND_ACK"]
     assert [m.result for m in acks] == [ACCEPTED]
     assert ends.command(31010, 191, 5) == [ACCEPTED]  # the end was not heard: said again
-    assert ends.control.asked == ["finalise"]
+    assert ends.control.asked == ["finalise"] * 3  # a stop is carried out every time
     assert "COMMAND_ACK" not in kinds(ends.pass_time(5.0))
 
 
@@ -620,6 +675,28 @@ def test_texts_are_spaced_and_not_repeated(ends: Ends) -> None:
     ends.companion.say(4, "text 1")
     ends.pass_time(1.0)
     assert len(ours()) == 6 and heard is not None
+
+
+def test_an_answer_is_sent_however_often_it_was_sent_before(ends: Ends) -> None:
+    ends.control.answers["capture_keyframe"] = Answer(Result.TEMPORARILY_REJECTED, "start first")
+    ends.companion.say(4, "start first")
+    for k in range(5):
+        ends.pass_time(2.0)
+        assert ends.texts().count("start first") == k + 1
+        assert ends.command(2000, 100, 0, 0, 1, k + 1) == [BUSY]
+    ends.companion.say(4, "start first")  # no answer: held back
+    ends.pass_time(10.0)
+    assert ends.texts().count("start first") == 6
+
+
+def test_a_flood_of_answers_neither_grows_nor_silences_the_rest(ends: Ends) -> None:
+    for k in range(1000):
+        ends.companion.say(4, f"answer {k}", is_answer=True)
+    assert len(ends.companion.texts._said) <= 100
+    ends.pass_time(25.0)
+    ends.companion.say(2, "camera gone")
+    ends.pass_time(2.0)
+    assert "camera gone" in ends.texts()
 
 
 def test_a_long_text_comes_in_chunks(ends: Ends) -> None:

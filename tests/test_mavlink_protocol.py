@@ -17,7 +17,7 @@ from mavlink.companion import Companion, CompanionConfig
 from mavlink.control import Answer, Result
 from mavlink.framing import Framer
 from mavlink.history import VehicleHistory
-from mavlink.messages import Outgoing
+from mavlink.messages import Address, Outgoing
 from mavlink.packer import Packer
 from mavlink.parameters import Parameter
 from mavlink.presence import Health, Presence, PresenceConfig
@@ -44,9 +44,9 @@ class Station:
         self.framer = Framer()
         self.sent: list[Outgoing] = []
 
-    def feed(self, data: bytes) -> None:
+    def feed(self, data: bytes, link: int = 0) -> None:
         for packet in self.framer.feed(data):
-            self.companion.receive(0, packet, self.now_ns)
+            self.companion.receive(link, packet, self.now_ns)
 
     def wait(self, seconds: float) -> list[Outgoing]:
         self.now_ns += round(seconds * S)
@@ -312,6 +312,27 @@ def test_timesync_takes_only_answers_to_its_own_questions() -> None:
     assert not sync.answer(0, request.ts1, 5 * S)
     assert not sync.answer(1_000, request.ts1, 5 * S + 10 * S)  # far too late
     assert not sync.answer(1_000, request.ts1, 5 * S)  # answered before
+
+
+def test_timesync_asks_the_autopilot_alone_and_on_its_link() -> None:
+    """Bytes 16 and 17 of the payload are target system and component (common.xml)."""
+    station = Station()
+
+    def asked() -> list[tuple[int | None, bytes]]:
+        out = [o for o in station.wait(1.5) if o.message.get_type() == "TIMESYNC"]
+        return [(o.link, packed(o.message)[26:-2]) for o in out]
+
+    station.feed(packed(beat()), link=1)
+    assert set(asked()) == {(1, b"\x01\x01")}
+    station.feed(packed(beat(), (7, 1)), link=0)  # which of the two is ours?
+    assert set(asked()) == {(None, b"")}
+
+
+def test_a_targeted_question_is_read_by_pymavlink() -> None:
+    request: Any = TimesyncFilter().request(5 * S, Address(1, 1))
+    (heard,) = dialect.MAVLink(None).parse_buffer(packed(request, (1, 191)))
+    assert (heard.get_type(), heard.tc1, heard.ts1) == ("TIMESYNC", 0, 5 * S)
+    assert packed(request)[26:-2] == b"\x01\x01"
 
 
 def test_timesync_starts_over_after_five_contradictions() -> None:

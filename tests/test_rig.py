@@ -57,6 +57,19 @@ def test_the_gimbal_counts_before_the_body_unless_the_mount_is_fixed() -> None:
     assert fixed.R_world_camera is not None and abs(fixed.R_world_camera[0, 2]) > 0.05
 
 
+@pytest.mark.parametrize(
+    ("speed_m_s", "agl_m", "at_rest"),
+    [(0.0, 0.1, True), (0.02, 1.5, True), (0.0, 60.0, False), (5.0, 0.1, False)],
+)
+def test_only_a_vehicle_on_the_ground_is_at_rest(
+    speed_m_s: float, agl_m: float, at_rest: bool
+) -> None:
+    velocity = np.array([speed_m_s, 0.0, 0.0])
+    state = VehicleState(0, lat_deg=47.0, lon_deg=8.0, alt_agl_m=agl_m, v_ned_m_s=velocity)
+    assert rig().prior(state, None).is_at_rest is at_rest
+    assert not rig().prior(VehicleState(0, alt_agl_m=agl_m), None).is_at_rest  # not known
+
+
 def test_the_first_position_is_the_origin() -> None:
     some = rig()
     state = VehicleState(0, lat_deg=47.0, lon_deg=8.0, alt_amsl_m=500.0, sigma_h_m=1.0)

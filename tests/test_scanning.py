@@ -17,7 +17,7 @@ from service.cameras.camera_file import load_camera
 from service.config import load_config
 from service.daemon import resumption
 from service.daemon.runtime import Daemon
-from service.daemon.scanning import Scanning
+from service.daemon.scan_run import ScanRun
 
 MODEL = Path(__file__).parent.parent / "demo/caliterra/camera.yaml"
 
@@ -34,8 +34,8 @@ def test_pictures_that_the_camera_model_does_not_fit_are_refused(
     source: Any = SimpleNamespace(
         size_px=(320, 240), description="gimbal", start_monotonic_ns=0, close=closed.set
     )
-    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_: told.append(text))
-    monkeypatch.setattr(scanning, "_open_camera", lambda: source)
+    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_, **__: told.append(text))
+    monkeypatch.setattr(ScanRun, "_open_camera", lambda _: source)
     scanning.camera, scanning._backend = load_camera(MODEL), CpuBackend()
     scanning.start()
     until(lambda: told and not scanning.is_running)
@@ -51,7 +51,7 @@ def test_a_scan_that_was_stopped_counts_as_closing_at_once(
 ) -> None:
     """A camera that hangs holds its scan for seconds: a start then waits, and is not swallowed."""
     end = threading.Event()
-    monkeypatch.setattr(Scanning, "_scan_once", lambda self: end.wait(60.0))
+    monkeypatch.setattr(ScanRun, "carry_out", lambda _: end.wait(60.0))
     daemon.scanning.start()
     assert daemon.actions.status().phase is Phase.SCANNING
     daemon.actions.stop_scan()
@@ -65,22 +65,23 @@ def test_a_camera_that_fails_is_told(daemon: Daemon, monkeypatch: pytest.MonkeyP
     scanning: Any = daemon.scanning
     monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, _: told.append(text))
     daemon._tell_of_camera()
-    scanning.gate, scanning._news_told, scanning.phase = gate, 1, Phase.SCANNING
+    run: Any = ScanRun(scanning, is_asked=True)
+    run.gate, run._news_told, scanning._run = gate, 1, run
     gate.warnings.append("the picture is frozen since 8 s")
     for silent_s in (0.0, 9.0, 11.0, 300.0):
-        scanning.progress_s = time.monotonic() - silent_s
+        run.progress_s = time.monotonic() - silent_s
         daemon._tell_of_camera()
         daemon._tell_of_camera()
-    scanning.progress_s = time.monotonic()
+    run.progress_s = time.monotonic()
     daemon._tell_of_camera()
     assert told == [
         "Camera: the picture is frozen since 8 s",
         "No picture for 10 s: nothing is scanned",
         "Pictures again",
     ]
-    scanning.progress_s = time.monotonic() - 60.0
+    run.progress_s = time.monotonic() - 60.0
     daemon._tell_of_camera()
-    scanning.phase = Phase.IDLE  # stopped meanwhile
+    scanning._run = None  # stopped meanwhile
     daemon._tell_of_camera()
     assert told[3:] == ["No picture for 10 s: nothing is scanned"]
 
@@ -107,11 +108,11 @@ def test_a_scan_by_command_goes_on_after_a_fall(
         (tmp_path / "scans" / resumption.MARK).write_text(boot)
     begun, end = threading.Event(), threading.Event()
 
-    def scan(self: Scanning) -> None:
+    def scan(_: ScanRun) -> None:
         begun.set()
         end.wait(60.0)
 
-    monkeypatch.setattr(Scanning, "_scan_once", scan)
+    monkeypatch.setattr(ScanRun, "carry_out", scan)
     daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}/scans", "health.http="]))
     presence = type(daemon.vehicle.presence)
     monkeypatch.setattr(presence, "is_armed", property(lambda _: armed))
@@ -142,7 +143,7 @@ def test_only_a_scan_that_nobody_ended_goes_on(
         return daemon.scanning.resumption.left
 
     end = threading.Event()
-    monkeypatch.setattr(Scanning, "_scan_once", lambda self: end.wait(60.0))
+    monkeypatch.setattr(ScanRun, "carry_out", lambda _: end.wait(60.0))
     killed = next_life()
     killed.scanning.start()
     assert left(next_life()) is resumption.Left.BY_SERVICE
@@ -165,11 +166,11 @@ def test_only_a_scan_that_nobody_ended_goes_on(
 def test_a_scan_is_started_once(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
     begun, end = [], threading.Event()
 
-    def scan(self: Scanning) -> None:
+    def scan(_: ScanRun) -> None:
         begun.append(threading.get_ident())
         end.wait(60.0)
 
-    monkeypatch.setattr(Scanning, "_scan_once", scan)
+    monkeypatch.setattr(ScanRun, "carry_out", scan)
     callers = [threading.Thread(target=daemon.scanning.start) for _ in range(20)]
     for caller in callers:
         caller.start()

@@ -19,6 +19,7 @@ from recon.types import Camera
 from service.cameras.images import open_images
 from service.config import Config, load_config
 from service.daemon.runtime import Daemon
+from service.daemon.scan_run import ScanRun
 from service.daemon.tuning import TUNABLES, parameters_of, with_parameter
 from service.errors import InputError
 from service.onboard.scan import Scan, ScanInputs, create_store
@@ -185,7 +186,8 @@ def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> N
         assert store.header.configuration["scan"]["resolution_m"] == 0.5
         scan = Scan(inputs, store)
         scanning, link = operator.daemon.scanning, Budget()
-        scanning.scan, scanning.link.flying = scan, link
+        run = scanning._run = ScanRun(scanning, is_asked=True)
+        run.scan, scanning.link.flying = scan, link
         operator.set("SR_LINK_KBIT_S", 64.0)
         assert link.budgets[-1] == (64.0, operator.config.datalink.share)
         operator.set("SR_BASELINE_M", 2.5)
@@ -195,5 +197,5 @@ def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> N
         assert scan.check.exposed_ns(3 * 10**9) == 3 * 10**9 - 70_000_000
         operator.set("SR_YAW_FRAME", 2.0)
         assert operator.daemon.vehicle.history.config.gimbal.yaw_frame == "earth"
-        scanning.scan = scanning.link.flying = None
+        scanning._run = scanning.link.flying = None
         scan.pipeline.finish()

@@ -10,12 +10,12 @@ from threading import Event
 import numpy as np
 import pytest
 
-from mavlink.control import Phase
 from service.cameras import CameraFrame
 from service.compute.side_by_side import SideBySide
 from service.config import load_config
 from service.daemon.frame_gate import FrameGate
 from service.daemon.runtime import COMPILING_S, HUNG_S, Daemon
+from service.daemon.scan_run import ScanRun
 from service.daemon.warm_up import MadeUpGround, is_warm, warm_up
 
 
@@ -86,8 +86,8 @@ def test_the_watchdog_starves_on_a_hang_only(
     daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
     busy_s = 0.0
     monkeypatch.setattr(type(daemon.scanning), "busy_s", property(lambda _: busy_s))
-    daemon.scanning.phase = Phase.SCANNING
-    daemon.scanning.progress_s -= 1000.0  # no frame for long: the camera's fault, not ours
+    run = daemon.scanning._run = ScanRun(daemon.scanning, is_asked=True)
+    run.progress_s -= 1000.0  # no frame for long: the camera's fault, not ours
     assert daemon.is_progressing
     daemon.scanning.is_warm = False
     busy_s = HUNG_S + 1.0

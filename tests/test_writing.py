@@ -46,7 +46,7 @@ class Landing:
 
     def write(self) -> None:
         self.writings.write(
-            self.store.path.parent, self.store, self.in_haste, self._land, self._hand_over
+            self.store.path.parent, self.store, self.in_haste.is_set, self._land, self._hand_over
         )
 
     def _land(self) -> None:

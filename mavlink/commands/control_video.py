@@ -24,5 +24,5 @@ def handle(call: Call, host: Companion) -> Handled | None:
     if recording in (1.0, 2.0):
         return start(host)
     if recording == 0.0:
-        return stop(host)
+        return stop(host, host.control.stop_scan)
     return Answer(Result.DENIED, "DO_CONTROL_VIDEO: param 4 must be 0, 1 or 2")

@@ -1,4 +1,4 @@
-"""VIDEO_START_CAPTURE: start a scan. Starting twice is one start."""
+"""VIDEO_START_CAPTURE: start a scan, or end its pause. Starting twice is one start."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def handle(call: Call, host: Companion) -> Handled | None:
 
 
 def start(host: Companion, status_hz: float = 0.0) -> Handled:
-    """Start a scan unless one runs, and send the camera's status at a rate."""
+    """Start a scan unless one takes frames, and send the camera's status at a rate."""
     phase = host.control.status().phase
     host.camera.stream_status(status_hz)
-    handled = ACCEPTED if phase in (Phase.SCANNING, Phase.PAUSED) else host.control.start_scan()
+    handled = ACCEPTED if phase is Phase.SCANNING else host.control.start_scan()
     host.camera.send_capture_status()
     return handled

@@ -38,13 +38,13 @@ def handle(call: Call, host: Companion) -> Handled | None:
     if action == BASELINE:
         return set_baseline(host, call.param(2, 0.0))
     if action == FINALISE:
-        return host.control.finalise()
+        return stop(host, host.control.finalise)
     if action == SELF_TEST:
         return _self_test(host)
     if action == START:
         return start(host)
     if action == STOP:
-        return stop(host)
+        return stop(host, host.control.stop_scan)
     return Answer(Result.DENIED, "unknown action of USER_1; 1 to 8 are known")
 
 

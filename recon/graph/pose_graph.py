@@ -415,7 +415,7 @@ class PoseGraph:
         """The prior without its position when the receiver repeats its last one."""
         if not self._nodes or not is_frozen(prior, self._newest().prior):
             return prior
-        self._kept_counts["position frozen"] += 1
+        self._kept_counts["position at rest" if prior.is_at_rest else "position frozen"] += 1
         return replace(prior, sigma_position_m=None)
 
     # ---- loops ---------------------------------------------------------------------------------

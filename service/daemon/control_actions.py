@@ -10,13 +10,21 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mavlink.control import ACCEPTED, Answer, Handled, Phase, Power, Result, ScanStatus, Work
-from mavlink.status import INFO, NOTICE, WARNING
 from service.daemon.scanning import Scanning
 from service.daemon.tuning import with_parameter
 from service.errors import InputError, OutsideError, SkyreliefError
 
 LEAST_FREE_MIB = 500.0
 """The self-test fails with less than that on the disk."""
+
+
+NO_PHOTO = {
+    Phase.IDLE: "start a scan first",
+    Phase.WAITING: "the scan failed and is tried again",
+    Phase.PAUSED: "the scan is paused, resume it first",
+    Phase.FINALISING: "the scan is being closed",
+}
+"""Why no keyframe can be taken."""
 
 
 class ControlActions:
@@ -34,9 +42,10 @@ class ControlActions:
         scan = scanning.scan
         recorder = scan.recorder if scan is not None else None
         latency = scan.check.latency if scan is not None else None
-        recording = scanning.phase in (Phase.SCANNING, Phase.PAUSED)
+        phase = scanning.phase
+        recording = phase in (Phase.SCANNING, Phase.PAUSED)
         return ScanStatus(
-            phase=Phase.FINALISING if scanning.is_closing else scanning.phase,
+            phase=phase,
             scan_id=scanning.scan_id,
             recording_ms=int(1e3 * (time.monotonic() - scanning.started_s)) if recording else 0,
             storage_total_mib=disk.total / 2**20,
@@ -48,47 +57,40 @@ class ControlActions:
             camera_latency_sigma_ms=latency.sigma_ms if latency is not None else math.nan,
         )
 
-    def start_scan(self) -> Handled:
-        """Start a scan; where the last one is being closed, as soon as that lets it."""
+    def start_scan(self) -> Answer:
+        """Start a scan; where the last one is being closed, as soon as that allows it."""
         if not self.is_ready:
             return Answer(Result.TEMPORARILY_REJECTED, "still starting")
-        if self._scanning.is_closing:
-            self._scanning.start_next()
-            self._scanning.vehicle.statustext("Scanning once the last scan is closed", NOTICE)
-            return ACCEPTED
-        if self._scanning.is_running:
-            return Answer(Result.TEMPORARILY_REJECTED, f"a scan is {self._scanning.phase.value}")
+        is_closing = self._scanning.is_closing
         self._scanning.start()
-        return ACCEPTED
+        return Answer(text="Scanning once the last scan is closed") if is_closing else ACCEPTED
 
-    def stop_scan(self) -> Handled:
-        """Close the running scan; the files are written after the answer."""
+    def stop_scan(self) -> Answer:
+        """Want no scan: close the running one; the files are written after the answer."""
         self._scanning.stop()
         return ACCEPTED
 
     def finalise(self) -> Handled:
-        """Close the scan and answer when everything is written out."""
-        return self._scanning.finalise() if self._scanning.is_running else ACCEPTED
+        """Stop, and answer when everything is written out."""
+        return self._scanning.finalise() or ACCEPTED
 
     def pause(self) -> Handled:
         """Take no frames until :meth:`resume`."""
-        if self._scanning.phase is not Phase.SCANNING:
-            return Answer(Result.DENIED, "no scan is running")
-        self._scanning.pause()
-        return ACCEPTED
+        is_paused = self._scanning.pause()
+        return ACCEPTED if is_paused else Answer(Result.DENIED, "no scan is running")
 
     def resume(self) -> Handled:
-        """Go on after a pause."""
-        if self._scanning.phase is not Phase.PAUSED:
-            return Answer(Result.DENIED, "the scan is not paused")
-        self._scanning.resume()
-        return ACCEPTED
+        """Take frames again after a pause."""
+        is_resumed = self._scanning.resume()
+        return ACCEPTED if is_resumed else Answer(Result.DENIED, "the scan is not paused")
 
     def capture_keyframe(self) -> Handled:
-        """Make the next frame a keyframe; refused while no scan runs."""
-        scan = self._scanning.scan
-        if scan is None or self._scanning.phase is not Phase.SCANNING:
-            return Answer(Result.TEMPORARILY_REJECTED, "start a scan first")
+        """Make the next frame a keyframe; refused while no scan takes frames."""
+        scan, phase = self._scanning.scan, self._scanning.phase
+        if phase is not Phase.SCANNING:
+            return Answer(Result.TEMPORARILY_REJECTED, f"photo refused: {NO_PHOTO[phase]}")
+        if scan is None:
+            return Answer(Result.TEMPORARILY_REJECTED, "photo refused: the camera is being opened")
         scan.pipeline.viewpoints.take_next()
         return ACCEPTED
 
@@ -133,7 +135,7 @@ class ControlActions:
         from service.cameras import open_camera
         from service.cameras.camera_file import check_size
 
-        config, vehicle = self._scanning.config, self._scanning.vehicle
+        config = self._scanning.config
         try:
             source = open_camera(config.camera.source)
             work.report(0.5)
@@ -144,11 +146,9 @@ class ControlActions:
             free_mib = shutil.disk_usage(folder).free / 2**20
             if free_mib < LEAST_FREE_MIB:
                 raise OutsideError(f"{folder} has {free_mib:.0f} MiB left")
-            work.finish(ACCEPTED)
-            vehicle.statustext("Self-test passed", INFO)
+            work.finish(Answer(text="Self-test passed"))
         except SkyreliefError as error:
-            work.finish(Answer(Result.FAILED, str(error)))
-            vehicle.statustext(f"Self-test: {error}", WARNING)
+            work.finish(Answer(Result.FAILED, f"Self-test: {error}"))
 
     def _erase(self, work: Work) -> None:
         found = [p.parent for p in Path(self._scanning.config.scan.folder).glob("*/scan.db")]

@@ -13,7 +13,7 @@ HEALTH: dict[str, Any] = {
         "ok": {"type": "boolean", "description": "false: it needs somebody"},
         "state": {
             **_TEXT,
-            "description": "starting, idle, scanning, paused or finalising",
+            "description": "starting, idle, waiting (to try again), scanning, paused or finalising",
         },
         "fault": {**_TEXT, "description": "why the last scan ended; empty: no reason"},
     },

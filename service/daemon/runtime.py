@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -23,6 +24,7 @@ from service.compute.threading_layer import kernels_may_overlap
 from service.config import Config, reload
 from service.daemon.control_actions import ControlActions
 from service.daemon.health import HealthServer
+from service.daemon.landing import Landing, LandingWatch
 from service.daemon.load_control import LoadControl
 from service.daemon.machine import CoreLoad, computer_load, read_machine
 from service.daemon.memory import give_back
@@ -45,6 +47,9 @@ HUNG_S = 20.0
 CLOSING_S = 120.0
 """Closing a scan without a step, a read or a written byte for so long is a hang, too."""
 
+PROGRESS_S = 1.5
+"""Closing made progress when its last step is not longer ago; looked at every second."""
+
 TIDY_S = 2.0
 """From one look at the machine, its memory and its disk to the next."""
 
@@ -66,6 +71,7 @@ class Daemon:
         self._wanted = config  # as it was asked for last; operators may have tuned it since
         self._quit = threading.Event()
         self._fault = fault
+        self._landing = LandingWatch()
         self._is_silent = False  # no picture comes, and that was said
         self.scanning = Scanning(config)
         self.load_control = LoadControl(self.scanning)
@@ -85,6 +91,8 @@ class Daemon:
         self.vehicle.start()
         http = self._serve_health()
         try:
+            if self.config.scan.start == "on-boot":
+                self.scanning.want()  # a stop that comes before it is ready holds
             self._load(notifier)
             self.actions.is_ready = True
             notifier.ready()
@@ -93,12 +101,10 @@ class Daemon:
                 self._begin(self._recover)
             else:
                 self._recover()
-            if self.config.scan.start == "on-boot":
-                self.actions.start_scan()
             self._watch(notifier)
         finally:
             notifier.stopping()
-            self.scanning.end(notifier.closing)
+            self.scanning.end(lambda: self._wait_for_closing(notifier))
             self.vehicle.stop()
             if http is not None:
                 http.close()
@@ -132,18 +138,31 @@ class Daemon:
             was_armed = self._follow_arming(was_armed)
             self._resume()
             self._tell_of_camera()
-            scanning.retry()
+            self._close_after_landing()
+            scanning.follow_intent()
             if self.is_progressing:
                 notifier.alive(scanning.phase.value)
+
+    def _wait_for_closing(self, notifier: Notifier) -> None:
+        """Say once a second that the last scan is being closed, unless that hangs."""
+        idle_s = self.scanning.idle_closing_s
+        hangs = idle_s > self._max_closing_s
+        self.vehicle.set_health(Health.CRITICAL if hangs else Health.ACTIVE)
+        if idle_s < PROGRESS_S:
+            notifier.closing()
+
+    @property
+    def _max_closing_s(self) -> float:
+        """Seconds without progress after which the closing of a scan counts as hung."""
+        return CLOSING_S + self.config.datalink.drain_s  # a dead radio is waited for
 
     @property
     def is_progressing(self) -> bool:
         """False for a hang that only a restart ends; a camera that gives nothing is none."""
         most_s = HUNG_S if self.scanning.is_warm else COMPILING_S
-        most_closing_s = CLOSING_S + self.config.datalink.drain_s  # a dead radio is waited for
         return (
             self.scanning.busy_s < most_s
-            and self.scanning.idle_closing_s < most_closing_s
+            and self.scanning.idle_closing_s < self._max_closing_s
             and self.vehicle.is_serving
         )
 
@@ -271,5 +290,24 @@ class Daemon:
         """Start and stop a scan with the motors, if so configured; whether they are on."""
         is_armed = self.vehicle.report().is_armed
         if self.config.scan.start == "on-arm" and is_armed != was_armed:
-            (self.actions.start_scan if is_armed else self.actions.stop_scan)()
+            answer = (self.actions.start_scan if is_armed else self.actions.stop_scan)()
+            if answer.text:
+                self.vehicle.statustext(answer.text, NOTICE)
         return is_armed
+
+    def _close_after_landing(self) -> None:
+        """Close a scan by command that outlives its flight: the command to stop may be lost."""
+        scan, presence = self.config.scan, self.vehicle.presence
+        landing = self._landing.look(
+            self.scanning.intent.wants_scan and scan.start == "on-command",
+            presence.is_armed,
+            presence.is_disarmed(time.monotonic_ns()),
+            scan.close_after_landing_s,
+            time.monotonic(),
+        )
+        if landing is Landing.LANDED:
+            text = f"Landed: the scan closes in {scan.close_after_landing_s:g} s unless you arm"
+            self.vehicle.statustext(text, WARNING)
+        elif landing is Landing.CLOSE:
+            self.vehicle.statustext("Landed and not stopped: the scan is closed", WARNING)
+            self.actions.stop_scan()

@@ -98,19 +98,19 @@ class Writings:
             writing.wait(seconds)
 
     def write(
-        self, folder: Path, store: ScanStore, in_haste: threading.Event,
+        self, folder: Path, store: ScanStore, in_haste: Callable[[], bool],
         land: Callable[[], None], hand_over: Callable[[], Work | None],
     ) -> None:  # fmt: skip
         """Write a scan's files, then ``land`` its sender and close its store.
 
-        When another scan comes ``in_haste``, and kernels may run on two threads at once, the
-        files are written beside that one: ``hand_over`` ends the sender, and the work that it
+        While ``in_haste`` says that another scan is wanted, and kernels may run on two threads at
+        once, no scan waits for the files: ``hand_over`` ends the sender, and the work that it
         gives is finished with the files. Raises what writing them raised.
         """
         writing = Writing(folder, store, self._written)
         self._all.append(writing)
         while not writing.wait(0.1):
-            if in_haste.is_set() and kernels_may_overlap() and writing.leave(hand_over):
+            if in_haste() and kernels_may_overlap() and writing.leave(hand_over):
                 return
         self._all.remove(writing)
         land()

@@ -21,6 +21,9 @@ ASSUMED_AGL_M = 50.0
 MOUNT_TILT_SIGMA_RAD = math.radians(6.0)
 """How far a camera may lean from its nominal mount when no attitude is known."""
 
+AT_REST_M_S, ON_GROUND_M = 0.3, 2.0
+"""A vehicle slower and lower than these stands on the ground."""
+
 NO_YAW_RAD = 3.0
 """Sigma of a heading that is not known."""
 
@@ -70,7 +73,8 @@ class Rig:
         agl, sigma_agl = self._agl(state, tag)
         lever = self._lever(state)
         position = None if position is None else position + lever
-        prior = PosePrior(R, tilt, yaw, position, sigma, agl, sigma_agl)
+        at_rest = state is not None and _is_at_rest(state)
+        prior = PosePrior(R, tilt, yaw, position, sigma, agl, sigma_agl, is_at_rest=at_rest)
         if position is not None and state is not None and state.receiver is not None:
             above = state.receiver
             prior = replace(prior, above_m=above.above_m, above_fixes=1, above_ns=above.time_ns)
@@ -149,6 +153,14 @@ class Rig:
         """False when the scan's scale rests on :data:`ASSUMED_AGL_M`."""
         agl, _ = self._agl(state, tag)
         return agl != ASSUMED_AGL_M
+
+
+def _is_at_rest(state: VehicleState) -> bool:
+    """True where telemetry says that the vehicle stands on the ground."""
+    if state.v_ned_m_s is None or state.alt_agl_m is None:
+        return False
+    speed_m_s = float(np.linalg.norm(state.v_ned_m_s))
+    return speed_m_s < AT_REST_M_S and state.alt_agl_m < ON_GROUND_M
 
 
 def attitude_of(T_world_camera: F64) -> tuple[float, float, float]:

@@ -207,7 +207,7 @@ def test_gpu_out_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reco
     given += [f"camera.source=images:{DEMO / 'frames'}?interval_s=0.7", "compute.guide_width=320"]
     daemon = Daemon(load_config(None, [*given, "compute.backend=cpu"]))
     heard: list[str] = []
-    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_: heard.append(text))
+    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_, **__: heard.append(text))
     daemon.scanning.load()
     gpu = OutOfMemory()
     daemon.scanning._backend = FallbackBackend(gpu)

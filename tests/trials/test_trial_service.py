@@ -38,6 +38,7 @@ from trial_rig import (
 from mavlink.control import Phase
 from service.config import load_config
 from service.daemon.runtime import Daemon
+from service.daemon.scan_run import ScanRun
 from service.errors import OutsideError
 from service.stream.store import ScanStore
 
@@ -370,25 +371,24 @@ def test_a_scan_that_fails_is_started_again(
     tried = len(faults)
     scanning = []
 
-    def scan_once() -> None:
+    def carry_out(run: ScanRun) -> None:
         if faults:
             raise faults.pop(0)
         scanning.append(daemon.scanning.phase)
-        daemon.scanning._stop.wait(PATIENCE_S)
+        run.stop.wait(PATIENCE_S)
 
-    monkeypatch.setattr(daemon.scanning, "_scan_once", scan_once)
-    monkeypatch.setattr("service.daemon.scanning.FIRST_RETRY_S", 0.01)
-    daemon.scanning._retry_s = 0.01
+    monkeypatch.setattr(ScanRun, "carry_out", carry_out)
+    monkeypatch.setattr("service.daemon.intent.FIRST_RETRY_S", 0.01)
     daemon.actions.start_scan()
     deadline = time.monotonic() + PATIENCE_S
     while not scanning and time.monotonic() < deadline:
-        daemon.scanning.retry()
+        daemon.scanning.follow_intent()
         time.sleep(0.005)
     assert scanning == [Phase.SCANNING]
     assert daemon.scanning.fault == ""
     daemon.actions.stop_scan()
     daemon.scanning.end()
-    daemon.scanning.retry()
+    daemon.scanning.follow_intent()
     assert daemon.scanning.phase is Phase.IDLE  # stopped by the operator: it stays so
     record("faults of camera, disk and our own code", tried, "scanning again each time")
 
@@ -397,17 +397,17 @@ def test_stopping_ends_the_retries(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
     daemon.actions.is_ready = True
 
-    def scan_once() -> None:
+    def carry_out(run: ScanRun) -> None:
         raise OutsideError("camera gone")
 
-    monkeypatch.setattr(daemon.scanning, "_scan_once", scan_once)
-    daemon.scanning._retry_s = 0.0
+    monkeypatch.setattr(ScanRun, "carry_out", carry_out)
+    monkeypatch.setattr("service.daemon.intent.FIRST_RETRY_S", 0.0)
     daemon.actions.start_scan()
-    assert daemon.scanning._worker is not None
-    daemon.scanning._worker.join()
+    assert daemon.scanning._thread is not None
+    daemon.scanning._thread.join()
     assert daemon.scanning.fault == "camera gone"
-    assert daemon.scanning._retry_at_s is not None
+    assert daemon.scanning.intent.wants_scan  # waits to try again
     daemon.actions.stop_scan()
-    daemon.scanning.retry()
+    daemon.scanning.follow_intent()
     assert daemon.scanning.phase is Phase.IDLE
     assert daemon.scanning.fault == "camera gone"

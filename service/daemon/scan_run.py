@@ -1,0 +1,221 @@
+"""One attempt at a scan: open the camera, scan, close the scan."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mavlink.status import WARNING
+from service.daemon.intent import FIRST_RETRY_S, LAST_RETRY_S
+from service.daemon.scan_reports import odometry_reporter, tell_keyframe
+from service.daemon.scan_time import disagreement, set_since
+from service.errors import OutsideError
+
+if TYPE_CHECKING:
+    from recon.types import Keyframe
+    from service.cameras.source import CameraSource
+    from service.daemon.frame_gate import FrameGate
+    from service.daemon.scanning import Scanning
+    from service.onboard.scan import Scan, ScanInputs
+    from service.stream.store import ScanStore
+
+log = logging.getLogger(__name__)
+
+LATER = "later"
+"""Folder in a scan's for images that are only kept."""
+
+
+class ScanRun:
+    """One attempt at a scan, from opening the camera until its files are written."""
+
+    def __init__(self, host: Scanning, is_asked: bool) -> None:
+        """``is_asked``: a command waits for this attempt, it is no retry."""
+        self.stop = threading.Event()
+        self.scan: Scan | None = None
+        self.gate: FrameGate | None = None
+        self.is_feeding = False  # frames go into the scan
+        self.is_closing = False
+        self.started_s = self.progress_s = time.monotonic()
+        self._host, self._is_asked = host, is_asked
+        self._store: ScanStore | None = None
+        self._thread_id = 0
+        self._news_told = 0  # of the camera's warnings
+
+    @property
+    def is_ending(self) -> bool:
+        """True once it was stopped or the scan is being closed."""
+        return self.stop.is_set() or self.is_closing
+
+    @property
+    def busy_s(self) -> float:
+        """Seconds for which one frame or view has been worked on; 0 while the camera is awaited."""
+        scan, gate = self.scan, self.gate
+        if scan is None or gate is None or not self.is_feeding:
+            return 0.0
+        return max(gate.busy_s, scan.pipeline.busy_s)
+
+    def close_camera(self) -> None:
+        """Wake up a scan that waits for a dead camera."""
+        scan = self.scan
+        if scan is not None:
+            scan.source.close()
+
+    def alive(self) -> None:
+        """Note that a frame was done."""
+        self.progress_s = time.monotonic()
+
+    def camera_news(self) -> list[str]:
+        """Return what has gone wrong with the camera since the last call."""
+        gate = self.gate
+        if gate is None or self.is_ending:
+            return []
+        fresh = gate.warnings[self._news_told :]
+        self._news_told += len(fresh)
+        return fresh
+
+    def closing_marks(self) -> tuple[Any, ...]:
+        """Return what changes when closing makes progress: uses of the store, keyframes."""
+        scan, store = self.scan, self._store
+        if scan is None or store is None:
+            return (self.is_closing,)
+        return (self.is_closing, store.uses(self._thread_id), scan.recorder.keyframes)
+
+    # ---- its thread --------------------------------------------------------------------------
+
+    def carry_out(self) -> None:
+        """Scan until stopped or the recording ends, then close the scan."""
+        self._thread_id = threading.get_ident()
+        try:
+            source = self._open_camera()
+            if source is not None:
+                try:
+                    self._scan(source)
+                finally:
+                    source.close()
+        finally:
+            self.is_closing = True
+            self.scan = self.gate = self._store = None
+
+    def _open_camera(self) -> CameraSource | None:
+        """The camera at its own pace, tried until it answers; None when stopped meanwhile."""
+        from service.cameras import open_camera
+        from service.cameras.pace import paced
+
+        wait_s, is_answer = FIRST_RETRY_S, self._is_asked
+        while not self.stop.is_set():
+            try:
+                source = open_camera(self._host.config.camera.source)
+                return source if source.is_live else paced(source)
+            except OutsideError as error:
+                log.warning("%s; trying again in %.1f s", error, wait_s)
+                text = f"Camera: {error}"
+                self._host.vehicle.statustext(text, WARNING, is_answer=is_answer)
+                is_answer = False
+                self.stop.wait(wait_s)
+                wait_s = min(2 * wait_s, LAST_RETRY_S)
+        return None
+
+    def _scan(self, source: CameraSource) -> None:
+        from service.onboard.scan import Scan, create_store
+
+        host = self._host
+        inputs, gate = self._inputs(source)
+        store = create_store(inputs)
+        for text in disagreement(inputs.unix_offset_ns):
+            gate.warnings.append(text)
+            host.vehicle.statustext(text, WARNING)
+        self._news_told = len(gate.warnings)
+        host.vehicle.record(inputs.folder / "link.tlog", inputs.unix_offset_ns)
+        host.link.take_off(store, host.config, host.vehicle)
+        self._store, self.gate, self.scan = store, gate, Scan(inputs, store)
+        host.set_level(host.level)
+        host.vehicle.statustext(f"Scan {inputs.scan_id} started")
+        try:
+            self._feed(self.scan)
+        finally:
+            source.close()
+            self.is_closing = True
+            host.vehicle.record(None)
+            try:
+                gate.warnings += set_since(inputs.unix_offset_ns, host.vehicle.unix_offset_ns())
+                self._close_scan(self.scan, store)
+            finally:
+                host.write_files(inputs.folder, store)
+
+    def _inputs(self, source: CameraSource) -> tuple[ScanInputs, FrameGate]:
+        """What the scan is made from, with its camera behind a gate."""
+        from service.cameras.camera_file import check_size
+        from service.daemon.frame_gate import FrameGate
+        from service.onboard.scan import ScanInputs
+
+        host, vehicle = self._host, self._host.vehicle
+        camera, backend = host.equipment()
+        check_size(camera, source.size_px, source.description)
+        zero_ns, offset_ns = _zero_ns(source), vehicle.unix_offset_ns()
+        unix_s = 1e-9 * (time.monotonic_ns() + offset_ns)
+        scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(unix_s))
+        folder = Path(host.config.scan.folder) / scan_id
+        host.made.add(scan_id)
+        gate = FrameGate(
+            source, folder / LATER, zero_ns + offset_ns, self.alive, host.intent.paused
+        )
+        inputs = ScanInputs(
+            gate,
+            camera,
+            host.config,
+            backend,
+            folder,
+            scan_id,
+            zero_ns,
+            unix_offset_ns=offset_ns,
+            history=vehicle.history,
+            extra={"backend": backend.name, "source": source.description},
+            latency_ms=host.latency_ms,
+            tell=lambda text: vehicle.statustext(text, WARNING),
+            on_step=odometry_reporter(host.config, vehicle),
+            on_keyframe=self._on_keyframe,
+        )
+        return inputs, gate
+
+    def _feed(self, scan: Scan) -> None:
+        """Frames into the scan until it is stopped or the recording ends."""
+        self.is_feeding = True
+        try:
+            scan.run(self.stop, self._on_frame, self._host.intent.paused)
+        finally:
+            self.is_feeding = False
+        self._host.fulfilled(self)
+
+    def _close_scan(self, scan: Scan, store: ScanStore) -> None:
+        """Finish the scan; when the pipeline cannot, what is stored is kept as interrupted."""
+        try:
+            summary = scan.close()
+        except Exception:
+            store.finish({"interrupted": True})
+            raise
+        if scan.check.latency is not None and scan.check.latency.is_settled:
+            self._host.latency_ms = scan.check.latency.latency_ms
+        self._host.vehicle.statustext(
+            f"Scan {scan.inputs.scan_id}: {summary['clouds']} clouds, {summary['distance_m']:.0f} m"
+        )
+
+    def _on_frame(self, scan: Scan) -> None:
+        self.alive()
+        if scan.recorder.keyframes:
+            self._host.intent.succeeded()
+        if scan.recorder.keyframes > 1:
+            self._host.is_warm = True
+
+    def _on_keyframe(self, keyframe: Keyframe) -> None:
+        scan = self.scan
+        if scan is not None:
+            tell_keyframe(self._host.vehicle, scan, keyframe)
+
+
+def _zero_ns(source: CameraSource) -> int:
+    """Monotonic clock at the source's time 0: its own word if it is live, else now."""
+    start_ns = source.start_monotonic_ns
+    return time.monotonic_ns() if start_ns is None else start_ns
