@@ -81,6 +81,13 @@ class Autopilots:
             return self.followed.system
         return self.given or self.remembered or 1
 
+    @property
+    def is_certain(self) -> bool:
+        """False while the one followed was only the first that was heard."""
+        followed = self.followed
+        expected = followed is not None and followed.system in (self.given, self.remembered)
+        return followed is None or self.is_proven or expected
+
     def hear(
         self, system: int, component: int, is_armed: bool, now_ns: int, firmware: int = 0
     ) -> None:

@@ -102,16 +102,22 @@ class Presence:
         return None if followed is None else followed.seen_ns
 
     @property
+    def is_certain(self) -> bool:
+        """False while our autopilot was only the first that was heard: it may be another's."""
+        return self._autopilots.is_certain
+
+    @property
     def is_armed(self) -> bool:
         """True while the autopilot says so."""
         followed = self._autopilots.followed
         return followed is not None and followed.is_armed
 
     def is_disarmed(self, now_ns: int) -> bool:
-        """True only where our autopilot said so a moment ago; silence is not disarmed."""
+        """True only where what is certainly our autopilot said so a moment ago."""
         followed = self._autopilots.followed
-        recent = followed is not None and now_ns - followed.seen_ns <= RECENT_NS
-        return recent and followed is not None and not followed.is_armed
+        if followed is None or followed.is_armed or not self.is_certain:
+            return False
+        return now_ns - followed.seen_ns <= RECENT_NS
 
     def others(self, now_ns: int) -> list[int]:
         """The systems of autopilots that are heard but not followed."""

@@ -92,6 +92,7 @@ class VehicleReport:
     links: tuple[LinkReport, ...]
     system: int
     autopilot: tuple[int, int] | None
+    is_certain: bool  # False while it was only the first that was heard: maybe another vehicle's
     autopilot_age_s: float | None
     is_armed: bool
     timesync_round_trip_ms: float | None
@@ -269,6 +270,7 @@ class VehicleLink:
             ),
             self.presence.system,
             self.presence.autopilot,
+            self.presence.is_certain,
             None if seen is None else (time.monotonic_ns() - seen) / S,
             self.presence.is_armed,
             None if round_trip is None else round_trip * 1e-6,

@@ -62,7 +62,7 @@ def test_a_gimbal_in_flight_does_not_let_the_companion_reboot() -> None:
 
 
 def test_disarmed_is_known_only_for_a_moment() -> None:
-    net = Net()
+    net = Net(given=1)
     assert not net.presence.is_disarmed(net.now_ns)
     net.beat((1, 1))
     assert net.presence.is_disarmed(net.now_ns + 3 * S)
@@ -80,6 +80,21 @@ def test_the_vehicle_that_answers_is_ours_though_another_was_heard_first() -> No
     assert net.presence.system == 7 and net.presence.autopilot == (7, 1)
     assert net.presence.proven_system == 7
     assert any("Following system 7, not 2" in text for text in net.texts)
+
+
+def test_the_first_that_is_heard_is_not_certain_before_there_is_evidence() -> None:
+    """Else a scan that starts with the motors would start with another vehicle's."""
+    net = Net(Vehicle(7, 0.002))
+    net.beat((2, 1), armed=True)
+    assert net.presence.is_armed and not net.presence.is_certain
+    net.beat((2, 1))
+    assert not net.presence.is_disarmed(net.now_ns)
+    net.wait(7.0)
+    assert net.presence.is_disarmed(net.now_ns)
+    assert net.presence.system == 7 and net.presence.is_certain and not net.presence.is_armed
+    for known in (Net(given=2), Net(remembered=2)):
+        known.beat((2, 1), armed=True)
+        assert known.presence.is_armed and known.presence.is_certain
 
 
 def test_the_nearer_of_two_that_answer_is_ours() -> None:

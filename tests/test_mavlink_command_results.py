@@ -35,7 +35,7 @@ class Vehicle:
     def __init__(self, stream: str = "") -> None:
         self.now_ns = 100 * S
         self.control = RehearsalControl()
-        self.presence = Presence(PresenceConfig(), 77, self.now_ns)
+        self.presence = Presence(PresenceConfig(system=1), 77, self.now_ns)
         config = CompanionConfig(camera=CameraConfig(stream_uri=stream))
         history = VehicleHistory()
         self.companion = Companion(config, self.control, self.presence, history, self.now_ns)

@@ -282,13 +282,15 @@ class Daemon:
         if self.config.scan.start != "on-command":
             return
         report, resumption = self.vehicle.report(), self.scanning.resumption
-        if resumption.is_due(report.autopilot is not None, report.is_armed):
+        is_heard = report.autopilot is not None and report.is_certain
+        if resumption.is_due(is_heard, report.is_armed and report.is_certain):
             self.vehicle.statustext("Scanning again after a restart", WARNING)
             self.actions.start_scan()
 
     def _follow_arming(self, was_armed: bool) -> bool:
         """Start and stop a scan with the motors, if so configured; whether they are on."""
-        is_armed = self.vehicle.report().is_armed
+        report = self.vehicle.report()
+        is_armed = report.is_armed and report.is_certain
         if self.config.scan.start == "on-arm" and is_armed != was_armed:
             answer = (self.actions.start_scan if is_armed else self.actions.stop_scan)()
             if answer.text:
