@@ -20,7 +20,9 @@ import msgspec
 import msgspec.toml
 
 from service.errors import InputError
+from service.small_file import read_small
 
+LARGEST_FILE_BYTES = 1_048_576
 T = TypeVar("T")
 
 
@@ -340,10 +342,9 @@ def keys() -> Iterator[tuple[str, dataclasses.Field[Any]]]:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        return msgspec.toml.decode(path.read_bytes(), type=dict[str, Any])
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from error
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        data = read_small(path, LARGEST_FILE_BYTES, "configuration file")
+        return msgspec.toml.decode(data, type=dict[str, Any])
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path} is not TOML: {error}") from error
 
 
@@ -392,13 +393,13 @@ def _override(config: Config, override: str) -> Config:
     """``config`` with one ``section.key=value``; bare words and single items are understood."""
     name, equals, text = override.partition("=")
     section, dot, field = name.strip().partition(".")
-    where = f"--set {override}"
+    where = f"--set {override[:200]}"
     if not equals or not dot:
         raise InputError(f"{where}: write section.key=value")
     text = text.strip()
     data: dict[str, dict[str, Any]] = config.to_dict()
     readings: list[Any] = [text, [text]]  # a name made of digits; one item of a list
-    with contextlib.suppress(msgspec.DecodeError):
+    with contextlib.suppress(msgspec.DecodeError, RecursionError):
         readings.insert(0, msgspec.toml.decode(f"value = {text}", type=dict[str, Any])["value"])
     _check_keys({section: {field: readings[0]}}, where)
     faults = []

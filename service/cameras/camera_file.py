@@ -18,6 +18,7 @@ import yaml
 from recon.camera_model import check_camera
 from recon.types import F64, Camera
 from service.errors import InputError, OutsideError
+from service.small_file import read_small
 
 MODEL = "plumb_bob"
 REQUIRED = (
@@ -102,13 +103,10 @@ def save_camera(
 def _read(path: Path) -> dict[str, Any]:
     """The mapping at the top of the YAML file."""
     try:
-        if path.stat().st_size > LARGEST_FILE_BYTES:
-            raise InputError(f"camera model {path}: not a camera_info YAML file (over 1 MiB)")
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"camera model {path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"camera model {path}: cannot be read ({error.strerror})") from error
+        text = read_small(path, LARGEST_FILE_BYTES, "camera_info YAML file").decode("utf-8")
+        document = yaml.safe_load(text)
+    except InputError as error:
+        raise InputError(f"camera model {error}") from error
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
         raise InputError(f"camera model {path}: not a YAML file ({_one_line(error)})") from error
     if not isinstance(document, dict):

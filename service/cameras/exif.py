@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+import struct
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -33,8 +34,31 @@ class Tags:
     geotag: GeoTag | None = None
 
 
+BROKEN = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+    struct.error,
+)
+"""What Pillow raises, besides OSError, for files that are no pictures or hold broken tags."""
+
+
 def read_tags(path: Path) -> Tags:
-    """The tags of the picture at ``path``; raises OSError when it is not a picture."""
+    """The tags of the picture at ``path``; raises OSError when it is not a picture, or one that
+    claims more pixels than any camera has."""
+    from PIL import Image
+
+    try:
+        return _read_tags(path)
+    except (*BROKEN, Image.DecompressionBombError) as error:
+        raise OSError(" ".join(str(error).split())[:200] or type(error).__name__) from error
+
+
+def _read_tags(path: Path) -> Tags:
     from PIL import Image
 
     with Image.open(path) as image:

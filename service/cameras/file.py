@@ -21,16 +21,19 @@ def open_file(rest: str, options: Mapping[str, str]) -> VideoSource:
         raise InputError(f"no such file: {path}")
     if path.is_dir():
         raise InputError(f"{path} is a folder; for a folder of pictures write images:{path}")
+    if not path.is_file():
+        raise InputError(f"{path} is no regular file; for a named pipe write pipe:{path}")
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty (0 bytes); copy it from the camera again")
     try:
-        container = av.open(str(path))
+        container = av.open(str(path), metadata_errors="replace")
     except av.error.InvalidDataError as error:
         raise InputError(_not_video(path)) from error
     except av.error.EOFError as error:
         raise InputError(f"{path} ends before its first picture; it was cut off") from error
-    except (av.error.FFmpegError, OSError) as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise InputError(f"{path} cannot be read: {why}") from error
     return VideoSource(container, str(path))
 
 

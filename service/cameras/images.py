@@ -25,7 +25,7 @@ ZONE_NS = 900 * SECOND_NS  # time zones are whole quarters of an hour
 
 
 class ImagesSource:
-    """The stills of one folder in order of time; unreadable ones are left out and told."""
+    """The stills of one folder in order of time; unreadable ones are left out, with a warning."""
 
     def __init__(self, folder: Path, interval_s: float | None) -> None:
         """Read the tags of every still; ``interval_s`` spaces stills by name instead of tags."""
@@ -45,7 +45,7 @@ class ImagesSource:
         """Yield the stills that decode."""
         seq = 0
         for path, tags, time_ns in self._stills:
-            image = _load(path)
+            image = _load(path, self.size_px)
             if image is None or image.shape[:2] != (self.size_px[1], self.size_px[0]):
                 self._warn(f"{path.name} cannot be decoded; left out")
                 continue
@@ -64,8 +64,9 @@ class ImagesSource:
         for path in paths:
             try:
                 tagged.append((path, read_tags(path)))
-            except (OSError, SyntaxError, ValueError) as error:
-                self._warn(f"{path.name} is not a picture that can be read ({error}); left out")
+            except OSError as error:
+                why = " ".join(str(error).split())[:120] or type(error).__name__
+                self._warn(f"{path.name} is not a picture that can be read ({why}); left out")
         if not tagged:
             raise InputError(f"{folder} holds no pictures (jpg, png, tif); name their folder")
         return tagged
@@ -128,7 +129,7 @@ def open_images(rest: str, options: Mapping[str, str]) -> ImagesSource:
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
     """Sort key that puts IMG_9 before IMG_10."""
     parts = re.split(r"(\d+)", path.name)
-    return [(0, int(p), "") if p.isdigit() else (1, 0, p.lower()) for p in parts if p]
+    return [(0, int(p), "") if p.isdecimal() else (1, 0, p.lower()) for p in parts if p]
 
 
 def clock_offset_ns(tags: list[Tags]) -> int | None:
@@ -173,12 +174,18 @@ def _from_first(times_ns: list[int]) -> list[int]:
     return [t - first for t in times_ns]
 
 
-def _load(path: Path) -> U8 | None:
-    """(H, W, 3) BGR as stored (no EXIF turn: the camera model is of the stored pixels)."""
+def _load(path: Path, size_px: tuple[int, int]) -> U8 | None:
+    """(H, W, 3) BGR as stored (no EXIF turn: the camera model is of the stored pixels).
+
+    None when the file does not decode, or says another size than ``size_px`` (W, H) meanwhile.
+    """
     import cv2
 
-    data = np.fromfile(path, np.uint8)
-    if data.size == 0:
+    try:
+        if read_tags(path).size_px != size_px:
+            return None
+        data = np.fromfile(path, np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except (OSError, cv2.error):
         return None
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return None if image is None else np.asarray(image, dtype=np.uint8)

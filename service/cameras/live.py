@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from recon.types import U8
 from service.cameras.source import CameraFrame
-from service.cameras.video import decoded_pictures, picture_bgr
+from service.cameras.video import decoded_pictures, picture_bgr, video_stream
 from service.errors import OutsideError
 from service.redaction import without_credentials
 
@@ -171,11 +171,10 @@ class LiveSource:
             self._tell(f"cannot be opened: {error}")
             return
         try:
-            if not container.streams.video:
-                self._tell("holds no video stream")
+            stream = video_stream(container)
+            if stream is None:
+                self._tell("holds no video stream that can be decoded")
                 return
-            stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
             rate = stream.average_rate  # as the camera says; it is not measured
             self.fps = float(rate) if rate else None
             log.info("%s: connected", self.description)

@@ -64,7 +64,13 @@ def open_pipe(rest: str, options: Mapping[str, str]) -> VideoSource:
         )
     demuxer = {key: value for key, value in options.items() if key != "format"}
     try:
-        container = av.open(reader, mode="r", format=options.get("format"), options=demuxer)
+        container = av.open(
+            reader,
+            mode="r",
+            format=options.get("format"),
+            options=demuxer,
+            metadata_errors="replace",
+        )
     except (av.error.FFmpegError, ValueError, OSError) as error:
         raise InputError(
             f"{name}: not a video stream that can be read ({error}); Matroska, MPEG-TS, "

@@ -54,6 +54,9 @@ def _live(url: str, demuxer: dict[str, str], format_: str | None = None) -> Came
     def open_container(stall_s: float) -> av.container.InputContainer:
         import av
 
-        return av.open(url, format=format_, options=demuxer, timeout=(OPEN_S, stall_s))
+        timeout = (OPEN_S, stall_s)
+        return av.open(
+            url, format=format_, options=demuxer, timeout=timeout, metadata_errors="replace"
+        )
 
     return paced(LiveSource(open_container, without_credentials(url)))

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+MAX_PIXELS = 1 << 27
+"""Of a picture; the decoder refuses larger ones before it makes room for them."""
+
 EARLIEST_UNIX_S = 946_684_800  # 2000-01-01: cameras without a clock write 1904 or 1970
 
 
@@ -43,8 +46,11 @@ class VideoSource:
         if not container.streams.video:
             self.close()
             raise InputError(f"{description}: holds no video stream; give a video of the flight")
-        self._stream = container.streams.video[0]
-        self._stream.thread_type = "AUTO"
+        stream = video_stream(container)
+        if stream is None:
+            self.close()
+            raise InputError(f"{description}: its video has a format that cannot be decoded")
+        self._stream = stream
         self._expected = self._stream.frames
         self._decoded = decoded_pictures(container, self._stream, self._warn, self._damage)
         self._first = next(self._decoded, None)
@@ -117,6 +123,16 @@ class VideoSource:
     def _warn(self, text: str) -> None:
         self.warnings.append(text)
         log.warning("%s: %s", self.description, text)
+
+
+def video_stream(container: av.container.InputContainer) -> av.VideoStream | None:
+    """The first video stream, ready to decode; None when there is none that can be decoded."""
+    stream = container.streams.video[0] if container.streams.video else None
+    if stream is None or stream.codec_context is None:
+        return None
+    stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+    stream.thread_type = "AUTO"
+    return stream
 
 
 def decoded_pictures(

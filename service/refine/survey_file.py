@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from service.errors import InputError
+from service.small_file import read_small
 
 PLACE = ("lat", "lon", "alt_amsl_m")
 PICTURE = ("u_px", "v_px")
@@ -83,14 +84,8 @@ def _said(p: SurveyPoint) -> tuple[str, float, float, float, float, float, bool]
 def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     """Line number and the filled cells by column."""
     try:
-        if path.stat().st_size > LARGEST_BYTES:
-            raise InputError(
-                f"{path} is larger than {LARGEST_BYTES} bytes; is it a list of points?"
-            )
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give the CSV of surveyed points") from None
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_small(path, LARGEST_BYTES, "CSV of surveyed points").decode("utf-8-sig")
+    except UnicodeDecodeError as error:
         raise InputError(f"{path} cannot be read ({error}); it should be CSV in UTF-8") from error
     table = csv.reader(text.splitlines())
     header = [name.strip() for name in next(table, [])]
