@@ -229,7 +229,7 @@ start_or_roll_back() {
   systemctl enable "$unit.service" >/dev/null
   if ! is_configured; then
     say "installed, not started: set camera.source and camera.model in $etc/skyrelief.toml," \
-      "look with $current/bin/skyrelief doctor, then systemctl restart $unit"
+      "look with sudo -u skyrelief $current/bin/skyrelief doctor, then systemctl restart $unit"
     return 0
   fi
   say "starting $unit; watching it for $health_s s"
