@@ -53,7 +53,13 @@ def ground(
         str | None, typer.Option(help="serve the web portal at HOST:PORT, such as 127.0.0.1:8080")
     ] = None,
     portal_token: Annotated[
-        Path | None, typer.Option(help="file with the portal's token; default: one is made")
+        Path | None,
+        typer.Option(
+            "--portal-token-file",
+            "--portal-token",
+            help="file of the portal's tokens, a line each: TOKEN or NAME TOKEN; "
+            "default: one is made and kept in STORE/portal-token",
+        ),
     ] = None,
     portal_tls: Annotated[
         tuple[Path, Path] | None, typer.Option(help="the portal's certificate and key")

@@ -5,8 +5,10 @@ No packages: the standard library's HTTP server.
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import logging
+import socket
 import threading
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -14,11 +16,13 @@ from typing import Any
 
 from service.daemon.health_api import DOCUMENT
 from service.errors import OutsideError
+from service.listener import BoundedListener, ListenerLimits, host_name, is_loopback
 from service.redaction import redacted
 
 log = logging.getLogger(__name__)
 
 Snapshot = Callable[[], dict[str, Any]]
+LIMITS = ListenerLimits(total=32, per_address=16)
 PREFIX = "skyrelief_"
 
 
@@ -34,15 +38,14 @@ class HealthServer:
         """Listen on HOST:PORT; raises OutsideError when that is taken."""
         host, _, port = address.rpartition(":")
         try:
-            self._server = ThreadingHTTPServer(
-                (host.strip("[]"), int(port)), _handler(snapshot), bind_and_activate=True
-            )
+            listener = BoundedListener(host.strip("[]"), int(port), LIMITS)
         except OSError as error:
             raise OutsideError(
                 f"health.http {address} cannot be served: {error.strerror}; give another port"
             ) from error
-        self._server.daemon_threads = True
-        self.port = int(self._server.server_address[1])
+        self.port = int(listener.getsockname()[1])
+        own_names = OwnNames(is_loopback(host.strip("[]")))
+        self._server = _Server(listener, _handler(snapshot, own_names))
         self._thread = threading.Thread(
             target=self._server.serve_forever, name="health", daemon=True
         )
@@ -53,6 +56,47 @@ class HealthServer:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
+
+
+class OwnNames:
+    """The names that a request may call this machine by.
+
+    A foreign site's name that resolves to this machine would let a browser read for that site.
+    """
+
+    def __init__(self, is_local: bool) -> None:
+        self._is_local = is_local
+        self._name = socket.gethostname().partition(".")[0].lower()
+
+    def holds(self, header: str | None) -> bool:
+        """Whether a ``Host`` header names this machine; true without one, browsers send one."""
+        if header is None:
+            return True
+        name = host_name(header)
+        if is_loopback(name):
+            return True
+        return not self._is_local and (_is_address(name) or name.partition(".")[0] == self._name)
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def __init__(self, listener: BoundedListener, handler: type[BaseHTTPRequestHandler]) -> None:
+        super().__init__(listener.getsockname()[:2], handler, bind_and_activate=False)
+        self.socket.close()
+        self.socket = self._listener = listener
+
+    def service_actions(self) -> None:
+        """Called twice a second while serving."""
+        self._listener.sweep()
 
 
 def metrics_text(snapshot: dict[str, Any], prefix: str = PREFIX) -> str:
@@ -71,13 +115,16 @@ def _metric_name(name: str) -> str:
     return "".join(c if c.isascii() and c.isalnum() else "_" for c in name)
 
 
-def _handler(snapshot: Snapshot) -> type[BaseHTTPRequestHandler]:
+def _handler(snapshot: Snapshot, own_names: OwnNames) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         server_version = "skyrelief"
         sys_version = ""
         timeout = 10.0
 
         def do_GET(self) -> None:
+            if not own_names.holds(self.headers.get("Host")):
+                self._answer(421, "this is not a name of this machine\n", "text/plain")
+                return
             path = self.path.partition("?")[0]
             if path == "/openapi.json":
                 self._answer(200, json.dumps(DOCUMENT), "application/json")

@@ -63,10 +63,15 @@ STATUS: dict[str, Any] = {
 }
 
 
+_NOT_US: dict[str, Any] = {"421": {"description": "the Host header names another machine"}}
+
+
 def _get(summary: str, kind: str, schema: dict[str, Any], *codes: tuple[int, str]) -> Any:
     content = {kind: {"schema": schema}}
-    answers = {str(code): {"description": text, "content": content} for code, text in codes}
-    return {"get": {"summary": summary, "responses": answers}}
+    answers: dict[str, Any] = {
+        str(code): {"description": text, "content": content} for code, text in codes
+    }
+    return {"get": {"summary": summary, "responses": answers | _NOT_US}}
 
 
 DOCUMENT: dict[str, Any] = {

@@ -10,8 +10,9 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import msgspec
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
@@ -19,27 +20,35 @@ from starlette.requests import HTTPConnection, Request
 from starlette.responses import (
     FileResponse,
     HTMLResponse,
-    JSONResponse,
     PlainTextResponse,
     Response,
 )
+from starlette.responses import JSONResponse as StarletteJSONResponse
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
 from service.errors import InputError, OutsideError
-from service.ground.guard import LARGEST_BODY_BYTES, Guard
+from service.ground.audit import AuditLog, Pace, note
+from service.ground.guard import WHO, Guard
 from service.ground.jobs import Jobs
-from service.ground.library import Library, StaleError
+from service.ground.library import ConflictError, Library
 from service.ground.live_socket import serve_live
 from service.ground.openapi import DOCUMENT
 from service.ground.scan_files import file_routes
 from service.ground.state import PortalState, names_of, state_of
+from service.ground.tokens import Tokens
 from service.ground.vehicle import Vehicle
 
+T = TypeVar("T")
+
 PAGE = Path(__file__).parent / "web" / "dist"
-MOST_LIVE_VIEWS = 16
+MAX_LIVE_VIEWS = 16
+MAX_VIEWS_WITHOUT_TOKEN = 8
+ORDERS_HZ, ORDERS_AT_ONCE = 1.0, 10
+"""How fast orders go to the vehicle; a stop always does."""
+
 NO_PAGE = (
     "<!doctype html><meta charset=utf-8><title>skyrelief</title><h1>skyrelief</h1>"
     "<p>The page was not built when skyrelief was installed. Build it with <code>npm ci</code>"
@@ -49,10 +58,46 @@ NO_PAGE = (
 )
 
 
+class JSONResponse(StarletteJSONResponse):
+    """JSON in ASCII: any text can be sent, also one with half a letter in it."""
+
+    def render(self, content: Any) -> bytes:
+        """The body."""
+        return json.dumps(content, allow_nan=False, separators=(",", ":")).encode("ascii")
+
+
+class LabelChange(msgspec.Struct, forbid_unknown_fields=True):
+    """A new title or tags, and the edition of the labels that they were made on."""
+
+    title: str | None = None
+    tags: list[str] | None = None
+    edition: int | None = None
+
+
+class ExportOrder(msgspec.Struct, forbid_unknown_fields=True):
+    """A deliverable to make."""
+
+    kind: str
+
+
+class ImportOrder(msgspec.Struct, forbid_unknown_fields=True):
+    """A scan folder or a recording of this machine."""
+
+    folder: str
+
+
+class VehicleOrder(msgspec.Struct, forbid_unknown_fields=True):
+    """An order to the companion."""
+
+    action: str
+    metres: float | None = None
+
+
 def portal_app(
     store: Path,
-    token: str,
+    tokens: Tokens,
     local: bool,
+    audit: AuditLog,
     progress: Callable[[], list[dict[str, Any]]] | None = None,
     vehicle: Vehicle | None = None,
 ) -> ASGIApp:
@@ -84,7 +129,8 @@ def portal_app(
         exception_handlers={InputError: _said, OutsideError: _said, HTTPException: _refused},
     )
     app.state.portal = state
-    return Guard(app, token, local)
+    app.state.order_pace = Pace(ORDERS_HZ, ORDERS_AT_ONCE)
+    return Guard(app, tokens, local, audit)
 
 
 def _said(request: HTTPConnection, error: Exception) -> Response:
@@ -94,26 +140,22 @@ def _said(request: HTTPConnection, error: Exception) -> Response:
     """
     if isinstance(error, OutsideError):
         return JSONResponse({"error": str(error)}, 503)
-    if isinstance(error, StaleError):
+    if isinstance(error, ConflictError):
         return JSONResponse({"error": str(error)}, 409)
     return JSONResponse({"error": str(error)}, 404 if str(error).startswith("no ") else 400)
 
 
 def _refused(request: HTTPConnection, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    return JSONResponse({"error": error.detail}, error.status_code)
+    return JSONResponse({"error": error.detail}, error.status_code, error.headers)
 
 
-async def _body(request: Request) -> dict[str, Any]:
+async def _body(request: Request, kind: type[T]) -> T:
     """The JSON object sent; InputError for anything else."""
-    data = await request.body()
     try:
-        document = json.loads(data[: LARGEST_BODY_BYTES + 1])
+        return msgspec.json.decode(await request.body(), type=kind)
     except (ValueError, RecursionError) as error:
-        raise InputError("the request is not JSON") from error
-    if not isinstance(document, dict):
-        raise InputError("the request is not a JSON object")
-    return document
+        raise InputError(f"the request does not fit: {error}"[:300]) from error
 
 
 def _page(request: Request) -> Response:
@@ -133,16 +175,13 @@ def _scan(request: Request) -> Response:
 
 
 async def _label(request: Request) -> Response:
-    body = await _body(request)
-    unknown = set(body) - {"title", "tags", "edition"}
-    if unknown:
-        raise InputError(f"unknown: {', '.join(sorted(unknown))[:100]}")
-    edition = body.get("edition")
-    if edition is not None and (isinstance(edition, bool) or not isinstance(edition, int)):
-        raise InputError("edition is a whole number")
+    drone, scan = names_of(request)
+    note(request, "rename", scan=f"{drone}/{scan}")
+    change = await _body(request, LabelChange)
+    note(request, "rename", title=change.title, tags=change.tags)
     library = state_of(request).library
     labels = await run_in_threadpool(
-        library.label, *names_of(request), body.get("title"), body.get("tags"), edition
+        library.label, drone, scan, change.title, change.tags, change.edition
     )
     return JSONResponse(
         {"title": labels.title, "tags": list(labels.tags), "edition": labels.edition}
@@ -151,6 +190,7 @@ async def _label(request: Request) -> Response:
 
 def _delete(request: Request) -> Response:
     state, (drone, scan) = state_of(request), names_of(request)
+    note(request, "delete", scan=f"{drone}/{scan}")
     for entry in state.progress():
         if (entry["drone"], entry["scan"]) == (drone, scan):
             raise HTTPException(409, "this scan is open at the receiver; delete it after a restart")
@@ -161,11 +201,11 @@ def _delete(request: Request) -> Response:
 
 
 async def _export(request: Request) -> Response:
-    body = await _body(request)
-    state = state_of(request)
-    folder = state.library.folder(*names_of(request))
-    job = state.jobs.start(folder, str(body.get("kind", "")))
-    return JSONResponse(job, 202)
+    state, (drone, scan) = state_of(request), names_of(request)
+    note(request, "export", scan=f"{drone}/{scan}")
+    kind = (await _body(request, ExportOrder)).kind
+    note(request, "export", kind=kind)
+    return JSONResponse(state.jobs.start(state.library.folder(drone, scan), kind), 202)
 
 
 def _bin(request: Request) -> Response:
@@ -173,16 +213,20 @@ def _bin(request: Request) -> Response:
 
 
 def _restore(request: Request) -> Response:
-    drone, scan = state_of(request).library.restore(request.path_params["name"])
+    name = request.path_params["name"]
+    note(request, "restore", name=name)
+    drone, scan = state_of(request).library.restore(name)
     return JSONResponse({"drone": drone, "scan": scan})
 
 
 async def _import(request: Request) -> Response:
-    body = await _body(request)
-    folder = body.get("folder")
-    if not isinstance(folder, str) or not folder or "\0" in folder:
+    note(request, "import")
+    folder = (await _body(request, ImportOrder)).folder
+    note(request, "import", folder=folder)
+    if not folder or "\0" in folder:
         raise InputError("give the folder or the .mcap to import")
     drone, scan = await run_in_threadpool(state_of(request).library.bring_in, Path(folder))
+    note(request, "import", scan=f"{drone}/{scan}")
     return JSONResponse({"drone": drone, "scan": scan}, 201)
 
 
@@ -204,15 +248,15 @@ def _figures(request: Request) -> Response:
 
 async def _order(request: Request) -> Response:
     """An order to the vehicle; the answer is the companion's own."""
-    body = await _body(request)
+    note(request, "order")
+    wanted = await _body(request, VehicleOrder)
+    note(request, wanted.action, metres=wanted.metres)
     vehicle = state_of(request).vehicle
     if vehicle is None:
         raise InputError("no vehicle: start with 'skyrelief ground --vehicle ENDPOINT'")
-    metres = body.get("metres")
-    if metres is not None and (isinstance(metres, bool) or not isinstance(metres, (int, float))):
-        raise InputError("metres is a number")
-    answer = await run_in_threadpool(vehicle.order, str(body.get("action", "")), metres)
-    return JSONResponse(answer)
+    if wanted.action != "stop" and not request.app.state.order_pace.take():
+        raise HTTPException(429, "too many orders; wait a second", {"retry-after": "1"})
+    return JSONResponse(await run_in_threadpool(vehicle.order, wanted.action, wanted.metres))
 
 
 def _metrics(request: Request) -> Response:
@@ -237,12 +281,21 @@ async def _live(socket: WebSocket) -> None:
     except InputError as error:
         await socket.close(1008, str(error)[:100])
         return
-    if state.live_views >= MOST_LIVE_VIEWS:
+    without_token = socket.scope[WHO] is None
+    anonymous = state.views_without_token
+    views, most = (
+        (anonymous, MAX_VIEWS_WITHOUT_TOKEN)
+        if without_token
+        else (state.live_views - anonymous, MAX_LIVE_VIEWS)
+    )
+    if views >= most:
         await socket.close(1013, "too many live views")
         return
-    await socket.accept()
     state.live_views += 1
+    state.views_without_token += without_token
     try:
+        await socket.accept()
         await serve_live(socket, folder)
     finally:
         state.live_views -= 1
+        state.views_without_token -= without_token

@@ -12,16 +12,21 @@ import os
 import re
 import shutil
 import sqlite3
+import tempfile
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from service.errors import InputError, OutsideError, SkyreliefError
+from service.ground.folder_import import copy_scan_folder, is_regular
 from service.ground.mcap_import import header_in, store_from_mcap
+from service.ground.scan_facts import facts_of, labels_in
 from service.scans.folder import SUMMARY, write_deliverables
 from service.scans.writing import writing
+from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
 BIN = ".bin"
@@ -31,7 +36,12 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 LONGEST_TITLE = 200
 MOST_TAGS = 20
-LARGEST_JSON_BYTES = 4_000_000
+IMPORTING = ".importing-"
+"""Begins the name of a folder in the store that an import fills."""
+
+UNREADABLE = (SkyreliefError, sqlite3.Error, OSError, ValueError, OverflowError, RecursionError)
+"""What a broken scan may raise; the list shows it with the reason."""
+
 FILES: dict[str, str] = {
     "cloud.laz": "fused cloud",
     "cloud.copc.laz": "cloud-optimised LAZ",
@@ -64,7 +74,11 @@ class Labels:
     edition: int = 0  # counts the changes
 
 
-class StaleError(InputError):
+class ConflictError(InputError):
+    """Somebody else was faster, or is at it."""
+
+
+class StaleError(ConflictError):
     """A change to labels that someone else has changed meanwhile."""
 
 
@@ -74,10 +88,16 @@ class Library:
     def __init__(self, store: Path) -> None:
         self.store = store
         self._lock = threading.Lock()
+        self._import_lock = threading.Lock()
+        for left in store.glob(f"{IMPORTING}*"):  # by a process that was killed
+            shutil.rmtree(left, ignore_errors=True)
 
     def scans(self) -> list[dict[str, Any]]:
         """One entry per scan, the newest first; a broken scan is listed with what is wrong."""
-        entries = [self.entry(drone, scan) for drone, scan in self._names()]
+        entries = []
+        for drone, scan in self._names():
+            with contextlib.suppress(InputError):  # deleted meanwhile
+                entries.append(self.entry(drone, scan))
         return sorted(entries, key=lambda e: e["started_unix_s"] or 0.0, reverse=True)
 
     def folder(self, drone: str, scan: str) -> Path:
@@ -85,7 +105,7 @@ class Library:
         if not (NAME.fullmatch(drone) and NAME.fullmatch(scan)):
             raise InputError("no such scan: a name may hold letters, digits, dots and dashes")
         folder = self.store / drone / scan
-        if not (folder / "scan.db").is_file():
+        if not is_regular(folder / "scan.db"):
             raise InputError(f"no scan {drone}/{scan}")
         return folder
 
@@ -100,8 +120,8 @@ class Library:
             "tags": list(labels.tags),
             "edition": labels.edition,
             "files": _files(folder),
-            "preview": (folder / "preview.jpg").is_file(),
-            "tiles": (folder / "3dtiles" / "tileset.json").is_file(),
+            "preview": is_regular(folder / "preview.jpg"),
+            "tiles": is_regular(folder / "3dtiles" / "tileset.json"),
             "started_unix_s": None,
             "origin": None,
             "finished": False,
@@ -109,14 +129,14 @@ class Library:
         }
         try:
             entry |= _facts(folder)
-        except (SkyreliefError, sqlite3.Error, ValueError, KeyError, TypeError) as error:
-            entry["trouble"] = str(error)
+        except UNREADABLE as error:
+            entry["trouble"] = str(error)[:300] or type(error).__name__
         return entry
 
     def file(self, drone: str, scan: str, name: str) -> Path:
         """The path of a deliverable. Raises InputError for any other file."""
         path = self.folder(drone, scan) / name
-        if name not in FILES or not path.is_file():
+        if name not in FILES or not is_regular(path):
             raise InputError(f"no file {name} in {drone}/{scan}"[:200])
         return path
 
@@ -177,56 +197,73 @@ class Library:
 
     def bring_in(self, source: Path) -> tuple[str, str]:
         """Import a scan folder or an MCAP; its drone and scan."""
-        if source.suffix.lower() == ".mcap":
-            return self.import_mcap(source)
-        return self.import_folder(source)
+        if not self._import_lock.acquire(blocking=False):
+            raise ConflictError("another import is running; try again when it is done")
+        try:
+            if source.suffix.lower() == ".mcap":
+                return self.import_mcap(source)
+            return self.import_folder(source)
+        finally:
+            self._import_lock.release()
 
     def import_mcap(self, source: Path) -> tuple[str, str]:
         """Make a scan folder of an aircraft's MCAP, with its usual files.
 
         Raises InputError when it is no scan's recording or the library has that scan already.
         """
+        if not is_regular(source):
+            raise InputError(f"{str(source)[:200]} is no file; give the recording itself")
         header = header_in(source)
-        drone, scan = _safe(header.drone, "drone"), _safe(header.scan_id, "scan")
-        target = self.store / drone / scan
-        part = target.with_name(f".{scan}.part")
-        try:
-            with self._lock:
-                if target.exists():
-                    raise InputError(f"the library holds {drone}/{scan} already")
-                shutil.rmtree(part, ignore_errors=True)
-                with store_from_mcap(source, part / "scan.db") as store:
-                    write_deliverables(part, store, {})
-                os.replace(part, target)
-        except OSError as error:
-            raise OutsideError(f"cannot write {target} ({error})") from error
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
-        return drone, scan
+
+        def fill(part: Path) -> ScanHeader:
+            with store_from_mcap(source, part / "scan.db") as store:
+                write_deliverables(part, store, {})
+            return header
+
+        self._check_new(header)
+        return self._take(fill)
 
     def import_folder(self, source: Path) -> tuple[str, str]:
         """Copy a scan folder, as it lay on the aircraft's disk, into the library.
 
         Raises InputError when it is none or the library has that scan already.
         """
-        if not (source / "scan.db").is_file():
-            raise InputError(f"{source} holds no scan.db; give a scan folder")
-        with ScanStore.open(source / "scan.db") as store:
-            drone, scan = _safe(store.header.drone, "drone"), _safe(store.header.scan_id, "scan")
-        target = self.store / drone / scan
-        part = target.with_name(f".{scan}.part")
+
+        def fill(part: Path) -> ScanHeader:
+            copy_scan_folder(source, part)
+            try:
+                with ScanStore.open(part / "scan.db") as store:
+                    return store.header
+            except (sqlite3.Error, ValueError) as error:
+                raise InputError(f"{str(source)[:200]} holds no sound scan ({error})") from error
+
+        return self._take(fill)
+
+    def _take(self, fill: Callable[[Path], ScanHeader]) -> tuple[str, str]:
+        """Have ``fill`` make a scan folder, then give it its place, under the lock."""
         try:
-            with self._lock:
-                if target.exists():
-                    raise InputError(f"the library holds {drone}/{scan} already")
-                shutil.rmtree(part, ignore_errors=True)
-                shutil.copytree(source, part, symlinks=False)
-                os.replace(part, target)
+            part = Path(tempfile.mkdtemp(prefix=IMPORTING, dir=self.store))
         except OSError as error:
-            raise OutsideError(f"cannot copy {source} to {target} ({error})") from error
+            raise OutsideError(f"cannot write in {self.store} ({error})") from error
+        try:
+            header = fill(part)
+            part.chmod(0o750)
+            with self._lock:
+                target = self._check_new(header)
+                _move(part, target)
+        except OSError as error:
+            raise OutsideError(f"cannot write in {part} ({error})") from error
         finally:
             shutil.rmtree(part, ignore_errors=True)
-        return drone, scan
+        return target.parent.name, target.name
+
+    def _check_new(self, header: ScanHeader) -> Path:
+        """Where a scan belongs; InputError when the library has it already."""
+        drone, scan = _safe(header.drone, "drone"), _safe(header.scan_id, "scan")
+        target = self.store / drone / scan
+        if target.exists():
+            raise InputError(f"the library holds {drone}/{scan} already")
+        return target
 
     def _names(self) -> list[tuple[str, str]]:
         """(drone, scan) of every folder that holds a scan."""
@@ -240,70 +277,35 @@ class Library:
 def read_labels(folder: Path) -> Labels:
     """The labels of a scan folder; none when the file is missing or unfit."""
     try:
-        document = json.loads(_small_text(folder / LABELS))
-        edition = document.get("edition", 0)
-        return Labels(
-            _title(document["title"]),
-            _tags(document["tags"]),
-            edition if isinstance(edition, int) else 0,
-        )
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, InputError):
+        found = labels_in(folder / LABELS)
+        return Labels(_title(found.title), _tags(found.tags), found.edition)
+    except UNREADABLE:
         return Labels()
 
 
 def _facts(folder: Path) -> dict[str, Any]:
     """From scan.json when it is there, else from the store's header."""
-    path = folder / SUMMARY
-    if path.is_file():
-        document = json.loads(_small_text(path))
-        if document.get("schema") != 1:
-            raise InputError("scan.json was written by another version; update skyrelief")
-        return {
-            "started_unix_s": float(document["times"]["started_unix_s"]),
-            "origin": document["origin"],
-            "finished": bool(document["finished"]),
-            "counts": document["counts"],
-            "quality": document["quality"],
-            "notes": document["notes"],
-        }
+    if (folder / SUMMARY).exists():
+        return facts_of(folder / SUMMARY)
     with ScanStore.open(folder / "scan.db") as store:
-        header = store.header
-        origin = None
-        if header.origin_lat_deg is not None:
-            origin = {
-                "lat_deg": header.origin_lat_deg,
-                "lon_deg": header.origin_lon_deg,
-                "alt_amsl_m": header.origin_alt_amsl_m,
-            }
-        return {
-            "started_unix_s": header.started_unix_ns / 1e9,
-            "origin": origin,
-            "finished": store.finished,
-            "counts": {"keyframes": len(store.seqs())},
-            "quality": {},
-            "notes": list(header.notes),
-        }
+        return facts_of(store)
 
 
 def _files(folder: Path) -> list[dict[str, Any]]:
     out = []
     for name, what in FILES.items():
         path = folder / name
-        if path.is_file():
-            out.append({"name": name, "what": what, "bytes": path.stat().st_size})
+        with contextlib.suppress(OSError):  # deleted meanwhile
+            if is_regular(path):
+                out.append({"name": name, "what": what, "bytes": path.stat().st_size})
     return out
-
-
-def _small_text(path: Path) -> str:
-    """The text of a small file. Raises ValueError when it is not small, OSError when not there."""
-    if path.stat().st_size > LARGEST_JSON_BYTES:
-        raise ValueError(f"{path.name} is too large")
-    return path.read_text(encoding="utf-8")
 
 
 def _title(title: Any) -> str:
     if not isinstance(title, str) or len(title) > LONGEST_TITLE:
         raise InputError(f"a title is a text of at most {LONGEST_TITLE} letters")
+    if any(0xD800 <= ord(letter) <= 0xDFFF for letter in title):
+        raise InputError("a title holds half a letter (a lone surrogate)")
     return " ".join(title.split())
 
 

@@ -45,7 +45,8 @@ async def serve_live(socket: WebSocket, folder: Path) -> None:
 
 def _most_points(socket: WebSocket) -> int | None:
     text = socket.query_params.get("points", "")
-    return min(max(int(text), 100), 1_000_000) if text.isdigit() and len(text) < 9 else None
+    is_number = text.isascii() and text.isdigit() and len(text) < 9
+    return min(max(int(text), 100), 1_000_000) if is_number else None
 
 
 def _send(socket: WebSocket, message: str | bytes) -> Awaitable[None]:

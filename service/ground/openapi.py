@@ -16,6 +16,7 @@ def _operation(
     if change:
         out["security"] = [{"token": []}]
         out["responses"]["401"] = {"description": "the token is missing"}
+        out["responses"]["413"] = {"description": "the request is too large"}
     if body is not None:
         schema = {"type": "object", "properties": body, "additionalProperties": False}
         out["requestBody"] = {"required": True, "content": {"application/json": {"schema": schema}}}
@@ -90,7 +91,8 @@ DOCUMENT: dict[str, Any] = {
         ),
         "/api/import": _path(
             post=_operation(
-                "Bring a scan folder or an MCAP of this machine into the library.",
+                "Copy the known files of a scan folder, or an MCAP, of this machine in;"
+                " 409 while another import runs.",
                 "its drone and scan",
                 True,
                 {"folder": _TEXT},
@@ -100,7 +102,7 @@ DOCUMENT: dict[str, Any] = {
         "/api/vehicle": _path(
             get=_operation("Battery, satellites, speed, height, distance from home.", "figures"),
             post=_operation(
-                "Give an order to the companion.",
+                "Give an order to the companion; 429 when they come too fast, but for stop.",
                 "its answer",
                 True,
                 {

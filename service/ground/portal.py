@@ -1,22 +1,37 @@
-"""The portal as a server: where it listens, its token, its thread."""
+"""The portal as a server: where it listens, its tokens, its thread."""
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import secrets
-import socket
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from service.errors import InputError, OutsideError
-from service.ground.guard import LARGEST_BODY_BYTES, is_loopback
+from service.ground.audit import AuditLog
 from service.ground.http import portal_app
+from service.ground.limits import LARGEST_BODY_BYTES, Limits
+from service.ground.tokens import Tokens, kept_token, parse_tokens, read_tokens
 from service.ground.vehicle import Vehicle
+from service.listener import (
+    BoundedListener,
+    ListenerLimits,
+    is_loopback,
+    raise_descriptor_limit,
+)
+from service.workers import Worker, Workers
 
 log = logging.getLogger(__name__)
+
+MIN_TOKEN_LETTERS = 16
+STALL_S = 60.0
+"""A portal whose event loop does not turn for so long hangs."""
+
+BACKLOG = 64
+"""Connections that may wait to be accepted, and that are accepted at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +41,7 @@ class PortalConfig:
     store: Path
     host: str = "127.0.0.1"
     port: int = 8080
-    token: str = ""  # empty: made at the start; only on this machine
+    token: str = ""  # one, or lines of NAME TOKEN; empty: made at the start, only on this machine
     tls_certificate: str = ""
     tls_key: str = ""
 
@@ -34,9 +49,11 @@ class PortalConfig:
         """Raise InputError for an address open to others without a token."""
         if not 0 <= self.port < 65536:
             raise InputError(f"portal: port {self.port} is not 0 to 65535")
-        if not is_loopback(self.host) and len(self.token) < 16:
+        shortest = min(map(len, parse_tokens(self.token).values())) if self.token else 0
+        if not is_loopback(self.host) and shortest < MIN_TOKEN_LETTERS:
             raise InputError(
-                f"portal on {self.host}: others can reach it; give a token of 16 letters or more"
+                f"portal on {self.host}: others can reach it; "
+                f"give a token of {MIN_TOKEN_LETTERS} letters or more"
             )
 
     @property
@@ -54,75 +71,131 @@ def parse_address(text: str) -> tuple[str, int]:
 
 
 class Portal:
-    """The web server, on a thread of its own between :meth:`start` and :meth:`close`."""
+    """The web server, on a worker of its own between :meth:`start` and :meth:`close`."""
 
     def __init__(
         self,
         config: PortalConfig,
         progress: Callable[[], list[dict[str, Any]]] | None = None,
         vehicle: Vehicle | None = None,
+        workers: Workers | None = None,
     ) -> None:
         """``progress`` gives one entry per scan being received (``Receiver.progress``)."""
         self.config = config
-        self.token = config.token or secrets.token_urlsafe(24)
+        self._workers = workers or Workers()
+        tokens = parse_tokens(config.token or secrets.token_urlsafe(24))
+        self.token = next(iter(tokens.values()))
         self._app = portal_app(
-            config.store, self.token, is_loopback(config.host), progress, vehicle
+            config.store,
+            Tokens(tokens),
+            is_loopback(config.host),
+            AuditLog(config.store),
+            progress,
+            vehicle,
         )
         self._vehicle = vehicle
-        self._socket: socket.socket | None = None
+        self._listener: BoundedListener | None = None
+        self._port = config.port
         self._server: Any = None
-        self._thread: threading.Thread | None = None
+        self._worker: Worker | None = None
 
     @property
     def url(self) -> str:
         """The address to open, with the token in it."""
-        port = self.config.port if self._socket is None else self._socket.getsockname()[1]
         scheme = "https" if self.config.tls else "http"
         host = f"[{self.config.host}]" if ":" in self.config.host else self.config.host
-        return f"{scheme}://{host}:{port}/?token={self.token}"
+        return f"{scheme}://{host}:{self._port}/?token={self.token}"
 
     def start(self) -> None:
         """Begin to serve; raises OutsideError when the address cannot be used."""
-        import uvicorn
-
         config = self.config
-        family = socket.AF_INET6 if ":" in config.host else socket.AF_INET
-        try:
-            self._socket = socket.create_server((config.host, config.port), family=family)
-        except OSError as error:
-            raise OutsideError(
-                f"portal: cannot listen on {config.host}:{config.port} ({error.strerror}); "
-                "choose another address"
-            ) from error
+        self._listener = self._listen(config.port)
+        self._port = int(self._listener.getsockname()[1])
         if not is_loopback(config.host) and not config.tls:
             log.warning("portal on %s without TLS: the token can be read on the way", config.host)
-        self._server = uvicorn.Server(
+        self._server = self._new_server(self._listener)
+        self._worker = self._workers.start("portal", self._run, STALL_S)
+
+    def _listen(self, port: int) -> BoundedListener:
+        host = self.config.host
+        try:
+            return BoundedListener(host, port, listener_limits())
+        except OSError as error:
+            raise OutsideError(
+                f"portal: cannot listen on {host}:{port} ({error.strerror}); choose another address"
+            ) from error
+
+    def _new_server(self, listener: BoundedListener) -> Any:
+        import uvicorn
+
+        return uvicorn.Server(
             uvicorn.Config(
-                self._app,
+                Limits(self._app, listener),
+                http="h11",
+                loop="asyncio",
+                backlog=BACKLOG,
+                proxy_headers=False,  # anybody here could write them
                 log_level="warning",
                 access_log=False,
                 lifespan="off",
                 ws_max_size=LARGEST_BODY_BYTES,
-                ssl_certfile=config.tls_certificate or None,
-                ssl_keyfile=config.tls_key or None,
+                ssl_certfile=self.config.tls_certificate or None,
+                ssl_keyfile=self.config.tls_key or None,
             )
         )
-        sockets = [self._socket]
-        self._thread = threading.Thread(
-            target=lambda: self._server.run(sockets=sockets), name="portal", daemon=True
-        )
-        self._thread.start()
+
+    def _run(self, worker: Worker) -> None:
+        """Serve until :meth:`close`; after a fault on a new socket with the same port."""
+        assert self._listener is not None
+        if worker.restarts:
+            self._listener.close()
+            self._listener = self._listen(self._port)
+            self._server = self._new_server(self._listener)
+        asyncio.run(self._serve(worker))
+
+    async def _serve(self, worker: Worker) -> None:
+        sweeper = asyncio.create_task(self._sweep(worker))
+        try:
+            await self._server.serve(sockets=[self._listener])
+        finally:
+            sweeper.cancel()
+
+    async def _sweep(self, worker: Worker) -> None:
+        """Close the connections whose request does not come, once a second."""
+        assert self._listener is not None
+        while True:
+            await asyncio.sleep(1.0)
+            worker.beat()
+            self._listener.sweep()
 
     def close(self) -> None:
-        """End; open connections and the vehicle are let go."""
-        if self._server is not None and self._thread is not None:
+        """End; open connections and the vehicle's link are closed."""
+        if self._server is not None and self._worker is not None:
+            self._worker.stop.set()
             self._server.should_exit = True
             self._server.force_exit = True
-            self._thread.join(timeout=5.0)
-        if self._socket is not None:
-            self._socket.close()
+            self._worker.join(5.0)
+        if self._listener is not None:
+            self._listener.close()
         if self._vehicle is not None:
             self._vehicle.close()
+
+
+def listener_limits() -> ListenerLimits:
+    """The portal's limits: at most a quarter of the descriptors, so that the datalink has some.
+
+    A connection takes two at most, itself and a file.
+    """
+    descriptors = raise_descriptor_limit()
+    default = ListenerLimits()
+    total = max(min(default.total, descriptors // 4), 1)
+    if total < default.total:
+        log.warning(
+            "only %d descriptors may be open: the portal takes %d connections; raise ulimit -n",
+            descriptors,
+            total,
+        )
+    return ListenerLimits(total, min(default.per_address, total), default.wait_s)
 
 
 def open_portal(
@@ -132,25 +205,20 @@ def open_portal(
     token_file: Path | None = None,
     tls: tuple[Path, Path] | None = None,
     vehicle: Vehicle | None = None,
+    workers: Workers | None = None,
 ) -> Portal:
     """A started portal at ``HOST:PORT`` on the scans below ``store``.
 
-    ``token_file`` holds the token; without it one is made, on this machine only. ``tls`` are
+    ``token_file`` holds the tokens; without it one is made and kept in the store. ``tls`` are
     certificate and key. Raises InputError or OutsideError, in one line.
     """
     host, port = parse_address(address)
-    token = ""
-    if token_file is not None:
-        try:
-            token = token_file.read_text(encoding="utf-8").strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"portal token {token_file} cannot be read ({error})") from error
-        if not token:
-            raise InputError(f"portal token {token_file} is empty")
+    token = kept_token(store) if token_file is None else read_tokens(token_file)
     for path in tls or ():
         if not path.is_file():
             raise InputError(f"portal certificate {path}: no such file")
     certificate, key = (str(path) for path in tls) if tls else ("", "")
-    portal = Portal(PortalConfig(store, host, port, token, certificate, key), progress, vehicle)
+    config = PortalConfig(store, host, port, token, certificate, key)
+    portal = Portal(config, progress, vehicle, workers)
     portal.start()
     return portal

@@ -12,11 +12,15 @@ from starlette.routing import Route
 
 from recon.types import U8, Bool
 from service.errors import InputError
+from service.ground.folder_import import is_regular
 from service.ground.state import names_of, state_of
 from service.stream.store import ScanStore
 
 TILE = re.compile(r"[A-Za-z0-9_]{1,80}\.(json|pnts|b3dm|glb)")
 """What py3dtiles names its files; all lie in one folder."""
+
+DEEPEST_TILE = 8
+SEQ = re.compile(r"[0-9]{1,9}")
 
 JPEG_QUALITY = 82
 DARK = (45, 38, 32)
@@ -31,7 +35,7 @@ def file_routes(one: str) -> list[Route]:
     return [
         Route(one + "/files/{name}", _file),
         Route(one + "/tiles/{name:path}", _tile),
-        Route(one + "/keyframes/{seq:int}.jpg", _picture),
+        Route(one + "/keyframes/{seq}.jpg", _picture),
         Route(one + "/coverage.png", _coverage),
         Route(one + "/coverage.json", _coverage),
     ]
@@ -52,8 +56,8 @@ def _tile(request: Request) -> Response:
     folder = state_of(request).library.folder(*names_of(request)) / "3dtiles"
     *inner, name = request.path_params["name"].split("/")
     fit = TILE.fullmatch(name) and all(re.fullmatch(r"[A-Za-z0-9_]{1,80}", part) for part in inner)
-    path = folder.joinpath(*inner, name) if fit else folder
-    if not path.is_file():
+    path = folder.joinpath(*inner, name) if fit and len(inner) < DEEPEST_TILE else folder
+    if not is_regular(path):
         raise InputError("no such tile")
     return FileResponse(path)
 
@@ -61,8 +65,10 @@ def _tile(request: Request) -> Response:
 def _picture(request: Request) -> Response:
     """The colours of a keyframe as JPEG; small gaps are closed, the rest is dark."""
     folder = state_of(request).library.folder(*names_of(request))
+    if not SEQ.fullmatch(request.path_params["seq"]):
+        raise InputError("no such keyframe")
     with ScanStore.open(folder / "scan.db") as store:
-        keyframe = store.keyframe(request.path_params["seq"])
+        keyframe = store.keyframe(int(request.path_params["seq"]))
     if keyframe is None:
         raise InputError("no such keyframe")
     bgr = _closed(keyframe.bgr, keyframe.fresh)
@@ -93,6 +99,6 @@ def _coverage(request: Request) -> Response:
     found = state.coverages.of(state.library.folder(*names_of(request)))
     if found is None:
         raise InputError("no surface yet")
-    if request.url.path.endswith(".png"):
+    if request.scope["path"].endswith(".png"):
         return Response(found.png_bytes(), media_type="image/png")
     return Response(found.json_bytes(), media_type="application/json")

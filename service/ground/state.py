@@ -25,6 +25,7 @@ class PortalState:
     vehicle: Vehicle | None
     coverages: LiveCoverages = field(default_factory=LiveCoverages)
     live_views: int = 0
+    views_without_token: int = 0  # of these
     started: float = field(default_factory=time.monotonic)
 
 

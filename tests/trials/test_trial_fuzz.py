@@ -168,13 +168,14 @@ def test_health_page_answers_as_described(tmp_path: Path, record: Row) -> None:
 def test_portal_answers_as_described(tmp_path: Path, record: Row) -> None:
     """Requests made from the served description, right and wrong: never a fault of ours."""
     schemathesis = pytest.importorskip("schemathesis")
+    from service.ground.audit import AuditLog
     from service.ground.http import portal_app
+    from service.ground.tokens import Tokens
 
     token, tried = "a-token-of-the-trials", 0
     headers = {"Authorization": f"Bearer {token}", "Host": "127.0.0.1"}
-    schema = schemathesis.openapi.from_asgi(
-        "/api/openapi.json", portal_app(tmp_path, token, local=True), headers=headers
-    )
+    app = portal_app(tmp_path, Tokens({"trial": token}), True, AuditLog(tmp_path))
+    schema = schemathesis.openapi.from_asgi("/api/openapi.json", app, headers=headers)
     for operation in schema.get_all_operations():
 
         @settings(

@@ -1,0 +1,120 @@
+"""What the library shows of a scan, read from files that may come from a stranger.
+
+Strict JSON into typed records with bounds: what does not fit raises ValueError or RecursionError
+here, and nothing odd (no NaN, no half letter) reaches the list.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+
+from service.errors import InputError
+from service.ground.folder_import import is_regular
+from service.stream.store import ScanStore
+
+LARGEST_JSON_BYTES = 4_000_000
+SCHEMA = 1
+
+UnixTime = Annotated[float, msgspec.Meta(ge=-1e11, le=1e11)]
+Figure = Annotated[float, msgspec.Meta(ge=-1e300, le=1e300)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
+Note = Annotated[str, msgspec.Meta(max_length=4000)]
+
+
+class Origin(msgspec.Struct):
+    """Where a scan's own coordinates begin."""
+
+    lat_deg: Annotated[float, msgspec.Meta(ge=-90, le=90)]
+    lon_deg: Annotated[float, msgspec.Meta(ge=-180, le=180)]
+    alt_amsl_m: Annotated[float, msgspec.Meta(ge=-1e5, le=1e7)]
+
+
+class Times(msgspec.Struct):
+    """When a scan was made."""
+
+    started_unix_s: UnixTime
+
+
+class Facts(msgspec.Struct):
+    """The part of a summary that the list shows."""
+
+    times: Times
+    finished: bool
+    counts: Annotated[dict[str, Count], msgspec.Meta(max_length=100)]
+    quality: Annotated[dict[str, Figure | None], msgspec.Meta(max_length=100)]
+    notes: Annotated[list[Note], msgspec.Meta(max_length=1000)]
+    origin: Origin | None = None
+
+    def shown(self) -> dict[str, Any]:
+        """The entries of the list."""
+        plain: dict[str, Any] = msgspec.to_builtins(self)
+        return {**plain.pop("times"), **plain}
+
+
+class _Schema(msgspec.Struct):
+    schema: int
+
+
+class StoredLabels(msgspec.Struct):
+    """What ``library.json`` holds."""
+
+    title: str
+    tags: list[str]
+    edition: Count = 0
+
+
+def labels_in(path: Path) -> StoredLabels:
+    """The labels in ``path``; ValueError, RecursionError or OSError when they are unfit."""
+    return msgspec.json.decode(_small(path), type=StoredLabels)
+
+
+def facts_of(source: Path | ScanStore) -> dict[str, Any]:
+    """What the list shows of a scan, from its ``scan.json`` or its open store.
+
+    Raises InputError, ValueError, RecursionError or OSError for what cannot be read.
+    """
+    return (_from_summary(source) if isinstance(source, Path) else _from_store(source)).shown()
+
+
+def _from_summary(path: Path) -> Facts:
+    data = _small(path)
+    try:
+        if msgspec.json.decode(data, type=_Schema).schema != SCHEMA:
+            raise InputError(f"{path.name} was written by another version; update skyrelief")
+        return msgspec.json.decode(data, type=Facts)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path.name} cannot be read: {error}") from error
+
+
+def _from_store(store: ScanStore) -> Facts:
+    header = store.header
+    origin = {
+        "lat_deg": header.origin_lat_deg,
+        "lon_deg": header.origin_lon_deg,
+        "alt_amsl_m": header.origin_alt_amsl_m,
+    }
+    return msgspec.convert(
+        {
+            "times": {"started_unix_s": header.started_unix_ns / 1e9},
+            "finished": store.finished,
+            "counts": {"keyframes": len(store.seqs())},
+            "quality": {},
+            "notes": list(header.notes),
+            "origin": None if header.origin_lat_deg is None else origin,
+        },
+        Facts,
+    )
+
+
+def _small(path: Path) -> bytes:
+    """The content of a small file; ValueError when it is not small."""
+    if not is_regular(path):
+        raise ValueError(f"{path.name} is no regular file")
+    with open(path, "rb") as file:
+        data = file.read(LARGEST_JSON_BYTES + 1)
+    if len(data) > LARGEST_JSON_BYTES:
+        raise ValueError(f"{path.name} is too large")
+    return data

@@ -1,0 +1,173 @@
+"""A listening socket that strangers cannot exhaust, and what belongs to serving on one.
+
+Descriptors are shared by the whole process: who opens thousands of connections to a web page would
+stop the datalink with it. So a listener has a limit in total and one per address, and a connection
+that waits too long for its request is closed. At a limit the connection that has waited longest
+gives way, so that half-open connections lock no operator out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import logging
+import re
+import resource
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+log = logging.getLogger(__name__)
+
+Peer = tuple[str, int]
+"""Address and port at the other end."""
+
+DESCRIPTORS = 8192
+"""What a service asks for; the same number stands in its systemd unit."""
+
+
+@dataclass(frozen=True, slots=True)
+class ListenerLimits:
+    """How many connections may be open, and how long one may wait for its request."""
+
+    total: int = 256
+    per_address: int = 32  # IPv6: per /64 network
+    wait_s: float = 10.0  # for a TLS handshake and a request's whole header
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        if not 0 < self.per_address <= self.total or self.wait_s <= 0:
+            raise ValueError("listener: 0 < per_address <= total and wait_s > 0 must hold")
+
+
+@dataclass(slots=True, eq=False)
+class _Connection:
+    socket: socket.socket
+    network: str
+    waits_since: float  # monotonic
+    is_busy: bool = False  # with a request or as a WebSocket
+
+    def end(self) -> None:
+        """Make its owner, who reads from it, close it."""
+        with contextlib.suppress(OSError):
+            self.socket.shutdown(socket.SHUT_RDWR)
+
+
+class BoundedListener(socket.socket):
+    """A listening TCP socket with limits. Use from one thread.
+
+    Raises OSError when HOST:PORT cannot be listened on.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        limits: ListenerLimits | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        super().__init__(fileno=socket.create_server((host, port), family=family).detach())
+        self._limits = limits or ListenerLimits()
+        self._clock = clock
+        self._open: dict[Peer, _Connection] = {}
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """The next connection; ConnectionAbortedError for one over the limits."""
+        connection, address = super().accept()
+        self._forget_closed()
+        network = network_of(address[0])
+        if not self._make_room(network):
+            connection.close()
+            raise ConnectionAbortedError(f"too many connections from {network}")
+        self._open[address[:2]] = _Connection(connection, network, self._clock())
+        return connection, address
+
+    def begin(self, peer: Peer | None) -> None:
+        """A request of ``peer`` is being served: it waits no longer."""
+        if peer is not None and (found := self._open.get(peer)):
+            found.is_busy = True
+
+    def end(self, peer: Peer | None) -> None:
+        """The request of ``peer`` was served: it waits for the next one."""
+        if peer is not None and (found := self._open.get(peer)):
+            found.is_busy, found.waits_since = False, self._clock()
+
+    def drop(self, peer: Peer | None) -> None:
+        """Close the connection of ``peer``."""
+        if peer is not None and (found := self._open.pop(peer, None)):
+            found.end()
+
+    def sweep(self) -> None:
+        """Close the connections that have waited too long; call it about once a second."""
+        self._forget_closed()
+        latest = self._clock() - self._limits.wait_s
+        for peer, connection in list(self._open.items()):
+            if not connection.is_busy and connection.waits_since <= latest:
+                self.drop(peer)
+
+    def _make_room(self, network: str) -> bool:
+        """Whether one more connection of ``network`` fits, perhaps in place of one that waits."""
+        same = [peer for peer, found in self._open.items() if found.network == network]
+        if len(same) >= self._limits.per_address:
+            return self._drop_longest_waiting(same)
+        if len(self._open) >= self._limits.total:
+            return self._drop_longest_waiting(list(self._open))
+        return True
+
+    def _drop_longest_waiting(self, peers: list[Peer]) -> bool:
+        waiting = [peer for peer in peers if not self._open[peer].is_busy]
+        if not waiting:
+            return False
+        self.drop(min(waiting, key=lambda peer: self._open[peer].waits_since))
+        return True
+
+    def _forget_closed(self) -> None:
+        for peer in [peer for peer, found in self._open.items() if found.socket.fileno() < 0]:
+            del self._open[peer]
+
+
+def network_of(host: str) -> str:
+    """What one limit is for: an IPv4 address, or the /64 network of an IPv6 address."""
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return host
+    if isinstance(address, ipaddress.IPv4Address):
+        return host
+    if address.ipv4_mapped is not None:
+        return str(address.ipv4_mapped)
+    return str(ipaddress.ip_network((int(address) >> 64 << 64, 64)))
+
+
+def is_loopback(host: str) -> bool:
+    """True when only this machine can reach ``host``."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def host_name(header: str) -> str:
+    """The name or address in a ``Host`` header, without port and brackets."""
+    found = re.fullmatch(r"\[([^\]]*)\](?::\d*)?|([^:\[\]]*)(?::\d*)?", header.strip())
+    return "" if found is None else (found[1] or found[2] or "").lower()
+
+
+def raise_descriptor_limit(wanted: int = DESCRIPTORS) -> int:
+    """Let this process open ``wanted`` descriptors, or as many as it may; how many that are."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    unlimited = resource.RLIM_INFINITY
+    target = wanted if hard == unlimited else min(wanted, hard)
+    if soft == unlimited or soft >= target:
+        return wanted if soft == unlimited else soft
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (target, hard))
+    except (OSError, ValueError) as error:
+        log.warning("only %d descriptors may be open (%s)", soft, error)
+        return soft
+    return target
