@@ -139,7 +139,6 @@ class Companion:
             self.counts["not understood"] += 1
             return
         name = message.get_type()
-        self.watch.hear(packet, message, now_ns)
         for listener in self._listeners.get(name, ()):
             listener(message)
         if packet.message_id == HEARTBEAT:
@@ -159,6 +158,7 @@ class Companion:
             self._hear_file_request(message, link)
         elif packet.message_id == TIMESYNC:
             self.autopilot.hear_timesync(message, packet, link, now_ns)
+        self.watch.hear(packet, message, now_ns)  # by now it is known whose heartbeat it was
 
     def _hear_command(self, message: Any, link: int, now_ns: int) -> None:
         call = decode_call(message, link)

@@ -116,7 +116,6 @@ class LinkProbe:
         if message is None:
             return
         self._presence.count(packet.system, packet.component)
-        self._watch.hear(packet, message, now_ns)
         if packet.message_id == HEARTBEAT:
             self._presence.hear(message, now_ns)
             self._autopilot.follow()
@@ -126,6 +125,7 @@ class LinkProbe:
             self._autopilot.hear_system_time(message, packet, now_ns)
         elif message.get_type() in READERS:
             self._autopilot.hear_telemetry(message.get_type(), message, packet, now_ns)
+        self._watch.hear(packet, message, now_ns)
 
     def _found(self, now_ns: int) -> Found:
         links = tuple(

@@ -59,7 +59,7 @@ NEVER_ASKED = (
 class Trouble:
     """Something that a flight misses."""
 
-    what: str  # autopilot, mavlink 1, gimbal or ground station
+    what: str  # autopilot, mavlink 1, gimbal or ground
     text: str
     is_known: bool = False  # another text has named it already
     is_grave: bool = True  # we are not ready to fly with it
@@ -144,10 +144,10 @@ class LinkWatch:
         if self._is_stale(self._ground_ns, wait_s, now_ns):
             is_asked = asked_ns is not None and not self._is_stale(asked_ns, wait_s, now_ns)
             text = UNANSWERED if is_asked and not self._is_ground_heard else NO_GROUND
-            return Trouble("ground station", text)
+            return Trouble("ground", text)
         is_late = self._is_stale(self._start_ns, ASK_WAIT_S, now_ns)
         if asked_ns is None and is_late and self._presence.firmware == PX4:
-            return Trouble("ground station", NEVER_ASKED, is_grave=False)
+            return Trouble("ground", NEVER_ASKED, is_grave=False)
         return None
 
     def news(self, now_ns: int, is_start: bool) -> Sequence[str]:

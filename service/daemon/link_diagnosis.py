@@ -13,7 +13,7 @@ from service.daemon.vehicle_config import watch_config
 if TYPE_CHECKING:
     from mavlink.link_probe import LinkFound
 
-WORST = {"ground station": NOTE}  # it may just be off
+WORST = {"ground": NOTE}  # it may just be off
 
 
 def examine_links(
