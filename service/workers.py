@@ -14,10 +14,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from service.errors import SkyreliefError
+
 log = logging.getLogger(__name__)
 
 MAX_RESTARTS, WINDOW_S = 5, 60.0
 """A worker that fails more often than this within the window is not restarted any more."""
+MAX_FAILED = 100
+"""Workers that are no longer restarted, kept for the report."""
 PAUSE_S = 0.5
 """From a fault to the restart."""
 
@@ -29,6 +33,7 @@ class Worker:
     name: str
     work: Callable[[Worker], None]
     stall_s: float | None  # without a beat for so long it hangs; None: it may block
+    is_essential: bool = True  # the process is of no use without it
     restarts: int = 0
     fault: str = ""  # the last exception, in one line
     has_failed: bool = False  # the budget of restarts is spent
@@ -67,26 +72,31 @@ class Workers:
         self._workers: list[Worker] = []
 
     def start(
-        self, name: str, work: Callable[[Worker], None], stall_s: float | None = None
+        self,
+        name: str,
+        work: Callable[[Worker], None],
+        stall_s: float | None = None,
+        is_essential: bool = True,
     ) -> Worker:
         """Run ``work(worker)`` on a thread until it returns; after an exception run it again.
 
         ``work`` ends soon after ``worker.stop`` is set.
         """
-        worker = Worker(name, work, stall_s)
+        worker = Worker(name, work, stall_s, is_essential)
         worker.thread = threading.Thread(
             target=self._supervise, args=(worker,), name=name, daemon=True
         )
         with self._lock:
-            self._workers = [w for w in self._workers if not w.is_done or w.has_failed]
-            self._workers.append(worker)
+            failed = [w for w in self._workers if w.has_failed and w.name != name]
+            running = [w for w in self._workers if not w.is_done]
+            self._workers = [*failed[-MAX_FAILED:], *running, worker]
         worker.thread.start()
         return worker
 
     @property
     def failed(self) -> list[Worker]:
-        """Workers that are no longer restarted."""
-        return [worker for worker in self._table() if worker.has_failed]
+        """Essential workers that are no longer restarted: the process should end."""
+        return [worker for worker in self._table() if worker.has_failed and worker.is_essential]
 
     @property
     def stalled(self) -> list[Worker]:
@@ -136,7 +146,10 @@ def guarded(name: str, work: Callable[[], None]) -> str:
     """Run ``work``; the exception that ended it in one line, empty when there was none."""
     try:
         work()
-    except Exception as error:  # whatever it is, it must not end anything else
+    except (SkyreliefError, OSError) as error:
+        log.error("%s: %s", name, error)
+        return str(error)
+    except Exception as error:  # a fault of ours; it must not end anything else
         log.exception("fault in %s", name)
         return f"{type(error).__name__}: {error}".splitlines()[0][:200]
     return ""

@@ -21,6 +21,7 @@ from service.bench import BenchOptions, BenchResult, radio
 from service.bench.keyframes import make_keyframe, strip
 from service.bench.link_emulator import LinkEmulator, LinkModel, free_port
 from service.config import DatalinkConfig
+from service.ground.received import ReceivedScan
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream import codec
 from service.stream.link import DatalinkSender
@@ -307,19 +308,17 @@ class _WatchedReceiver(Receiver):
         super().__init__(config)
         self.came: dict[tuple[str, str, int], float] = {}
 
-    def _scan(self, drone: str, scan_id: str):  # type: ignore[no-untyped-def]
-        known = (drone, scan_id) in self._scans
-        scan = super()._scan(drone, scan_id)
-        if scan is not None and not known:
+    def opened(self, scan: ReceivedScan) -> None:
+        """Listen to the scan's store."""
 
-            def came(kind: str, number: int) -> None:
-                self.came.setdefault((drone, kind, number), time.monotonic())
+        def came(kind: str, number: int) -> None:
+            self.came.setdefault((scan.drone, kind, number), time.monotonic())
 
-            scan.intake.store.listen(came)
-        return scan
+        scan.intake.store.listen(came)
 
-    def _write(self, scan) -> None:  # type: ignore[no-untyped-def]
-        scan.unwritten = False
+    def write(self, scan: ReceivedScan) -> None:
+        """Write nothing."""
+        scan.unwritten, scan.is_writing, scan.is_written = False, False, True
 
 
 def _coarse_share(drone: _Drone, ground: _WatchedReceiver) -> float:

@@ -29,6 +29,7 @@ from recon import se3
 from recon.types import F64, DepthMap, Keyframe, Pose
 from service.bench.link_emulator import free_port
 from service.config import DatalinkConfig
+from service.ground.received import ReceivedScan
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream import codec
 from service.stream.link import DatalinkSender
@@ -174,8 +175,9 @@ def _fly(folder: Path) -> RadioOutcome:
 class _Receiver(Receiver):
     """A receiver that writes no deliverables."""
 
-    def _write(self, scan) -> None:  # type: ignore[no-untyped-def]
-        scan.unwritten = False
+    def write(self, scan: ReceivedScan) -> None:
+        """Write nothing."""
+        scan.unwritten, scan.is_writing, scan.is_written = False, False, True
 
 
 def _produce(store: ScanStore, flight: _Flight, at_s: float) -> None:

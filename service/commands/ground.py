@@ -12,16 +12,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from service.errors import InputError, SkyreliefError
 from service.packages import needing
 
 if TYPE_CHECKING:
+    from service.ground.drone import Limits
     from service.ground.portal import Portal
     from service.ground.receiver import Receiver
+    from service.init_system import Notifier
     from service.stream.radio_link import RadioLink
+    from service.workers import Worker, Workers
 
 DEFAULT_PORT = 7447
 RADIO_REFRESH_S = 15.0
 MAV_TYPE_GCS = 6
+NOTIFY_S = 1.0
+CLOSING_S = 900.0
+"""Writing deliverables at the end may take so long; then the init system ends it."""
 
 
 def ground(
@@ -41,6 +48,13 @@ def ground(
     ] = False,
     quota_mb: Annotated[
         float | None, typer.Option(help="of one scan; beyond it only coarse layers are kept")
+    ] = None,
+    drone_share: Annotated[
+        float, typer.Option(help="percent of the disk that the scans of one drone may take")
+    ] = 50.0,
+    reserve_mb: Annotated[
+        float | None,
+        typer.Option(help="of the disk, kept free; default: 5 percent, at most 2 GiB"),
     ] = None,
     mavlink: Annotated[
         list[str] | None,
@@ -80,9 +94,11 @@ def ground(
 ) -> None:
     """Receive scans from drones; end with Ctrl-C. Scans lie in STORE/DRONE/SCAN."""
     from service.ground.receiver import Receiver, ReceiverConfig
+    from service.init_system import Notifier
     from service.stream.keys import tls_files
     from service.stream.radio_link import GROUND, RadioLink
     from service.stream.session import SessionConfig
+    from service.workers import Workers
 
     ca, certificate, key = tls_files(keys) if keys is not None else ("", "", "")
     if not connect and not listen:
@@ -98,11 +114,13 @@ def ground(
         tls_key=key,
         fleet_rights=keys is not None and bool(listen),
     )
-    quota = None if quota_mb is None else int(quota_mb * 1e6)
+    limits = _limits(quota_mb, drone_share, reserve_mb)
     refresh = refresh_s if refresh_s is not None else RADIO_REFRESH_S if mavlink else 0.0
+    notifier = Notifier()
     for folder in take or ():
         _take_in(store, folder)
-    receiver = Receiver(ReceiverConfig(store, session, quota, refresh_s=refresh))
+    stop, workers = _stop_by_signal(), Workers()
+    receiver = Receiver(ReceiverConfig(store, session, limits, refresh_s=refresh), workers)
     radios = [RadioLink(endpoint, GROUND, receiver.add_radio) for endpoint in mavlink or ()]
     receiver.start()
     where = ", ".join((*session.listen, *session.connect))
@@ -112,16 +130,35 @@ def ground(
     page = None
     try:
         if portal is not None:
-            page = _open_portal(portal, receiver, store, portal_token, portal_tls, vehicle)
-        _watch(receiver, radios, once, idle_exit_s)
+            page = _open_portal(portal, receiver, workers, store, portal_token, portal_tls, vehicle)
+        notifier.ready()
+        _watch(stop, receiver, workers, notifier, radios, once, idle_exit_s)
         entries = receiver.progress()
     finally:
+        notifier.stopping()
+        closing = workers.start("closing", lambda worker: _ask_for_time(notifier, worker))
         if page is not None:
             page.close()
         for radio in radios:
             radio.close()
         receiver.close()
+        closing.join()
     _report(entries, receiver.dropped, as_json)
+
+
+def _limits(quota_mb: float | None, drone_share: float, reserve_mb: float | None) -> Limits:
+    """What one drone may take; InputError for what cannot be."""
+    from service.ground.drone import Limits
+
+    if not 0.0 < drone_share <= 100.0:
+        raise InputError("--drone-share is a percentage: more than 0, at most 100")
+    if (quota_mb is not None and not quota_mb >= 0) or (
+        reserve_mb is not None and not reserve_mb >= 0
+    ):
+        raise InputError("--quota-mb and --reserve-mb are 0 or more")
+    quota = None if quota_mb is None else int(quota_mb * 1e6)
+    reserve = None if reserve_mb is None else int(reserve_mb * 1e6)
+    return Limits(quota, drone_share / 100.0, reserve)
 
 
 def _take_in(store: Path, folder: Path) -> None:
@@ -135,6 +172,7 @@ def _take_in(store: Path, folder: Path) -> None:
 def _open_portal(
     address: str,
     receiver: Receiver,
+    workers: Workers,
     store: Path,
     token: Path | None,
     tls: tuple[Path, Path] | None,
@@ -144,7 +182,7 @@ def _open_portal(
     with needing("the portal"):
         from service.ground.portal import open_portal
         from service.ground.vehicle import Vehicle
-    vehicle = None if endpoint is None else Vehicle(endpoint)
+    vehicle = None if endpoint is None else Vehicle(endpoint, workers=workers)
     page = open_portal(address, store, receiver.progress, token, tls, vehicle)
     if vehicle is not None:
         vehicle.start()
@@ -152,18 +190,53 @@ def _open_portal(
     return page
 
 
-def _watch(
-    receiver: Receiver, radios: list[RadioLink], once: bool, idle_exit_s: float | None
-) -> None:
-    """Return on a signal, or when what the options name has come about."""
+def _ask_for_time(notifier: Notifier, worker: Worker) -> None:
+    """Keep the init system waiting while deliverables are written, for so long and no longer."""
+    deadline = time.monotonic() + CLOSING_S
+    while time.monotonic() < deadline:
+        notifier.closing()
+        if worker.stop.wait(NOTIFY_S):
+            return
+
+
+def _check(workers: Workers, notifier: Notifier) -> None:
+    """Feed the watchdog while every worker makes progress.
+
+    Raises SkyreliefError when one that the station cannot do without has failed for good.
+    """
+    for worker in workers.failed:
+        raise SkyreliefError(f"{worker.name} failed too often ({worker.fault}); see the log")
+    stalled = ", ".join(worker.name for worker in workers.stalled)
+    if stalled:
+        notifier.status(f"no progress: {stalled}")
+    else:
+        notifier.alive()
+
+
+def _stop_by_signal() -> Event:
+    """What the signals to end set; from now on they do not end the process themselves."""
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
+def _watch(
+    stop: Event,
+    receiver: Receiver,
+    workers: Workers,
+    notifier: Notifier,
+    radios: list[RadioLink],
+    once: bool,
+    idle_exit_s: float | None,
+) -> None:
+    """Return on a signal, or when what the options name has come about."""
     shown = beat_at = 0.0
     while not stop.wait(0.2):
         entries = receiver.progress()
         if time.monotonic() >= beat_at:
-            beat_at = time.monotonic() + 1.0
+            beat_at = time.monotonic() + NOTIFY_S
+            _check(workers, notifier)
             for radio in radios:
                 radio.beat(MAV_TYPE_GCS)
         if once and any(entry["complete"] for entry in entries):

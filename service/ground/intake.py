@@ -9,10 +9,12 @@ from __future__ import annotations
 import logging
 from collections import deque
 from dataclasses import dataclass, field
+from itertools import islice
 
+from service.stream import layer
 from service.stream.messages import Ask, Head, Held, Numbers, missing
 from service.stream.parts import Assembler, parse
-from service.stream.ranges import RangeSet
+from service.stream.ranges import MAX_RANGES, RangeSet
 from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
@@ -24,7 +26,9 @@ GRACE_S = 1.0
 """An item the drone has had for less than this may still come by itself."""
 STALL_S = 4.0
 SILENCE_S = 4.0
-"""A drone that told nothing for so long was away, or the link was; it knows no requests."""
+"""A drone silent for so long was away, or the link was; it knows no requests."""
+TIMED, MAX_TIMED = 64, 4096
+"""How many new layers of one kind in a head are timed, the newest, and how many in all."""
 REST_S = 2.0
 """Pause after a request that brought nothing."""
 
@@ -42,7 +46,7 @@ class Progress:
 
     received_bytes: int = 0
     duplicates: int = 0  # records that came although held
-    unsound: int = 0  # records that did not hold together
+    unsound: int = 0  # records that are not valid, or not what their parts said
     lag_s: dict[str, deque[float]] = field(default_factory=dict)  # by kind, the last 200
     asked: int = 0  # requests made
 
@@ -79,11 +83,12 @@ class ScanIntake:
 
     def on_head(self, head: Head, now: float) -> None:
         """The drone says what it has."""
-        held = self.store.numbers()
-        for kind, numbers in missing(head.numbers, held).items():
+        for kind, numbers in missing(head.numbers, self.store.numbers()).items():
             if kind.startswith("k"):
-                for number in numbers:
+                for number in islice(numbers.newest_first(), TIMED):
                     self._seen.setdefault((kind, number), now)
+        while len(self._seen) > MAX_TIMED:
+            del self._seen[next(iter(self._seen))]
         if now - self.head_at > SILENCE_S:
             self._requests.clear()
             self._rest_until.clear()
@@ -112,18 +117,42 @@ class ScanIntake:
 
     def _store(self, kind: str, number: int, record: bytes, now: float) -> bool:
         refused = self.store.refused
-        if not self.store.put_record(kind, number, record):
+        if not self._is_sound(kind, number, record) or not self.store.put_record(
+            kind, number, record
+        ):
             if self.store.refused > refused:
                 log.warning("quota reached: %s %d of %s is not kept", kind, number, self.store.path)
             else:
                 self.progress.unsound += 1
-            self._given_up.setdefault(kind, RangeSet()).add(number)
+            self._give_up(kind, number)
             return False
         for request in self._requests.values():
             request.brought += request.kind == kind
-        seen = self._seen.pop((kind, number), now)
-        self.progress.lag_s.setdefault(kind, deque(maxlen=200)).append(now - seen)
+        self._note_lag(kind, number, now)
         return True
+
+    def _is_sound(self, kind: str, number: int, record: bytes) -> bool:
+        """Whether a layer is the item that its parts named."""
+        if not kind.startswith("k"):
+            return True
+        head = layer.peek(record)
+        return head is not None and (f"k{head.layer}", head.seq) == (kind, number)
+
+    def _give_up(self, kind: str, number: int) -> None:
+        """Ask for an item no more. Too many are forgotten, and asked for again."""
+        given_up = self._given_up.setdefault(kind, RangeSet())
+        if given_up.range_count >= MAX_RANGES:
+            given_up = self._given_up[kind] = RangeSet()
+        given_up.add(number)
+
+    def _note_lag(self, kind: str, number: int, now: float) -> None:
+        """How long after the drone named it an item came; nothing for one that was not timed."""
+        seen = self._seen.pop((kind, number), None)
+        is_named = self.head is not None and number in self.head.numbers.get(kind, RangeSet())
+        if seen is None and is_named:
+            return
+        lags_s = self.progress.lag_s.setdefault(kind, deque(maxlen=200))
+        lags_s.append(0.0 if seen is None else now - seen)
 
     # What to say
 
@@ -136,6 +165,11 @@ class ScanIntake:
         if self.head is None:
             return {}
         return missing(missing(self.head.numbers, self.store.numbers()), self._given_up)
+
+    @property
+    def held_bytes(self) -> int:
+        """Memory that unfinished records take."""
+        return self._assembler.held_bytes
 
     @property
     def complete(self) -> bool:

@@ -1,15 +1,14 @@
-"""A scan that is being received: what is known of it, and its deliverables."""
+"""A scan that is being received: its state, and its deliverables."""
 
 from __future__ import annotations
 
 import logging
-from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from service.errors import InputError, SkyreliefError
+from service.errors import InputError
 from service.ground.intake import ScanIntake
 from service.stream.naming import ROOT
 
@@ -18,18 +17,25 @@ log = logging.getLogger(__name__)
 
 @dataclass(slots=True, eq=False)
 class ReceivedScan:
-    """One scan of one drone; used by the receiver's thread alone, but for :meth:`progress`."""
+    """One open scan of one drone; used by the drone's worker alone.
+
+    The writer of deliverables sets ``is_written`` and ``is_writing``, and ``trouble`` when it
+    fails.
+    """
 
     drone: str
     name: str  # on the datalink
     folder: Path
     intake: ScanIntake
     reported_at: float = -1e9
+    used_at: float = 0.0
     changed: bool = True  # since the last report
     unwritten: bool = False  # since the last deliverables
     rest_until: float = 0.0
-    writing: Future[None] | None = None
+    is_writing: bool = False
+    is_written: bool = False
     radio_messages: int = 0
+    trouble: str = ""  # why it does not grow, or has no deliverables
 
     @property
     def key(self) -> str:
@@ -37,42 +43,46 @@ class ReceivedScan:
         return f"{ROOT}/{self.drone}/{self.name}"
 
     @property
-    def idle(self) -> bool:
-        """True when its deliverables are not being written."""
-        return self.writing is None or self.writing.done()
+    def may_close(self) -> bool:
+        """Whether nothing would be lost by closing it."""
+        return not self.unwritten and not self.is_writing
 
     def progress(self) -> dict[str, Any]:
         """Items held and missing, bytes, lags and folder, for people and for JSON."""
         intake = self.intake
+        held = intake.store.numbers()
         lags = {
             kind: round(median(lags), 3)
-            for kind, lags in list(intake.progress.lag_s.items())
+            for kind, lags in intake.progress.lag_s.items()
             if lags and kind.startswith("k")
         }
         return {
             "drone": self.drone,
             "scan": self.folder.name,
             "folder": str(self.folder),
-            "held": {kind: len(n) for kind, n in intake.store.numbers().items()},
+            "open": True,
+            "held": {kind: len(numbers) for kind, numbers in held.items()},
             "missing": {kind: len(n) for kind, n in intake.missing().items()},
-            "finished": intake.store.finished,
-            "complete": intake.complete and self.writing is not None and self.writing.done(),
+            "finished": "summary" in held,
+            "complete": intake.complete and self.is_written and not self.is_writing,
             "received_bytes": intake.progress.received_bytes,
             "duplicates": intake.progress.duplicates,
+            "unsound": intake.progress.unsound,
             "refused": intake.store.refused,
             "radio_messages": self.radio_messages,
             "lag_s": lags,
+            "trouble": self.trouble or None,
         }
 
 
 def deliver(scan: ReceivedScan) -> None:
-    """Write the scan's deliverables beside its database; what goes wrong is logged."""
+    """Write the scan's deliverables next to its database.
+
+    Raises InputError that names those which could not be made, OutsideError for the disk.
+    """
     from service.scans.folder import write_deliverables
 
-    try:
-        failed = write_deliverables(scan.folder, scan.intake.store, {})["failed"]
-        if failed:
-            why = "; ".join(f"{name} ({reason})" for name, reason in failed.items())
-            raise InputError(f"some could not be made: {why}")
-    except (SkyreliefError, OSError) as error:
-        log.error("deliverables of %s not written: %s", scan.folder, error)
+    failed = write_deliverables(scan.folder, scan.intake.store, {})["failed"]
+    if failed:
+        why = "; ".join(f"{name} ({reason})" for name, reason in failed.items())
+        raise InputError(f"some could not be made: {why}")

@@ -1,8 +1,11 @@
 """The ground station: receives the scans of any number of drones into scan folders.
 
 Each scan lives in ``<store>/<drone>/<scan>/scan.db``, the same database as onboard. When a
-finished scan is complete, and when the receiver closes, the deliverables are written beside
+finished scan is complete, and when the receiver closes, the deliverables are written next to
 it. Everything may be killed at any time and started again.
+
+Threads, all of the table of workers: one that keeps the session, three that take messages
+from it, one per drone (:mod:`service.ground.drone`), one that writes deliverables.
 """
 
 from __future__ import annotations
@@ -10,41 +13,49 @@ from __future__ import annotations
 import contextlib
 import logging
 import queue
+import resource
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.errors import InputError, OutsideError, SkyreliefError
-from service.ground.intake import FINE, SILENCE_S, SMALL, ScanIntake
+from service.errors import InputError, SkyreliefError
+from service.ground.drone import DRONE_TIMEOUT_S, DroneReceiver, Limits
 from service.ground.placing import scan_folder
 from service.ground.received import ReceivedScan, deliver
-from service.stream.messages import count, pack_ask, pack_held, unpack_head
-from service.stream.naming import ROOT, place_of, split_scan_name, station_name
-from service.stream.radio_messages import RADIO_NOTE
-from service.stream.records import ScanHeader
+from service.ground.replies import CHANNEL, Replies
+from service.stream.naming import ROOT, place_of, station_name
 from service.stream.session import SessionConfig, check_endpoints, open_session
-from service.stream.store import ScanStore
 from service.stream.tunnel import TunnelIntake
+from service.workers import Worker, Workers, guarded
 
 if TYPE_CHECKING:
     import zenoh
 
 log = logging.getLogger(__name__)
 
-MAX_SCANS = 1000
-"""Scans that one receiver takes in; the heads of more are dropped."""
-MAX_WAITING = 20_000
+MAX_DRONES = 64
+"""Drones received at once; more wait until one is silent."""
+MAX_OPEN_SCANS = 32
+"""Scans of one drone that may be open, where the descriptors allow it."""
+DESCRIPTORS_PER_SCAN, DESCRIPTOR_SHARE = 3, 4
+"""An open scan holds so many; all of them together get this fraction (1/n) of the limit."""
+STRANGER_S = 1.0
+"""A drone without any scan makes way for another after so long without a message."""
+MAX_RADIO_WAITING = 2000
 ASK_TIMEOUT_S = 120.0
-REPORT_S = 1.0
-REPORT_IDLE_S = 3.0
-DRONE_TIMEOUT_S = 30.0
 RETRY_S = 1.0
 LOOK_AROUND_S = 3.0
-FULL_DISK_REST_S = 10.0
+TURN_S = 0.1
+STALL_S = 120.0
+"""A worker without progress for so long hangs; closing a session over a dead link does not
+take as long."""
+REFUSAL_S = 60.0
+"""From one warning about a drone that is not received to the next."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +64,17 @@ class ReceiverConfig:
 
     store: Path
     session: SessionConfig = field(default_factory=lambda: SessionConfig(mode="router"))
-    quota_bytes: int | None = None  # of one scan's chunks; beyond it only coarse layers
+    limits: Limits = field(default_factory=Limits)
     name: str = ""  # of this station; empty: made once and kept in the store
     refresh_s: float = 0.0  # write deliverables of growing scans so often; 0: when complete
+
+
+@dataclass(slots=True, eq=False)
+class _Member:
+    """A drone and its worker."""
+
+    drone: DroneReceiver
+    worker: Worker
 
 
 class Receiver:
@@ -64,44 +83,62 @@ class Receiver:
     Raises InputError for endpoints or a store that cannot be used.
     """
 
-    def __init__(self, config: ReceiverConfig) -> None:
+    def __init__(self, config: ReceiverConfig, workers: Workers | None = None) -> None:
         check_endpoints(config.session)
         self._config = config
         try:
             config.store.mkdir(parents=True, exist_ok=True)
-            self._name = config.name or station_name(config.store)
+            self.name = config.name or station_name(config.store)
         except OSError as error:
             raise InputError(f"cannot write the store {config.store}: {error.strerror}") from error
-        self._scans: dict[tuple[str, str], ReceivedScan] = {}
-        self._events: queue.Queue[Callable[[float], None]] = queue.Queue(MAX_WAITING)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="receiver", daemon=True)
-        self._writer = ThreadPoolExecutor(1, "deliverables")
+        self.limits = config.limits
+        self.workers = workers or Workers()
+        self._lock = threading.Lock()  # of the table of drones
+        self._members: dict[str, _Member] = {}
+        self._gone: list[dict[str, Any]] = []  # entries of drones that left
         self._session: zenoh.Session | None = None
+        self._replies = Replies()
         self._opened = threading.Event()
         self._failure: SkyreliefError | None = None
+        self._radio: deque[bytes] = deque(maxlen=MAX_RADIO_WAITING)
         self._tunnel = TunnelIntake()
-        self._refresh_at = 0.0
-        self.dropped = 0  # messages that were malformed, foreign or too many
-        self.last_news_at = time.monotonic()
+        self._writes: queue.Queue[ReceivedScan | None] = queue.Queue()
+        self._running: list[Worker] = []
+        self._refresh_at = self._refused_at = -1e9
+        self._dropped = 0
+        self._last_news_at = time.monotonic()
 
     def start(self) -> None:
         """Begin; returns when the endpoints are open. Raises OutsideError when they cannot."""
-        self._thread.start()
+        start = self.workers.start
+        self._running = [
+            start("deliverables", self._write_all),
+            start("replies", self._replies.run, STALL_S),
+            start("receiver", self._run, STALL_S),
+        ]
         while not self._opened.wait(0.1):
             if self._failure is not None:
+                self.close()
                 raise self._failure
 
     def close(self) -> None:
         """End, and write the deliverables of what has changed."""
-        self._stop.set()
-        if self._thread.ident is not None:
-            self._thread.join()
-        for scan in self._scans.values():
-            if scan.unwritten and scan.writing is None:
-                self._write(scan)
-        self._writer.shutdown(wait=True)
-        for scan in self._scans.values():
+        if not self._running:
+            return
+        writer, replies, main = self._running
+        self._running = []
+        main.join()
+        replies.join()
+        members = list(self._members.values())
+        for member in members:
+            member.worker.join()
+        scans = [scan for member in members for scan in member.drone.scans]
+        for scan in scans:
+            if scan.unwritten and not scan.is_writing:
+                self.write(scan)
+        self._writes.put(None)
+        writer.join()
+        for scan in scans:
             scan.intake.store.close()
 
     def folder(self, drone: str, name: str) -> Path:
@@ -110,80 +147,197 @@ class Receiver:
 
     def add_radio(self, payload: bytes) -> None:
         """Take in a message of the narrow radio; from any thread."""
-        self._post(lambda now: self._radio(payload, now))
+        self._radio.append(payload)
 
     def progress(self) -> list[dict[str, Any]]:
         """One entry per scan: drone, scan, items held and missing, bytes, lags, folder."""
-        return [scan.progress() for scan in list(self._scans.values())]
+        here = [entry for member in self._table() for entry in member.drone.entries]
+        return here + list(self._gone)
 
-    # The worker
+    @property
+    def dropped(self) -> int:
+        """Messages that were malformed, foreign or too many."""
+        drones = [member.drone for member in self._table()]
+        return self._dropped + sum(drone.dropped + drone.inbox.dropped for drone in drones)
 
-    def _run(self) -> None:
-        while not self._stop.is_set():
+    @property
+    def last_news_at(self) -> float:
+        """When something new was stored last; monotonic seconds."""
+        drones = [member.drone.last_news_at for member in self._table() if member.drone.is_known]
+        return max([self._last_news_at, *drones])
+
+    def _table(self) -> list[_Member]:
+        with self._lock:
+            return list(self._members.values())
+
+    # The session
+
+    def _run(self, worker: Worker) -> None:
+        while not worker.stop.is_set():
+            worker.beat()
             try:
                 session = open_session(self._config.session)
             except SkyreliefError as error:
-                if self._config.session.listen or isinstance(error, InputError):
+                if not self._opened.is_set() and (
+                    self._config.session.listen or isinstance(error, InputError)
+                ):
                     self._failure = error
                     return
                 log.debug("%s", error)
                 self._opened.set()  # a station that only connects waits for its router
-                self._stop.wait(RETRY_S)
+                worker.stop.wait(RETRY_S)
                 continue
-            self._session = session
             try:
-                self._serve(session)
+                self._serve(session, worker)
             finally:
                 self._session = None
                 session.close()
 
-    def _serve(self, session: zenoh.Session) -> None:
-        session.declare_subscriber(f"{ROOT}/*/*/head", self._on_head)
-        session.declare_subscriber(f"{ROOT}/*/*/item/*/*", self._on_item)
+    def _serve(self, session: zenoh.Session, worker: Worker) -> None:
+        """Take messages until the stop, or until the session ends.
+
+        Channels and threads of our own: a callback's thread would belong to the library, and
+        end the process with an abort when it outlives the interpreter.
+        """
+        import zenoh
+
+        channel = zenoh.handlers.FifoChannel(CHANNEL)
+        heads = session.declare_subscriber(f"{ROOT}/*/*/head", channel)
+        items = session.declare_subscriber(f"{ROOT}/*/*/item/*/*", channel)
+        pumps = [
+            self.workers.start("heads", lambda _: self._pump(heads, self._on_head)),
+            self.workers.start("items", lambda _: self._pump(items, self._on_item)),
+        ]
+        self._session = session
         self._opened.set()
         look_at = 0.0
-        while not self._stop.is_set() and not session.is_closed():
-            if time.monotonic() >= look_at:
-                self._look_around(session)
-                look_at = time.monotonic() + LOOK_AROUND_S
-            try:
-                event = self._events.get(timeout=0.1)
-                event(time.monotonic())
-                for _ in range(200):
-                    self._events.get_nowait()(time.monotonic())
-            except queue.Empty:
-                pass
-            for scan in self._scans.values():
-                self._tend(session, scan, time.monotonic())
-            self._refresh(time.monotonic())
+        try:
+            while not worker.stop.wait(TURN_S) and not session.is_closed():
+                worker.beat()
+                now = time.monotonic()
+                if now >= look_at:
+                    self._look_around(session, now)
+                    look_at = now + LOOK_AROUND_S
+                self._take_radio()
+                self._retire(now)
+                self._refresh(now)
+        finally:
+            for subscriber in (heads, items):
+                with contextlib.suppress(zenoh.ZError):
+                    subscriber.undeclare()
+            for pump in pumps:
+                pump.join()
 
-    def _look_around(self, session: zenoh.Session) -> None:
+    def _pump(
+        self,
+        subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]],
+        take: Callable[[DroneReceiver, str, bytes], bool],
+    ) -> None:
+        """Hand on each message until the subscriber ends."""
+        for sample in subscriber:
+            place = place_of(str(sample.key_expr))
+            drone = None if place is None else self._drone(place[0])
+            if place is None or drone is None:
+                self._dropped += 1
+                continue
+            take(drone, place[1], sample.payload.to_bytes())
+
+    def _on_head(self, drone: DroneReceiver, scan: str, payload: bytes) -> bool:
+        return drone.inbox.put_head(scan, payload)
+
+    def _on_item(self, drone: DroneReceiver, scan: str, payload: bytes) -> bool:
+        return drone.inbox.put_item(scan, payload)
+
+    def _look_around(self, session: zenoh.Session, now: float) -> None:
         """Have the drones that are there say at once what they have."""
-        if any(time.monotonic() - s.intake.head_at < LOOK_AROUND_S for s in self._scans.values()):
-            return
         import zenoh
 
+        if any(now - member.drone.heard_at < LOOK_AROUND_S for member in self._table()):
+            return
         with contextlib.suppress(zenoh.ZError):
-            session.get(f"{ROOT}/*/*/head", lambda _: None, timeout=LOOK_AROUND_S)
+            session.get(f"{ROOT}/*/*/head", zenoh.handlers.RingChannel(1), timeout=LOOK_AROUND_S)
 
-    def _tend(self, session: zenoh.Session, scan: ReceivedScan, now: float) -> None:
-        """Report, ask, and write what is complete."""
-        if now - scan.intake.head_at > DRONE_TIMEOUT_S:
+    def _take_radio(self) -> None:
+        while self._radio:
+            for item in self._tunnel.receive(self._radio.popleft()):
+                drone = self._drone(item[0].drone)
+                if drone is None:
+                    self._dropped += 1
+                else:
+                    drone.inbox.put_event(partial(drone.add_radio, *item))
+
+    # The drones
+
+    @property
+    def max_open(self) -> int:
+        """Scans that one drone may have open now."""
+        soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        room = soft // DESCRIPTOR_SHARE // DESCRIPTORS_PER_SCAN
+        return max(2, min(MAX_OPEN_SCANS, room // max(1, len(self._members))))
+
+    def _drone(self, name: str) -> DroneReceiver | None:
+        """The worker's part of a drone, started if need be; None when there are too many."""
+        with self._lock:
+            member = self._members.get(name)
+            if member is not None:
+                return member.drone
+            if len(self._members) >= MAX_DRONES and not self._make_way():
+                if time.monotonic() - self._refused_at > REFUSAL_S:
+                    self._refused_at = time.monotonic()
+                    log.warning("%s is not received: %d drones are", name, MAX_DRONES)
+                return None
+            drone = DroneReceiver(name, self)
+            worker = self.workers.start(f"drone {name}", drone.run, STALL_S, False)
+            self._members[name] = _Member(drone, worker)
+            return drone
+
+    def _make_way(self) -> bool:
+        """End the worker of a drone that never had a scan and is silent; False for none."""
+        now = time.monotonic()
+        for name, member in self._members.items():
+            drone = member.drone
+            if not drone.is_known and now - drone.heard_at > STRANGER_S:
+                member.worker.stop.set()
+                self._dropped += drone.dropped + drone.inbox.dropped
+                del self._members[name]
+                return True
+        return False
+
+    def _retire(self, now: float) -> None:
+        """Drop drones that are silent and have nothing open, or whose worker failed."""
+        with self._lock:
+            gone = {
+                name: member
+                for name, member in self._members.items()
+                if member.worker.is_done or _is_idle(member.drone, now)
+            }
+            for name in gone:
+                del self._members[name]
+        for member in gone.values():
+            member.worker.join()
+            self._gone = (self._gone + member.drone.entries)[-1000:]
+            self._dropped += member.drone.dropped + member.drone.inbox.dropped
+            self._last_news_at = max(self._last_news_at, member.drone.last_news_at)
+            for scan in member.drone.scans:  # of a worker that failed
+                scan.intake.store.close()
+
+    def _refresh(self, now: float) -> None:
+        """Write the deliverables of scans that grow, every ``refresh_s``."""
+        if not self._config.refresh_s or now < self._refresh_at:
             return
-        pause = REPORT_S if scan.changed else REPORT_IDLE_S
-        if now - scan.reported_at >= pause:
-            scan.reported_at, scan.changed = now, False
-            self._put(session, f"{scan.key}/held/{self._name}", pack_held(scan.intake.held()))
-        if scan.unwritten and scan.intake.complete and scan.idle:
-            scan.changed = True
-            self._write(scan)
-        if now >= scan.rest_until:
-            for slot in (SMALL, FINE):
-                self._ask(session, scan, slot, now)
+        self._refresh_at = now + self._config.refresh_s
+        for member in self._table():
+            member.drone.inbox.put_event(member.drone.write_grown)
 
-    def _put(self, session: zenoh.Session, key: str, payload: bytes) -> None:
+    # What the drones' workers need
+
+    def put(self, key: str, payload: bytes) -> None:
+        """Publish; nothing happens while there is no session."""
         import zenoh
 
+        session = self._session
+        if session is None:
+            return
         try:
             session.put(
                 key,
@@ -195,28 +349,24 @@ class Receiver:
         except zenoh.ZError as error:
             log.debug("report not sent: %s", error)
 
-    def _ask(self, session: zenoh.Session, scan: ReceivedScan, slot: int, now: float) -> None:
+    def get(
+        self,
+        key: str,
+        payload: bytes,
+        on_message: Callable[[bytes], object],
+        on_end: Callable[[], object],
+    ) -> None:
+        """Ask a drone; both callbacks come from another thread."""
         import zenoh
 
-        wanted = scan.intake.next_ask(slot, now)
-        if wanted is None:
+        session = self._session
+        if session is None:
             return
-        kind, numbers, ask = wanted
-        intake = scan.intake
-        number_of_ask = intake.progress.asked
-
-        def ended() -> None:
-            self._post(lambda at: intake.answered(slot, number_of_ask, at))
-
-        def reply(answer: zenoh.Reply) -> None:
-            if answer.ok is not None:
-                self._on_item(answer.ok)
-
         try:
-            session.get(
-                f"{scan.key}/item/{kind}/{numbers.text()}",
-                zenoh.handlers.Callback(reply, ended),
-                payload=pack_ask(ask),
+            replies = session.get(
+                key,
+                zenoh.handlers.FifoChannel(CHANNEL),
+                payload=payload,
                 priority=zenoh.Priority.BACKGROUND,
                 congestion_control=zenoh.CongestionControl.DROP,
                 consolidation=zenoh.ConsolidationMode.NONE,
@@ -224,106 +374,28 @@ class Receiver:
             )
         except zenoh.ZError as error:
             log.debug("not asked: %s", error)
-
-    def _write(self, scan: ReceivedScan) -> None:
-        """Have the scan's deliverables written beside its database."""
-        scan.unwritten = False
-        scan.writing = self._writer.submit(deliver, scan)
-
-    # What comes
-
-    def _post(self, event: Callable[[float], None]) -> None:
-        try:
-            self._events.put_nowait(event)
-        except queue.Full:
-            self.dropped += 1
-
-    def _on_head(self, sample: zenoh.Sample) -> None:
-        head = unpack_head(sample.payload.to_bytes())
-        place = place_of(str(sample.key_expr))
-        if head is None or place is None:
-            self.dropped += 1
             return
+        self._replies.add(replies, on_message, on_end)
 
-        def arrived(now: float) -> None:
-            scan = self._scan(*place)
-            if scan is not None:
-                if now - scan.intake.head_at > SILENCE_S:
-                    scan.reported_at = -1e9  # the drone is back: say at once that we listen
-                before = scan.intake.missing()
-                scan.intake.on_head(head, now)
-                scan.changed = scan.changed or count(scan.intake.missing()) != count(before)
+    def opened(self, scan: ReceivedScan) -> None:
+        """A scan was opened; for those who watch."""
 
-        self._post(arrived)
+    def write(self, scan: ReceivedScan) -> None:
+        """Have the scan's deliverables written."""
+        scan.unwritten, scan.is_writing = False, True
+        self._writes.put(scan)
 
-    def _on_item(self, sample: zenoh.Sample) -> None:
-        payload = sample.payload.to_bytes()
-        place = place_of(str(sample.key_expr))
-        if place is None:
-            self.dropped += 1
-            return
-        self._post(lambda now: self._items(place, payload, now))
-
-    def _items(self, place: tuple[str, str], payload: bytes, now: float) -> None:
-        scan = self._scan(*place)
-        if scan is None or now < scan.rest_until:
-            return
-        try:
-            if scan.intake.on_items(payload, now):
-                scan.changed = scan.unwritten = True
-                self.last_news_at = now
-        except OutsideError as error:
-            log.error("%s; trying again in %.0f s", error, FULL_DISK_REST_S)
-            scan.rest_until = now + FULL_DISK_REST_S
-
-    def _radio(self, payload: bytes, now: float) -> None:
-        for header, kind, number, part, data in self._tunnel.receive(payload):
-            scan = self._scan(header.drone, header.name)
+    def _write_all(self, _: Worker) -> None:
+        while True:
+            scan = self._writes.get()
             if scan is None:
-                continue
-            store = scan.intake.store
-            try:
-                provisional = not store.header.started_unix_ns or RADIO_NOTE in store.header.notes
-                if provisional and header != store.header:
-                    store.put_header(header)
-                if kind != "header" and store.add_radio(kind, number, part, data):
-                    scan.radio_messages += 1
-                    scan.unwritten = True
-                    self.last_news_at = now
-            except OutsideError as error:
-                log.error("%s", error)
+                return
+            scan.trouble = guarded(f"deliverables of {scan.folder}", partial(deliver, scan))
+            scan.is_written, scan.is_writing = True, False
+            member = self._members.get(scan.drone)
+            if member is not None:
+                member.drone.inbox.put_event(lambda _: None)  # its state is shown at once
 
-    def _refresh(self, now: float) -> None:
-        """Write the deliverables of scans that grow, every ``refresh_s``."""
-        if not self._config.refresh_s or now < self._refresh_at:
-            return
-        self._refresh_at = now + self._config.refresh_s
-        for scan in self._scans.values():
-            if scan.unwritten and scan.idle:
-                self._write(scan)
 
-    def _scan(self, drone: str, name: str) -> ReceivedScan | None:
-        found = self._scans.get((drone, name))
-        if found is not None:
-            return found
-        if len(self._scans) >= MAX_SCANS:
-            self.dropped += 1
-            return None
-        scan_id, run_id = split_scan_name(name)
-        try:
-            path = self.folder(drone, name) / "scan.db"
-            if path.exists():
-                store = ScanStore.open(path, self._config.quota_bytes)
-            else:
-                header = ScanHeader(scan_id, drone, 0, run_id=run_id)
-                store = ScanStore.create(path, header, self._config.quota_bytes)
-        except SkyreliefError as error:
-            log.error("%s", error)
-            self.dropped += 1
-            return None
-        scan = self._scans[drone, name] = ReceivedScan(
-            drone, name, path.parent, ScanIntake(store, self._name)
-        )
-        scan.unwritten = True
-        log.info("receiving %s/%s into %s", drone, name, path.parent)
-        return scan
+def _is_idle(drone: DroneReceiver, now: float) -> bool:
+    return not drone.has_open_scans and now - drone.heard_at > DRONE_TIMEOUT_S

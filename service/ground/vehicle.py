@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from service.errors import InputError, OutsideError
 from service.ground.orders import order
+from service.workers import Worker, Workers
 
 if TYPE_CHECKING:
     from service.ground.operator import Operator
@@ -34,25 +35,29 @@ class Vehicle:
     while nobody is there.
     """
 
-    def __init__(self, endpoint: str, connect: Callable[[str], Operator] | None = None) -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        connect: Callable[[str], Operator] | None = None,
+        workers: Workers | None = None,
+    ) -> None:
         self.endpoint = endpoint
         self._connect = connect or _operator
         self._operator: Operator | None = None
         self._lock = threading.Lock()
-        self._stop = threading.Event()
+        self._workers = workers or Workers()
+        self._searching: Worker | None = None
         self._heard: dict[str, tuple[float, dict[str, Any]]] = {}
         self._trouble = "looking for the companion"
-        self._thread = threading.Thread(target=self._search, name="vehicle", daemon=True)
 
     def start(self) -> None:
         """Begin to look."""
-        self._thread.start()
+        self._searching = self._workers.start("vehicle", self._search, is_essential=False)
 
     def close(self) -> None:
-        """Let go of the link."""
-        self._stop.set()
-        if self._thread.ident is not None:
-            self._thread.join(timeout=2 * SEARCH_S)
+        """Close the link."""
+        if self._searching is not None:
+            self._searching.join(2 * SEARCH_S)
         with self._lock:
             if self._operator is not None:
                 self._operator.__exit__(None, None, None)
@@ -95,13 +100,13 @@ class Vehicle:
             },
         }
 
-    def _search(self) -> None:
-        while not self._stop.is_set():
+    def _search(self, worker: Worker) -> None:
+        while not worker.stop.is_set():
             try:
                 operator = self._connect(self.endpoint)
             except (InputError, OutsideError) as error:
                 self._trouble = str(error)
-                self._stop.wait(1.0)
+                worker.stop.wait(1.0)
                 continue
             for name in HEARD:
                 operator.subscribe(name, self._keeper(name))

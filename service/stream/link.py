@@ -15,14 +15,16 @@ from typing import TYPE_CHECKING, Any
 from service.config import DatalinkConfig
 from service.errors import OutsideError, SkyreliefError
 from service.stream.lanes import Outgoing
-from service.stream.messages import Held, missing, unpack_ask, unpack_held
+from service.stream.messages import Ask, unpack_ask, unpack_held
 from service.stream.naming import ROOT, check_name
 from service.stream.outbox import Outbox
 from service.stream.radio_link import Carrier, EndpointCarrier, RadioSender
-from service.stream.ranges import ranges_from_text
+from service.stream.ranges import RangeSet, ranges_from_text
+from service.stream.reports import TAKE_S, HeldNotes, Reports
 from service.stream.session import SessionConfig, check_endpoints, open_session
 from service.stream.store import ScanStore
 from service.stream.tunnel import TunnelConfig
+from service.workers import Worker, Workers
 
 if TYPE_CHECKING:
     import zenoh
@@ -30,6 +32,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_WAITING_EVENTS = 100_000
+CHANNEL = 256
+"""Messages that may wait between the session and each of our threads."""
+MAX_WAITING_ASKS = 64
 RETRY_S = 1.0
 """From one attempt to open a session to the next, at least; a tenth of it after a timeout."""
 SILENCE_S = 5.0
@@ -42,9 +47,6 @@ a link that is back sooner than one whose waits have grown."""
 PATIENT_ATTEMPT = 20
 CLOSING_S, PROMPT_CLOSING_S = 15.0, 1.0
 """Closing a session over a dead link takes Zenoh 10 s and more; only the process's end waits."""
-KEEP_HELD_S = 10.0
-"""How often a ground station's report is written to the store while it lacks something."""
-
 PRIORITIES = ("REAL_TIME", "INTERACTIVE_HIGH", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND")
 """Zenoh's priority of each lane of the outbox."""
 
@@ -100,20 +102,22 @@ class DatalinkSender:
         self._outbox = Outbox(_rate(config.budget_kbit_s, config.share), time.monotonic())
         self._stores: list[tuple[ScanStore, Callable[[str, int], None]]] = []
         self._events: deque[Callable[[float], None]] = deque(maxlen=MAX_WAITING_EVENTS)
+        self._asks: deque[tuple[Any, str, str, RangeSet, Ask]] = deque()
+        self._reports, self._notes = Reports(self._outbox), HeldNotes(self._outbox)
+        self._is_looked_for = False  # somebody asks for the heads
         self._wake = threading.Event()
         self._stop = threading.Event()
         self._connected = False
         self._heard_at: float | None = None  # on the session that is open
         self._opening_s = FIRST_PATIENCE_S / PATIENCE  # what the last session took to open
         self._queries: dict[int, Any] = {}
-        self._thread: threading.Thread | None = None
-        self._kept_at: dict[str, float] = {}
+        self._workers = Workers()
+        self._thread: Worker | None = None
         self._owned: list[ScanStore] = []
         if store is not None:
             self.add(store)
         if config.connect or config.listen:
-            self._thread = threading.Thread(target=self._run, name="datalink", daemon=True)
-            self._thread.start()
+            self._thread = self._workers.start("datalink", self._run)
         atexit.register(self.close)  # Zenoh aborts a process that ends around an open session
         self._radio = None
         if store is not None and radio is None and config.radio:
@@ -204,13 +208,14 @@ class DatalinkSender:
         self._stop.set()
         self._wake.set()
         if self._thread is not None:
-            self._thread.join(timeout=CLOSING_S)
+            self._thread.join(CLOSING_S)
             self._thread = None
         if self._radio is not None:
             self._radio.close()
             self._radio = None
         for store, news in self._stores:
             store.unlisten(news)
+            self._notes.keep(store, time.monotonic(), is_last=True)
         self._stores.clear()
         while self._owned:
             self._owned.pop().close()
@@ -221,7 +226,7 @@ class DatalinkSender:
 
     # The link's side
 
-    def _run(self) -> None:
+    def _run(self, _: Worker) -> None:
         attempt = 0
         while not self._stop.is_set():
             began = time.monotonic()
@@ -242,48 +247,87 @@ class DatalinkSender:
             self._opening_s = time.monotonic() - began
             attempt = 0
             log.info("datalink open")
+            pumps: list[Worker] = []
             try:
+                pumps = self._listen(session)
                 self._serve(session)
             finally:
                 self._connected = False
-                self._close_session(session)
+                self._close_session(session, pumps)
 
-    def _close_session(self, session: zenoh.Session) -> None:
+    def _close_session(self, session: zenoh.Session, pumps: list[Worker]) -> None:
         """Close it on a thread of its own: over a dead link that takes long."""
         self._queries.clear()
+        self._asks.clear()
         closing = threading.Thread(
-            target=_close, args=(session,), name="datalink closing", daemon=True
+            target=_close, args=(session, pumps), name="datalink closing", daemon=True
         )
         atexit.register(closing.join, CLOSING_S)
         closing.start()
         closing.join(PROMPT_CLOSING_S if self._stop.is_set() else 0.0)
 
+    def _listen(self, session: zenoh.Session) -> list[Worker]:
+        """Workers that take what comes. They end with the session.
+
+        Channels and threads of our own: a callback's thread would belong to the library, and
+        end the process with an abort when it outlives the interpreter.
+        """
+        import zenoh
+
+        base, channel = f"{ROOT}/{self._drone}", zenoh.handlers.FifoChannel(CHANNEL)
+        held = session.declare_subscriber(f"{base}/*/held/*", channel)
+        asks = session.declare_queryable(f"{base}/*/item/*/*", channel)
+        looks = session.declare_queryable(f"{base}/*/head", channel)
+        start = self._workers.start
+        return [
+            start("datalink reports", lambda _: _pump(held, self._on_held)),
+            start("datalink requests", lambda _: _pump(asks, self._on_query)),
+            start("datalink looks", lambda _: _pump(looks, self._on_look)),
+        ]
+
     def _serve(self, session: zenoh.Session) -> None:
         """Send and answer until the stop, or until those who listened fall silent."""
-        base = f"{ROOT}/{self._drone}"
         self._heard_at = None
-        # The session keeps these while it is open.
-        session.declare_subscriber(f"{base}/*/held/*", self._on_held)
-        session.declare_queryable(f"{base}/*/item/*/*", self._on_query)
-        session.declare_queryable(f"{base}/*/head", self._on_look)
         with self._lock:
             self._outbox.reconnected(time.monotonic())
         while not self._stop.is_set() and not session.is_closed():
             self._connected = True
             self._wake.clear()
             with self._lock:
-                while self._events:
-                    self._events.popleft()(time.monotonic())
+                self._take_in(time.monotonic())
                 todo = self._outbox.next(time.monotonic())
             if isinstance(todo, Outgoing):
                 self._send(session, todo)
             else:
-                self._wake.wait(todo)
+                self._wake.wait(min(todo, TAKE_S) if self._reports else todo)
             heard = self._heard_at
             is_caller = not self._config.listen  # who is called waits for the others to call
             if is_caller and heard is not None and time.monotonic() - heard > SILENCE_S:
-                log.info("datalink silent; opening it anew")
+                log.info("datalink silent; opening it again")
                 return
+
+    def _take_in(self, now: float) -> None:
+        """What happened since the last turn, here and at the ground stations."""
+        while self._events:
+            self._events.popleft()(now)
+        while self._asks:
+            query, scan_id, kind, numbers, ask = self._asks.popleft()
+            token = id(query)
+            self._queries[token] = query
+            for ended in self._outbox.ask(scan_id, kind, numbers, ask, token, now):
+                self._end(int(str(ended)))
+            if self._outbox.serves(ask.peer):
+                self._heard_at = now
+        if self._is_looked_for:
+            self._is_looked_for = False
+            self._outbox.tell(now)
+        reports = self._reports.take(now)
+        for scan_id, peer, payload in reports:
+            held = unpack_held(payload)
+            if held is not None and self._outbox.held(scan_id, peer, held, now):
+                self._heard_at = now
+        for store, _ in list(self._stores) if reports else ():
+            self._notes.keep(store, now)
 
     def _send(self, session: zenoh.Session, message: Outgoing) -> None:
         import zenoh
@@ -312,58 +356,41 @@ class DatalinkSender:
         if query is not None:
             query.drop()
 
-    # Zenoh's threads
+    # The threads that take what comes
 
     def _on_held(self, sample: zenoh.Sample) -> None:
-        held = unpack_held(sample.payload.to_bytes())
-        parts = str(sample.key_expr).split("/")
-        if held is not None and len(parts) == 5:
-            self._heard_at = time.monotonic()
-            scan_id, peer = parts[2], parts[4]
-            self._post(lambda now: self._heard(scan_id, peer, held, now))
-
-    def _heard(self, scan_id: str, peer: str, held: Held, now: float) -> None:
-        """Take in a report; now and then it is kept in the scan's store."""
-        self._outbox.held(scan_id, peer, held, now)
-        store = next((s for s, _ in self._stores if s.header.name == scan_id), None)
-        if store is None:
-            return
-        whole = not missing(store.numbers(), held.numbers)
-        if whole or now - self._kept_at.get(scan_id, -KEEP_HELD_S) >= KEEP_HELD_S:
-            self._kept_at[scan_id] = now
-            try:
-                store.set_held(peer, held.numbers)
-            except OutsideError as error:
-                log.warning("%s", error)
+        if self._reports.put(str(sample.key_expr), sample.payload.to_bytes()):
+            self._wake.set()
 
     def _on_look(self, query: zenoh.Query) -> None:
         query.drop()
-        self._post(self._outbox.tell)
+        self._is_looked_for = True
+        self._wake.set()
 
     def _on_query(self, query: zenoh.Query) -> None:
         parts = str(query.key_expr).split("/")
         ask = unpack_ask(query.payload.to_bytes()) if query.payload is not None else None
         numbers = ranges_from_text(parts[5]) if len(parts) == 6 else None
-        if ask is None or numbers is None:
+        if ask is None or numbers is None or len(self._asks) >= MAX_WAITING_ASKS:
             query.drop()
             return
-        scan_id, kind = parts[2], parts[4]
-        self._heard_at = time.monotonic()
-
-        def asked(now: float) -> None:
-            token = id(query)
-            self._queries[token] = query
-            for ended in self._outbox.ask(scan_id, kind, numbers, ask, token, now):
-                self._end(int(str(ended)))
-
-        self._post(asked)
+        self._asks.append((query, parts[2], parts[4], numbers, ask))
+        self._wake.set()
 
 
-def _close(session: zenoh.Session) -> None:
+def _pump(declared: Any, take: Callable[[Any], None]) -> None:
+    """Hand on each message until the subscriber or queryable ends."""
+    for message in declared:
+        take(message)
+
+
+def _close(session: zenoh.Session, pumps: list[Worker]) -> None:
     import zenoh
 
     with contextlib.suppress(zenoh.ZError):
         session.close()
+    for pump in pumps:
+        pump.join()
     atexit.unregister(threading.current_thread().join)
 
 

@@ -1,16 +1,26 @@
-"""The small JSON messages of the datalink: what a drone has, what a ground holds and asks."""
+"""The small JSON messages of the datalink: what a drone has, what a ground holds and asks.
+
+Every number in them is bounded by what it means. A message that breaks a bound is no message.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated, Final, Literal, TypeVar
 
 import msgspec
+from msgspec import Meta
 
-from service.stream.parts import CODES
-from service.stream.ranges import RangeSet, ranges_from_pairs
+from service.stream.naming import MAX_NAME, NAME
+from service.stream.parts import CODES, MAX_PARTS, WHOLE
+from service.stream.ranges import MAX_NUMBER, MAX_RANGES, Pairs, RangeSet, ranges_from_pairs
 
 MAX_MESSAGE_BYTES = 262_144
-VERSION = 1
+VERSION: Final = 1
+MAX_COUNTED = (1 << 24) - 1
+"""The highest number of a pose, re-pose or keyframe: ten a second for 19 days."""
+MAX_KINDS = 64
+MAX_RECEIVED_BYTES = 1 << 53
 
 Numbers = dict[str, RangeSet]
 """Kind of item to the numbers of that kind."""
@@ -42,24 +52,43 @@ class Ask:
     parts_of: int = 0  # the count of parts that ``parts`` refers to
 
 
+_Pair = tuple[Annotated[int, Meta(ge=0, le=MAX_NUMBER)], Annotated[int, Meta(ge=0, le=MAX_NUMBER)]]
+_Ranges = Annotated[list[_Pair], Meta(max_length=MAX_RANGES)]
+_Numbers = Annotated[dict[str, _Ranges], Meta(max_length=MAX_KINDS)]
+_Name = Annotated[str, Meta(max_length=MAX_NAME, pattern=rf"^{NAME.pattern}\Z")]
+
+
 class _HeadJson(msgspec.Struct):
-    v: int
-    numbers: dict[str, list[tuple[int, int]]]
-    live: dict[str, list[tuple[int, int]]]
+    v: Literal[1]
+    numbers: _Numbers
+    live: _Numbers
     finished: bool
 
 
 class _HeldJson(msgspec.Struct):
-    v: int
-    numbers: dict[str, list[tuple[int, int]]]
-    received_bytes: int
+    v: Literal[1]
+    numbers: _Numbers
+    received_bytes: Annotated[int, Meta(ge=0, le=MAX_RECEIVED_BYTES)]
 
 
 class _AskJson(msgspec.Struct):
-    v: int
-    peer: str
-    parts: list[tuple[int, int]] | None = None
-    parts_of: int = 0
+    v: Literal[1]
+    peer: _Name
+    parts: _Ranges | None = None
+    parts_of: Annotated[int, Meta(ge=0, le=MAX_PARTS)] = 0
+
+
+_Json = TypeVar("_Json", _HeadJson, _HeldJson, _AskJson)
+
+
+def _decode(data: bytes, kind: type[_Json]) -> _Json | None:
+    """The message in ``data``, strict UTF-8; None for anything else."""
+    if len(data) > MAX_MESSAGE_BYTES:
+        return None
+    try:
+        return msgspec.json.decode(data.decode("utf-8"), type=kind)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        return None
 
 
 def pack_head(head: Head) -> bytes:
@@ -76,14 +105,11 @@ def pack_head(head: Head) -> bytes:
 
 def unpack_head(data: bytes) -> Head | None:
     """The head in ``data``; None for anything else."""
-    try:
-        if len(data) > MAX_MESSAGE_BYTES:
-            return None
-        raw = msgspec.json.decode(data, type=_HeadJson)
-    except (msgspec.DecodeError, msgspec.ValidationError, RecursionError):
+    raw = _decode(data, _HeadJson)
+    if raw is None:
         return None
     numbers, live = numbers_from(raw.numbers), numbers_from(raw.live)
-    if raw.v != VERSION or numbers is None or live is None:
+    if numbers is None or live is None:
         return None
     return Head(numbers, live, raw.finished)
 
@@ -95,16 +121,9 @@ def pack_held(held: Held) -> bytes:
 
 def unpack_held(data: bytes) -> Held | None:
     """The report in ``data``; None for anything else."""
-    try:
-        if len(data) > MAX_MESSAGE_BYTES:
-            return None
-        raw = msgspec.json.decode(data, type=_HeldJson)
-    except (msgspec.DecodeError, msgspec.ValidationError, RecursionError):
-        return None
-    numbers = numbers_from(raw.numbers)
-    if raw.v != VERSION or numbers is None:
-        return None
-    return Held(numbers, raw.received_bytes)
+    raw = _decode(data, _HeldJson)
+    numbers = None if raw is None else numbers_from(raw.numbers)
+    return None if raw is None or numbers is None else Held(numbers, raw.received_bytes)
 
 
 def pack_ask(ask: Ask) -> bytes:
@@ -115,32 +134,33 @@ def pack_ask(ask: Ask) -> bytes:
 
 def unpack_ask(data: bytes) -> Ask | None:
     """The request in ``data``; None for anything else."""
-    try:
-        if len(data) > MAX_MESSAGE_BYTES:
-            return None
-        raw = msgspec.json.decode(data, type=_AskJson)
-    except (msgspec.DecodeError, msgspec.ValidationError, RecursionError):
+    raw = _decode(data, _AskJson)
+    if raw is None:
         return None
-    parts = None if raw.parts is None else ranges_from_pairs(raw.parts)
-    if raw.v != VERSION or (parts is None) != (raw.parts is None) or len(raw.peer) > 128:
-        return None
-    return Ask(raw.peer, parts, raw.parts_of)
+    if raw.parts is None:
+        return Ask(raw.peer, None, raw.parts_of)
+    parts = ranges_from_pairs(raw.parts, MAX_PARTS - 1)
+    return None if parts is None else Ask(raw.peer, parts, raw.parts_of)
 
 
-def pairs_of(numbers: Numbers) -> dict[str, list[tuple[int, int]]]:
+def pairs_of(numbers: Numbers) -> dict[str, Pairs]:
     """``numbers`` as plain pairs, for JSON."""
     return {kind: ranges.pairs() for kind, ranges in numbers.items() if ranges}
 
 
-def numbers_from(raw: dict[str, list[tuple[int, int]]]) -> Numbers | None:
-    """The sets in decoded JSON; kinds that this version does not know are passed over."""
+def numbers_from(raw: dict[str, Pairs]) -> Numbers | None:
+    """The sets in decoded JSON; kinds that this version does not know are passed over.
+
+    None when a number cannot be: a scan has one header, one summary, and counts the rest.
+    """
     out: Numbers = {}
     for kind, pairs in raw.items():
-        if kind in CODES:
-            ranges = ranges_from_pairs(pairs)
-            if ranges is None:
-                return None
-            out[kind] = ranges
+        if kind not in CODES:
+            continue
+        ranges = ranges_from_pairs(pairs, MAX_NUMBER if kind in WHOLE else MAX_COUNTED)
+        if ranges is None or (kind in WHOLE and len(ranges) > 1):
+            return None
+        out[kind] = ranges
     return out
 
 

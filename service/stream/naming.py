@@ -12,6 +12,7 @@ from service.errors import InputError
 ROOT = "skyrelief"
 """All keys are ``skyrelief/<drone>/<scan>/<topic>``."""
 
+MAX_NAME = 64
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 """What a drone, scan or station may be called."""
 

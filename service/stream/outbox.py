@@ -14,7 +14,8 @@ from itertools import islice
 
 from service.stream.budget import RateEstimate, TokenBucket, wire_bytes
 from service.stream.lanes import MAX_ASKED, AskedLane, LiveLane, Outgoing, Request
-from service.stream.messages import Ask, Head, Held, Numbers, missing, pack_head
+from service.stream.messages import Ask, Head, Held, Numbers, count, missing, pack_head
+from service.stream.parts import CODES
 from service.stream.ranges import RangeSet
 from service.stream.store import ScanStore
 
@@ -22,6 +23,10 @@ STATUS, POSE, COARSE, ASKED, FINE, BACKFILL = range(6)
 """The lanes, most urgent first."""
 
 PEER_TIMEOUT_S = 8.0
+MAX_STATIONS = 8
+"""Ground stations that a drone serves; another one has to wait until one of them is silent."""
+MAX_ESTIMATES = 256
+"""Rates of stations that are kept over a new session."""
 HEAD_AFTER_NEWS_S = 0.5
 HEAD_IDLE_S = 2.0
 HEAD_COMPLETE_S = 10.0
@@ -84,19 +89,30 @@ class Outbox:
         lane = POSE if kind in ("pose", "repose") else COARSE if kind == "k0" else FINE
         self._live[lane].push(feed.store, kind, number)
 
-    def held(self, scan_id: str, peer: str, report: Held, now: float) -> None:
-        """A ground station reports what it holds."""
-        anew = not self.listened(now)
-        self._hear(peer, now)
+    def offers(self, scan_id: str) -> bool:
+        """Whether a scan is on offer."""
+        return scan_id in self._feeds
+
+    def serves(self, peer: str) -> bool:
+        """Whether a ground station is one of those served."""
+        return peer in self._heard
+
+    def held(self, scan_id: str, peer: str, report: Held, now: float) -> bool:
+        """A ground station reports what it holds; False when it is not served."""
         feed = self._feeds.get(scan_id)
-        if feed is None:
-            return
+        anew = not self.listened(now)
+        if feed is None or not self._hear(peer, now):
+            return False
+        feed.held.pop(peer, None)
         feed.held[peer] = report.numbers
+        for former in list(feed.held)[:-MAX_STATIONS]:
+            del feed.held[former]
         if anew:
             self._catch_up(feed, report.numbers)
         estimate = self._estimates.setdefault((scan_id, peer), RateEstimate(self._configured))
         estimate.report(feed.sent_bytes, report.received_bytes, now)
         self._adapt(now)
+        return True
 
     def _catch_up(self, feed: _Feed, held: Numbers) -> None:
         """Put the newest coarse layers that a station lacks, when it listens at last."""
@@ -107,6 +123,7 @@ class Outbox:
     def reconnected(self, now: float) -> None:
         """The connection is a new one: nobody was heard on it, and nothing is under way."""
         self._heard.clear()
+        self._estimates = dict(list(self._estimates.items())[-MAX_ESTIMATES:])
         for estimate in self._estimates.values():
             estimate.begin_anew()
         self._clear_live()
@@ -137,9 +154,8 @@ class Outbox:
 
         A request takes the place of the same station's former one in its lane.
         """
-        self._hear(ask.peer, now)
         feed = self._feeds.get(scan_id)
-        if feed is None:
+        if feed is None or kind not in CODES or not self._hear(ask.peer, now):
             return [token]
         left: deque[int] = deque()
         for number in islice(numbers.newest_first(), MAX_ASKED):
@@ -158,10 +174,19 @@ class Outbox:
         for feed in self._feeds.values():
             feed.head_due = min(feed.head_due, max(now, feed.head_sent + HEAD_AFTER_NEWS_S))
 
-    def _hear(self, peer: str, now: float) -> None:
+    def _hear(self, peer: str, now: float) -> bool:
+        """Note that a station listens; False for one too many."""
+        if peer not in self._heard and len(self._heard) >= MAX_STATIONS:
+            silent = min(self._heard, key=self._heard.__getitem__)
+            if now - self._heard[silent] < PEER_TIMEOUT_S:
+                return False
+            del self._heard[silent]
+            for key in [key for key in self._estimates if key[1] == silent]:
+                del self._estimates[key]
         if not self.listened(now):
             self.tell(now)
         self._heard[peer] = now
+        return True
 
     # What to do
 
@@ -228,10 +253,17 @@ class Outbox:
 
     def lacking(self, scan_id: str) -> Numbers:
         """What the best supplied ground station still lacks of a scan on offer."""
+        best = self.best(scan_id)
+        numbers = self._feeds[scan_id].store.numbers()
+        return numbers if best is None else missing(numbers, best[1])
+
+    def best(self, scan_id: str) -> tuple[str, Numbers] | None:
+        """The best supplied ground station and what it holds; None when none has reported."""
         feed = self._feeds[scan_id]
         numbers = feed.store.numbers()
-        lacks = [missing(numbers, held) for held in feed.held.values()]
-        return min(lacks, key=lambda m: sum(map(len, m.values())), default=numbers)
+        return min(
+            feed.held.items(), key=lambda entry: count(missing(numbers, entry[1])), default=None
+        )
 
     def complete(self, scan_id: str) -> bool:
         """Whether some ground station holds everything that the scan has so far."""

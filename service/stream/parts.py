@@ -18,12 +18,16 @@ VERSION = 1
 MAX_RECORD_BYTES = 1 << 24
 MAX_PARTS = 65_535
 MAX_OPEN_RECORDS = 64
-MAX_OPEN_BYTES = 1 << 26
+MAX_OPEN_BYTES = 1 << 25
 """Unfinished records beyond either limit make way, the stalest first."""
+PIECE_BYTES = 160
+"""What keeping a part takes beyond its payload."""
 
 KINDS = {0: "header", 1: "summary", 2: "pose", 3: "repose"} | {16 + k: f"k{k}" for k in range(8)}
 """Code of a part to the kind of its record: ``k0`` is the coarsest layer of a keyframe."""
 CODES = {name: code for code, name in KINDS.items()}
+WHOLE = ("header", "summary")
+"""Kinds of which a scan has one; a new one replaces the former."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,10 +87,20 @@ def parse(message: bytes) -> Iterator[Part]:
         at += HEAD_BYTES
         if magic != MAGIC or version != VERSION or code not in KINDS or at + size > len(message):
             return
-        if not (index < count and total <= MAX_RECORD_BYTES and size <= total):
+        if index >= count or total > MAX_RECORD_BYTES or size != _size_of(index, count, total):
             return
         yield Part(KINDS[code], number, index, count, total, crc, message[at : at + size])
         at += size
+
+
+def _size_of(index: int, count: int, total: int) -> int:
+    """Bytes of a part: all but the last have the same size, and none is empty but that of an
+    empty record. -1 when no record is cut like that."""
+    step = max(1, -(-total // count))
+    left = total - index * step
+    if count > 1 and total - (count - 1) * step <= 0:
+        return -1
+    return min(step, left)
 
 
 @dataclass(slots=True)
@@ -123,8 +137,8 @@ class Assembler:
             self.repeated += 1
             return None
         entry.pieces[part.index] = part.payload
-        entry.held_bytes += len(part.payload)
-        self._bytes += len(part.payload)
+        entry.held_bytes += len(part.payload) + PIECE_BYTES
+        self._bytes += len(part.payload) + PIECE_BYTES
         if len(entry.pieces) < entry.count:
             self._make_room(key)
             return None
@@ -134,6 +148,11 @@ class Assembler:
             self.spoiled += 1
             return None
         return record
+
+    @property
+    def held_bytes(self) -> int:
+        """What the unfinished records take."""
+        return self._bytes
 
     def missing_parts(self, kind: str, number: int) -> list[int] | None:
         """The parts still to come of a record that has begun; None when it has not."""

@@ -133,6 +133,11 @@ class RangeSet:
         same._firsts, same._lasts = self._firsts[:], self._lasts[:]
         return same
 
+    @property
+    def range_count(self) -> int:
+        """How many ranges there are: what it takes to keep or compare the set."""
+        return len(self._firsts)
+
     def pairs(self) -> Pairs:
         """The ranges (first, last), in order; at most the newest MAX_RANGES."""
         return list(zip(self._firsts[-MAX_RANGES:], self._lasts[-MAX_RANGES:], strict=True))
@@ -145,6 +150,8 @@ class RangeSet:
 def ranges_from_text(text: str) -> RangeSet | None:
     """The set that :meth:`RangeSet.text` wrote; None for anything else."""
     pairs: Pairs = []
+    if text.count(",") >= MAX_RANGES:
+        return None
     for part in text.split(","):
         first, _, last = part.partition("-")
         if not (first.isascii() and first.isdigit() and len(first) <= 10):
@@ -155,13 +162,16 @@ def ranges_from_text(text: str) -> RangeSet | None:
     return ranges_from_pairs(pairs)
 
 
-def ranges_from_pairs(pairs: Any) -> RangeSet | None:
-    """The set of decoded JSON ``[[first, last], …]``; None when it is anything else."""
+def ranges_from_pairs(pairs: Any, max_number: int = MAX_NUMBER) -> RangeSet | None:
+    """The set of decoded JSON ``[[first, last], …]``; None when it is anything else.
+
+    A number above ``max_number`` makes it anything else.
+    """
     if not isinstance(pairs, list) or len(pairs) > MAX_RANGES:
         return None
     for pair in pairs:
         if not (isinstance(pair, (list, tuple)) and len(pair) == 2):
             return None
-        if not all(type(n) is int and 0 <= n <= MAX_NUMBER for n in pair) or pair[0] > pair[1]:
+        if not all(type(n) is int and 0 <= n <= max_number for n in pair) or pair[0] > pair[1]:
             return None
     return RangeSet((a, b) for a, b in pairs)

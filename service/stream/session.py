@@ -23,6 +23,8 @@ SEND_BUFFER_BYTES, SEND_BUFFER_S = 16_384, 0.2
 must cover a round trip, and nothing urgent may wait behind more."""
 BATCH_BYTES = 8_192
 LEASE_MS = 8_000
+MAX_MESSAGE_BYTES = 1 << 19
+"""A larger message is dropped by Zenoh as it comes in: heads have at most half of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +109,7 @@ def zenoh_config(config: SessionConfig) -> zenoh.Config:
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/batch_size": BATCH_BYTES,
+        "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
         "adminspace/enabled": False,
     }
     if config.tls_ca:

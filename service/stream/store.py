@@ -39,6 +39,8 @@ from service.stream.validity import summary_from_json
 
 _NOT_TOO_LARGE = f"LENGTH(data) <= {layer.MAX_LAYER_BYTES}"
 _IS_LAYER = f"typeof(layer) = 'integer' AND layer BETWEEN 0 AND {layer.MAX_LAYERS - 1}"
+MAX_HELD_PEERS = 8
+"""Ground stations whose holdings are kept."""
 
 
 class ScanStore:
@@ -380,10 +382,12 @@ class ScanStore:
             self._inventory.note_whole(kind, data)
 
     def set_held(self, peer: str, numbers: dict[str, RangeSet]) -> None:
-        """Note what ``peer`` says it holds."""
+        """Note what ``peer`` says it holds; those noted longest ago make way for it."""
         sql = "INSERT OR REPLACE INTO held VALUES (?, ?, ?)"
         rows = [(peer, kind, json.dumps(ranges.pairs())) for kind, ranges in numbers.items()]
-        self._db.write([(sql, row) for row in rows])
+        newest = "SELECT peer FROM held GROUP BY peer ORDER BY MAX(rowid) DESC LIMIT ?"
+        forget = (f"DELETE FROM held WHERE peer NOT IN ({newest})", (MAX_HELD_PEERS,))
+        self._db.write([*((sql, row) for row in rows), forget])
 
     def held(self) -> dict[str, dict[str, RangeSet]]:
         """Peer to what it said it holds."""

@@ -34,6 +34,8 @@ ANNOUNCE_EVERY_S = 10.0
 POSE_EVERY_S = 1.0
 REPEATS = 2
 MAX_WAITING = 2000
+MAX_ANNOUNCED = 64
+"""Scans that the ground knows by their announcement; the one announced longest ago makes way."""
 MOVED_M, TURNED, RESCALED = 0.5, 0.01, 0.01
 """A correction beyond any of these is worth sending a keyframe's tiles again."""
 MAVLINK_OVERHEAD_BYTES = 17
@@ -200,7 +202,10 @@ class TunnelIntake:
         header = unpack_announce(payload)
         if header is not None:
             tag = tag_of(header.drone, header.name)
+            self.headers.pop(tag, None)
             self.headers[tag] = header
+            while len(self.headers) > MAX_ANNOUNCED:
+                del self.headers[next(iter(self.headers))]
             ready = [item[1:] for item in self.waiting if item[0] == tag]
             for item in [item for item in self.waiting if item[0] == tag]:
                 self.waiting.remove(item)

@@ -1,0 +1,388 @@
+"""The receiver's worker for one drone: its scans, its queue, its share of the disk.
+
+Each drone has a worker, so that none waits for the work of another. A scan is open only
+while it is in use, and has a folder only once its header came and is valid.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+from service.errors import OutsideError, SkyreliefError
+from service.ground.disk_share import DiskShare
+from service.ground.inbox import Batch, Inbox
+from service.ground.intake import FINE, SILENCE_S, SMALL, ScanIntake
+from service.ground.introduction import Introduction
+from service.ground.received import ReceivedScan
+from service.stream.messages import Ask, count, pack_ask, pack_held, unpack_head
+from service.stream.naming import ROOT
+from service.stream.radio_messages import RADIO_NOTE
+from service.stream.ranges import RangeSet
+from service.stream.records import ScanHeader
+from service.stream.store import ScanStore
+from service.workers import Worker
+
+log = logging.getLogger(__name__)
+
+TICK_S = 0.1
+MAX_REST_S = 0.5
+"""After each turn a worker rests as long as it computed, at most so long: one drone never
+takes more than half of a core."""
+REPORT_S = 1.0
+REPORT_IDLE_S = 3.0
+DRONE_TIMEOUT_S = 30.0
+BUSY_S = 10.0
+"""A scan of which something was heard so lately, and that lacks something, stays open."""
+CLOSE_AFTER_S = 600.0
+"""A scan of which nothing was heard for so long is written and closed."""
+FULL_DISK_REST_S = 10.0
+MAX_INTRODUCTIONS = 8
+MAX_CLOSED = 1000
+"""Closed scans whose last figures are kept."""
+UNREADABLE_REST_S = 60.0
+MAX_UNREADABLE = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What one drone may take of the ground station."""
+
+    scan_bytes: int | None = None  # of one scan's chunks; beyond it only coarse layers
+    drone_share: float = 0.5  # of the disk
+    reserve_bytes: int | None = None  # that stay free on the disk; None: by its size
+
+
+class Station(Protocol):
+    """What a drone's worker needs of the receiver."""
+
+    name: str
+    limits: Limits
+
+    @property
+    def max_open(self) -> int:
+        """Scans that one drone may have open now."""
+
+    def folder(self, drone: str, name: str) -> Path:
+        """Where a scan is kept."""
+
+    def put(self, key: str, payload: bytes) -> None:
+        """Publish; nothing happens while there is no session."""
+
+    def get(
+        self,
+        key: str,
+        payload: bytes,
+        on_message: Callable[[bytes], object],
+        on_end: Callable[[], object],
+    ) -> None:
+        """Ask a drone; both callbacks come from another thread."""
+
+    def write(self, scan: ReceivedScan) -> None:
+        """Have the scan's deliverables written."""
+
+    def opened(self, scan: ReceivedScan) -> None:
+        """A scan was opened."""
+
+
+class DroneReceiver:
+    """Receives the scans of one drone. All but :meth:`run` is safe from any thread."""
+
+    def __init__(self, drone: str, station: Station) -> None:
+        self.drone = drone
+        self.inbox = Inbox()
+        self.heard_at = self.last_news_at = time.monotonic()
+        self.dropped = 0  # messages that were malformed, or of a scan without a header
+        self.entries: list[dict[str, Any]] = []
+        self.is_known = False  # has, or had, a scan here
+        self._station = station
+        self._scans: OrderedDict[str, ReceivedScan] = OrderedDict()  # open, the last used last
+        self._closed: OrderedDict[str, dict[str, Any]] = OrderedDict()
+        self._introductions: OrderedDict[str, Introduction] = OrderedDict()
+        self._unreadable: OrderedDict[str, float] = OrderedDict()
+        limits = station.limits
+        folder = station.folder(drone, "scan").parent
+        self._share = DiskShare(folder, limits.drone_share, limits.reserve_bytes)
+        self._published_at = 0.0
+
+    @property
+    def scans(self) -> list[ReceivedScan]:
+        """Those that are open; for use when the worker has ended."""
+        return list(self._scans.values())
+
+    @property
+    def has_open_scans(self) -> bool:
+        """Whether any scan is open."""
+        return bool(self._scans)
+
+    def run(self, worker: Worker) -> None:
+        """Take in what comes until the worker is to stop."""
+        while not worker.stop.is_set():
+            worker.beat()
+            batch = self.inbox.take(TICK_S)
+            began_s = time.thread_time()
+            self._handle(batch)
+            self._look_after(time.monotonic())
+            self._publish(bool(batch))
+            worker.stop.wait(min(time.thread_time() - began_s, MAX_REST_S))
+        self._publish(True)
+
+    # What comes
+
+    def _handle(self, batch: Batch) -> None:
+        if batch:
+            self.heard_at = time.monotonic()
+        for name, payload in batch.heads.items():
+            self._on_head(name, payload, time.monotonic())
+        for name, payload in batch.items:
+            self._on_items(name, payload, time.monotonic())
+        for event in batch.events:
+            event(time.monotonic())
+
+    def _on_head(self, name: str, payload: bytes, now: float) -> None:
+        head = unpack_head(payload)
+        if head is None:
+            self.dropped += 1
+            return
+        scan = self._scan(name, now)
+        if scan is None:
+            if name not in self._closed and now >= self._unreadable.get(name, now):
+                self._introduction(name).on_head(head, now)
+            return
+        if now - scan.intake.head_at > SILENCE_S:
+            scan.reported_at = -1e9  # the drone is back: say at once that we listen
+        before = scan.intake.missing()
+        scan.intake.on_head(head, now)
+        scan.changed = scan.changed or count(scan.intake.missing()) != count(before)
+
+    def _on_items(self, name: str, payload: bytes, now: float) -> None:
+        if name in self._introductions:
+            self._introduce(name, payload, now)
+            return
+        if name not in self._scans and name not in self._closed:
+            self.dropped += 1  # a head or an announcement comes first
+            return
+        scan = self._scan(name, now)
+        if scan is None:
+            self.dropped += 1
+        elif now >= scan.rest_until:
+            self._take_in(scan, payload, now)
+
+    def _take_in(self, scan: ReceivedScan, payload: bytes, now: float) -> None:
+        try:
+            self._share.check(len(payload), now)
+            if scan.intake.on_items(payload, now):
+                scan.changed = scan.unwritten = True
+                self.last_news_at = now
+                scan.trouble = ""
+        except OutsideError as error:
+            self._rest(scan, str(error), now)
+
+    def _rest(self, scan: ReceivedScan, trouble: str, now: float) -> None:
+        """Leave a scan alone that cannot be written; what is missed is asked for later."""
+        if trouble != scan.trouble:
+            log.error("%s; trying again every %.0f s", trouble, FULL_DISK_REST_S)
+        scan.trouble, scan.rest_until = trouble, now + FULL_DISK_REST_S
+
+    def add_radio(
+        self, header: ScanHeader, kind: str, number: int, part: int, data: bytes, now: float
+    ) -> None:
+        """Take in what the narrow radio brought; called by the worker."""
+        scan = self._scan(header.name, now) or self._create(header, now)
+        if scan is None or now < scan.rest_until:
+            return
+        store = scan.intake.store
+        try:
+            self._share.check(len(data), now)
+            provisional = not store.header.started_unix_ns or RADIO_NOTE in store.header.notes
+            if provisional and header != store.header:
+                store.put_header(header)
+            if kind != "header" and store.add_radio(kind, number, part, data):
+                scan.radio_messages += 1
+                scan.unwritten = True
+                self.last_news_at = now
+        except OutsideError as error:
+            self._rest(scan, str(error), now)
+
+    # Scans that have no folder yet
+
+    def _introduction(self, name: str) -> Introduction:
+        """That of a scan, a new one if need be; the one heard longest ago makes way."""
+        found = self._introductions.pop(name, None) or Introduction(self.drone, name)
+        self._introductions[name] = found
+        while len(self._introductions) > MAX_INTRODUCTIONS:
+            self._introductions.popitem(last=False)
+        return found
+
+    def _introduce(self, name: str, payload: bytes, now: float) -> None:
+        """Take in an item of a scan without a folder; a valid header makes the folder."""
+        introduction = self._introductions[name]
+        header = introduction.on_items(payload, now)
+        scan = None if header is None else self._create(header, now)
+        if scan is None or introduction.head is None:
+            return
+        self._introductions.pop(name)
+        scan.intake.store.put_record("header", introduction.number, introduction.record)
+        scan.intake.on_head(introduction.head, now)
+        for message in introduction.kept:
+            self._take_in(scan, message, now)
+
+    # Scans that have one
+
+    def _scan(self, name: str, now: float) -> ReceivedScan | None:
+        """The scan, opened if need be; None when it has no folder or cannot be opened."""
+        found = self._scans.get(name)
+        if found is not None:
+            self._scans.move_to_end(name)
+            found.used_at = now
+            return found
+        if now < self._unreadable.get(name, now):
+            return None
+        return self._open(name, now, self._reopen)
+
+    def _reopen(self, name: str) -> ScanStore | None:
+        path = self._station.folder(self.drone, name) / "scan.db"
+        return ScanStore.open(path, self._station.limits.scan_bytes) if path.is_file() else None
+
+    def _create(self, header: ScanHeader, now: float) -> ReceivedScan | None:
+        def create(name: str) -> ScanStore:
+            found = self._reopen(name)
+            if found is not None:
+                return found
+            path = self._station.folder(self.drone, name) / "scan.db"
+            self._share.check(len(header.to_json()), now)
+            return ScanStore.create(path, header, self._station.limits.scan_bytes)
+
+        return self._open(header.name, now, create)
+
+    def _open(
+        self, name: str, now: float, opening: Callable[[str], ScanStore | None]
+    ) -> ReceivedScan | None:
+        if not self._has_room(now):
+            self.dropped += 1
+            return None
+        try:
+            store = opening(name)
+        except SkyreliefError as error:
+            log.error("%s", error)
+            self._unreadable[name] = now + UNREADABLE_REST_S
+            while len(self._unreadable) > MAX_UNREADABLE:
+                self._unreadable.popitem(last=False)
+            return None
+        self._unreadable.pop(name, None)
+        if store is None:
+            return None
+        intake = ScanIntake(store, self._station.name)
+        scan = ReceivedScan(self.drone, name, store.path.parent, intake, used_at=now)
+        before = self._closed.pop(name, None)
+        scan.is_written = before is not None
+        scan.unwritten = before is None
+        self._scans[name] = scan
+        self.is_known = True
+        self._station.opened(scan)
+        log.info("receiving %s/%s into %s", self.drone, name, scan.folder)
+        return scan
+
+    def _has_room(self, now: float) -> bool:
+        """Close the scans used longest ago until one more may be open.
+
+        Those that are coming in just now stay: another scan of this drone waits for its turn.
+        """
+        for scan in list(self._scans.values()):
+            if len(self._scans) < self._station.max_open:
+                return True
+            if now - scan.used_at < BUSY_S and not scan.intake.complete:
+                continue
+            if scan.may_close:
+                self._close(scan)
+            elif scan.unwritten:
+                self._write(scan)
+        return len(self._scans) < self._station.max_open
+
+    def _close(self, scan: ReceivedScan) -> None:
+        self._closed[scan.name] = scan.progress() | {"open": False}
+        while len(self._closed) > MAX_CLOSED:
+            self._closed.popitem(last=False)
+        del self._scans[scan.name]
+        scan.intake.store.close()
+
+    def _write(self, scan: ReceivedScan) -> None:
+        """Have a scan's deliverables written, one scan of a drone at a time."""
+        if not any(other.is_writing for other in self._scans.values()):
+            scan.changed, scan.unwritten, scan.is_writing = True, False, True
+            self._station.write(scan)
+
+    def write_grown(self, _: float) -> None:
+        """Write the deliverables of a scan that has grown since; called by the worker."""
+        for scan in self._scans.values():
+            if scan.unwritten:
+                self._write(scan)
+
+    # What to say
+
+    def _look_after(self, now: float) -> None:
+        for introduction in list(self._introductions.values()):
+            if now - introduction.seen_at > DRONE_TIMEOUT_S:
+                del self._introductions[introduction.name]
+                continue
+            wanted = introduction.next_ask(now)
+            if wanted is not None:
+                self._get(introduction.name, "header", wanted, Ask(self._station.name), None)
+        for scan in list(self._scans.values()):
+            if now - scan.used_at > CLOSE_AFTER_S:
+                if scan.may_close:
+                    self._close(scan)
+                elif scan.unwritten:
+                    self._write(scan)
+            elif now - scan.intake.head_at <= DRONE_TIMEOUT_S:
+                self._tend(scan, now)
+
+    def _tend(self, scan: ReceivedScan, now: float) -> None:
+        """Report, ask, and write what is complete."""
+        pause = REPORT_S if scan.changed else REPORT_IDLE_S
+        if now - scan.reported_at >= pause:
+            scan.reported_at, scan.changed = now, False
+            key = f"{scan.key}/held/{self._station.name}"
+            self._station.put(key, pack_held(scan.intake.held()))
+        if scan.unwritten and scan.intake.complete and not scan.is_writing:
+            self._write(scan)
+        if now < scan.rest_until:
+            return
+        for slot in (SMALL, FINE):
+            asked = scan.intake.next_ask(slot, now)
+            if asked is not None:
+                serial = scan.intake.progress.asked
+                answered = partial(scan.intake.answered, slot, serial)
+                self._get(scan.name, *asked, answered)
+
+    def _get(
+        self,
+        name: str,
+        kind: str,
+        numbers: RangeSet,
+        ask: Ask,
+        answered: Callable[[float], None] | None,
+    ) -> None:
+        """Ask for items; the replies come to the inbox."""
+
+        def ended() -> None:
+            if answered is not None:
+                self.inbox.put_event(answered)
+
+        key = f"{ROOT}/{self.drone}/{name}/item/{kind}/{numbers.text()}"
+        self._station.get(key, pack_ask(ask), partial(self.inbox.put_item, name), ended)
+
+    def _publish(self, has_news: bool) -> None:
+        """Show how it goes: at once when there is news, else every second."""
+        now = time.monotonic()
+        if not has_news and now - self._published_at < REPORT_S:
+            return
+        self._published_at = now
+        entries = [scan.progress() for scan in list(self._scans.values())]
+        self.entries = entries + list(self._closed.values())

@@ -1,0 +1,80 @@
+"""What waits for one drone's worker: bounded, so that no drone takes the memory of another."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+MAX_ITEM_BYTES, MAX_ITEMS = 8 << 20, 4096
+MAX_HEADS = 256
+"""Scans of one drone whose newest head may wait."""
+MAX_EVENTS = 2048
+ITEM_BYTES = 200
+"""What keeping a message takes beyond its payload."""
+
+Event = Callable[[float], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Batch:
+    """What came since the last look, in order."""
+
+    heads: dict[str, bytes] = field(default_factory=dict)  # scan to its newest head
+    items: list[tuple[str, bytes]] = field(default_factory=list)  # scan and message of parts
+    events: list[Event] = field(default_factory=list)
+
+    def __bool__(self) -> bool:
+        return bool(self.heads or self.items or self.events)
+
+
+class Inbox:
+    """Takes messages from any thread; each method says False for what there is no room for."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._batch = Batch()
+        self._item_bytes = 0
+        self.dropped = 0
+
+    def put_head(self, scan_id: str, payload: bytes) -> bool:
+        """A head; it takes the place of one of the same scan that waits."""
+        with self._changed:
+            heads = self._batch.heads
+            return self._note(
+                scan_id in heads or len(heads) < MAX_HEADS,
+                lambda: heads.__setitem__(scan_id, payload),
+            )
+
+    def put_item(self, scan_id: str, payload: bytes) -> bool:
+        """A message of parts."""
+        with self._changed:
+            size = len(payload) + ITEM_BYTES
+            has_room = (
+                self._item_bytes + size <= MAX_ITEM_BYTES and len(self._batch.items) < MAX_ITEMS
+            )
+            self._item_bytes += size if has_room else 0
+            return self._note(has_room, lambda: self._batch.items.append((scan_id, payload)))
+
+    def put_event(self, event: Event) -> bool:
+        """Something else to do."""
+        with self._changed:
+            return self._note(
+                len(self._batch.events) < MAX_EVENTS, lambda: self._batch.events.append(event)
+            )
+
+    def take(self, timeout_s: float) -> Batch:
+        """All that waits; what comes within the timeout when nothing does."""
+        with self._changed:
+            self._changed.wait_for(lambda: bool(self._batch), timeout_s)
+            batch, self._batch = self._batch, Batch()
+            self._item_bytes = 0
+            return batch
+
+    def _note(self, has_room: bool, put: Callable[[], None]) -> bool:
+        if not has_room:
+            self.dropped += 1
+            return False
+        put()
+        self._changed.notify()
+        return True
