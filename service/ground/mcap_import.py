@@ -7,10 +7,9 @@ re-poses, the scan's settings) is left at defaults and said in a note.
 
 from __future__ import annotations
 
+import logging
 import math
 import re
-import struct
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,26 +20,32 @@ import numpy as np
 from recon import se3
 from recon.types import F64, U8, DepthMap, Keyframe, Pose
 from service.errors import InputError
-from service.packages import needing
+from service.ground.mcap_records import messages
 from service.stream import codec
+from service.stream.layer import MAX_PIXELS, MAX_SIDE_PX
 from service.stream.mcap_export import POINT
-from service.stream.records import PoseRecord, ScanHeader
+from service.stream.planes import picture_size
+from service.stream.records import PoseRecord, ScanHeader, read_header
 from service.stream.store import ScanStore
+from service.stream.validity import MAX_SIGMA_M, is_pinhole, is_position
+
+log = logging.getLogger(__name__)
 
 HEADER = re.compile(r"scan (\S+) of (\S+), (.*), origin (\S+), (\S+), (\S+) m")
-MOST_PIXELS = 4096 * 4096
+MOST_WAITING = 4
+"""Keyframes of which something is missing: the recording has their parts one after the other."""
 USED = ("/points", "/image", "/camera", "/pose", "/fix", "/log")
 NOTE = "imported from an MCAP: covariances of rotation and settings are not known"
 
 
 def header_in(path: Path) -> ScanHeader:
     """The scan's header from the first log line; InputError when the file is no scan of ours."""
-    for topic, time_ns, message in _messages(path, ("/log",)):
+    for topic, time_ns, message in messages(path, ("/log",)):
         found = HEADER.fullmatch(message.message) if topic == "/log" else None
         if found:
             scan, drone, software, *origin = found.groups()
             lat, lon, alt = (_number(text) for text in origin)
-            return ScanHeader(
+            header = ScanHeader(
                 scan,
                 drone,
                 time_ns,
@@ -51,6 +56,10 @@ def header_in(path: Path) -> ScanHeader:
                 georeference="none" if lat is None else "gnss",
                 notes=(NOTE,),
             )
+            fault = read_header(header.to_json())
+            if isinstance(fault, str):
+                raise InputError(f"{path}: its scan cannot be ({fault})")
+            return header
     raise InputError(f"{path} is no recording of a skyrelief scan")
 
 
@@ -63,17 +72,19 @@ def store_from_mcap(path: Path, out: Path) -> ScanStore:
     store = ScanStore.create(out, header_in(path))
     try:
         waiting: dict[int, dict[str, Any]] = {}
-        poses: dict[int, dict[str, Any]] = {}
+        track = _Track(store)
         count = 0
-        for topic, time_ns, message in _messages(path, USED):
+        for topic, time_ns, message in messages(path, USED):
             if topic in ("/points", "/image", "/camera"):
                 parts = waiting.setdefault(time_ns, {})
                 parts[topic] = message
                 if len(parts) == 3:
                     count += _add_keyframe(store, waiting.pop(time_ns), time_ns)
+                elif len(waiting) > MOST_WAITING:
+                    del waiting[next(iter(waiting))]
             elif topic in ("/pose", "/fix"):
-                poses.setdefault(time_ns, {})[topic] = message
-        _add_poses(store, poses)
+                track.add(topic, time_ns, message)
+        track.close()
         if not count:
             raise InputError(f"{path} holds no keyframe; nothing to import")
         store.finish({"keyframes": count, "source": "mcap"})
@@ -83,65 +94,23 @@ def store_from_mcap(path: Path, out: Path) -> ScanStore:
     return store
 
 
-def _messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, Any]]:
-    """(topic, time, decoded message) in order of time."""
-    with needing("an MCAP"):
-        from google.protobuf.message import DecodeError
-        from mcap.exceptions import McapError
-        from mcap.reader import make_reader
-    classes: dict[int, Any] = {}
-    try:
-        with open(path, "rb") as file:
-            for schema, channel, message in make_reader(file).iter_messages(topics=list(topics)):
-                if schema is None or schema.encoding != "protobuf":
-                    continue
-                if schema.id not in classes:
-                    classes[schema.id] = _message_class(schema)
-                decoded = classes[schema.id].FromString(message.data)
-                yield channel.topic, message.log_time, decoded
-    except (
-        McapError,
-        DecodeError,
-        struct.error,
-        ValueError,
-        KeyError,
-        TypeError,
-        EOFError,
-    ) as error:
-        raise InputError(f"{path} is no sound MCAP ({type(error).__name__})") from error
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror or error})") from error
-
-
-def _message_class(schema: Any) -> Any:
-    """A message class made from the descriptors that the recording itself carries."""
-    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-
-    pool = descriptor_pool.DescriptorPool()
-    waiting = list(descriptor_pb2.FileDescriptorSet.FromString(schema.data).file)
-    for _ in range(len(waiting) ** 2):  # a file comes after those that it imports
-        if not waiting:
-            break
-        file = waiting.pop(0)
-        try:
-            pool.Add(file)
-        except TypeError:
-            waiting.append(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
-
-
 def _add_keyframe(store: ScanStore, parts: dict[str, Any], time_ns: int) -> bool:
     """Store one keyframe; False when its parts do not fit together."""
     camera, points, image = parts["/camera"], parts["/points"], parts["/image"]
     seq = re.fullmatch(r"keyframe-(\d{1,9})", camera.frame_id)
     size = (camera.height, camera.width)
-    if seq is None or not 0 < size[0] * size[1] <= MOST_PIXELS or len(camera.K) != 9:
+    is_size = 0 < size[0] <= MAX_SIDE_PX and 0 < size[1] <= MAX_SIDE_PX
+    if seq is None or not is_size or size[0] * size[1] > MAX_PIXELS or len(camera.K) != 9:
         return False
     K = np.array(camera.K, np.float64).reshape(3, 3)
+    if not is_pinhole((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), size[::-1]):
+        return False
+    if picture_size(image.data) != size[::-1]:
+        return False
     bgr = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
     T = _transform(points.pose)
     usable = points.point_stride == POINT.itemsize and len(points.data) % POINT.itemsize == 0
-    if T is None or bgr is None or bgr.shape[:2] != size or not usable or K[0, 0] <= 0:
+    if T is None or bgr is None or bgr.shape[:2] != size or not usable:
         return False
     depth = _depth(np.frombuffer(points.data, POINT), K, size, T)
     number = int(seq.group(1))
@@ -153,7 +122,11 @@ def _add_keyframe(store: ScanStore, parts: dict[str, Any], time_ns: int) -> bool
         Pose(T, np.eye(6), ("vision",)),
         np.isfinite(depth.depth_m),
     )
-    store.add_keyframe(number, codec.encode(frame, time_ns))
+    try:
+        store.add_keyframe(number, codec.encode(frame, time_ns))
+    except ValueError as error:  # such as a pose out of reach
+        log.debug("keyframe %d: %s", number, error)
+        return False
     return True
 
 
@@ -174,37 +147,53 @@ def _depth(points: Any, K: F64, size: tuple[int, int], T: F64) -> DepthMap:
     return DepthMap(depth, sigma, views, K, T)
 
 
-def _add_poses(store: ScanStore, poses: dict[int, dict[str, Any]]) -> None:
-    """The trajectory, with distance and speed from its positions."""
-    flown, before = 0.0, None
-    for time_ns in sorted(poses):
-        message, fix = poses[time_ns].get("/pose"), poses[time_ns].get("/fix")
+class _Track:
+    """The trajectory, with distance and speed from its positions, stored as it comes."""
+
+    def __init__(self, store: ScanStore) -> None:
+        self._store = store
+        self._now: dict[str, Any] = {}  # the messages of one time
+        self._time_ns = 0
+        self._before: tuple[int, F64] | None = None
+        self._flown_m = 0.0
+
+    def add(self, topic: str, time_ns: int, message: Any) -> None:
+        """A pose or a fix; both of one time follow each other."""
+        if time_ns != self._time_ns:
+            self.close()
+            self._time_ns = time_ns
+        self._now[topic] = message
+
+    def close(self) -> None:
+        """Store what is complete."""
+        message, fix = self._now.get("/pose"), self._now.get("/fix")
+        self._now = {}
         T = None if message is None else _transform(message.pose)
         if T is None:
-            continue
+            return
         speed = 0.0
-        if before is not None:
-            step = float(np.linalg.norm(T[:3, 3] - before[1][:3, 3]))
-            flown += step
-            speed = step / max((time_ns - before[0]) / 1e9, 1e-3)
-        before = (time_ns, T)
+        if self._before is not None:
+            step = float(np.linalg.norm(T[:3, 3] - self._before[1][:3, 3]))
+            self._flown_m += step
+            speed = step / max((self._time_ns - self._before[0]) / 1e9, 1e-3)
+        self._before = (self._time_ns, T)
         covariance = np.eye(6)
         if fix is not None and len(fix.position_covariance) == 9:
             covariance[3:, 3:] = np.array(fix.position_covariance).reshape(3, 3)
         spread = float(np.sqrt(max(np.trace(covariance[3:, 3:]) / 3.0, 0.0)))
         record = PoseRecord(
-            time_ns,
+            self._time_ns,
             T,
             covariance,
             speed_m_s=min(speed, 1e4),
-            distance_m=flown,
+            distance_m=self._flown_m,
             sources=("vision",),
-            sigma_m=spread,
+            sigma_m=min(spread, MAX_SIGMA_M),
         )
         if fix is not None:
             place = {"lat_deg": fix.latitude, "lon_deg": fix.longitude, "alt_amsl_m": fix.altitude}
             record = replace(record, **place)
-        store.add_pose(record)
+        self._store.add_pose(record)
 
 
 def _transform(pose: Any) -> F64 | None:
@@ -212,7 +201,7 @@ def _transform(pose: Any) -> F64 | None:
     q = np.array([pose.orientation.w, pose.orientation.x, pose.orientation.y, pose.orientation.z])
     t = np.array([pose.position.x, pose.position.y, pose.position.z])
     length = float(np.linalg.norm(q))
-    if not (np.isfinite(t).all() and math.isfinite(length) and abs(length - 1.0) < 0.1):
+    if not (is_position(t) and math.isfinite(length) and abs(length - 1.0) < 0.1):
         return None
     return se3.compose(se3.rotation_from_quaternion(q / length), t)
 
