@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import logging
 import sys
+import threading
+import traceback
 from importlib import import_module
+from types import TracebackType
 from typing import Any
 
 import typer
@@ -14,6 +17,7 @@ import typer.main
 from service.errors import SkyreliefError
 from service.journal import log_handler
 from service.packages import needing
+from service.redaction import without_credentials
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("service.commands.demo:demo", "A real flight through both ends, here."),
@@ -88,12 +92,25 @@ def _root(
 
 def main() -> None:
     """Run the command line; exit codes: 0 done, 2 usage or input, 3 outside world, 1 ours."""
+    threading.excepthook = lambda hook: _print_fault(
+        hook.exc_type, hook.exc_value or hook.exc_type(), hook.exc_traceback
+    )
     try:
         with needing("this command"):
             app(standalone_mode=True)
     except SkyreliefError as error:
         print(f"skyrelief: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
+    finally:
+        sys.excepthook = _print_fault  # typer has put its own in place
+
+
+def _print_fault(
+    kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
+    """Print the traceback of our own fault, with the credentials in it hidden."""
+    text = "".join(traceback.format_exception(kind, error, trace))
+    print(without_credentials(text), end="", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +30,7 @@ from service.daemon.health import HealthServer
 from service.errors import InputError, OutsideError
 from service.ground import limits
 from service.ground.audit import AuditLog, Pace
-from service.ground.folder_import import copy_scan_folder
+from service.ground.folder_import import copy_files
 from service.ground.library import ConflictError, Library
 from service.ground.portal import Portal, PortalConfig, open_portal
 from service.ground.tokens import KEPT, Tokens, kept_token, parse_tokens
@@ -38,6 +38,7 @@ from service.ground.vehicle import Vehicle
 from service.listener import BoundedListener, ListenerLimits, host_name, network_of
 from service.scans.folder import write_deliverables
 from service.stream.session import SessionConfig, open_session
+from service.workers import Workers
 
 if TYPE_CHECKING:
     from conftest import HouseFlight
@@ -459,18 +460,19 @@ def test_a_recording_that_is_a_link_or_a_pipe_is_refused(client: Client, tmp_pat
 
 
 def test_an_import_fits_the_room_or_is_refused(tmp_path: Path, card: Path) -> None:
-    size = (card / "scan.db").stat().st_size + 2
+    names = ("scan.db", "cloud.ply")
     with open(card / "cloud.ply", "wb") as file:
         file.truncate(10**12)  # a sparse file costs its maker nothing
     out = tmp_path / "out"
     out.mkdir()
     with pytest.raises(OutsideError, match="room for"):
-        copy_scan_folder(card, out)
+        copy_files(card, out, names)
     assert not list(out.iterdir())
     (card / "cloud.ply").unlink()
+    size = (card / "scan.db").stat().st_size
     with pytest.raises(OutsideError, match="room for"):
-        copy_scan_folder(card, out, size - 1)
-    copy_scan_folder(card, out, size)
+        copy_files(card, out, names, size - 1)
+    assert copy_files(card, out, names, size) == {"scan.db"}
 
 
 def test_an_import_holds_no_lock_of_the_library(
@@ -480,12 +482,12 @@ def test_an_import_holds_no_lock_of_the_library(
     library.delete("drone-1", "test-1")
     begun, go_on = threading.Event(), threading.Event()
 
-    def slow(source: Path, target: Path) -> None:
+    def slow(source: Path, target: Path, names: Iterable[str]) -> set[str]:
         begun.set()
         assert go_on.wait(60)
-        copy_scan_folder(source, target)
+        return copy_files(source, target, names)
 
-    monkeypatch.setattr("service.ground.library.copy_scan_folder", slow)
+    monkeypatch.setattr("service.ground.library.copy_files", slow)
     importing = threading.Thread(target=library.bring_in, args=(card,))
     importing.start()
     try:
@@ -725,6 +727,39 @@ def test_half_open_requests_leave_the_health_page_answering() -> None:
         for one in held:
             one.close()
         server.close()
+
+
+def test_a_portal_that_fails_starts_again_at_its_address(
+    store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import uvicorn
+
+    serve, failed = uvicorn.Server.serve, threading.Event()
+
+    async def fails_once(server: uvicorn.Server, sockets: Any = None) -> None:
+        if failed.is_set():
+            await serve(server, sockets)
+        failed.set()
+        sockets[0].close()
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(uvicorn.Server, "serve", fails_once)
+    workers = Workers(pause_s=0.0)
+    portal = Portal(PortalConfig(store, port=0, token=TOKEN), workers=workers)
+    portal.start()
+    try:
+        client = Client(portal)
+        assert failed.wait(20)
+
+        def answers() -> bool:
+            with contextlib.suppress(OSError):
+                return bool(client.ask("/api/scans")[0] == 200)
+            return False
+
+        until(answers)
+        assert [(w["name"], w["restarts"]) for w in workers.report()] == [("portal", 1)]
+    finally:
+        portal.close()
 
 
 def test_half_open_tls_handshakes_leave_the_portal_answering(store: Path, tmp_path: Path) -> None:

@@ -152,3 +152,26 @@ def test_the_shown_configuration_holds_no_secret(options: list[str]) -> None:
     command = [sys.executable, "-m", "service.cli", "config", "show", *sets, *options]
     shown = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "rtsp://***@127.0.0.1" in shown.stdout and "s3cret" not in shown.stdout
+
+
+@pytest.mark.parametrize("where", ["main", "aside"])
+def test_a_traceback_of_a_command_holds_no_secret(where: str) -> None:
+    code = f"""
+import sys, threading, types
+from service import cli
+def main():
+    raise ZeroDivisionError("{SOURCE}")
+def aside():
+    thread = threading.Thread(target=main)
+    thread.start()
+    thread.join()
+sys.modules["broken"] = module = types.ModuleType("broken")
+module.main, module.aside = main, aside
+cli.COMMANDS["broken"] = ("broken:{where}", "fails")
+sys.argv = ["skyrelief", "broken"]
+cli.main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == (1 if where == "main" else 0)
+    assert "ZeroDivisionError: rtsp://***@127.0.0.1" in done.stderr
+    assert "s3cret" not in done.stderr

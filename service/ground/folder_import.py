@@ -9,37 +9,14 @@ from __future__ import annotations
 import os
 import shutil
 import stat
+from collections.abc import Iterable
 from pathlib import Path
 
 from service.errors import InputError, OutsideError
 
-COPIED = (
-    "scan.db",
-    "scan.db-wal",
-    "scan.json",
-    "library.json",
-    "cloud.laz",
-    "cloud.copc.laz",
-    "cloud.ply",
-    "dsm.tif",
-    "ortho.tif",
-    "contours.geojson",
-    "coverage.tif",
-    "coverage.png",
-    "coverage.json",
-    "mesh.glb",
-    "trajectory.tum",
-    "trajectory.csv",
-    "flight.geojson",
-    "flight.kml",
-    "flight.mcap",
-    "report.html",
-    "preview.jpg",
-    "telemetry.csv",
-    "link.tlog",
-    "camera.refined.yaml",
-)
-"""Files of a scan folder that are worth copying; 3D Tiles can be made again."""
+STORE_FILES = ("scan.db", "scan.db-wal")
+OTHER_FILES = ("coverage.json", "library.json", "telemetry.csv", "link.tlog", "camera.refined.yaml")
+"""Worth copying though no deliverable; 3D Tiles can be made again."""
 
 KEPT_FREE, KEPT_FREE_BYTES = 0.1, 2 << 30
 """An import leaves free this share of the store's disk, but no more than these bytes."""
@@ -55,11 +32,13 @@ def is_regular(path: Path) -> bool:
         return False
 
 
-def copy_scan_folder(source: Path, target: Path, room_bytes: int | None = None) -> None:
-    """Copy the known files of the scan folder ``source`` into the folder ``target``.
+def copy_files(
+    source: Path, target: Path, names: Iterable[str], room_bytes: int | None = None
+) -> set[str]:
+    """Copy the regular files called ``names`` from one folder to another; those there were.
 
     ``room_bytes`` bounds the copy; by default a tenth of the disk, at most 2 GiB, stays free.
-    Raises InputError when ``source`` is no scan folder, OutsideError for too little room and for a
+    Raises InputError when ``source`` is no folder, OutsideError for too little room and for a
     failing disk.
     """
     try:
@@ -68,12 +47,10 @@ def copy_scan_folder(source: Path, target: Path, room_bytes: int | None = None) 
         raise InputError(f"{_short(source)} is no folder that can be read") from error
     files: dict[str, int] = {}
     try:
-        for name in COPIED:
+        for name in names:
             handle = _open_regular(folder, name)
             if handle is not None:
                 files[name] = handle
-        if COPIED[0] not in files:
-            raise InputError(f"{_short(source)} holds no scan.db; give a scan folder")
         sizes = {name: os.fstat(handle).st_size for name, handle in files.items()}
         _check_room(sum(sizes.values()), target, room_bytes)
         for name, handle in files.items():
@@ -83,6 +60,7 @@ def copy_scan_folder(source: Path, target: Path, room_bytes: int | None = None) 
     finally:
         for handle in (folder, *files.values()):
             os.close(handle)
+    return set(files)
 
 
 def _open_regular(folder: int, name: str) -> int | None:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import InputError, OutsideError, SkyreliefError
-from service.ground.folder_import import copy_scan_folder, is_regular
+from service.ground.folder_import import OTHER_FILES, STORE_FILES, copy_files, is_regular
 from service.ground.mcap_import import header_in, store_from_mcap
 from service.ground.scan_facts import facts_of, labels_in
 from service.scans.folder import SUMMARY, write_deliverables
@@ -230,12 +230,16 @@ class Library:
         """
 
         def fill(part: Path) -> ScanHeader:
-            copy_scan_folder(source, part)
+            if STORE_FILES[0] not in copy_files(source, part, STORE_FILES):
+                raise InputError(f"{str(source)[:200]} holds no scan.db; give a scan folder")
             try:
-                with ScanStore.open(part / "scan.db") as store:
-                    return store.header
+                with ScanStore.open(part / STORE_FILES[0]) as store:
+                    header = store.header
             except (sqlite3.Error, ValueError) as error:
                 raise InputError(f"{str(source)[:200]} holds no sound scan ({error})") from error
+            self._check_new(header)
+            copy_files(source, part, ({*FILES, *OTHER_FILES} - {*STORE_FILES}))
+            return header
 
         return self._take(fill)
 
