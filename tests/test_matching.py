@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from functools import lru_cache
 from pathlib import Path
 
@@ -13,7 +14,8 @@ import scipy.ndimage as ndi
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.tracking.matching import MatchingConfig, Pyramid, global_shift, harris_grid, match
+from recon.tracking.common_view import common_view, features
+from recon.tracking.matching import MatchingConfig, Pyramid, harris_grid, match
 from recon.types import F64, U8, Bool
 
 CALITERRA = Path(__file__).resolve().parents[2] / "shared" / "data" / "caliterra_nadir" / "frames"
@@ -288,49 +290,40 @@ def test_wrong_shapes_are_named() -> None:
             MatchingConfig(**{field: value})  # type: ignore[arg-type]
 
 
-# ---- global shift ----------------------------------------------------------------------------
+# ---- a start without a prediction ----------------------------------------------------------------
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(
-    st.floats(-180, 180), st.floats(0.95, 1.05), st.floats(-90, 90), st.floats(-70, 70)
+    st.floats(-180, 180), st.floats(0.6, 1.6), st.floats(-90, 90), st.floats(-70, 70)
 )  # fmt: skip
-def test_any_turn_is_found(angle: float, scale: float, du: float, dv: float) -> None:
+def test_any_turn_and_zoom_is_found(angle: float, scale: float, du: float, dv: float) -> None:
     a, b, A, t = turned(angle, scale, (du, dv))
-    shift = global_shift(a, b)
-    grid = np.array([[150.0, 120.0], [450.0, 120.0], [300.0, 225.0], [150.0, 330.0]])
-    error = np.linalg.norm(shift.apply(grid) - (grid @ A.T + t), axis=1)
-    assert error.max() < 0.05 * 600
-    assert np.median(error) < 0.03 * 600
-    assert shift.confidence > 1.4
-    wrapped = (shift.rotation_rad - np.radians(angle) + np.pi) % (2 * np.pi) - np.pi
-    assert abs(wrapped) < np.radians(4)
-    assert abs(shift.scale / scale - 1) < 0.06
+    view = common_view(features(a), features(b))
+    assert view is not None
+    grid = np.array([[250.0, 180.0], [350.0, 180.0], [300.0, 225.0], [300.0, 270.0]])
+    assert np.linalg.norm(view.carry(grid) - (grid @ A.T + t), axis=1).max() < 4.0
 
 
-def test_a_global_shift_is_a_start_for_matching() -> None:
+def test_a_common_view_is_a_start_for_matching() -> None:
     a, b, A, t = turned(100.0, 1.0, (60.0, -40.0))
-    shift = global_shift(a, b)
+    view = common_view(features(a), features(b))
+    assert view is not None
     corners = harris_grid(a, CONFIG).uv_px.astype(np.float64)
+    there = view.predict(corners, 8.0)
     found = match(
-        Pyramid.build(a), corners, Pyramid.build(b), shift.apply(corners), 40.0, shift.A, CONFIG
+        Pyramid.build(a), corners, Pyramid.build(b), there.uv, there.radius_px, there.warp, CONFIG
     )
     truth = corners @ A.T + t
     assert found.ok[inside(truth, b.shape, margin=14)].mean() > 0.7
     assert np.median(np.linalg.norm(found.uv_px - truth, axis=1)[found.ok]) < 0.1
 
 
-def test_strangers_get_no_confidence() -> None:
-    confidences = [
-        global_shift(grey(ground(300, 400, seed=2 * i)), grey(ground(300, 400, seed=2 * i + 1)))
-        .confidence
-        for i in range(5)
-    ]  # fmt: skip
-    assert max(confidences) < 1.4
-    blank = np.full((300, 400), 90, np.uint8)
-    assert global_shift(blank, grey(ground(300, 400))).confidence == 0.0
-    with pytest.raises(ValueError, match="one size"):
-        global_shift(blank, np.zeros((300, 300), np.uint8))
+def test_strangers_share_nothing() -> None:
+    images = [features(grey(ground(300, 400, seed=i))) for i in range(8)]
+    assert all(common_view(a, b) is None for a, b in itertools.combinations(images, 2))
+    blank = features(np.full((300, 400), 90, np.uint8))
+    assert len(blank.uv_px) == 0 and common_view(blank, images[0]) is None
 
 
 @pytest.mark.skipif(not CALITERRA.is_dir(), reason="caliterra_nadir is not here")
@@ -342,15 +335,14 @@ def test_real_stills_obey_one_epipolar_geometry(first: str, second: str) -> None
         np.asarray(cv2.imread(str(next(CALITERRA.glob(f"*{n}*"))), cv2.IMREAD_GRAYSCALE), np.uint8)
         for n in (first, second)
     )
-    shift = global_shift(a, b)
-    assert shift.confidence > 1.4
+    view = common_view(features(a), features(b))
+    assert view is not None
     corners = harris_grid(a, CONFIG).uv_px.astype(np.float64)
-    found = match(
-        Pyramid.build(a), corners, Pyramid.build(b), shift.apply(corners), 80.0, shift.A, CONFIG
-    )
-    assert found.ok.sum() > 300
+    there = view.predict(corners, 40.0)
+    found = match(Pyramid.build(a), corners, Pyramid.build(b), there.uv, 40.0, there.warp, CONFIG)
     K = np.array([[1162.0, 0, 799.5], [0, 1162.0, 599.5], [0, 0, 1.0]])
     _, inliers = cv2.findEssentialMat(
         corners[found.ok], found.uv_px[found.ok].astype(np.float64), K, cv2.RANSAC, 0.999, 2.0
     )
-    assert np.mean(inliers) > 0.9
+    # The lens bends lines, which is not taken out here: the rim fits less well.
+    assert inliers.sum() > 400 and np.mean(inliers) > 0.85

@@ -17,7 +17,11 @@ from recon import se3
 from recon.camera_model import project, rays
 from recon.clouds.registration import IcpConfig, register_projective
 from recon.tracking import matching, pnp
+from recon.tracking.common_view import common_view, features
 from recon.types import F32, F64, U8, Bool, DepthMap
+
+FEATURE_SHARE = 0.03
+"""Search radius around places that features predict, as a share of the width."""
 
 LEAST_RAD, LEAST_SHARE = 2e-4, 0.1
 """A loop's sigmas are no less than this, and than this share of its depths' sigma: what the
@@ -42,7 +46,6 @@ class LoopConfig:
     least_gap: int = 10  # keyframes between the two ends of a loop
     least_overlap: float = 0.35  # of the later view in the earlier one
     search_share: float = 0.12  # of the picture's width, about the predicted places
-    least_confidence: float = 1.4  # of the global shift, tried when the prediction fails
     min_matches: int = 40
     max_disagreement: float = 4.0  # chi-square per degree of freedom between EPnP and ICP
     matching: matching.MatchingConfig = field(default_factory=matching.MatchingConfig)
@@ -159,8 +162,8 @@ def verify(
 ) -> LoopClosure | None:
     """The motion between two keyframes that may see the same place, or None when they do not.
 
-    ``T_a_b_guess`` (4, 4) is the pose graph's word. Where it is too far off, the global shift
-    between the pictures is tried.
+    ``T_a_b_guess`` (4, 4) is the pose graph's word. Where it is too far off, the features that
+    both images share predict instead.
     """
     config = config or LoopConfig()
     uv, points = landmarks(a, config.matching)
@@ -171,10 +174,12 @@ def verify(
     predicted = project(b.K, se3.transform(T_b_a, points))
     warp = warps(a.K, b.K, T_b_a, uv, points)
     solved = _pose(pyramids, uv, points, predicted, warp, b, T_b_a, config)
-    if solved is None and a.gray.shape == b.gray.shape:
-        shift = matching.global_shift(a.gray, b.gray)
-        if shift.confidence >= config.least_confidence:
-            solved = _pose(pyramids, uv, points, shift.apply(uv), shift.A, b, None, config)
+    if solved is None:
+        view = common_view(features(a.gray), features(b.gray))
+        if view is not None:
+            near = replace(config, search_share=FEATURE_SHARE)
+            there = view.predict(uv, FEATURE_SHARE * b.gray.shape[1])
+            solved = _pose(pyramids, uv, points, there.uv, there.warp, b, None, near)
     if solved is None:
         return None
     T_a_b = se3.inverse(solved.T_camera_points)

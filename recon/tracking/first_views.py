@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from recon.tracking import matching, prediction
+from recon.tracking.common_view import FeatureCache, common_view
 from recon.tracking.keyframe_window import Incoming, OdometryKeyframe
 from recon.tracking.matcher import Matcher
 from recon.types import F64, Bool, Camera
@@ -14,19 +15,19 @@ from recon.types import F64, Bool, Camera
 
 class FirstViews:
     """Matches the first frame's corners by what is likely: as in the frame before, by
-    telemetry, by the global shift between the pictures."""
+    telemetry, by the features that both images share."""
 
     def __init__(
         self,
         camera: Camera,
         config: matching.MatchingConfig,
         radius_px: float,
-        least_shift_confidence: float,
         matcher: Matcher,
+        features: FeatureCache,
     ) -> None:
         self._matcher = matcher
         self._K, self._config, self._radius_px = camera.K, config, radius_px
-        self._least_shift_confidence = least_shift_confidence
+        self._features = features
         self._drift = np.eye(3)  # from the first frame's pixels to the last one's
 
     def begin(self) -> None:
@@ -56,7 +57,8 @@ class FirstViews:
             if best[1].sum() > 0.5 * len(first.uv):
                 self._drift = prediction.common_affine(first.uv[best[1]], best[0][best[1]])
                 break
-        assert best is not None
+        if best is None:
+            return first.uv, np.zeros(len(first.uv), np.bool_)
         return best
 
     def _guesses(
@@ -68,13 +70,10 @@ class FirstViews:
         if R_b_a is not None:
             H = self._by_telemetry(new, first, R_b_a)
             yield prediction.by_homography(H, first.uv, self._radius_px)
-        shift = matching.global_shift(first.pyramid.levels[0], new.grey)
-        if shift is not None and shift.confidence > self._least_shift_confidence:
-            H = np.eye(3)
-            H[:2, :2], H[:2, 2] = shift.A, shift.shift_px
-            yield prediction.by_homography(H, first.uv, self._radius_px)
-        elif R_b_a is None:
-            yield prediction.by_homography(np.eye(3), first.uv, self._radius_px)
+        here = self._features.of(new.seq, new.grey)
+        view = common_view(self._features.of(first.seq, first.pyramid.levels[0]), here)
+        if view is not None:
+            yield view.predict(first.uv, self._radius_px)
 
     def _by_telemetry(self, new: Incoming, first: OdometryKeyframe, R_b_a: F64) -> F64:
         """(3, 3) homography of level ground by attitude, and by position and height if known."""

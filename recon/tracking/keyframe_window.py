@@ -26,6 +26,7 @@ class OdometryKeyframe:
     uv: F64  # (N, 2) corners
     landmark: I64  # (N,) number in ``map``, -1 none yet
     map: Landmarks  # of its segment, in the odometry's frame
+    sigma_scale: float = 0.0  # relative, of the step to it; what the landmarks do not show
 
     @property
     def T_odom_camera(self) -> F64:

@@ -6,70 +6,155 @@ new frame (Eq. 6-7), and the two are averaged.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from recon import se3
-from recon.tracking import matching, pnp, prediction, robust_geometry
+from recon.tracking import matching, pnp, prediction, robust_geometry, two_view
+from recon.tracking.common_view import CommonView, FeatureCache, common_view
 from recon.tracking.keyframe_window import Incoming, OdometryKeyframe
 from recon.tracking.matcher import Matcher
 from recon.tracking.motion import Motion
 from recon.tracking.odometry_config import OdometryConfig
-from recon.types import F64, U8, Bool, Camera, PosePrior
+from recon.types import F64, Bool, Camera, PosePrior
+
+RECALLED = 4
+"""Newest keyframes that a frame is compared with by features."""
+
+FEATURE_SHARE = 0.03
+"""Search radius around places that features predict."""
+
+CLEAR_SHARE = 0.6
+"""Of the corners searched: so many found leave no need for another start."""
+
+RELIEF_SHARE = 0.02
+"""Sigma of a depth that is only that of the plane through other landmarks."""
+
+Start = tuple[OdometryKeyframe, F64, float]
+"""A keyframe, where the camera may be (T_camera_odom) and how far to search."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Located:
-    """A frame's pose and the keyframe's corners found in it."""
+    """A frame's pose and a keyframe's corners found in it."""
 
+    key: OdometryKeyframe
     pose: pnp.PnpResult  # camera from odometry
     uv: F64  # (N, 2) of the keyframe's corners
     ok: Bool  # (N,) found, and not contradicted by the pose
     share: float  # of the keyframe's corners that are found, by those searched
+    found_share: float  # of the corners searched
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bridge:
+    """A frame's pose by what it and one keyframe see, and its scale by that keyframe's depths."""
+
+    key: OdometryKeyframe
+    T_camera_odom: F64  # (4, 4)
+    uv: F64  # (N, 2) of the keyframe's corners
+    ok: Bool  # (N,)
+    sigma_scale: float  # relative, of the step between the two
+    parallax_rad: float
 
 
 class Localiser:
     """Poses of frames of one camera without distortion."""
 
-    def __init__(self, camera: Camera, config: OdometryConfig, matcher: Matcher) -> None:
-        """``matcher`` finds the corners again."""
+    def __init__(
+        self, camera: Camera, config: OdometryConfig, matcher: Matcher, features: FeatureCache
+    ) -> None:
+        """``matcher`` finds corners again; ``features`` finds views that no motion predicts."""
         self.camera, self.config, self.matcher = camera, config, matcher
+        self._features = features
 
     def locate(
         self, new: Incoming, keyframes: Sequence[OdometryKeyframe], motion: Motion,
         still: bool, lost: bool,
     ) -> Located | str:  # fmt: skip
-        """The frame against the last keyframe, averaged with the one before; or why not.
+        """The frame against a recent keyframe, averaged with the one before; or why not.
 
         Args:
             motion: where the camera was last and how it moved.
             still: too long since the frame before for that motion to hold.
             lost: the frame before has no pose.
         """
-        right = keyframes[-1]
-        reason = "no match"
+        reason, best = "no match", None
         least = self.config.min_tracks
         most = None if still else self.config.tracked_landmarks
-        for T_camera_odom, share in self._predicted_poses(new, right, motion, lost):
-            found = self.pose_from(right, new.pyramid, T_camera_odom, share, least, most)
+        for key, T_camera_odom, share in self._starts(new, keyframes, motion, lost):
+            found = self.pose_from(key, new.pyramid, T_camera_odom, share, least, most)
             if isinstance(found, str):
                 reason = found
                 continue
-            T = found.pose.T_camera_points
-            if not self._agrees(T, new.prior, right):
+            if not self._agrees(found.pose.T_camera_points, new.prior, key):
                 reason = "vision and attitude disagree"
                 continue
-            return self._with_left(new, keyframes, found)
-        return reason
+            if best is None or found.ok.sum() > best.ok.sum():
+                best = found
+            if not still or found.found_share > CLEAR_SHARE:
+                break
+        return reason if best is None else self._with_left(new, keyframes, best)
+
+    def others(
+        self, new: Incoming, keyframes: Sequence[OdometryKeyframe], found: Located
+    ) -> list[Located]:
+        """The frame against the other recent keyframes that see the same ground."""
+        share, least = 0.5 * self.config.search_share, self.config.min_tracks // 3
+        T = found.pose.T_camera_points
+        rest = [key for key in keyframes[-RECALLED:] if key is not found.key]
+        located = [self.pose_from(key, new.pyramid, T, share, least) for key in rest]
+        return [other for other in located if not isinstance(other, str)]
+
+    def bridge(self, new: Incoming, keyframes: Sequence[OdometryKeyframe]) -> Bridge | None:
+        """The frame by two views alone: little of what it shares with a keyframe has landmarks.
+
+        The scale is that of the keyframe's landmarks, or where none is shared of the ground
+        that they lie on.
+        """
+        for key, view in self._views(new, keyframes):
+            guess = view.predict(key.uv, FEATURE_SHARE * self.camera.size_px[0])
+            found = self.matcher.match(
+                key.pyramid, key.uv.astype(np.float32), new.pyramid, guess.uv.astype(np.float32),
+                guess.radius_px, guess.warp.astype(np.float32), self.config.matching,
+            )  # fmt: skip
+            bridge = self._two_views(new, key, found.uv_px.astype(np.float64), found.ok)
+            if bridge is not None:
+                return bridge
+        return None
+
+    def _two_views(self, new: Incoming, key: OdometryKeyframe, uv: F64, ok: Bool) -> Bridge | None:
+        """The pose by the keyframe's corners found at ``uv`` (N, 2) where ``ok`` (N,)."""
+        if ok.sum() < 2 * self.config.min_tracks:
+            return None
+        turn = prediction.relative_rotation(key.prior, new.prior)
+        largest = np.pi if turn is None else self.config.max_tilt_error_rad
+        up = key.T_camera_odom[:3, 2]
+        seen = two_view.solve(key.uv[ok], uv[ok], self.camera.K, turn, largest, up)
+        if seen is None or seen.parallax_rad < self.config.least_base_to_height:
+            return None
+        rows = np.flatnonzero(ok)[seen.inliers]
+        depth = prediction.landmark_depths(key, self.camera.K, rows)
+        if depth is None:
+            return None
+        ratio = np.log(depth.z / seen.points[seen.inliers, 2])
+        ratio = ratio[np.isfinite(ratio)]
+        scale = float(np.exp(np.median(ratio)))
+        spread = 1.48 * float(np.median(np.abs(ratio - np.median(ratio))))
+        sigma = spread / np.sqrt(len(ratio)) if depth.is_measured else max(spread, RELIEF_SHARE)
+        step = se3.compose(seen.T_b_a[:3, :3], scale * seen.T_b_a[:3, 3])
+        good = np.zeros(len(ok), np.bool_)
+        good[rows] = True
+        return Bridge(key, step @ key.T_camera_odom, uv, good, float(sigma), seen.parallax_rad)
 
     def _with_left(
         self, new: Incoming, keyframes: Sequence[OdometryKeyframe], found: Located
     ) -> Located:
         """The pose averaged with the one that the keyframe before gives, as the paper does."""
-        if len(keyframes) < 2:
+        if len(keyframes) < 2 or found.key is not keyframes[-1]:
             return found
         T, share = found.pose.T_camera_points, 0.5 * self.config.search_share
         least, most = self.config.min_tracks // 3, self.config.tracked_landmarks // 2
@@ -78,38 +163,52 @@ class Localiser:
             return found
         return replace(found, pose=_averaged(left.pose, found.pose))
 
-    def _predicted_poses(
-        self, new: Incoming, key: OdometryKeyframe, motion: Motion, lost: bool
-    ) -> list[tuple[F64, float]]:
-        """Start poses T_camera_odom with their search radius share, most trusted first."""
+    def _starts(
+        self, new: Incoming, keyframes: Sequence[OdometryKeyframe], motion: Motion, lost: bool
+    ) -> Iterator[Start]:
+        """Where the camera may be, most trusted first."""
+        key = keyframes[-1]
         T_odom_camera, turn, gap_s = motion.ahead(new.time_ns, new.prior)
         still = gap_s > self.config.still_gap_s
-        share = self.config.wide_search_share if still else self.config.search_share
-        by_motion = (se3.inverse(T_odom_camera), share)
-        by_picture: list[tuple[F64, float]] = []
+        by_motion = se3.inverse(T_odom_camera)
+        if not still or turn is not None:
+            share = self.config.wide_search_share if still else self.config.search_share
+            yield key, by_motion, share
         if still or lost:
-            by_picture = self._pose_by_picture(new.grey, key)
-        if still and turn is None:
-            return [*by_picture, by_motion]
-        wide = (by_motion[0], self.config.wide_search_share)
-        return [by_motion, *by_picture] if still else [by_motion, *by_picture, wide]
+            yield from self._by_features(new, keyframes)
+        if not still or turn is None:
+            yield key, by_motion, self.config.wide_search_share
 
-    def _pose_by_picture(self, grey: U8, key: OdometryKeyframe) -> list[tuple[F64, float]]:
-        """A start pose from the global shift between the keyframe's picture and this one."""
-        shift = matching.global_shift(key.pyramid.levels[0], grey)
-        if shift is None or shift.confidence < self.config.least_shift_confidence:
-            return []
+    def _by_features(self, new: Incoming, keyframes: Sequence[OdometryKeyframe]) -> Iterator[Start]:
+        """Poses by features that the frame shares with recent keyframes, the most first."""
+        for key, view in self._views(new, keyframes):
+            T_camera_odom = self._pose_by(key, view)
+            if T_camera_odom is not None:
+                yield key, T_camera_odom, FEATURE_SHARE
+
+    def _views(
+        self, new: Incoming, keyframes: Sequence[OdometryKeyframe]
+    ) -> list[tuple[OdometryKeyframe, CommonView]]:
+        """Recent keyframes that share features with the frame, the most first."""
+        here = self._features.of(new.seq, new.grey)
+        views = []
+        for key in keyframes[-RECALLED:]:
+            view = common_view(self._features.of(key.seq, key.pyramid.levels[0]), here)
+            if view is not None:
+                views.append((key, view))
+        return sorted(views, key=lambda item: -len(item[1]))
+
+    def _pose_by(self, key: OdometryKeyframe, view: CommonView) -> F64 | None:
+        """T_camera_odom by the keyframe's landmarks, carried to where ``view`` says."""
         known = np.flatnonzero(key.map.known(key.landmark))
-        points = key.map[key.landmark[known]]
-        there = shift.apply(key.uv[known])
-        W, H = self.camera.size_px
-        inside = np.all((there > 0) & (there < [W, H]), axis=1)
+        there = view.carry(key.uv[known])
+        inside = np.all((there > 0) & (there < self.camera.size_px), axis=1)
         if inside.sum() < 12:
-            return []
-        T = robust_geometry.pose_from_points(
-            points[inside], there[inside], self.camera.K, cv2.SOLVEPNP_SQPNP
+            return None
+        points = key.map[key.landmark[known[inside]]]
+        return robust_geometry.pose_from_points(
+            points, there[inside], self.camera.K, cv2.SOLVEPNP_SQPNP
         )
-        return [] if T is None else [(T, 0.07)]
 
     def pose_from(
         self,
@@ -160,7 +259,8 @@ class Localiser:
         if solved is None:
             return "no pose fits the matches"
         ok[known[~solved.inliers]] = False
-        return Located(solved, uv, ok, in_view * float(ok[index].mean()))
+        share = float(ok[index].mean())
+        return Located(key, solved, uv, ok, in_view * share, share)
 
     def _solve(self, points: F64, uv: F64, start: F64, least: int) -> pnp.PnpResult | None:
         """EPnP with a tight gate, else with a loose one; None with fewer than ``least``."""

@@ -15,16 +15,13 @@ import numpy.typing as npt
 
 from recon.tracking import harris, patch_search
 from recon.tracking.affine_trend import affine_trend
-from recon.tracking.phase_correlation import GlobalShift, global_shift
 from recon.types import F32, F64, U8, Bool
 
 __all__ = [
     "Corners",
-    "GlobalShift",
     "Matches",
     "MatchingConfig",
     "Pyramid",
-    "global_shift",
     "harris_grid",
     "match",
 ]

@@ -17,6 +17,7 @@ import numpy as np
 
 from recon import se3
 from recon.tracking import matching, prediction, two_view
+from recon.tracking.common_view import FeatureCache
 from recon.tracking.first_views import FirstViews
 from recon.tracking.keyframe_window import (
     Incoming,
@@ -26,7 +27,7 @@ from recon.tracking.keyframe_window import (
     triangulate,
 )
 from recon.tracking.landmarks import I64, Landmarks
-from recon.tracking.localisation import Localiser, Located
+from recon.tracking.localisation import Bridge, Localiser, Located
 from recon.tracking.matcher import HostMatcher, Matcher
 from recon.tracking.motion import Motion
 from recon.tracking.odometry_config import OdometryConfig
@@ -71,13 +72,14 @@ class Odometry:
         self._metric = False  # the current segment has landmarks
         self._lost = 0
         self._motion: Motion | None = None
-        self._localiser = Localiser(camera, self.config, self._matcher)
+        features = FeatureCache()
+        self._localiser = Localiser(camera, self.config, self._matcher, features)
         self._first_views = FirstViews(
             camera,
             self.config.matching,
             self.config.wide_search_share * camera.size_px[0],
-            self.config.least_shift_confidence,
             self._matcher,
+            features,
         )
         self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
 
@@ -110,9 +112,10 @@ class Odometry:
         found = self._localiser.locate(
             new, self.keyframes, self._moving, self._still, lost=self._lost > 0
         )
-        if isinstance(found, str):
-            return self._missed(new, found)
-        return self._accept(new, found)
+        if not isinstance(found, str):
+            return self._accept(new, found)
+        bridge = self._localiser.bridge(new, self.keyframes) if self._still else None
+        return self._missed(new, found) if bridge is None else self._cross(new, bridge)
 
     @property
     def _still(self) -> bool:
@@ -207,7 +210,7 @@ class Odometry:
         second = se3.compose(view.T_b_a[:3, :3], view.T_b_a[:3, 3] * scale)
         T_camera_odom = second @ first.T_camera_odom
         self._metric = True
-        self._add_keyframe(new, T_camera_odom, uv, ok)
+        self._add_keyframe(new, T_camera_odom, [(first, uv, ok)])
         self._moving.update(new.time_ns, self.keyframes[-1].T_odom_camera, new.prior)
         return Tracked(
             "keyframe",
@@ -235,7 +238,7 @@ class Odometry:
         found: Located,
     ) -> Tracked:
         """Keep the pose; make the frame a keyframe when it has moved enough."""
-        key = self.keyframes[-1]
+        key = found.key
         T_camera_odom, covariance = found.pose.T_camera_points, found.pose.covariance
         moved = T_camera_odom @ key.T_odom_camera
         depth = self.median_depth(key)
@@ -253,25 +256,47 @@ class Odometry:
             key, new.pyramid, T_camera_odom, share, self.config.min_tracks
         )
         found = found if isinstance(whole, str) else whole
-        self._add_keyframe(new, found.pose.T_camera_points, found.uv, found.ok)
+        seen = [found]
+        if self._still:  # little overlap: every keyframe that sees the same ground counts
+            seen += self._localiser.others(new, self.keyframes, found)
+        self._add_keyframe(
+            new, found.pose.T_camera_points, [(other.key, other.uv, other.ok) for other in seen]
+        )
         last, tracks = self.keyframes[-1], int(found.ok.sum())
         self._moving.correct(last.T_odom_camera)
         return Tracked("keyframe", self.segment, last.T_odom_camera, last.covariance, tracks, base)
 
+    def _cross(self, new: Incoming, bridge: Bridge) -> Tracked:
+        """Make a keyframe of a frame that two views alone place."""
+        self._lost = 0
+        self._add_keyframe(new, bridge.T_camera_odom, [(bridge.key, bridge.uv, bridge.ok)])
+        last = self.keyframes[-1]
+        last.sigma_scale = bridge.sigma_scale
+        self._moving.update(new.time_ns, last.T_odom_camera, new.prior)
+        tracks = int(bridge.ok.sum())
+        return Tracked(
+            "keyframe", self.segment, last.T_odom_camera, last.covariance, tracks,
+            bridge.parallax_rad,
+        )  # fmt: skip
+
     def _add_keyframe(
-        self,
-        new: Incoming,
-        T_camera_odom: F64,
-        uv: F64,
-        ok: Bool,
+        self, new: Incoming, T_camera_odom: F64, seen: list[tuple[OdometryKeyframe, F64, Bool]]
     ) -> None:
-        """Append a keyframe: tracked corners, new landmarks, fresh corners; adjust the window."""
-        key = self.keyframes[-1]
+        """Append a keyframe: tracked corners, new landmarks, fresh corners; adjust the window.
+
+        ``seen`` are keyframes with where (N, 2) their corners were found and which (N,) were,
+        the one that gave the pose first. Of the others only corners with landmarks count.
+        """
         least = 0.5 * self.config.least_base_to_height
-        triangulate(key, T_camera_odom, uv, ok, self.K, least, self.config.loose_px)
-        kept = np.flatnonzero(ok)
+        kept, landmark = np.zeros((0, 2)), np.zeros(0, np.int64)
+        for key, uv, ok in seen:
+            triangulate(key, T_camera_odom, uv, ok, self.K, least, self.config.loose_px)
+            if key is not seen[0][0]:
+                ok = ok & (key.landmark >= 0) & ~np.isin(key.landmark, landmark)
+            kept = np.vstack([kept, uv[ok]])
+            landmark = np.concatenate([landmark, key.landmark[ok]])
         fresh = prediction.fresh_corners(
-            self._corners(new), uv[kept], self.camera.size_px, self.config.matching.grid
+            self._corners(new), kept, self.camera.size_px, self.config.matching.grid
         )
         key_new = OdometryKeyframe(
             new.seq,
@@ -281,9 +306,9 @@ class Odometry:
             np.zeros((6, 6)),
             new.prior,
             new.pyramid,
-            np.vstack([uv[kept], fresh]),
-            np.concatenate([key.landmark[kept], np.full(len(fresh), -1, np.int64)]),
-            key.map,
+            np.vstack([kept, fresh]),
+            np.concatenate([landmark, np.full(len(fresh), -1, np.int64)]),
+            seen[0][0].map,
         )
         self.keyframes.append(key_new)
         adjust_window(self.keyframes[-self.config.window - 2 :], self.K)

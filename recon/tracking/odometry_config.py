@@ -22,7 +22,6 @@ class OdometryConfig:
     max_tilt_error_rad: float = 0.35  # vision against attitude: more is a false solution
     loose_px: float = 6.0  # gate of a second try: a rolling shutter bends pictures that much
     lost_after: int = 8  # frames in a row without a pose before a new segment starts
-    least_shift_confidence: float = 1.4  # of the global shift between two pictures
     still_gap_s: float = 0.7  # frames further apart are stills: no motion model holds
     matching: matching.MatchingConfig = field(default_factory=matching.MatchingConfig)
     pnp: pnp.PnpConfig = field(default_factory=pnp.PnpConfig)

@@ -11,7 +11,11 @@ from recon import se3
 from recon.camera_model import rays
 from recon.tracking import robust_geometry, two_view
 from recon.tracking.keyframe_window import OdometryKeyframe
+from recon.tracking.landmarks import I64
 from recon.types import F64, Bool, PosePrior
+
+MIN_MEASURED = 12
+"""Landmarks that give a scale."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +56,30 @@ def on_landmarks(
     W, Hh = size_px
     visible = np.all((uv > 8) & (uv < [W - 8, Hh - 8]), axis=1) & np.isfinite(uv[:, 0])
     return Prediction(uv, warp, radius_px), visible
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Depths:
+    z: F64  # (N,) in the keyframe's camera, odometry units
+    is_measured: bool  # by landmarks; else on the plane through landmarks elsewhere
+
+
+def landmark_depths(key: OdometryKeyframe, K: F64, rows: I64) -> Depths | None:
+    """Depths of the keyframe's corners ``rows`` (N,), NaN without a landmark.
+
+    With too few landmarks among them all depths are those of the plane through the others;
+    None where that does not reach.
+    """
+    known = key.map.known(key.landmark)
+    P = se3.transform(key.T_camera_odom, key.map[key.landmark[known]])
+    z = np.full(len(key.uv), np.nan)
+    z[known] = P[:, 2]
+    if np.isfinite(z[rows]).sum() >= MIN_MEASURED:
+        return Depths(z[rows], True)
+    if len(P) < MIN_MEASURED:
+        return None
+    inverse = rays(K, key.uv[rows]) @ _inverse_depth_plane(K, P)
+    return Depths(1.0 / inverse, False) if np.all(inverse > 0) else None
 
 
 def relative_rotation(a: PosePrior, b: PosePrior) -> F64 | None:

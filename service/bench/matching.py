@@ -7,11 +7,11 @@ from functools import partial
 import cv2
 import numpy as np
 
+from recon.tracking.common_view import CommonView, common_view, features
 from recon.tracking.matching import (
     Corners,
     MatchingConfig,
     Pyramid,
-    global_shift,
     harris_grid,
     match,
 )
@@ -46,10 +46,15 @@ def run(options: BenchOptions) -> list[BenchResult]:
             note="pyramids included",
         ),
         compare(
-            "matching", "global shift without a prior", partial(global_shift, a, b), options
+            "matching", "common view without a prior", partial(shared, a, b), options
         ),
     ]  # fmt: skip
     return timed + accuracy(a, b, corners, config)
+
+
+def shared(a: U8, b: U8) -> CommonView | None:
+    """What two images have in common, their features included."""
+    return common_view(features(a), features(b))
 
 
 def pictures() -> tuple[U8, U8]:

@@ -1,0 +1,155 @@
+"""What two images have in common, whatever turn, zoom or shift lies between them.
+
+SIFT features (Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94) with the square root of their
+descriptors (Arandjelovic and Zisserman 2012, doi:10.1109/CVPR.2012.6248018), found on a small
+image with its contrast leveled. It is the start where no prediction holds: stills, turns, gaps,
+places seen before. The search for Harris corners makes it exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from recon.tracking import robust_geometry
+from recon.tracking.prediction import Prediction, by_homography
+from recon.types import F32, F64, U8
+
+WIDTH_PX = 480
+"""Of the image that features are found on: 0.1 s on one core."""
+
+MOST = 1000
+"""Features of an image."""
+
+RATIO = 0.8
+"""Distance to the best descriptor over that to the second best, at most."""
+
+GATE_SHARE = 0.015
+"""Share of the image's width by which a match may miss the common homography: relief."""
+
+MIN_MATCHES, MIN_MATCH_SHARE = 14, 0.5
+"""That follow one homography, and their share of all matches; strangers have 7 of 27."""
+
+NEAR_SHARE = 0.06
+"""Matches within this share of the width say how far a place is off the homography."""
+
+KEPT = 16
+"""Images whose features are remembered."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """Distinct places of one image with their descriptors."""
+
+    uv_px: F64  # (N, 2) of the full image
+    descriptors: F32  # (N, 128) unit length
+    width_px: int  # of the full image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CommonView:
+    """The ground that two images share, as a homography and the matches that follow it."""
+
+    H: F64  # (3, 3) pixels of image a to pixels of image b
+    uv_a: F64  # (M, 2)
+    uv_b: F64  # (M, 2)
+    width_px: int  # of image a
+
+    def __len__(self) -> int:
+        return len(self.uv_a)
+
+    def carry(self, uv_px: F64) -> F64:
+        """(N, 2) pixels of image b for the pixels ``uv_px`` (N, 2) of image a.
+
+        The homography's word, corrected by the three nearest matches where there are any.
+        """
+        there = cv2.perspectiveTransform(uv_px[:, None].astype(np.float64), self.H)[:, 0]
+        off = self.uv_b - cv2.perspectiveTransform(self.uv_a[:, None], self.H)[:, 0]
+        apart = np.linalg.norm(uv_px[:, None] - self.uv_a, axis=2)
+        nearest = np.argpartition(apart, 2, axis=1)[:, :3]
+        is_near = np.take_along_axis(apart, nearest, axis=1).max(axis=1) < (
+            NEAR_SHARE * self.width_px
+        )
+        correction = np.median(off[nearest], axis=1)
+        return np.asarray(there + correction * is_near[:, None], np.float64)
+
+    def predict(self, uv_px: F64, radius_px: float) -> Prediction:
+        """Where the pixels ``uv_px`` (N, 2) of image a are in image b, to within ``radius_px``."""
+        by_plane = by_homography(self.H, uv_px, radius_px)
+        return replace(by_plane, uv=self.carry(uv_px))
+
+
+def features(gray: U8) -> Features:
+    """The features of ``gray`` (H, W) uint8; none where it shows nothing."""
+    H, W = gray.shape
+    size = (min(WIDTH_PX, W), max(16, round(min(WIDTH_PX, W) * H / W)))
+    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    level = cv2.createCLAHE(4.0, (8, 8)).apply(small)
+    found, descriptors = cv2.SIFT.create(MOST, contrastThreshold=0.01).detectAndCompute(level, None)
+    if descriptors is None or len(found) == 0:
+        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), W)
+    # OpenCV keeps features of equal strength beyond the limit.
+    uv = np.array([point.pt for point in found[:MOST]], np.float64)
+    root = np.sqrt(descriptors[:MOST] / np.maximum(descriptors[:MOST].sum(1, keepdims=True), 1e-9))
+    scale = np.array([W / size[0], H / size[1]])
+    return Features((uv + 0.5) * scale - 0.5, np.asarray(root, np.float32), W)
+
+
+def common_view(a: Features, b: Features) -> CommonView | None:
+    """What images ``a`` and ``b`` share, or None when they do not surely share anything."""
+    rows_a, rows_b = _mutual(a.descriptors, b.descriptors)
+    if len(rows_a) < MIN_MATCHES:
+        return None
+    uv_a, uv_b = a.uv_px[rows_a], b.uv_px[rows_b]
+    found = robust_geometry.homography(uv_a, uv_b, GATE_SHARE * b.width_px)
+    if found is None:
+        return None
+    H, good = found
+    if good.sum() < max(MIN_MATCHES, MIN_MATCH_SHARE * len(rows_a)):
+        return None
+    if not _is_sound(H, uv_a[good]):
+        return None
+    return CommonView(H, uv_a[good], uv_b[good], a.width_px)
+
+
+def _mutual(a: F32, b: F32) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of ``a`` and ``b`` that are each other's best match, and clearly so."""
+    none = np.zeros(0, np.int64)
+    if min(len(a), len(b)) < MIN_MATCHES:
+        return none, none
+    likeness = a @ b.T
+    best, back = likeness.argmax(axis=1), likeness.argmax(axis=0)
+    top = np.partition(likeness, -2, axis=1)[:, -2:]
+    distance = np.sqrt(np.maximum(2.0 - 2.0 * top, 0.0))
+    rows = np.arange(len(a))
+    good = (back[best] == rows) & (distance[:, 1] < RATIO * distance[:, 0])
+    return rows[good], best[good]
+
+
+def _is_sound(H: F64, uv: F64) -> bool:
+    """False where a homography mirrors, folds, or shrinks the matches (N, 2) onto a spot."""
+    w = uv @ H[2, :2] + H[2, 2]
+    if not (np.all(w > 0) or np.all(w < 0)):
+        return False
+    growth = np.linalg.det(H) / w**3  # of areas
+    return bool(np.all((growth > 1.0 / 36.0) & (growth < 36.0)))
+
+
+class FeatureCache:
+    """Features of the last few images by number, found when they are first asked for."""
+
+    def __init__(self, kept: int = KEPT) -> None:
+        self._kept = kept
+        self._of: dict[int, Features] = {}
+
+    def of(self, seq: int, gray: U8) -> Features:
+        """Features of image ``seq``, which is ``gray`` (H, W)."""
+        known = self._of.pop(seq, None)
+        if known is None:
+            known = features(gray)
+        self._of[seq] = known
+        while len(self._of) > self._kept:
+            del self._of[next(iter(self._of))]
+        return known
