@@ -188,12 +188,6 @@ def test_useless_gps_is_no_position(tmp_path: Path) -> None:
         assert read_tags(path).geotag is None, name
 
 
-def test_stored_pixels_are_not_turned(tmp_path: Path) -> None:
-    write_still(tmp_path / "a.jpg", orientation=6)
-    (frame,) = open_camera(str(tmp_path))
-    assert frame.image.shape == (48, 64, 3)
-
-
 def test_odd_ones_are_left_out_and_told(tmp_path: Path) -> None:
     for i in range(3):
         write_still(tmp_path / f"{i}.jpg", f"2024:06:01 12:00:0{i}", offset="+00:00")

@@ -13,11 +13,15 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from service.cameras.lens import Lens, lens_of
 from service.cameras.source import GeoTag
 
 XMP_BYTES = 1 << 18  # DJI's block sits in the first 64 KiB
 DEFAULT_SIGMA_H_M = 5.0
 NAME_TIME = re.compile(r"(?<!\d)(20\d{6})[T_-]?(\d{6})[._]?(\d{1,6})?Z(?![A-Za-z0-9])")
+TURNED_DEG = {3: 180, 6: 90, 8: 270}
+"""EXIF orientation to degrees clockwise; no camera writes the mirrored ones."""
+
 EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
 
@@ -32,6 +36,8 @@ class Tags:
     name_unix_ns: int | None = None  # UTC in the file name
     sub_second: bool = False  # local_ns is finer than a second
     geotag: GeoTag | None = None
+    lens: Lens | None = None
+    turned_deg: int = 0  # clockwise, by which viewers turn the stored pixels
 
 
 BROKEN = (
@@ -76,6 +82,8 @@ def _read_tags(path: Path) -> Tags:
         name_unix_ns=name_unix_ns(path.name),
         sub_second=sub.isdigit(),
         geotag=_geotag(gps, xmp),
+        lens=lens_of(photo, xmp, size_px),
+        turned_deg=TURNED_DEG.get(exif.get(274), 0),
     )
 
 
@@ -156,14 +164,15 @@ def _gimbal_ypr_deg(xmp: dict[str, str]) -> tuple[float, float, float] | None:
 
 
 def _xmp(path: Path) -> dict[str, str]:
-    """The drone-dji values of the XMP block, written as attributes or as elements."""
+    """DJI's and Pix4D's values of the XMP block, written as attributes or as elements."""
     with path.open("rb") as stream:
         head = stream.read(XMP_BYTES)
-    if b"drone-dji:" not in head:
-        return {}
     text = head.decode("latin-1")
-    pairs = re.findall(r"drone-dji:(\w+)=\"([^\"]*)\"", text)
-    pairs += re.findall(r"<drone-dji:(\w+)>([^<]*)</", text)
+    pairs = re.findall(r"(?:drone-dji|Camera):(\w+)=\"([^\"]*)\"", text)
+    pairs += re.findall(r"<(?:drone-dji|Camera):(\w+)>([^<]*)</", text)
+    # Lists: <Camera:PrincipalPoint><rdf:Seq><rdf:li>3.4,2.6</rdf:li>...
+    for name, block in re.findall(r"<Camera:(\w+)>\s*<rdf:Seq>(.*?)</rdf:Seq>", text, re.DOTALL):
+        pairs.append((name, ",".join(re.findall(r"<rdf:li>([^<]*)</rdf:li>", block))))
     return dict(pairs)
 
 

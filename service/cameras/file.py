@@ -34,7 +34,7 @@ def open_file(rest: str, options: Mapping[str, str]) -> VideoSource:
     except (av.error.FFmpegError, OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         raise InputError(f"{path} cannot be read: {why}") from error
-    return VideoSource(container, str(path))
+    return VideoSource(container, str(path), follows_turn=True)
 
 
 def _not_video(path: Path) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from recon.types import U8
 from service.cameras import reject_options
 from service.cameras.exif import Tags, read_tags
+from service.cameras.lens import turned
 from service.cameras.source import CameraFrame
 from service.errors import InputError
 
@@ -21,6 +22,10 @@ log = logging.getLogger(__name__)
 
 SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"))
 SECOND_NS = 1_000_000_000
+ZOOM = 0.03
+"""Share by which focal lengths of one camera may differ."""
+
+ROLLED_DEG = 45.0
 ZONE_NS = 900 * SECOND_NS  # time zones are whole quarters of an hour
 
 
@@ -33,11 +38,17 @@ class ImagesSource:
         self.is_live = False
         self.start_monotonic_ns: int | None = None
         self.warnings: list[str] = []
-        tagged = self._same_size(self._read(folder))
+        tagged = self._same_lens(self._same_size(self._read(folder)))
         times, self.epoch_unix_ns = self._times(tagged, interval_s)
         order = sorted(range(len(tagged)), key=lambda i: (times[i], i))
         self._stills = [(*tagged[i], times[i]) for i in order]
-        self.size_px = tagged[0][1].size_px
+        stored = tagged[0][1].size_px
+        self.turned_deg = self._turn(tagged)
+        self.size_px = stored[::-1] if self.turned_deg % 180 else stored
+        self.lens = tagged[0][1].lens
+        self.camera = (
+            None if self.lens is None else turned(self.lens.camera(stored), self.turned_deg)
+        )
         span_s = (self._stills[-1][2] - self._stills[0][2]) / 1e9
         self.fps = (len(self._stills) - 1) / span_s if span_s > 0 else None
 
@@ -45,7 +56,7 @@ class ImagesSource:
         """Yield the stills that decode."""
         seq = 0
         for path, tags, time_ns in self._stills:
-            image = _load(path, self.size_px)
+            image = _load(path, tags.size_px, self.turned_deg)
             if image is None or image.shape[:2] != (self.size_px[1], self.size_px[0]):
                 self._warn(f"{path.name} cannot be decoded; left out")
                 continue
@@ -81,6 +92,40 @@ class ImagesSource:
                 "others; left out"
             )
         return kept
+
+    def _same_lens(self, tagged: list[tuple[Path, Tags]]) -> list[tuple[Path, Tags]]:
+        """Those of the most frequent focal length: one camera model fits one zoom."""
+        focal = [0.0 if tags.lens is None else tags.lens.focal for _, tags in tagged]
+        known = [f for f in focal if f]
+        if not known:
+            return tagged
+        usual = max(known, key=lambda f: sum(abs(f / other - 1) < ZOOM for other in known))
+        kept = [t for t, f in zip(tagged, focal, strict=True) if f and abs(f / usual - 1) < ZOOM]
+        if len(kept) < len(tagged):
+            self._warn(
+                f"{len(tagged) - len(kept)} images were not taken with the focal length of the "
+                "others; left out"
+            )
+        return kept
+
+    def _turn(self, tagged: list[tuple[Path, Tags]]) -> int:
+        """Degrees clockwise that all stills are to be turned by, as their tags say.
+
+        A camera that looks down does not know its upper side: where the tags differ, or the
+        gimbal itself was rolled, the images stay as they are stored.
+        """
+        turns = {tags.turned_deg for _, tags in tagged}
+        rolls = [
+            abs(tags.geotag.ypr_deg[2])
+            for _, tags in tagged
+            if tags.geotag is not None and tags.geotag.ypr_deg is not None
+        ]
+        if rolls and median(rolls) > ROLLED_DEG:
+            return 0
+        if len(turns) > 1:
+            self._warn("the images' tags name different upper sides: taken as stored")
+            return 0
+        return turns.pop()
 
     def _times(
         self, tagged: list[tuple[Path, Tags]], interval_s: float | None
@@ -174,18 +219,20 @@ def _from_first(times_ns: list[int]) -> list[int]:
     return [t - first for t in times_ns]
 
 
-def _load(path: Path, size_px: tuple[int, int]) -> U8 | None:
-    """(H, W, 3) BGR as stored (no EXIF turn: the camera model is of the stored pixels).
+def _load(path: Path, stored_px: tuple[int, int], turned_deg: int) -> U8 | None:
+    """(H, W, 3) BGR, turned clockwise by ``turned_deg``.
 
-    None when the file does not decode, or says another size than ``size_px`` (W, H) meanwhile.
+    None when the file does not decode, or is not of ``stored_px`` (W, H) any more.
     """
     import cv2
 
     try:
-        if read_tags(path).size_px != size_px:
+        if read_tags(path).size_px != stored_px:
             return None
         data = np.fromfile(path, np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except (OSError, cv2.error):
         return None
-    return None if image is None else np.asarray(image, dtype=np.uint8)
+    if image is None:
+        return None
+    return np.ascontiguousarray(np.rot90(image, -(turned_deg // 90)), dtype=np.uint8)

@@ -33,9 +33,18 @@ EARLIEST_UNIX_S = 946_684_800  # 2000-01-01: cameras without a clock write 1904 
 class VideoSource:
     """The pictures of one open PyAV container; its first picture is decoded on construction."""
 
-    def __init__(self, container: av.container.InputContainer, description: str) -> None:
-        """Take over ``container``; raises InputError when it shows no picture."""
+    def __init__(
+        self,
+        container: av.container.InputContainer,
+        description: str,
+        follows_turn: bool = False,
+    ) -> None:
+        """Take over ``container``; raises InputError when it shows no image.
+
+        ``follows_turn`` turns the images as the container asks players to.
+        """
         self.description = description
+        self.turned_deg = 0
         self.is_live = False
         self.start_monotonic_ns: int | None = None
         self.warnings: list[str] = []
@@ -57,7 +66,11 @@ class VideoSource:
         if self._first is None:
             self.close()
             raise InputError(f"{description}: no picture could be decoded; is it cut off or empty?")
-        self.size_px = (int(self._first.width), int(self._first.height))
+        stored = int(self._first.width), int(self._first.height)
+        self._stored_px = stored
+        if follows_turn:  # counterclockwise there
+            self.turned_deg = round(-getattr(self._first, "rotation", 0) / 90) * 90 % 360
+        self.size_px = stored[::-1] if self.turned_deg % 180 else stored
         self._start_s = _start_s(self._stream, self._first)
         self.epoch_unix_ns = creation_unix_ns(container, self._stream)
         rate = self._stream.average_rate or self._stream.guessed_rate
@@ -78,13 +91,14 @@ class VideoSource:
                 self._unordered += 1
                 continue
             size_px = (int(picture.width), int(picture.height))
-            if size_px != self.size_px:
+            if size_px != self._stored_px:
                 self._warn(
-                    f"picture size changed from {_by(self.size_px)} to {_by(size_px)} at "
+                    f"picture size changed from {_by(self._stored_px)} to {_by(size_px)} at "
                     f"{time_ns / 1e9:.2f} s; what follows is left out"
                 )
                 break
-            yield CameraFrame(picture_bgr(picture), time_ns, seq, None, f"frame {seq}")
+            image = np.rot90(picture_bgr(picture), -(self.turned_deg // 90))
+            yield CameraFrame(np.ascontiguousarray(image), time_ns, seq, None, f"frame {seq}")
             last_ns = time_ns
             seq += 1
         else:

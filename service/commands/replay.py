@@ -92,7 +92,6 @@ def _replay(
     realtime: bool,
     as_json: bool,
 ) -> dict[str, Any]:
-    from service.cameras.camera_file import check_size
     from service.cameras.pace import paced
     from service.compute.opening import open_backend
     from service.onboard.datalink import open_datalink
@@ -100,10 +99,7 @@ def _replay(
     from service.scans.folder import write_deliverables
 
     notes: list[str] = []
-    if camera is None:
-        camera = _assumed_camera(source, notes)
-    else:
-        check_size(camera, source.size_px, source.description)
+    camera = _told_camera(source, notes) if camera is None else _fitted(camera, source, notes)
     epoch_ns = _epoch(source, log, video_epoch, notes)
     scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(epoch_ns / 1e9))
     folder = out or Path(f"scan-{scan_id}")
@@ -137,14 +133,37 @@ def _replay(
     return summary | {"scan_folder": str(folder)}
 
 
-def _assumed_camera(source: CameraSource, notes: list[str]) -> Camera:
-    """A pinhole of 70 degrees across, with a note that says so."""
+def _fitted(camera: Camera, source: CameraSource, notes: list[str]) -> Camera:
+    """The camera model for the source's images; a note says when it is of another size."""
+    from service.cameras.camera_file import check_size
+    from service.cameras.lens import fitted
+
+    model = fitted(camera, source.size_px, getattr(source, "turned_deg", 0))
+    if model is None:
+        check_size(camera, source.size_px, source.description)
+        return camera
+    if sorted(model.size_px) != sorted(camera.size_px):
+        (w, h), (W, H) = camera.size_px, source.size_px
+        notes.append(f"the camera model is for {w}x{h} images: scaled to {W}x{H}")
+    return model
+
+
+def _told_camera(source: CameraSource, notes: list[str]) -> Camera:
+    """A pinhole by the images' own tags, else of 70 degrees, with a note that says so."""
     import numpy as np
 
     from recon.types import Camera
+    from service.cameras.images import ImagesSource
 
+    if isinstance(source, ImagesSource) and source.lens is not None and source.camera is not None:
+        f, side = source.lens.focal, max(source.size_px)
+        notes.append(
+            f"no camera model given: taken from {source.lens.source} ({f * side:.0f} px); "
+            "make one with 'skyrelief calibrate' for shapes to be true"
+        )
+        return source.camera
     W, H = source.size_px
-    f = W / 2 / np.tan(np.radians(35.0))
+    f = max(W, H) / 2 / np.tan(np.radians(35.0))
     notes.append(
         "no camera model given: a lens of 70 degrees without distortion is assumed; "
         "make one with 'skyrelief calibrate' for shapes to be true"

@@ -1,0 +1,191 @@
+"""The lens as a still's own tags describe it: the maker's calibration, else the focal length.
+
+EXIF 2.32 (CIPA DC-008-2019) sections 4.6.5 (focal plane resolution) and G (35 mm equivalent, by
+the diagonal); XMP names as DJI, Pix4D and Parrot write them.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from recon.camera_model import check_camera, scaled
+from recon.types import Camera
+
+DIAGONAL_35MM = 43.2666
+MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+LEAST_FOCAL, MOST_FOCAL = 0.2, 20.0
+"""Focal length over the longer side of the image; outside, a tag is wrong."""
+
+SAME_SHAPE = 0.005
+"""Share by which the sides of two images of one shape may differ: sizes are whole pixels."""
+
+AGREEMENT = 0.1
+"""A focal length that differs from the 35 mm equivalent by a larger share is of another size of
+the image: programs that make images smaller keep such tags as they were."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """A pinhole with distortion, in shares of the longer side of the image."""
+
+    focal: float
+    principal: tuple[float, float] = (0.0, 0.0)  # off the middle of the image
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    source: str = ""  # "the maker's calibration", "the focal length in EXIF", ...
+
+    def camera(self, size_px: tuple[int, int]) -> Camera:
+        """The camera for images of ``size_px`` (W, H) that are not cropped."""
+        side = max(size_px)
+        f = self.focal * side
+        cx, cy = ((n - 1) / 2 + c * side for n, c in zip(size_px, self.principal, strict=True))
+        K = np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
+        return Camera(K, np.array(self.distortion), size_px)
+
+
+def turned(camera: Camera, clockwise_deg: int) -> Camera:
+    """The camera of its image turned clockwise by 0, 90, 180 or 270 degrees."""
+    for _ in range(clockwise_deg // 90 % 4):
+        (W, H), K = camera.size_px, camera.K
+        k1, k2, p1, p2, k3 = camera.distortion
+        quarter = [[K[1, 1], 0.0, H - 1 - K[1, 2]], [0.0, K[0, 0], K[0, 2]], [0.0, 0.0, 1.0]]
+        camera = Camera(np.array(quarter), np.array([k1, k2, p2, -p1, k3]), (H, W))
+    return camera
+
+
+def fitted(camera: Camera, size_px: tuple[int, int], turned_deg: int) -> Camera | None:
+    """The camera model for images of ``size_px`` (W, H); None where its shape is another one.
+
+    The model may be of another size, and of the images as they are stored: those are turned
+    clockwise by ``turned_deg`` before anyone sees them.
+    """
+    for clockwise_deg in dict.fromkeys((turned_deg, 0)):
+        model = turned(camera, clockwise_deg)
+        if model.size_px == size_px:
+            return model
+        aspects = [size[0] / size[1] for size in (model.size_px, size_px)]
+        if abs(aspects[0] / aspects[1] - 1.0) < SAME_SHAPE:
+            return scaled(model, size_px)
+    return None
+
+
+def lens_of(
+    photo: Mapping[int, Any], xmp: Mapping[str, str], size_px: tuple[int, int]
+) -> Lens | None:
+    """The lens by a still's EXIF (``photo``) and XMP; None where they do not tell it.
+
+    ``size_px`` (W, H) is of the still as it is, which may be smaller than it was taken.
+    """
+    found = [_maker(photo, xmp, size_px), _pix4d(photo, xmp, size_px), _focal(photo, size_px)]
+    sound = [lens for lens in found if lens is not None and _is_sound(lens, size_px)]
+    coarse = _full_frame(photo, size_px)
+    if coarse is None or not _is_sound(coarse, size_px):
+        return sound[0] if sound else None
+    near = [lens for lens in sound if abs(math.log(lens.focal / coarse.focal)) < AGREEMENT]
+    return near[0] if near else coarse
+
+
+def _is_sound(lens: Lens, size_px: tuple[int, int]) -> bool:
+    if not LEAST_FOCAL < lens.focal < MOST_FOCAL or max(map(abs, lens.principal)) > 0.2:
+        return False
+    try:
+        check_camera(lens.camera(size_px))
+    except ValueError:
+        return False
+    return True
+
+
+def _maker(
+    photo: Mapping[int, Any], xmp: Mapping[str, str], size_px: tuple[int, int]
+) -> Lens | None:
+    """DJI's calibration: pixels of the full image."""
+    side = _taken_side(photo, size_px)
+    numbers = _numbers(xmp.get("DewarpData", "").partition(";")[2], 9)
+    is_straight = xmp.get("DewarpFlag", "0").strip() == "1"
+    if numbers is not None:
+        fx, _, cx, cy, k1, k2, p1, p2, k3 = numbers
+        bent = (0.0, 0.0, 0.0, 0.0, 0.0) if is_straight else (k1, k2, p1, p2, k3)
+        return Lens(fx / side, (cx / side, cy / side), bent, "the maker's calibration")
+    focal = _number(xmp.get("CalibratedFocalLength"))
+    if focal is None:
+        return None
+    W, H = (side * n / max(size_px) for n in size_px)
+    x, y = (_number(xmp.get(f"CalibratedOpticalCenter{axis}")) for axis in "XY")
+    middle = (0.0, 0.0) if x is None or y is None else ((x - W / 2) / side, (y - H / 2) / side)
+    return Lens(focal / side, middle, source="the maker's calibration")
+
+
+def _pix4d(
+    photo: Mapping[int, Any], xmp: Mapping[str, str], size_px: tuple[int, int]
+) -> Lens | None:
+    """Pix4D's names, as Parrot, senseFly and MicaSense write them: millimetres."""
+    focal = _number(xmp.get("PerspectiveFocalLength"))
+    per_mm = _pixels_per_mm(photo)
+    if focal is None or per_mm is None:
+        return None
+    side = _taken_side(photo, size_px)
+    W, H = (side * n / max(size_px) for n in size_px)
+    point = _numbers(xmp.get("PrincipalPoint", ""), 2)
+    middle = (0.0, 0.0)
+    if point is not None:
+        middle = ((point[0] * per_mm - W / 2) / side, (point[1] * per_mm - H / 2) / side)
+    bent = _numbers(xmp.get("PerspectiveDistortion", ""), 5) or [0.0] * 5
+    k1, k2, k3, p1, p2 = bent
+    source = "the maker's calibration"
+    return Lens(focal * per_mm / side, middle, (k1, k2, p1, p2, k3), source)
+
+
+def _focal(photo: Mapping[int, Any], size_px: tuple[int, int]) -> Lens | None:
+    focal, per_mm = _number(photo.get(37386)), _pixels_per_mm(photo)
+    if focal is None or per_mm is None:
+        return None
+    return Lens(focal * per_mm / _taken_side(photo, size_px), source="the focal length in EXIF")
+
+
+def _full_frame(photo: Mapping[int, Any], size_px: tuple[int, int]) -> Lens | None:
+    focal = _number(photo.get(41989))
+    if focal is None:
+        return None
+    share = math.hypot(*size_px) / max(size_px) / DIAGONAL_35MM
+    return Lens(focal * share, source="the 35 mm equivalent in EXIF")
+
+
+def _taken_side(photo: Mapping[int, Any], size_px: tuple[int, int]) -> float:
+    """Longer side in pixels of the image as it was taken."""
+    taken = [_number(photo.get(tag)) or 0.0 for tag in (40962, 40963)]
+    same_shape = (
+        min(taken) > 0 and abs(max(taken) / min(taken) / (max(size_px) / min(size_px)) - 1.0) < 0.02
+    )
+    return max(taken) if same_shape else float(max(size_px))
+
+
+def _pixels_per_mm(photo: Mapping[int, Any]) -> float | None:
+    resolution = _number(photo.get(41486))
+    unit = MM_PER_UNIT.get(int(_number(photo.get(41488)) or 2))
+    return resolution / unit if resolution is not None and unit is not None else None
+
+
+def _numbers(text: str, count: int) -> list[float] | None:
+    parts = [_float(part) for part in re.split(r"[,\s]+", text.strip())]
+    if len(parts) != count or any(n is None for n in parts):
+        return None
+    return [n for n in parts if n is not None]
+
+
+def _number(value: Any) -> float | None:
+    """A positive finite number of an EXIF rational or a text."""
+    number = _float(value)
+    return number if number is not None and number > 0 else None
+
+
+def _float(value: Any) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) else None
