@@ -161,10 +161,9 @@ def host_name(header: str) -> str:
 def raise_descriptor_limit(wanted: int = DESCRIPTORS) -> int:
     """Let this process open ``wanted`` descriptors, or as many as it may; how many that are."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    unlimited = resource.RLIM_INFINITY
-    target = wanted if hard == unlimited else min(wanted, hard)
-    if soft == unlimited or soft >= target:
-        return wanted if soft == unlimited else soft
+    target = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+    if soft >= target:
+        return soft
     try:
         resource.setrlimit(resource.RLIMIT_NOFILE, (target, hard))
     except (OSError, ValueError) as error:

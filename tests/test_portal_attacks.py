@@ -24,6 +24,7 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 pytest.importorskip("websockets")
 
+from test_listener import Clock
 from test_portal import TOKEN, Client, FakeOperator
 
 from service.daemon.health import HealthServer
@@ -35,7 +36,6 @@ from service.ground.library import ConflictError, Library
 from service.ground.portal import Portal, PortalConfig, open_portal
 from service.ground.tokens import KEPT, Tokens, kept_token, parse_tokens
 from service.ground.vehicle import Vehicle
-from service.listener import BoundedListener, ListenerLimits, host_name, network_of
 from service.scans.folder import write_deliverables
 from service.stream.session import SessionConfig, open_session
 from service.workers import Workers
@@ -108,99 +108,6 @@ def test_1100_half_open_requests_stop_neither_portal_nor_datalink(tmp_path: Path
         process.terminate()
         process.communicate(timeout=60)
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-
-
-class Clock:
-    """A clock that a test turns."""
-
-    now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
-def is_closed(one: socket.socket) -> bool:
-    """Whether the other end has closed it; waits a moment for that."""
-    one.settimeout(0.2)
-    try:
-        return one.recv(1) == b""
-    except TimeoutError:
-        return False
-    except ConnectionResetError:
-        return True
-
-
-def connect(listener: BoundedListener, source: str = "127.0.0.1") -> socket.socket:
-    one = socket.create_connection(listener.getsockname(), source_address=(source, 0))
-    listener.accept()
-    return one
-
-
-def test_who_waits_longest_gives_way_and_who_is_served_does_not() -> None:
-    clock = Clock()
-    with BoundedListener("127.0.0.1", 0, ListenerLimits(4, 2, 10.0), clock) as listener:
-        served = connect(listener)
-        listener.begin(served.getsockname())
-        clock.now += 1
-        first = connect(listener)
-        clock.now += 1
-        second = connect(listener)
-        assert is_closed(first) and not is_closed(second) and not is_closed(served)
-        other = connect(listener, "127.0.0.2")
-        assert not is_closed(second)
-        listener.begin(second.getsockname())
-        with pytest.raises(ConnectionAbortedError, match=r"127\.0\.0\.1"):
-            connect(listener)
-        connect(listener, "127.0.0.3")
-        clock.now += 1
-        connect(listener, "127.0.0.4")  # the fifth: full in total
-        assert is_closed(other) and not is_closed(served) and not is_closed(second)
-
-
-def test_a_request_that_does_not_come_in_time_is_closed() -> None:
-    clock = Clock()
-    with BoundedListener("127.0.0.1", 0, ListenerLimits(4, 4, 10.0), clock) as listener:
-        waits, served = connect(listener), connect(listener)
-        listener.begin(served.getsockname())
-        clock.now += 9.9
-        listener.sweep()
-        assert not is_closed(waits)
-        clock.now += 0.1
-        listener.sweep()
-        assert is_closed(waits) and not is_closed(served)
-        listener.end(served.getsockname())
-        clock.now += 10
-        listener.sweep()
-        assert is_closed(served)
-        assert listener.accept is not None and not listener._open
-
-
-@pytest.mark.parametrize(
-    ("host", "network"),
-    [
-        ("10.0.0.1", "10.0.0.1"),
-        ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"),
-        ("2001:db8:1:2:ffff::1", "2001:db8:1:2::/64"),
-        ("::ffff:10.0.0.1", "10.0.0.1"),
-        ("odd", "odd"),
-    ],
-)
-def test_an_ipv6_network_counts_as_one(host: str, network: str) -> None:
-    assert network_of(host) == network
-
-
-@pytest.mark.parametrize(
-    ("header", "name"),
-    [("a:80", "a"), ("[::1]:80", "::1"), ("[::1]", "::1"), ("B", "b"), ("[", ""), ("a:b:c", "")],
-)
-def test_the_name_in_a_host_header(header: str, name: str) -> None:
-    assert host_name(header) == name
-
-
-@pytest.mark.parametrize("wrong", [(0, 1, 1.0), (4, 5, 1.0), (4, 4, 0.0)])
-def test_nonsense_limits_are_refused(wrong: tuple[int, int, float]) -> None:
-    with pytest.raises(ValueError, match="listener"):
-        ListenerLimits(*wrong)
 
 
 def answer_to(client: Client, head: str, body: bytes = b"") -> bytes:
