@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +14,7 @@ import pytest
 from recon.types import DepthMap, Keyframe, Pose
 from service.errors import InputError
 from service.ground import storage
+from service.ground.library import Library
 from service.ground.storage import take_in
 from service.stream import codec
 from service.stream.radio_messages import pack_announce, pack_tile, tag_of, unpack_announce
@@ -96,3 +99,44 @@ def test_two_cards_with_runs_of_one_time_are_kept_apart(
 def test_a_folder_without_scans_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds no scan"):
         take_in(tmp_path / "ground", tmp_path)
+
+
+def test_what_a_killed_process_left_is_deleted_at_the_start(tmp_path: Path, card: Path) -> None:
+    """The process dies while it copies; another one, that still copies, keeps its folder."""
+    ground = tmp_path / "ground"
+    script = (
+        "import os, sys\nfrom pathlib import Path\nfrom service.ground import storage\n"
+        "storage._open = lambda *_: os.kill(os.getpid(), 9)\n"
+        "storage.take_in(Path(sys.argv[1]), Path(sys.argv[2]))\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", script, str(ground), str(card)])
+    assert ended.returncode == -9
+    assert [path.name[:8] for path in ground.iterdir()] == [".taking-"]
+    with storage._workplace(ground) as busy:
+        assert storage.clear_leftovers(ground) == 1
+        assert list(ground.iterdir()) == [busy]
+    assert list(ground.iterdir()) == []
+
+
+def test_links_and_devices_on_a_card_are_not_followed(tmp_path: Path, card: Path) -> None:
+    odd = tmp_path / "odd"
+    for name, target in (("one", "/dev/zero"), ("two", str(card / "scan-1" / "scan.db"))):
+        (odd / name).mkdir(parents=True)
+        (odd / name / "scan.db").symlink_to(target)
+    with pytest.raises(InputError, match="holds no scan"):
+        take_in(tmp_path / "ground", odd)
+
+
+def test_the_library_imports_two_runs_of_one_time_and_no_run_twice(tmp_path: Path) -> None:
+    library = Library(tmp_path / "ground")
+    cards = []
+    for run_id in ("a" * 32, "b" * 32):
+        cards.append(tmp_path / run_id)
+        ScanStore.create(cards[-1] / "scan.db", replace(HEADER, run_id=run_id)).close()
+    (tmp_path / "ground").mkdir()
+    assert [library.import_folder(card) for card in cards] == [
+        ("red", "scan-1"),
+        ("red", "scan-1-2"),
+    ]
+    with pytest.raises(InputError, match="holds red/scan-1-2 already"):
+        library.import_folder(cards[1])

@@ -19,6 +19,7 @@ from recon import se3
 from recon.types import F64
 from service.errors import OutsideError
 from service.georeference import LocalFrame
+from service.ground.scan_facts import facts_of
 from service.scans.folder import CLOUD, CSV, PREVIEW, REPORT, SUMMARY, TUM, write_deliverables
 from service.scans.fused_cloud import _Extent, fused_cloud, strip_edges
 from service.scans.retention import close_open_scans
@@ -237,6 +238,8 @@ def test_a_file_that_cannot_be_made_costs_itself_only(
     with house.flown(tmp_path) as store:
         summary = write_deliverables(tmp_path, store, {})
     why = {CLOUD: "OverflowError: cannot convert float infinity to integer"}
+    trouble = facts_of(tmp_path / SUMMARY)["trouble"]  # what the portal's list shows
+    assert trouble == f"could not be made: {CLOUD} ({why[CLOUD]})"
     assert summary["failed"] == json.loads((tmp_path / SUMMARY).read_text())["failed"] == why
     assert not (tmp_path / CLOUD).exists()
     assert all((tmp_path / name).stat().st_size for name in (TUM, CSV, PREVIEW, REPORT))

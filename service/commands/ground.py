@@ -117,6 +117,7 @@ def ground(
     limits = _limits(quota_mb, drone_share, reserve_mb)
     refresh = refresh_s if refresh_s is not None else RADIO_REFRESH_S if mavlink else 0.0
     notifier = Notifier()
+    _clear(store)
     for folder in take or ():
         _take_in(store, folder)
     stop, workers = _stop_by_signal(), Workers()
@@ -159,6 +160,13 @@ def _limits(quota_mb: float | None, drone_share: float, reserve_mb: float | None
     quota = None if quota_mb is None else int(quota_mb * 1e6)
     reserve = None if reserve_mb is None else int(reserve_mb * 1e6)
     return Limits(quota, drone_share / 100.0, reserve)
+
+
+def _clear(store: Path) -> None:
+    """Delete what a process that was killed left unfinished in the store."""
+    from service.ground.storage import clear_leftovers
+
+    clear_leftovers(store)
 
 
 def _take_in(store: Path, folder: Path) -> None:

@@ -23,6 +23,7 @@ from typing import Any
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.ground.folder_import import OTHER_FILES, STORE_FILES, copy_files, is_regular
 from service.ground.mcap_import import header_in, store_from_mcap
+from service.ground.placing import run_folder
 from service.ground.scan_facts import facts_of, labels_in
 from service.scans.folder import SUMMARY, write_deliverables
 from service.scans.writing import writing
@@ -264,9 +265,9 @@ class Library:
     def _check_new(self, header: ScanHeader) -> Path:
         """Where a scan belongs; InputError when the library has it already."""
         drone, scan = _safe(header.drone, "drone"), _safe(header.scan_id, "scan")
-        target = self.store / drone / scan
+        target = run_folder(self.store / drone, scan, header.identity)
         if target.exists():
-            raise InputError(f"the library holds {drone}/{scan} already")
+            raise InputError(f"the library holds {drone}/{target.name} already")
         return target
 
     def _names(self) -> list[tuple[str, str]]:

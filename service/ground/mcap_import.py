@@ -24,6 +24,7 @@ from service.ground.mcap_records import messages
 from service.stream import codec
 from service.stream.layer import MAX_PIXELS, MAX_SIDE_PX
 from service.stream.mcap_export import POINT
+from service.stream.naming import split_scan_name
 from service.stream.planes import picture_size
 from service.stream.records import PoseRecord, ScanHeader, read_header
 from service.stream.store import ScanStore
@@ -45,8 +46,9 @@ def header_in(path: Path) -> ScanHeader:
         if found:
             scan, drone, software, *origin = found.groups()
             lat, lon, alt = (_number(text) for text in origin)
+            scan_id, run_id = split_scan_name(scan)
             header = ScanHeader(
-                scan,
+                scan_id,
                 drone,
                 time_ns,
                 origin_lat_deg=lat,
@@ -55,6 +57,7 @@ def header_in(path: Path) -> ScanHeader:
                 software=software[:100],
                 georeference="none" if lat is None else "gnss",
                 notes=(NOTE,),
+                run_id=run_id,
             )
             fault = read_header(header.to_json())
             if isinstance(fault, str):

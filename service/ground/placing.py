@@ -19,16 +19,23 @@ def scan_folder(store: Path, drone: str, name: str) -> Path:
     Raises InputError when there are MOST_RUNS already.
     """
     scan_id, run_id = split_scan_name(name)
-    places = [store / drone / scan_id]
-    places += [store / drone / f"{scan_id}-{n}" for n in range(2, MOST_RUNS + 1)]
+    return run_folder(store / drone, scan_id, (drone, scan_id, run_id))
+
+
+def run_folder(drone: Path, scan: str, identity: tuple[str, str, str]) -> Path:
+    """The folder in ``drone`` of the scan with that identity; ``scan`` is what it is called.
+
+    Raises InputError when there are MOST_RUNS of others already.
+    """
+    places = [drone / scan, *(drone / f"{scan}-{n}" for n in range(2, MOST_RUNS + 1))]
     free = [place for place in places if not (place / "scan.db").exists()]
     for place in places:
         if place not in free:
             header = header_of(place / "scan.db")
-            if header is not None and header.identity == (drone, scan_id, run_id):
+            if header is not None and header.identity == identity:
                 return place
     if not free:
         raise InputError(
-            f"{store / drone} holds {MOST_RUNS} runs of {scan_id}; move some away to take in more"
+            f"{drone} holds {MOST_RUNS} runs of {scan}; move some away to take in more"
         )
     return free[0]

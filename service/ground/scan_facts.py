@@ -17,6 +17,7 @@ from service.stream.store import ScanStore
 
 LARGEST_JSON_BYTES = 4_000_000
 SCHEMA = 1
+LONGEST_TROUBLE = 500
 
 UnixTime = Annotated[float, msgspec.Meta(ge=-1e11, le=1e11)]
 Figure = Annotated[float, msgspec.Meta(ge=-1e300, le=1e300)]
@@ -47,10 +48,15 @@ class Facts(msgspec.Struct):
     quality: Annotated[dict[str, Figure | None], msgspec.Meta(max_length=100)]
     notes: Annotated[list[Note], msgspec.Meta(max_length=1000)]
     origin: Origin | None = None
+    failed: Annotated[dict[str, Note], msgspec.Meta(max_length=100)] = {}
 
     def shown(self) -> dict[str, Any]:
         """The entries of the list."""
         plain: dict[str, Any] = msgspec.to_builtins(self)
+        failed = plain.pop("failed")
+        if failed:
+            why = "; ".join(f"{name} ({reason})" for name, reason in failed.items())
+            plain["trouble"] = f"could not be made: {why}"[:LONGEST_TROUBLE]
         return {**plain.pop("times"), **plain}
 
 

@@ -100,7 +100,7 @@ class _Recording:
         """What the scan is, and its notes."""
         header = store.header
         origin = f"{header.origin_lat_deg}, {header.origin_lon_deg}, {header.origin_alt_amsl_m} m"
-        text = f"scan {header.scan_id} of {header.drone}, {header.software}, origin {origin}"
+        text = f"scan {header.name} of {header.drone}, {header.software}, origin {origin}"
         for line in (text, *header.notes):
             self._say(line, header.started_unix_ns)
 
