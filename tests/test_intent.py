@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +12,13 @@ import pytest
 from autopilot import beat, packed
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
 from loopback import until
 
 from mavlink.control import Phase, Result
@@ -301,8 +308,7 @@ def test_a_scan_that_is_being_closed_is_not_critical(
 def test_a_scan_by_command_is_closed_after_landing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    daemon, end, told, now_s = daemon_in(tmp_path), threading.Event(), list[str](), 1000.0
-    armed = True
+    daemon, told, now_s, armed = daemon_in(tmp_path), list[str](), 1000.0, True
     presence = type(daemon.vehicle.presence)
     monkeypatch.setattr(presence, "is_armed", property(lambda _: armed))
     monkeypatch.setattr(presence, "is_disarmed", lambda *_: not armed)
@@ -328,7 +334,6 @@ def test_a_scan_by_command_is_closed_after_landing(
     fly(1.5, False)
     assert told[1:] == [told[0], "Landed and not stopped: the scan is closed"]
     until(lambda: daemon.scanning.phase is Phase.IDLE)
-    end.set()
 
 
 def landings(watch: LandingWatch, *steps: tuple[float, bool, bool], after_s: float = 60.0) -> str:
@@ -367,10 +372,8 @@ class NoThread:
 class AnyOrder(RuleBasedStateMachine):
     """Commands, faults and ends of a scan in any order, against what they should come to."""
 
-    @initialize(folder=st.just(None))
-    def begin(self, folder: None) -> None:
-        import tempfile
-
+    def __init__(self) -> None:
+        super().__init__()
         self.folder = tempfile.TemporaryDirectory()
         self.daemon = daemon_in(Path(self.folder.name))
         self.scanning, self.wanted, self.begun = self.daemon.scanning, "nothing", 0
@@ -389,7 +392,6 @@ class AnyOrder(RuleBasedStateMachine):
     @rule(finalise=st.booleans())
     def stop(self, finalise: bool) -> None:
         actions = self.daemon.actions
-        self.stopped = self.run
         (actions.finalise if finalise else actions.stop_scan)()
         self.wanted = "nothing"
         assert self.run is None or self.run.stop.is_set()
@@ -437,8 +439,6 @@ class AnyOrder(RuleBasedStateMachine):
 
     @invariant()
     def what_is_wanted_is_known(self) -> None:
-        if not hasattr(self, "scanning"):
-            return
         phase, intent = self.scanning.phase, self.scanning.intent
         assert intent.wanted.value == self.wanted
         assert intent.paused.is_set() == (self.wanted == "pause")
@@ -453,13 +453,10 @@ class AnyOrder(RuleBasedStateMachine):
             assert phase is (Phase.PAUSED if self.wanted == "pause" else Phase.SCANNING)
 
     def teardown(self) -> None:
-        if hasattr(self, "folder"):
-            self.folder.cleanup()
+        self.folder.cleanup()
 
 
 def test_any_order_of_commands_and_faults(monkeypatch: pytest.MonkeyPatch) -> None:
-    from hypothesis.stateful import run_state_machine_as_test
-
     fake = SimpleNamespace(**{n: getattr(threading, n) for n in ("RLock", "Event")})
     fake.Thread = NoThread
     monkeypatch.setattr(scanning_module, "threading", fake)

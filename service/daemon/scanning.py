@@ -205,12 +205,17 @@ class Scanning:
         return 0.0 if run is None else run.busy_s
 
     @property
+    def progress_s(self) -> float:
+        """Monotonic time at which a frame was done last; now where no scan runs."""
+        run = self._run
+        return time.monotonic() if run is None else run.progress_s
+
+    @property
     def silent_s(self) -> float:
         """Seconds since a frame was done; 0 while no scan takes frames."""
-        run = self._run
-        if run is None or self.phase is not Phase.SCANNING:
+        if self.phase is not Phase.SCANNING:
             return 0.0
-        return time.monotonic() - run.progress_s
+        return time.monotonic() - self.progress_s
 
     def camera_news(self) -> list[str]:
         """Return what has gone wrong with the camera of a running scan since the last call."""
