@@ -20,7 +20,7 @@ from service.errors import InputError, OutsideError
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream.fleet import access_control, load_fleet
-from service.stream.keys import make_keys, revoke, tls_files
+from service.stream.keys import make_keys, member_name, revoke, tls_files
 from service.stream.link import DatalinkSender
 from service.stream.records import ScanHeader
 from service.stream.session import SessionConfig, open_session
@@ -118,6 +118,31 @@ def test_a_viewer_reads_and_cannot_write(
     finally:
         link.close()
         viewer.close()
+
+
+def test_a_station_reports_under_its_own_name_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet = tmp_path / "fleet"
+    make_keys(fleet, {"drone": ["red"], "ground": ["base", "mobile"]})
+    assert member_name(fleet / "ground" / "mobile" / "certificate.pem") == "mobile"
+    heard: list[str] = []
+    with served(fleet, tmp_path, monkeypatch) as (_, endpoint):
+        drone = open_session(session_config(fleet / "drone" / "red", connect=(endpoint,)))
+        drone.declare_subscriber("skyrelief/red/*/held/*", lambda s: heard.append(str(s.key_expr)))
+        mobile = open_session(session_config(fleet / "ground" / "mobile", connect=(endpoint,)))
+
+        def comes() -> bool:
+            for name in ("base", "invented", "mobile"):
+                mobile.put(f"skyrelief/red/scan-1/held/{name}", b"")
+            return len(heard) >= 3
+
+        try:
+            until(comes)
+        finally:
+            mobile.close()
+            drone.close()
+    assert set(heard) == {"skyrelief/red/scan-1/held/mobile"}
 
 
 @pytest.mark.parametrize("fault", ["another fleet", "expired", "no certificate", "drone serves"])

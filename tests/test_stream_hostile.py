@@ -14,7 +14,6 @@ from loopback import free_port, until
 from service.config import DatalinkConfig
 from service.stream.link import DatalinkSender
 from service.stream.messages import (
-    MAX_COUNTED,
     Ask,
     Held,
     pack_ask,
@@ -24,7 +23,7 @@ from service.stream.messages import (
     unpack_held,
 )
 from service.stream.outbox import MAX_STATIONS, PEER_TIMEOUT_S, Outbox
-from service.stream.parts import HEAD_BYTES, Assembler, Part, parse, split_in
+from service.stream.parts import HEAD_BYTES, MAX_COUNTED, Assembler, Part, parse, split_in
 from service.stream.ranges import RangeSet
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.reports import Reports
@@ -117,6 +116,8 @@ def test_parts_are_cut_in_one_way_only() -> None:
         part = Part("k0", 1, index, count, total, 7, bytes(size))
         assert not list(parse(part.pack())), part
     assert list(parse(Part("k0", 1, 0, 1, 0, 0, b"").pack()))
+    assert not list(parse(Part("pose", MAX_COUNTED + 1, 0, 1, 0, 0, b"").pack()))
+    assert list(parse(Part("header", MAX_COUNTED + 1, 0, 1, 0, 0, b"").pack()))
 
 
 def test_small_parts_do_not_take_more_memory_than_they_say() -> None:

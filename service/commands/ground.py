@@ -95,7 +95,7 @@ def ground(
     """Receive scans from drones; end with Ctrl-C. Scans lie in STORE/DRONE/SCAN."""
     from service.ground.receiver import Receiver, ReceiverConfig
     from service.init_system import Notifier
-    from service.stream.keys import tls_files
+    from service.stream.keys import member_name, tls_files
     from service.stream.radio_link import GROUND, RadioLink
     from service.stream.session import SessionConfig
     from service.workers import Workers
@@ -121,7 +121,8 @@ def ground(
     for folder in take or ():
         _take_in(store, folder)
     stop, workers = _stop_by_signal(), Workers()
-    receiver = Receiver(ReceiverConfig(store, session, limits, refresh_s=refresh), workers)
+    name = member_name(Path(certificate)) if certificate else ""
+    receiver = Receiver(ReceiverConfig(store, session, limits, name, refresh), workers)
     radios = [RadioLink(endpoint, GROUND, receiver.add_radio) for endpoint in mavlink or ()]
     receiver.start()
     where = ", ".join((*session.listen, *session.connect))
@@ -144,7 +145,7 @@ def ground(
             radio.close()
         receiver.close()
         closing.join()
-    _report(entries, receiver.dropped, as_json)
+    _report(entries, receiver.dropped, workers.report(), as_json)
 
 
 def _limits(quota_mb: float | None, drone_share: float, reserve_mb: float | None) -> Limits:
@@ -258,9 +259,11 @@ def _watch(
                 print(_line(entry), file=sys.stderr)
 
 
-def _report(entries: list[dict[str, Any]], dropped: int, as_json: bool) -> None:
+def _report(
+    entries: list[dict[str, Any]], dropped: int, workers: list[dict[str, Any]], as_json: bool
+) -> None:
     if as_json:
-        print(json.dumps({"scans": entries, "dropped": dropped}))
+        print(json.dumps({"scans": entries, "dropped": dropped, "workers": workers}))
         return
     for entry in entries:
         print(f"{_line(entry)}; {entry['folder']}")

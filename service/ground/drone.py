@@ -43,7 +43,8 @@ BUSY_S = 10.0
 CLOSE_AFTER_S = 600.0
 """A scan of which nothing was heard for so long is written and closed."""
 FULL_DISK_REST_S = 10.0
-MAX_INTRODUCTIONS = 8
+MAX_INTRODUCTIONS = 32
+"""Scans without a folder whose header is waited for; a drone offers 21 at once."""
 MAX_CLOSED = 1000
 """Closed scans whose last figures are kept."""
 UNREADABLE_REST_S = 60.0

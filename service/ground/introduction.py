@@ -9,7 +9,7 @@ from service.stream.records import ScanHeader, header_from_json
 
 REST_S = 1.0
 """From one request for the header to the next."""
-MAX_KEPT_BYTES = 1 << 19
+MAX_KEPT_BYTES = 1 << 18
 """Items that may come before the header."""
 
 

@@ -63,8 +63,9 @@ def access_control(fleet: Fleet) -> dict[str, Any]:
     """Zenoh's access control for a ground station's router.
 
     A drone reaches only what lies under its own key. A viewer only reads. A ground station
-    reads, asks and reports. Whoever is not of the fleet, or no longer, may do nothing: Zenoh
-    checks no revocation lists, so a revoked certificate still connects but has no rights.
+    reads, asks, and reports under its own name. Whoever is not of the fleet, or no longer, may
+    do nothing: Zenoh checks no revocation lists, so a revoked certificate still connects but has
+    no rights.
     """
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
@@ -103,7 +104,7 @@ def access_control(fleet: Fleet) -> dict[str, Any]:
         grant(
             "ground",
             name,
-            ("ingress", ("put",), f"{ROOT}/*/*/held/*"),
+            ("ingress", ("put",), f"{ROOT}/*/*/held/{name}"),
             ("ingress", ("declare_subscriber", "query"), f"{ROOT}/**"),
             ("egress", everything, f"{ROOT}/**"),
         )

@@ -44,15 +44,31 @@ def expiry_unix_s(certificate: Path) -> float:
 
     Raises OutsideError without the ``cryptography`` package.
     """
+    return _read(certificate).not_valid_after_utc.timestamp()
+
+
+def member_name(certificate: Path) -> str:
+    """The name of the member whose certificate (PEM) this is; InputError for another file.
+
+    Raises OutsideError without the ``cryptography`` package.
+    """
+    read = _read(certificate)
+    from cryptography.x509.oid import NameOID
+
+    found = read.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    _, _, name = str(found[0].value).partition(".") if found else ("", "", "")
+    return check_name(name.partition("~")[0], "the member of the certificate")
+
+
+def _read(certificate: Path) -> x509.Certificate:
     try:
         from cryptography import x509
     except ImportError as error:
         raise OutsideError("reading certificates needs the package 'cryptography'") from error
     try:
-        read = x509.load_pem_x509_certificate(certificate.read_bytes())
+        return x509.load_pem_x509_certificate(certificate.read_bytes())
     except (OSError, ValueError) as error:
         raise InputError(f"{certificate} is no certificate ({error})") from error
-    return read.not_valid_after_utc.timestamp()
 
 
 def make_keys(

@@ -12,13 +12,11 @@ import msgspec
 from msgspec import Meta
 
 from service.stream.naming import MAX_NAME, NAME
-from service.stream.parts import CODES, MAX_PARTS, WHOLE
+from service.stream.parts import CODES, MAX_COUNTED, MAX_PARTS, WHOLE
 from service.stream.ranges import MAX_NUMBER, MAX_RANGES, Pairs, RangeSet, ranges_from_pairs
 
 MAX_MESSAGE_BYTES = 262_144
 VERSION: Final = 1
-MAX_COUNTED = (1 << 24) - 1
-"""The highest number of a pose, re-pose or keyframe: ten a second for 19 days."""
 MAX_KINDS = 64
 MAX_RECEIVED_BYTES = 1 << 53
 

@@ -17,6 +17,8 @@ MAGIC = b"SK"
 VERSION = 1
 MAX_RECORD_BYTES = 1 << 24
 MAX_PARTS = 65_535
+MAX_COUNTED = (1 << 24) - 1
+"""The highest number of a pose, re-pose or keyframe: ten a second for 19 days."""
 MAX_OPEN_RECORDS = 64
 MAX_OPEN_BYTES = 1 << 25
 """Unfinished records beyond either limit make way, the stalest first."""
@@ -88,6 +90,8 @@ def parse(message: bytes) -> Iterator[Part]:
         if magic != MAGIC or version != VERSION or code not in KINDS or at + size > len(message):
             return
         if index >= count or total > MAX_RECORD_BYTES or size != _size_of(index, count, total):
+            return
+        if KINDS[code] not in WHOLE and number > MAX_COUNTED:
             return
         yield Part(KINDS[code], number, index, count, total, crc, message[at : at + size])
         at += size
