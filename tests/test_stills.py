@@ -2,49 +2,14 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
+from painted_ground import CAMERA, DOWN, FOOTPRINT_M, HEIGHT_M, SIZE, pose, still
 
-from recon import se3
 from recon.tracking.odometry import Odometry, Tracked
-from recon.types import F64, U8, Camera, PosePrior
+from recon.types import F64, U8, PosePrior
 
-SIZE = (480, 360)
-K = np.array([[400.0, 0, 239.5], [0, 400.0, 179.5], [0, 0, 1]])
-CAMERA = Camera(K, np.zeros(5), SIZE)
-M_PER_PX = 0.1
-DOWN = np.diag([1.0, -1, -1])
-HEIGHT_M = 40.0
-FOOTPRINT_M = HEIGHT_M * SIZE[0] / K[0, 0]
 PLACED = ("started", "tracked", "keyframe")
-
-
-@pytest.fixture(scope="module")
-def ground() -> U8:
-    """A texture with detail at all scales, 240 m across."""
-    rng = np.random.default_rng(7)
-    out = np.zeros((2400, 2400), np.float32)
-    for size in (8, 25, 80, 250, 1000, 2400):
-        layer = rng.normal(0, 1, (size, size)).astype(np.float32)
-        out += cv2.resize(layer, (2400, 2400), interpolation=cv2.INTER_CUBIC)
-    out = (out - out.mean()) / out.std() * 45 + 128
-    return np.asarray(np.clip(out, 0, 255).astype(np.uint8))
-
-
-def still(ground: U8, T_world_camera: F64) -> U8:
-    """What the camera sees of the plane z = 0."""
-    R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
-    plane = np.array([[M_PER_PX, 0, -120.0], [0, M_PER_PX, -120.0], [0, 0, 1]])
-    H = K @ R.T @ (np.c_[np.eye(3)[:, :2], -t] @ plane)
-    return np.asarray(cv2.warpPerspective(ground, H, SIZE, flags=cv2.INTER_AREA), np.uint8)
-
-
-def pose(east_m: float, yaw_deg: float = 0.0, height_m: float = HEIGHT_M, seed: int = 0) -> F64:
-    """Looking down with up to a few degrees of tilt, as a kite or a drone in wind."""
-    tilt = np.random.default_rng(seed).normal(0.0, 0.03, 2)
-    R = se3.so3_exp(np.array([0.0, 0.0, np.radians(yaw_deg)])) @ se3.so3_exp(np.r_[tilt, 0.0])
-    return se3.compose(R @ DOWN, np.array([east_m, 0.1 * east_m, height_m]))
 
 
 def flown(images: list[U8]) -> list[Tracked]:
@@ -76,43 +41,43 @@ def assert_one_piece(track: list[F64], found: list[Tracked], share_of_height: fl
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 90.0])
-def test_stills_at_60_percent_overlap_are_one_piece(ground: U8, yaw_deg: float) -> None:
+def test_stills_at_60_percent_overlap_are_one_piece(yaw_deg: float) -> None:
     """Straight on, and with a quarter turn before every shot."""
     step = 0.4 * FOOTPRINT_M * (1.0 if yaw_deg == 0.0 else 0.75)
     track = [pose(step * (i - 4), yaw_deg * i, seed=i) for i in range(9)]
-    assert_one_piece(track, flown([still(ground, T) for T in track]), 0.02)
+    assert_one_piece(track, flown([still(T) for T in track]), 0.02)
 
 
-def test_a_camera_that_climbs_and_sinks_is_followed(ground: U8) -> None:
+def test_a_camera_that_climbs_and_sinks_is_followed() -> None:
     heights = [40.0, 42.0, 44.0, 66.0, 68.0, 45.0, 43.0]
     track = [
         pose(0.3 * FOOTPRINT_M * (i - 3), 25.0 * i, height, seed=i)
         for i, height in enumerate(heights)
     ]
-    assert_one_piece(track, flown([still(ground, T) for T in track]), 0.03)
+    assert_one_piece(track, flown([still(T) for T in track]), 0.03)
 
 
-def test_a_still_that_shows_nothing_does_not_part_the_flight(ground: U8) -> None:
+def test_a_still_that_shows_nothing_does_not_part_the_flight() -> None:
     """The one after it is found in an earlier one than the last keyframe, turned around."""
     track = [pose(0.25 * FOOTPRINT_M * (i - 4), 0.0, seed=i) for i in range(5)]
     track += [pose(0.25 * FOOTPRINT_M * (i - 4), 180.0, seed=10 + i) for i in (2, 1)]
-    images = [still(ground, T) for T in track]
+    images = [still(T) for T in track]
     images.insert(5, np.full(SIZE[::-1], 120, np.uint8))
     found = flown(images)
     assert found.pop(5).state == "lost"
     assert_one_piece(track, found, 0.02)
 
 
-def test_two_views_bridge_what_has_no_landmarks(ground: U8) -> None:
+def test_two_views_bridge_what_has_no_landmarks() -> None:
     """Forty percent overlap: hardly anything is seen three times."""
     track = [pose(0.2 * FOOTPRINT_M * i - 60.0, seed=i) for i in range(3)]
     track += [pose(track[2][0, 3] + 0.6 * FOOTPRINT_M * i, seed=5 + i) for i in (1, 2, 3)]
-    assert_one_piece(track, flown([still(ground, T) for T in track]), 0.03)
+    assert_one_piece(track, flown([still(T) for T in track]), 0.03)
 
 
-def test_stills_of_other_places_are_not_joined(ground: U8) -> None:
+def test_stills_of_other_places_are_not_joined() -> None:
     here = [pose(0.3 * FOOTPRINT_M * i - 90.0, seed=i) for i in range(3)]
     there = [pose(0.3 * FOOTPRINT_M * i + 30.0, seed=5 + i) for i in range(3)]
-    found = flown([still(ground, T) for T in here + there])
+    found = flown([still(T) for T in here + there])
     assert found[3].state == "lost"
     assert {f.segment for f in found[4:]} == {1}

@@ -32,6 +32,7 @@ from service.compute.side_by_side import SideBySide
 from service.config import ComputeConfig, Config, ScanConfig
 from service.onboard.anchorage import VIEW, Anchorage, Carriers, Key
 from service.onboard.dense import Dense, Job
+from service.onboard.pieces import Pieces
 from service.onboard.rig import Rig
 from service.onboard.viewpoints import Offer, Viewpoint, Viewpoints
 from service.scans.file_ledger import FileLedger
@@ -97,6 +98,7 @@ class Pipeline:
         self._views: dict[int, Viewpoint] = {}  # asked for and not done yet
         self._carriers = Carriers(None if pages is None else FileLedger(VIEW, pages.parent))
         self._segment = self.odometry.segment
+        self.pieces = Pieces()
         self._fixes = FixAverage()
         self._priors: dict[int, PosePrior] = {}  # of the views that wait
         self._seen: tuple[int, PosePrior, Placed] | None = None  # what vision placed last
@@ -157,6 +159,11 @@ class Pipeline:
     def busy_s(self) -> float:
         """Seconds for which one view has been under reconstruction; 0 when none is."""
         return self._jobs.busy_s
+
+    def apart(self) -> list[tuple[int, int]]:
+        """First and last keyframe of each stretch that nothing ties to the rest of the scan."""
+        with self.dense.lock:
+            return self.pieces.apart(self.dense.trajectory.graph)
 
     def all_refusals(self) -> Counter[str]:
         """Frames and pairs not used, by reason."""
@@ -240,6 +247,8 @@ class Pipeline:
             self._carriers.add(Anchorage(viewpoint.seq, viewpoint.key, viewpoint.T_key_camera))
             if keyframe is not None:
                 out.append(keyframe)
+                points = int(np.count_nonzero(keyframe.fresh & np.isfinite(keyframe.depth.depth_m)))
+                self.pieces.add(keyframe.seq, job.segment, points, job.prior)
         self._carriers.settle(self.is_settled)
         return tuple(out)
 

@@ -61,12 +61,16 @@ class Recorder:
         self.last = self._record(told, step.placed)
         self.store.add_pose(self.last)
 
-    def close(self, extra: dict[str, Any]) -> dict[str, Any]:
-        """Write what is left, correct the trajectory, close the scan; return its summary."""
+    def flush(self) -> None:
+        """Write what the pipeline still holds and correct the trajectory; call it once."""
         self._write_keyframes(self.pipeline.finish())
         self._correct_trajectory()
         self._told.close()
+
+    def close(self, extra: dict[str, Any]) -> dict[str, Any]:
+        """Close the scan, which is flushed; return its summary."""
         summary = self.summary() | {"graph": graph_figures(self.pipeline.dense.trajectory.graph)}
+        summary["apart"] = [list(ends) for ends in self.pipeline.apart()]
         summary |= extra
         self.store.finish(summary)
         return summary

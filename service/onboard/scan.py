@@ -188,6 +188,7 @@ class Scan:
         self.check.finish()
         if self.tags is not None:
             self.tags.close()
+        self.recorder.flush()
         extra = self.check.summary() | {
             "frames_tagged": self.tagged,
             "frames_of_another_size": self.odd_sized,
@@ -213,6 +214,12 @@ class Scan:
             out.append(
                 f"no telemetry: the scale assumes {ASSUMED_AGL_M:g} m above ground; "
                 "set scan.assumed_agl_m to the true height"
+            )
+        apart = self.pipeline.apart()
+        if apart:
+            out.append(
+                f"{len(apart)} stretches of the flight are left out of the cloud: neither fixes "
+                "nor a place seen twice tie them to the rest; fly with GNSS or more overlap"
             )
         if frames and self.recorder.keyframes == 0:
             top = self.pipeline.all_refusals().most_common(2)

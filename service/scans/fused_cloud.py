@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -74,13 +75,25 @@ def fused_cloud(store: ScanStore, voxel_m: float | None = None) -> FusedCloud:
 def _extents(store: ScanStore) -> list[_Extent]:
     """The keyframes that hold points."""
     out = []
+    apart = _apart(store.summary or {})
     for keyframe in store.keyframes():
+        if any(first <= keyframe.seq <= last for first, last in apart):
+            continue
         sample = ground_sample_m(keyframe.depth)
         cloud = cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh)
         if sample is not None and len(cloud):
             x = cloud.xyz_m[:, 0]
             out.append(_Extent(keyframe.seq, len(cloud), sample, float(x.min()), float(x.max())))
     return out
+
+
+def _apart(summary: dict[str, Any]) -> list[tuple[int, int]]:
+    """First and last keyframe of each stretch that hangs on nothing, by the scan's summary."""
+    rows = summary.get("apart")
+    if not isinstance(rows, list):
+        return []
+    pairs = [row for row in rows if isinstance(row, list) and len(row) == 2]
+    return [(a, b) for a, b in pairs if isinstance(a, int) and isinstance(b, int)]
 
 
 def strip_edges(extents: Iterable[_Extent], most_points: int) -> list[float]:
