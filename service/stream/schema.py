@@ -97,6 +97,9 @@ def _opened(path: Path, how: str) -> sqlite3.Connection:
             connection.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
             connection.setlimit(sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH, 1)
         connection.execute("SELECT COUNT(*) FROM sqlite_master")  # opens the file
+    except UnicodeDecodeError as error:  # of SQLite's own message, which quotes the file
+        connection.close()
+        raise sqlite3.DatabaseError("its schema is damaged") from error
     except BaseException:
         connection.close()
         raise
