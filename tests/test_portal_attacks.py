@@ -298,6 +298,18 @@ def test_the_list_works_whatever_one_scan_holds(
     assert found["drone-4", "scan.json"]["trouble"]
 
 
+def test_a_damaged_schema_is_said(client: Client, store: Path) -> None:
+    """SQLite quotes the damaged place in its message, which then is no UTF-8."""
+    path = store / "drone-1/test-1/scan.db"
+    data = path.read_bytes()
+    assert data.count(b"CREATE TABLE chunks") == 1
+    path.write_bytes(data.replace(b"CREATE TABLE chunks", b"CREATE TABL\xf4 chunks"))
+    for name in ("keyframes/2.jpg", "coverage.json"):
+        status, answer, _ = client.ask(f"{ONE}/{name}")
+        assert status in (200, 400), answer
+    assert client.ask("/api/scans")[0] == 200
+
+
 def test_a_file_that_became_a_link_is_not_served(client: Client, store: Path) -> None:
     folder = store / "drone-1/test-1"
     (folder / "report.html").unlink()
