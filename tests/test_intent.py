@@ -133,7 +133,7 @@ def test_every_stop_ends_the_retries_of_a_scan_that_fails(
 def test_a_scan_that_fails_ends_with_its_flight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with Refused(tmp_path, monkeypatch, "scan.start=on-arm") as refused:
+    with Refused(tmp_path, monkeypatch, "scan.start=on-arm", "mavlink.system_id=1") as refused:
         refused.hear(beat(armed=True), (1, 1))
         until(lambda: refused.opened >= 3)
         refused.hear(beat(armed=False), (1, 1))
