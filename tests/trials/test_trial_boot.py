@@ -20,7 +20,17 @@ from typing import Any
 import pytest
 from loopback import free_port
 from trial_machine import Machine, another_release, lacking, make_bundle
-from trial_rig import BACK_S, WHOLE, Chunk, Row, answer, small_model, stored, stream_to
+from trial_rig import (
+    BACK_S,
+    WHOLE,
+    Chunk,
+    Row,
+    answer,
+    scan_folders,
+    small_model,
+    stored,
+    stream_to,
+)
 
 pytestmark = [
     pytest.mark.trial,
@@ -260,7 +270,7 @@ def _ended(aircraft: Aircraft) -> list[Path]:
     """Scans with keyframes that do not run any more."""
     running = aircraft.status().get("scan")
     with_chunks = {name for name, *_ in stored(aircraft.scans)}
-    return [s for s in aircraft.scans.iterdir() if s.name != running and s.name in with_chunks]
+    return [s for s in scan_folders(aircraft.scans) if s.name != running and s.name in with_chunks]
 
 
 def test_upgrade_and_rollback(aircraft: Aircraft, record: Row) -> None:

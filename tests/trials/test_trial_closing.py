@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from loopback import free_port
 from trial_autopilot import Autopilot
-from trial_rig import BACK_S, WHOLE, Row, Service, stored, with_site
+from trial_rig import BACK_S, WHOLE, Row, Service, scan_folders, stored, with_site
 
 from service.stream.store import ScanStore
 
@@ -23,7 +23,7 @@ def test_term_closes_the_scan(tmp_path: Path, record: Row) -> None:
     with Service(tmp_path) as service:
         service.until(lambda: stored(service.scans), "a chunk")
         assert service.stop() == 0
-        (folder,) = service.scans.iterdir()
+        (folder,) = scan_folders(service.scans)
         with ScanStore.open(folder / "scan.db") as store:
             assert store.finished
             assert store.summary is not None
@@ -92,7 +92,7 @@ def test_closing_that_hangs_ends_in_a_restart(tmp_path: Path, record: Row) -> No
         service.until(lambda: stored(service.scans), "a chunk")
         time.sleep(2.0)
         acknowledged, fed = stored(service.scans), watchdog.fed
-        (scan,) = service.scans.iterdir()
+        (scan,) = scan_folders(service.scans)
         autopilot.armed.clear()
         start = time.monotonic()
         while service.process.poll() is None and time.monotonic() < start + 60.0:
@@ -140,7 +140,7 @@ def test_taking_off_while_files_are_written(tmp_path: Path, record: Row) -> None
         service.until_up()
         autopilot.armed.set()
         service.until(lambda: stored(service.scans), "a chunk")
-        (first,) = service.scans.iterdir()
+        (first,) = scan_folders(service.scans)
         autopilot.armed.clear()
         service.until(lambda: service.get().get("state") == "finalising", "landing")
         autopilot.armed.set()
@@ -162,7 +162,7 @@ def test_taking_off_while_files_are_written(tmp_path: Path, record: Row) -> None
         back_s,
     )
     assert not lost
-    for folder in service.scans.iterdir():
+    for folder in scan_folders(service.scans):
         assert json.loads((folder / "scan.json").read_text())["finished"] is True
         assert (folder / "cloud.laz").is_file()
     assert "Scanning once the last scan is closed" in autopilot.texts

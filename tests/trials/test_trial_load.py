@@ -22,6 +22,7 @@ from trial_rig import (
     Row,
     Service,
     burn,
+    scan_folders,
     small_model,
     stored,
 )
@@ -84,7 +85,7 @@ def test_lag_is_relieved_and_passes(tmp_path: Path, record: Row) -> None:
             time.sleep(0.3)
         calm_s = time.monotonic() - start
         back_s = service.until_more_frames("frames")
-        (folder,) = service.scans.iterdir()
+        (folder,) = scan_folders(service.scans)
         assert service.stop() == 0
     told = [text for text in autopilot.texts if text.startswith("Load:")]
     record(
@@ -118,7 +119,7 @@ def test_a_camera_is_there_again_after_landing_under_load(tmp_path: Path, record
                 time.sleep(4.0)
                 autopilot.armed.clear()
                 service.until(lambda: service.get().get("state") == "idle", "landing")
-        assert len(list(service.scans.iterdir())) == times
+        assert len(scan_folders(service.scans)) == times
         acknowledged = stored(service.scans)
         assert service.stop() == 0
     lost = acknowledged - stored(service.scans)
@@ -144,7 +145,7 @@ def test_memory_short_is_relieved(tmp_path: Path, record: Row) -> None:
         service.reload(("least_memory_mib = 1e6", "relief = false"))
         back_s = service.until_more_frames("frames")
         assert service.get()["load"]["name"] == "full"
-        (folder,) = service.scans.iterdir()
+        (folder,) = scan_folders(service.scans)
         assert service.stop() == 0
     kept = list((folder / "later").glob("*.jpg"))
     record("memory short", 1, f"record only: {len(kept)} pictures kept for a replay", "-", back_s)

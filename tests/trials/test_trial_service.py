@@ -29,6 +29,7 @@ from trial_rig import (
     Row,
     Service,
     burn,
+    scan_folders,
     small_model,
     stored,
     stream_to,
@@ -73,7 +74,7 @@ def test_kill_9_loses_nothing_that_was_stored(tmp_path: Path, record: Row) -> No
             process.kill()
             process.wait()
     with Service(tmp_path, "on-command") as service:
-        for folder in scans.iterdir():
+        for folder in scan_folders(scans):
             service.until((folder / "scan.json").is_file, f"recovery of {folder.name}")
         assert service.stop() == 0
     lost = acknowledged - stored(scans)
@@ -87,7 +88,7 @@ def test_kill_9_loses_nothing_that_was_stored(tmp_path: Path, record: Row) -> No
     assert len(acknowledged) >= KILLS
     assert not lost
     assert max(back_s) < BACK_S
-    for folder in scans.iterdir():
+    for folder in scan_folders(scans):
         assert json.loads((folder / "scan.json").read_text())["finished"] is True
         assert (folder / "cloud.laz").stat().st_size > 0
 
@@ -169,7 +170,7 @@ def test_camera_fails_and_comes_back(fault: str, tmp_path: Path, record: Row) ->
                     )
                 service.until_more_frames("pictures again")
                 back_s.append(time.monotonic() - start)
-            scans = list(service.scans.iterdir())
+            scans = scan_folders(service.scans)
             assert service.stop() == 0
     finally:
         sender.kill()
@@ -183,7 +184,7 @@ def test_full_disk_keeps_what_is_stored(tmp_path: Path, record: Row) -> None:
     with Service(tmp_path, largest_file_bytes=400_000) as service:
         service.until(lambda: service.said("Scan failed") or service.get().get("fault"), "fault")
         service.until(lambda: len(list(service.scans.glob("*/scan.db"))) >= 2, "a new attempt")
-        first = min(service.scans.iterdir())
+        first = min(scan_folders(service.scans))
         acknowledged = {row for row in stored(service.scans) if row[0] == first.name}
         service.stop()
     assert acknowledged
@@ -259,7 +260,7 @@ def test_clock_set_back_by_a_power_cut(tmp_path: Path, record: Row) -> None:
     with Service(tmp_path) as service:
         service.until(lambda: stored(service.scans), "a chunk")
         acknowledged = stored(service.scans)
-    (before,) = service.scans.iterdir()
+    (before,) = scan_folders(service.scans)
     (tmp_path / "clock").write_text("-2592000")
     environment = with_site(tmp_path, CLOCK) | {"TRIAL_CLOCK": str(tmp_path / "clock")}
     link = free_port()
@@ -270,7 +271,7 @@ def test_clock_set_back_by_a_power_cut(tmp_path: Path, record: Row) -> None:
         again.until((before / "scan.json").is_file, "the files of the scan that lay open")
         assert again.stop() == 0
     autopilot.ended.set()
-    (after,) = {path for path in again.scans.iterdir() if path.is_dir()} - {before}
+    (after,) = set(scan_folders(again.scans)) - {before}
     lost = acknowledged - stored(again.scans)
     record(
         "power cut that sets the clock back by a month",
@@ -297,7 +298,7 @@ def test_wall_clock_steps(tmp_path: Path, record: Row) -> None:
         for step_s in steps:
             clock.write_text(str(step_s))
             back_s.append(service.until_more_frames("frames after the step"))
-        (folder,) = service.scans.iterdir()
+        (folder,) = scan_folders(service.scans)
         assert service.stop() == 0
     times = [float(x.split()[0]) for x in (folder / "trajectory.tum").read_text().splitlines()]
     record("wall clock steps", len(steps), "times of the scan go on evenly", "-", max(back_s))

@@ -224,6 +224,11 @@ def with_site(folder: Path, code: str) -> dict[str, str]:
     return {"PYTHONPATH": os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")])}
 
 
+def scan_folders(scans: Path) -> list[Path]:
+    """The folders of scans by name; the service keeps a file of its own among them."""
+    return sorted(path for path in scans.iterdir() if path.is_dir())
+
+
 def stored(scans: Path) -> set[Chunk]:
     """(scan, keyframe, layer, checksum) of every chunk that a store has acknowledged."""
     found: set[Chunk] = set()
