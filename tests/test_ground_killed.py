@@ -12,8 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import HouseFlight
 
+from service.ground import files_due
+from service.ground.receiver import Receiver, ReceiverConfig
 from service.scans.folder import CLOUD, CSV, PREVIEW, TUM, write_deliverables
+from service.stream.session import SessionConfig
 from service.stream.store import ScanStore
 
 pytest.importorskip("zenoh")
@@ -118,3 +122,44 @@ def test_killed_and_restarted_on_both_sides(tmp_path: Path) -> None:
         write_deliverables(received.parent, b, {})
     for name in (CLOUD, TUM, CSV, PREVIEW):
         assert (tmp_path / name).read_bytes() == (received.parent / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("killed", ["while receiving", "while writing"])
+def test_files_that_a_killed_station_left_are_written_at_the_next_start(
+    tmp_path: Path, house: HouseFlight, killed: str
+) -> None:
+    folder = tmp_path / "drone-1" / "test-1"
+    house.flown(folder).close()
+    files_due.mark(folder)
+    if killed == "while writing":
+        files_due.begin(folder)
+    assert files_due.left(tmp_path) == [folder]
+    station = Receiver(ReceiverConfig(tmp_path, SessionConfig(mode="peer")))
+    station.start()
+    try:
+        for _ in range(1200):
+            if not files_due.left(tmp_path):
+                break
+            time.sleep(0.1)
+    finally:
+        station.close()
+    assert files_due.left(tmp_path) == []
+    names = {path.name for path in folder.iterdir()}
+    assert {CLOUD, TUM, CSV, PREVIEW, "scan.json", "report.html"} <= names
+    assert not {".files-due", ".files-begun"} & names
+
+
+def test_what_comes_while_files_are_written_is_due_again(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    folder = tmp_path / "drone-1" / "test-1"
+    files_due.mark(folder)  # of a folder that is gone: nothing happens
+    with house.flown(folder) as store:
+        files_due.mark(folder)
+        files_due.begin(folder)
+        files_due.mark(folder)
+        write_deliverables(folder, store, {})
+        files_due.end(folder)
+    assert files_due.left(tmp_path) == [folder]
+    files_due.write_left(folder)
+    assert files_due.left(tmp_path) == []

@@ -179,7 +179,7 @@ class DroneReceiver:
         try:
             self._share.check(len(payload), now)
             if scan.intake.on_items(payload, now):
-                scan.changed = scan.unwritten = True
+                scan.grew()
                 self.last_news_at = now
                 scan.trouble = ""
         except OutsideError as error:
@@ -206,7 +206,7 @@ class DroneReceiver:
                 store.put_header(header)
             if kind != "header" and store.add_radio(kind, number, part, data):
                 scan.radio_messages += 1
-                scan.unwritten = True
+                scan.grew()
                 self.last_news_at = now
         except OutsideError as error:
             self._rest(scan, str(error), now)
@@ -283,7 +283,8 @@ class DroneReceiver:
         scan = ReceivedScan(self.drone, name, store.path.parent, intake, used_at=now)
         before = self._closed.pop(name, None)
         scan.is_written = before is not None
-        scan.unwritten = before is None
+        if before is None:
+            scan.grew()
         self._scans[name] = scan
         self.is_known = True
         self._station.opened(scan)

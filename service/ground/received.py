@@ -9,6 +9,7 @@ from statistics import median
 from typing import Any
 
 from service.errors import InputError
+from service.ground import files_due
 from service.ground.intake import ScanIntake
 from service.stream.naming import ROOT
 
@@ -41,6 +42,12 @@ class ReceivedScan:
     def key(self) -> str:
         """Where its messages are."""
         return f"{ROOT}/{self.drone}/{self.name}"
+
+    def grew(self) -> None:
+        """Something new was stored: its files are due, also for the next process."""
+        if not self.unwritten:
+            files_due.mark(self.folder)
+        self.changed = self.unwritten = True
 
     @property
     def may_close(self) -> bool:

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.errors import InputError, SkyreliefError
+from service.ground import files_due
 from service.ground.drone import DRONE_TIMEOUT_S, DroneReceiver, Limits
 from service.ground.placing import scan_folder
 from service.ground.received import ReceivedScan, deliver
@@ -385,12 +386,24 @@ class Receiver:
         scan.unwritten, scan.is_writing = False, True
         self._writes.put(scan)
 
-    def _write_all(self, _: Worker) -> None:
+    def _write_all(self, worker: Worker) -> None:
+        """Write what is asked for, and in between what a former process left."""
+        left = deque(files_due.left(self._config.store))
         while True:
-            scan = self._writes.get()
+            try:
+                scan = self._writes.get(block=not left)
+            except queue.Empty:
+                folder = left.popleft()
+                if worker.stop.is_set():
+                    left.clear()  # for the next process
+                else:
+                    guarded(f"files of {folder}", partial(files_due.write_left, folder))
+                continue
             if scan is None:
                 return
+            files_due.begin(scan.folder)
             scan.trouble = guarded(f"deliverables of {scan.folder}", partial(deliver, scan))
+            files_due.end(scan.folder)
             scan.is_written, scan.is_writing = True, False
             member = self._members.get(scan.drone)
             if member is not None:
