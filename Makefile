@@ -1,4 +1,4 @@
-# make demo | test | lint | types | bench | trials | bundle | clean. The first call makes .venv.
+# make demo | test | lint | types | bench | trials | bundle | lock | notices | clean. The first call makes .venv.
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -12,7 +12,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 PEERS := $(VENV)/peers/installed
 
-.PHONY: demo test lint types check bench trials format bundle clean
+.PHONY: demo test lint types check bench trials format bundle lock notices clean
 
 demo: $(STAMP)
 	$(BIN)/skyrelief demo --out demo-output $(ARGS)
@@ -55,6 +55,17 @@ format: $(STAMP)
 # Everything that deploy/install.sh needs on a machine without a network.
 bundle: $(STAMP)
 	PYTHON=$(abspath $(BIN))/python deploy/bundle.sh $(ARGS)
+
+# deploy/locked: pins and hashes of what is installed, renewed after a change of constraints.txt.
+lock: $(STAMP)
+	@test -x $(VENV)/lock/bin/uv || { $(BIN)/python -m venv $(VENV)/lock && \
+	  $(VENV)/lock/bin/python -m pip install --disable-pip-version-check -q uv==0.13.9; }
+	$(BIN)/python deploy/lock.py $(abspath $(VENV))/lock/bin/uv
+
+# What a bundle holds, again: requirements.txt, sbom.cdx.json and THIRD_PARTY_NOTICES.
+BUNDLE ?= dist/bundle
+notices:
+	$(PYTHON) deploy/inventory.py $(BUNDLE)
 
 clean:
 	rm -rf demo-output build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

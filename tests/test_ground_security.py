@@ -107,11 +107,11 @@ def test_a_viewer_reads_and_cannot_write(
     try:
         assert link.drain(15.0)
 
-        def told() -> bool:
+        def published() -> bool:
             link._post(link._outbox.tell)
             return "skyrelief/red/scan-1/head" in seen
 
-        until(told)
+        until(published)
         viewer.put("skyrelief/red/scan-9/head", b'{"v":1,"numbers":{},"live":{},"finished":false}')
         time.sleep(0.5)
         assert [entry["scan"] for entry in receiver.progress()] == ["scan-1"]
@@ -273,11 +273,11 @@ def test_a_revoked_viewer_sees_nothing_and_its_successor_does(
         up.callback(link.close)
         assert link.drain(15.0)
 
-        def told() -> bool:
+        def published() -> bool:
             link._post(link._outbox.tell)
             return "new" in seen
 
-        until(told)
+        until(published)
         assert "old" not in seen
 
 
@@ -302,9 +302,9 @@ def test_a_revoked_ground_station_cannot_serve_and_the_others_have_new_keys(
         assert link.drain(15.0)
 
 
-def test_revoking_nobody_or_several_is_said_in_one_line(tmp_path: Path) -> None:
+def test_revoking_an_unknown_or_shared_name_is_said_in_one_line(tmp_path: Path) -> None:
     make_keys(tmp_path, {"drone": ["red"], "ground": ["base"], "viewer": ["red"]})
-    with pytest.raises(InputError, match="nobody in this fleet is called 'green'"):
+    with pytest.raises(InputError, match="no member of this fleet is called 'green'"):
         revoke(tmp_path, "green")
     with pytest.raises(InputError, match=r"give drone.red or viewer.red"):
         revoke(tmp_path, "red")

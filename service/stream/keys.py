@@ -108,7 +108,7 @@ def revoke(folder: Path, member: str, days: int = 365, now: float | None = None)
 
     A drone or viewer loses its rights with the ``fleet.json`` of every ground station. With a
     ground station the authority ends: all other members get new keys under a new one. What was
-    valid is kept under ``folder/revoked``. Raises InputError for nobody's name.
+    valid is kept under ``folder/revoked``. Raises InputError for an unknown name.
     """
     fleet = load_fleet(folder / FLEET)
     role, name = _named(fleet, member)
@@ -132,7 +132,7 @@ def _named(fleet: Fleet, member: str) -> tuple[str, str]:
     everybody = [(role, name) for role, names in fleet.members.items() for name in names]
     found = [both for both in everybody if member in (both[1], ".".join(both))]
     if not found:
-        raise InputError(f"nobody in this fleet is called {member!r}")
+        raise InputError(f"no member of this fleet is called {member!r}")
     if len(found) > 1:
         names = " or ".join(".".join(both) for both in found)
         raise InputError(f"{member!r} is the name of several: give {names}")
@@ -154,12 +154,12 @@ def _write_fleet(folder: Path, fleet: Fleet) -> list[Path]:
     """Write ``fleet.json`` for the folder and every ground station; the ground stations'."""
     text = json.dumps({**fleet.members, "revoked": fleet.revoked}, indent=2) + "\n"
     stations = [folder / "ground" / name for name in fleet.members.get("ground", ())]
-    told = [home / FLEET for home in stations if home.is_dir()]
-    for path in (folder / FLEET, *told):
+    copies = [home / FLEET for home in stations if home.is_dir()]
+    for path in (folder / FLEET, *copies):
         part = path.with_suffix(".part")
         part.write_text(text, encoding="utf-8")
         part.replace(path)
-    return told
+    return copies
 
 
 def _authority(

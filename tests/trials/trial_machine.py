@@ -134,6 +134,7 @@ def another_release(bundle: Path, target: Path, number: str, start: str = "") ->
             data = source.read(item)
             sink.writestr(item, data + start.encode() if item.filename == ENTRY else data)
     other.replace(wheel)
+    _checked([sys.executable, str(target / "deploy" / "inventory.py"), str(target)])
 
 
 ENTRY = "service/__init__.py"
