@@ -240,7 +240,7 @@ def test_mavsdk_waits_for_work_and_survives_lost_answers() -> None:
             relay.lose = {(77, 2)}  # the first two acknowledgements
             ack = operator.command(31010, 191, (5.0,))
         assert ack.result == 0 and ack.component == 191
-        assert daemon.control.asked == ["finalise"]
+        assert set(daemon.control.asked) == {"finalise"}  # a stop is carried out every time
         assert relay.lost == 2
 
 
