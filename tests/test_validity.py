@@ -71,6 +71,8 @@ def fine(house: HouseFlight) -> bytes:
         (58, "d", (math.nan,)),
         (82, "4d", (0.0, 0.0, 0.0, 0.0)),  # rotation
         (114, "f", (math.nan,)),  # covariance
+        (12, "q", (-(2**63),)),  # time
+        (12, "q", (2**63 - 1,)),
     ],
 )
 def test_a_layer_that_no_camera_made_is_dropped(
@@ -83,6 +85,7 @@ def test_a_layer_that_no_camera_made_is_dropped(
 @pytest.mark.parametrize(
     ("at", "kind", "values"),
     [
+        (4, "q", (2**63 - 1,)),  # time
         (16, "d", (-1e7,)),  # position
         (72, "f", (math.inf,)),  # covariance
         (156, "d", (1e308,)),  # latitude
@@ -128,6 +131,7 @@ def test_a_repose_puts_no_surface_out_of_reach(house: HouseFlight) -> None:
         {"origin_alt_amsl_m": 1e9},
         {"started_unix_ns": -1},
         {"started_unix_ns": 10**40},
+        {"started_unix_ns": 2**63 - 1},
         {"epsg": 10**30},
         {"scan_id": "a/b"},
         {"scan_id": "a\u0007"},

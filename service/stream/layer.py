@@ -16,7 +16,7 @@ import numpy as np
 from recon.camera_model import scaled_K
 from recon.types import F64
 from service.stream.records import PLACE_BYTES, pack_place, source_bits, sources_of, unpack_place
-from service.stream.validity import is_inverse_depth, is_pinhole
+from service.stream.validity import is_inverse_depth, is_pinhole, is_time
 
 MAX_SIDE_PX = 4096
 MAX_PIXELS = 1 << 22
@@ -157,6 +157,8 @@ def _ints(values: tuple[object, ...]) -> list[int]:
 def _plausible(head: LayerHead) -> bool:
     w, h = head.full_px
     if not (0 < w <= MAX_SIDE_PX and 0 < h <= MAX_SIDE_PX and w * h <= MAX_PIXELS):
+        return False
+    if not is_time(head.time_unix_ns):
         return False
     if not (head.factor >= 1 and head.layer < head.layers <= MAX_LAYERS):
         return False

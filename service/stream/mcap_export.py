@@ -84,7 +84,7 @@ class _Recording:
         self._log = channels.LogChannel("/log", context=context)
 
     def _write(self, channel: Any, message: Any, time_ns: int) -> None:
-        channel.log(message, log_time=time_ns)
+        channel.log(message, log_time=max(time_ns, 0))
         self.messages += 1
         self._last_ns = max(self._last_ns, time_ns)
 
@@ -218,6 +218,7 @@ def _points(keyframe: Keyframe, stamp: Any) -> Any:
 def _stamp(time_ns: int) -> Any:
     from foxglove.messages import Timestamp
 
+    time_ns = max(time_ns, 0)  # the format has no time before 1970
     return Timestamp(time_ns // 1_000_000_000, time_ns % 1_000_000_000)
 
 

@@ -18,7 +18,7 @@ from recon import se3
 from recon.types import F32, F64, U8, Bool
 from service.stream.naming import NAME, split_scan_name
 from service.stream.records import PoseRecord, ScanHeader, source_bits, sources_of
-from service.stream.validity import is_on_globe, is_pinhole
+from service.stream.validity import is_on_globe, is_pinhole, is_time
 
 U16 = npt.NDArray[np.uint16]
 
@@ -93,7 +93,11 @@ def unpack_announce(data: bytes) -> ScanHeader | None:
     drone, scan = names[:length], names[length:]
     if not (NAME.fullmatch(drone) and NAME.fullmatch(scan)) or tag_of(drone, scan) != tag:
         return None
-    if started < 0 or not is_on_globe(_finite(lat), _finite(lon), _finite(alt)):
+    if (
+        started < 0
+        or not is_time(started)
+        or not is_on_globe(_finite(lat), _finite(lon), _finite(alt))
+    ):
         return None
     scan_id, run_id = split_scan_name(scan)
     return ScanHeader(
@@ -146,6 +150,8 @@ def unpack_pose(data: bytes) -> tuple[int, int, PoseRecord] | None:
         return None
     no_fix = f[11] == -(1 << 31)
     sigma = f[14] / _METRE_CM
+    if not is_time(f[3]):
+        return None
     if not no_fix and not is_on_globe(f[11] * 1e-7, f[12] * 1e-7, _finite(f[13])):
         return None
     pose = PoseRecord(

@@ -261,7 +261,9 @@ def unpack_pose(data: bytes) -> PoseRecord | None:
     (bits, time_unix_ns, seq), motion, covariance, last = found
     lat, lon, alt, agl = map(_or_none, last[:4])
     roll, pitch, yaw, speed, distance, turn, sigma = last[4:]
-    if not (validity.is_on_globe(lat, lon, alt, agl) and all(map(math.isfinite, last[4:]))):
+    if not (validity.is_time(time_unix_ns) and validity.is_on_globe(lat, lon, alt, agl)):
+        return None
+    if not all(map(math.isfinite, last[4:])):
         return None
     return PoseRecord(
         time_unix_ns=time_unix_ns,

@@ -35,7 +35,8 @@ MAX_HEADER_BYTES = 262_144
 MAX_SUMMARY_BYTES = 1_048_576
 MAX_NOTES = 10_000
 MAX_NAME = 128
-MAX_TIME_NS = (1 << 63) - 1
+MIN_TIME_NS, MAX_TIME_NS = -86_400 * 10**9, (1 << 32) * 10**9
+"""Unix time up to 2106; a clock that starts at 0 may be corrected to a little before."""
 
 NAME_TEXT = r"^[^\x00-\x1f\x7f/\\]+$"
 """No control character and no slash: names stand in file names, XML and keys."""
@@ -141,6 +142,11 @@ def is_position(xyz_m: F64) -> bool:
 def is_rotation(quaternion: F64) -> bool:
     """Whether w x y z can be made a rotation."""
     return 0.5 < float(np.linalg.norm(quaternion)) < 2.0
+
+
+def is_time(time_unix_ns: int) -> bool:
+    """Whether a camera may have been exposed then."""
+    return MIN_TIME_NS <= time_unix_ns < MAX_TIME_NS
 
 
 def is_scale(scale: float) -> bool:
