@@ -71,6 +71,15 @@ def test_las_and_laz(scan_dir: Path, tmp_path: Path, house: HouseFlight, name: s
     assert_is_the_house(to_enu(np.column_stack([cloud.x, cloud.y, cloud.z]), 32632, house), house)
 
 
+def test_copc_of_a_scan_without_a_place(tmp_path: Path, house: HouseFlight) -> None:
+    pytest.importorskip("copclib")
+    house.flown(tmp_path, georeferenced=False).close()
+    cloud = laspy.read(written(tmp_path, "copc"))
+    points = np.column_stack([cloud.x, cloud.y, cloud.z])
+    assert_is_the_house(points, house)
+    assert cloud.header.parse_crs() is None
+
+
 def test_copc_by_laspy(scan_dir: Path, house: HouseFlight) -> None:
     pytest.importorskip("copclib")
     path = written(scan_dir, "copc")

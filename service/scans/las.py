@@ -42,6 +42,7 @@ def las_header(xyz_m: F64, frame: LocalFrame | None, started_unix_ns: int) -> la
     header.system_identifier = "camera stereo"
     when = dt.datetime.fromtimestamp(started_unix_ns / 1e9, dt.timezone.utc)
     header.creation_date = when.date()
+    header.global_encoding.wkt = True  # LAS 1.4 asks for it with this format, also without a CRS
     if frame is not None:
         header.add_crs(CRS.from_epsg(frame.epsg))
     return header
