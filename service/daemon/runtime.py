@@ -281,11 +281,10 @@ class Daemon:
         """Go on scanning where a fault of the service, or of its power, ended a flight's scan."""
         if self.config.scan.start != "on-command":
             return
-        report, resumption = self.vehicle.report(), self.scanning.resumption
+        report = self.vehicle.report()
         is_heard = report.autopilot is not None and report.is_certain
-        if resumption.is_due(is_heard, report.is_armed and report.is_certain):
+        if self.scanning.start_again(is_heard, report.is_armed and report.is_certain):
             self.vehicle.statustext("Scanning again after a restart", WARNING)
-            self.actions.start_scan()
 
     def _follow_arming(self, was_armed: bool) -> bool:
         """Start and stop a scan with the motors, if so configured; whether they are on."""

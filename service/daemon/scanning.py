@@ -99,6 +99,14 @@ class Scanning:
             self.want()
             self.follow_intent()
 
+    def start_again(self, is_heard: bool, is_armed: bool) -> bool:
+        """Start the scan that a fall of the service or the computer ended; False: none is due."""
+        with self._lock:
+            is_due = self.resumption.is_due(is_heard, is_armed)
+            if is_due:
+                self.start()
+            return is_due
+
     def stop(self) -> None:
         """Want no scan: close the one that runs, drop every retry, forget a scan to resume."""
         with self._lock:
