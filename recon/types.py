@@ -39,6 +39,15 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Travel:
+    """A velocity integrated since the start of an unbroken run of readings."""
+
+    metres: F64  # (3,) ENU
+    seconds: float
+    run: int  # travels of two runs cannot be compared
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PosePrior:
     """What telemetry says of the camera's pose; a missing part is None."""
 
@@ -57,6 +66,9 @@ class PosePrior:
     above_fixes: int = 0  # whose mean that is
     above_ns: int = 0  # time of the newest of them
     is_at_rest: bool = False  # the vehicle stands on the ground: its position repeats rightly
+    is_agl_measured: bool = True  # False: above the take-off point, or assumed
+    velocity_m_s: F64 | None = None  # (3,) ENU, of the vehicle
+    travel: Travel | None = None  # the velocity integrated up to this moment
 
 
 @dataclass(frozen=True, slots=True, eq=False)

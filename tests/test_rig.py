@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -140,3 +141,20 @@ def test_attitude_of_a_pose_is_that_of_the_head() -> None:
 @pytest.mark.parametrize("rpy", [(0.1, 0.2, 0.3), (-0.5, 1.2, -3.0), (0.0, -math.pi / 2, 1.0)])
 def test_angles_and_rotations_undo_each_other(rpy: tuple[float, float, float]) -> None:
     np.testing.assert_allclose(rpy_from_rotation(rotation_from_rpy(*rpy)), rpy, atol=1e-7)
+
+
+def test_a_height_above_the_take_off_point_is_not_measured() -> None:
+    state = VehicleState(0, alt_agl_m=40.0, sigma_agl_m=5.0, sources=("relative",))
+    below = replace(state, sources=("rangefinder",))
+    above, measured = rig().prior(state, None), rig().prior(below, None)
+    assert above.agl_m == 40.0 and not above.is_agl_measured and above.sigma_agl_m >= 10.0
+    assert measured.is_agl_measured and measured.sigma_agl_m == 5.0
+    without = rig(fusion=FusionConfig(altitude=False)).prior(below, None)
+    assert not without.is_agl_measured
+
+
+def test_a_height_set_by_the_operator_is_known_whatever_it_is() -> None:
+    fifty = Rig(CameraConfig(), ScanConfig(assumed_agl_m=50.0), FusionConfig())
+    assert fifty.height_known(None, None)
+    assert fifty.prior(None, None).is_agl_measured
+    assert not rig().height_known(None, None)

@@ -404,7 +404,8 @@ class PoseGraph:
         frame = self._segments.known(node.segment)
         drift_m = None if frame is None else self.config.frame_drift * self._path[node.key]
         node = self._segments.freed(node)
-        used = self._readings.add(node, T, spread, drift_m)
+        noise = self._segments.noise(node.segment)
+        used = self._readings.add(node, T, spread, drift_m, noise)
         if frame is not None and self._readings.height(
             node, self._motions.scale_key(node), frame.scale
         ):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from recon import se3
-from recon.graph.alignment import Anchor, height_ratio
+from recon.graph.alignment import LEAST_FIX_M, Anchor, ReadingNoise, height_ratio
 from recon.graph.records import Node, PoseGraphConfig
 from recon.graph.smoother import Smoother
 from recon.types import F64, PosePrior
@@ -52,7 +52,14 @@ class Readings:
         self._keyframes, self._span_s = max(keyframes, 1), max(span_s, 1.0)
         self._offset_m = altitude_offset_m
 
-    def add(self, node: Node, T: F64, spread: F64, drift_m: float | None) -> set[str]:
+    def add(
+        self,
+        node: Node,
+        T: F64,
+        spread: F64,
+        drift_m: float | None,
+        noise: ReadingNoise | None = None,
+    ) -> set[str]:
         """The sensors that took part; the keyframe is predicted at ``T`` +- ``spread``.
 
         ``drift_m`` is how far the segment's track may have left its frame. None while there is
@@ -63,14 +70,14 @@ class Readings:
         if drift_m is not None:
             lever = np.hstack([-se3.hat(T[:3, 3]), np.eye(3)])
             place = np.diag(lever @ spread @ lever.T)
-            used |= {"gnss"} if self._position(node, T, place, drift_m) else set()
+            used |= {"gnss"} if self._position(node, T, place, drift_m, noise) else set()
             used |= {"altitude"} if self._altitude(node, T) else set()
         return used
 
     def height(self, node: Node, scale_key: int, scale: float) -> bool:
         """True when the height above ground was taken as a reading of the scale."""
         ratio = height_ratio(Anchor(node.T_odom_camera, node.prior, node.height, node.lean))
-        if ratio is None:
+        if ratio is None or not node.prior.is_agl_measured:
             return False
         if node.lean == 0.0 and abs(ratio[0] - np.log(scale)) > HEIGHT_GATE:
             self._counts["height off"] += 1  # a tree or a roof under the one sensor alone
@@ -105,20 +112,27 @@ class Readings:
         self._smoother.add(factor, "attitude")
         return True
 
-    def _position(self, node: Node, T: F64, place: F64, drift_m: float) -> bool:
+    def _position(
+        self, node: Node, T: F64, place: F64, drift_m: float, measured: ReadingNoise | None
+    ) -> bool:
         prior = node.prior
         if prior.position_m is None or prior.sigma_position_m is None:
             return False
-        sigma = np.maximum(prior.sigma_position_m, 0.005)
+        sigma = np.maximum(prior.sigma_position_m, LEAST_FIX_M)
         # The frame rests on all fixes: it is no worse than one of them.
         sure = np.minimum(place, sigma**2 + drift_m**2)
         apart = np.abs(prior.position_m - T[:3, 3])
         if np.any(apart > self._config.gate_sigmas * np.sqrt(sure + sigma**2)):
             self._counts["position off"] += 1
             return False
-        precise = float(sigma[0]) < PRECISE_M
-        seconds = self._config.precise_fix_s if precise else self._config.fix_s
-        sigma = sigma * self._inflated(seconds)
+        if measured is not None and measured.horizontal and measured.vertical:
+            known = (measured.horizontal, measured.horizontal, measured.vertical)
+            each = [one.of_each(self._keyframes, self._span_s) for one in known]
+            sigma = np.maximum(each, LEAST_FIX_M)
+        else:
+            precise = float(sigma[0]) < PRECISE_M
+            seconds = self._config.precise_fix_s if precise else self._config.fix_s
+            sigma = sigma * self._inflated(seconds)
         noise = self._robust(self._gtsam.noiseModel.Diagonal.Sigmas(sigma))
         factor = self._gtsam.GPSFactor(node.key, prior.position_m, noise)
         self._smoother.add(factor, "position")

@@ -10,7 +10,7 @@ import numpy as np
 
 from recon import se3
 from recon.graph import alignment
-from recon.graph.alignment import Anchor, Scale, Similarity
+from recon.graph.alignment import Anchor, ReadingNoise, Scale, Similarity
 from recon.graph.fix_average import at_camera
 from recon.graph.records import Node
 from recon.graph.sensor_offsets import Constants, Offsets, constants, offsets
@@ -85,6 +85,11 @@ class SegmentFrames:
         """What the sensors are constantly off by, as the segment's frame was fitted with."""
         return self._constants.get(segment, Constants())
 
+    def noise(self, segment: int) -> ReadingNoise | None:
+        """How the segment's fixes err; None before they were fitted."""
+        frame = self._frames.get(segment)
+        return None if frame is None else frame.noise
+
     def rests_on_fixes(self, segment: int) -> bool:
         """True when positions place the segment."""
         frame = self._frames.get(segment)
@@ -125,7 +130,7 @@ class SegmentFrames:
         self._fitted[segment] = seen
         fresh = self._newest_constants()
         anchors = self._anchors(segment, fresh)
-        found = alignment.fit(anchors)
+        found = alignment.fit(anchors, self._wander_s[0])
         if found is None:
             return False
         if "gnss" not in found.sources and nodes[0].key > 0:
@@ -167,7 +172,7 @@ class SegmentFrames:
 
     def _anchors(self, segment: int, known: Constants) -> list[Anchor]:
         return [
-            Anchor(n.T_odom_camera, known.applied(n.prior), n.height, n.lean)
+            Anchor(n.T_odom_camera, known.applied(n.prior), n.height, n.lean, n.time_ns * 1e-9)
             for n in self.nodes[segment]
         ]
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from recon import se3
-from recon.graph.alignment import Anchor, Similarity, height_ratios
+from recon.graph.alignment import EXACT_HEIGHTS, Anchor, Similarity, height_ratios
 from recon.graph.altitude_datum import AltitudeDatum, altitude_datum
 from recon.graph.boresight import Boresight, Turns, boresight
 from recon.types import F64, PosePrior
@@ -96,7 +96,8 @@ class Offsets:
 
 def offsets(anchors: Sequence[Anchor], frame: Similarity) -> Offsets:
     """The constants of all sensors over the anchors of one segment, robustly."""
-    ratios, is_exact = height_ratios(anchors)
+    ratios, independent = height_ratios(anchors)
+    is_exact = independent == EXACT_HEIGHTS
     log_height = 0.0
     if ratios:
         mean = np.average([r[0] for r in ratios], weights=[r[1] ** -2 for r in ratios])

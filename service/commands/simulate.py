@@ -52,6 +52,8 @@ def simulate(
     video: Annotated[bool, typer.Option(help="Render flight.mp4.")] = True,
     gimbal_frame: Annotated[str, typer.Option(help="Yaw of the gimbal: earth, vehicle.")] = "earth",
     rangefinder: Annotated[bool, typer.Option(help="Send DISTANCE_SENSOR.")] = True,
+    gnss_accuracy: Annotated[bool, typer.Option(help="GPS_RAW_INT carries h_acc.")] = True,
+    home_above_m: Annotated[float, typer.Option(help="Take-off point above the site.")] = 0.0,
     telemetry_gap: Annotated[str, typer.Option(help="FROM:TO seconds without packets.")] = "",
     log_lead_s: Annotated[float, typer.Option(help="How long the log begins earlier.")] = 0.0,
     blank: Annotated[list[str] | None, typer.Option(help="FRAME:COUNT black frames.")] = None,
@@ -94,7 +96,7 @@ def simulate(
             TelemetryOptions(
                 gimbal_frame, rangefinder,
                 _pair(telemetry_gap, "--telemetry-gap") if telemetry_gap else None, log_lead_s,
-                _pair(boresight_deg, "--boresight-deg"),
+                _pair(boresight_deg, "--boresight-deg"), gnss_accuracy, home_above_m,
             ),
             Look(noise=image_noise),
             recording.Faults(

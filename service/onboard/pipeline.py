@@ -20,6 +20,7 @@ from recon.camera_model import Undistorter, scaled
 from recon.graph.dead_reckoning import carried
 from recon.graph.fix_average import FixAverage
 from recon.graph.trajectory import Placed
+from recon.graph.travel import Odometer
 from recon.stereo.exposure import stretch
 from recon.stereo.virtual_stereo import View
 from recon.tracking.keyframe_window import landmarks
@@ -100,6 +101,7 @@ class Pipeline:
         self._segment = self.odometry.segment
         self.pieces = Pieces()
         self._fixes = FixAverage()
+        self._odometer = Odometer()
         self._priors: dict[int, PosePrior] = {}  # of the views that wait
         self._seen: tuple[int, PosePrior, Placed] | None = None  # what vision placed last
         self._latest: Offer | None = None  # the last tracked frame that did not become a view
@@ -111,7 +113,7 @@ class Pipeline:
 
         Raises ValueError when the picture is not of the camera model's size.
         """
-        prior = self.rig.prior(state, tag)
+        prior = self._odometer.take(frame.time_ns, self.rig.prior(state, tag))
         with self.stopwatch("undistort"):
             picture, grey, mask = self._pictures(frame.image)
         with self.stopwatch("track"):  # Harris and ZSSD (Eq. 4-5), EPnP (Eq. 6-7)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from service.georeference import LocalFrame
 ASSUMED_AGL_M = 50.0
 """Height above ground that gives a scan its scale when nothing else does (stated in it)."""
 
+ABOVE_HOME_SHARE = 0.25
+"""Sigma of a height above the take-off point as a height above ground, as a share of it."""
+
 MOUNT_TILT_SIGMA_RAD = math.radians(6.0)
 """How far a camera may lean from its nominal mount when no attitude is known."""
 
@@ -26,6 +30,14 @@ AT_REST_M_S, ON_GROUND_M = 0.3, 2.0
 
 NO_YAW_RAD = 3.0
 """Sigma of a heading that is not known."""
+
+
+class HeightSource(Enum):
+    """Where a height above ground comes from."""
+
+    MEASURED = "measured"  # by a rangefinder or over known terrain, or set by the operator
+    ABOVE_HOME = "above home"  # the site may lie higher or lower than the take-off point
+    ASSUMED = "assumed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +82,16 @@ class Rig:
         R, tilt, yaw = self._rotation(state, tag)
         fix = self._fix(state, tag)
         position, sigma = self._position(fix)
-        agl, sigma_agl = self._agl(state, tag)
+        agl, sigma_agl, source = self._agl(state, tag)
         lever = self._lever(state)
         position = None if position is None else position + lever
-        at_rest = state is not None and _is_at_rest(state)
-        prior = PosePrior(R, tilt, yaw, position, sigma, agl, sigma_agl, is_at_rest=at_rest)
+        prior = PosePrior(
+            R, tilt, yaw, position, sigma, agl, sigma_agl,
+            is_at_rest=state is not None and _is_at_rest(state),
+            is_agl_measured=source is HeightSource.MEASURED,
+        )  # fmt: skip
+        if state is not None and state.v_ned_m_s is not None and self._fusion.gnss:
+            prior = replace(prior, velocity_m_s=R_ENU_NED @ state.v_ned_m_s)
         if position is not None and state is not None and state.receiver is not None:
             above = state.receiver
             prior = replace(prior, above_m=above.above_m, above_fixes=1, above_ns=above.time_ns)
@@ -136,23 +153,29 @@ class Rig:
         enu = self.frame.to_enu(np.array([[fix.lat_deg, fix.lon_deg, altitude]]))[0]
         return enu, np.array([fix.sigma_h_m, fix.sigma_h_m, fix.sigma_v_m])
 
-    def _agl(self, state: VehicleState | None, tag: GeoTag | None) -> tuple[float, float]:
-        """Height above ground and its sigma in metres."""
+    def _agl(
+        self, state: VehicleState | None, tag: GeoTag | None
+    ) -> tuple[float, float, HeightSource]:
+        """Height above ground, its sigma in metres, and where it comes from."""
         if self._scan.assumed_agl_m is not None:
-            return self._scan.assumed_agl_m, 0.1 * self._scan.assumed_agl_m
+            agl = self._scan.assumed_agl_m
+            return agl, 0.1 * agl, HeightSource.MEASURED
         if state is not None and state.alt_agl_m is not None and state.alt_agl_m > 1.0:
             if self._fusion.altitude:
-                spread = state.sigma_agl_m or 3.0
-                agl = state.alt_agl_m + float(self._lever(state)[2])
-                return agl, max(spread, 0.03 * state.alt_agl_m)
+                agl = state.alt_agl_m
+                spread = max(state.sigma_agl_m or 3.0, 0.03 * agl)
+                raised = agl + float(self._lever(state)[2])
+                if "relative" not in state.sources:
+                    return raised, spread, HeightSource.MEASURED
+                return raised, max(spread, ABOVE_HOME_SHARE * agl), HeightSource.ABOVE_HOME
         elif tag is not None and tag.relative_alt_m is not None and tag.relative_alt_m > 1.0:
-            return tag.relative_alt_m, 0.1 * tag.relative_alt_m + 2.0
-        return ASSUMED_AGL_M, 0.5 * ASSUMED_AGL_M
+            agl = tag.relative_alt_m
+            return agl, ABOVE_HOME_SHARE * agl + 2.0, HeightSource.ABOVE_HOME
+        return ASSUMED_AGL_M, 0.5 * ASSUMED_AGL_M, HeightSource.ASSUMED
 
     def height_known(self, state: VehicleState | None, tag: GeoTag | None) -> bool:
         """False when the scan's scale rests on :data:`ASSUMED_AGL_M`."""
-        agl, _ = self._agl(state, tag)
-        return agl != ASSUMED_AGL_M
+        return self._agl(state, tag)[2] is not HeightSource.ASSUMED
 
 
 def _is_at_rest(state: VehicleState) -> bool:

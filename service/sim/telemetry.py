@@ -37,12 +37,16 @@ class TelemetryOptions:
     gap_s: tuple[float, float] | None = None  # nothing is sent between these times
     lead_s: float = 0.0  # how long before the first frame the log begins
     boresight_deg: tuple[float, float] = (0.0, 0.0)  # the camera looks right and up of it
+    accuracy: bool = True  # GPS_RAW_INT carries h_acc and v_acc
+    home_above_m: float = 0.0  # the take-off point above the ground at the world's origin
 
     def __post_init__(self) -> None:
         if not all(abs(angle) <= 45.0 for angle in self.boresight_deg):
             raise ValueError(f"boresight of {self.boresight_deg} deg is not within 45 deg")
         if not 0.0 <= self.lead_s <= LEAD_S:
             raise ValueError(f"log lead of {self.lead_s:g} s is not within 0 to {LEAD_S:g} s")
+        if not abs(self.home_above_m) <= 1000.0:
+            raise ValueError(f"home of {self.home_above_m:g} m above the site is not within 1000 m")
         if self.gimbal_frame not in ("earth", "vehicle"):
             raise ValueError(f"gimbal frame {self.gimbal_frame!r} is not 'earth' or 'vehicle'")
 
@@ -104,11 +108,11 @@ def _kinds(
     """The messages kind by kind, each kind in the order of time."""
     duration = sensors.flight.plan.duration_s
     kinds = [
-        _housekeeping(origin, epoch_unix_s, duration, dialect),
+        _housekeeping(origin, epoch_unix_s, duration, options, dialect),
         _attitude(sensors, duration, dialect),
         _gimbal(sensors, duration, options, dialect),
-        _position(sensors, origin, duration, dialect),
-        _satellites(sensors, origin, duration, dialect),
+        _position(sensors, origin, duration, options, dialect),
+        _satellites(sensors, origin, duration, options, dialect),
     ]
     if options.rangefinder:
         kinds.append(_range(sensors, ground_range, duration, dialect))
@@ -116,7 +120,11 @@ def _kinds(
 
 
 def _housekeeping(
-    origin: LocalFrame, epoch_unix_s: float, duration_s: float, dialect: Any
+    origin: LocalFrame,
+    epoch_unix_s: float,
+    duration_s: float,
+    options: TelemetryOptions,
+    dialect: Any,
 ) -> Iterator[Timed]:
     """HEARTBEAT (armed, in a mission), SYSTEM_TIME and HOME_POSITION, once a second."""
     lat, lon = round(origin.lat_deg * 1e7), round(origin.lon_deg * 1e7)
@@ -127,7 +135,7 @@ def _housekeeping(
         yield dialect.MAVLink_heartbeat_message(26, 8, 0, 0, 4, 3), GIMBAL_COMPONENT, float(t)
         unix_us, boot_ms = round((epoch_unix_s + t) * 1e6), int(_boot_ms(np.array([t]))[0])
         yield dialect.MAVLink_system_time_message(unix_us, boot_ms), 1, float(t) + 0.001
-        alt = round(origin.alt_amsl_m * 1e3)
+        alt = round((origin.alt_amsl_m + options.home_above_m) * 1e3)
         home = dialect.MAVLink_home_position_message(lat, lon, alt, 0, 0, 0, level, 0, 0, 0)
         yield home, 1, float(t) + 0.002
 
@@ -166,7 +174,11 @@ def _gimbal(
 
 
 def _position(
-    sensors: Sensors, origin: LocalFrame, duration_s: float, dialect: Any
+    sensors: Sensors,
+    origin: LocalFrame,
+    duration_s: float,
+    options: TelemetryOptions,
+    dialect: Any,
 ) -> Iterator[Timed]:
     """GLOBAL_POSITION_INT at 10 Hz."""
     t = _times(10.0, duration_s) + 0.001
@@ -178,19 +190,25 @@ def _position(
         lat, lon = round(geodetic[k, 0] * 1e7), round(geodetic[k, 1] * 1e7)
         ned = round(v[k, 1] * 100), round(v[k, 0] * 100), round(-v[k, 2] * 100)
         yield dialect.MAVLink_global_position_int_message(
-            int(boot), lat, lon, round(geodetic[k, 2] * 1e3), round(at[k, 2] * 1e3), *ned,
+            int(boot), lat, lon, round(geodetic[k, 2] * 1e3),
+            round((at[k, 2] - options.home_above_m) * 1e3), *ned,
             round(float(yaw[k]) * 100) % 36000,
         ), 1, float(t[k])  # fmt: skip
 
 
 def _satellites(
-    sensors: Sensors, origin: LocalFrame, duration_s: float, dialect: Any
+    sensors: Sensors,
+    origin: LocalFrame,
+    duration_s: float,
+    options: TelemetryOptions,
+    dialect: Any,
 ) -> Iterator[Timed]:
     """GPS_RAW_INT at 5 Hz."""
     t = _times(5.0, duration_s) + 0.004
     geodetic = origin.to_geodetic(sensors.gps(t))
     v = sensors.flight.velocity(t)
     h_acc = round(1e3 * max(0.02, np.hypot(sensors.noise.gps_m, sensors.noise.gps_white_m)))
+    h_acc *= options.accuracy  # 0: unknown
     for k, boot in enumerate(_boot_ms(t)):
         course = round(float(np.degrees(np.arctan2(v[k, 0], v[k, 1]))) * 100) % 36000
         yield dialect.MAVLink_gps_raw_int_message(

@@ -1,0 +1,138 @@
+"""How much a sensor errs along one flight, from its residuals against vision.
+
+A receiver's error has a part that is new in each reading (white) and a part that wanders
+(first-order Gauss-Markov). The variogram D(h), the mean square of the change of the residual over
+a lag h, separates them: D(h) = 2 white^2 + 2 wander^2 (1 - exp(-h / tau)) (Cressie, Statistics
+for Spatial Data, 1993, section 2.3.1). Medians stand for means, so that jumps do not count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import nnls
+from scipy.stats import chi2
+
+from recon.types import F64
+
+MIN_READINGS = 12
+"""Readings from which on their scatter is measured."""
+
+TAUS_S = (2.0, 5.0, 10.0, 20.0, 40.0)
+"""Time constants that are tried."""
+
+TAUS_SEEN = 2.5
+"""Time constants that the longest lag must span, so that the variogram is seen to level off."""
+
+SURE_OF_WANDER = 1.4
+"""A wander is accepted when the variogram fits so many times better with it."""
+
+PRECISE_TAU_S = 10.0
+"""Time constant of a receiver's wander with RTK or PPK."""
+
+LEAST_WANDER = 0.25
+"""Of what a receiver claims, what it always wanders by."""
+
+PRECISE_M = 0.3
+"""Fixes of a smaller sigma are RTK's or PPK's."""
+
+LAG_SHARE = 1.0 / 6.0
+"""Of the span, the longest lag: a fit to the readings hides what they share over longer ones."""
+
+LAGS = 12
+
+MAX_PAIRED = 400
+"""Readings that are compared with each other; of more, every n-th."""
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Errors of one kind of reading, 1 sigma per axis, in the readings' unit."""
+
+    white: float
+    wander: float
+    tau_s: float
+
+    @property
+    def total(self) -> float:
+        """Of one reading."""
+        return float(np.hypot(self.white, self.wander))
+
+    def bounded(self, claimed: float, usual_tau_s: float) -> Noise:
+        """The same with a wander between a share of what the sensor claims and all of that.
+
+        A steady drift of the sensor looks like another scale and cannot be measured, so a share
+        is always there. What was measured beyond the claim is vision's own drift. In both cases
+        the time constant is not the sensor's, and the usual one stands in for it.
+        """
+        least, most = LEAST_WANDER * claimed, claimed
+        if least <= self.wander <= most or usual_tau_s <= 0:
+            return self
+        tau_s = PRECISE_TAU_S if claimed < PRECISE_M else usual_tau_s
+        return replace(self, wander=min(max(self.wander, least), most), tau_s=tau_s)
+
+    def of_each(self, count: int, span_s: float) -> float:
+        """The sigma of each of ``count`` readings over ``span_s``, as if all were independent.
+
+        A wander counts as 1 + span / (2 tau) independent errors.
+        """
+        independent = min(1.0 + span_s / (2.0 * self.tau_s), count)
+        return float(np.sqrt(self.white**2 + self.wander**2 * count / independent))
+
+
+def wander_noise(times_s: F64, residuals: F64, usual_tau_s: float) -> Noise | None:
+    """The noise of readings with (N, axes) ``residuals`` at (N,) times; None for too few.
+
+    ``usual_tau_s`` is the time constant of a wander too slow to be measured; 0: none wanders.
+    """
+    lag, change = variogram(times_s, residuals)
+    if len(lag) < 3:
+        return None
+    weight = np.sqrt(lag[-1] / lag) / np.maximum(change, 1e-12 + 0.01 * change.max())
+    found = []
+    taus = [tau for tau in TAUS_S if tau <= lag[-1] / TAUS_SEEN]
+    for tau_s in [*taus, usual_tau_s] if usual_tau_s > 0 else []:
+        columns = np.column_stack([np.full(len(lag), 2.0), 2.0 * (1.0 - np.exp(-lag / tau_s))])
+        parts, error = nnls(columns * weight[:, None], change * weight)
+        found.append((error, tau_s, parts))
+    white, flat_error = nnls(2.0 * weight[:, None], change * weight)
+    error, tau_s, parts = min(found, key=lambda one: one[0], default=(np.inf, 1.0, white))
+    if flat_error < SURE_OF_WANDER * error:
+        return Noise(float(np.sqrt(white[0])), 0.0, max(usual_tau_s, 1.0))
+    return Noise(float(np.sqrt(parts[0])), float(np.sqrt(parts[1])), tau_s)
+
+
+def drift_noise(times_s: F64, residuals: F64) -> tuple[float, float] | None:
+    """Random walk (m / sqrt(s)) and constant rate (m / s) of a drift, 1 sigma per axis.
+
+    ``residuals`` (N, axes) m are an integrated velocity's at (N,) times; None for too few.
+    """
+    lag, change = variogram(times_s, residuals)
+    if len(lag) < 3:
+        return None
+    weight = np.sqrt(lag[-1] / lag) / np.maximum(change, 1e-12 + 0.01 * change.max())
+    columns = np.column_stack([lag, lag**2])
+    parts, _ = nnls(columns * weight[:, None], change * weight)
+    return float(np.sqrt(parts[0])), float(np.sqrt(parts[1]))
+
+
+def variogram(times_s: F64, residuals: F64) -> tuple[F64, F64]:
+    """Lags (L,) s up to a sixth of the span, and the robust mean square (L,) of the change."""
+    if len(times_s) < MIN_READINGS:
+        return np.zeros(0), np.zeros(0)
+    step = max(1, len(times_s) // MAX_PAIRED)
+    t, e = times_s[::step], residuals[::step]
+    a, b = np.triu_indices(len(t), 1)
+    h = np.abs(t[b] - t[a])
+    near = (h > 0) & (h <= LAG_SHARE * float(np.ptp(t)))
+    if not near.any():
+        return np.zeros(0), np.zeros(0)
+    h, square = h[near], np.mean((e[b[near]] - e[a[near]]) ** 2, axis=1)
+    axes = e.shape[1]
+    edges = np.geomspace(h.min() * 0.999, h.max() * 1.001, LAGS + 1)
+    bins = np.digitize(h, edges)
+    used = [k for k in range(1, LAGS + 1) if np.count_nonzero(bins == k) >= MIN_READINGS // 2]
+    lag = np.array([np.mean(h[bins == k]) for k in used])
+    change = np.array([np.median(square[bins == k]) for k in used])
+    return lag, change * axes / chi2.median(axes)

@@ -1,0 +1,138 @@
+"""Telemetry weighs by what its residuals show, and velocity gives the scale."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.graph.alignment import Anchor, fit
+from recon.graph.sensor_noise import Noise, drift_noise, wander_noise
+from recon.graph.travel import Odometer
+from recon.types import F64, PosePrior, Travel
+
+NADIR = np.diag([1.0, -1.0, -1.0])
+SPEED_M_S = 5.0
+
+
+def seconds(count: int, step_s: float = 1.0) -> F64:
+    return np.arange(count, dtype=np.float64) * step_s
+
+
+def gauss_markov(rng: np.random.Generator, times: F64, sigma: float, tau_s: float) -> F64:
+    """(N, 2) first-order Gauss-Markov errors."""
+    keep = np.exp(-np.diff(times) / tau_s)
+    out = rng.normal(size=(len(times), 2)) * sigma
+    for i, k in enumerate(keep, 1):
+        out[i] = k * out[i - 1] + np.sqrt(1 - k * k) * out[i]
+    return np.asarray(out)
+
+
+@pytest.mark.parametrize(("white", "wander", "tau_s"), [(1.0, 0.0, 60.0), (0.1, 1.5, 5.0)])
+def test_white_noise_and_wander_are_separated(white: float, wander: float, tau_s: float) -> None:
+    found = []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        times = seconds(300, 2.0)
+        errors = gauss_markov(rng, times, wander, tau_s) + white * rng.normal(size=(300, 2))
+        noise = wander_noise(times, errors, 60.0)
+        assert noise is not None
+        found.append((noise.white, noise.wander, noise.of_each(300, 600.0)))
+    each = Noise(white, wander, tau_s).of_each(300, 600.0)
+    assert np.median(found, axis=0) == pytest.approx([white, wander, each], rel=0.2, abs=0.15)
+
+
+def test_outliers_do_not_count_as_noise() -> None:
+    rng = np.random.default_rng(1)
+    times = seconds(100)
+    errors = 0.5 * rng.normal(size=(100, 2))
+    errors[10:90:9] += 40.0
+    noise = wander_noise(times, errors, 60.0)
+    assert noise is not None and noise.total < 1.0
+
+
+@pytest.mark.parametrize(("walk", "rate"), [(0.1, 0.0), (0.02, 0.05), (0.1, 0.05)])
+def test_a_drift_is_known_after_a_minute(walk: float, rate: float) -> None:
+    """What walk and rate add up to over 60 s, whichever of them it is counted as."""
+    after_m = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        times = seconds(400)
+        drift: F64 = np.cumsum(walk * rng.normal(size=(400, 3)), axis=0)
+        drift = drift + times[:, None] * rate * np.array([1.0, -1.0, 1.0])
+        found = drift_noise(times, drift)
+        assert found is not None
+        after_m.append(np.hypot(found[0] * 60.0**0.5, found[1] * 60.0))
+    truth_m = np.hypot(walk * 60.0**0.5, rate * 60.0)
+    assert np.median(after_m) == pytest.approx(truth_m, rel=0.35)
+    assert drift_noise(times[:5], drift[:5]) is None
+
+
+def anchors(stretch: float, claimed_m: float, seed: int = 3, travel: bool = True) -> list[Anchor]:
+    """30 s along a line at 60 m; fixes drift so that the line seems ``stretch`` times as long."""
+    rng, out = np.random.default_rng(seed), []
+    for i in range(30):
+        at = np.array([SPEED_M_S * i, 0.3 * np.sin(0.4 * i), 60.0])
+        fix = at * [stretch, 1.0, 1.0] + 0.05 * rng.normal(size=3)
+        way = Travel(at + 0.03 * rng.normal(size=3), float(i), 1) if travel else None
+        prior = PosePrior(
+            NADIR, 0.01, 0.05, fix, np.full(3, claimed_m), None, travel=way, is_agl_measured=False
+        )
+        out.append(Anchor(se3.compose(NADIR, at / 1.5), prior, 40.0, 0.0, float(i)))
+    return out
+
+
+def test_velocity_gives_the_scale_where_fixes_drift() -> None:
+    drifting = fit(anchors(1.006, 2.0))
+    alone = fit(anchors(1.006, 2.0, travel=False))
+    assert drifting is not None and alone is not None
+    assert drifting.scale == pytest.approx(1.5, rel=0.002)
+    assert alone.scale == pytest.approx(1.5 * 1.006, rel=0.002)
+    assert abs(np.log(drifting.scale / 1.5)) < 2.0 * drifting.sigma_scale
+
+
+def test_fixes_of_a_precise_receiver_outweigh_velocity() -> None:
+    some = anchors(1.0, 0.02)
+    for i, a in enumerate(some):
+        slow = Travel(0.99 * a.T_odom_camera[:3, 3] * 1.5, float(i), 1)
+        some[i] = replace(a, prior=replace(a.prior, travel=slow))
+    found = fit(some)
+    assert found is not None
+    assert found.scale == pytest.approx(1.5, rel=0.002)
+
+
+@pytest.mark.parametrize("claimed_m", [1.0, 5.0])
+def test_a_take_off_point_above_the_site_does_not_bend_the_scale(claimed_m: float) -> None:
+    some = []
+    for a in anchors(1.0, claimed_m):
+        some.append(replace(a, prior=replace(a.prior, agl_m=40.0, sigma_agl_m=10.0)))
+    found = fit(some)
+    assert found is not None
+    assert found.scale == pytest.approx(1.5, rel=0.002)
+
+
+def test_velocities_that_contradict_the_fixes_are_left_out() -> None:
+    standing = [
+        replace(a, prior=replace(a.prior, travel=Travel(np.zeros(3), float(i), 1)))
+        for i, a in enumerate(anchors(1.0, 1.0))
+    ]
+    found = fit(standing)
+    assert found is not None
+    assert found.scale == pytest.approx(1.5, rel=0.002)
+
+
+def test_velocity_is_integrated_until_a_gap() -> None:
+    odometer = Odometer()
+    prior = PosePrior(velocity_m_s=np.array([4.0, 0.0, 0.0]))
+    faster = PosePrior(velocity_m_s=np.array([6.0, 0.0, 0.0]))
+    assert odometer.take(0, PosePrior()).travel is None
+    steps = [odometer.take(t, p).travel for t, p in ((10**9, prior), (2 * 10**9, faster))]
+    assert steps[0] is not None and steps[1] is not None
+    np.testing.assert_allclose(steps[1].metres - steps[0].metres, [5.0, 0.0, 0.0])
+    assert (steps[1].seconds, steps[1].run) == (1.0, steps[0].run)
+    after = odometer.take(20 * 10**9, faster).travel
+    assert after is not None and after.run != steps[1].run and after.seconds == 0.0
+    back = odometer.take(19 * 10**9, faster).travel
+    assert back is not None and back.run != after.run
