@@ -20,6 +20,8 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 pytest.importorskip("websockets")
 
+from portal_client import TOKEN, Client, FakeOperator, flown_store, serving
+
 from recon import se3
 from service.errors import InputError, OutsideError
 from service.ground.library import Library
@@ -28,7 +30,6 @@ from service.ground.portal import Portal, PortalConfig, open_portal, parse_addre
 from service.ground.scan_files import DARK
 from service.ground.scan_files import _closed as closed_picture
 from service.ground.vehicle import Vehicle
-from service.scans.folder import write_deliverables
 from service.stream.codec import encode
 from service.stream.records import Repose, ScanHeader
 from service.stream.store import ScanStore
@@ -36,56 +37,16 @@ from service.stream.store import ScanStore
 if TYPE_CHECKING:
     from conftest import HouseFlight
 
-TOKEN = "a-token-of-enough-letters"
-
-
-class Client:
-    """Requests to a portal on this machine."""
-
-    def __init__(self, portal: Portal) -> None:
-        self.base = portal.url.split("/?")[0]
-
-    def ask(
-        self,
-        path: str,
-        method: str = "GET",
-        body: Any = None,
-        token: str | None = TOKEN,
-        headers: dict[str, str] | None = None,
-    ) -> tuple[int, Any, dict[str, str]]:
-        """Status, JSON (or bytes) and headers."""
-        data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(self.base + path, data, method=method)
-        for name, value in (headers or {}).items():
-            request.add_header(name, value)
-        if token is not None:
-            request.add_header("Authorization", f"Bearer {token}")
-        try:
-            with urllib.request.urlopen(request, timeout=10) as answer:
-                content, status, found = answer.read(), answer.status, dict(answer.headers)
-        except urllib.error.HTTPError as error:
-            content, status, found = error.read(), error.code, dict(error.headers)
-        found = {name.lower(): value for name, value in found.items()}
-        if found.get("content-type", "").startswith("application/json"):
-            return status, json.loads(content), found
-        return status, content, found
-
 
 @pytest.fixture
 def store(tmp_path: Path, house: HouseFlight) -> Path:
-    root = tmp_path / "scans"
-    folder = root / "drone-1" / "test-1"
-    with house.flown(folder) as scan:
-        write_deliverables(folder, scan, {})
-    return root
+    return flown_store(tmp_path / "scans", house)
 
 
 @pytest.fixture
 def client(store: Path) -> Iterator[Client]:
-    portal = Portal(PortalConfig(store, port=0, token=TOKEN))
-    portal.start()
-    yield Client(portal)
-    portal.close()
+    with serving(store) as client:
+        yield client
 
 
 def test_the_list_shows_the_scan(client: Client, store: Path) -> None:
@@ -546,29 +507,6 @@ def test_unfit_tokens_and_certificates_are_said(store: Path, tmp_path: Path) -> 
     ):
         with pytest.raises(InputError):
             open_portal("127.0.0.1:0", store, **options)
-
-
-class FakeOperator:
-    """Stands in for mavsdk: answers orders and lets a test say what the vehicle sends."""
-
-    system = 7
-
-    def __init__(self, result: int = 0) -> None:
-        self.result, self.closed = result, False
-        self.commands: list[tuple[int, int, tuple[float, ...]]] = []
-        self.callbacks: dict[str, Any] = {}
-
-    def subscribe(self, name: str, callback: Any) -> None:
-        self.callbacks[name] = callback
-
-    def command(self, number: int, component: int, params: tuple[float, ...] = ()) -> Any:
-        from service.ground.operator import Ack
-
-        self.commands.append((number, component, params))
-        return Ack(7, component, self.result)
-
-    def __exit__(self, *_: object) -> None:
-        self.closed = True
 
 
 def test_orders_and_figures_of_the_vehicle(store: Path) -> None:

@@ -1,0 +1,95 @@
+"""What the tests of the portal share: a client, a store with a scan, a vehicle's other end."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from service.ground.portal import Portal, PortalConfig
+from service.scans.folder import write_deliverables
+
+if TYPE_CHECKING:
+    from conftest import HouseFlight
+
+TOKEN = "a-token-of-enough-letters"
+ONE = "/api/scans/drone-1/test-1"
+"""The scan of :func:`flown_store`."""
+
+
+class Client:
+    """Requests to a portal on this machine."""
+
+    def __init__(self, portal: Portal) -> None:
+        self.base = portal.url.split("/?")[0]
+
+    def ask(
+        self,
+        path: str,
+        method: str = "GET",
+        body: Any = None,
+        token: str | None = TOKEN,
+        headers: dict[str, str] | None = None,
+    ) -> tuple[int, Any, dict[str, str]]:
+        """Status, JSON (or bytes) and headers."""
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(self.base + path, data, method=method)
+        for name, value in (headers or {}).items():
+            request.add_header(name, value)
+        if token is not None:
+            request.add_header("Authorization", f"Bearer {token}")
+        try:
+            with urllib.request.urlopen(request, timeout=10) as answer:
+                content, status, found = answer.read(), answer.status, dict(answer.headers)
+        except urllib.error.HTTPError as error:
+            content, status, found = error.read(), error.code, dict(error.headers)
+        found = {name.lower(): value for name, value in found.items()}
+        if found.get("content-type", "").startswith("application/json"):
+            return status, json.loads(content), found
+        return status, content, found
+
+
+def flown_store(root: Path, house: HouseFlight) -> Path:
+    """``root`` with the scan drone-1/test-1 and its files in it."""
+    folder = root / "drone-1" / "test-1"
+    with house.flown(folder) as scan:
+        write_deliverables(folder, scan, {})
+    return root
+
+
+@contextlib.contextmanager
+def serving(store: Path) -> Iterator[Client]:
+    """A client of a portal on ``store``."""
+    portal = Portal(PortalConfig(store, port=0, token=TOKEN))
+    portal.start()
+    try:
+        yield Client(portal)
+    finally:
+        portal.close()
+
+
+class FakeOperator:
+    """Stands in for mavsdk: answers orders and lets a test say what the vehicle sends."""
+
+    system = 7
+
+    def __init__(self, result: int = 0) -> None:
+        self.result, self.closed = result, False
+        self.commands: list[tuple[int, int, tuple[float, ...]]] = []
+        self.callbacks: dict[str, Any] = {}
+
+    def subscribe(self, name: str, callback: Any) -> None:
+        self.callbacks[name] = callback
+
+    def command(self, number: int, component: int, params: tuple[float, ...] = ()) -> Any:
+        from service.ground.operator import Ack
+
+        self.commands.append((number, component, params))
+        return Ack(7, component, self.result)
+
+    def __exit__(self, *_: object) -> None:
+        self.closed = True
