@@ -192,7 +192,7 @@ def _open_portal(
         from service.ground.portal import open_portal
         from service.ground.vehicle import Vehicle
     vehicle = None if endpoint is None else Vehicle(endpoint, workers=workers)
-    page = open_portal(address, store, receiver.progress, token, tls, vehicle)
+    page = open_portal(address, store, receiver.progress, token, tls, vehicle, workers)
     if vehicle is not None:
         vehicle.start()
     print(f"portal: {page.url}", file=sys.stderr, flush=True)
