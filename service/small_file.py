@@ -9,23 +9,23 @@ from pathlib import Path
 from service.errors import InputError
 
 
-def read_small(path: Path, most_bytes: int, what: str) -> bytes:
+def read_small(path: Path, max_bytes: int, what: str) -> bytes:
     """The bytes of the regular file at ``path``, a ``what``.
 
     Raises InputError, in one line, for a missing file, a folder, a device or pipe, and a file
-    larger than ``most_bytes``.
+    larger than ``max_bytes``.
     """
     try:
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # no pipe makes us wait
         with open(handle, "rb") as file:
             if not stat.S_ISREG(os.fstat(handle).st_mode):
                 raise InputError(f"{path} is no regular file; give the {what} itself")
-            data = file.read(most_bytes + 1)
+            data = file.read(max_bytes + 1)
     except FileNotFoundError:
         raise InputError(f"{path} cannot be read: no such file; give the {what}") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path} cannot be read: {reason}") from error
-    if len(data) > most_bytes:
-        raise InputError(f"{path} is larger than {most_bytes} bytes; is it a {what}?")
+    if len(data) > max_bytes:
+        raise InputError(f"{path} is larger than {max_bytes} bytes; is it a {what}?")
     return data

@@ -1,4 +1,4 @@
-"""Whole scans with records that nobody's camera made: the rest of the scan is delivered."""
+"""Whole scans with records that no camera made: the rest of the scan is delivered."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from conftest import HouseFlight
 
-from recon.types import DepthMap, Keyframe
+from recon.types import DepthMap, Keyframe, Pose
 from service.errors import InputError
 from service.exports.view import ExportOptions, ScanView, export
+from service.refine.refinement import RefineOptions, refine
 from service.scans.folder import CLOUD, CSV, PREVIEW, TUM, write_deliverables
 from service.stream.codec import encode
 from service.stream.records import Repose, pack_pose, pack_repose
@@ -132,3 +133,23 @@ def test_extreme_records_within_bounds_give_files_or_one_line(
                 export(scan, kind, None, ExportOptions())
         except InputError as error:
             assert "\n" not in str(error)
+
+
+def test_poses_that_cannot_be_adjusted_are_said_in_one_line(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    """Two keyframes a million metres above and below the others."""
+    with house.flown(tmp_path) as store:
+        for seq, up_m in ((9, 9e5), (10, -9e5)):
+            k = house.keyframe(seq, 1.0)
+            T = k.depth.T_world_camera.copy()
+            T[2, 3] = up_m
+            d = k.depth
+            depth = DepthMap(d.depth_m, d.sigma_m, d.views, d.K, T)
+            pose = Pose(T, np.eye(6))
+            store.add_keyframe(
+                seq, encode(Keyframe(seq, k.time_ns, depth, k.bgr, pose, k.fresh), 1)
+            )
+        store.finish({})
+    with pytest.raises(InputError, match="contradict each other"):
+        refine(tmp_path, RefineOptions(None, None, None, True))

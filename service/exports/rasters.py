@@ -27,7 +27,7 @@ from service.scans.writing import writing
 
 NODATA_M = -9999.0
 SHORTEST_CONTOUR_CELLS = 12
-MOST_CONTOURS = 5000
+MAX_CONTOURS = 5000
 """Heights at which contours are drawn: every metre up to the highest mountains."""
 OPEN_STEP_M = 2
 SIDEWAYS_DEG = 15.0
@@ -165,7 +165,7 @@ def contour_lines(raster: Raster, step_m: float) -> Iterator[tuple[float, F64]]:
     filled = np.where(known, raster.height_m, np.float32(np.nanmedian(raster.height_m)))
     smooth = cv2.GaussianBlur(filled.astype(np.float32), (0, 0), 1.5)
     low, high = float(smooth[known].min()), float(smooth[known].max())
-    if (high - low) / step_m > MOST_CONTOURS:
+    if (high - low) / step_m > MAX_CONTOURS:
         raise InputError(
             f"contours every {step_m:g} m over {high - low:.0f} m of height are too many; "
             "give a larger --contour-m"

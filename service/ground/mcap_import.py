@@ -33,7 +33,7 @@ from service.stream.validity import MAX_SIGMA_M, is_pinhole, is_position
 log = logging.getLogger(__name__)
 
 HEADER = re.compile(r"scan (\S+) of (\S+), (.*), origin (\S+), (\S+), (\S+) m")
-MOST_WAITING = 4
+MAX_WAITING = 4
 """Keyframes of which something is missing: the recording has their parts one after the other."""
 USED = ("/points", "/image", "/camera", "/pose", "/fix", "/log")
 NOTE = "imported from an MCAP: covariances of rotation and settings are not known"
@@ -83,7 +83,7 @@ def store_from_mcap(path: Path, out: Path) -> ScanStore:
                 parts[topic] = message
                 if len(parts) == 3:
                     count += _add_keyframe(store, waiting.pop(time_ns), time_ns)
-                elif len(waiting) > MOST_WAITING:
+                elif len(waiting) > MAX_WAITING:
                     del waiting[next(iter(waiting))]
             elif topic in ("/pose", "/fix"):
                 track.add(topic, time_ns, message)

@@ -347,7 +347,12 @@ class _Refinement:
         while True:
             used = [c for c in candidates if c.usable and not c.point.is_check]
             marks = [m for c in used for m in c.marks]
-            found = adjust(track, points, marks, self._config())
+            try:
+                found = adjust(track, points, marks, self._config())
+            except RuntimeError as error:  # so the solver says that the system is ill-posed
+                raise InputError(
+                    "the poses of this scan contradict each other too far to be adjusted"
+                ) from error
             worst, by = None, 1.0
             for one in used:
                 after = map_position(found.poses, found.scales, one.marks)

@@ -19,7 +19,7 @@ import numpy as np
 from recon.types import F64, DepthMap, Keyframe
 from service.errors import InputError
 from service.stream import layer
-from service.stream.database import Database, Statement, blob
+from service.stream.database import Database, Statement, blob, json_object
 from service.stream.records import (
     PoseRecord,
     Repose,
@@ -30,7 +30,7 @@ from service.stream.records import (
     unpack_pose,
     unpack_repose,
 )
-from service.stream.store import ScanStore, json_object
+from service.stream.store import ScanStore
 
 REFINED = 1_000_000
 """Revisions of refinements begin here; a flight's own stay far below."""

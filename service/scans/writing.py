@@ -28,5 +28,5 @@ def writing(path: Path) -> Iterator[Path]:
             f"cannot write {path} ({error.strerror or error}); check the disk and its rights"
         ) from error
     finally:
-        with suppress(OSError):  # the disk that cannot be written cannot be tidied either
+        with suppress(OSError):  # the disk that cannot be written cannot be cleaned either
             part.unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import sqlite3
 import threading
@@ -20,6 +21,20 @@ Statement = tuple[str, tuple[Any, ...]]
 def blob(value: object) -> bytes:
     """The bytes in a column; none when the file has something else there."""
     return value if isinstance(value, bytes) else b""
+
+
+def json_value(text: object) -> Any:
+    """What a text of the file says; None unless it is JSON."""
+    try:
+        return json.loads(text) if isinstance(text, str) else None
+    except (ValueError, RecursionError):
+        return None
+
+
+def json_object(text: object) -> dict[str, Any]:
+    """The JSON object in a text of the file; empty when there is none."""
+    value = json_value(text)
+    return value if isinstance(value, dict) else {}
 
 
 class Database:

@@ -67,7 +67,7 @@ def header_from_json(data: bytes) -> ScanHeader | None:
 
 
 def read_header(data: bytes) -> ScanHeader | str:
-    """The header in ``data``, or what is wrong with it."""
+    """The header in ``data``, or the fault in it."""
     if len(data) > MAX_HEADER_BYTES:
         return f"it has {len(data)} bytes, at most {MAX_HEADER_BYTES} are allowed"
     try:

@@ -19,7 +19,7 @@ from typing import Any
 from recon.types import Keyframe
 from service.errors import InputError
 from service.stream import codec, layer
-from service.stream.database import Database, blob
+from service.stream.database import Database, blob, json_object, json_value
 from service.stream.inventory import Inventory, Listener
 from service.stream.radio_store import RadioStore
 from service.stream.ranges import RangeSet, is_number, ranges_from_pairs
@@ -418,20 +418,6 @@ class ScanStore:
     def _next_id(self, table: str) -> int:
         row = self._db.one(f"SELECT MAX(id) FROM {table} WHERE {is_number('id')}")
         return 1 if row is None or row[0] is None else int(row[0]) + 1
-
-
-def json_value(text: object) -> Any:
-    """What a text of the file says; None unless it is JSON."""
-    try:
-        return json.loads(text) if isinstance(text, str) else None
-    except (ValueError, RecursionError):
-        return None
-
-
-def json_object(text: object) -> dict[str, Any]:
-    """The JSON object in a text of the file; empty when there is none."""
-    value = json_value(text)
-    return value if isinstance(value, dict) else {}
 
 
 def header_of(path: Path) -> ScanHeader | None:

@@ -57,7 +57,7 @@ _Side = Annotated[int, Meta(ge=1, le=65_535)]
 
 
 class _CameraJson(msgspec.Struct):
-    """What a header may say of its camera; the rest is passed over."""
+    """The camera in a header; other keys are passed over."""
 
     width: _Side | None = None
     height: _Side | None = None
@@ -107,7 +107,7 @@ def summary_from_json(data: bytes) -> dict[str, Any] | None:
 
 
 def fault_of_camera(camera: dict[str, Any]) -> str:
-    """What is wrong with a header's camera; empty when nothing is."""
+    """The fault in a header's camera; empty when there is none."""
     try:
         found = msgspec.convert(camera, _CameraJson)
     except msgspec.ValidationError as error:
@@ -117,12 +117,14 @@ def fault_of_camera(camera: dict[str, Any]) -> str:
     fx, _, cx, _, fy, cy, *_ = found.K
     width, height = found.width or 65_535, found.height or 65_535
     if not is_pinhole((fx, fy, cx, cy), (width, height)):
-        return f"camera: fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g} fit no {width}x{height} picture"
+        return (
+            f"camera: fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g} fit no image of {width}x{height}"
+        )
     return ""
 
 
 def is_pinhole(optics_px: tuple[float, float, float, float], size_px: tuple[int, int]) -> bool:
-    """Whether fx, fy, cx, cy are those of a pinhole camera with pictures of (W, H) pixels."""
+    """Whether fx, fy, cx, cy are those of a pinhole camera with images of (W, H) pixels."""
     fx, fy, cx, cy = optics_px
     w, h = size_px
     if not (all(map(math.isfinite, optics_px)) and fx > 0.0 and fy > 0.0):
