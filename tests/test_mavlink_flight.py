@@ -193,13 +193,13 @@ def _check_tags(lines: list[str]) -> None:
 
 
 def _check_odometry(told: list[Any]) -> None:
-    """It flies east at the pace of the pictures, level, at the height that it was told."""
+    """It flies east, level, at the pace of the images; after a long step no velocity is known."""
     moving = told[10:20]
     assert [m.q[0] for m in moving] == pytest.approx([1.0] * 10, abs=0.01)
     east = [m.y for m in moving]
     speed = (east[-1] - east[0]) / (moving[-1].time_usec - moving[0].time_usec) * 1e6
     assert speed == pytest.approx(SPEED_M_S, rel=0.15)
-    assert np.median([m.vx for m in moving]) == pytest.approx(0.0, abs=1.0)
-    assert np.median([m.vy for m in moving]) == pytest.approx(SPEED_M_S, rel=0.25)
+    assert np.nanmedian([m.vx for m in moving]) == pytest.approx(0.0, abs=1.0)
+    assert np.nanmedian([m.vy for m in moving]) == pytest.approx(SPEED_M_S, rel=0.25)
     assert all(m.pose_covariance[0] > 0.0 and m.quality > 0 for m in moving)
     assert (moving[0].frame_id, moving[0].child_frame_id) == (20, 12)
