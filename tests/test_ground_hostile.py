@@ -21,6 +21,7 @@ from loopback import free_port, until
 
 from service.config import DatalinkConfig
 from service.ground import drone as drone_module
+from service.ground import drones as drones_module
 from service.ground import receiver as receiver_module
 from service.ground.drone import Limits
 from service.ground.inbox import MAX_HEADS, MAX_ITEM_BYTES, MAX_ITEMS, Inbox
@@ -187,7 +188,7 @@ def test_junk_makes_no_folder(tmp_path: Path) -> None:
 def test_scans_are_open_only_while_they_are_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(receiver_module, "MAX_OPEN_SCANS", 3)
+    monkeypatch.setattr(drones_module, "MAX_OPEN_SCANS", 3)
     most = 0
     with serving(tmp_path / "ground") as (ground, endpoint):
         stores = [scan_of(tmp_path, "red", f"scan-{k}") for k in range(10)]
@@ -297,7 +298,7 @@ def test_an_inbox_holds_no_more_than_its_bounds() -> None:
 def test_many_drones_share_the_station_and_one_more_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(receiver_module, "MAX_DRONES", 3)
+    monkeypatch.setattr(drones_module, "MAX_DRONES", 3)
     with serving(tmp_path / "ground") as (ground, endpoint), hostile(endpoint) as session:
         for name in ("a", "b", "c"):
             assert until(partial(_introduced, ground, session, name, "scan-1"))
@@ -306,6 +307,48 @@ def test_many_drones_share_the_station_and_one_more_is_refused(
         assert until(lambda: ground.dropped >= 50)
         assert {entry["drone"] for entry in ground.progress()} == {"a", "b", "c"}
         assert not list((tmp_path / "ground").glob("invented-*"))
+
+
+def test_a_silent_drone_has_no_worker_and_its_scans_stay_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drones_module, "DRONE_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(drone_module, "CLOSE_WHOLE_AFTER_S", 0.0)
+    written: list[str] = []
+    monkeypatch.setattr(receiver_module, "deliver", lambda scan: written.append(scan.name))
+    with serving(tmp_path / "ground") as (ground, endpoint):
+        for scan_id in ("first", "second"):
+            store = scan_of(tmp_path, "red", scan_id)
+            link = DatalinkSender(store, DatalinkConfig(connect=(endpoint,)))
+            assert link.drain(20.0)
+            until(lambda: all(entry["complete"] for entry in ground.progress()))
+            link.close()
+            store.close()
+            until(lambda: not any(w["name"] == "drone red" for w in _running(ground)))
+        entries = ground.progress()
+        assert [(entry["scan"], entry["open"]) for entry in entries] == [
+            ("first", False),
+            ("second", False),
+        ]
+        assert written == ["first", "second"]
+
+
+def _running(ground: Receiver) -> list[dict[str, object]]:
+    return [worker for worker in ground.workers.report() if worker["state"] == "running"]
+
+
+def test_unfinished_records_of_all_scans_of_a_drone_share_one_bound(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drone_module, "MAX_UNFINISHED_BYTES", 100_000)
+    part = split("k1", 1, bytes(90_000), 60_000)[0].pack()
+    with serving(tmp_path / "ground") as (ground, endpoint), hostile(endpoint) as session:
+        for k in range(4):
+            until(partial(_introduced, ground, session, "evil", f"scan-{k}"))
+            session.put(f"skyrelief/evil/scan-{k}/item/k1/1", part)
+        (evil,) = ground._drones.all
+        until(lambda: sum(e["received_bytes"] > 45_000 for e in ground.progress()) == 4)
+        until(lambda: sum(scan.intake.held_bytes for scan in evil.scans) <= 100_000)
 
 
 @pytest.mark.timeout(3600 if WHOLE else 300)

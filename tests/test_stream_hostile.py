@@ -23,7 +23,15 @@ from service.stream.messages import (
     unpack_held,
 )
 from service.stream.outbox import MAX_STATIONS, PEER_TIMEOUT_S, Outbox
-from service.stream.parts import HEAD_BYTES, MAX_COUNTED, Assembler, Part, parse, split_in
+from service.stream.parts import (
+    HEAD_BYTES,
+    MAX_BYTES,
+    MAX_COUNTED,
+    Assembler,
+    Part,
+    parse,
+    split_in,
+)
 from service.stream.ranges import RangeSet
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.reports import Reports
@@ -122,10 +130,20 @@ def test_parts_are_cut_in_one_way_only() -> None:
 
 def test_small_parts_do_not_take_more_memory_than_they_say() -> None:
     assembler = Assembler()
-    for number in range(40):
-        for part in split_in("k1", number, bytes(20_000), 20_000)[:-1]:
+    for number in range(6):
+        for part in split_in("k1", number, bytes(40_000), 40_000)[:-1]:
             assembler.add(part, float(number))
     assert assembler.held_bytes <= 1 << 25
+
+
+@pytest.mark.parametrize("kind", ["header", "summary", "pose", "repose", "k0"])
+def test_a_record_is_as_large_as_its_kind_can_be(kind: str) -> None:
+    def begins(total: int) -> bool:
+        size = -(-total // 16)
+        return bool(list(parse(Part(kind, 1, 0, 16, total, 7, bytes(size)).pack())))
+
+    limit = MAX_BYTES.get(kind, 1 << 24)
+    assert begins(limit) and not begins(limit + 1)
 
 
 @pytest.fixture

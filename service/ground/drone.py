@@ -37,18 +37,18 @@ MAX_REST_S = 0.5
 takes more than half of a core."""
 REPORT_S = 1.0
 REPORT_IDLE_S = 3.0
-DRONE_TIMEOUT_S = 30.0
-BUSY_S = 10.0
+DRONE_TIMEOUT_S, BUSY_S = 30.0, 10.0
 """A scan of which something was heard so lately, and that lacks something, stays open."""
-CLOSE_AFTER_S = 600.0
-"""A scan of which nothing was heard for so long is written and closed."""
+CLOSE_AFTER_S, CLOSE_WHOLE_AFTER_S = 600.0, 60.0
+"""A scan of which nothing was heard for so long is written and closed; a whole one sooner."""
+MAX_UNFINISHED_BYTES = 1 << 25
+"""Memory of the unfinished records of one drone's scans; beyond it the largest make way."""
 FULL_DISK_REST_S = 10.0
 MAX_INTRODUCTIONS = 32
 """Scans without a folder whose header is waited for; a drone offers 21 at once."""
-MAX_CLOSED = 1000
+MAX_CLOSED = 200
 """Closed scans whose last figures are kept."""
-UNREADABLE_REST_S = 60.0
-MAX_UNREADABLE = 64
+UNREADABLE_REST_S, MAX_UNREADABLE = 60.0, 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,14 +91,17 @@ class Station(Protocol):
     def opened(self, scan: ReceivedScan) -> None:
         """A scan was opened."""
 
+    def note_news(self) -> None:
+        """Something new was stored."""
+
 
 class DroneReceiver:
-    """Receives the scans of one drone. All but :meth:`run` is safe from any thread."""
+    """Receives the scans of one drone, with :meth:`run` on a worker."""
 
     def __init__(self, drone: str, station: Station) -> None:
         self.drone = drone
         self.inbox = Inbox()
-        self.heard_at = self.last_news_at = time.monotonic()
+        self.heard_at = time.monotonic()
         self.dropped = 0  # messages that were malformed, or of a scan without a header
         self.entries: list[dict[str, Any]] = []
         self.is_known = False  # has, or had, a scan here
@@ -114,13 +117,8 @@ class DroneReceiver:
 
     @property
     def scans(self) -> list[ReceivedScan]:
-        """Those that are open; for use when the worker has ended."""
+        """Those that are open."""
         return list(self._scans.values())
-
-    @property
-    def has_open_scans(self) -> bool:
-        """Whether any scan is open."""
-        return bool(self._scans)
 
     def run(self, worker: Worker) -> None:
         """Take in what comes until the worker is to stop."""
@@ -180,7 +178,7 @@ class DroneReceiver:
             self._share.check(len(payload), now)
             if scan.intake.on_items(payload, now):
                 scan.grew()
-                self.last_news_at = now
+                self._station.note_news()
                 scan.trouble = ""
         except OutsideError as error:
             self._rest(scan, str(error), now)
@@ -207,7 +205,7 @@ class DroneReceiver:
             if kind != "header" and store.add_radio(kind, number, part, data):
                 scan.radio_messages += 1
                 scan.grew()
-                self.last_news_at = now
+                self._station.note_news()
         except OutsideError as error:
             self._rest(scan, str(error), now)
 
@@ -314,6 +312,13 @@ class DroneReceiver:
         del self._scans[scan.name]
         scan.intake.store.close()
 
+    def close_all(self) -> None:
+        """Close every scan; for use when the worker has ended."""
+        for scan in self.scans:
+            self._close(scan)
+            if not scan.may_close:
+                del self._closed[scan.name]  # its files are due when it is opened again
+
     def _write(self, scan: ReceivedScan) -> None:
         """Have a scan's deliverables written, one scan of a drone at a time."""
         if not any(other.is_writing for other in self._scans.values()):
@@ -336,8 +341,13 @@ class DroneReceiver:
             wanted = introduction.next_ask(now)
             if wanted is not None:
                 self._get(introduction.name, "header", wanted, Ask(self._station.name), None)
+        while sum(scan.intake.held_bytes for scan in self.scans) > MAX_UNFINISHED_BYTES:
+            max(self.scans, key=lambda scan: scan.intake.held_bytes).intake.forget_unfinished()
         for scan in list(self._scans.values()):
-            if now - scan.used_at > CLOSE_AFTER_S:
+            limit_s = CLOSE_AFTER_S
+            if scan.intake.complete and not scan.changed:  # and the drone knows it
+                limit_s = CLOSE_WHOLE_AFTER_S
+            if now - scan.used_at > limit_s:
                 if scan.may_close:
                     self._close(scan)
                 elif scan.unwritten:

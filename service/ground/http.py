@@ -192,8 +192,8 @@ def _delete(request: Request) -> Response:
     state, (drone, scan) = state_of(request), names_of(request)
     note(request, "delete", scan=f"{drone}/{scan}")
     for entry in state.progress():
-        if (entry["drone"], entry["scan"]) == (drone, scan):
-            raise HTTPException(409, "this scan is open at the receiver; delete it after a restart")
+        if entry.get("open", True) and (entry["drone"], entry["scan"]) == (drone, scan):
+            raise HTTPException(409, "this scan is being received; delete it some minutes later")
     if state.jobs.busy(state.library.folder(drone, scan)):
         raise HTTPException(409, "a deliverable of this scan is being made; wait for it")
     state.coverages.forget(state.library.folder(drone, scan))

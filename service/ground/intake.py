@@ -171,6 +171,10 @@ class ScanIntake:
         """Memory that unfinished records take."""
         return self._assembler.held_bytes
 
+    def forget_unfinished(self) -> None:
+        """Drop what came of unfinished records; they are asked for again."""
+        self._assembler = Assembler()
+
     @property
     def complete(self) -> bool:
         """Whether the scan is finished and all of it is here that can be had."""

@@ -13,7 +13,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import queue
-import resource
 import threading
 import time
 from collections import deque
@@ -25,7 +24,8 @@ from typing import TYPE_CHECKING, Any
 
 from service.errors import InputError, SkyreliefError
 from service.ground import files_due
-from service.ground.drone import DRONE_TIMEOUT_S, DroneReceiver, Limits
+from service.ground.drone import DroneReceiver, Limits
+from service.ground.drones import STALL_S, Drones
 from service.ground.placing import scan_folder
 from service.ground.received import ReceivedScan, deliver
 from service.ground.replies import CHANNEL, Replies
@@ -39,24 +39,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MAX_DRONES = 64
-"""Drones received at once; more wait until one is silent."""
-MAX_OPEN_SCANS = 32
-"""Scans of one drone that may be open, where the descriptors allow it."""
-DESCRIPTORS_PER_SCAN, DESCRIPTOR_SHARE = 3, 4
-"""An open scan holds so many; all of them together get this fraction (1/n) of the limit."""
-STRANGER_S = 1.0
-"""A drone without any scan makes way for another after so long without a message."""
 MAX_RADIO_WAITING = 2000
 ASK_TIMEOUT_S = 120.0
 RETRY_S = 1.0
 LOOK_AROUND_S = 3.0
 TURN_S = 0.1
-STALL_S = 120.0
-"""A worker without progress for so long hangs; closing a session over a dead link does not
-take as long."""
-REFUSAL_S = 60.0
-"""From one warning about a drone that is not received to the next."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,14 +55,6 @@ class ReceiverConfig:
     limits: Limits = field(default_factory=Limits)
     name: str = ""  # of this station; empty: made once and kept in the store
     refresh_s: float = 0.0  # write deliverables of growing scans so often; 0: when complete
-
-
-@dataclass(slots=True, eq=False)
-class _Member:
-    """A drone and its worker."""
-
-    drone: DroneReceiver
-    worker: Worker
 
 
 class Receiver:
@@ -94,9 +73,7 @@ class Receiver:
             raise InputError(f"cannot write the store {config.store}: {error.strerror}") from error
         self.limits = config.limits
         self.workers = workers or Workers()
-        self._lock = threading.Lock()  # of the table of drones
-        self._members: dict[str, _Member] = {}
-        self._gone: list[dict[str, Any]] = []  # entries of drones that left
+        self._drones = Drones(self, self.workers)
         self._session: zenoh.Session | None = None
         self._replies = Replies()
         self._opened = threading.Event()
@@ -105,7 +82,7 @@ class Receiver:
         self._tunnel = TunnelIntake()
         self._writes: queue.Queue[ReceivedScan | None] = queue.Queue()
         self._running: list[Worker] = []
-        self._refresh_at = self._refused_at = -1e9
+        self._refresh_at = -1e9
         self._dropped = 0
         self._last_news_at = time.monotonic()
 
@@ -130,10 +107,7 @@ class Receiver:
         self._running = []
         main.join()
         replies.join()
-        members = list(self._members.values())
-        for member in members:
-            member.worker.join()
-        scans = [scan for member in members for scan in member.drone.scans]
+        scans = self._drones.close()
         for scan in scans:
             if scan.unwritten and not scan.is_writing:
                 self.write(scan)
@@ -152,24 +126,21 @@ class Receiver:
 
     def progress(self) -> list[dict[str, Any]]:
         """One entry per scan: drone, scan, items held and missing, bytes, lags, folder."""
-        here = [entry for member in self._table() for entry in member.drone.entries]
-        return here + list(self._gone)
+        return self._drones.entries
 
     @property
     def dropped(self) -> int:
         """Messages that were malformed, foreign or too many."""
-        drones = [member.drone for member in self._table()]
-        return self._dropped + sum(drone.dropped + drone.inbox.dropped for drone in drones)
+        return self._dropped + self._drones.dropped
 
     @property
     def last_news_at(self) -> float:
         """When something new was stored last; monotonic seconds."""
-        drones = [member.drone.last_news_at for member in self._table() if member.drone.is_known]
-        return max([self._last_news_at, *drones])
+        return self._last_news_at
 
-    def _table(self) -> list[_Member]:
-        with self._lock:
-            return list(self._members.values())
+    def note_news(self) -> None:
+        """Something new was stored."""
+        self._last_news_at = time.monotonic()
 
     # The session
 
@@ -220,7 +191,7 @@ class Receiver:
                     self._look_around(session, now)
                     look_at = now + LOOK_AROUND_S
                 self._take_radio()
-                self._retire(now)
+                self._drones.retire(now)
                 self._refresh(now)
         finally:
             for subscriber in (heads, items):
@@ -237,7 +208,7 @@ class Receiver:
         """Hand on each message until the subscriber ends."""
         for sample in subscriber:
             place = place_of(str(sample.key_expr))
-            drone = None if place is None else self._drone(place[0])
+            drone = None if place is None else self._drones.get(place[0])
             if place is None or drone is None:
                 self._dropped += 1
                 continue
@@ -253,82 +224,32 @@ class Receiver:
         """Have the drones that are there say at once what they have."""
         import zenoh
 
-        if any(now - member.drone.heard_at < LOOK_AROUND_S for member in self._table()):
+        if any(now - drone.heard_at < LOOK_AROUND_S for drone in self._drones.all):
             return
         with contextlib.suppress(zenoh.ZError):
             session.get(f"{ROOT}/*/*/head", zenoh.handlers.RingChannel(1), timeout=LOOK_AROUND_S)
 
     def _take_radio(self) -> None:
-        while self._radio:
+        for _ in range(len(self._radio)):
             for item in self._tunnel.receive(self._radio.popleft()):
-                drone = self._drone(item[0].drone)
+                drone = self._drones.get(item[0].drone)
                 if drone is None:
                     self._dropped += 1
                 else:
                     drone.inbox.put_event(partial(drone.add_radio, *item))
 
-    # The drones
-
     @property
     def max_open(self) -> int:
         """Scans that one drone may have open now."""
-        soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-        room = soft // DESCRIPTOR_SHARE // DESCRIPTORS_PER_SCAN
-        return max(2, min(MAX_OPEN_SCANS, room // max(1, len(self._members))))
-
-    def _drone(self, name: str) -> DroneReceiver | None:
-        """The worker's part of a drone, started if need be; None when there are too many."""
-        with self._lock:
-            member = self._members.get(name)
-            if member is not None:
-                return member.drone
-            if len(self._members) >= MAX_DRONES and not self._make_way():
-                if time.monotonic() - self._refused_at > REFUSAL_S:
-                    self._refused_at = time.monotonic()
-                    log.warning("%s is not received: %d drones are", name, MAX_DRONES)
-                return None
-            drone = DroneReceiver(name, self)
-            worker = self.workers.start(f"drone {name}", drone.run, STALL_S, False)
-            self._members[name] = _Member(drone, worker)
-            return drone
-
-    def _make_way(self) -> bool:
-        """End the worker of a drone that never had a scan and is silent; False for none."""
-        now = time.monotonic()
-        for name, member in self._members.items():
-            drone = member.drone
-            if not drone.is_known and now - drone.heard_at > STRANGER_S:
-                member.worker.stop.set()
-                self._dropped += drone.dropped + drone.inbox.dropped
-                del self._members[name]
-                return True
-        return False
-
-    def _retire(self, now: float) -> None:
-        """Drop drones that are silent and have nothing open, or whose worker failed."""
-        with self._lock:
-            gone = {
-                name: member
-                for name, member in self._members.items()
-                if member.worker.is_done or _is_idle(member.drone, now)
-            }
-            for name in gone:
-                del self._members[name]
-        for member in gone.values():
-            member.worker.join()
-            self._gone = (self._gone + member.drone.entries)[-1000:]
-            self._dropped += member.drone.dropped + member.drone.inbox.dropped
-            self._last_news_at = max(self._last_news_at, member.drone.last_news_at)
-            for scan in member.drone.scans:  # of a worker that failed
-                scan.intake.store.close()
+        return self._drones.max_open
 
     def _refresh(self, now: float) -> None:
         """Write the deliverables of scans that grow, every ``refresh_s``."""
         if not self._config.refresh_s or now < self._refresh_at:
             return
         self._refresh_at = now + self._config.refresh_s
-        for member in self._table():
-            member.drone.inbox.put_event(member.drone.write_grown)
+        for drone in self._drones.all:
+            drone.inbox.put_event(drone.write_grown)
 
     # What the drones' workers need
 
@@ -405,10 +326,6 @@ class Receiver:
             scan.trouble = guarded(f"deliverables of {scan.folder}", partial(deliver, scan))
             files_due.end(scan.folder)
             scan.is_written, scan.is_writing = True, False
-            member = self._members.get(scan.drone)
-            if member is not None:
-                member.drone.inbox.put_event(lambda _: None)  # its state is shown at once
-
-
-def _is_idle(drone: DroneReceiver, now: float) -> bool:
-    return not drone.has_open_scans and now - drone.heard_at > DRONE_TIMEOUT_S
+            drone = self._drones.present(scan.drone)
+            if drone is not None:
+                drone.inbox.put_event(lambda _: None)  # its state is shown at once

@@ -11,11 +11,20 @@ import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+from service.stream.validity import MAX_HEADER_BYTES, MAX_SUMMARY_BYTES
+
 _HEAD = struct.Struct("<2sBBIHHIII")
 HEAD_BYTES = _HEAD.size
 MAGIC = b"SK"
 VERSION = 1
-MAX_RECORD_BYTES = 1 << 24
+MAX_RECORD_BYTES, MAX_SMALL_BYTES = 1 << 24, 1024
+MAX_BYTES = {
+    "header": MAX_HEADER_BYTES,
+    "summary": MAX_SUMMARY_BYTES,
+    "pose": MAX_SMALL_BYTES,
+    "repose": MAX_SMALL_BYTES,
+}
+"""Bytes of a record by kind; layers have MAX_RECORD_BYTES at most."""
 MAX_PARTS = 65_535
 MAX_COUNTED = (1 << 24) - 1
 """The highest number of a pose, re-pose or keyframe: ten a second for 19 days."""
@@ -89,11 +98,14 @@ def parse(message: bytes) -> Iterator[Part]:
         at += HEAD_BYTES
         if magic != MAGIC or version != VERSION or code not in KINDS or at + size > len(message):
             return
-        if index >= count or total > MAX_RECORD_BYTES or size != _size_of(index, count, total):
+        kind = KINDS[code]
+        if kind not in WHOLE and number > MAX_COUNTED:
             return
-        if KINDS[code] not in WHOLE and number > MAX_COUNTED:
+        if index >= count or total > MAX_BYTES.get(kind, MAX_RECORD_BYTES):
             return
-        yield Part(KINDS[code], number, index, count, total, crc, message[at : at + size])
+        if size != _size_of(index, count, total):
+            return
+        yield Part(kind, number, index, count, total, crc, message[at : at + size])
         at += size
 
 

@@ -1,0 +1,142 @@
+"""The drones that a ground station receives, each with its worker; few at once."""
+
+from __future__ import annotations
+
+import logging
+import resource
+import threading
+import time
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any
+
+from service.ground.drone import DRONE_TIMEOUT_S, DroneReceiver, Station
+from service.ground.received import ReceivedScan
+from service.workers import Worker, Workers
+
+log = logging.getLogger(__name__)
+
+MAX_DRONES = 64
+"""Drones received at once; more wait until one is silent."""
+MAX_OPEN_SCANS = 32
+"""Scans of one drone that may be open, where the descriptors allow it."""
+DESCRIPTORS_PER_SCAN, DESCRIPTOR_SHARE = 3, 4
+"""An open scan holds so many; all of them together get this fraction (1/n) of the limit."""
+MAX_RESTING = 256
+"""Drones without a worker whose figures are kept."""
+STRANGER_S = 1.0
+"""A drone without any scan makes way for another after so long without a message."""
+REFUSAL_S = 60.0
+"""From one warning about a drone that is not received to the next."""
+STALL_S = 120.0
+"""A worker without progress for so long hangs."""
+
+
+@dataclass(slots=True, eq=False)
+class _Member:
+    """A drone and its worker."""
+
+    drone: DroneReceiver
+    worker: Worker
+
+
+class Drones:
+    """The table of drones. Safe between threads, but for :meth:`retire` and :meth:`close`."""
+
+    def __init__(self, station: Station, workers: Workers) -> None:
+        self._station, self._workers = station, workers
+        self._lock = threading.Lock()
+        self._members: dict[str, _Member] = {}
+        self._resting: OrderedDict[str, DroneReceiver] = OrderedDict()
+        self._refused_at = -1e9
+        self._dropped = 0  # messages of drones that left
+
+    def get(self, name: str) -> DroneReceiver | None:
+        """A drone, its worker started if need be; None when there are too many."""
+        with self._lock:
+            member = self._members.get(name)
+            if member is not None:
+                return member.drone
+            if len(self._members) >= MAX_DRONES and not self._make_way():
+                if time.monotonic() - self._refused_at > REFUSAL_S:
+                    self._refused_at = time.monotonic()
+                    log.warning("%s is not received: %d drones are", name, MAX_DRONES)
+                return None
+            drone = self._resting.pop(name, None) or DroneReceiver(name, self._station)
+            drone.heard_at = time.monotonic()
+            worker = self._workers.start(f"drone {name}", drone.run, STALL_S, False)
+            self._members[name] = _Member(drone, worker)
+            return drone
+
+    def present(self, name: str) -> DroneReceiver | None:
+        """A drone that has a worker."""
+        member = self._members.get(name)
+        return None if member is None else member.drone
+
+    @property
+    def all(self) -> list[DroneReceiver]:
+        """Those that have a worker."""
+        with self._lock:
+            return [member.drone for member in self._members.values()]
+
+    @property
+    def entries(self) -> list[dict[str, Any]]:
+        """One entry per scan."""
+        with self._lock:
+            drones = [*(member.drone for member in self._members.values()), *self._resting.values()]
+        return [entry for drone in drones for entry in drone.entries]
+
+    @property
+    def dropped(self) -> int:
+        """Messages that were malformed or too many."""
+        return self._dropped + sum(drone.dropped + drone.inbox.dropped for drone in self.all)
+
+    @property
+    def max_open(self) -> int:
+        """Scans that one drone may have open now."""
+        soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        room = soft // DESCRIPTOR_SHARE // DESCRIPTORS_PER_SCAN
+        return max(2, min(MAX_OPEN_SCANS, room // max(1, len(self._members))))
+
+    def retire(self, now: float) -> None:
+        """End the workers of drones that are silent and have nothing open, or that failed."""
+        with self._lock:
+            gone = {
+                name: member
+                for name, member in self._members.items()
+                if member.worker.is_done
+                or (not member.drone.scans and now - member.drone.heard_at > DRONE_TIMEOUT_S)
+            }
+            for name in gone:
+                del self._members[name]
+        for name, member in gone.items():
+            member.worker.join()
+            member.drone.close_all()
+            with self._lock:
+                self._resting.pop(name, None)
+                if member.drone.is_known and not member.worker.has_failed:
+                    self._resting[name] = member.drone
+                else:
+                    self._dropped += member.drone.dropped + member.drone.inbox.dropped
+                while len(self._resting) > MAX_RESTING:
+                    self._resting.popitem(last=False)
+
+    def close(self) -> list[ReceivedScan]:
+        """End all workers; the scans that are open."""
+        for member in self._members.values():
+            member.worker.stop.set()
+        for member in self._members.values():
+            member.worker.join()
+        return [scan for member in self._members.values() for scan in member.drone.scans]
+
+    def _make_way(self) -> bool:
+        """End the worker of a drone that never had a scan and is silent; False for none."""
+        now = time.monotonic()
+        for name, member in self._members.items():
+            drone = member.drone
+            if not drone.is_known and now - drone.heard_at > STRANGER_S:
+                member.worker.stop.set()
+                self._dropped += drone.dropped + drone.inbox.dropped
+                del self._members[name]
+                return True
+        return False
