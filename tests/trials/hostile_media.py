@@ -1,4 +1,4 @@
-"""What a stranger's camera, log or settings file may hold: sound files, damaged and made to harm."""
+"""What a stranger's video, log or settings file may hold: damaged, or made to harm."""
 
 from __future__ import annotations
 

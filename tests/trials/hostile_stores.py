@@ -9,10 +9,12 @@ import shutil
 import sqlite3
 import zlib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from hostile_records import (
     BIG,
     damaged,
@@ -22,6 +24,8 @@ from hostile_records import (
     hostile_poses,
     hostile_reposes,
 )
+
+from service.stream import layer
 
 Change = Callable[[Path], None]
 
@@ -48,7 +52,7 @@ SCHEMAS: dict[str, str] = {
     f"INSERT INTO meta {ENDLESS} SELECT x, x FROM n; END; CREATE TRIGGER u AFTER INSERT ON meta "
     "BEGIN DELETE FROM chunks; END; CREATE TRIGGER v AFTER UPDATE ON meta BEGIN "
     "DELETE FROM poses; END; CREATE TRIGGER w AFTER INSERT ON reposes BEGIN DELETE FROM meta; END",
-    "index on a slow expression": f"CREATE INDEX i ON poses (length(hex(zeroblob(1000 + id))))",
+    "index on a slow expression": "CREATE INDEX i ON poses (length(hex(zeroblob(1000 + id))))",
     "generated column": "ALTER TABLE poses ADD COLUMN g AS (zeroblob(900000000))",
     "no such columns": "DROP TABLE poses; CREATE TABLE poses (a, b)",
     "text keys": "DROP TABLE poses; CREATE TABLE poses (id TEXT, time_unix_ns TEXT, data TEXT); "
@@ -145,6 +149,59 @@ def _chunk(data: bytes) -> Change:
     return change
 
 
+def _spread(change: Callable[[Any, int], Any]) -> Change:
+    """The scan's own layers, each with its header changed by ``change(head, seq)``."""
+
+    def apply(folder: Path) -> None:
+        db = sqlite3.connect(folder / "scan.db")
+        with db:
+            for seq, k, data in db.execute("SELECT seq, layer, data FROM chunks").fetchall():
+                opened = layer.unpack(data)
+                assert opened is not None
+                whole = layer.pack(change(opened[0], seq), opened[1])
+                db.execute(
+                    "UPDATE chunks SET data = ?, crc = ? WHERE seq = ? AND layer = ?",
+                    (whole, zlib.crc32(whole), seq, k),
+                )
+        db.close()
+
+    return apply
+
+
+def _at(far_m: float, up_m: float = 0.0) -> Callable[[Any, int], Any]:
+    """Cameras so far from each other, every other one on the other side."""
+
+    def change(head: Any, seq: int) -> Any:
+        T = head.T_world_camera.copy()
+        side = 1 - 2 * (seq % 2)
+        T[:3, 3] = far_m * side, far_m * seq / 5, T[2, 3] + up_m * side
+        return replace(head, T_world_camera=T)
+
+    return change
+
+
+def _lens(f_px: float, ratio: float = 1.0) -> Callable[[Any, int], Any]:
+    K = [[f_px, 0.0, 79.5], [0.0, f_px * ratio, 44.5], [0.0, 0.0, 1.0]]
+    return lambda head, _: replace(head, K=np.array(K))
+
+
+def _depths(low: float, step: float) -> Callable[[Any, int], Any]:
+    return lambda head, _: replace(head, inverse_min=low, inverse_step=step)
+
+
+SPREADS: dict[str, Callable[[Any, int], Any]] = {
+    **{f"cameras {far} m apart": _at(far) for far in (1e3, 1e4, 1e5, 9.9e5)},
+    **{f"cameras {up} m above each other": _at(5.0, up) for up in (1e3, 1e5, 9.9e5)},
+    **{f"lens of {f} px": _lens(f) for f in (1.5, 2.0, 5.0, 20.0, 1e4, 1e5)},
+    "lens of 30 x 149 px": _lens(30.0, 4.9),
+    **{f"depths from {1 / low:g} m": _depths(low, 1e-9) for low in (1.01e-5, 1e-4, 1.0, 900.0)},
+    "depths all over": _depths(1.01e-5, 0.01),
+    "one instant": lambda head, _: replace(head, time_unix_ns=7),
+    "backward in time": lambda head, seq: replace(head, time_unix_ns=(1 << 62) - seq * 10**18),
+}
+"""What a decoder that looks at one record takes, and no flight ever brought."""
+
+
 def _file(name: str, make: Callable[[Path], object]) -> Change:
     def change(folder: Path) -> None:
         path = folder / name
@@ -170,7 +227,10 @@ def by_file(base: Path) -> Iterator[tuple[str, Change]]:
     yield "a pipe", _file("scan.db", os.mkfifo)
     yield "a folder", _file("scan.db", Path.mkdir)
     yield "one terabyte of zeros", _file("scan.db", _sparse)
-    yield "another page size", _file("scan.db", lambda p: p.write_bytes(data[:16] + b"\0\1" + data[18:]))
+    yield (
+        "another page size",
+        _file("scan.db", lambda p: p.write_bytes(data[:16] + b"\0\1" + data[18:])),
+    )
     yield "log of noise", _file("scan.db-wal", lambda p: p.write_bytes(noise))
     yield "log is a folder", _file("scan.db-wal", Path.mkdir)
     yield "log without end", _file("scan.db-wal", lambda p: p.symlink_to("/dev/zero"))
@@ -189,6 +249,8 @@ def by_meaning() -> Iterator[tuple[str, Change]]:
     """Rows that SQLite finds sound."""
     for what, script in CHUNKS.items():
         yield what, _sql(script)
+    for what, spread in SPREADS.items():
+        yield what, _spread(spread)
     for what, data in hostile_layers():
         yield what, _chunk(data)
     for k, (what, data) in enumerate(hostile_poses()):

@@ -44,7 +44,13 @@ SLOW = 1000
 GROWTH_MIB = 50.0
 POSE_S = 2.0
 EXPORTS = ("laz", "coverage", "dsm", "3dtiles", "kml", "mcap", "colmap", "ply", "contours")
-OTHERS = (("mesh",), ("refine",), ("inspect",), ("refly",), *(("export", k) for k in ("glb", "copc")))
+OTHERS = (
+    ("mesh",),
+    ("refine",),
+    ("inspect",),
+    ("refly",),
+    *(("export", k) for k in ("glb", "copc")),
+)
 COMMANDS = (*(("export", kind) for kind in EXPORTS), *OTHERS)
 
 
@@ -62,6 +68,15 @@ def sent(session: Any, key: str, payload: bytes) -> bool:
     """Whether the key is one that Zenoh carries."""
     try:
         session.put(f"{ROOT}/{key}", payload, congestion_control=zenoh.CongestionControl.BLOCK)
+    except (zenoh.ZError, ValueError):
+        return False
+    return True
+
+
+def asked(session: Any, key: str, payload: bytes) -> bool:
+    """Whether the request is one that Zenoh carries; nobody waits for the answer."""
+    try:
+        session.get(f"{ROOT}/{key}", lambda _: None, payload=payload, timeout=1.0)
     except (zenoh.ZError, ValueError):
         return False
     return True
@@ -132,20 +147,16 @@ def hostile_rate(stop: threading.Event, session: Any, seed: int, tally: Counter[
         stop.wait(max(0.0, began + count / 300.0 - time.monotonic()))
 
 
-def rogue_station(stop: threading.Event, session: Any, drones: list[str], tally: Any) -> None:
+def rogue_station(stop: threading.Event, session: Any, keys: list[str], tally: Any) -> None:
     """A ground station of the fleet that reports and asks what nobody can mean."""
     rng = random.Random(SEED)
     reports = [data for _, data in hostile_reports("rogue")]
     while not stop.wait(0.05):
-        name = rng.choice(drones)
+        key, kind = rng.choice(keys), rng.choice(("k0", "k1", "pose", "k9"))
         data = rng.choice((rng.choice(reports), damaged(rng.choice(reports), rng)))
-        station = f"station-{rng.randrange(1 << 40):x}"
-        tally["reports"] += sent(session, f"{name}/scan-1/held/{station}", data)
-        with contextlib.suppress(zenoh.ZError):
-            numbers = rng.choice(("0-4294967295", "0", str(rng.randrange(1 << 33))))
-            key = f"{ROOT}/{name}/scan-1/item/{rng.choice(('k0', 'k1', 'pose', 'k9'))}/{numbers}"
-            session.get(key, lambda _: None, payload=data, timeout=1.0)
-            tally["requests"] += 1
+        tally["reports"] += sent(session, f"{key}/held/station-{rng.randrange(1 << 40):x}", data)
+        numbers = rng.choice(("0-4294967295", "0", str(rng.randrange(1 << 33))))
+        tally["requests"] += asked(session, f"{key}/item/{kind}/{numbers}", data)
 
 
 def test_hostile_datalink_beside_honest_drones(tmp_path: Path, record: Row) -> None:
@@ -160,12 +171,13 @@ def test_hostile_datalink_beside_honest_drones(tmp_path: Path, record: Row) -> N
             stack.enter_context(HonestDrone(tmp_path, name, ground.endpoint, **fleet.drone(name)))
             for name in names
         ]
+        keys = [one.key for one in drones]
         ground.until(lambda: all(stored(ground.store / n) for n in names), "honest chunks")
         watches = [Watch(ground, name) for name in names]
         drone, station = fleet.session(ground.endpoint), fleet.session(ground.endpoint, "rogue")
         attackers = [
             threading.Thread(target=hostile_rate, args=(stop, drone, SEED, tally)),
-            threading.Thread(target=rogue_station, args=(stop, station, names, tally)),
+            threading.Thread(target=rogue_station, args=(stop, station, keys, tally)),
         ]
         for attacker in attackers:
             attacker.start()
@@ -206,8 +218,11 @@ def followed(ground: Ground, stop: threading.Event, tally: Counter[str]) -> list
         assert ground.ask("/api/scans")[0] == 200
         if time.monotonic() > began + min(length_s / 4, 600.0):
             mib.append(ground.mib)
-        print(f"{time.monotonic() - began:.0f} s: {ground.mib:.0f} MiB, {ground.files} files, "
-              f"{dict(tally)}", flush=True)
+        print(
+            f"{time.monotonic() - began:.0f} s: {ground.mib:.0f} MiB, {ground.files} files, "
+            f"{dict(tally)}",
+            flush=True,
+        )
     return mib
 
 

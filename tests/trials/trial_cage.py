@@ -91,7 +91,7 @@ def _serve(folder: Path) -> None:
     import service.exports.points
     import service.exports.rasters
     import service.scans.folder
-    import service.stream.store  # noqa: F401
+    import service.stream.store
 
     said = folder / "said.txt"
     for line in sys.stdin:

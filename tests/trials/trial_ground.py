@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import re
+import secrets
 import signal
 import socket
 import sqlite3
@@ -23,6 +24,7 @@ from loopback import free_port
 from trial_rig import PATIENCE_S, stored
 
 from service.stream.keys import make_keys, tls_files
+from service.stream.records import ScanHeader
 from service.stream.session import SessionConfig, open_session
 
 DRONE = """
@@ -43,7 +45,8 @@ coded = [
     [layer.unpack(data) for data in codec.encode(make_keyframe(k, size, strip(size, k), 1 + k), 0)]
     for k in range(4)
 ]
-store = ScanStore.create(path, ScanHeader("scan-1", name, time.time_ns()))
+run_id = config.pop("run_id")
+store = ScanStore.create(path, ScanHeader("scan-1", name, time.time_ns(), run_id=run_id))
 link = DatalinkSender(store, DatalinkConfig(**{k: tuple(v) if isinstance(v, list) else v
     for k, v in config.items()}))
 os.set_blocking(0, False)
@@ -170,9 +173,7 @@ class Fleet:
         role = f"ground/{member}" if member else f"drone/{self._attacker}"
         ca, certificate, key = tls_files(self._folder / role)
         return open_session(
-            SessionConfig(
-                connect=(endpoint,), tls_ca=ca, tls_certificate=certificate, tls_key=key
-            )
+            SessionConfig(connect=(endpoint,), tls_ca=ca, tls_certificate=certificate, tls_key=key)
         )
 
 
@@ -181,7 +182,9 @@ class HonestDrone:
 
     def __init__(self, folder: Path, name: str, endpoint: str, **settings: str) -> None:
         self.name, self.scans = name, folder / name
-        link = {"connect": [endpoint], "budget_kbit_s": 4000.0, **settings}
+        run_id = secrets.token_hex(16)
+        self.key = f"{name}/{ScanHeader('scan-1', name, 1, run_id=run_id).name}"
+        link = {"connect": [endpoint], "budget_kbit_s": 4000.0, "run_id": run_id, **settings}
         self.process = subprocess.Popen(
             [sys.executable, "-c", DRONE, str(self.scans / "scan.db"), name, json.dumps(link)],
             stdin=subprocess.PIPE,
