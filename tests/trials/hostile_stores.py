@@ -78,7 +78,7 @@ SCHEMAS: dict[str, str] = {
     "UPDATE sqlite_master SET rootpage = 1 WHERE name = 'chunks'",
     "far root page": "PRAGMA writable_schema=ON; "
     "UPDATE sqlite_master SET rootpage = 99999999 WHERE name = 'poses'",
-    "text of UTF-16": "PRAGMA writable_schema=ON; UPDATE meta SET value = CAST(x'fffe0000' AS TEXT)",
+    "text that is none": "UPDATE meta SET value = CAST(x'fffe0000' AS TEXT)",
 }
 CHUNKS: dict[str, str] = {
     "negative keyframe": "UPDATE chunks SET seq = -1 - seq",
@@ -227,10 +227,8 @@ def by_file(base: Path) -> Iterator[tuple[str, Change]]:
     yield "a pipe", _file("scan.db", os.mkfifo)
     yield "a folder", _file("scan.db", Path.mkdir)
     yield "one terabyte of zeros", _file("scan.db", _sparse)
-    yield (
-        "another page size",
-        _file("scan.db", lambda p: p.write_bytes(data[:16] + b"\0\1" + data[18:])),
-    )
+    other = data[:16] + b"\0\1" + data[18:]
+    yield "another page size", _file("scan.db", lambda p: p.write_bytes(other))
     yield "log of noise", _file("scan.db-wal", lambda p: p.write_bytes(noise))
     yield "log is a folder", _file("scan.db-wal", Path.mkdir)
     yield "log without end", _file("scan.db-wal", lambda p: p.symlink_to("/dev/zero"))

@@ -9,12 +9,14 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import pkgutil
 import resource
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,9 @@ PROCESSOR_S = 60
 LARGEST_FILE_BYTES = 1 << 30
 MOST_MIB = 1024
 """Resident memory that a case may take, imports included."""
+PRELOADED = ("exports", "scans", "refine", "stream", "cameras", "commands", "onboard", "ground")
+LATE = ("torch", "triton", "onnx", "mesh_cluster")
+"""What a case imports itself: large, or with threads that a fork does not copy."""
 FOREWARNED = {0: "done", 2: "refused in a line", 3: "outside world"}
 
 
@@ -88,11 +93,15 @@ def _serve(folder: Path) -> None:
     import hostile_media
 
     import service.cli
-    import service.exports.points
-    import service.exports.rasters
-    import service.scans.folder
-    import service.stream.store
 
+    for package in ("recon", "mavlink.logs", *(f"service.{name}" for name in PRELOADED)):
+        for found in pkgutil.walk_packages(import_module(package).__path__, f"{package}."):
+            if not any(name in found.name for name in LATE):
+                with contextlib.suppress(ImportError):
+                    import_module(found.name)
+    for name in ("rasterio", "laspy", "lazrs", "pyproj", "imagecodecs", "scipy.spatial", "pyulog"):
+        with contextlib.suppress(ImportError):
+            import_module(name)
     said = folder / "said.txt"
     for line in sys.stdin:
         case = json.loads(line)
