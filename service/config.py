@@ -22,7 +22,8 @@ import msgspec.toml
 from service.errors import InputError
 from service.small_file import read_small
 
-LARGEST_FILE_BYTES = 1_048_576
+LARGEST_FILE_BYTES, LONGEST_LINE_BYTES = 65_536, 4_096
+"""The memory that a dotted key takes grows with the square of its length."""
 T = TypeVar("T")
 
 
@@ -343,6 +344,10 @@ def keys() -> Iterator[tuple[str, dataclasses.Field[Any]]]:
 def _read(path: Path) -> dict[str, Any]:
     try:
         data = read_small(path, LARGEST_FILE_BYTES, "configuration file")
+        if max(map(len, data.splitlines()), default=0) > LONGEST_LINE_BYTES:
+            raise InputError(
+                f"{path} is not TOML of ours: a line of over {LONGEST_LINE_BYTES} bytes"
+            )
         return msgspec.toml.decode(data, type=dict[str, Any])
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path} is not TOML: {error}") from error

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mavlink.logs import load_telemetry
 from service.cameras import open_camera, video
 from service.cameras.camera_file import load_camera
 from service.config import load_config
@@ -155,6 +156,32 @@ def test_toml_of_ten_thousand_brackets_is_refused(tmp_path: Path) -> None:
         load_config(path)
     with pytest.raises(InputError, match="--set"):
         load_config(None, [f"scan.resolution_m={deep}"])
+
+
+@pytest.mark.parametrize("shape", ["a = %s", "%sb = 1", "[%sb]"])
+def test_one_line_of_toml_takes_no_memory_beyond_its_own(tmp_path: Path, shape: str) -> None:
+    """A dotted key of 30,000 parts would take 4 GiB."""
+    path = tmp_path / "long.toml"
+    path.write_text(shape % ("a." * 30_000))
+    with pytest.raises(InputError, match=r"a line of over 4096 bytes"):
+        load_config(path)
+
+
+@pytest.mark.parametrize(
+    "text", ["\0" * 200_000, 'name,"' + "x" * 200_000, 'name,lat\n"' + "x" * 200_000]
+)
+def test_a_survey_with_an_endless_cell_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "points.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"points\.csv line 1"):
+        read_survey(path)
+
+
+def test_a_dataflash_log_of_formats_that_do_not_exist_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "flight.bin"
+    path.write_bytes(b"\xa3\x95\x80" + b"\xff" * 86)
+    with pytest.raises(ValueError, match=r"flight\.bin"):
+        load_telemetry(path)
 
 
 def test_an_endless_device_is_no_recording() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -54,16 +53,15 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
 def _messages(path: Path) -> Iterator[Any]:
     from pymavlink.DFReader import DFReader_binary  # type: ignore[import-untyped]
 
-    broken = (ValueError, KeyError, IndexError, AttributeError, TypeError, struct.error)
     try:
         log = DFReader_binary(str(path))
-    except broken as error:
+    except Exception as error:  # DFReader raises this class itself
         raise ValueError(f"{path}: the .BIN log cannot be read ({error})") from error
     try:
         while True:
             try:
                 message = log.recv_match(type=list(_Reader.TABLE))
-            except broken:
+            except Exception:
                 return  # torn at this point: what came before stands
             if message is None:
                 return

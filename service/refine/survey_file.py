@@ -88,9 +88,9 @@ def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     except UnicodeDecodeError as error:
         raise InputError(f"{path} cannot be read ({error}); it should be CSV in UTF-8") from error
     table = csv.reader(text.splitlines())
-    header = [name.strip() for name in next(table, [])]
-    _check_header(path, header)
     try:
+        header = [name.strip() for name in next(table, [])]
+        _check_header(path, header)
         for cells in table:
             if not any(cell.strip() for cell in cells) or cells[0].startswith("#"):
                 continue
