@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from loopback import free_port
-from trial_rig import PATIENCE_S, stored
+from trial_rig import PATIENCE_S, WHOLE, stored
 
 from service.stream.keys import make_keys, tls_files
 from service.stream.records import ScanHeader
@@ -56,7 +56,8 @@ seq = at = 0
 while not sys.stdin.buffer.read(1):
     if at % poses == 0:
         T = np.eye(4)
-        T[:3, 3] = seq, 0, 72
+        T[:3, :3] = np.diag([1.0, -1.0, -1.0])
+        T[:3, 3] = 10 * (seq % 40), 25 * (seq // 40 % 16), 72
         layers = [
             layer.pack(replace(head, seq=seq, time_unix_ns=time.time_ns(), T_world_camera=T), rest)
             for head, rest in coded[seq % 4]
@@ -144,9 +145,9 @@ class Ground:
             return 0, b""
 
     def stop(self) -> int:
-        """The exit code after Ctrl-C."""
+        """The exit code after Ctrl-C and after the deliverables of all scans."""
         self.process.send_signal(signal.SIGINT)
-        return self.process.wait(timeout=PATIENCE_S)
+        return self.process.wait(timeout=3600 if WHOLE else PATIENCE_S)
 
     def check(self) -> None:
         """It runs, and no thread or task of it has failed."""
