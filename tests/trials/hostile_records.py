@@ -26,6 +26,7 @@ from service.stream.records import PoseRecord, Repose, ScanHeader, pack_pose, pa
 ATTACKER = "mallory"
 BIG = (1 << 32) - 1
 NUMBER_OF_BYTES = struct.Struct("<I")
+VALUES: list[Any] = [None, -1, 1e308, [], {"a": []}, "\ud800", "/etc/passwd", True, 1 << 70]
 HEAD = '{"v":1,"numbers":{%s},"live":{},"finished":true}'
 
 
@@ -69,7 +70,7 @@ def hostile_json(sound: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
     yield "Latin-1", text.replace("{", '{"caf\xe9": 1,', 1).encode("latin-1")
     yield "nothing", b""
     yield "zeros", bytes(64)
-    for what, value in (
+    for what, wrong in (
         ("list", "[]"),
         ("null", "null"),
         ("number", "1e999"),
@@ -89,9 +90,9 @@ def hostile_json(sound: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
         ("5000 digits", f'{{{inside},"keyframes":{"9" * 5000}}}'),
         ("deep inside", f'{{{inside},"camera":{"[" * 400}{"]" * 400}}}'),
     ):
-        yield what, value.encode("utf-8", "surrogatepass")
+        yield what, wrong.encode("utf-8", "surrogatepass")
     for key in sound:
-        for value in (None, -1, 1e308, [], {"a": []}, "\ud800", "/etc/passwd", True, 1 << 70):
+        for value in VALUES:
             yield f"{key} {value!r:.14}", json.dumps({**sound, key: value}).encode()
 
 
@@ -156,14 +157,14 @@ def hostile_layers() -> Iterator[tuple[str, bytes]]:
         T[:3, 3] = far
         yield f"camera at {far}", layer.pack(replace(head, T_world_camera=T), sections)
     place = bytearray(layer.pack(head, sections)[58:198])
-    for what, at, value in (
+    for what, at, put in (
         ("no rotation", 24, bytes(32)),
         ("rotation of NaN", 24, np.full(4, np.nan).tobytes()),
         ("huge rotation", 24, np.full(4, 1e300).tobytes()),
         ("negative covariance", 56, np.full(21, -1, np.float32).tobytes()),
         ("huge covariance", 56, np.full(21, 3e38, np.float32).tobytes()),
     ):
-        changed = bytes(place[:at]) + value + bytes(place[at + len(value) :])
+        changed = bytes(place[:at]) + put + bytes(place[at + len(put) :])
         yield what, layer.pack(head, sections, changed)
     for what, change in (
         ("empty box", {"box": (0, 0, 0, 0)}),
@@ -181,7 +182,7 @@ def hostile_layers() -> Iterator[tuple[str, bytes]]:
         ("first instant", {"time_unix_ns": -(1 << 63)}),
         ("last instant", {"time_unix_ns": (1 << 63) - 1}),
     ):
-        yield what, layer.pack(replace(head, **change), sections)  # type: ignore[arg-type]
+        yield what, layer.pack(replace(head, **change), sections)
     bomb = bytes(18) + zlib.compress(bytes(15 << 20), 9)
     wide = np.frombuffer(sections[4], np.uint8).tobytes()
     sof = wide.find(b"\xff\xc0")

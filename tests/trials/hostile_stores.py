@@ -211,6 +211,10 @@ def _file(name: str, make: Callable[[Path], object]) -> Change:
     return change
 
 
+def _holds(name: str, data: bytes) -> Change:
+    return _file(name, lambda path: path.write_bytes(data))
+
+
 def _sparse(path: Path) -> None:
     with path.open("wb") as file:
         file.write(b"SQLite format 3\0")
@@ -221,26 +225,26 @@ def by_file(base: Path) -> Iterator[tuple[str, Change]]:
     """Other files in the place of the database, or next to it."""
     data = (base / "scan.db").read_bytes()
     noise = random.Random(3).randbytes(40_000)
-    yield "empty file", _file("scan.db", lambda p: p.write_bytes(b""))
-    yield "noise", _file("scan.db", lambda p: p.write_bytes(noise))
+    yield "empty file", _holds("scan.db", b"")
+    yield "noise", _holds("scan.db", noise)
     yield "no end", _file("scan.db", lambda p: p.symlink_to("/dev/zero"))
     yield "a pipe", _file("scan.db", os.mkfifo)
     yield "a folder", _file("scan.db", Path.mkdir)
     yield "one terabyte of zeros", _file("scan.db", _sparse)
     other = data[:16] + b"\0\1" + data[18:]
-    yield "another page size", _file("scan.db", lambda p: p.write_bytes(other))
-    yield "log of noise", _file("scan.db-wal", lambda p: p.write_bytes(noise))
+    yield "another page size", _holds("scan.db", other)
+    yield "log of noise", _holds("scan.db-wal", noise)
     yield "log is a folder", _file("scan.db-wal", Path.mkdir)
     yield "log without end", _file("scan.db-wal", lambda p: p.symlink_to("/dev/zero"))
-    yield "journal of noise", _file("scan.db-journal", lambda p: p.write_bytes(noise))
+    yield "journal of noise", _holds("scan.db-journal", noise)
     for name in ("scan.json", "library.json"):
         for what, text in hostile_json({"format": "skyrelief scan 1", "title": "x", "tags": []}):
-            yield f"{name}: {what}", _file(name, lambda p, text=text: p.write_bytes(text))
+            yield f"{name}: {what}", _holds(name, text)
         yield f"{name} without end", _file(name, lambda p: p.symlink_to("/dev/zero"))
         yield f"{name} is a pipe", _file(name, os.mkfifo)
         yield f"{name} elsewhere", _file(name, lambda p: p.symlink_to("/etc/passwd"))
     for name in ("link.tlog", "cloud.laz", "preview.png", "trajectory.csv"):
-        yield f"{name} of noise", _file(name, lambda p: p.write_bytes(noise))
+        yield f"{name} of noise", _holds(name, noise)
 
 
 def by_meaning() -> Iterator[tuple[str, Change]]:
@@ -274,7 +278,7 @@ def by_bytes(base: Path, seed: int) -> Iterator[tuple[str, Change]]:
             size = 4096 if at == 0 else 600
             piece = damaged(rest[at : at + size], rng)
             rest = rest[:at] + piece + rest[at + size :]
-        yield f"bytes {number}", _file("scan.db", lambda p, rest=rest: p.write_bytes(rest))
+        yield f"bytes {number}", _holds("scan.db", rest)
 
 
 def hostile_stores(base: Path, folder: Path, count: int, seed: int) -> Iterator[tuple[str, Path]]:
