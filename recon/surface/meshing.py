@@ -28,8 +28,9 @@ def height_mesh(raster: Raster, largest_faces: int = 400_000) -> Mesh:
     """The raster's surface as one sheet, with texture coordinates into the raster.
 
     A vertex per known cell, two triangles per four known cells. Above ``largest_faces`` flat
-    parts are merged (quadric error, Open3D). Walls are steep triangles, undersides are not
-    there: meant for surveys flown looking down. Raises ValueError without two triangles.
+    parts are merged (quadric error by Open3D; without it vertices are clustered). Walls are steep
+    triangles, undersides are not there: meant for surveys flown looking down. Raises ValueError
+    without two triangles.
     """
     known = raster.known
     index = np.full(known.shape, -1, np.int64)
@@ -129,13 +130,35 @@ def _without_lone_vertices(vertices: F64, faces: I32) -> tuple[F64, I32]:
 
 def _simplified(vertices: F64, faces: I32, largest_faces: int) -> tuple[F64, I32]:
     """About ``largest_faces`` triangles of the same surface."""
-    import open3d as o3d
-
+    try:
+        import open3d as o3d
+    except ImportError:
+        return _clustered(vertices, faces, largest_faces)
     mesh = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces)
     )
     small = _reduced(mesh, largest_faces)
     return np.asarray(small.vertices).copy(), np.asarray(small.triangles, np.int32).copy()
+
+
+def _clustered(vertices: F64, faces: I32, largest_faces: int) -> tuple[F64, I32]:
+    """At most ``largest_faces`` triangles: the vertices of each cell of a grid become their mean.
+
+    Rossignac and Borrel 1993 (doi:10.1007/978-3-642-78114-8_29); flat parts get no fewer
+    triangles than others.
+    """
+    width, depth = np.ptp(vertices[:, :2], axis=0)
+    cell = float(np.sqrt(2.0 * width * depth / largest_faces))
+    while True:
+        _, number = np.unique(np.floor(vertices / cell), axis=0, return_inverse=True)
+        number = number.ravel()
+        joined = number[faces].astype(np.int32)
+        whole = (joined != np.roll(joined, 1, axis=1)).all(axis=1)
+        if int(whole.sum()) <= largest_faces:
+            count = np.bincount(number)[:, None]
+            sums = np.column_stack([np.bincount(number, vertices[:, k]) for k in range(3)])
+            return _without_lone_vertices(sums / count, joined[whole])
+        cell *= 1.2
 
 
 def _reduced(mesh: Any, largest_faces: int) -> Any:

@@ -14,11 +14,18 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh
 from recon.types import F32, F64, U8, Bool
 
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
+
+Rays = Callable[[F64, F64], F64]
+"""Camera (3,) and unit directions (N, 3) to metres (N,) up to the mesh, infinite without a hit."""
+
+LARGEST_GRID = 4000
+"""Columns along a side of our own ray casting's grid."""
 
 CANDIDATES = 6
 """Views kept per triangle, the finest."""
@@ -61,15 +68,8 @@ def look(
     the camera, and at least half of those four places have colour. ``progress`` is told the
     share done.
     """
-    import open3d as o3d
-
-    scene = o3d.t.geometry.RaycastingScene()
+    reach = _rays(mesh)
     vertices = np.asarray(mesh.vertices_m, np.float64)
-    tensor: Any = o3d.core.Tensor
-    scene.add_triangles(
-        tensor(np.ascontiguousarray(vertices, np.float32)),
-        tensor(np.ascontiguousarray(mesh.faces, np.uint32)),
-    )
     corners = vertices[mesh.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = 0.5 * np.linalg.norm(normal, axis=1)
@@ -85,12 +85,12 @@ def look(
         progress(number / len(views))
         px, depth = _projected(view, vertices)
         inside = _inside(px, depth, view)
-        inside[inside] = _free(scene, view, vertices[inside], tolerance)
+        inside[inside] = _free(reach, view, vertices[inside], tolerance)
         faces = np.flatnonzero(inside[mesh.faces].all(axis=1))
         towards = view.T_world_camera[:3, 3] - middle[faces]
         facing = np.einsum("ij,ij->i", normal[faces], towards)
         faces = faces[facing > LEAST_COSINE * 2.0 * area[faces] * np.linalg.norm(towards, axis=1)]
-        faces = faces[_free(scene, view, middle[faces], tolerance)]
+        faces = faces[_free(reach, view, middle[faces], tolerance)]
         middle_px = _projected(view, middle[faces])[0]
         resolution = np.sqrt(_doubled_area(px[mesh.faces[faces]]) / (2.0 * area[faces]))
         places = np.concatenate([px[mesh.faces[faces]], middle_px[:, None]], axis=1)
@@ -102,6 +102,34 @@ def look(
         )  # fmt: skip
     progress(1.0)
     return out
+
+
+def _rays(mesh: Mesh) -> Rays:
+    """Exact ray casting against ``mesh``: by Open3D (Embree), else by our own slower grid."""
+    try:
+        import open3d as o3d
+    except ImportError:
+        return _grid_rays(mesh)
+    scene = o3d.t.geometry.RaycastingScene()
+    tensor: Any = o3d.core.Tensor
+    scene.add_triangles(
+        tensor(np.ascontiguousarray(mesh.vertices_m, np.float32)),
+        tensor(np.ascontiguousarray(mesh.faces, np.uint32)),
+    )
+
+    def reach(eye: F64, directions: F64) -> F64:
+        rays: Any = np.empty((len(directions), 6), np.float32)
+        rays[:, :3], rays[:, 3:] = eye, directions
+        return np.asarray(scene.cast_rays(rays)["t_hit"].numpy())
+
+    return reach
+
+
+def _grid_rays(mesh: Mesh) -> Rays:
+    side_m = float(np.ptp(mesh.vertices_m[:, :2], axis=0).max())
+    cell_m = max(2.0 * side_m / np.sqrt(len(mesh.faces)), side_m / LARGEST_GRID, 1e-6)
+    grid = triangle_grid.build(mesh.vertices_m, mesh.faces, cell_m)
+    return lambda eye, directions: np.nan_to_num(grid.cast(eye, directions)[0], nan=np.inf)
 
 
 def consistent(found: Sightings) -> Sightings:
@@ -144,17 +172,14 @@ def _inside(px: F64, depth: F64, view: TextureView) -> Bool:
     return np.asarray(u & v & np.isfinite(depth))
 
 
-def _free(scene: Any, view: TextureView, xyz: F64, tolerance_m: float) -> Bool:
+def _free(reach: Rays, view: TextureView, xyz: F64, tolerance_m: float) -> Bool:
     """(N,) places with no surface between them and the camera, but for ``tolerance_m``."""
     if not len(xyz):
         return np.zeros(0, np.bool_)
     eye = view.T_world_camera[:3, 3]
     ray = xyz - eye
     distance = np.linalg.norm(ray, axis=1)
-    rays = np.empty((len(xyz), 6), np.float32)
-    rays[:, :3] = eye
-    rays[:, 3:] = ray / distance[:, None]
-    hit = scene.cast_rays(rays)["t_hit"].numpy()
+    hit = reach(eye, ray / distance[:, None])
     return np.asarray(hit > distance - tolerance_m - 1e-4 * distance)
 
 
