@@ -6,7 +6,7 @@ import contextlib
 import json
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -82,8 +82,9 @@ class FakeOperator:
         self.commands: list[tuple[int, int, tuple[float, ...]]] = []
         self.callbacks: dict[str, Any] = {}
 
-    def subscribe(self, name: str, callback: Any) -> None:
+    def subscribe(self, name: str, callback: Any) -> Callable[[], None]:
         self.callbacks[name] = callback
+        return lambda: None
 
     def command(self, number: int, component: int, params: tuple[float, ...] = ()) -> Any:
         from service.ground.operator import Ack

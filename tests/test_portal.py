@@ -552,6 +552,35 @@ def test_orders_and_figures_of_the_vehicle(store: Path) -> None:
     assert fake.closed
 
 
+def test_a_stop_waits_for_no_other_order() -> None:
+    """The answer to a start does not come; the stop goes out all the same."""
+    answered, asked = threading.Event(), threading.Event()
+
+    class Slow(FakeOperator):
+        def command(self, number: int, component: int, params: tuple[float, ...] = ()) -> Any:
+            if number == 2500:
+                asked.set()
+                answered.wait()
+            return super().command(number, component, params)
+
+    slow = Slow()
+    vehicle = Vehicle("udpin://x", lambda _: slow)  # type: ignore[arg-type, return-value]
+    vehicle.start()
+    until(lambda: vehicle.figures()["connected"])
+    starting = threading.Thread(target=vehicle.order, args=("start", None), daemon=True)
+    stopping = threading.Thread(target=vehicle.order, args=("stop", None), daemon=True)
+    try:
+        starting.start()
+        asked.wait()
+        stopping.start()
+        until(lambda: [c[0] for c in slow.commands] == [2501])
+    finally:
+        answered.set()
+        starting.join()
+        stopping.join()
+        vehicle.close()
+
+
 def test_without_a_vehicle_orders_are_refused(client: Client) -> None:
     assert client.ask("/api/vehicle")[1] == {"connected": None}
     status, answer, _ = client.ask("/api/vehicle", "POST", {"action": "start"})

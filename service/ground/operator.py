@@ -192,13 +192,19 @@ class Operator:
         result = int(json.loads(answer.fields_json)["result"])
         return Ack(answer.system_id, answer.component_id, result)
 
-    def subscribe(self, name: str, callback: Callable[[int, dict[str, Any]], None]) -> None:
-        """Call back with (component, fields) for every message of a name; "" is all."""
+    def subscribe(
+        self, name: str, callback: Callable[[int, dict[str, Any]], None]
+    ) -> Callable[[], None]:
+        """Call back with (component, fields) for every message of a name; "" is all.
+
+        Returns what ends the subscription.
+        """
 
         def on_message(message: Any, _: Any = None) -> None:
             callback(message.component_id, parse_fields(message.fields_json))
 
-        self._direct.subscribe_message(name, on_message)
+        handle = self._direct.subscribe_message(name, on_message)
+        return lambda: self._direct.unsubscribe_message(handle)
 
     def request(self, number: int, name: str, component: int, wait_s: float) -> dict[str, Any]:
         """One message of a kind, asked for; empty when it does not come in time."""

@@ -25,16 +25,21 @@ def order(operator: Operator, action: str, metres: float | None) -> dict[str, An
     """Give one of the orders; its result. OutsideError when the vehicle does not carry it out."""
     wanted = ORDERS[action]
     reasons: list[str] = []
-    operator.subscribe("STATUSTEXT", lambda _, fields: reasons.append(str(fields.get("text", ""))))
     params = list(wanted.params)
     if wanted.takes_metres:
         assert metres is not None
         params = [metres]
-    ack = operator.command(wanted.number, wanted.component, tuple(params))
-    if ack.result != 0:
-        _wait(lambda: bool(reasons))
-        why = f": {reasons[-1]}" if reasons else ""
-        raise OutsideError(f"{action} {ack.text} by system {ack.system}{why}")
+    end = operator.subscribe(
+        "STATUSTEXT", lambda _, fields: reasons.append(str(fields.get("text", "")))
+    )
+    try:
+        ack = operator.command(wanted.number, wanted.component, tuple(params))
+        if ack.result != 0:
+            _wait(lambda: bool(reasons))
+            why = f": {reasons[-1]}" if reasons else ""
+            raise OutsideError(f"{action} {ack.text} by system {ack.system}{why}")
+    finally:
+        end()
     return {"action": action, "result": ack.text, "system": ack.system, "component": ack.component}
 
 

@@ -44,7 +44,8 @@ class Vehicle:
         self.endpoint = endpoint
         self._connect = connect or _operator
         self._operator: Operator | None = None
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # of the operator's link
+        self._one_order, self._one_stop = threading.Lock(), threading.Lock()
         self._workers = workers or Workers()
         self._searching: Worker | None = None
         self._heard: dict[str, tuple[float, dict[str, Any]]] = {}
@@ -58,13 +59,13 @@ class Vehicle:
         """Close the link."""
         if self._searching is not None:
             self._searching.join(2 * SEARCH_S)
-        with self._lock:
+        with self._one_order, self._one_stop, self._lock:
             if self._operator is not None:
                 self._operator.__exit__(None, None, None)
                 self._operator = None
 
     def order(self, action: str, metres: float | None) -> dict[str, Any]:
-        """Give an order and return its answer.
+        """Send an order and return its answer; one at a time, but a stop waits for no other.
 
         Raises InputError for an unknown one, OutsideError when it was not carried out.
         """
@@ -75,9 +76,11 @@ class Vehicle:
         if metres is not None and not (math.isfinite(metres) and 0.0 <= metres <= 1000.0):
             raise InputError("metres are 0 to 1000")
         with self._lock:
-            if self._operator is None:
-                raise OutsideError(f"no vehicle: {self._trouble}")
-            return order(self._operator, action, metres)
+            operator = self._operator
+        if operator is None:
+            raise OutsideError(f"no vehicle: {self._trouble}")
+        with self._one_stop if action == "stop" else self._one_order:
+            return order(operator, action, metres)
 
     def figures(self) -> dict[str, Any]:
         """Battery, satellites, speed, height, attitude, distance from home; None if not heard."""
