@@ -268,14 +268,26 @@ def test_a_lost_stretch_is_found_again_from_the_pictures() -> None:
     assert apart_m(search, poses, 1, 6) < 0.2
 
 
+def test_a_lost_stretch_is_found_by_its_look_among_many() -> None:
+    """Three keyframes over ground seen long ago, in a frame that says nothing of the place."""
+    poses = [camera(9.0 * i - 50.0, 0.0, 40.0, 0.0) for i in range(12)]
+    poses += [camera(9.0 * i - 40.0, 3.0, 40.0, 2.0) for i in range(3)]
+    other = se3.exp(np.array([0.0, 0.0, 1.2, 150.0, 90.0, 0.0]))
+    chain = [*poses[:12], *(other @ T for T in poses[12:])]
+    search = search_along(poses, chain, [0] * 12 + [1] * 3)
+    assert search.trajectory.graph.is_tied(1)
+    assert apart_m(search, poses, 2, 13) < 0.3
+
+
 def test_the_search_keeps_a_bounded_number_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = view(A, 1)
     trajectory = Trajectory()
     search = LoopSearch(trajectory, threading.Lock(), most_views=6)
+    rng = np.random.default_rng(4)
     for i in range(20):
         T = camera(300.0 * i, 0.0, 40.0, 0.0)
         trajectory.add(i, 0, T, PosePrior(), None, i * 10**9, np.eye(6) * 1e-4)
-        search.look(i, 0, seen.gray, K, seen.depth)
+        search.look(i, 0, rng.integers(0, 255, seen.gray.shape, np.uint8), K, seen.depth)
         assert len(search) <= 6
     assert search.counts["tried"] == 0
 

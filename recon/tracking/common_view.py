@@ -8,6 +8,7 @@ places seen before. The search for Harris corners makes it exact.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -35,13 +36,16 @@ MIN_MATCHES, MIN_MATCH_SHARE = 14, 0.5
 NEAR_SHARE = 0.06
 """Matches within this share of the width say how far a place is off the homography."""
 
+SIGNATURE, SIGNATURE_STEPS = 300, 400.0
+"""Features that say what an image looks like, and steps of their descriptors in a byte."""
+
 KEPT = 16
 """Images whose features are remembered."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Features:
-    """Distinct places of one image with their descriptors."""
+    """Distinct places of one image with their descriptors, the strongest first."""
 
     uv_px: F64  # (N, 2) of the full image
     descriptors: F32  # (N, 128) unit length
@@ -90,9 +94,10 @@ def features(gray: U8) -> Features:
     found, descriptors = cv2.SIFT.create(MOST, contrastThreshold=0.01).detectAndCompute(level, None)
     if descriptors is None or len(found) == 0:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), W)
-    # OpenCV keeps features of equal strength beyond the limit.
-    uv = np.array([point.pt for point in found[:MOST]], np.float64)
-    root = np.sqrt(descriptors[:MOST] / np.maximum(descriptors[:MOST].sum(1, keepdims=True), 1e-9))
+    order = np.argsort([-point.response for point in found], kind="stable")[:MOST]
+    uv = np.array([found[i].pt for i in order], np.float64)
+    total = np.maximum(descriptors[order].sum(1, keepdims=True), 1e-9)
+    root = np.sqrt(descriptors[order] / total)
     scale = np.array([W / size[0], H / size[1]])
     return Features((uv + 0.5) * scale - 0.5, np.asarray(root, np.float32), W)
 
@@ -135,6 +140,33 @@ def _is_sound(H: F64, uv: F64) -> bool:
         return False
     growth = np.linalg.det(H) / w**3  # of areas
     return bool(np.all((growth > 1.0 / 36.0) & (growth < 36.0)))
+
+
+def alike(a: U8, b: U8) -> int:
+    """How many features two signatures (N, 128) have in common, each surely the other's."""
+    rows, _ = _mutual(
+        a.astype(np.float32) / SIGNATURE_STEPS, b.astype(np.float32) / SIGNATURE_STEPS
+    )
+    return len(rows)
+
+
+class Signatures:
+    """The strongest features of many images by number, in 40 kB each."""
+
+    def __init__(self) -> None:
+        self._of: dict[int, U8] = {}
+
+    def of(self, seq: int, gray: Callable[[], U8]) -> U8:
+        """(N, 128) descriptors of image ``seq``, which ``gray`` gives when it is first needed."""
+        if seq not in self._of:
+            strongest = features(gray()).descriptors[:SIGNATURE]
+            steps = np.clip(np.rint(strongest * SIGNATURE_STEPS), 0, 255)
+            self._of[seq] = np.asarray(steps, np.uint8)
+        return self._of[seq]
+
+    def forget(self, seq: int) -> None:
+        """Drop an image."""
+        self._of.pop(seq, None)
 
 
 class FeatureCache:

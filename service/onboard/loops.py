@@ -20,6 +20,7 @@ from recon.loops.loop_closure import (
     ground_seen,
     verify,
 )
+from recon.tracking.common_view import Signatures, alike
 from recon.types import F64, U8, DepthMap
 
 WIDTH_PX = 640
@@ -30,6 +31,12 @@ LEAST_DEPTH_PX = 120
 
 TRIES = 2
 """Verifications per keyframe, at most. Each is bounded work: some 30 to 120 ms on one core."""
+
+COMPARED = 40
+"""Keyframes whose look is compared with a new one's, at most: some 3 ms each."""
+
+MIN_ALIKE = 8
+"""Features that two images of one place have in common, of their strongest."""
 
 PAUSE = 3
 """Keyframes without a search after a loop was taken; neighbours would only repeat it."""
@@ -50,15 +57,18 @@ class _Kept:
     depth_K: F64
     size_px: tuple[int, int]
 
+    def gray(self) -> U8:
+        """(H, W) image."""
+        return np.asarray(cv2.imdecode(self.picture, cv2.IMREAD_GRAYSCALE), np.uint8)
+
     def unpacked(self, scale: float) -> LoopView:
         """The view with its depth in metres."""
-        grey = cv2.imdecode(self.picture, cv2.IMREAD_GRAYSCALE)
         depth = self.depth.astype(np.float32) * np.float32(scale * self.far / 65535.0)
         depth[self.depth == 0] = np.nan
         sigma = self.sigma.astype(np.float32) * np.float32(scale)
         views = np.where(self.depth > 0, 2, 0).astype(np.uint8)
         return LoopView(
-            np.asarray(grey, np.uint8), self.K,
+            self.gray(), self.K,
             DepthMap(depth, sigma, views, self.depth_K, np.eye(4)),
         )  # fmt: skip
 
@@ -102,6 +112,7 @@ class LoopSearch:
         self._kept: dict[int, _Kept] = {}
         self._rest = 0
         self._turn = 0
+        self._signatures = Signatures()
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -165,17 +176,24 @@ class LoopSearch:
         config = self._config.without_gap()
         ground = ground_seen(view.depth)
         found = [s for s, _ in candidates(some, new.seq, new.K, new.size_px, ground, config)]
-        return (found[: TRIES - 1] + self._by_turns(new, seqs) + found[TRIES - 1 :])[:TRIES]
+        return list(dict.fromkeys(self._by_look(new, seqs) + found))[:TRIES]
 
-    def _by_turns(self, new: _Kept, seqs: list[int]) -> list[int]:
-        """One more to try when the segment's place is not known: its predecessor's by turns."""
-        if new.segment == 0 or self.trajectory.graph.is_tied(new.segment):
+    def _by_look(self, new: _Kept, seqs: list[int]) -> list[int]:
+        """Earlier keyframes that look like this one, the most alike first; some of them a time.
+
+        Where fixes or a loop tell where the segment lies, the place says more.
+        """
+        if self.trajectory.graph.is_tied(new.segment):
             return []
-        earlier = [seq for seq in seqs if self._kept[seq].segment != new.segment]
-        if not earlier:
-            return []
+        here = self._signatures.of(new.seq, new.gray)
         self._turn += 1
-        return [earlier[-1 - (self._turn - 1) % len(earlier)]]
+        every = -(-len(seqs) // COMPARED)
+        found = []
+        for seq in seqs[self._turn % every :: every]:
+            count = alike(self._signatures.of(seq, self._kept[seq].gray), here)
+            if count >= MIN_ALIKE:
+                found.append((count, seq))
+        return [seq for _, seq in sorted(found, reverse=True)]
 
     def _is_apart(self, one: _Kept, two: _Kept) -> bool:
         """True when two keyframes are not neighbours on one chain."""
@@ -186,3 +204,4 @@ class LoopSearch:
         """Forget every second keyframe of the older half."""
         for seq in list(self._kept)[: len(self._kept) // 2 : 2]:
             del self._kept[seq]
+            self._signatures.forget(seq)
