@@ -51,10 +51,10 @@ HUBER = 2.5
 WILD = 12.5
 """Fixes and attitudes beyond this are left out once the fit stands, if fewer than half are."""
 
-LEAST_FIX_M = 0.005
+MIN_FIX_M = 0.005
 """Sigma that no fix is better than."""
 
-LEAST_WALK, LEAST_RATE_M_S = 0.02, 0.01
+MIN_WALK, MIN_RATE_M_S = 0.02, 0.01
 """The same of an integrated velocity: m / sqrt(s), and the constant part of its error."""
 
 I64 = npt.NDArray[np.int64]
@@ -201,8 +201,8 @@ class ReadingNoise:
         span_s = float(np.ptp(times_s)) if len(times_s) else 0.0
         for noise, axes in ((self.horizontal, slice(0, 2)), (self.vertical, slice(2, 3))):
             if noise is not None:
-                weighing[:, axes] = max(noise.of_each(len(claimed), span_s), LEAST_FIX_M)
-                single[:, axes] = max(noise.total, LEAST_FIX_M)
+                weighing[:, axes] = max(noise.of_each(len(claimed), span_s), MIN_FIX_M)
+                single[:, axes] = max(noise.total, MIN_FIX_M)
         return weighing, single
 
     def of_travels(self, seconds: F64, span_s: float) -> F64:
@@ -353,7 +353,7 @@ def _measured(
         drift, _ = ways.moved(alone.R, alone.log_scale)
         found = drift_noise(np.cumsum(ways.way_s), np.cumsum(drift, axis=0))
         if found is not None:
-            walk, rate = max(found[0], LEAST_WALK), max(found[1], LEAST_RATE_M_S)
+            walk, rate = max(found[0], MIN_WALK), max(found[1], MIN_RATE_M_S)
             out = replace(out, walk_m_per_sqrt_s=walk, rate_m_s=rate)
     return out
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from recon import se3
-from recon.graph.alignment import LEAST_FIX_M, Anchor, ReadingNoise, height_ratio
+from recon.graph.alignment import MIN_FIX_M, Anchor, ReadingNoise, height_ratio
 from recon.graph.records import Node, PoseGraphConfig
 from recon.graph.smoother import Smoother
 from recon.types import F64, PosePrior
@@ -118,7 +118,7 @@ class Readings:
         prior = node.prior
         if prior.position_m is None or prior.sigma_position_m is None:
             return False
-        sigma = np.maximum(prior.sigma_position_m, LEAST_FIX_M)
+        sigma = np.maximum(prior.sigma_position_m, MIN_FIX_M)
         # The frame rests on all fixes: it is no worse than one of them.
         sure = np.minimum(place, sigma**2 + drift_m**2)
         apart = np.abs(prior.position_m - T[:3, 3])
@@ -128,7 +128,7 @@ class Readings:
         if measured is not None and measured.horizontal and measured.vertical:
             known = (measured.horizontal, measured.horizontal, measured.vertical)
             each = [one.of_each(self._keyframes, self._span_s) for one in known]
-            sigma = np.maximum(each, LEAST_FIX_M)
+            sigma = np.maximum(each, MIN_FIX_M)
         else:
             precise = float(sigma[0]) < PRECISE_M
             seconds = self._config.precise_fix_s if precise else self._config.fix_s

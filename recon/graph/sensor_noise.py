@@ -31,7 +31,7 @@ SURE_OF_WANDER = 1.4
 PRECISE_TAU_S = 10.0
 """Time constant of a receiver's wander with RTK or PPK."""
 
-LEAST_WANDER = 0.25
+MIN_WANDER = 0.25
 """Of what a receiver claims, what it always wanders by."""
 
 PRECISE_M = 0.3
@@ -66,7 +66,7 @@ class Noise:
         is always there. What was measured beyond the claim is vision's own drift. In both cases
         the time constant is not the sensor's, and the usual one stands in for it.
         """
-        least, most = LEAST_WANDER * claimed, claimed
+        least, most = MIN_WANDER * claimed, claimed
         if least <= self.wander <= most or usual_tau_s <= 0:
             return self
         tau_s = PRECISE_TAU_S if claimed < PRECISE_M else usual_tau_s

@@ -1,7 +1,7 @@
 """Velocity of the vehicle integrated along the flight.
 
-Between two instants of one run the difference of two travels is the way flown, with an error
-that grows with time only. That tells the scale of the odometry better than fixes, whose error
+Between two instants of one run the difference of two travels is the displacement, with an error
+that grows with time only. That gives the scale of the odometry better than fixes, whose error
 wanders (:mod:`recon.graph.alignment`).
 """
 
