@@ -89,11 +89,10 @@ class Smoother:
         if not now and len(self._waiting) <= LEAST_WAIT + self._held // POSES_PER_WAIT:
             return False
         self._isam.update(self._graph, self._values)
-        again = self._gtsam.ISAM2UpdateParams()
-        again.force_relinearize = True
-        empty = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
+        g = self._gtsam
+        empty = g.NonlinearFactorGraph(), g.Values(), [], g.KeyGroupMap(), g.KeyList(), g.KeyList()
         for _ in range(rounds):
-            self._isam.update(*empty, again)
+            self._isam.update(*empty, True)  # relinearise; no new factors, removals or groups
         self._graph.resize(0)
         self._values.clear()
         self._held += len(self._waiting)
