@@ -90,9 +90,10 @@ class Smoother:
             return False
         self._isam.update(self._graph, self._values)
         g = self._gtsam
-        empty = g.NonlinearFactorGraph(), g.Values(), [], g.KeyGroupMap(), g.KeyList(), g.KeyList()
+        nothing: list[Any] = [g.NonlinearFactorGraph(), g.Values(), [], g.KeyGroupMap()]
+        nothing += [g.KeyList(), g.KeyList()]
         for _ in range(rounds):
-            self._isam.update(*empty, True)  # relinearise; no new factors, removals or groups
+            self._isam.update(*nothing, True)  # relinearise; no new factors, removals or groups
         self._graph.resize(0)
         self._values.clear()
         self._held += len(self._waiting)
