@@ -36,8 +36,9 @@ MIN_MATCHES, MIN_MATCH_SHARE = 14, 0.5
 NEAR_SHARE = 0.06
 """Matches within this share of the width say how far a place is off the homography."""
 
-SIGNATURE, SIGNATURE_STEPS = 300, 400.0
-"""Features that say what an image looks like, and steps of their descriptors in a byte."""
+SIGNATURE_WIDTH_PX, SIGNATURE, SIGNATURE_STEPS = 320, 200, 400.0
+"""Width of the image and its features that say what it looks like, and steps of their
+descriptors in a byte."""
 
 KEPT = 16
 """Images whose features are remembered."""
@@ -85,10 +86,11 @@ class CommonView:
         return replace(by_plane, uv=self.carry(uv_px))
 
 
-def features(gray: U8) -> Features:
-    """The features of ``gray`` (H, W) uint8; none where it shows nothing."""
+def features(gray: U8, width_px: int = WIDTH_PX) -> Features:
+    """The features of ``gray`` (H, W) uint8, looked for at ``width_px``; none where it shows
+    nothing."""
     H, W = gray.shape
-    size = (min(WIDTH_PX, W), max(16, round(min(WIDTH_PX, W) * H / W)))
+    size = (min(width_px, W), max(16, round(min(width_px, W) * H / W)))
     small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     level = cv2.createCLAHE(4.0, (8, 8)).apply(small)
     found, descriptors = cv2.SIFT.create(MOST, contrastThreshold=0.01).detectAndCompute(level, None)
@@ -151,7 +153,7 @@ def alike(a: U8, b: U8) -> int:
 
 
 class Signatures:
-    """The strongest features of many images by number, in 40 kB each."""
+    """The strongest features of many images by number, in 26 kB each."""
 
     def __init__(self) -> None:
         self._of: dict[int, U8] = {}
@@ -159,7 +161,7 @@ class Signatures:
     def of(self, seq: int, gray: Callable[[], U8]) -> U8:
         """(N, 128) descriptors of image ``seq``, which ``gray`` gives when it is first needed."""
         if seq not in self._of:
-            strongest = features(gray()).descriptors[:SIGNATURE]
+            strongest = features(gray(), SIGNATURE_WIDTH_PX).descriptors[:SIGNATURE]
             steps = np.clip(np.rint(strongest * SIGNATURE_STEPS), 0, 255)
             self._of[seq] = np.asarray(steps, np.uint8)
         return self._of[seq]

@@ -32,8 +32,8 @@ LEAST_DEPTH_PX = 120
 TRIES = 2
 """Verifications per keyframe, at most. Each is bounded work: some 30 to 120 ms on one core."""
 
-COMPARED = 40
-"""Keyframes whose look is compared with a new one's, at most: some 3 ms each."""
+COMPARED = 20
+"""Keyframes whose look is compared with a new one's, at most: some 4 ms each."""
 
 MIN_ALIKE = 8
 """Features that two images of one place have in common, of their strongest."""
