@@ -218,8 +218,9 @@ class Scan:
         apart = self.pipeline.apart()
         if apart:
             out.append(
-                f"{len(apart)} stretches of the flight are left out of the cloud: neither fixes "
-                "nor a place seen twice tie them to the rest; fly with GNSS or more overlap"
+                f"left out of the cloud: {len(apart)} of {self.pipeline.odometry.segment + 1} "
+                "stretches of the flight, which neither fixes nor a place seen twice tie to the "
+                "rest; fly with GNSS or more overlap"
             )
         if frames and self.recorder.keyframes == 0:
             top = self.pipeline.all_refusals().most_common(2)
