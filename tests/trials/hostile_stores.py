@@ -60,9 +60,9 @@ SCHEMAS: dict[str, str] = {
     "held of many": "INSERT INTO held WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 "
     "FROM n LIMIT 200000) SELECT 'peer' || x, 'k0', '[[0,4294967295]]' FROM n",
     "many poses of nothing": "INSERT OR REPLACE INTO poses WITH RECURSIVE n(x) AS (SELECT 1 UNION "
-    "ALL SELECT x + 1 FROM n LIMIT 500000) SELECT x * 7, x, x'00' FROM n",
+    "ALL SELECT x + 1 FROM n LIMIT 100000) SELECT x * 7, x, x'00' FROM n",
     "many keyframes of nothing": "INSERT OR REPLACE INTO chunks WITH RECURSIVE n(x) AS (SELECT 1 "
-    "UNION ALL SELECT x + 1 FROM n LIMIT 300000) SELECT x * 3, 0, 1, 1, 1, 1, x'00' FROM n",
+    "UNION ALL SELECT x + 1 FROM n LIMIT 100000) SELECT x * 3, 0, 1, 1, 1, 1, x'00' FROM n",
     "virtual table": "CREATE VIRTUAL TABLE f USING fts5(x); DROP TABLE radio; "
     "CREATE VIRTUAL TABLE radio USING fts5(kind, number, part, data)",
     "view of itself": "DROP TABLE held; CREATE VIEW held AS SELECT * FROM held",

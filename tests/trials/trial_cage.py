@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,9 @@ ADDRESSES_BYTES = 6 << 30
 """Beyond it an allocation fails, so that a case cannot take the machine."""
 PROCESSOR_S = 60
 LARGEST_FILE_BYTES = 1 << 30
-MOST_MIB = 1024
-"""Resident memory that a case may take, imports included."""
+MOST_MIB, MOST_OF_MESHES_MIB = 1536, 4096
+"""Resident memory that a case may take, imports included: rasters and meshes have their own
+bounds of cells and triangles, which scans of square kilometres reach."""
 PRELOADED = ("exports", "scans", "refine", "stream", "cameras", "commands", "onboard", "ground")
 LATE = ("torch", "triton", "onnx", "mesh_cluster")
 """What a case imports itself: large, or with threads that a fork does not copy."""
@@ -40,6 +41,7 @@ class Outcome:
     mib: int  # resident memory at its most
     processor_s: float
     said: str  # the end of standard error
+    most_mib: int = MOST_MIB
 
     @property
     def fault(self) -> str:
@@ -48,7 +50,7 @@ class Outcome:
         last = lines[-1][:200] if lines else ""
         if self.code not in FOREWARNED or "Traceback" in self.said:
             return f"exit code {self.code}: {last}"
-        if self.mib > MOST_MIB:
+        if self.mib > self.most_mib:
             return f"{self.mib} MiB"
         return ""
 
@@ -75,7 +77,9 @@ class Cage:
 
     def command(self, *arguments: object) -> Outcome:
         """``skyrelief`` with these arguments."""
-        return self._run({"argv": list(map(str, arguments))})
+        end = self._run({"argv": list(map(str, arguments))})
+        is_mesh = arguments[0] == "mesh" or "glb" in arguments
+        return replace(end, most_mib=MOST_OF_MESHES_MIB) if is_mesh else end
 
     def reader(self, name: str, path: Path) -> Outcome:
         """One of :data:`hostile_media.READERS` on a file or folder."""
@@ -116,7 +120,7 @@ def _serve(folder: Path) -> None:
         text = said.read_bytes()[-4000:].decode("utf-8", "replace")
         took = usage.ru_utime + usage.ru_stime
         out = Outcome(code, usage.ru_maxrss >> 10, round(took, 2), text)
-        print(json.dumps({name: getattr(out, name) for name in Outcome.__slots__}), flush=True)
+        print(json.dumps(asdict(out)), flush=True)
 
 
 def _bound(said: Path) -> None:
