@@ -19,8 +19,9 @@ import numpy as np
 
 from recon import se3
 from service.bench.keyframes import make_keyframe
-from service.stream import codec, layer
+from service.stream import codec, layer, radio_messages
 from service.stream.parts import CODES, Part, split, split_in
+from service.stream.radio_tiles import tiles_of
 from service.stream.records import PoseRecord, Repose, ScanHeader, pack_pose, pack_repose
 
 ATTACKER = "mallory"
@@ -347,6 +348,32 @@ def hostile_reports(station: str) -> Iterator[tuple[str, bytes]]:
     yield from hostile_json(sound)
     for value in (-1, 1 << 62, 1 << 70, 1e300):
         yield f"received {value}", json.dumps({**sound, "received_bytes": value}).encode()
+
+
+def hostile_tunnels(seed: int, count: int) -> Iterator[bytes]:
+    """``count`` payloads of the narrow radio: sound ones, their fields at the ends of their
+    types, invented announcements, damaged ones."""
+    rng = random.Random(seed)
+    header = sound_header("radio")
+    tag = radio_messages.tag_of(ATTACKER, header.name)
+    tiles = [radio_messages.pack_tile(tag, t) for t in tiles_of(make_keyframe(0, (160, 90)))]
+    pose = PoseRecord(1_700_000_000_000_000_000, np.eye(4), np.eye(6), 47.39, 8.54, 450.0)
+    sound = [radio_messages.pack_announce(header), radio_messages.pack_pose(tag, 1, pose), *tiles]
+    ends = [sound[k][:at] + end * size + sound[k][at + size :]
+        for k, fields in ((0, ((5, 8), (13, 8), (21, 8), (29, 4), (33, 2), (35, 1))),
+            (1, ((5, 4), (9, 8), (17, 12), (29, 8), (37, 8), (45, 4), (49, 2))),
+            (2, ((5, 2), (7, 4), (11, 1), (12, 1), (13, 1), (14, 12), (26, 8), (34, 2), (36, 4),
+                (40, 2), (42, 2), (44, 1), (45, 2), (47, 80))))
+        for at, size in fields
+        for end in (b"\0", b"\xff", b"\x7f", b"\x80")
+    ]  # fmt: skip
+    yield from (sound + ends)[:count]
+    for number in range(count - len(sound) - len(ends)):
+        if number % 10 == 0:
+            scan = sound_header(f"radio-{rng.randrange(1 << 30):x}", f"ghost-{number}")
+            yield radio_messages.pack_announce(scan)
+        else:
+            yield damaged(rng.choice(sound), rng)[:128]
 
 
 def endless_puts(seed: int) -> Iterator[Put]:

@@ -20,13 +20,22 @@ import numpy as np
 import pytest
 from conftest import HouseFlight
 from hostile_media import hostile_media
-from hostile_records import ATTACKER, damaged, endless_puts, hostile_puts, hostile_reports
+from hostile_records import (
+    ATTACKER,
+    damaged,
+    endless_puts,
+    hostile_puts,
+    hostile_reports,
+    hostile_tunnels,
+)
 from hostile_stores import hostile_stores, numbered
+from loopback import free_port
 from trial_cage import Cage
 from trial_ground import Fleet, Ground, HonestDrone, Watch
 from trial_rig import WHOLE, Row, Service, stored
 
 from service.stream.naming import ROOT
+from service.stream.radio_link import DRONE, RadioLink
 from service.stream.records import Repose
 from service.stream.session import SessionConfig, open_session
 
@@ -90,7 +99,11 @@ def cage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cage]:
 
 def test_hostile_records_stop_nobody(tmp_path: Path, cage: Cage, record: Row) -> None:
     """Each known message, and damaged ones, while an honest drone streams; then every file."""
-    with Ground(tmp_path) as ground, HonestDrone(tmp_path, "honest", ground.endpoint) as drone:
+    radio = f"127.0.0.1:{free_port()}"
+    with (
+        Ground(tmp_path, more=("--mavlink", f"udpin:{radio}")) as ground,
+        HonestDrone(tmp_path, "honest", ground.endpoint) as drone,
+    ):
         ground.until(lambda: stored(ground.store / "honest"), "an honest chunk")
         session = open_session(SessionConfig(connect=(ground.endpoint,)))
         known = list(hostile_puts())
@@ -106,6 +119,7 @@ def test_hostile_records_stop_nobody(tmp_path: Path, cage: Cage, record: Row) ->
                             key = f"{ROOT}/{name}/scan-1/item/k0/{numbers}"
                             session.get(key, lambda _: None, payload=data, timeout=1.0)
                             count += 1
+            count += tunnelled(f"udpout:{radio}", 5000 if WHOLE else 400)
             before = len(stored(drone.scans))
             ground.until(lambda: len(stored(ground.store / "honest")) > before, "later chunks")
             ground.check()
@@ -119,13 +133,27 @@ def test_hostile_records_stop_nobody(tmp_path: Path, cage: Cage, record: Row) ->
     scans = sorted((ground.store / ATTACKER).glob("*/scan.db"))
     faults = exported(cage, [path.parent for path in scans])
     record(
-        f"attack: {len(known)} kinds of hostile messages of the datalink",
+        f"attack: {len(known)} kinds of hostile messages of the datalink, and the radio's",
         count,
         "dropped or kept apart; the ground runs on, each scan's files are written or refused",
         f"{lost} of {made} honest chunks",
     )
     assert not lost
     assert not faults, "\n".join(faults)
+
+
+def tunnelled(endpoint: str, count: int) -> int:
+    """Send hostile payloads of the narrow radio; how many."""
+    link = RadioLink(endpoint, DRONE, lambda _: None)
+    link.start()
+    try:
+        for number, payload in enumerate(hostile_tunnels(SEED, count)):
+            link.send(payload)
+            if number % 50 == 0:
+                time.sleep(0.05)
+    finally:
+        link.close()
+    return count
 
 
 def exported(cage: Cage, scans: list[Path]) -> list[str]:
