@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+import warnings
 import zlib
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from service.stream.records import (
     header_from_json,
     pack_pose,
     pack_repose,
+    unpack_motion,
     unpack_pose,
     unpack_repose,
 )
@@ -243,3 +245,10 @@ def test_a_few_stray_points_do_not_choose_the_size_of_a_grid() -> None:
     for cell_m in (1e-320, 1e-300):
         with pytest.raises(ValueError, match="too large"):
             grid_over(xy, cell_m)
+
+
+def test_a_huge_quaternion_is_none_without_a_word() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert unpack_motion([0.0, 0.0, 0.0, *[1e300] * 4]) is None
+        assert unpack_motion([0.0, 0.0, 0.0, 1.0, math.nan, 0.0, 0.0]) is None

@@ -143,7 +143,7 @@ def is_position(xyz_m: F64) -> bool:
 
 def is_rotation(quaternion: F64) -> bool:
     """Whether w x y z can be made a rotation."""
-    return 0.5 < float(np.linalg.norm(quaternion)) < 2.0
+    return 0.5 < math.hypot(*quaternion) < 2.0
 
 
 def is_time(time_unix_ns: int) -> bool:

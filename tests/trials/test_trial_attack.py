@@ -126,6 +126,9 @@ def test_hostile_records_stop_nobody(tmp_path: Path, cage: Cage, record: Row) ->
             assert ground.ask("/api/scans")[0] == 200
         finally:
             session.close()
+        with HonestDrone(tmp_path, "newcomer", ground.endpoint) as late:
+            ground.until(lambda: stored(ground.store / "newcomer"), "a drone that came later")
+            assert late.land() and late.lost(ground)[0] == 0
         assert drone.land(), ground.said[-3000:]
         lost, made = drone.lost(ground)
         assert ground.stop() == 0, ground.said[-3000:]
