@@ -9,6 +9,8 @@ from typing import Any
 from mavlink import gimbal
 from mavlink.quaternion import from_rpy, normalised
 from mavlink.samples import (
+    RECEIVER_SIGMA_H_M,
+    RECEIVER_SIGMA_V_M,
     AccuracySample,
     AttitudeSample,
     PositionSample,
@@ -55,13 +57,14 @@ def _global_position(m: Message) -> Sample | None:
 
 def _gps_raw(m: Message) -> Sample | None:
     fix = m.fix_type >= 3
-    sigma_h = m.h_acc * 1e-3 if m.h_acc else _from_dop(m.eph, HDOP_TO_M)
-    sigma_v = m.v_acc * 1e-3 if m.v_acc else _from_dop(m.epv, HDOP_TO_M)
+    sigma_h = m.h_acc * 1e-3 if m.h_acc else _from_dop(m.eph, RECEIVER_SIGMA_H_M)
+    sigma_v = m.v_acc * 1e-3 if m.v_acc else _from_dop(m.epv, RECEIVER_SIGMA_V_M)
     return AccuracySample(None, fix, sigma_h, sigma_v, m.alt * 1e-3 if fix else None)
 
 
-def _from_dop(dop_cent: int, metres: float) -> float:
-    return 5.0 if dop_cent == UNKNOWN_U16 or dop_cent == 0 else dop_cent * 0.01 * metres
+def _from_dop(dop_cent: int, unknown_m: float) -> float:
+    """Metres, 1 sigma, from a dilution of precision in hundredths; ``unknown_m`` without one."""
+    return unknown_m if dop_cent in (UNKNOWN_U16, 0) else dop_cent * 0.01 * HDOP_TO_M
 
 
 def _distance_sensor(m: Message) -> Sample | None:

@@ -12,6 +12,8 @@ from mavlink.gimbal import GimbalConfig, steadiest_frame, to_earth
 from mavlink.quaternion import Quaternion, down_component, multiply, slerp
 from mavlink.receiver import receiver_above
 from mavlink.samples import (
+    RECEIVER_SIGMA_H_M,
+    RECEIVER_SIGMA_V_M,
     AccuracySample,
     AttitudeSample,
     GimbalFrame,
@@ -42,8 +44,8 @@ class HistoryConfig:
     sigma_tilt_rad: float = 0.01
     sigma_yaw_rad: float = 0.05
     sigma_gimbal_rad: float = 0.01
-    sigma_h_m: float = 5.0  # without an accuracy from the GNSS receiver
-    sigma_v_m: float = 8.0
+    sigma_h_m: float = RECEIVER_SIGMA_H_M  # without an accuracy from the GNSS receiver
+    sigma_v_m: float = RECEIVER_SIGMA_V_M
     angular_acceleration_rad_s2: float = 1.5  # between samples the attitude may bend this much
     acceleration_m_s2: float = 1.0  # the same for a position with velocity at both ends
 

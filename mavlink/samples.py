@@ -7,6 +7,10 @@ from enum import Enum
 
 from mavlink.quaternion import Quaternion
 
+RECEIVER_SIGMA_H_M, RECEIVER_SIGMA_V_M = 2.1, 3.5
+"""1 sigma per axis of a receiver that states no accuracy: a circular error of 2.5 m, as the data
+sheets of u-blox M8 receivers give it, is 2.1 m per axis; heights are worse by about 1.7."""
+
 
 class GimbalFrame(Enum):
     """What a gimbal's quaternion refers to."""

@@ -237,7 +237,7 @@ def test_receiver_accuracy_becomes_the_sigma_and_no_fix_no_position() -> None:
     for k in range(40):
         history.add(position(50.0, 8.0, 580.0, (0.0, 0.0, 0.0)), T0 + k * 100 * MS)
     state = history.state_at(T0 + 5 * MS)
-    assert state is not None and state.sigma_h_m == pytest.approx(5.0, rel=1e-3)
+    assert state is not None and state.sigma_h_m == pytest.approx(2.1, rel=1e-3)
     history.add(AccuracySample(None, True, 0.02, 0.03), T0 + 100 * MS)
     state = history.state_at(T0 + 100 * MS)
     assert state is not None and state.sigma_h_m == pytest.approx(0.02)

@@ -18,6 +18,7 @@ from mavlink.history import M_PER_DEG, HistoryConfig, VehicleHistory
 from mavlink.logs import TelemetryLog, finish
 from mavlink.quaternion import from_rpy
 from mavlink.samples import (
+    RECEIVER_SIGMA_H_M,
     AccuracySample,
     AttitudeSample,
     GimbalFrame,
@@ -92,7 +93,7 @@ def _place(text: str, fields: dict[str, float]) -> tuple[PositionSample, Accurac
     if lat is None or lon is None or not plausible_place(lat, lon):
         return None
     position = PositionSample(None, lat, lon, fields.get("abs_alt"), relative, None)
-    return position, AccuracySample(None, True, math.hypot(5.0, coarse_m), 8.0)
+    return position, AccuracySample(None, True, math.hypot(RECEIVER_SIGMA_H_M, coarse_m), 8.0)
 
 
 def _attitudes(history: VehicleHistory, text: str, fields: dict[str, float], time_ns: int) -> None:
