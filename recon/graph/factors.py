@@ -46,6 +46,20 @@ def matrix(pose: Any) -> F64:
     return np.asarray(pose.matrix(), np.float64)
 
 
+def whitened(factor: Any, noise: Any, values: Any) -> F64:
+    """(n,) error of a factor over the sigmas of ``noise``, its noise model without a robust loss.
+
+    Some builds of GTSAM give the error of no GPSFactor and the whitening of no robust model.
+    """
+    import gtsam
+
+    if isinstance(factor, gtsam.GPSFactor):
+        error = values.atPose3(factor.keys()[0]).translation() - factor.measurementIn()
+    else:
+        error = factor.unwhitenedError(values)
+    return np.asarray(noise.whiten(error), np.float64)
+
+
 def scaled_motion_error(T_a_b: F64) -> Any:
     """Error function of (pose a, pose b, log scale): their motion against the scaled ``T_a_b``."""
     R, t = T_a_b[:3, :3].copy(), T_a_b[:3, 3].copy()

@@ -258,6 +258,7 @@ class _Batch:
         self._gtsam, self._track, self._config = gtsam, track, config
         self._graph, self._start = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._kinds: list[str] = []
+        self._noises: list[Any] = []
         for key, T in enumerate(track.poses):
             self._start.insert(key, pose3(T))
         self._add_scales()
@@ -289,18 +290,17 @@ class _Batch:
         """Whitened residuals by kind, without the robust losses."""
         out: dict[str, list[F64]] = {}
         for i, kind in enumerate(self._kinds):
-            factor: Any = self._graph.at(i)
-            noise = factor.noiseModel()
-            noise = noise.noise() if hasattr(noise, "noise") else noise
-            error = np.asarray(noise.whiten(factor.unwhitenedError(self._values)), np.float64)
+            error = graph_factors.whitened(self._graph.at(i), self._noises[i], self._values)
             out.setdefault(kind, []).append(np.pad(error, (0, 6 - len(error))))
         return {kind: np.array(rows) for kind, rows in out.items()}
 
     # ---- factors ---------------------------------------------------------------------------
 
-    def _add(self, factor: Any, kind: str) -> None:
+    def _add(self, factor: Any, kind: str, noise: Any = None) -> None:
+        """``noise`` is the factor's noise model without a robust loss, when it has one."""
         self._graph.add(factor)
         self._kinds.append(kind)
+        self._noises.append(noise or factor.noiseModel())
 
     def _robust(self, noise: Any, loss: str = "Huber", at: float = 1.5) -> Any:
         model = self._gtsam.noiseModel
@@ -336,14 +336,12 @@ class _Batch:
         self._add(self._gtsam.CustomFactor(noise, keys, error), kind)
 
     def _add_loop(self, loop: Closure) -> None:
-        noise = self._robust(
-            self._gtsam.noiseModel.Gaussian.Covariance(
-                graph_factors.right_covariance(loop.T_a_b, loop.covariance)
-            )
+        noise = self._gtsam.noiseModel.Gaussian.Covariance(
+            graph_factors.right_covariance(loop.T_a_b, loop.covariance)
         )
         keys = [loop.a, loop.b, self._scale_key(loop.a)]
         error = graph_factors.scaled_motion_error(loop.T_a_b)
-        self._add(self._gtsam.CustomFactor(noise, keys, error), "loop")
+        self._add(self._gtsam.CustomFactor(self._robust(noise), keys, error), "loop", noise)
 
     def _add_placing(self) -> None:
         """The poses' own covariances: they err together, so each counts one N-th."""
@@ -369,15 +367,16 @@ class _Batch:
                 sigma = np.array([prior.sigma_tilt_rad, prior.sigma_tilt_rad, yaw])
                 sigma = sigma * np.sqrt(max(1.0, 2.0 * ATTITUDE_S / gap_s))
                 spread = R.T @ np.diag(sigma**2) @ R
-                noise = self._robust(gtsam.noiseModel.Gaussian.Covariance(spread))
-                factor = gtsam.PoseRotationPrior3D(key, pose3(se3.compose(R, np.zeros(3)))
-                                                   .rotation(), noise)  # fmt: skip
-                self._add(factor, "attitude")
+                noise = gtsam.noiseModel.Gaussian.Covariance(spread)
+                turn = pose3(se3.compose(R, np.zeros(3))).rotation()
+                factor = gtsam.PoseRotationPrior3D(key, turn, self._robust(noise))
+                self._add(factor, "attitude", noise)
             if prior.position_m is not None and prior.sigma_position_m is not None:
                 sigma = np.maximum(prior.sigma_position_m, 0.005)
                 sigma = sigma * np.sqrt(max(1.0, 2.0 * FIX_S / gap_s))
-                noise = self._robust(gtsam.noiseModel.Diagonal.Sigmas(sigma), "Cauchy", 2.0)
-                self._add(gtsam.GPSFactor(key, prior.position_m, noise), "position")
+                noise = gtsam.noiseModel.Diagonal.Sigmas(sigma)
+                robust = self._robust(noise, "Cauchy", 2.0)
+                self._add(gtsam.GPSFactor(key, prior.position_m, robust), "position", noise)
 
     def _add_points(self, points: Sequence[Point], marks: Sequence[Mark]) -> None:
         gtsam = self._gtsam
@@ -392,5 +391,6 @@ class _Batch:
             if mark.depth_m is not None:
                 keys.append(self._scale_key(mark.keyframe))
                 rows = 3
-            noise = self._robust(gtsam.noiseModel.Unit.Create(rows), at=2.5)
-            self._add(gtsam.CustomFactor(noise, keys, mark_error(mark)), "control")
+            noise = gtsam.noiseModel.Unit.Create(rows)
+            robust = self._robust(noise, at=2.5)
+            self._add(gtsam.CustomFactor(robust, keys, mark_error(mark)), "control", noise)

@@ -83,9 +83,10 @@ class Readings:
             self._counts["height off"] += 1  # a tree or a roof under the one sensor alone
             return False
         sigma = ratio[1] * float(np.sqrt(BLOCK * self._config.blocks_per_height))
-        noise = self._robust(self._gtsam.noiseModel.Isotropic.Sigma(1, sigma))
+        noise = self._gtsam.noiseModel.Isotropic.Sigma(1, sigma)
         measured = np.array([ratio[0] - np.log(scale)])
-        self._smoother.add(self._gtsam.PriorFactorVector(scale_key, measured, noise), "height")
+        factor = self._gtsam.PriorFactorVector(scale_key, measured, self._robust(noise))
+        self._smoother.add(factor, "height", noise)
         return True
 
     def _attitude(self, node: Node, T: F64, spread: F64, is_placed: bool) -> bool:
@@ -107,9 +108,9 @@ class Readings:
         R = se3.so3_exp(turn) @ T[:3, :3]
         sigma = sigma * self._inflated(self._config.attitude_s)
         covariance = R.T @ np.diag(sigma**2) @ R
-        noise = self._robust(self._gtsam.noiseModel.Gaussian.Covariance(covariance))
-        factor = self._gtsam.PoseRotationPrior3D(node.key, self._gtsam.Rot3(R), noise)
-        self._smoother.add(factor, "attitude")
+        noise = self._gtsam.noiseModel.Gaussian.Covariance(covariance)
+        factor = self._gtsam.PoseRotationPrior3D(node.key, self._gtsam.Rot3(R), self._robust(noise))
+        self._smoother.add(factor, "attitude", noise)
         return True
 
     def _position(
@@ -133,9 +134,9 @@ class Readings:
             precise = float(sigma[0]) < PRECISE_M
             seconds = self._config.precise_fix_s if precise else self._config.fix_s
             sigma = sigma * self._inflated(seconds)
-        noise = self._robust(self._gtsam.noiseModel.Diagonal.Sigmas(sigma))
-        factor = self._gtsam.GPSFactor(node.key, prior.position_m, noise)
-        self._smoother.add(factor, "position")
+        noise = self._gtsam.noiseModel.Diagonal.Sigmas(sigma)
+        factor = self._gtsam.GPSFactor(node.key, prior.position_m, self._robust(noise))
+        self._smoother.add(factor, "position", noise)
         return True
 
     def _altitude(self, node: Node, T: F64) -> bool:
@@ -152,9 +153,10 @@ class Readings:
             return False
         loose = 1e4  # m: says nothing of east and north
         sigma = np.array([loose, loose, one * self._inflated(self._config.altitude_s)])
-        noise = self._robust(self._gtsam.noiseModel.Diagonal.Sigmas(sigma))
+        noise = self._gtsam.noiseModel.Diagonal.Sigmas(sigma)
         place = np.array([T[0, 3], T[1, 3], z])
-        self._smoother.add(self._gtsam.GPSFactor(node.key, place, noise), "altitude")
+        factor = self._gtsam.GPSFactor(node.key, place, self._robust(noise))
+        self._smoother.add(factor, "altitude", noise)
         return True
 
     def _inflated(self, seconds: float) -> float:

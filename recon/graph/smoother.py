@@ -58,6 +58,7 @@ class Smoother:
         self._graph: Any = gtsam.NonlinearFactorGraph()
         self._values: Any = gtsam.Values()
         self._kinds: list[str] = []
+        self._noises: list[Any] = []
         self._waiting: dict[int, tuple[F64, F64]] = {}  # pose and its left covariance
         self._held = 0
         self.updates = 0
@@ -68,10 +69,14 @@ class Smoother:
 
     # ---- what goes in --------------------------------------------------------------------------
 
-    def add(self, factor: Any, kind: str) -> None:
-        """Take a factor; its residuals are told under ``kind``."""
+    def add(self, factor: Any, kind: str, noise: Any = None) -> None:
+        """Take a factor; its residuals are reported under ``kind``.
+
+        ``noise`` is its noise model without a robust loss, when it has one.
+        """
         self._graph.add(factor)
         self._kinds.append(kind)
+        self._noises.append(noise or factor.noiseModel())
 
     def add_pose(self, key: int, T: F64, covariance: F64) -> None:
         """A new pose (4, 4) with its predicted left covariance (6, 6); keys follow each other."""
@@ -152,10 +157,8 @@ class Smoother:
         values, factors = self._isam.calculateEstimate(), self._isam.getFactorsUnsafe()
         out: dict[str, list[F64]] = {}
         for i, kind in enumerate(self._kinds[: factors.size()]):
-            noise = factors.at(i).noiseModel()
-            noise = noise.noise() if hasattr(noise, "noise") else noise
-            error = noise.whiten(factors.at(i).unwhitenedError(values))
-            out.setdefault(kind, []).append(np.asarray(error, np.float64))
+            error = graph_factors.whitened(factors.at(i), self._noises[i], values)
+            out.setdefault(kind, []).append(error)
         return {kind: np.array(rows) for kind, rows in out.items()}
 
 
