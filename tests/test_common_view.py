@@ -1,0 +1,51 @@
+"""Features of images: the strongest first, remembered for a while, compared by their look."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from painted_ground import pose, still
+
+from recon.tracking import common_view
+from recon.tracking.common_view import FeatureCache, Features, Signatures, alike, features
+from recon.types import U8
+
+
+def noisy(image: U8, seed: int) -> U8:
+    noise = np.random.default_rng(seed).normal(0.0, 12.0, image.shape)
+    return np.asarray(np.clip(image + noise, 0, 255), np.uint8)
+
+
+def test_the_strongest_features_come_first() -> None:
+    """They survive noise better than the last ones."""
+    image = still(pose(0.0))
+    one, other = (features(noisy(image, seed)) for seed in (1, 2))
+    apart_px = np.linalg.norm(one.uv_px[:, None] - other.uv_px, axis=2).min(axis=1)
+    found = apart_px < 0.5
+    assert found[:200].mean() > found[-200:].mean() + 0.15
+
+
+def test_a_cache_forgets_what_was_not_asked_for_longest(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+
+    def counted(gray: U8) -> Features:
+        made.append(int(gray[0, 0]))
+        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), 16)
+
+    monkeypatch.setattr(common_view, "features", counted)
+    cache = FeatureCache(kept=2)
+    for number in (0, 1, 0, 2, 0, 1):
+        cache.of(number, np.full((16, 16), number, np.uint8))
+    assert made == [0, 1, 2, 1]
+
+
+def test_a_look_is_that_of_the_place_whatever_the_turn() -> None:
+    signatures = Signatures()
+    here, turned, elsewhere = (
+        signatures.of(i, partial(still, T))
+        for i, T in enumerate((pose(0.0), pose(6.0, 130.0, seed=1), pose(80.0)))
+    )
+    assert alike(here, turned) > 20 > 8 > alike(here, elsewhere)
+    assert here.dtype == np.uint8 and here.nbytes <= 200 * 128
