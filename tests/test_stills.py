@@ -12,10 +12,13 @@ from recon.types import F64, U8, PosePrior
 PLACED = ("started", "tracked", "keyframe")
 
 
-def flown(images: list[U8]) -> list[Tracked]:
-    """The odometry over stills two seconds apart; nothing is known but the nominal mount."""
+def flown(images: list[U8], sigma_yaw_rad: float = 3.0) -> list[Tracked]:
+    """The odometry over stills two seconds apart, each said to look down, its top to the north.
+
+    By default only the nominal mount is known, and no heading.
+    """
     odometry = Odometry(CAMERA)
-    prior = PosePrior(DOWN, 0.1, 3.0, agl_m=HEIGHT_M)
+    prior = PosePrior(DOWN, 0.1, sigma_yaw_rad, agl_m=HEIGHT_M)
     return [odometry.track(image, i, i * 2_000_000_000, prior) for i, image in enumerate(images)]
 
 
@@ -46,6 +49,12 @@ def test_stills_at_60_percent_overlap_are_one_piece(yaw_deg: float) -> None:
     step = 0.4 * FOOTPRINT_M * (1.0 if yaw_deg == 0.0 else 0.75)
     track = [pose(step * (i - 4), yaw_deg * i, seed=i) for i in range(9)]
     assert_one_piece(track, flown([still(T) for T in track]), 0.02)
+
+
+def test_headings_that_are_wrong_do_not_part_the_flight() -> None:
+    """Tags that say north to five degrees while the camera turns by 40 at every shot."""
+    track = [pose(0.3 * FOOTPRINT_M * (i - 3), 40.0 * i, seed=i) for i in range(7)]
+    assert_one_piece(track, flown([still(T) for T in track], sigma_yaw_rad=0.09), 0.02)
 
 
 def test_a_camera_that_climbs_and_sinks_is_followed() -> None:

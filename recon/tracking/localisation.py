@@ -33,8 +33,15 @@ CLEAR_SHARE = 0.6
 RELIEF_SHARE = 0.02
 """Sigma of a depth that is only that of the plane through other landmarks."""
 
-Start = tuple[OdometryKeyframe, F64, float]
-"""A keyframe, where the camera may be (T_camera_odom) and how far to search."""
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """Where the camera may be, and how far from there to search for a keyframe's corners."""
+
+    key: OdometryKeyframe
+    T_camera_odom: F64  # (4, 4)
+    share: float  # radius, of the image's width
+    by_features: bool = False  # which leave no doubt about the heading
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,12 +92,13 @@ class Localiser:
         reason, best = "no match", None
         least = self.config.min_tracks
         most = None if still else self.config.tracked_landmarks
-        for key, T_camera_odom, share in self._starts(new, keyframes, motion, lost):
-            found = self.pose_from(key, new.pyramid, T_camera_odom, share, least, most)
+        for start in self._starts(new, keyframes, motion, lost):
+            key, T_camera_odom = start.key, start.T_camera_odom
+            found = self.pose_from(key, new.pyramid, T_camera_odom, start.share, least, most)
             if isinstance(found, str):
                 reason = found
                 continue
-            if not self._agrees(found.pose.T_camera_points, new.prior, key):
+            if not self._agrees(found.pose.T_camera_points, new.prior, key, start.by_features):
                 reason = "vision and attitude disagree"
                 continue
             if best is None or found.ok.sum() > best.ok.sum():
@@ -134,6 +142,8 @@ class Localiser:
         largest = np.pi if turn is None else self.config.max_tilt_error_rad
         up = key.T_camera_odom[:3, 2]
         seen = two_view.solve(key.uv[ok], uv[ok], self.camera.K, turn, largest, up)
+        if seen is None and turn is not None:  # tags are often wrong
+            seen = two_view.solve(key.uv[ok], uv[ok], self.camera.K, None, np.pi, up)
         if seen is None or seen.parallax_rad < self.config.least_base_to_height:
             return None
         rows = np.flatnonzero(ok)[seen.inliers]
@@ -173,18 +183,18 @@ class Localiser:
         by_motion = se3.inverse(T_odom_camera)
         if not still or turn is not None:
             share = self.config.wide_search_share if still else self.config.search_share
-            yield key, by_motion, share
+            yield Start(key, by_motion, share)
         if still or lost:
             yield from self._by_features(new, keyframes)
         if not still or turn is None:
-            yield key, by_motion, self.config.wide_search_share
+            yield Start(key, by_motion, self.config.wide_search_share)
 
     def _by_features(self, new: Incoming, keyframes: Sequence[OdometryKeyframe]) -> Iterator[Start]:
         """Poses by features that the frame shares with recent keyframes, the most first."""
         for key, view in self._views(new, keyframes):
             T_camera_odom = self._pose_by(key, view)
             if T_camera_odom is not None:
-                yield key, T_camera_odom, FEATURE_SHARE
+                yield Start(key, T_camera_odom, FEATURE_SHARE, by_features=True)
 
     def _views(
         self, new: Incoming, keyframes: Sequence[OdometryKeyframe]
@@ -271,13 +281,24 @@ class Localiser:
                 return solved
         return None
 
-    def _agrees(self, T_camera_odom: F64, prior: PosePrior, key: OdometryKeyframe) -> bool:
-        """False when vision turned otherwise than telemetry since the keyframe."""
+    def _agrees(
+        self, T_camera_odom: F64, prior: PosePrior, key: OdometryKeyframe, tilt_only: bool
+    ) -> bool:
+        """False when vision turned otherwise than telemetry since the keyframe.
+
+        ``tilt_only`` where vision is sure of the heading: tags and compasses are often wrong.
+        """
         turn = prediction.relative_rotation(key.prior, prior)
         if turn is None:
             return True
         seen = T_camera_odom[:3, :3] @ key.T_odom_camera[:3, :3]
-        return float(np.linalg.norm(se3.so3_log(seen @ turn.T))) < self.config.max_tilt_error_rad
+        if not tilt_only:
+            off = float(np.linalg.norm(se3.so3_log(seen @ turn.T)))
+        else:
+            assert key.prior.R_world_camera is not None and prior.R_world_camera is not None
+            cosine = (seen @ key.prior.R_world_camera[2]) @ prior.R_world_camera[2]
+            off = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        return off < self.config.max_tilt_error_rad
 
 
 def _averaged(left: pnp.PnpResult, right: pnp.PnpResult) -> pnp.PnpResult:

@@ -202,6 +202,8 @@ class Odometry:
         up_a = first.T_camera_odom[:3, 2]
         turn = 0.12 if R_b_a is not None else np.pi
         view = two_view.solve(first.uv[ok], uv[ok], self.K, R_b_a, turn, up_a)
+        if view is None and R_b_a is not None and self._still:  # tags are often wrong
+            view = two_view.solve(first.uv[ok], uv[ok], self.K, None, np.pi, up_a)
         if view is None or view.parallax_rad < self.config.least_base_to_height:
             return self._missed(new, "no certain motion between two frames")
         matched = np.flatnonzero(ok)
