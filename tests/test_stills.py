@@ -89,4 +89,5 @@ def test_stills_of_other_places_are_not_joined() -> None:
     there = [pose(0.3 * FOOTPRINT_M * i + 30.0, seed=5 + i) for i in range(3)]
     found = flown([still(T) for T in here + there])
     assert found[3].state == "lost"
+    assert [f.state for f in found[4:]] == ["keyframe"] * 2
     assert {f.segment for f in found[4:]} == {1}

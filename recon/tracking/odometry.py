@@ -71,6 +71,7 @@ class Odometry:
         self.segment = -1
         self._metric = False  # the current segment has landmarks
         self._lost = 0
+        self._missed_still: Incoming | None = None  # the last frame, when it has no pose
         self._motion: Motion | None = None
         features = FeatureCache()
         self._localiser = Localiser(camera, self.config, self._matcher, features)
@@ -133,10 +134,15 @@ class Odometry:
         new: Incoming,
         reason: str,
     ) -> Tracked:
-        """Count a frame without a pose; after too many, or at a still, begin a new segment."""
+        """Count a frame without a pose; after too many, or two stills, begin a new segment."""
         self._lost += 1
-        if self._lost >= (2 if self._still else self.config.lost_after):
+        if self._still and self._missed_still is not None and self._lost >= 2:
+            first, self._missed_still = self._missed_still, None
+            if self._start(first).state == "started":
+                return self._second_view(new)
+        elif not self._still and self._lost >= self.config.lost_after:
             self._start(new)
+        self._missed_still = new if self._still else None
         return Tracked("lost", self.segment, reason=reason)
 
     def _start(
