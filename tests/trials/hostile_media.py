@@ -68,7 +68,7 @@ def _decoded(name: str) -> Callable[[Path], None]:
 READERS: dict[str, Callable[[Path], None]] = {
     "video .mp4": _camera,
     "video .ts": _camera,
-    "pictures .jpg": _camera,
+    "images .jpg": _camera,
     "recording .mcap": _mcap,
     "survey .csv": _survey,
     **{
@@ -77,11 +77,11 @@ READERS: dict[str, Callable[[Path], None]] = {
         if name.startswith("log ") or name in ("configuration", "camera model")
     },
 }
-"""Name to what reads a file, or a folder of pictures; it may refuse one in words."""
+"""Name to what reads a file, or a folder of images; it may refuse one in words."""
 
 
 def sound_video(path: Path) -> bytes:
-    """Ten small pictures as a video."""
+    """Ten small images as a video."""
     import av
 
     rng = np.random.default_rng(5)
@@ -90,8 +90,8 @@ def sound_video(path: Path) -> bytes:
         stream = out.add_stream("mpeg4" if path.suffix == ".ts" else "libx264", Fraction(10))
         stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
         for k in range(10):
-            picture = np.ascontiguousarray(wall[k : k + 120, 2 * k : 2 * k + 160])
-            for packet in stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")):
+            image = np.ascontiguousarray(wall[k : k + 120, 2 * k : 2 * k + 160])
+            for packet in stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")):
                 out.mux(packet)
         for packet in stream.encode():
             out.mux(packet)
@@ -99,7 +99,7 @@ def sound_video(path: Path) -> bytes:
 
 
 def sound_files(folder: Path, mcap: bytes) -> dict[str, bytes]:
-    """A sound file for each reader but the pictures; ``mcap`` is an exported flight."""
+    """A sound file for each reader but the images; ``mcap`` is an exported flight."""
     first = seeds
     logs = {name: first(name)[0] for name in READERS if name in DECODERS and first(name)}
     model = (FRAMES.parent / "camera.yaml").read_bytes()
@@ -151,7 +151,7 @@ def made_to_harm() -> Iterator[tuple[str, str, bytes]]:
     yield "log .tlog", "last instant", b"\xff" * 8 + bytes(300)
 
 
-def hostile_pictures(folder: Path, rng: random.Random, name: str) -> Path:
+def hostile_images(folder: Path, rng: random.Random, name: str) -> Path:
     """A folder of stills of which some are damaged, bombs, of another size, or no files."""
     here = folder / name
     here.mkdir()
@@ -192,7 +192,7 @@ def _bomb(side_px: int) -> bytes:
 
 
 def hostile_media(folder: Path, mcap: bytes, seed: int) -> Iterator[tuple[str, str, Path]]:
-    """(reader, what it is, path), the reader's kinds in turn, without end; files are made anew."""
+    """(reader, what it is, path), the kinds in turn, without end; each overwrites the last."""
     rng = random.Random(seed)
     sound = sound_files(folder, mcap)
     for reader, what, data in made_to_harm():
@@ -200,8 +200,8 @@ def hostile_media(folder: Path, mcap: bytes, seed: int) -> Iterator[tuple[str, s
     for number in range(1 << 30):
         for reader, data in sound.items():
             yield reader, f"damaged {number}", _file(folder, reader, damaged(data, rng))
-        what = f"pictures {number}"
-        yield "pictures .jpg", what, hostile_pictures(folder, rng, f"pictures-{number}")
+        what = f"images {number}"
+        yield "images .jpg", what, hostile_images(folder, rng, f"images-{number}")
 
 
 def _file(folder: Path, reader: str, data: bytes) -> Path:

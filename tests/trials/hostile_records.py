@@ -343,7 +343,7 @@ def hostile_puts() -> Iterator[Put]:
 
 
 def hostile_reports(station: str) -> Iterator[tuple[str, bytes]]:
-    """What comes to a drone as ``held``; ``station`` only tells one from the next."""
+    """What comes to a drone as ``held``; ``station`` makes each differ."""
     sound = {"v": 1, "numbers": {"k0": [[0, 9]]}, "received_bytes": 5, "from": station}
     yield from hostile_json(sound)
     for value in (-1, 1 << 62, 1 << 70, 1e300):

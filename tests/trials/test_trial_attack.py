@@ -79,7 +79,7 @@ def sent(session: Any, key: str, payload: bytes) -> bool:
 
 
 def asked(session: Any, key: str, payload: bytes) -> bool:
-    """Whether the request is one that Zenoh carries; nobody waits for the answer."""
+    """Whether the request is one that Zenoh carries; the answer is dropped."""
     try:
         session.get(f"{ROOT}/{key}", lambda _: None, payload=payload, timeout=1.0)
     except (zenoh.ZError, ValueError):
@@ -97,7 +97,7 @@ def cage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cage]:
 # Hostile peers
 
 
-def test_hostile_records_stop_nobody(tmp_path: Path, cage: Cage, record: Row) -> None:
+def test_hostile_records_stop_nothing(tmp_path: Path, cage: Cage, record: Row) -> None:
     """Each known message, and damaged ones, while an honest drone streams; then every file."""
     radio = f"127.0.0.1:{free_port()}"
     with (
@@ -336,7 +336,7 @@ def shown(ground: Ground, made: list[str]) -> list[str]:
 def test_hostile_media_is_refused_or_read(
     tmp_path: Path, flown: Path, cage: Cage, record: Row
 ) -> None:
-    """Videos, pictures, logs, settings, camera models, surveys, recordings."""
+    """Videos, images, logs, settings, camera models, surveys, recordings."""
     faults: list[str] = []
     kinds, codes = Counter[str](), Counter[int]()
     media = tmp_path / "media"
@@ -367,7 +367,7 @@ def test_hostile_media_is_refused_or_read(
 FRAMES = Path(__file__).parents[2] / "demo" / "caliterra" / "frames"
 REPLAYED: dict[str, Any] = {
     "video .mp4": lambda path: (path,),
-    "pictures .jpg": lambda path: (path,),
+    "images .jpg": lambda path: (path,),
     "log .tlog": lambda path: (FRAMES, "--telemetry", path),
     "configuration": lambda path: (FRAMES, "--config", path),
     "camera model": lambda path: (FRAMES, "--camera-model", path),
@@ -405,7 +405,7 @@ def slow_requests() -> Iterator[tuple[bytes, bytes]]:
     yield b"GET /api/scans HTTP/1.1\r\n" + host + b"\r\n", b""
 
 
-def test_slow_connections_stop_nobody(tmp_path: Path, record: Row) -> None:
+def test_slow_connections_stop_nothing(tmp_path: Path, record: Row) -> None:
     """Half of them from one address, half from addresses of their own."""
     requests = list(slow_requests())
     opened, refused, held = [], 0, 0

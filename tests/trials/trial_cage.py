@@ -25,7 +25,7 @@ ADDRESSES_BYTES = 6 << 30
 PROCESSOR_S, PROCESSOR_TO_COMPILE_S = 60, 400
 """Of a core; the second for what compiles the pipeline where that has not run yet."""
 LARGEST_FILE_BYTES = 1 << 30
-MOST_MIB, MOST_OF_MESHES_MIB = 1536, 4096
+MAX_MIB, MAX_MESH_MIB = 1536, 4096
 """Resident memory that a case may take, imports included: rasters and meshes have their own
 bounds of cells and triangles, which scans of square kilometres reach."""
 PRELOADED = ("exports", "scans", "refine", "stream", "cameras", "commands", "onboard", "ground")
@@ -42,16 +42,16 @@ class Outcome:
     mib: int  # resident memory at its most
     processor_s: float
     said: str  # the end of standard error
-    most_mib: int = MOST_MIB
+    max_mib: int = MAX_MIB
 
     @property
     def fault(self) -> str:
-        """What is wrong with it; empty when nothing is."""
+        """The fault, or an empty text."""
         lines = self.said.strip().splitlines()
         last = lines[-1][:200] if lines else ""
         if self.code not in FOREWARNED or "Traceback" in self.said:
             return f"exit code {self.code}: {last}"
-        if self.mib > self.most_mib:
+        if self.mib > self.max_mib:
             return f"{self.mib} MiB"
         return ""
 
@@ -80,7 +80,7 @@ class Cage:
         """``skyrelief`` with these arguments."""
         end = self._run({"argv": list(map(str, arguments))})
         is_mesh = arguments[0] == "mesh" or "glb" in arguments
-        return replace(end, most_mib=MOST_OF_MESHES_MIB) if is_mesh else end
+        return replace(end, max_mib=MAX_MESH_MIB) if is_mesh else end
 
     def reader(self, name: str, path: Path) -> Outcome:
         """One of :data:`hostile_media.READERS` on a file or folder."""
