@@ -309,6 +309,21 @@ def test_many_drones_share_the_station_and_one_more_is_refused(
         assert not list((tmp_path / "ground").glob("invented-*"))
 
 
+def test_a_silent_drone_that_brought_least_makes_way_for_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Invented drones with a scan each fill the table; who comes later is received all the same."""
+    monkeypatch.setattr(drones_module, "MAX_DRONES", 3)
+    monkeypatch.setattr(drones_module, "DRONE_TIMEOUT_S", 0.5)
+    with serving(tmp_path / "ground") as (ground, endpoint), hostile(endpoint) as session:
+        for name in ("ghost-1", "ghost-2"):
+            assert until(partial(_introduced, ground, session, name, "scan-1"))
+        assert arrives(tmp_path, endpoint, "first")
+        assert arrives(tmp_path, endpoint, "late")
+        assert "drone late" in {worker["name"] for worker in _running(ground)}
+        assert len({entry["drone"] for entry in ground.progress()}) == 4
+
+
 def test_a_silent_drone_has_no_worker_and_its_scans_stay_listed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

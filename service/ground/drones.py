@@ -49,6 +49,7 @@ class Drones:
         self._members: dict[str, _Member] = {}
         self._resting: OrderedDict[str, DroneReceiver] = OrderedDict()
         self._refused_at = -1e9
+        self._is_wanted = False  # a drone was refused since the last turn
         self._dropped = 0  # messages of drones that left
 
     def get(self, name: str) -> DroneReceiver | None:
@@ -58,6 +59,7 @@ class Drones:
             if member is not None:
                 return member.drone
             if len(self._members) >= MAX_DRONES and not self._make_way():
+                self._is_wanted = True
                 if time.monotonic() - self._refused_at > REFUSAL_S:
                     self._refused_at = time.monotonic()
                     log.warning("%s is not received: %d drones are", name, MAX_DRONES)
@@ -99,7 +101,10 @@ class Drones:
         return max(2, min(MAX_OPEN_SCANS, room // max(1, len(self._members))))
 
     def retire(self, now: float) -> None:
-        """End the workers of drones that are silent and have nothing open, or that failed."""
+        """End the workers of drones that are silent and have nothing open, or that failed.
+
+        While drones are refused, the silent one that brought least makes way, with its scans.
+        """
         with self._lock:
             gone = {
                 name: member
@@ -107,6 +112,9 @@ class Drones:
                 if member.worker.is_done
                 or (not member.drone.scans and now - member.drone.heard_at > DRONE_TIMEOUT_S)
             }
+            if self._is_wanted and len(self._members) - len(gone) >= MAX_DRONES:
+                gone |= self._least_silent(now)
+            self._is_wanted = False
             for name in gone:
                 del self._members[name]
         for name, member in gone.items():
@@ -129,6 +137,16 @@ class Drones:
             member.worker.join()
         return [scan for member in self._members.values() for scan in member.drone.scans]
 
+    def _least_silent(self, now: float) -> dict[str, _Member]:
+        """The silent drone that brought least, the one heard longest ago of several; or none."""
+        silent = [
+            (_brought(member.drone), member.drone.heard_at, name)
+            for name, member in self._members.items()
+            if now - member.drone.heard_at > DRONE_TIMEOUT_S
+            and not any(scan.is_writing for scan in member.drone.scans)
+        ]
+        return {name: self._members[name] for *_, name in sorted(silent)[:1]}
+
     def _make_way(self) -> bool:
         """End the worker of a drone that never had a scan and is silent; False for none."""
         now = time.monotonic()
@@ -140,3 +158,8 @@ class Drones:
                 del self._members[name]
                 return True
         return False
+
+
+def _brought(drone: DroneReceiver) -> int:
+    """How much came of a drone."""
+    return sum(entry["received_bytes"] + entry["radio_messages"] for entry in drone.entries)
