@@ -49,11 +49,13 @@ def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @contextlib.contextmanager
-def serving(folder: Path, limits: Limits | None = None) -> Iterator[tuple[Receiver, str]]:
+def serving(
+    folder: Path, limits: Limits | None = None, refresh_s: float = 0.0
+) -> Iterator[tuple[Receiver, str]]:
     """A ground station and where it listens."""
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     session = SessionConfig(mode="router", listen=(endpoint,))
-    ground = Receiver(ReceiverConfig(folder, session, limits or Limits(), name="base"))
+    ground = Receiver(ReceiverConfig(folder, session, limits or Limits(), "base", refresh_s))
     ground.start()
     try:
         yield ground, endpoint
@@ -315,7 +317,8 @@ def test_a_silent_drone_that_brought_least_makes_way_for_another(
     """Invented drones with a scan each fill the table; who comes later is received all the same."""
     monkeypatch.setattr(drones_module, "MAX_DRONES", 3)
     monkeypatch.setattr(drones_module, "DRONE_TIMEOUT_S", 0.5)
-    with serving(tmp_path / "ground") as (ground, endpoint), hostile(endpoint) as session:
+    station = serving(tmp_path / "ground", refresh_s=0.2)
+    with station as (ground, endpoint), hostile(endpoint) as session:
         for name in ("ghost-1", "ghost-2"):
             assert until(partial(_introduced, ground, session, name, "scan-1"))
         assert arrives(tmp_path, endpoint, "first")

@@ -135,7 +135,7 @@ class DroneReceiver:
     # What comes
 
     def _handle(self, batch: Batch) -> None:
-        if batch:
+        if batch.heads or batch.items:  # events may be of our own
             self.heard_at = time.monotonic()
         for name, payload in batch.heads.items():
             self._on_head(name, payload, time.monotonic())
@@ -193,6 +193,7 @@ class DroneReceiver:
         self, header: ScanHeader, kind: str, number: int, part: int, data: bytes, now: float
     ) -> None:
         """Take in what the narrow radio brought; called by the worker."""
+        self.heard_at = now
         scan = self._scan(header.name, now) or self._create(header, now)
         if scan is None or now < scan.rest_until:
             return
