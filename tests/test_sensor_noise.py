@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.graph.alignment import Anchor, fit
+from recon.graph.alignment import Anchor, fit, scales
 from recon.graph.sensor_noise import Noise, drift_noise, wander_noise
 from recon.graph.travel import Odometer
 from recon.types import F64, PosePrior, Travel
@@ -111,6 +111,7 @@ def test_a_take_off_point_above_the_site_does_not_bend_the_scale(claimed_m: floa
     found = fit(some)
     assert found is not None
     assert found.scale == pytest.approx(1.5, rel=0.002)
+    assert scales(some, found)[1] is None  # so nothing is reported against the fixes
 
 
 def test_velocities_that_contradict_the_fixes_are_left_out() -> None:

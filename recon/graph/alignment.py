@@ -235,6 +235,7 @@ class _Readings:
         self.way = _stack([_way(a.prior, b.prior) for a, b in moved], (3,))
         self.way_s = _stack([_seconds(a.prior, b.prior) for a, b in moved], ())
         self.sigma_way = noise.of_travels(self.way_s, float(np.sum(self.way_s)))
+        self.has_measured_heights = bool(heights) and independent > UNMEASURED_HEIGHTS
         self.log_ratio = _stack([h[0] for h in heights], ())
         thinned = min(1.0, (independent / max(len(heights), 1)) ** 0.5)
         self.sigma_log = _stack([h[1] for h in heights], ()) / thinned
@@ -369,9 +370,9 @@ def _velocities_contradict(readings: _Readings) -> bool:
 
 
 def scales(anchors: Sequence[Anchor], at: Similarity) -> tuple[Scale | None, Scale | None]:
-    """The scale by position fixes alone and by heights alone, each with its sigma.
+    """The scale by position fixes alone and by measured heights alone, each with its sigma.
 
-    None where the track flown or the readings say nothing.
+    None where the track or the readings give none.
     """
     r = _Readings(anchors)
     by_fixes = by_heights = None
@@ -385,7 +386,7 @@ def scales(anchors: Sequence[Anchor], at: Similarity) -> tuple[Scale | None, Sca
             # Errors of fixes wander slowly: all of them together count as a few.
             sigma = np.sqrt(max(len(x) / INDEPENDENT_HEIGHTS, 1.0) / power) / max(scale, 1e-9)
             by_fixes = Scale(scale, float(sigma)) if scale > 0 else None
-    if len(r.log_ratio):
+    if r.has_measured_heights:
         spread = 1.0 / float(np.sqrt(np.sum(1.0 / r.sigma_log**2)))
         by_heights = Scale(float(np.exp(np.median(r.log_ratio))), spread)
     return by_fixes, by_heights
