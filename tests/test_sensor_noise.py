@@ -114,6 +114,19 @@ def test_a_take_off_point_above_the_site_does_not_bend_the_scale(claimed_m: floa
     assert scales(some, found)[1] is None  # so nothing is reported against the fixes
 
 
+def test_a_compass_that_is_off_is_no_drift_of_the_velocity() -> None:
+    """Its 3 degrees are 8 m across a line of 150 m, which the velocity does not drift by."""
+    off = se3.so3_exp(np.array([0.0, 0.0, np.radians(3.0)]))
+    some = []
+    for a in anchors(1.0, 2.0):
+        assert a.prior.R_world_camera is not None
+        some.append(replace(a, prior=replace(a.prior, R_world_camera=off @ a.prior.R_world_camera)))
+    found = fit(some)
+    assert found is not None and found.noise is not None
+    assert found.noise.rate_m_s < 0.03
+    assert abs(np.degrees(se3.so3_log(found.R)[2])) < 0.5
+
+
 def test_velocities_that_contradict_the_fixes_are_left_out() -> None:
     standing = [
         replace(a, prior=replace(a.prior, travel=Travel(np.zeros(3), float(i), 1)))

@@ -51,6 +51,9 @@ HUBER = 2.5
 WILD = 12.5
 """Fixes and attitudes beyond this are left out once the fit stands, if fewer than half are."""
 
+KNOWN_YAW_RAD, NO_YAW_RAD = 1.0, 3.0
+"""Sigma below which a heading counts as known, and one of a heading that is not."""
+
 MIN_FIX_M = 0.005
 """Sigma that no fix is better than."""
 
@@ -225,7 +228,7 @@ class _Readings:
         self.sigma_turn = _stack(
             [[a.prior.sigma_tilt_rad] * 2 + [a.prior.sigma_yaw_rad] for a in turned], (3,)
         )
-        self.heading_known = self.sigma_turn[:, 2] < 1.0
+        self.heading_known = self.sigma_turn[:, 2] < KNOWN_YAW_RAD
         self.x = _stack([a.place_of_fix for a in fixed], (3,))
         self.fix = _stack([a.prior.position_m for a in fixed], (3,))
         self.claimed = _stack([a.prior.sigma_position_m for a in fixed], (3,))
@@ -325,15 +328,16 @@ def _measured(
     anchors: Sequence[Anchor], start: _Solution, fix_s: float, iterations: int
 ) -> ReadingNoise:
     """The noise of fixes and of velocities, each by its residuals to the track as it alone, with
-    the attitudes, has it.
+    the tilt of the attitudes, has it: a compass that is off would look like a drift.
 
     A slow difference may be vision's own drift, so a receiver's wander is bounded by what it
     claims. Its white part is not: from one fix to the next vision does not err by as much.
     """
     out, at = ReadingNoise(), (start.R, start.t, start.log_scale, iterations)
-    fixes = _Readings(
-        [replace(a, height=None, prior=replace(a.prior, travel=None)) for a in anchors]
-    )
+    level = [
+        replace(a, height=None, prior=replace(a.prior, sigma_yaw_rad=NO_YAW_RAD)) for a in anchors
+    ]
+    fixes = _Readings([replace(a, prior=replace(a.prior, travel=None)) for a in level])
     if len(fixes.fix) >= MIN_READINGS:
         alone = _solve(fixes, *at)
         apart, _ = fixes.placed(alone.R, alone.t, alone.log_scale)
@@ -346,9 +350,7 @@ def _measured(
                 horizontal=across.bounded(float(claimed[:2].mean()), fix_s),
                 vertical=along.bounded(float(claimed[2]), fix_s),
             )
-    ways = _Readings(
-        [replace(a, height=None, prior=replace(a.prior, position_m=None)) for a in anchors]
-    )
+    ways = _Readings([replace(a, prior=replace(a.prior, position_m=None)) for a in level])
     if len(ways.way) >= MIN_READINGS:
         alone = _solve(ways, *at)
         drift, _ = ways.moved(alone.R, alone.log_scale)
