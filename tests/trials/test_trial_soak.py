@@ -27,7 +27,7 @@ import numpy as np
 import pytest
 from scipy.stats import theilslopes
 from trial_autopilot import Autopilot, aircraft
-from trial_rig import PATIENCE_S, WHOLE, Chunk, Row, Service, stored
+from trial_rig import PATIENCE_S, WHOLE, Chunk, Row, Service, scan_folders, stored
 
 pytestmark = [pytest.mark.trial, pytest.mark.timeout(9000 if WHOLE else 280)]
 
@@ -133,7 +133,7 @@ def flown(
 
     The ``camera`` holds still now and then.
     """
-    scans = set(service.scans.glob("*"))
+    scans = set(scan_folders(service.scans))
     autopilot.armed.set()
     service.until(lambda: service.get().get("clouds", 0) > 0, "a keyframe")
     start, out = time.monotonic(), []
@@ -162,7 +162,7 @@ def flown(
     time.sleep(5.0)  # until what the scan held is given back
     now = held(service.process.pid)
     hours = (time.monotonic() - begin_s) / 3600.0
-    (folder,) = set(service.scans.glob("*")) - scans
+    (folder,) = set(scan_folders(service.scans)) - scans
     assert (folder / "cloud.laz").is_file()
     keyframes = int(json.loads((folder / "scan.json").read_text())["counts"]["keyframes"])
     landed = replace(out[-1], aloft_s=LANDED, hours=hours, keyframes=keyframes, files=now.files)
