@@ -136,9 +136,10 @@ def test_hostile_records_stop_nothing(tmp_path: Path, cage: Cage, record: Row) -
     scans = sorted((ground.store / ATTACKER).glob("*/scan.db"))
     faults = exported(cage, [path.parent for path in scans])
     record(
-        f"attack: {len(known)} kinds of hostile messages of the datalink, and the radio's",
+        "attack: hostile messages of the datalink and the radio",
         count,
-        "dropped or kept apart; the ground runs on, each scan's files are written or refused",
+        f"{len(known)} kinds, and damaged ones: dropped or kept apart; a drone that comes later is "
+        "received; each scan's files are written or refused",
         f"{lost} of {made} honest chunks",
     )
     assert not lost
