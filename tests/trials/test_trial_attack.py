@@ -43,12 +43,12 @@ zenoh = pytest.importorskip("zenoh")
 for needed in ("starlette", "uvicorn", "websockets", "cryptography", "mcap", "rasterio", "laspy"):
     pytest.importorskip(needed)
 
-SOAK_MINUTES = float(os.environ.get("SKYRELIEF_SOAK_MINUTES", "60")) if WHOLE else 0.07
+SOAK_MINUTES = float(os.environ.get("SKYRELIEF_SOAK_MINUTES", "60")) if WHOLE else 0.05
 pytestmark = [pytest.mark.trial, pytest.mark.timeout(SOAK_MINUTES * 60 + 7200 if WHOLE else 280)]
 
 SEED = 18
-STORES = 300 if WHOLE else 6
-MEDIA = 300 if WHOLE else 50
+STORES = 300 if WHOLE else 4
+MEDIA = 300 if WHOLE else 40
 SLOW = 1000
 GROWTH_MIB = 50.0
 POSE_S = 2.0
@@ -126,9 +126,10 @@ def test_hostile_records_stop_nothing(tmp_path: Path, cage: Cage, record: Row) -
             assert ground.ask("/api/scans")[0] == 200
         finally:
             session.close()
-        with HonestDrone(tmp_path, "newcomer", ground.endpoint) as late:
-            ground.until(lambda: stored(ground.store / "newcomer"), "a drone that came later")
-            assert late.land() and late.lost(ground)[0] == 0
+        if WHOLE:  # invented drones have filled the table
+            with HonestDrone(tmp_path, "newcomer", ground.endpoint) as late:
+                ground.until(lambda: stored(ground.store / "newcomer"), "a drone that came later")
+                assert late.land() and late.lost(ground)[0] == 0
         assert drone.land(), ground.said[-3000:]
         lost, made = drone.lost(ground)
         assert ground.stop() == 0, ground.said[-3000:]
@@ -163,7 +164,7 @@ def tunnelled(endpoint: str, count: int) -> int:
 def exported(cage: Cage, scans: list[Path]) -> list[str]:
     """What goes wrong when deliverables of hostile ``scans`` are written."""
     faults = []
-    for number, scan in enumerate(scans[:40] if WHOLE else scans[:9]):
+    for number, scan in enumerate(scans[:40] if WHOLE else scans[:4]):
         for kind in EXPORTS if WHOLE else EXPORTS[number % len(EXPORTS) :][:1]:
             end = cage.command("export", scan, "--to", kind)
             faults += [f"{scan.name} to {kind}: {end.fault}"] if end.fault else []
@@ -350,7 +351,7 @@ def test_hostile_media_is_refused_or_read(
         kinds[reader] += 1
         end = cage.reader(reader, path)
         faults += [f"{reader}: {what}: {end.fault}"] if end.fault else []
-        if kinds[reader] % (10 if WHOLE else 40) == 1 and reader in REPLAYED:
+        if WHOLE and kinds[reader] % 10 == 1 and reader in REPLAYED:
             end = cage.command("replay", *REPLAYED[reader](path), "--out", media / "scan")
             codes[end.code] += 1
             faults += [f"replay, {reader}: {what}: {end.fault}"] if end.fault else []
@@ -422,7 +423,7 @@ def test_slow_connections_stop_nothing(tmp_path: Path, record: Row) -> None:
                 one.bind((address, 0))
                 one.connect_ex(("127.0.0.1", ground.port))
                 opened.append((one, *requests[k // 2 % len(requests)]))
-                if k % 100 == 99:
+                if k % 200 == 199:
                     honest(ground, answers)
             for one, first, _ in opened:
                 with contextlib.suppress(OSError):
@@ -432,7 +433,7 @@ def test_slow_connections_stop_nothing(tmp_path: Path, record: Row) -> None:
                 for one, _, rest in opened:
                     with contextlib.suppress(OSError):
                         one.send(rest)
-                time.sleep(1.0 if WHOLE else 0.2)
+                time.sleep(1.0 if WHOLE else 0.1)
             before = len(stored(drone.scans))
             ground.until(lambda: len(stored(ground.store / "honest")) > before, "later chunks")
             for one, _, _ in opened:
