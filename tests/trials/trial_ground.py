@@ -225,6 +225,7 @@ class Watch:
     def __init__(self, ground: Ground, name: str) -> None:
         self.ages_s: list[float] = []
         self._place, self._last = ground.store / name, 0
+        self._late: list[tuple[float, float]] = []  # (age, time since the start) over a second
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -233,10 +234,13 @@ class Watch:
         """The worst age, s."""
         self._stop.set()
         self._thread.join()
+        late = [f"{age:.2f} s at {at:.0f} s" for age, at in self._late]
+        print(f"{self._place.name}: {len(self.ages_s)} poses, late ones: {late}", flush=True)
         return max(self.ages_s, default=float("inf"))
 
     def _run(self) -> None:
         seen: set[int] = set()
+        began = time.monotonic()
         while not self._stop.wait(0.1):
             for path in self._place.rglob("scan.db"):
                 with contextlib.suppress(sqlite3.Error):
@@ -247,6 +251,9 @@ class Watch:
                     now = time.time_ns()
                     fresh = [row for row in rows if row[0] not in seen]
                     if seen:
-                        self.ages_s += [(now - time_ns) * 1e-9 for _, time_ns in fresh]
+                        ages_s = [(now - time_ns) * 1e-9 for _, time_ns in fresh]
+                        self.ages_s += ages_s
+                        at = time.monotonic() - began
+                        self._late += [(age, at) for age in ages_s if age > 1.0]
                     seen |= {row[0] for row in fresh}
                     self._last = max(seen, default=0)
