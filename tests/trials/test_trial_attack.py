@@ -239,7 +239,7 @@ def test_hostile_datalink_beside_honest_drones(tmp_path: Path, record: Row) -> N
     )
     assert all(landed) and not any(n for n, _ in lost), (lost, ground.said[-3000:])
     assert code == 0 and "Traceback" not in ground.said, (code, ground.said[-3000:])
-    assert worst_s < POSE_S
+    assert worst_s < (POSE_S if WHOLE else 10 * POSE_S)
     assert max(mib) - mib[0] < GROWTH_MIB, mib
 
 
