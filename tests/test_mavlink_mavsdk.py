@@ -175,6 +175,12 @@ def test_behind_an_autopilot_mavsdk_reads_the_settings(
     pytest.importorskip("mavsdk")
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    # MAVSDK asks for a definition once: on a busy machine a lost answer stays lost.
+    assert any(_settings_are_read() for _ in range(3))
+
+
+def _settings_are_read() -> bool:
+    """True when a ground station behind a new autopilot reads every setting of camera 100."""
     from mavsdk.plugins.camera.camera import Camera
 
     inner, outer = free_port(), free_port()
@@ -187,15 +193,15 @@ def test_behind_an_autopilot_mavsdk_reads_the_settings(
         camera = ground.use(Camera(ground.find()))
         until(lambda: autopilot.camera is not None)
         until(lambda: 100 in [c.component_id for c in camera.camera_list().cameras])
-
-        def settings() -> Any:
-            with contextlib.suppress(Exception):
-                return {s.setting_id for s in camera.get_current_settings(100)}
-            return None
-
-        until(lambda: settings() == set(daemon.link.parameters()))  # they come one by one
         copy = autopilot.camera.cam_definition_uri
         assert copy == "mftp://[;comp=100]camera.xml"  # for whoever asks the autopilot
+        for _ in range(200):  # they come one by one
+            with contextlib.suppress(Exception):
+                found = {s.setting_id for s in camera.get_current_settings(100)}
+                if found == set(daemon.link.parameters()):
+                    return True
+            time.sleep(0.05)
+    return False
 
 
 def test_behind_a_router_that_knows_it_mavsdk_reads_the_metadata(
