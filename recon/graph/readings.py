@@ -15,11 +15,9 @@ import numpy as np
 from recon import se3
 from recon.graph.alignment import MIN_FIX_M, Anchor, ReadingNoise, height_ratio
 from recon.graph.records import Node, PoseGraphConfig
+from recon.graph.sensor_noise import PRECISE_M
 from recon.graph.smoother import Smoother
 from recon.types import F64, PosePrior
-
-PRECISE_M = 0.3
-"""Fixes of a smaller sigma are RTK's or PPK's."""
 
 HEIGHT_GATE = 0.05
 """Share of a height by which one exactly below may be off, once its constant is out."""
