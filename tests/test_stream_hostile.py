@@ -251,3 +251,14 @@ def _complete(session: zenoh.Session, link: DatalinkSender, report: bytes) -> bo
 def test_messages_of_any_size_are_not_put_together() -> None:
     limit = json.loads(zenoh_config(SessionConfig()).get_json("transport/link/rx/max_message_size"))
     assert limit == MAX_MESSAGE_BYTES > HEAD_BYTES
+
+
+@pytest.mark.parametrize("mode", ["client", "router"])
+def test_an_asker_cannot_demand_that_others_wait(mode: str) -> None:
+    """Zenoh sends an answer as its query asks: with BLOCK, an asker that reads nothing holds up
+    the drone for 5 s. Both ends turn that into DROP as the query arrives."""
+    (rule,) = json.loads(zenoh_config(SessionConfig(mode=mode)).get_json("qos/network"))
+    assert rule["messages"] == ["query"] and rule["flows"] == ["ingress"]
+    assert rule["key_exprs"] is None and rule["interfaces"] is None
+    assert rule["overwrite"]["congestion_control"] == "drop"
+    assert rule["overwrite"]["priority"] == "background"

@@ -111,6 +111,16 @@ def zenoh_config(config: SessionConfig) -> zenoh.Config:
         "transport/link/tx/batch_size": BATCH_BYTES,
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
         "adminspace/enabled": False,
+        # Zenoh answers a query with the query's own quality of service. Whoever asks must not
+        # make the drone or the router wait for them (BLOCK), nor pass what is live.
+        "qos/network": [
+            {
+                "id": "answers-yield",
+                "messages": ["query"],
+                "flows": ["ingress"],
+                "overwrite": {"congestion_control": "drop", "priority": "background"},
+            }
+        ],
     }
     if config.tls_ca:
         settings |= {
