@@ -154,7 +154,7 @@ def test_residuals_that_err_together_are_counted_alike(device: str) -> None:
     import cv2
 
     from recon.backends.torch_icp import _area
-    from recon.backends.torch_partners import correlation_sums
+    from recon.backends.torch_surface import correlation_sums
 
     rng = np.random.default_rng(0)
     none = np.zeros((20, 30))

@@ -38,7 +38,7 @@ def kernels(device: str) -> Any:
     if device == "cpu":
         os.environ["TRITON_INTERPRET"] = "1"
     pytest.importorskip("triton", reason="Triton is not installed; torch for CUDA brings it")
-    from recon.backends.kernel_trials import load_kernels
+    from recon.backends.torch_kernels import load_kernels
 
     return load_kernels()
 
@@ -63,7 +63,7 @@ def test_swept_messages_give_the_beliefs_of_the_reference(
     kernels: Any, device: str, height: int, width: int, labels: int, settings: dict[str, float]
 ) -> None:
     """Odd sizes, room around the pair, both colours, several levels."""
-    from recon.backends.torch_dense import edge_weights, propagate
+    from recon.backends.torch_stereo import edge_weights, propagate
 
     config = BeliefPropagationConfig(**settings)  # type: ignore[arg-type]
     left, right = textured(height, width, 1), np.roll(textured(height, width, 2), -2, 1)
@@ -92,7 +92,7 @@ def test_upsampling_in_one_kernel_is_the_reference(
     diameter: int,
 ) -> None:  # fmt: skip
     """Ratios that are not whole, unknown taps, little support, and room around the pictures."""
-    from recon.backends.torch_upsampling import JointBilateral
+    from recon.backends.torch_depth import JointBilateral
 
     config = UpsamplingConfig(min_support=support, diameter_px=diameter)
     rng = np.random.default_rng(0)
@@ -149,10 +149,8 @@ def rolling(east_m: float, up_m: float) -> DepthMap:
 
 def test_registration_by_kernels_is_the_compiled_one(kernels: Any, device: str) -> None:
     """Every iteration of both levels; sums, directions and steps as plain torch has them."""
-    from recon.backends.torch_icp import DeviceIcp, descend
-    from recon.backends.torch_partners import points
-    from recon.backends.torch_sums import weigh
-    from recon.backends.torch_surface import build
+    from recon.backends.torch_icp import DeviceIcp, descend, weigh
+    from recon.backends.torch_surface import build, points
 
     source, target = rolling(0.6, 0.3), rolling(0.0, 0.0)
     config = IcpConfig(strides=(4, 2), iterations=(4, 3))
@@ -187,10 +185,10 @@ COMPILE = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from recon.backends.triton_cost import PIXELS, _census, _cost
+from recon.backends.triton_dense import (
+    CELLS, COLUMNS, PIXELS, ROWS, _bilateral, _census, _cost, _sweep,
+)
 from recon.backends.triton_icp import ROW, _advance, _normal_equations, _residuals
-from recon.backends.triton_propagation import CELLS, _sweep
-from recon.backends.triton_upsampling import COLUMNS, ROWS, _bilateral
 
 def compiled(capability, warps, kernel, words, *constants):
     names = kernel.arg_names
@@ -243,9 +241,9 @@ def test_a_kernel_is_used_only_when_it_agrees_and_is_faster(
     device: str, monkeypatch: pytest.MonkeyPatch, told: Callable[[], str]
 ) -> None:
     """A wrong one, a slow one, one that cannot run, and no Triton at all."""
+    from recon.backends.torch_depth import JointBilateral
+    from recon.backends.torch_icp import advance, weigh
     from recon.backends.torch_kernels import PLAIN, Kernels
-    from recon.backends.torch_sums import advance, weigh
-    from recon.backends.torch_upsampling import JointBilateral
     from service.compute import fused_kernels
 
     def wrong(data: Any, messages: Any, slope: Any, cut: Any, colour: int) -> None:
@@ -318,9 +316,9 @@ def test_a_backend_on_cuda_is_given_the_kernels_that_pay(
 def test_the_backend_computes_with_the_kernels_it_is_given(device: str) -> None:
     """Calls and whole path; what was built before is built anew."""
     from recon.backends.torch_backend import TorchBackend
-    from recon.backends.torch_dense import sweep_plainly
+    from recon.backends.torch_depth import JointBilateral
     from recon.backends.torch_kernels import Kernels
-    from recon.backends.torch_upsampling import JointBilateral
+    from recon.backends.torch_stereo import sweep_plainly
 
     used: list[str] = []
 

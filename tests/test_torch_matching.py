@@ -148,7 +148,7 @@ def test_matching_on_the_device_is_that_of_the_host(
     device: str, radius_px: float, shift: float, zoom: float
 ) -> None:
     """From one level, two and four: the same points, at the same places to 0.02 px."""
-    from recon.backends.torch_matcher import TorchMatcher
+    from recon.backends.torch_tracking import TorchMatcher
     from recon.tracking.matcher import HostMatcher, Matcher
 
     A = np.array([[zoom, 0.02], [-0.02, zoom]])
@@ -181,7 +181,7 @@ def test_matching_on_the_device_is_that_of_the_host(
 
 def test_what_the_matcher_is_given_is_checked(device: str) -> None:
     """Shapes, sizes and radius; no points are no matches; a pyramid of another maker will do."""
-    from recon.backends.torch_matcher import TorchMatcher
+    from recon.backends.torch_tracking import TorchMatcher
     from recon.tracking.matching import Pyramid
 
     own = TorchMatcher(device)

@@ -115,7 +115,7 @@ def test_belief_on_the_device_equals_the_compiled_one(
     device: str, seed: int, tolerance: float
 ) -> None:
     """Contrast, visibility, speckles of every size, and what either picture does not see."""
-    from recon.backends.torch_believe import believe, drop_unseen
+    from recon.backends.torch_stereo import believe, drop_unseen
 
     config = BeliefPropagationConfig(occlusion_tolerance=tolerance)
     pair = stereo_pair(60, 100, 16, seed)
@@ -142,7 +142,7 @@ def test_belief_on_the_device_equals_the_compiled_one(
 
 def test_guide_is_averaged_as_on_the_host(device: str) -> None:
     """Whole and broken ratios; a level of difference where a mean lies half way."""
-    from recon.backends.torch_upsampling import averaged
+    from recon.backends.torch_depth import averaged
 
     rng = np.random.default_rng(0)
     for h, w, H, W in ((30, 40, 120, 160), (27, 41, 229, 347)):
@@ -221,7 +221,7 @@ def by_stages(pairs: list[StereoPair], matching: BeliefPropagationConfig) -> Dep
 @pytest.mark.parametrize("guide", [0, 2])
 def test_the_whole_path_equals_the_stages(device: str, guide: int) -> None:
     """Pairs of several sizes, twice over; the second time nothing is built anew."""
-    from recon.backends.torch_path import DensePath
+    from recon.backends.torch_depth import DensePath
 
     matching = BeliefPropagationConfig()
     path = DensePath(device, matching, UpsamplingConfig(), ALL)
@@ -238,7 +238,7 @@ def test_the_whole_path_equals_the_stages(device: str, guide: int) -> None:
 
 def test_what_the_path_does_not_do_is_said(device: str) -> None:
     """No pair, the guided filter, filled occlusions."""
-    from recon.backends.torch_path import DensePath
+    from recon.backends.torch_depth import DensePath
 
     with pytest.raises(ValueError, match="no stereo pair"):
         path = DensePath(device, BeliefPropagationConfig(), UpsamplingConfig(), ALL)
@@ -283,7 +283,7 @@ def test_half_precision_holds_the_sums_of_small_truncations(
     device: str, truncation: float, exact: bool
 ) -> None:
     """Whole numbers up to 2048: four costs of four truncations fit for 1 label, not for 2.5."""
-    from recon.backends.torch_dense import edge_weights, propagate
+    from recon.backends.torch_stereo import edge_weights, propagate
 
     config = BeliefPropagationConfig(smoothness_truncation=truncation)
     rng = np.random.default_rng(0)

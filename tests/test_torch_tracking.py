@@ -120,7 +120,7 @@ def test_the_pipeline_tracks_on_its_backend(device: str) -> None:
     """Torch brings a matcher of its own; the compiled backend leaves it to the processor."""
     from recon.backends import load_backend
     from recon.backends.torch_backend import TorchBackend
-    from recon.backends.torch_matcher import TorchMatcher
+    from recon.backends.torch_tracking import TorchMatcher
     from recon.tracking.matcher import HostMatcher
 
     own = Pipeline(CAMERA, Config(), FallbackBackend(TorchBackend(device))).odometry._matcher

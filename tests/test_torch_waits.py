@@ -186,10 +186,10 @@ class OffTheDevice(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
 def test_nothing_is_made_on_the_host_between_upload_and_result() -> None:
     """A graph cannot capture a copy from the host's memory; on a processor it would not show."""
+    from recon.backends.torch_depth import DensePath, PairDepthStage
     from recon.backends.torch_icp import _descent
     from recon.backends.torch_kernels import PLAIN
     from recon.backends.torch_matching import harris_cells
-    from recon.backends.torch_path import DensePath, PairDepthStage
     from recon.backends.torch_tracking import match
 
     def empty(kind: Any, *shape: int) -> Any:

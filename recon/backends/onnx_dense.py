@@ -1,6 +1,6 @@
 """The dense stage as ONNX models of fixed shapes: the same numbers as the compiled backend.
 
-Integers are held exactly in float32, as in :mod:`recon.backends.torch_dense`, and as there a
+Integers are held exactly in float32, as in :mod:`recon.backends.torch_stereo`, and as there a
 model may be larger than the pair that it is fed: its true size is then one more input. Tensors
 are (labels, h, w), messages (4, labels, h, w).
 """

@@ -11,11 +11,10 @@ from torch import Tensor
 
 from recon.backends import DenseStages
 from recon.backends.room import pyramid_levels, room
-from recon.backends.torch_dense import DenseStereo
+from recon.backends.torch_depth import DensePath, JointBilateral
 from recon.backends.torch_kernels import PLAIN, Kernels
-from recon.backends.torch_path import DensePath
 from recon.backends.torch_plan import Part, Plan, part, read
-from recon.backends.torch_upsampling import JointBilateral
+from recon.backends.torch_stereo import DenseStereo
 from recon.stereo.belief_propagation import BeliefPropagationConfig, believe
 from recon.stereo.matching_cost import check_pair
 from recon.stereo.upsampling import UpsamplingConfig, check_guide, guide_at_taps, upsample
@@ -60,7 +59,7 @@ class TorchBackend:
 
     def matcher(self) -> Matcher:
         """Corners and tracks on the same device, for another thread."""
-        from recon.backends.torch_matcher import TorchMatcher
+        from recon.backends.torch_tracking import TorchMatcher
 
         return TorchMatcher(self.device)
 

@@ -19,10 +19,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from recon.backends.torch_linear import scale_of
-from recon.backends.torch_partners import SourcePoints
-from recon.backends.torch_sums import SHARED, SIGN_ROUNDS, Weighed
-from recon.backends.torch_surface import DeviceSurface
+from recon.backends.torch_icp import SHARED, SIGN_ROUNDS, Weighed
+from recon.backends.torch_surface import DeviceSurface, SourcePoints, scale_of
 from recon.clouds.registration import MIN_PARTNERS, IcpConfig
 
 POINTS = 128
@@ -36,7 +34,7 @@ def weigh(
     seen: SourcePoints, a: DeviceSurface, b: DeviceSurface, T: Tensor, tukey: bool,
     config: IcpConfig,
 ) -> Weighed:  # fmt: skip
-    """As :func:`recon.backends.torch_sums.weigh`."""
+    """As :func:`recon.backends.torch_icp.weigh`."""
     count = len(seen.sigma)
     residual, found = torch.empty((2, count), dtype=torch.float64, device=T.device)
     blocks = triton.cdiv(count, POINTS)
@@ -64,7 +62,7 @@ def weigh(
 def advance(
     weighed: Weighed, a: DeviceSurface, T: Tensor, state: Tensor, share: float, config: IcpConfig
 ) -> tuple[Tensor, Tensor]:
-    """As :func:`recon.backends.torch_sums.advance`; ``T`` and ``state`` are new ones."""
+    """As :func:`recon.backends.torch_icp.advance`; ``T`` and ``state`` are new ones."""
     T, state = T.clone(), state.clone()
     _advance[(1,)](
         weighed.H, weighed.common, weighed.g, weighed.partners, weighed.centre, a.lever_m, T,
@@ -214,7 +212,7 @@ def _advance(
     H, common, g, partners, centre, lever, T, state, share, weak_slope, shared, least,
     rounds,
 ):  # fmt: skip
-    """See :func:`recon.backends.torch_sums.advance`."""
+    """See :func:`recon.backends.torch_icp.advance`."""
     c = tl.arange(0, 8)
     r, s = c[:, None], c[None, :]
     inside = (r < 6) & (s < 6)

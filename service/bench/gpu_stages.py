@@ -13,16 +13,13 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from recon.backends.room import pyramid_levels
-from recon.backends.torch_believe import believe, drop_unseen
-from recon.backends.torch_dense import DenseStereo
-from recon.backends.torch_depth import fuse, reproject
+from recon.backends.torch_depth import DensePath, JointBilateral, averaged, fuse, reproject
 from recon.backends.torch_icp import DeviceIcp
 from recon.backends.torch_kernels import PLAIN, Kernels
-from recon.backends.torch_matcher import TorchMatcher
 from recon.backends.torch_matching import harris_cells, refine, search
-from recon.backends.torch_path import DensePath
 from recon.backends.torch_plan import Plan, part
-from recon.backends.torch_upsampling import JointBilateral, averaged
+from recon.backends.torch_stereo import DenseStereo, believe, drop_unseen
+from recon.backends.torch_tracking import TorchMatcher
 from recon.clouds.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.depth_fusion import FusionConfig

@@ -7,8 +7,7 @@ import time
 from collections.abc import Callable
 from subprocess import SubprocessError
 
-from recon.backends.kernel_trials import Trial, joined, load_kernels, trials
-from recon.backends.torch_kernels import PLAIN, Kernels
+from recon.backends.torch_kernels import PLAIN, Kernels, Trial, joined, load_kernels, trials
 
 log = logging.getLogger(__name__)
 

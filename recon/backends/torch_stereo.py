@@ -1,4 +1,4 @@
-"""The dense stage in torch: matching cost, belief propagation, winner.
+"""Stereo in torch: matching cost, belief propagation (Eq. 1), winner, and whether to believe it.
 
 Written in plain operations on fixed shapes, so that it runs on any device and is captured as
 one CUDA graph. The pairs of a flight differ by a few pixels and labels from each other: arrays
@@ -16,11 +16,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from recon.backends.torch_cost import FAR, inside, matching_cost
 from recon.backends.torch_kernels import PLAIN, Kernels, Sweep
-from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.belief_propagation import SPECKLE_STEP, BeliefPropagationConfig
 from recon.stereo.disparity_selection import NOISE, RADIUS, SURE_EVIDENCE
-from recon.stereo.matching_cost import COST_UNIT
+from recon.stereo.matching_cost import CENSUS_RADIUS, COST_UNIT
 from recon.stereo.message_passing import FULL_WEIGHT
 
 BEYOND = 28000
@@ -243,3 +242,154 @@ def select(
     sees = (there >= 0) & (there < true[1]) & inside(best.shape, true)
     confidence = torch.where(believed & sees, margin.clamp(max=1) * sure, 0.0)
     return torch.where(sees, px, math.nan), confidence
+
+
+FAR = 1.0e6
+"""More than any cost or sum of costs."""
+
+
+def inside(shape: torch.Size | tuple[int, ...], true: Tensor) -> Tensor:
+    """(h, w) boolean: rows and columns of the pair itself; ``true`` begins with its size."""
+    rows = torch.arange(shape[-2], device=true.device)[:, None]
+    return (rows < true[0]) & (torch.arange(shape[-1], device=true.device)[None, :] < true[1])
+
+
+def census(image: Tensor) -> Tensor:
+    """(48, h, w) float32: 1 where the neighbour is darker than the pixel."""
+    h, w = image.shape
+    r = CENSUS_RADIUS
+    padded = F.pad(image[None, None], (r, r, r, r), mode="replicate")[0, 0]
+    offsets = [(j, i) for j in range(2 * r + 1) for i in range(2 * r + 1) if (j, i) != (r, r)]
+    return torch.stack([(padded[j : j + h, i : i + w] < image).float() for j, i in offsets])
+
+
+def matching_cost(
+    left: Tensor, right: Tensor, labels: int, true: Tensor, config: BeliefPropagationConfig
+) -> Tensor:
+    """(L, h, w) cost of each label, see :mod:`recon.stereo.matching_cost`; 0 beyond."""
+    c = config.cost
+    width = left.shape[1]
+    bits_left, bits_right = census(left), census(right)
+    column = torch.arange(width, device=left.device)
+    layers = []
+    for label in range(labels):
+        shift = label + config.min_disparity
+        first, last = min(max(0, shift), width), max(min(width, width + shift), 0)
+        if first >= last:
+            layers.append(torch.full_like(left, FAR))
+            continue
+        there = slice(first - shift, last - shift)
+        bits = (bits_left[:, :, first:last] - bits_right[:, :, there]).abs().sum(0)
+        grey = (left[:, first:last] - right[:, there]).abs()
+        seen = bits.clamp(max=c.census_truncation) * round(c.census_weight * COST_UNIT)
+        seen = seen + grey.clamp(max=c.difference_truncation) * round(
+            c.difference_weight * COST_UNIT
+        )
+        partner = column[first:last] - shift
+        seen = torch.where((partner < true[1]) & (label < true[2]), seen, FAR)
+        layers.append(F.pad(seen, (first, width - last), value=FAR))
+    cost = torch.stack(layers)
+    best = cost.amin(0, keepdim=True)
+    unseen = torch.where(best < FAR, best + round(c.unseen * COST_UNIT), torch.zeros_like(best))
+    return torch.where(cost < FAR, cost, unseen) * inside(cost.shape, true)
+
+
+CONTRAST_PX = 9
+UNKNOWN = -2048 * SPECKLE_STEP
+
+
+def believe(
+    left: Tensor, px: Tensor, confidence: Tensor, true: Tensor, config: BeliefPropagationConfig
+) -> tuple[Tensor, Tensor]:
+    """Labels (h, w), NaN where nothing speaks for them, and their confidence.
+
+    Raises ValueError for ``fill_occluded``, which belongs to still pairs.
+    """
+    if config.fill_occluded:
+        raise ValueError("fill_occluded is not done on the device")
+    if config.min_contrast > 0:
+        confidence = torch.where(_contrast(left) < config.min_contrast, 0.0, confidence)
+    gone = confidence <= 0
+    if config.occlusion_tolerance >= 0:
+        gone = gone | _hidden(px, confidence, true, config)
+    px = torch.where(gone | ~inside(px.shape, true), math.nan, px)
+    if config.speckle_px > 0:
+        px = torch.where(_speckles(px, config.speckle_px), math.nan, px)
+    return px, torch.where(px == px, confidence, 0.0)
+
+
+def _contrast(image: Tensor) -> Tensor:
+    """Standard deviation of the grey levels in 9x9, (h, w) float64; sums are exact."""
+    r = CONTRAST_PX // 2
+    wide = F.pad(image.float()[None], (r, r, r, r), mode="replicate")
+
+    def mean(values: Tensor) -> Tensor:
+        summed = F.avg_pool2d(values, CONTRAST_PX, 1, divisor_override=1)[0]
+        return summed.double() / CONTRAST_PX**2
+
+    return (mean(wide * wide) - mean(wide) ** 2).clamp(min=0).sqrt()
+
+
+def _hidden(
+    px: Tensor, confidence: Tensor, true: Tensor, config: BeliefPropagationConfig
+) -> Tensor:
+    """True where the right view would see a nearer, believed surface."""
+    w = px.shape[1]
+    known = px == px
+    label = torch.where(known, px, 0.0)
+    column = torch.arange(w, device=px.device)[None, :]
+    partner = column - torch.floor(label + 0.5).long() - config.min_disparity
+    sees = known & (partner >= 0) & (partner < true[1])
+    partner = partner.clamp(0, w - 1)
+    told = torch.where(sees & (confidence > 0), label, -math.inf)
+    nearest = torch.full_like(px, -math.inf).scatter_reduce(1, partner, told, "amax")
+    return sees & (nearest.gather(1, partner) > label + config.occlusion_tolerance)
+
+
+def _speckles(px: Tensor, largest: int) -> Tensor:
+    """True on surfaces of at most ``largest`` pixels.
+
+    The least index of a surface wanders from neighbour to neighbour. After ``largest`` steps it
+    has been everywhere on a surface that small; a set of pixels with one index is a whole
+    surface when no neighbour of the same surface has another index.
+    """
+    h, w = px.shape
+    level = torch.where(px == px, px * SPECKLE_STEP, float(UNKNOWN)).int()
+    known = level > UNKNOWN
+    across = ((level[:, 1:] - level[:, :-1]).abs() <= SPECKLE_STEP) & known[:, 1:] & known[:, :-1]
+    down = ((level[1:] - level[:-1]).abs() <= SPECKLE_STEP) & known[1:] & known[:-1]
+    own = torch.arange(h * w, device=px.device, dtype=torch.int32).view(h, w)
+    for _ in range(largest):
+        own = torch.minimum(own, _of_neighbours(own, across, down, h * w, torch.minimum))
+    most = _of_neighbours(own, across, down, -1, torch.maximum)
+    least = _of_neighbours(own, across, down, h * w, torch.minimum)
+    mixed = ((most > own) | (least < own)).int().view(-1)
+    index = own.view(-1).long()
+    count = torch.zeros_like(mixed).scatter_add(0, index, torch.ones_like(mixed))
+    part = torch.zeros_like(mixed).scatter_reduce(0, index, mixed, "amax")
+    small = (count[index] <= largest) & (part[index] == 0)
+    return small.view(h, w) & known
+
+
+def _of_neighbours(own: Tensor, across: Tensor, down: Tensor, none: int, best: object) -> Tensor:
+    """The best of the indices of the connected neighbours; ``none`` without any."""
+    assert callable(best)
+    right = F.pad(torch.where(across, own[:, 1:], none), (0, 1), value=none)
+    left = F.pad(torch.where(across, own[:, :-1], none), (1, 0), value=none)
+    below = F.pad(torch.where(down, own[1:], none), (0, 0, 0, 1), value=none)
+    above = F.pad(torch.where(down, own[:-1], none), (0, 0, 1, 0), value=none)
+    result: Tensor = best(best(right, left), best(below, above))
+    return result
+
+
+def drop_unseen(
+    px: Tensor, confidence: Tensor, left_seen: Tensor, right_seen: Tensor, true: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The labels without those that rest on nothing in either picture; masks are 0 or 1."""
+    w = px.shape[1]
+    known = px == px
+    column = torch.arange(w, device=px.device)[None, :]
+    partner = torch.round(column - torch.where(known, px, 0.0).double()).long()
+    sees = known & (left_seen > 0) & (partner >= 0) & (partner < true[1])
+    sees = sees & (right_seen.gather(1, partner.clamp(0, w - 1)) > 0)
+    return torch.where(sees, px, math.nan), torch.where(sees, confidence, 0.0)
