@@ -27,9 +27,9 @@ from service.config import Config, DatalinkConfig
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.onboard.datalink import OWN_LINKS, DaemonLink
+from service.radio import GROUND, TUNNEL, EndpointCarrier, RadioLink
 from service.stream import codec
 from service.stream.link import DatalinkSender
-from service.stream.radio_link import GROUND, TUNNEL, EndpointCarrier, RadioLink, RadioSender
 from service.stream.radio_messages import (
     MAX_BYTES,
     Tile,
@@ -46,7 +46,7 @@ from service.stream.records import PoseRecord, Repose, ScanHeader
 from service.stream.records import unpack_pose as unpack_record
 from service.stream.session import SessionConfig
 from service.stream.store import ScanStore
-from service.stream.tunnel import TunnelConfig, TunnelIntake, TunnelSender
+from service.stream.tunnel import RadioSender, TunnelConfig, TunnelIntake, TunnelSender
 
 HEADER = ScanHeader("20260101T120000Z", "drone-a", 1_767_268_800_000_000_000, 47.5, 8.25, 431.5)
 F = 260.0

@@ -31,14 +31,13 @@ from service.bench.link_emulator import free_port
 from service.config import DatalinkConfig
 from service.ground.received import ReceivedScan
 from service.ground.receiver import Receiver, ReceiverConfig
+from service.radio import GROUND, TUNNEL, RadioLink, VehicleRadio
 from service.stream import codec
 from service.stream.link import DatalinkSender
-from service.stream.radio_link import GROUND, TUNNEL, RadioLink
 from service.stream.radio_messages import unpack_tile
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.session import SessionConfig
 from service.stream.store import ScanStore
-from service.stream.vehicle_radio import VehicleRadio
 
 BAUD = 57_600
 BYTES_S = BAUD / 10

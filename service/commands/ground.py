@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from service.ground.portal import Portal
     from service.ground.receiver import Receiver
     from service.init_system import Notifier
-    from service.stream.radio_link import RadioLink
+    from service.radio import RadioLink
     from service.workers import Worker, Workers
 
 DEFAULT_PORT = 7447
@@ -95,8 +95,8 @@ def ground(
     """Receive scans from drones; end with Ctrl-C. Scans lie in STORE/DRONE/SCAN."""
     from service.ground.receiver import Receiver, ReceiverConfig
     from service.init_system import Notifier
+    from service.radio import GROUND, RadioLink
     from service.stream.keys import member_name, tls_files
-    from service.stream.radio_link import GROUND, RadioLink
     from service.stream.session import SessionConfig
     from service.workers import Workers
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import threading
 from collections.abc import Callable
@@ -15,9 +14,9 @@ from service.errors import SkyreliefError
 if TYPE_CHECKING:
     from mavlink.vehicle import VehicleLink
     from service.onboard.scan import Datalink
-    from service.stream.radio_link import Carrier
+    from service.radio import VehicleRadio
     from service.stream.store import ScanStore
-    from service.stream.vehicle_radio import VehicleRadio
+    from service.stream.tunnel import Carrier
 
 log = logging.getLogger(__name__)
 
@@ -32,15 +31,20 @@ def open_datalink(
 
     ``own_links`` are the vehicle's links; without a vehicle, as in a replay, there are none.
     """
-
-    datalink, radio = config.datalink, None
-    if datalink.radio == OWN_LINKS:
-        datalink, radio = dataclasses.replace(datalink, radio=""), own_links
-    if not (datalink.connect or datalink.listen or datalink.radio or radio):
+    datalink, radio = config.datalink, own_links
+    if datalink.radio != OWN_LINKS:
+        radio = _endpoint(datalink.radio) if datalink.radio else None
+    if not (datalink.connect or datalink.listen or radio):
         return None
     from service.stream.link import DatalinkSender
 
     return DatalinkSender(store, datalink, radio=radio)
+
+
+def _endpoint(endpoint: str) -> Carrier:
+    from service.radio import EndpointCarrier
+
+    return EndpointCarrier(endpoint)
 
 
 def open_backlog(config: Config) -> Datalink | None:
@@ -81,7 +85,7 @@ class DaemonLink:
         """Send a scan, in place of the backlog, to the ground stations that are configured."""
         self.rest()
         if config.datalink.radio == OWN_LINKS and self._radio is None:
-            from service.stream.vehicle_radio import VehicleRadio
+            from service.radio import VehicleRadio
 
             self._radio = VehicleRadio(vehicle)
         self.flying = open_datalink(store, config, self._radio)

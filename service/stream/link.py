@@ -18,12 +18,11 @@ from service.stream.lanes import Outgoing
 from service.stream.messages import Ask, unpack_ask, unpack_held
 from service.stream.naming import ROOT, check_name
 from service.stream.outbox import Outbox
-from service.stream.radio_link import Carrier, EndpointCarrier, RadioSender
 from service.stream.ranges import RangeSet, ranges_from_text
 from service.stream.reports import TAKE_S, HeldNotes, Reports
 from service.stream.session import SessionConfig, check_endpoints, open_session
 from service.stream.store import ScanStore
-from service.stream.tunnel import TunnelConfig
+from service.stream.tunnel import Carrier, RadioSender, TunnelConfig
 from service.workers import Worker, Workers
 
 if TYPE_CHECKING:
@@ -75,7 +74,7 @@ class DatalinkSender:
     All puts happen on a thread of its own. Without endpoints in ``config`` nothing is opened.
     Raises InputError when an endpoint or a name cannot be used; a ground station that is not
     there yet is waited for. Between flights ``store`` is None and ``drone`` says whose scans
-    :meth:`add` will bring. ``radio`` carries the narrow fallback in place of ``config.radio``.
+    :meth:`add` will bring. ``radio`` carries the narrow fallback.
     """
 
     def __init__(
@@ -120,11 +119,11 @@ class DatalinkSender:
             self._thread = self._workers.start("datalink", self._run)
         atexit.register(self.close)  # Zenoh aborts a process that ends around an open session
         self._radio = None
-        if store is not None and radio is None and config.radio:
-            radio = EndpointCarrier(config.radio)
         if store is not None and radio is not None:
             tunnel = TunnelConfig(config.radio_baud / 10, config.radio_share)
-            self._radio = RadioSender(store, tunnel, radio, lambda: not self._listened())
+            self._radio = RadioSender(
+                store, tunnel, radio, lambda: not self._listened(), self._workers
+            )
 
     def _listened(self) -> bool:
         with self._lock:

@@ -1,4 +1,4 @@
-"""The narrow radio, both ends, without sockets or clocks: coarse tiles and poses by TUNNEL.
+"""The narrow radio, both ends: coarse tiles and poses by TUNNEL.
 
 When there is no IP link, the drone sends small messages over the telemetry radio, each
 decodable alone, within a share of the radio's rate and slower when RADIO_STATUS says that
@@ -8,11 +8,15 @@ the radio's buffer fills. What was sent is repeated while there is nothing new.
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 
+from service.errors import InputError
 from service.stream import codec
 from service.stream.budget import TokenBucket
 from service.stream.radio_messages import (
@@ -29,7 +33,9 @@ from service.stream.radio_tiles import tiles_of
 from service.stream.records import PoseRecord, Repose, ScanHeader, unpack_repose
 from service.stream.records import unpack_pose as unpack_record
 from service.stream.store import ScanStore
+from service.workers import Worker, Workers
 
+HEARTBEAT_S = 1.0
 ANNOUNCE_EVERY_S = 10.0
 POSE_EVERY_S = 1.0
 REPEATS = 2
@@ -181,6 +187,83 @@ class TunnelSender:
             waiting.payload = b""
             if waiting.repeats > 0:
                 self._again.appendleft(waiting)
+
+
+class Carrier(Protocol):
+    """What takes tunnelled payloads to the ground."""
+
+    def open(self, on_status: Callable[[int], None]) -> None:
+        """Begin; ``on_status`` gets the free share of the radio's buffer in percent."""
+
+    def beat(self) -> None:
+        """Say that we are there; asked every second."""
+
+    def send(self, payload: bytes) -> None:
+        """Send a payload to everybody."""
+
+    def close(self) -> None:
+        """End."""
+
+
+class RadioSender:
+    """Sends a scan's coarse tiles and poses over the radio while ``needed`` says so."""
+
+    def __init__(
+        self,
+        store: ScanStore,
+        config: TunnelConfig,
+        carrier: Carrier,
+        needed: Callable[[], bool] = lambda: True,
+        workers: Workers | None = None,
+    ) -> None:
+        try:
+            self._tunnel = TunnelSender(store, config, time.monotonic())
+        except ValueError as error:
+            raise InputError(str(error)) from error
+        self._events: deque[Callable[[float], None]] = deque(maxlen=10_000)
+        self._store = store
+        self._needed = needed
+        self._carrier = carrier
+        store.listen(self._news)
+        carrier.open(self._status)
+        self._worker = (workers or Workers()).start("radio", self._run)
+
+    @property
+    def sent_bytes(self) -> int:
+        """Bytes handed to the radio."""
+        return self._tunnel.sent_bytes
+
+    @property
+    def all_sent(self) -> bool:
+        """Whether everything has been sent at least once; nobody confirms it on the radio."""
+        return not self._events and self._tunnel.all_sent
+
+    def close(self) -> None:
+        """Stop sending."""
+        self._worker.join(5.0)
+        self._store.unlisten(self._news)
+        self._carrier.close()
+
+    def _news(self, kind: str, number: int) -> None:
+        self._events.append(lambda _: self._tunnel.news(kind, number))
+
+    def _status(self, free_percent: int) -> None:
+        self._events.append(lambda now: self._tunnel.radio_status(free_percent, now))
+
+    def _run(self, worker: Worker) -> None:
+        beat_at = 0.0
+        while not worker.stop.is_set():
+            now = time.monotonic()
+            while self._events:
+                self._events.popleft()(now)
+            if now >= beat_at:
+                self._carrier.beat()
+                beat_at = now + HEARTBEAT_S
+            todo = self._tunnel.next(now) if self._needed() else 0.5
+            if isinstance(todo, bytes):
+                self._carrier.send(todo)
+            else:
+                worker.stop.wait(min(todo, 0.1))
 
 
 @dataclass(slots=True, eq=False)

@@ -34,8 +34,8 @@ from trial_cage import Cage
 from trial_ground import Fleet, Ground, HonestDrone, Watch
 from trial_rig import WHOLE, Row, Service, stored
 
+from service.radio import DRONE, RadioLink
 from service.stream.naming import ROOT
-from service.stream.radio_link import DRONE, RadioLink
 from service.stream.records import Repose
 from service.stream.session import SessionConfig, open_session
 

@@ -1,44 +1,25 @@
-"""The narrow radio on a real MAVLink link: TUNNEL out and in, RADIO_STATUS heeded."""
+"""The narrow radio on MAVLink: TUNNEL out and in, RADIO_STATUS handed on.
+
+Either an endpoint of its own, or the links that the daemon already holds: a serial port has one
+owner, so where the telemetry radio hangs on the autopilot the coarse map goes through the
+vehicle's own link.
+"""
 
 from __future__ import annotations
 
-import logging
-import threading
-import time
-from collections import deque
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 from mavlink.framing import Decoder, Framer
 from mavlink.link import Link, parse_link
+from mavlink.vehicle import VehicleLink
 from mavlink.wire import dialect
 from service.errors import InputError
 from service.stream.radio_messages import MAX_BYTES, PAYLOAD_TYPE
-from service.stream.store import ScanStore
-from service.stream.tunnel import TunnelConfig, TunnelSender
 
-log = logging.getLogger(__name__)
-
-HEARTBEAT_S = 1.0
 TUNNEL, RADIO_STATUS = 385, 109
 DRONE = (1, 191)  # system and component: the onboard computer
 GROUND = (254, 190)
-
-
-class Carrier(Protocol):
-    """What takes tunnelled payloads to the ground."""
-
-    def open(self, on_status: Callable[[int], None]) -> None:
-        """Begin; ``on_status`` gets the free share of the radio's buffer in percent."""
-
-    def beat(self) -> None:
-        """Say that we are there; asked every second."""
-
-    def send(self, payload: bytes) -> None:
-        """Send a payload to everybody."""
-
-    def close(self) -> None:
-        """End."""
 
 
 class RadioLink:
@@ -126,64 +107,30 @@ class EndpointCarrier:
         self._link.close()
 
 
-class RadioSender:
-    """Sends a scan's coarse tiles and poses over the radio while ``needed`` says so."""
+class VehicleRadio:
+    """A carrier of one scan's tunnelled payloads after the other; made once per vehicle."""
 
-    def __init__(
-        self,
-        store: ScanStore,
-        config: TunnelConfig,
-        carrier: Carrier,
-        needed: Callable[[], bool] = lambda: True,
-    ) -> None:
-        try:
-            self._tunnel = TunnelSender(store, config, time.monotonic())
-        except ValueError as error:
-            raise InputError(str(error)) from error
-        self._events: deque[Callable[[float], None]] = deque(maxlen=10_000)
-        self._store = store
-        self._needed = needed
-        self._stop = threading.Event()
-        self._carrier = carrier
-        self._thread = threading.Thread(target=self._run, name="radio", daemon=True)
-        store.listen(self._news)
-        carrier.open(self._status)
-        self._thread.start()
+    def __init__(self, vehicle: VehicleLink) -> None:
+        self._vehicle = vehicle
+        self._on_status: Callable[[int], None] | None = None
+        vehicle.listen("RADIO_STATUS", self._heard)
 
-    @property
-    def sent_bytes(self) -> int:
-        """Bytes handed to the radio."""
-        return self._tunnel.sent_bytes
+    def open(self, on_status: Callable[[int], None]) -> None:
+        """Begin; ``on_status`` gets the free share of the radio's buffer in percent."""
+        self._on_status = on_status
 
-    @property
-    def all_sent(self) -> bool:
-        """Whether everything has been sent at least once; nobody confirms it on the radio."""
-        return not self._events and self._tunnel.all_sent
+    def beat(self) -> None:
+        """Nothing: the vehicle's link has heartbeats of its own."""
+
+    def send(self, payload: bytes) -> None:
+        """Send a payload to everybody."""
+        self._vehicle.send_tunnel(PAYLOAD_TYPE, payload)
 
     def close(self) -> None:
-        """Stop sending."""
-        self._stop.set()
-        self._thread.join(5.0)
-        self._store.unlisten(self._news)
-        self._carrier.close()
+        """End; the link stays open."""
+        self._on_status = None
 
-    def _news(self, kind: str, number: int) -> None:
-        self._events.append(lambda _: self._tunnel.news(kind, number))
-
-    def _status(self, free_percent: int) -> None:
-        self._events.append(lambda now: self._tunnel.radio_status(free_percent, now))
-
-    def _run(self) -> None:
-        beat_at = 0.0
-        while not self._stop.is_set():
-            now = time.monotonic()
-            while self._events:
-                self._events.popleft()(now)
-            if now >= beat_at:
-                self._carrier.beat()
-                beat_at = now + HEARTBEAT_S
-            todo = self._tunnel.next(now) if self._needed() else 0.5
-            if isinstance(todo, bytes):
-                self._carrier.send(todo)
-            else:
-                self._stop.wait(min(todo, 0.1))
+    def _heard(self, message: Any) -> None:
+        on_status = self._on_status
+        if on_status is not None:
+            on_status(int(message.txbuf))
