@@ -9,8 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from service.cameras.ahead import ahead
-from service.cameras.source import CameraFrame
+from service.cameras.source import CameraFrame, ahead
 
 
 class Recording:

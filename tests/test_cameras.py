@@ -15,9 +15,7 @@ import numpy as np
 import pytest
 
 from service.cameras import CAMERAS, CameraFrame, CameraSource, open_camera, parse_source
-from service.cameras import pipe as pipe_module
-from service.cameras.pipe import PipeReader, index_at_end
-from service.cameras.video import parse_time_unix_ns
+from service.cameras.video import PipeReader, index_at_end, parse_time_unix_ns
 from service.errors import InputError
 
 SIZE_PX = (160, 96)
@@ -234,7 +232,9 @@ def test_pipe_of_every_streamable_container(monkeypatch: pytest.MonkeyPatch) -> 
     for container_format, options in formats.items():
         data = io.BytesIO()
         write_video(data, container_format, options)
-        monkeypatch.setattr(pipe_module, "_stream", lambda rest, d=data: io.BytesIO(d.getvalue()))
+        monkeypatch.setattr(
+            "service.cameras.video._stream", lambda rest, d=data: io.BytesIO(d.getvalue())
+        )
         frames = list(open_camera("-"))
         check_pictures(frames)
         for frame, ms in zip(frames, TIMES_MS, strict=True):
@@ -243,7 +243,7 @@ def test_pipe_of_every_streamable_container(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_pipe_of_raw_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     data = b"".join(picture(i).tobytes() for i in range(len(TIMES_MS)))
-    monkeypatch.setattr(pipe_module, "_stream", lambda rest: io.BytesIO(data))
+    monkeypatch.setattr("service.cameras.video._stream", lambda rest: io.BytesIO(data))
     source = open_camera(
         f"pipe:-?format=rawvideo&video_size={SIZE_PX[0]}x{SIZE_PX[1]}"
         "&pixel_format=bgr24&framerate=25"
@@ -263,7 +263,7 @@ def test_pipe_refuses_what_cannot_be_piped(monkeypatch: pytest.MonkeyPatch, tmp_
         b"no video at all " * 400: "not a video stream",
     }
     for data, expected in cases.items():
-        monkeypatch.setattr(pipe_module, "_stream", lambda rest, d=data: io.BytesIO(d))
+        monkeypatch.setattr("service.cameras.video._stream", lambda rest, d=data: io.BytesIO(d))
         with pytest.raises(InputError, match=expected):
             open_camera("pipe:-")
     assert index_at_end(path.read_bytes()[:4096])

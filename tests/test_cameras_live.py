@@ -23,7 +23,7 @@ from loopback import until
 
 from service.cameras import CameraFrame, CameraSource, open_camera
 from service.cameras.live import LiveConfig, LiveSource, StampFilter
-from service.cameras.pace import paced
+from service.cameras.source import paced
 from service.errors import InputError, OutsideError
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs the ffmpeg command")

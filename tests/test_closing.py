@@ -15,11 +15,11 @@ from loopback import until
 from mavlink.control import Phase
 from service.config import load_config
 from service.daemon import runtime
-from service.daemon.closing import ClosingWatch, sizes
-from service.daemon.memory import KEPT_EACH, fill_small_caches, give_back, one_pool
+from service.daemon.machine import KEPT_EACH, fill_small_caches, give_back, one_pool
 from service.daemon.runtime import Daemon
 from service.daemon.scan_run import ScanRun
 from service.daemon.scanning import Scanning
+from service.daemon.writing import ClosingWatch, sizes
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 

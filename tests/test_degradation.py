@@ -12,7 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.config import ComputeConfig
-from service.daemon.degradation import Ladder, LadderConfig, Level, Move, Readings, lowered, strain
+from service.daemon.load_shedding import (
+    Ladder,
+    LadderConfig,
+    Level,
+    Move,
+    Readings,
+    lowered,
+    strain,
+)
 
 CALM = Readings(10, 0, 60, 0, 0.05, 55.0, False, 4000.0)
 LATE = replace(CALM, late_views=4)

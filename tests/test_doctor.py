@@ -15,8 +15,7 @@ from loopback import free_port
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 
 from service.config import load_config
-from service.daemon.diagnosis import examine
-from service.daemon.findings import BAD, GOOD, NOTE
+from service.daemon.diagnosis import BAD, GOOD, NOTE, examine
 
 DEMO = Path(__file__).resolve().parents[1] / "demo" / "caliterra"
 
@@ -134,7 +133,7 @@ def test_what_is_missing_to_fly_is_told(tmp_path: Path) -> None:
 
 
 def test_the_boards_settings_are_compared() -> None:
-    from service.daemon.boards import BOARDS, board_of, other_than_profile, profile_path
+    from service.daemon.diagnosis import BOARDS, board_of, other_than_profile, profile_path
 
     assert board_of("NVIDIA Jetson Orin Nano Developer Kit") == "orin-nano"
     assert board_of("NVIDIA Jetson AGX Orin Developer Kit") == "orin-agx"

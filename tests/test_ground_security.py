@@ -14,8 +14,7 @@ import pytest
 from loopback import until
 
 from service.config import DatalinkConfig, load_config
-from service.daemon.diagnosis import _certificate
-from service.daemon.findings import BAD, GOOD, NOTE
+from service.daemon.diagnosis import BAD, GOOD, NOTE, _certificate
 from service.errors import InputError, OutsideError
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig

@@ -19,8 +19,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 
 from service.config import Config, load_config, reload
-from service.daemon.health import HealthServer, metrics_text
-from service.daemon.health_api import STATUS
+from service.daemon.health import STATUS, HealthServer, metrics_text
 from service.daemon.machine import CoreLoad, Machine, computer_load, read_machine
 from service.daemon.runtime import Daemon
 from service.errors import InputError, OutsideError

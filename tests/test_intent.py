@@ -29,10 +29,17 @@ from recon.backends.cpu import CpuBackend
 from service.cameras.camera_file import load_camera
 from service.config import load_config
 from service.daemon import intent as intent_module
-from service.daemon import resumption
 from service.daemon import scanning as scanning_module
-from service.daemon.intent import LAST_RETRY_S, Intent, Wanted
-from service.daemon.landing import Landing, LandingWatch
+from service.daemon.intent import (
+    LAST_RETRY_S,
+    MARK,
+    Intent,
+    Landing,
+    LandingWatch,
+    Left,
+    Resumption,
+    Wanted,
+)
 from service.daemon.runtime import Daemon
 from service.daemon.scan_run import ScanRun
 from service.daemon.scanning import Scanning
@@ -125,7 +132,7 @@ def test_every_stop_ends_the_retries_of_a_scan_that_fails(
         opened, looks = refused.opened, refused.looks
         until(lambda: refused.looks > looks + 4)
         assert refused.opened == opened
-        assert resumption.Resumption(tmp_path).left is resumption.Left.NOTHING
+        assert Resumption(tmp_path).left is Left.NOTHING
         assert refused.command(2500, 100) == Result.ACCEPTED  # and a start starts again
         until(lambda: refused.opened > opened)
 
@@ -165,8 +172,8 @@ def test_a_stop_before_the_service_is_ready_holds(
 def test_a_stop_forgets_a_scan_to_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     boot = tmp_path / "boot"
     boot.write_text("another")
-    monkeypatch.setattr(resumption, "BOOT", boot)
-    (tmp_path / resumption.MARK).write_text("this")  # a power cut, and no autopilot heard yet
+    monkeypatch.setattr("service.daemon.intent.BOOT", boot)
+    (tmp_path / MARK).write_text("this")  # a power cut, and no autopilot heard yet
     daemon, begun = daemon_in(tmp_path), list[ScanRun]()
     monkeypatch.setattr(ScanRun, "carry_out", begun.append)
     daemon.actions.is_ready = True
@@ -442,7 +449,7 @@ class AnyOrder(RuleBasedStateMachine):
         phase, intent = self.scanning.phase, self.scanning.intent
         assert intent.wanted.value == self.wanted
         assert intent.paused.is_set() == (self.wanted == "pause")
-        mark = Path(self.folder.name) / resumption.MARK
+        mark = Path(self.folder.name) / MARK
         assert mark.exists() == (self.wanted != "nothing")
         if self.run is None:
             assert phase is (Phase.IDLE if self.wanted == "nothing" else Phase.WAITING)

@@ -19,8 +19,8 @@ from service.cameras import CameraFrame, open_camera
 from service.cameras.source import CameraSource
 from service.compute.backend_choice import FallbackBackend
 from service.config import load_config
-from service.daemon.degradation import Level
 from service.daemon.frame_gate import FrameGate, picture_name
+from service.daemon.load_shedding import Level
 from service.daemon.machine import Machine
 from service.daemon.runtime import Daemon
 

@@ -19,8 +19,7 @@ from mavlink.presence import Health
 from mavlink.rehearsal import RehearsalControl
 from mavlink.wire import dialect
 from service.config import load_config
-from service.daemon.findings import BAD, NOTE, Finding
-from service.daemon.link_diagnosis import examine_links
+from service.daemon.diagnosis import BAD, NOTE, Finding, examine_links
 
 GCS = (255, 190)
 

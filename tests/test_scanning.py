@@ -15,7 +15,7 @@ from mavlink.control import Phase
 from recon.backends.cpu import CpuBackend
 from service.cameras.camera_file import load_camera
 from service.config import load_config
-from service.daemon import resumption
+from service.daemon.intent import MARK, Left
 from service.daemon.runtime import Daemon
 from service.daemon.scan_run import ScanRun
 
@@ -102,10 +102,10 @@ def test_a_scan_by_command_goes_on_after_a_fall(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     (tmp_path / "boot").write_text("this")
-    monkeypatch.setattr(resumption, "BOOT", tmp_path / "boot")
+    monkeypatch.setattr("service.daemon.intent.BOOT", tmp_path / "boot")
     if boot != "none":
         (tmp_path / "scans").mkdir()
-        (tmp_path / "scans" / resumption.MARK).write_text(boot)
+        (tmp_path / "scans" / MARK).write_text(boot)
     begun, end = threading.Event(), threading.Event()
 
     def scan(_: ScanRun) -> None:
@@ -121,7 +121,7 @@ def test_a_scan_by_command_goes_on_after_a_fall(
     for _ in range(3):
         daemon._resume()
     assert begun.wait(10.0 if goes_on else 0.2) == goes_on
-    mark = tmp_path / "scans" / resumption.MARK
+    mark = tmp_path / "scans" / MARK
     if goes_on:
         assert mark.read_text() == "this"
         daemon.actions.stop_scan()
@@ -139,25 +139,25 @@ def test_only_a_scan_that_nobody_ended_goes_on(
             load_config(None, [f"scan.folder={tmp_path}", f"scan.start={start}", "health.http="])
         )
 
-    def left(daemon: Daemon) -> resumption.Left:
+    def left(daemon: Daemon) -> Left:
         return daemon.scanning.resumption.left
 
     end = threading.Event()
     monkeypatch.setattr(ScanRun, "carry_out", lambda _: end.wait(60.0))
     killed = next_life()
     killed.scanning.start()
-    assert left(next_life()) is resumption.Left.BY_SERVICE
+    assert left(next_life()) is Left.BY_SERVICE
     killed.scanning.stop()
-    assert left(next_life()) is resumption.Left.NOTHING
+    assert left(next_life()) is Left.NOTHING
     end.set()
     until(lambda: not killed.scanning.is_running)
     killed.scanning.start()  # the recording ends by itself
     until(lambda: not killed.scanning.is_running)
-    assert left(next_life()) is resumption.Left.NOTHING
+    assert left(next_life()) is Left.NOTHING
     by_itself = next_life("on-boot")
     by_itself.scanning.start()
-    assert left(next_life()) is resumption.Left.NOTHING
-    (tmp_path / resumption.MARK).write_text("of a configuration that was on-command")
+    assert left(next_life()) is Left.NOTHING
+    (tmp_path / MARK).write_text("of a configuration that was on-command")
     by_itself = next_life("on-boot")
     by_itself._resume()
     assert not by_itself.scanning.is_running

@@ -20,7 +20,7 @@ from service.cameras.images import open_images
 from service.config import Config, load_config
 from service.daemon.runtime import Daemon
 from service.daemon.scan_run import ScanRun
-from service.daemon.tuning import TUNABLES, parameters_of, with_parameter
+from service.daemon.vehicle_config import TUNABLES, parameters_of, with_parameter
 from service.errors import InputError
 from service.onboard.scan import Scan, ScanInputs, create_store
 

@@ -11,7 +11,7 @@ from loopback import free_port, until
 from mavlink.rehearsal import RehearsalVehicle
 from mavlink.wall_time import DIFFER_NS, WallTime, computer_offset_ns
 from mavlink.wire import dialect
-from service.daemon.scan_time import disagreement, set_since
+from service.daemon.scan_run import disagreement, set_since
 
 S = 1_000_000_000
 MONTH_NS = 30 * 86_400 * S

@@ -19,13 +19,13 @@ from service.errors import InputError
 __all__ = ["CAMERAS", "CameraFrame", "CameraSource", "GeoTag", "open_camera"]
 
 CAMERAS: dict[str, str] = {
-    "file": "service.cameras.file:open_file",
+    "file": "service.cameras.video:open_file",
     "images": "service.cameras.images:open_images",
-    "pipe": "service.cameras.pipe:open_pipe",
-    "rtsp": "service.cameras.stream:open_rtsp",
-    "v4l2": "service.cameras.stream:open_v4l2",
+    "pipe": "service.cameras.video:open_pipe",
+    "rtsp": "service.cameras.live:open_rtsp",
+    "v4l2": "service.cameras.live:open_v4l2",
     "gst": "service.cameras.gstreamer:open_gst",
-    "stream": "service.cameras.stream:open_stream",
+    "stream": "service.cameras.live:open_stream",
 }
 """Word to ``module:function(rest, options) -> CameraSource``; imported on first use."""
 

@@ -15,10 +15,8 @@ from collections.abc import Mapping
 from typing import IO, Any
 
 from service.cameras import reject_options
-from service.cameras.live import LiveSource
-from service.cameras.pace import paced
-from service.cameras.source import CameraSource
-from service.cameras.stream import OPEN_S
+from service.cameras.live import OPEN_S, LiveSource
+from service.cameras.source import CameraSource, paced
 from service.errors import InputError, OutsideError
 from service.redaction import without_credentials
 

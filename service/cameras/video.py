@@ -1,20 +1,26 @@
-"""Encoded video through PyAV, with the container's own presentation times.
+"""Recorded video through PyAV, with the container's own presentation times.
 
-Shared by the sources whose pictures come out of a container or a stream: a file, a pipe.
+``file:flight.mp4``: mp4, mov, mkv, MPEG-TS, whatever FFmpeg reads. ``pipe:-`` or a named pipe:
+``ffmpeg -i flight.mp4 -c copy -f mpegts - | skyrelief replay -``. Matroska, MPEG-TS, fragmented
+mp4 and y4m describe themselves; raw frames need their shape in the options:
+``pipe:-?format=rawvideo&video_size=1280x720&pixel_format=bgr24&framerate=30`` (FFmpeg's names).
 """
 
 from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime, timezone
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
 from recon.types import U8
+from service.cameras import reject_options
 from service.cameras.source import CameraFrame
 from service.errors import InputError
 
@@ -28,6 +34,10 @@ MAX_PIXELS = 1 << 27
 """Of a picture; the decoder refuses larger ones before it makes room for them."""
 
 EARLIEST_UNIX_S = 946_684_800  # 2000-01-01: cameras without a clock write 1904 or 1970
+
+OPTIONS = ("format", "video_size", "pixel_format", "framerate")
+
+HEAD_BYTES = 4096
 
 
 class VideoSource:
@@ -229,3 +239,131 @@ def picture_bgr(picture: av.VideoFrame) -> U8:
 
 def _by(size_px: tuple[int, int]) -> str:
     return f"{size_px[0]}x{size_px[1]}"
+
+
+def open_file(rest: str, options: Mapping[str, str]) -> VideoSource:
+    """The video at path ``rest``; raises InputError naming what is wrong with it."""
+    import av
+    import av.error
+
+    reject_options("file", options)
+    path = Path(rest)
+    if not path.exists():
+        raise InputError(f"no such file: {path}")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; for a folder of pictures write images:{path}")
+    if not path.is_file():
+        raise InputError(f"{path} is no regular file; for a named pipe write pipe:{path}")
+    if path.stat().st_size == 0:
+        raise InputError(f"{path} is empty (0 bytes); copy it from the camera again")
+    try:
+        container = av.open(str(path), metadata_errors="replace")
+    except av.error.InvalidDataError as error:
+        raise InputError(_not_video(path)) from error
+    except av.error.EOFError as error:
+        raise InputError(f"{path} ends before its first picture; it was cut off") from error
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise InputError(f"{path} cannot be read: {why}") from error
+    return VideoSource(container, str(path), follows_turn=True)
+
+
+def _not_video(path: Path) -> str:
+    with path.open("rb") as stream:
+        head = stream.read(12)
+    if head[4:8] == b"ftyp":
+        return (
+            f"{path} has no index: the recording was cut off before the camera closed it; "
+            "repair it with the camera or a recovery tool, or record mkv"
+        )
+    return f"{path} is not a video that can be read (mp4, mkv, MPEG-TS)"
+
+
+class PipeReader:
+    """A read-only byte stream whose first bytes can be looked at before they are consumed."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        """Wrap ``stream``; nothing is read yet."""
+        self._stream = stream
+        self._head = b""
+
+    def peek(self, n: int) -> bytes:
+        """Up to ``n`` first bytes, fewer only when the stream ends before."""
+        while len(self._head) < n:
+            more = self._stream.read(n - len(self._head))
+            if not more:
+                break
+            self._head += more
+        return self._head[:n]
+
+    def read(self, n: int = -1) -> bytes:
+        """The next bytes, at most ``n``; empty at the end."""
+        if self._head:
+            size = len(self._head) if n < 0 else n
+            out, self._head = self._head[:size], self._head[size:]
+            return out
+        return self._stream.read(n)
+
+
+def open_pipe(rest: str, options: Mapping[str, str]) -> VideoSource:
+    """The video that comes out of ``-`` (standard input) or the named pipe at ``rest``."""
+    import av
+    import av.error
+
+    reject_options("pipe", options, OPTIONS)
+    name = "standard input" if rest in ("-", "") else rest
+    reader = PipeReader(_stream(rest))
+    head = reader.peek(HEAD_BYTES)
+    if not head:
+        raise InputError(f"{name}: nothing came; pipe a video into it")
+    if index_at_end(head):
+        raise InputError(
+            f"{name}: an mp4 with its index at the end cannot be piped; give the file itself, or "
+            "'ffmpeg -i FILE -c copy -f mpegts - | …'"
+        )
+    demuxer = {key: value for key, value in options.items() if key != "format"}
+    try:
+        container = av.open(
+            reader,
+            mode="r",
+            format=options.get("format"),
+            options=demuxer,
+            metadata_errors="replace",
+        )
+    except (av.error.FFmpegError, ValueError, OSError) as error:
+        raise InputError(
+            f"{name}: not a video stream that can be read ({error}); Matroska, MPEG-TS, "
+            "fragmented mp4 and y4m describe themselves, raw frames need "
+            "pipe:-?format=rawvideo&video_size=WxH&pixel_format=bgr24&framerate=F"
+        ) from error
+    return VideoSource(container, name)
+
+
+def index_at_end(head: bytes) -> bool:
+    """True when ``head`` starts an mp4 whose pictures come before their index."""
+    if head[4:8] != b"ftyp":
+        return False
+    at = 0
+    while at + 8 <= len(head):
+        size = int.from_bytes(head[at : at + 4], "big")
+        kind = head[at + 4 : at + 8]
+        if kind == b"mdat":
+            return True
+        if kind in (b"moov", b"moof") or size < 8:
+            return False
+        at += size
+    return False
+
+
+def _stream(rest: str) -> BinaryIO:
+    if rest in ("-", ""):
+        if sys.stdin is None or sys.stdin.isatty():
+            raise InputError("standard input is a terminal; pipe a video into it")
+        return sys.stdin.buffer
+    path = Path(rest)
+    if not path.exists():
+        raise InputError(f"no such named pipe: {path}; make it with 'mkfifo {path}'")
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from error

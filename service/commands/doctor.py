@@ -26,8 +26,7 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
     """Say what works, what does not, and what to do. Exit code 3 when something is bad."""
-    from service.daemon.diagnosis import examine
-    from service.daemon.findings import BAD
+    from service.daemon.diagnosis import BAD, examine
 
     chosen = config or (INSTALLED if INSTALLED.is_file() else None)
     findings = []

@@ -92,7 +92,7 @@ def _replay(
     realtime: bool,
     as_json: bool,
 ) -> dict[str, Any]:
-    from service.cameras.pace import paced
+    from service.cameras.source import paced
     from service.compute.opening import open_backend
     from service.onboard.datalink import open_datalink
     from service.onboard.scan import Scan, ScanInputs, create_store

@@ -28,7 +28,7 @@ def run(
 
     A HUP signal reads the configuration again; a broken one changes nothing.
     """
-    from service.daemon.memory import one_pool
+    from service.daemon.machine import one_pool
 
     one_pool()  # before there are threads
     chosen, fault = _configuration(config, set_ or [])

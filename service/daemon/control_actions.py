@@ -10,8 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mavlink.control import ACCEPTED, Answer, Handled, Phase, Power, Result, ScanStatus, Work
+from service.daemon.machine import existing
 from service.daemon.scanning import Scanning
-from service.daemon.tuning import with_parameter
+from service.daemon.vehicle_config import with_parameter
 from service.errors import InputError, OutsideError, SkyreliefError
 
 LEAST_FREE_MIB = 500.0
@@ -38,7 +39,7 @@ class ControlActions:
     def status(self) -> ScanStatus:
         """A snapshot for the operator."""
         scanning = self._scanning
-        disk = shutil.disk_usage(_existing(Path(scanning.config.scan.folder)))
+        disk = shutil.disk_usage(existing(Path(scanning.config.scan.folder)))
         scan = scanning.scan
         recorder = scan.recorder if scan is not None else None
         latency = scan.check.latency if scan is not None else None
@@ -142,7 +143,7 @@ class ControlActions:
             source.close()
             if self._scanning.camera is not None:
                 check_size(self._scanning.camera, source.size_px, source.description)
-            folder = _existing(Path(config.scan.folder))
+            folder = existing(Path(config.scan.folder))
             free_mib = shutil.disk_usage(folder).free / 2**20
             if free_mib < LEAST_FREE_MIB:
                 raise OutsideError(f"{folder} has {free_mib:.0f} MiB left")
@@ -160,13 +161,6 @@ class ControlActions:
             work.finish(ACCEPTED)
         except OSError as error:
             work.finish(Answer(Result.FAILED, f"{error.filename}: {error.strerror}"))
-
-
-def _existing(folder: Path) -> Path:
-    """The folder, or the nearest of its parents that exists."""
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
-    return folder
 
 
 def _systemctl(verb: str) -> Answer:

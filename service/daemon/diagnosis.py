@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import http.client
+import json
 import os
 import platform
+import re
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,15 +20,15 @@ from typing import TYPE_CHECKING, Any
 
 from mavlink.wall_time import EARLIEST_UNIX_S
 from service.compute.threading_layer import REMEDY, kernels_may_overlap
-from service.config import Config
-from service.daemon.findings import BAD, GOOD, NOTE, Finding
-from service.daemon.link_diagnosis import examine_links
-from service.daemon.running import running_service
+from service.config import Config, keys, load_config
+from service.daemon.machine import existing, read_machine
+from service.daemon.vehicle_config import watch_config
 from service.daemon.warm_up import is_warm
 from service.errors import InputError, SkyreliefError
 from service.packages import unusable_packages
 
 if TYPE_CHECKING:
+    from mavlink.link_probe import LinkFound
     from recon.types import Camera
 
 CORE = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "pymavlink", "eclipse-zenoh")
@@ -34,6 +40,36 @@ WARM_UP = (
 )
 
 SOON_DAYS = 30  # a certificate that ends before needs thinking of
+
+GOOD, NOTE, BAD = "good", "note", "bad"
+
+WAIT_S = 1.0
+
+LARGEST_BYTES = 1 << 20
+
+BOARDS: dict[str, str] = {
+    "orin-nano": r"Orin.*Nano",
+    "orin-nx": r"Orin.*NX",
+    "orin-agx": r"AGX.*Orin",
+    "raspberry-pi-5": r"Raspberry Pi 5|Compute Module 5",
+}
+"""Name of the profile to what the device tree calls the board; as in deploy/install.sh."""
+
+PLACES = (
+    Path(__file__).resolve().parents[2] / "deploy" / "profiles",
+    Path(sys.prefix) / "share" / "skyrelief" / "deploy" / "profiles",
+)
+
+WORST = {"ground": NOTE}  # it may just be off
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at."""
+
+    what: str
+    verdict: str  # GOOD, NOTE (flies, but know it) or BAD
+    text: str
 
 
 def examine(config: Config, listen_s: float) -> Iterator[Finding]:
@@ -86,8 +122,6 @@ def _parent(name: str) -> str:
 
 
 def _machine(config: Config) -> Iterator[Finding]:
-    from service.daemon.machine import read_machine
-
     m = read_machine(Path(config.scan.folder))
     yield Finding("machine", GOOD, f"{m.model}, {os.cpu_count()} cores")
     yield from _board(config, m.model)
@@ -104,7 +138,6 @@ def _machine(config: Config) -> Iterator[Finding]:
 
 
 def _board(config: Config, model: str) -> Iterator[Finding]:
-    from service.daemon.boards import board_of, other_than_profile, profile_path
 
     name = board_of(model)
     path = profile_path(name)
@@ -140,11 +173,7 @@ def _clock() -> Iterator[Finding]:
 
 
 def _folder(folder: Path) -> Iterator[Finding]:
-    import shutil
-
-    nearest = folder
-    while not nearest.exists() and nearest != nearest.parent:
-        nearest = nearest.parent
+    nearest = existing(folder)
     if not os.access(nearest, os.W_OK):
         yield Finding("scans", BAD, f"{folder} cannot be written; set scan.folder or its owner")
         return
@@ -254,3 +283,102 @@ def _datalink(config: Config) -> Iterator[Finding]:
             yield Finding("datalink", NOTE, f"{endpoint} does not answer now ({error})")
         else:
             yield Finding("datalink", GOOD, f"{endpoint} answers")
+
+
+def running_service(address: str) -> dict[str, Any] | None:
+    """The ``/status`` at ``address`` (HOST:PORT); None when no skyrelief answers there."""
+    host, _, port = address.rpartition(":")
+    try:
+        with closing(http.client.HTTPConnection(host.strip("[]"), int(port), WAIT_S)) as page:
+            page.request("GET", "/status")
+            status = json.loads(page.getresponse().read(LARGEST_BYTES))
+    except (OSError, ValueError, http.client.HTTPException):
+        return None
+    is_ours = isinstance(status, dict) and str(status.get("software", "")).startswith("skyrelief")
+    return status if is_ours else None
+
+
+def board_of(model: str) -> str:
+    """The profile's name for a board called ``model``; empty when there is none."""
+    for name, pattern in BOARDS.items():
+        if re.search(pattern, model):
+            return name
+    return "x86-bench" if platform.machine() == "x86_64" else ""
+
+
+def profile_path(name: str) -> Path | None:
+    """The profile's file; None when it is not installed."""
+    found = (place / f"{name}.toml" for place in PLACES)
+    return next((path for path in found if path.is_file()), None)
+
+
+def other_than_profile(config: Config, path: Path) -> list[str]:
+    """What the profile sets and ``config`` has otherwise: ``compute.threads = 0, not 4``."""
+    profile, default = load_config(path), Config()
+    out = []
+    for section, field in keys():
+        wanted = getattr(getattr(profile, section), field.name)
+        if wanted == getattr(getattr(default, section), field.name):
+            continue
+        value = getattr(getattr(config, section), field.name)
+        if value != wanted:
+            out.append(f"{section}.{field.name} = {value}, not {wanted}")
+    return out
+
+
+def examine_links(
+    config: Config, listen_s: float, running: dict[str, Any] | None
+) -> Iterator[Finding]:
+    """What is heard on each link, and what is missing; a running service says it itself."""
+    if not config.mavlink.links:
+        yield Finding("mavlink", NOTE, "mavlink.links is empty: no telemetry, no commands")
+    elif running is not None:
+        yield from _of_service(running.get("mavlink", {}))
+    else:
+        yield from _by_listening(config, listen_s)
+
+
+def _of_service(heard: dict[str, Any]) -> Iterator[Finding]:
+    up, packets = heard.get("links_up", 0), heard.get("packets", 0)
+    text = f"held by the running service: {up} open, {packets} messages heard"
+    yield Finding("mavlink", GOOD if packets else NOTE, text)
+    for trouble in heard.get("troubles", ()):
+        yield _trouble(trouble["what"], trouble["text"], trouble["is_grave"])
+
+
+def _by_listening(config: Config, listen_s: float) -> Iterator[Finding]:
+    from mavlink.link_probe import LinkProbe
+
+    mavlink = config.mavlink
+    watch = watch_config(config, wait_s=listen_s / 2, ground_wait_s=listen_s / 2)
+    key = Path(mavlink.signing_key) if mavlink.signing_key else None
+    try:
+        probe = LinkProbe(mavlink.links, mavlink.system_id or None, watch, key)
+    except ValueError as error:
+        yield Finding("mavlink", BAD, str(error))
+        return
+    found = probe.look(listen_s)
+    for link in found.links:
+        if link.packets:
+            heard = (f"system {s}: {n / listen_s:.0f}/s" for s, n in sorted(link.packets.items()))
+            yield Finding("mavlink", GOOD, f"{link.name}: {', '.join(heard)}")
+        else:
+            yield Finding("mavlink", BAD, f"{link.name}: {_why_silent(link)}")
+    if found.autopilot is not None:
+        system, component = found.autopilot
+        yield Finding("autopilot", GOOD, f"system {system}, component {component}")
+    if any(link.packets for link in found.links):
+        for trouble in found.troubles:
+            yield _trouble(trouble.what, trouble.text, trouble.is_grave)
+
+
+def _why_silent(link: LinkFound) -> str:
+    if not link.is_up:
+        return f"does not open: {link.last_error}" if link.last_error else "does not open"
+    if link.skipped_bytes:
+        return "only noise: is SERIALn_BAUD (PX4: SER_TELn_BAUD) the baud rate of mavlink.links?"
+    return "silent: is the autopilot on, its port set to MAVLink 2?"
+
+
+def _trouble(what: str, text: str, is_grave: bool) -> Finding:
+    return Finding(what, WORST.get(what, BAD) if is_grave else NOTE, text)

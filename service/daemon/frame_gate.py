@@ -15,7 +15,7 @@ from pathlib import Path
 from threading import Event
 
 from service.cameras.source import CameraFrame, CameraSource
-from service.daemon.degradation import STRIDE, Level
+from service.daemon.load_shedding import STRIDE, Level
 
 log = logging.getLogger(__name__)
 

@@ -1,16 +1,26 @@
 """What is wanted of the scan, whatever happens to it: nothing, a scan, or a scan that is paused.
 
 Commands, arming and the configuration change it; retries follow it. So a stop ends every retry,
-and a pause or a fault does not end what was asked for.
+and a pause or a fault does not end what was asked for. A small file in the folder of scans says
+that a scan by command runs, so that it goes on after the service or the computer fell over; its
+text names the boot of the computer.
 """
 
 from __future__ import annotations
 
+import logging
+import os
 import threading
-from enum import Enum
+from enum import Enum, auto
+from pathlib import Path
+
+log = logging.getLogger(__name__)
 
 FIRST_RETRY_S, LAST_RETRY_S = 1.0, 8.0
 """Waits between attempts at a scan; names of scans are whole seconds."""
+
+MARK = ".scanning"
+BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 
 class Wanted(Enum):
@@ -88,3 +98,107 @@ class Intent:
     def succeeded(self) -> None:
         """Note that the attempt produces data, so the next fault is retried soon."""
         self._retry_s = FIRST_RETRY_S
+
+
+class Left(Enum):
+    """What the last life of the service left undone."""
+
+    NOTHING = "nothing"
+    BY_SERVICE = "the service ended while scanning"
+    BY_COMPUTER = "the computer ended while scanning"
+
+
+class Resumption:
+    """What is to be scanned again; known until somebody starts or stops a scan."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / MARK
+        self.left = self._read()
+
+    def _read(self) -> Left:
+        try:
+            boot = self._path.read_text(encoding="utf-8")
+        except (OSError, ValueError):
+            return Left.NOTHING
+        return Left.BY_SERVICE if boot and boot == _boot() else Left.BY_COMPUTER
+
+    def note(self) -> None:
+        """A scan runs that must go on after a fall."""
+        self.left = Left.NOTHING
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with self._path.open("w", encoding="utf-8") as file:
+                file.write(_boot())
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            log.warning("%s: a restart in flight will not scan again: %s", self._path, error)
+
+    def forget(self) -> None:
+        """None does any more, or none need go on."""
+        self.left = Left.NOTHING
+        try:
+            self._path.unlink(missing_ok=True)
+        except OSError as error:
+            log.warning("%s stays: %s", self._path, error.strerror)
+
+    def is_due(self, is_heard: bool, is_armed: bool) -> bool:
+        """True when a scan must be started now; asked until it is, or until nothing is left.
+
+        After a power cut only an autopilot that is armed says that it was in flight; one that
+        is not (``is_heard``) says that the battery was changed.
+        """
+        if self.left is Left.BY_COMPUTER and is_heard and not is_armed:
+            self.forget()
+        return self.left is Left.BY_SERVICE or (self.left is Left.BY_COMPUTER and is_armed)
+
+
+def _boot() -> str:
+    """Names this boot of the computer; empty where the system does not tell."""
+    try:
+        return BOOT.read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
+
+
+class Landing(Enum):
+    """What to do after a look."""
+
+    NOTHING = auto()
+    LANDED = auto()  # announce it
+    CLOSE = auto()  # close the scan
+
+
+class LandingWatch:
+    """Look at it often: it notices that the motors of a scan's flight stopped for good."""
+
+    def __init__(self) -> None:
+        self._has_flown = False  # armed while this scan was wanted
+        self._landed_s: float | None = None
+
+    def look(
+        self,
+        wants_scan: bool,
+        is_armed: bool,
+        is_disarmed: bool,
+        close_after_s: float,
+        now_s: float,
+    ) -> Landing:
+        """Return what to do at ``now_s`` of a clock that never goes back.
+
+        ``is_disarmed`` is what the autopilot says; it is false where none is heard. A
+        ``close_after_s`` of 0 never closes.
+        """
+        if is_armed or not wants_scan or close_after_s <= 0.0:
+            self._has_flown = wants_scan and (is_armed or self._has_flown)
+            self._landed_s = None
+            return Landing.NOTHING
+        if self._landed_s is None:
+            if not (self._has_flown and is_disarmed):
+                return Landing.NOTHING
+            self._landed_s = now_s
+            return Landing.LANDED
+        if now_s - self._landed_s < close_after_s:
+            return Landing.NOTHING
+        self._has_flown, self._landed_s = False, None
+        return Landing.CLOSE

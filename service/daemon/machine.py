@@ -2,10 +2,17 @@
 
 Everything comes from the kernel's files, so nothing has to be installed; ``root`` stands in
 for ``/`` in tests.
+
+The functions at the end keep the process from holding memory that nothing uses: the C library
+gives threads pools of their own, and keeps what was freed in them. Images are taken and freed on
+several threads, so that each pool would grow to the largest need of all; and what is free at the
+end of a pool is given back for the first one only.
 """
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import os
 import shutil
 from dataclasses import asdict, dataclass
@@ -16,6 +23,10 @@ if TYPE_CHECKING:
     from mavlink.status import ComputerLoad
 
 THROTTLED_NOW = 0b1111  # Raspberry Pi: under-voltage, frequency capped, throttled, soft limit
+
+M_ARENA_MAX = -8  # mallopt(3)
+
+SMALL_BYTES, KEPT_EACH = 1024, 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,12 +185,17 @@ def _load(root: Path) -> float | None:
     return float(text.split()[0]) / (os.cpu_count() or 1) if text else None
 
 
+def existing(folder: Path) -> Path:
+    """The folder, or the nearest of its parents that exists."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder
+
+
 def _disk_mib(disk: Path) -> tuple[float | None, float | None]:
     """(free, total) of the disk that holds ``disk`` or the nearest folder above it."""
-    while not disk.exists() and disk != disk.parent:
-        disk = disk.parent
     try:
-        usage = shutil.disk_usage(disk)
+        usage = shutil.disk_usage(existing(disk))
     except OSError:
         return None, None
     return usage.free / 2**20, usage.total / 2**20
@@ -206,3 +222,45 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8", errors="replace").strip("\0\n ")
     except OSError:
         return ""
+
+
+def one_pool() -> bool:
+    """True when the C library keeps to one pool from now on; threads that run have theirs.
+
+    Before NumPy is imported: it would ask for huge pages (2 MiB) wherever a large array lay in
+    that pool, for whatever little comes there next.
+    """
+    os.environ.setdefault("NUMPY_MADVISE_HUGEPAGE", "0")
+    libc = _libc("mallopt")
+    return libc is not None and libc.mallopt(M_ARENA_MAX, 1) == 1
+
+
+def fill_small_caches() -> None:
+    """Have NumPy take all the small blocks at once that it would take in the course of hours.
+
+    It keeps up to :data:`KEPT_EACH` freed blocks of every size below :data:`SMALL_BYTES`
+    (numpy/_core/src/multiarray/alloc.c): 3.5 MiB. Taken one by one they would lie between
+    pictures, and each hold a page of memory; taken together they lie together.
+    """
+    import numpy as np
+
+    held = [np.empty(size, np.uint8) for size in range(1, SMALL_BYTES) for _ in range(KEPT_EACH)]
+    held.clear()
+
+
+def give_back(collect: bool = False) -> bool:
+    """True when freed memory went back to the system: a millisecond or two of work.
+
+    With ``collect`` objects that only refer to each other are freed before, as after a scan;
+    that takes longer.
+    """
+    if collect:
+        gc.collect()
+    libc = _libc("malloc_trim")
+    return libc is not None and libc.malloc_trim(0) == 1
+
+
+def _libc(name: str) -> ctypes.CDLL | None:
+    """The C library if it has that function (glibc has)."""
+    libc = ctypes.CDLL(None)
+    return libc if hasattr(libc, name) else None

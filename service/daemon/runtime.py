@@ -24,13 +24,11 @@ from service.compute.threading_layer import kernels_may_overlap
 from service.config import Config, reload
 from service.daemon.control_actions import ControlActions
 from service.daemon.health import HealthServer
-from service.daemon.landing import Landing, LandingWatch
-from service.daemon.load_control import LoadControl
-from service.daemon.machine import CoreLoad, computer_load, read_machine
-from service.daemon.memory import give_back
+from service.daemon.intent import Landing, LandingWatch
+from service.daemon.load_shedding import LoadControl
+from service.daemon.machine import CoreLoad, computer_load, give_back, read_machine
 from service.daemon.scanning import Scanning
-from service.daemon.tuning import TUNABLES, parameters_of
-from service.daemon.vehicle_config import vehicle_config
+from service.daemon.vehicle_config import TUNABLES, parameters_of, vehicle_config
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.init_system import Notifier
 from service.scans.retention import close_open_scans, make_room

@@ -9,16 +9,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mavlink.status import WARNING
+from mavlink.wall_time import agree, computer_offset_ns
+from service.config import Config
 from service.daemon.intent import FIRST_RETRY_S, LAST_RETRY_S
-from service.daemon.scan_reports import odometry_reporter, tell_keyframe
-from service.daemon.scan_time import disagreement, set_since
 from service.errors import OutsideError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from mavlink.state import VehicleState
+    from mavlink.vehicle import VehicleLink
     from recon.types import Keyframe
     from service.cameras.source import CameraSource
     from service.daemon.frame_gate import FrameGate
     from service.daemon.scanning import Scanning
+    from service.onboard.pipeline import Step
     from service.onboard.scan import Scan, ScanInputs
     from service.stream.store import ScanStore
 
@@ -102,7 +107,7 @@ class ScanRun:
     def _open_camera(self) -> CameraSource | None:
         """The camera at its own pace, tried until it answers; None when stopped meanwhile."""
         from service.cameras import open_camera
-        from service.cameras.pace import paced
+        from service.cameras.source import paced
 
         wait_s, is_answer = FIRST_RETRY_S, self._is_asked
         while not self.stop.is_set():
@@ -219,3 +224,51 @@ def _zero_ns(source: CameraSource) -> int:
     """Monotonic clock at the source's time 0: its own word if it is live, else now."""
     start_ns = source.start_monotonic_ns
     return time.monotonic_ns() if start_ns is None else start_ns
+
+
+def odometry_reporter(
+    config: Config, vehicle: VehicleLink
+) -> Callable[[Step, VehicleState | None, int], None] | None:
+    """What tells the autopilot how it moves, where that is wanted."""
+    if not config.mavlink.odometry:
+        return None
+    from service.onboard.odometry_report import OdometryReport
+
+    return OdometryReport(config.camera, vehicle.report_odometry).tell
+
+
+def tell_keyframe(vehicle: VehicleLink, scan: Scan, keyframe: Keyframe) -> None:
+    """Tell ground stations of a keyframe, at the pose that it has now."""
+    from service.onboard.keyframe_report import keyframe_report
+
+    inputs = scan.inputs
+    state = vehicle.history.state_at(keyframe.time_ns)
+    agl_m = None if state is None else state.alt_agl_m
+    time_ns = keyframe.time_ns + inputs.unix_offset_ns
+    T = keyframe.pose.T_world_camera
+    vehicle.report_keyframe(keyframe_report(time_ns, T, scan.pipeline.rig.frame, agl_m))
+
+
+def disagreement(offset_ns: int) -> list[str]:
+    """Nothing, or that a scan with this offset (unix time less monotonic clock) goes by another
+    clock than the computer's."""
+    own_ns = computer_offset_ns()
+    if agree(offset_ns, own_ns):
+        return []
+    return [f"Companion's clock is {_apart(own_ns - offset_ns)}: the scan takes the autopilot's"]
+
+
+def set_since(offset_ns: int, now_ns: int) -> list[str]:
+    """Nothing, or how far the times of a scan with ``offset_ns`` are off by what is known now."""
+    if agree(offset_ns, now_ns):
+        return []
+    return [
+        "the clock was set while scanning, or the autopilot told the time only then: the scan's "
+        f"times are {_apart(offset_ns - now_ns)}"
+    ]
+
+
+def _apart(ahead_ns: int) -> str:
+    seconds = abs(ahead_ns) / 1e9
+    unit_s, unit = next(u for u in ((86_400, "days"), (3600, "h"), (1, "s")) if seconds >= u[0])
+    return f"{seconds / unit_s:.0f} {unit} {'ahead' if ahead_ns > 0 else 'behind'}"

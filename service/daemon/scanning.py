@@ -16,14 +16,12 @@ from mavlink.control import ACCEPTED, Answer, Phase, Result, Work
 from mavlink.status import CRITICAL, WARNING
 from mavlink.vehicle import VehicleLink
 from service.config import Config
-from service.daemon.closing import ClosingWatch
-from service.daemon.degradation import Level, lowered
-from service.daemon.intent import Intent, Wanted
-from service.daemon.memory import fill_small_caches, give_back
-from service.daemon.resumption import Resumption
+from service.daemon.intent import Intent, Resumption, Wanted
+from service.daemon.load_shedding import Level, lowered
+from service.daemon.machine import fill_small_caches, give_back
 from service.daemon.scan_run import ScanRun
 from service.daemon.warm_up import is_warm
-from service.daemon.writing import Writings
+from service.daemon.writing import ClosingWatch, Writings
 from service.errors import InputError, SkyreliefError
 from service.onboard.datalink import DaemonLink
 from service.scans.claim import Claim

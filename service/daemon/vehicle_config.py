@@ -1,18 +1,22 @@
-"""The [mavlink] section as the vehicle link wants it."""
+"""What the vehicle link is given: the [mavlink] section, and the keys that operators tune in flight
+as MAVLink parameters."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from mavlink.companion import CompanionConfig
-from mavlink.gimbal import GimbalConfig
+from mavlink.gimbal import YAW_FRAMES, GimbalConfig
 from mavlink.history import HistoryConfig
 from mavlink.link_watch import WatchConfig
+from mavlink.parameters import YAW_FRAME
 from mavlink.presence import PresenceConfig
 from mavlink.signing import read_key
 from mavlink.vehicle import VehicleConfig
-from service.config import Config
-from service.daemon.tuning import parameters_of
+from service.config import Config, change
 from service.errors import InputError
 
 KEEP_S = 120.0
@@ -49,3 +53,51 @@ def watch_config(
     """What the links must carry for this camera, and how long it is waited for."""
     gimbal = {"auto": None, "gimbal": True, "fixed": False}[config.camera.mount]
     return WatchConfig(gimbal, wait_s, ground_wait_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Tunable:
+    """A configuration key, and its values as a parameter's."""
+
+    key: str
+    to_key: Callable[[float], object] = float
+    from_key: Callable[[Any], float | None] = float  # None: no parameter can say it
+
+
+def _metres_or_auto(value: object) -> float | None:
+    """The baseline as a parameter: 0 for automatic; frames cannot be said."""
+    if value == "auto":
+        return 0.0
+    return float(value) if isinstance(value, int | float) else None
+
+
+TUNABLES: dict[str, Tunable] = {
+    "SR_BASELINE_M": Tunable("scan.baseline", lambda v: v if v > 0.0 else "auto", _metres_or_auto),
+    "SR_RESOLUTION_M": Tunable("scan.resolution_m"),
+    "SR_LINK_KBIT_S": Tunable("datalink.budget_kbit_s"),
+    YAW_FRAME: Tunable(
+        "mavlink.gimbal_yaw_frame", lambda v: YAW_FRAMES[round(v)], lambda v: YAW_FRAMES.index(v)
+    ),
+    "SR_CAM_LATENCY": Tunable("camera.latency_ms"),
+    "SR_CAM_LAT_AUTO": Tunable(
+        "camera.latency", lambda v: "auto" if v else "fixed", lambda v: float(v == "auto")
+    ),
+}
+"""The next parameter is a line here and one in :data:`mavlink.parameters.PARAMETERS`."""
+
+
+def with_parameter(config: Config, name: str, value: float) -> Config:
+    """``config`` with a parameter's value; InputError when the key does not take it."""
+    tunable = TUNABLES[name]
+    return change(config, tunable.key, tunable.to_key(value))
+
+
+def parameters_of(config: Config) -> dict[str, float]:
+    """The parameters as the configuration says; those that it says otherwise are left out."""
+    found = {}
+    for name, tunable in TUNABLES.items():
+        section, _, field = tunable.key.partition(".")
+        value = tunable.from_key(getattr(getattr(config, section), field))
+        if value is not None:
+            found[name] = float(value)
+    return found

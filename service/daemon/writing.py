@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mavlink.control import ACCEPTED, Answer, Result, Work
 from service.compute.threading_layer import kernels_may_overlap
-from service.daemon.closing import sizes
 
 if TYPE_CHECKING:
     from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
+
+OTHERS = ("scan.db", "link.tlog")
 
 
 class Writing:
@@ -129,3 +131,34 @@ class Writings:
             answer = Answer(Result.FAILED, str(writing.error))
         if writing.work is not None:
             writing.work.finish(answer)
+
+
+class ClosingWatch:
+    """Feed it what :func:`marks` gives, often; it tells for how long that has been the same."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._marks: tuple[Any, ...] | None = None
+        self._since_s = 0.0
+
+    def look(self, marks: tuple[Any, ...] | None) -> float:
+        """Seconds without progress; 0 when nothing is being closed (``marks`` is None)."""
+        now_s = self._clock()
+        if marks is None or marks != self._marks:
+            self._marks, self._since_s = marks, now_s
+        return 0.0 if marks is None else now_s - self._since_s
+
+
+def sizes(folder: Path) -> tuple[tuple[str, int], ...]:
+    """Name and bytes of each file that closing writes into a scan's folder.
+
+    The store and the link's log are left out: others write them, too.
+    """
+    found = []
+    try:
+        for path in folder.iterdir():
+            if not path.name.startswith(OTHERS):
+                found.append((path.name, path.stat().st_size))
+    except OSError:
+        pass  # it is not there yet, or a file was renamed meanwhile
+    return tuple(sorted(found))

@@ -16,8 +16,7 @@ from mavlink.history import VehicleHistory
 from mavlink.state import VehicleState
 from recon.backends import Backend
 from recon.types import Camera, Frame, Keyframe
-from service.cameras.ahead import ahead
-from service.cameras.source import CameraFrame, CameraSource
+from service.cameras.source import CameraFrame, CameraSource, ahead
 from service.config import Config
 from service.errors import InputError
 from service.onboard.frame_tags import FILE as TAGS

@@ -23,8 +23,8 @@ from recon.self_calibration import SelfCalibrated, Sightings, self_calibrate
 from recon.tracking import matching
 from recon.types import F64, U8, Camera
 from service.cameras.camera_file import save_camera
-from service.cameras.file import open_file
 from service.cameras.images import open_images
+from service.cameras.video import open_file
 from service.errors import InputError
 from service.stream.records import ScanHeader
 
