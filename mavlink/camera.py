@@ -39,7 +39,7 @@ class CameraConfig:
     definition_version: int = 0
     stream_uri: str = ""  # of a live picture, when we offer one
     stream_hz: float = 0.0
-    shortest_interval_s: float = 0.2
+    min_interval_s: float = 0.2
 
     def __post_init__(self) -> None:
         if len(self.vendor) > 31 or len(self.model) > 31:

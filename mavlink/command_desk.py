@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from mavlink.control import Answer, Handled, Result, Work
 from mavlink.messages import Address, Outbox
@@ -48,15 +48,13 @@ class Call:
         return self.target.component == 0
 
 
-class Command(Protocol):
-    """What a module in ``mavlink.commands`` offers."""
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What carries out a command."""
 
-    NUMBERS: tuple[int, ...]
-    COMPONENTS: frozenset[int]
-    WINDOW_S: float  # how long a repetition is a retransmission; 0 for questions
-
-    def handle(self, call: Call, host: Any) -> Handled | None:
-        """Carry the call out; None when it is not meant for this component."""
+    components: frozenset[int]  # of ours that take it
+    window_s: float  # how long a repetition is a retransmission; 0 for questions
+    handle: Callable[[Call, Any], Handled | None]  # None: it is not meant for this component
 
 
 def decode_call(message: Any, link: int) -> Call | None:
@@ -124,13 +122,13 @@ class CommandDesk:
         """Carry out a call for one of our components (which the caller has checked)."""
         command = self._commands.get(call.number)
         if call.is_broadcast:
-            mine = [c for c in components if command is not None and c in command.COMPONENTS]
+            mine = [c for c in components if command is not None and c in command.components]
             if not mine:
                 return  # somebody else's; two refusals from us would only mislead the asker
             component = mine[0]
         else:
             component = call.target.component
-        if command is None or component not in command.COMPONENTS:
+        if command is None or component not in command.components:
             self._answer(component, call, Answer(Result.UNSUPPORTED))
             return
         self._carry_out(component, command, call, now_ns)
@@ -153,13 +151,13 @@ class CommandDesk:
             if not call.is_broadcast:
                 self._answer(component, call, Answer(Result.DENIED))
         elif isinstance(handled, Work):
-            window_ns = int(command.WINDOW_S * S)
+            window_ns = int(command.window_s * S)
             limit_ns, report_ns = now_ns + WORK_LIMIT_NS, now_ns + PROGRESS_EVERY_NS
             running = _Running(call, key, window_ns, handled, limit_ns, report_ns)
             self._start(component, running, now_ns)
         else:
             self._answer(component, call, handled)
-            self._remember(key, handled, now_ns, int(command.WINDOW_S * S))
+            self._remember(key, handled, now_ns, int(command.window_s * S))
 
     def _answer_while(
         self, running: _Running, component: int, call: Call, key: tuple[object, ...]

@@ -16,8 +16,7 @@ from mavlink.autopilot_link import AutopilotLink
 from mavlink.camera import CAPTURE_STATUS, CameraComponent, CameraConfig, KeyframeReport
 from mavlink.camera_definition import FILE, URI, camera_definition, definition_version
 from mavlink.command_desk import CommandDesk, decode_call
-from mavlink.commands import load_commands
-from mavlink.commands.stop_scan import is_stop
+from mavlink.commands import COMMANDS, is_stop
 from mavlink.component_metadata import NUMBER as METADATA
 from mavlink.component_metadata import ComponentMetadata
 from mavlink.control import Answer, Result, ScanControl
@@ -118,7 +117,7 @@ class Companion:
             self._boot_ms,
             lambda: self._now_ns,
         )
-        self.desk = CommandDesk(load_commands(), self._outbox, self, self._answer, is_stop)
+        self.desk = CommandDesk(COMMANDS, self._outbox, self, self._answer, is_stop)
         self.streams.add(ONBOARD, LOAD_STATUS, round(config.load_every_s * 1e6), self._send_load)
         self.streams.add(ONBOARD, MOTION, round(config.motion_every_s * 1e6), self._send_motion)
         self.watch = LinkWatch(config.watch, presence, now_ns)

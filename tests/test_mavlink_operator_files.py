@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from mavlink.commands import load_commands
-from mavlink.commands.user import (
+from mavlink.commands import (
     BASELINE,
     CLEAR_MAP,
+    COMMANDS,
     FINALISE,
     PAUSE,
     RESUME,
@@ -25,9 +25,8 @@ ROOT = Path(__file__).resolve().parents[1]
 def test_every_button_of_qgroundcontrol_has_its_command() -> None:
     actions = json.loads((ROOT / "deploy" / "qgc-custom-actions.json").read_text())
     assert actions["fileType"] == "MavlinkActions" and actions["version"] == 1
-    table = load_commands()
     for action in actions["actions"]:
-        assert action["compId"] in table[action["mavCmd"]].COMPONENTS
+        assert action["compId"] in COMMANDS[action["mavCmd"]].components
         assert action["label"] and action["description"]
     used = {action["param1"] for action in actions["actions"]}
     assert used == {BASELINE, CLEAR_MAP, FINALISE, PAUSE, RESUME, SELF_TEST, START, STOP}
@@ -37,7 +36,7 @@ def test_the_operators_page_names_every_parameter_and_command() -> None:
     page = (ROOT / "docs" / "operators.md").read_text()
     for parameter in PARAMETERS:
         assert f"`{parameter.name}`" in page
-    for number in load_commands():
+    for number in COMMANDS:
         assert str(number) in page
     for k, frame in enumerate(YAW_FRAMES):
         assert f"{k} {frame}" in page
