@@ -29,7 +29,7 @@ from service.ground.intake import ScanIntake
 from service.ground.received import ReceivedScan
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream.link import DatalinkSender
-from service.stream.parts import split
+from service.stream.messages import split
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.session import SessionConfig, open_session
 from service.stream.store import ScanStore

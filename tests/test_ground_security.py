@@ -18,8 +18,14 @@ from service.daemon.diagnosis import BAD, GOOD, NOTE, _certificate
 from service.errors import InputError, OutsideError
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
-from service.stream.fleet import access_control, load_fleet
-from service.stream.keys import make_keys, member_name, revoke, tls_files
+from service.stream.keys import (
+    access_control,
+    load_fleet,
+    make_keys,
+    member_name,
+    revoke,
+    tls_files,
+)
 from service.stream.link import DatalinkSender
 from service.stream.records import ScanHeader
 from service.stream.session import SessionConfig, open_session

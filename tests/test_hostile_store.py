@@ -12,7 +12,7 @@ import pytest
 from conftest import HouseFlight
 
 from service.errors import InputError, OutsideError
-from service.stream import schema
+from service.stream import database as database_module
 from service.stream.database import Database
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore, header_of
@@ -77,7 +77,7 @@ def test_a_newer_schema_asks_for_an_update(path: Path) -> None:
 
 
 def test_a_statement_has_a_deadline(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(schema, "STATEMENT_S", -1.0)
+    monkeypatch.setattr(database_module, "STATEMENT_S", -1.0)
     database = Database(path, read_only=True)
     with pytest.raises(OutsideError, match="interrupted"):
         database.all(f"{ENDLESS} SELECT COUNT(*) FROM n")
@@ -135,7 +135,7 @@ def test_a_scan_on_a_disk_that_cannot_be_written_is_read(
 
 def test_a_disk_that_refuses_is_not_called_a_wrong_file(path: Path) -> None:
     for text in ("attempt to write a readonly database", "unable to open database file"):
-        error = schema.as_error(path, sqlite3.OperationalError(text))
+        error = database_module.as_error(path, sqlite3.OperationalError(text))
         assert isinstance(error, OutsideError) and "not a scan database" not in str(error)
-    wrong = schema.as_error(path, sqlite3.DatabaseError("file is not a database"))
+    wrong = database_module.as_error(path, sqlite3.DatabaseError("file is not a database"))
     assert isinstance(wrong, InputError) and "not a scan database" in str(wrong)

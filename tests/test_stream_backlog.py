@@ -16,9 +16,9 @@ from service.config import Config
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.onboard.datalink import DaemonLink, open_backlog
-from service.stream.backlog import delivered, open_undelivered
 from service.stream.link import DatalinkSender
 from service.stream.records import PoseRecord, ScanHeader
+from service.stream.reports import delivered, open_undelivered
 from service.stream.session import SessionConfig
 from service.stream.store import ScanStore
 

@@ -14,24 +14,22 @@ from loopback import free_port, until
 from service.config import DatalinkConfig
 from service.stream.link import DatalinkSender
 from service.stream.messages import (
+    HEAD_BYTES,
+    MAX_BYTES,
+    MAX_COUNTED,
     Ask,
+    Assembler,
     Held,
+    Part,
     pack_ask,
     pack_held,
+    parse,
+    split_in,
     unpack_ask,
     unpack_head,
     unpack_held,
 )
 from service.stream.outbox import MAX_STATIONS, PEER_TIMEOUT_S, Outbox
-from service.stream.parts import (
-    HEAD_BYTES,
-    MAX_BYTES,
-    MAX_COUNTED,
-    Assembler,
-    Part,
-    parse,
-    split_in,
-)
 from service.stream.ranges import RangeSet
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.reports import Reports

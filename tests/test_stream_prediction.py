@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.stream.prediction import U16, WEIGHTS, decode, encode
+from service.stream.plane_coders import U16, WEIGHTS, decode_codes, encode_codes
 
 
 def bumpy(h: int, w: int, noise: float) -> U16:
@@ -25,7 +25,7 @@ def test_any_plane_with_any_holes_comes_back(h: int, w: int, seed: int, share: f
     rng = np.random.default_rng(seed)
     codes = rng.integers(0, 65536, (h, w), np.uint16)
     known = rng.random((h, w)) < share
-    back = decode(encode(codes, known), known)
+    back = decode_codes(encode_codes(codes, known), known)
     assert back is not None
     np.testing.assert_array_equal(back, np.where(known, codes, 0))
 
@@ -34,29 +34,29 @@ def test_smaller_than_jpeg_ls_on_noisy_surface_and_far_smaller_with_holes() -> N
     codes = bumpy(180, 320, 4.0)
     everything = np.ones(codes.shape, bool)
     plain = len(imagecodecs.jpegls_encode(codes))
-    assert len(encode(codes, everything)) < 0.97 * plain
+    assert len(encode_codes(codes, everything)) < 0.97 * plain
     holes = np.random.default_rng(2).random(codes.shape) > 0.4
     filled = np.where(holes, codes, 0).astype(np.uint16)
-    assert len(encode(codes, holes)) < 0.6 * len(imagecodecs.jpegls_encode(filled))
+    assert len(encode_codes(codes, holes)) < 0.6 * len(imagecodecs.jpegls_encode(filled))
 
 
 def test_holes_do_not_show_in_the_bytes() -> None:
     codes = bumpy(60, 80, 2.0)
     known = np.random.default_rng(3).random(codes.shape) > 0.5
     other = np.where(known, codes, 54321).astype(np.uint16)
-    assert encode(codes, known) == encode(other, known)
+    assert encode_codes(codes, known) == encode_codes(other, known)
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=200))
 def test_any_bytes_give_none_or_a_plane(data: bytes) -> None:
     known = np.ones((7, 9), bool)
-    back = decode(data, known)
+    back = decode_codes(data, known)
     assert back is None or back.shape == (7, 9)
-    back = decode(bytes(2 * WEIGHTS) + zlib.compress(data), known)
+    back = decode_codes(bytes(2 * WEIGHTS) + zlib.compress(data), known)
     assert back is None or back.shape == (7, 9)
 
 
 def test_a_bomb_is_not_unpacked() -> None:
     bomb = bytes(2 * WEIGHTS) + zlib.compress(bytes(10_000_000))
-    assert decode(bomb, np.ones((4, 4), bool)) is None
+    assert decode_codes(bomb, np.ones((4, 4), bool)) is None

@@ -22,21 +22,22 @@ from service.ground.intake import FINE, SMALL, ScanIntake
 from service.stream import codec
 from service.stream.budget import RateEstimate, TokenBucket, wire_bytes
 from service.stream.database import Database
-from service.stream.lanes import Outgoing
 from service.stream.messages import (
     Ask,
+    Assembler,
     Head,
     Held,
     pack_ask,
     pack_head,
     pack_held,
+    parse,
+    split,
     unpack_ask,
     unpack_head,
     unpack_held,
 )
-from service.stream.outbox import COARSE, POSE, STATUS, Outbox
+from service.stream.outbox import COARSE, POSE, STATUS, Outbox, Outgoing
 from service.stream.outbox import FINE as LIVE_FINE
-from service.stream.parts import Assembler, parse, split
 from service.stream.ranges import RangeSet
 from service.stream.records import PoseRecord, Repose, ScanHeader
 from service.stream.store import ScanStore

@@ -16,14 +16,16 @@ from PIL import Image
 
 from service.stream import codec
 from service.stream.messages import (
+    Assembler,
     pack_ask,
     pack_head,
     pack_held,
+    parse,
+    split,
     unpack_ask,
     unpack_head,
     unpack_held,
 )
-from service.stream.parts import Assembler, parse, split
 from service.stream.radio_messages import pack_announce, pack_tile, unpack_announce, unpack_tile
 from service.stream.radio_messages import pack_pose as pack_radio_pose
 from service.stream.radio_messages import unpack_pose as unpack_radio_pose

@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 
 from service.stream import layer
-from service.stream.messages import Ask, Head, Held, Numbers, missing
-from service.stream.parts import Assembler, parse
+from service.stream.messages import Ask, Assembler, Head, Held, Numbers, missing, parse
 from service.stream.ranges import MAX_RANGES, RangeSet
 from service.stream.store import ScanStore
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from service.stream.messages import Head
-from service.stream.parts import Assembler, parse
+from service.stream.messages import Assembler, Head, parse
 from service.stream.ranges import RangeSet
 from service.stream.records import ScanHeader, header_from_json
 

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import IO, Any, cast
 
 from service.errors import InputError
+from service.exports.recording import POINT
 from service.packages import needing
 from service.stream.layer import MAX_PIXELS
-from service.stream.mcap_export import POINT
 from service.stream.validity import MAX_TIME_NS
 
 SMALL_BYTES = 65_536

@@ -52,7 +52,7 @@ def open_backlog(config: Config) -> Datalink | None:
 
     None when no ground station is configured or it has everything. Close it before a scan.
     """
-    from service.stream.backlog import open_undelivered
+    from service.stream.reports import open_undelivered
 
     if not (config.datalink.connect or config.datalink.listen):
         return None

@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 from service.config import DatalinkConfig
 from service.errors import OutsideError, SkyreliefError
-from service.stream.lanes import Outgoing
 from service.stream.messages import Ask, unpack_ask, unpack_held
 from service.stream.naming import ROOT, check_name
-from service.stream.outbox import Outbox
+from service.stream.outbox import Outbox, Outgoing
 from service.stream.ranges import RangeSet, ranges_from_text
 from service.stream.reports import TAKE_S, HeldNotes, Reports
 from service.stream.session import SessionConfig, check_endpoints, open_session

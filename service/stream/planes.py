@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.types import F32, U8, Array, Bool, DepthMap
-from service.stream import mask_coder, plane_kernels, prediction
+from service.stream import plane_coders, plane_kernels
 
 U16 = npt.NDArray[np.uint16]
 
@@ -93,12 +93,12 @@ def _fill_back(values: Array, known: Bool) -> Array:
 
 def encode_mask(known: Bool) -> bytes:
     """The section that says which pixels of the box are known; empty when all are."""
-    return b"" if known.all() else mask_coder.encode(known)
+    return b"" if known.all() else plane_coders.encode_mask(known)
 
 
 def decode_mask(data: bytes, w: int, h: int) -> Bool:
     """(h, w) known pixels; any bytes give some."""
-    return mask_coder.decode(data, w, h) if data else np.ones((h, w), np.bool_)
+    return plane_coders.decode_mask(data, w, h) if data else np.ones((h, w), np.bool_)
 
 
 # Depth: codes of inverse depth.
@@ -125,7 +125,7 @@ def quantise(planes: Planes, step: float) -> tuple[U16, float, float]:
 def encode_depth(codes: U16, known: Bool, method: int) -> bytes:
     """The codes by prediction, or as one JPEG-LS picture (8 bits deep when they fit)."""
     if method == METHOD_PREDICTION:
-        return prediction.encode(codes, known)
+        return plane_coders.encode_codes(codes, known)
     codes = _fill_back(codes, known)
     picture = codes.astype(np.uint8) if codes.max() < 256 else codes
     return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(picture)))
@@ -136,7 +136,7 @@ def decode_depth(data: bytes, known: Bool, method: int, low: float, step: float)
     h, w = known.shape
     codes: Array | None = None
     if method == METHOD_PREDICTION:
-        codes = prediction.decode(data, known)
+        codes = plane_coders.decode_codes(data, known)
     elif method == METHOD_JPEG_LS:
         codes = _open_jpeg_ls(data, w, h)
     if codes is None:

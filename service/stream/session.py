@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.errors import InputError, OutsideError
-from service.stream.fleet import FLEET, access_control, load_fleet
+from service.stream.keys import FLEET, access_control, load_fleet
 
 if TYPE_CHECKING:
     import zenoh

@@ -19,9 +19,19 @@ from typing import Any
 from recon.types import Keyframe
 from service.errors import InputError
 from service.stream import codec, layer
-from service.stream.database import Database, blob, json_object, json_value
+from service.stream.database import (
+    SCHEMA_VERSION,
+    Database,
+    blob,
+    can_write,
+    is_sound,
+    json_object,
+    json_value,
+    peek_meta,
+    rescue,
+)
 from service.stream.inventory import Inventory, Listener
-from service.stream.radio_store import RadioStore
+from service.stream.radio_tiles import RadioStore
 from service.stream.ranges import RangeSet, is_number, ranges_from_pairs
 from service.stream.records import (
     PoseRecord,
@@ -33,8 +43,6 @@ from service.stream.records import (
     unpack_pose,
     unpack_repose,
 )
-from service.stream.rescue import is_sound, rescue
-from service.stream.schema import SCHEMA, SCHEMA_VERSION, can_write, peek_meta
 from service.stream.validity import summary_from_json
 
 _NOT_TOO_LARGE = f"LENGTH(data) <= {layer.MAX_LAYER_BYTES}"
@@ -100,7 +108,7 @@ class ScanStore:
         if not is_sound(path):
             if read_only or not can_write(path):
                 raise InputError(f"{path} is damaged; copy its folder where it can be repaired")
-            rescue(path, SCHEMA)
+            rescue(path)
         return cls(path, None, quota_bytes, read_only)
 
     def close(self) -> None:
@@ -323,7 +331,7 @@ class ScanStore:
     # What the link asks
 
     def record(self, kind: str, number: int) -> bytes | None:
-        """The stored bytes of item ``number`` of a kind of :mod:`service.stream.parts`.
+        """The stored bytes of item ``number`` of a kind of :mod:`service.stream.messages`.
 
         Header and summary are numbered by the CRC-32 of their JSON, so that a change shows.
         """

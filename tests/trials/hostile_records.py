@@ -20,7 +20,7 @@ import numpy as np
 from recon import se3
 from service.bench.keyframes import make_keyframe
 from service.stream import codec, layer, radio_messages
-from service.stream.parts import CODES, Part, split, split_in
+from service.stream.messages import CODES, Part, split, split_in
 from service.stream.radio_tiles import tiles_of
 from service.stream.records import PoseRecord, Repose, ScanHeader, pack_pose, pack_repose
 

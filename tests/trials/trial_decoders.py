@@ -17,8 +17,8 @@ from recon.types import DepthMap, Keyframe, Pose
 from service.cameras.camera_file import load_camera
 from service.config import load_config
 from service.errors import SkyreliefError
-from service.stream import codec, layer, messages, planes, prediction, radio_messages
-from service.stream.parts import Assembler, parse, split
+from service.stream import codec, layer, messages, plane_coders, planes, radio_messages
+from service.stream.messages import Assembler, parse, split
 from service.stream.records import PoseRecord, Repose, pack_pose, pack_repose, unpack_pose
 from service.stream.records import unpack_repose as unpack_corrected
 from service.stream.tunnel import TunnelIntake
@@ -84,7 +84,7 @@ def _planes(_: Path) -> Decoder:
         planes.decode_sigma(data, 13, 9)
         planes.decode_views(data, 13, 9)
         planes.decode_colour(data, 13, 9)
-        prediction.decode(data, known)
+        plane_coders.decode_codes(data, known)
 
     return decode
 
