@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from mavlink.control import ACCEPTED, Answer, Handled, Result, ScanControl, Work
-from mavlink.messages import CAMERA, Address, Outbox
-from mavlink.streams import Streams
+from mavlink.first_beat import CAMERA
+from mavlink.messages import Address, Outbox, Streams
 from mavlink.wire import dialect
 
 S = 1_000_000_000

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from mavlink.command_desk import Call, Command
 from mavlink.control import ACCEPTED, Answer, Handled, Phase, Power, Result
-from mavlink.messages import CAMERA, ONBOARD
+from mavlink.first_beat import CAMERA, ONBOARD
 
 if TYPE_CHECKING:
     from mavlink.companion import Companion

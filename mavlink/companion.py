@@ -12,28 +12,30 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from mavlink import status as texts
-from mavlink.autopilot_link import AutopilotLink
+from mavlink.autopilot_link import WANTED_HZ, AutopilotLink
 from mavlink.camera import CAPTURE_STATUS, CameraComponent, CameraConfig, KeyframeReport
-from mavlink.camera_definition import FILE, URI, camera_definition, definition_version
 from mavlink.command_desk import CommandDesk, decode_call
 from mavlink.commands import COMMANDS, is_stop
-from mavlink.component_metadata import NUMBER as METADATA
-from mavlink.component_metadata import ComponentMetadata
 from mavlink.control import Answer, Result, ScanControl
 from mavlink.decode import READERS
-from mavlink.extended_parameters import ExtendedParameters
-from mavlink.framing import Decoder, Packet
+from mavlink.first_beat import CAMERA, ONBOARD
+from mavlink.framing import Decoder, Packet, TelemetryDecoder
 from mavlink.ftp import FileServer
 from mavlink.gimbal import YAW_FRAMES
 from mavlink.history import VehicleHistory
 from mavlink.link_watch import LinkWatch, WatchConfig
-from mavlink.messages import CAMERA, ONBOARD, Address, Outbox, Outgoing
-from mavlink.parameters import YAW_FRAME, Parameters, with_defaults
+from mavlink.messages import Address, Outbox, Outgoing, Streams
+from mavlink.metadata import (
+    DEFINITION,
+    DEFINITION_URI,
+    ComponentMetadata,
+    camera_definition,
+    definition_version,
+)
+from mavlink.metadata import NUMBER as METADATA
+from mavlink.parameters import YAW_FRAME, ExtendedParameters, Parameters, with_defaults
 from mavlink.presence import Presence
-from mavlink.rates import WANTED_HZ
 from mavlink.status import ComputerLoad, StatusTexts, computer_status, motion_values
-from mavlink.streams import Streams
-from mavlink.telemetry import TelemetryDecoder
 from mavlink.wire import COMMAND_CANCEL, numbers_of
 
 S = 1_000_000_000
@@ -108,7 +110,7 @@ class Companion:
         table = self.parameters.table
         definition = camera_definition(config.camera.vendor, config.camera.model, table)
         self._metadata = ComponentMetadata(config.camera, table)
-        self._files = FileServer({FILE: definition, **self._metadata.files})
+        self._files = FileServer({DEFINITION: definition, **self._metadata.files})
         self.camera = CameraComponent(
             _with_definition(config.camera, definition_version(table)),
             control,
@@ -308,4 +310,4 @@ def _with_definition(camera: CameraConfig, version: int) -> CameraConfig:
     """The camera with our own definition, unless it names another."""
     if camera.definition_uri:
         return camera
-    return replace(camera, definition_uri=URI, definition_version=version)
+    return replace(camera, definition_uri=DEFINITION_URI, definition_version=version)

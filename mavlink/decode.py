@@ -6,13 +6,15 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mavlink import gimbal
+from mavlink.gimbal import frame_of_flags
 from mavlink.quaternion import from_rpy, normalised
 from mavlink.samples import (
     RECEIVER_SIGMA_H_M,
     RECEIVER_SIGMA_V_M,
     AccuracySample,
     AttitudeSample,
+    GimbalFrame,
+    GimbalSample,
     PositionSample,
     RangeSample,
     Sample,
@@ -96,6 +98,36 @@ def _altitude(m: Message) -> Sample | None:
     return TerrainSample(boot_ms, m.bottom_clearance, CLEARANCE_SIGMA_M)
 
 
+def _device_status(m: Any) -> GimbalSample | None:
+    """The sample in a GIMBAL_DEVICE_ATTITUDE_STATUS (285)."""
+    q = normalised(m.q)
+    if q is None:
+        return None
+    return GimbalSample(m.time_boot_ms, q, frame_of_flags(m.flags), m.get_srcComponent(), 0)
+
+
+def _mount_orientation(m: Any) -> GimbalSample | None:
+    """The sample in a MOUNT_ORIENTATION (265): degrees, earth yaw when it sends one."""
+    if not all(map(math.isfinite, (m.roll, m.pitch))):
+        return None
+    absolute = float(getattr(m, "yaw_absolute", math.nan))
+    # A sender of the short form leaves the extension zero although it points elsewhere.
+    earth = math.isfinite(absolute) and absolute != 0.0
+    yaw = absolute if earth else m.yaw
+    if not math.isfinite(yaw):
+        return None
+    q = from_rpy(*map(math.radians, (m.roll, m.pitch, yaw)))
+    frame = GimbalFrame.EARTH if earth else GimbalFrame.VEHICLE
+    return GimbalSample(m.time_boot_ms, q, frame, m.get_srcComponent(), 1)
+
+
+def _mount_status(m: Any) -> GimbalSample | None:
+    """The sample in an old MOUNT_STATUS (158): hundredths of a degree, vehicle's heading."""
+    roll, pitch, yaw = (math.radians(a * 0.01) for a in (m.pointing_b, m.pointing_a, m.pointing_c))
+    q = from_rpy(roll, pitch, yaw)
+    return GimbalSample(None, q, GimbalFrame.VEHICLE, m.get_srcComponent(), 2)
+
+
 def _finite(*values: float) -> bool:
     return all(math.isfinite(value) for value in values)
 
@@ -116,8 +148,8 @@ READERS: dict[str, Callable[[Message], Sample | None]] = {
     "RANGEFINDER": _rangefinder,
     "TERRAIN_REPORT": _terrain_report,
     "ALTITUDE": _altitude,
-    "GIMBAL_DEVICE_ATTITUDE_STATUS": gimbal.from_device_status,
-    "MOUNT_ORIENTATION": gimbal.from_mount_orientation,
-    "MOUNT_STATUS": gimbal.from_mount_status,
+    "GIMBAL_DEVICE_ATTITUDE_STATUS": _device_status,
+    "MOUNT_ORIENTATION": _mount_orientation,
+    "MOUNT_STATUS": _mount_status,
 }
 """Message name to reader. The next message is one function and one line."""

@@ -1,4 +1,4 @@
-"""Heartbeats before the heavy imports: the links are opened and spoken to at once.
+"""Our two components, and their heartbeats before the heavy imports.
 
 An autopilot may not talk on a serial line until it hears MAVLink, and ArduPilot stops looking
 for a camera a minute after boot. Dialect and arrays take a while to import on a busy machine,
@@ -11,16 +11,34 @@ import struct
 import threading
 import time
 from collections.abc import Sequence
+from typing import Any
 
 from mavlink.link import Link, parse_link
-from mavlink.messages import CAMERA, ONBOARD
 
+ONBOARD = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
+CAMERA = 100  # MAV_COMP_ID_CAMERA
 TYPES = {ONBOARD: 18, CAMERA: 30}  # MAV_TYPE_ONBOARD_CONTROLLER, MAV_TYPE_CAMERA
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 BOOT = 1  # MAV_STATE
 HEARTBEAT, CRC_EXTRA, VERSION = 0, 50, 3
 PERIOD_S = 1.0
 LONGEST_S = 120.0  # who has not taken over by then is dead, and says so by silence
+
+
+FIRST_DEVICE = 100  # from here on component ids are of cameras, gimbals, computers, receivers ...
+NOT_VEHICLES = frozenset({5, 6, 18, 26, 27, 30, *range(31, 35), *range(36, 43), 44, 48, 49})
+"""MAV_TYPE of antenna trackers, ground stations, onboard computers, gimbals, ADS-B, cameras,
+charging stations, FLARM, servos, Open Drone ID, batteries, parachutes, loggers, OSDs, IMUs, GPS,
+winches, illuminators, grippers and radios."""
+
+
+def is_autopilot(component: int, heartbeat: Any) -> bool:
+    """True for the heartbeat of a vehicle's autopilot, not of any other component."""
+    return (
+        heartbeat.autopilot != NO_AUTOPILOT
+        and heartbeat.type not in NOT_VEHICLES
+        and 0 < component < FIRST_DEVICE
+    )
 
 
 def heartbeat_packet(

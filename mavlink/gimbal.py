@@ -1,10 +1,10 @@
-"""Gimbal messages into attitudes of the head in NED.
+"""Quaternions of gimbals into attitudes of the head in NED.
 
 GIMBAL_DEVICE_ATTITUDE_STATUS says by its flags what its quaternion refers to (MAVLink gimbal
 protocol v2): bit 64 earth, bit 32 the vehicle's heading, neither: earth when yaw is locked
 (16), else the vehicle's heading. Some senders claim what is not so: ArduPilot's servo mounts
 send servo angles with flags 44, which claim the horizon. Hence the override by configuration,
-:func:`steadiest_frame` (by telemetry alone) and :func:`judge_frame` (by the pictures).
+:func:`steadiest_frame` (by telemetry alone) and :mod:`mavlink.frame_watch` (by the images).
 """
 
 from __future__ import annotations
@@ -12,19 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from mavlink.quaternion import (
     Quaternion,
-    angle_between,
-    conjugate,
     from_rpy,
     multiply,
-    normalised,
     to_rpy,
     yaw_of,
 )
-from mavlink.samples import GimbalFrame, GimbalSample
+from mavlink.samples import GimbalFrame
 
 YAW_LOCK = 16
 YAW_IN_VEHICLE_FRAME = 32
@@ -33,8 +29,6 @@ YAW_IN_EARTH_FRAME = 64
 STRAIGHT_RAD = math.radians(0.05)
 TILT_LAG = 30
 TILTED_RAD = math.radians(1.0)
-SAME_RAD = math.radians(0.3)
-CLEAR_RAD = math.radians(0.05)
 
 YAW_FRAMES = ("auto", "vehicle", "earth", "body", "servo")
 
@@ -62,36 +56,6 @@ class GimbalConfig:
             return None
         roll, pitch, yaw = map(math.radians, self.mount_rpy_deg)
         return from_rpy(roll, pitch, yaw)
-
-
-def from_device_status(m: Any) -> GimbalSample | None:
-    """The sample in a GIMBAL_DEVICE_ATTITUDE_STATUS (285)."""
-    q = normalised(m.q)
-    if q is None:
-        return None
-    return GimbalSample(m.time_boot_ms, q, frame_of_flags(m.flags), m.get_srcComponent(), 0)
-
-
-def from_mount_orientation(m: Any) -> GimbalSample | None:
-    """The sample in a MOUNT_ORIENTATION (265): degrees, earth yaw when it sends one."""
-    if not all(map(math.isfinite, (m.roll, m.pitch))):
-        return None
-    absolute = float(getattr(m, "yaw_absolute", math.nan))
-    # A sender of the short form leaves the extension zero although it points elsewhere.
-    earth = math.isfinite(absolute) and absolute != 0.0
-    yaw = absolute if earth else m.yaw
-    if not math.isfinite(yaw):
-        return None
-    q = from_rpy(*map(math.radians, (m.roll, m.pitch, yaw)))
-    frame = GimbalFrame.EARTH if earth else GimbalFrame.VEHICLE
-    return GimbalSample(m.time_boot_ms, q, frame, m.get_srcComponent(), 1)
-
-
-def from_mount_status(m: Any) -> GimbalSample | None:
-    """The sample in an old MOUNT_STATUS (158): hundredths of a degree, vehicle's heading."""
-    roll, pitch, yaw = (math.radians(a * 0.01) for a in (m.pointing_b, m.pointing_a, m.pointing_c))
-    q = from_rpy(roll, pitch, yaw)
-    return GimbalSample(None, q, GimbalFrame.VEHICLE, m.get_srcComponent(), 2)
 
 
 def frame_of_flags(flags: int) -> GimbalFrame:
@@ -135,71 +99,6 @@ def _of_servos(q: Quaternion) -> Quaternion:
 
 def _tilt(pitch_rad: float) -> Quaternion:
     return from_rpy(0.0, pitch_rad, 0.0)
-
-
-@dataclass(frozen=True, slots=True)
-class FrameVerdict:
-    """Which frame agrees with the pictures, and by how much."""
-
-    frame: GimbalFrame
-    rms_rad: float  # disagreement of the frame chosen, per step
-    runner_up_rms_rad: float
-    decided: bool  # the turns told the frames apart
-    refuted: tuple[GimbalFrame, ...] = ()  # those that disagree clearly more
-
-
-Ends = tuple[Quaternion, Quaternion]
-"""A rotation at the first and at the second of two pictures."""
-
-
-def judge_frame(
-    q_sent: Sequence[Ends], q_ned_body: Sequence[Ends], q_seen_steps: Sequence[Quaternion]
-) -> FrameVerdict | None:
-    """The frame of a gimbal's quaternions that agrees with the rotation seen by the camera.
-
-    For N pairs of pictures: what the gimbal sent and the body's attitude at both, and the
-    rotation ``q_head(first)_head(second)`` measured between them, in the head's axes. None
-    when there is nothing to compare. ``decided`` needs the best frame to disagree less than
-    half as much as the next one that means something else.
-    """
-    if not len(q_sent) == len(q_ned_body) == len(q_seen_steps):
-        raise ValueError(
-            f"judge_frame needs as many of each, got "
-            f"{len(q_sent)}, {len(q_ned_body)} and {len(q_seen_steps)}"
-        )
-    if not q_sent:
-        return None
-    heads: dict[GimbalFrame, list[Ends]] = {
-        frame: [
-            (to_earth(a, frame, body_a), to_earth(b, frame, body_b))
-            for (a, b), (body_a, body_b) in zip(q_sent, q_ned_body, strict=True)
-        ]
-        for frame in GimbalFrame
-    }
-    rms = {frame: _disagreement(heads[frame], q_seen_steps) for frame in GimbalFrame}
-    best = min(rms, key=lambda frame: rms[frame])
-    # A frame that means the same attitudes all along is no rival.
-    rivals = [f for f in GimbalFrame if _largest_angle(heads[f], heads[best]) > SAME_RAD]
-    second = min((rms[f] for f in rivals), default=math.inf)
-    refuted = tuple(
-        f for f in rivals if rms[f] > 2.0 * rms[best] and rms[f] - rms[best] > CLEAR_RAD
-    )
-    return FrameVerdict(best, rms[best], second, bool(rivals) and refuted == tuple(rivals), refuted)
-
-
-def _disagreement(heads: Sequence[Ends], steps: Sequence[Quaternion]) -> float:
-    """Root mean square angle in rad between the steps of the heads and those seen."""
-    squares = [
-        angle_between(multiply(conjugate(a), b), seen) ** 2
-        for (a, b), seen in zip(heads, steps, strict=True)
-    ]
-    return math.sqrt(sum(squares) / len(squares))
-
-
-def _largest_angle(a: Sequence[Ends], b: Sequence[Ends]) -> float:
-    return max(
-        angle_between(p, q) for pair in zip(a, b, strict=True) for p, q in zip(*pair, strict=True)
-    )
 
 
 def steadiest_frame(

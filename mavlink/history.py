@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mavlink.gimbal import GimbalConfig, steadiest_frame, to_earth
 from mavlink.quaternion import Quaternion, down_component, multiply, slerp
-from mavlink.receiver import receiver_above
 from mavlink.samples import (
     RECEIVER_SIGMA_H_M,
     RECEIVER_SIGMA_V_M,
@@ -20,10 +20,11 @@ from mavlink.samples import (
     GimbalSample,
     PositionSample,
     RangeSample,
+    ReceiverAltitude,
     Sample,
     TerrainSample,
+    VehicleState,
 )
-from mavlink.state import VehicleState
 from mavlink.track import MAX_GAP_NS, Bracket, Row, Track
 
 M_PER_DEG = 111_319.49  # along a meridian, and along the equator
@@ -396,3 +397,55 @@ def _hermite(step: float, m0: float, m1: float, u: float) -> float:
         return straight
     h10, h01, h11 = u * (1 - u) ** 2, u * u * (3 - 2 * u), u * u * (u - 1)
     return h10 * m0 + h01 * step + h11 * m1
+
+
+PATIENCE_S = 0.3  # a little more than the 3.5 Hz of a slow telemetry radio
+
+
+class LiveHistory(VehicleHistory):
+    """A VehicleHistory on the monotonic clock; ``state_at`` may wait for ``patience_s``."""
+
+    def __init__(self, config: HistoryConfig | None = None, patience_s: float = PATIENCE_S) -> None:
+        super().__init__(config)
+        self.patience_s = patience_s
+        self._news = threading.Condition()
+        self._waiting = 0  # readers
+
+    def add(self, sample: Sample, time_ns: int) -> None:
+        """Put a sample in at its time and wake whoever waits for it."""
+        super().add(sample, time_ns)
+        if self._waiting:
+            with self._news:
+                self._news.notify_all()
+
+    def state_at(self, time_ns: int) -> VehicleState | None:
+        """The state at ``time_ns``, as soon as every stream that flows has come past it."""
+        now_s = time.monotonic()
+        end_s = now_s + self.patience_s
+        if time_ns * 1e-9 < end_s:  # what lies further ahead cannot come in time
+            with self._news:
+                self._waiting += 1  # before looking, so that nothing new goes unnoticed
+                while not self.covers(time_ns) and now_s < end_s:
+                    self._news.wait(end_s - now_s)
+                    now_s = time.monotonic()
+                self._waiting -= 1
+        return super().state_at(time_ns)
+
+
+ALTITUDE = 3
+"""Column of the receiver's samples."""
+
+EKF_ALTITUDE = 2
+"""Column of the autopilot's positions."""
+
+
+def receiver_above(accuracy: Bracket | None, positions: Track) -> ReceiverAltitude | None:
+    """The fix nearest in time against the autopilot's altitude then; None without either."""
+    if accuracy is None:
+        return None
+    at = positions.around(accuracy.nearer_ns)
+    if at is None:
+        return None
+    before, after = at.before[EKF_ALTITUDE], at.after[EKF_ALTITUDE]
+    above = accuracy.nearer[ALTITUDE] - (before + (after - before) * at.fraction)
+    return ReceiverAltitude(accuracy.nearer_ns, above) if math.isfinite(above) else None

@@ -1,6 +1,8 @@
-"""What an operator tunes in flight: the PARAM_* protocol on the onboard computer.
+"""What an operator tunes in flight: PARAM_* on the onboard computer, PARAM_EXT_* on the camera.
 
-All values are REAL32: ArduPilot and PX4 encode other types differently.
+Both show the same values. All are REAL32: ArduPilot and PX4 encode other types differently.
+Ground stations use PARAM_EXT_* for the settings in a camera definition; there the 4 bytes of a
+REAL32 travel in a field of 128.
 """
 
 from __future__ import annotations
@@ -12,8 +14,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from mavlink.control import Answer, Result
+from mavlink.first_beat import CAMERA, ONBOARD
 from mavlink.gimbal import YAW_FRAMES
-from mavlink.messages import ONBOARD, Outbox
+from mavlink.messages import Outbox
 from mavlink.wire import dialect
 
 REAL32 = 9  # MAV_PARAM_TYPE
@@ -175,3 +178,66 @@ def text_of(raw: str | bytes) -> str:
     """A parameter's name as it came, without what follows a zero."""
     text = raw.decode("ascii", "replace") if isinstance(raw, bytes) else raw
     return text.partition("\0")[0]
+
+
+VALUE = 128
+ACK_ACCEPTED, ACK_UNSUPPORTED, ACK_FAILED = 0, 1, 2
+
+
+class ExtendedParameters:
+    """The protocol's answers."""
+
+    def __init__(self, parameters: Parameters, outbox: Outbox) -> None:
+        self._parameters = parameters
+        self._outbox = outbox
+
+    def receive(self, message: Any) -> Answer | None:
+        """Serve a PARAM_EXT_* message; the answer of a SET, for the operator."""
+        kind = message.get_type()
+        names = [parameter.name for parameter in self._parameters.table]
+        if kind == "PARAM_EXT_REQUEST_LIST":
+            for i in range(len(names)):
+                self._send(i)
+        elif kind == "PARAM_EXT_REQUEST_READ":
+            i = int(message.param_index)
+            if i < 0:
+                name = text_of(message.param_id)
+                i = names.index(name) if name in names else -1
+            if 0 <= i < len(names):
+                self._send(i)
+        elif kind == "PARAM_EXT_SET":
+            return self._set(message, names)
+        return None
+
+    def _set(self, message: Any, names: list[str]) -> Answer:
+        name = text_of(message.param_id)
+        if name not in names or message.param_type != REAL32:
+            self._acknowledge(name, 0.0, ACK_UNSUPPORTED)
+            return Answer(Result.DENIED, f"no parameter {name}")
+        raw = _raw(message)
+        answer = self._parameters.change(name, struct.unpack("<f", raw[:4])[0])
+        accepted = answer.result is Result.ACCEPTED
+        self._acknowledge(name, self._parameters[name], ACK_ACCEPTED if accepted else ACK_FAILED)
+        return answer
+
+    def _send(self, i: int) -> None:
+        name = self._parameters.table[i].name
+        value = _packed(self._parameters[name])
+        count = len(self._parameters.table)
+        message = dialect.MAVLink_param_ext_value_message(name.encode(), value, REAL32, count, i)
+        self._outbox.put(CAMERA, message)
+
+    def _acknowledge(self, name: str, value: float, result: int) -> None:
+        raw = name.encode("ascii", "replace")[:16]
+        message = dialect.MAVLink_param_ext_ack_message(raw, _packed(value), REAL32, result)
+        self._outbox.put(CAMERA, message)
+
+
+def _packed(value: float) -> bytes:
+    return struct.pack("<f", value).ljust(VALUE, b"\0")
+
+
+def _raw(message: Any) -> bytes:
+    """The value's own bytes; pymavlink drops the zeros at their end."""
+    value: bytes = message._param_value_raw
+    return value.ljust(VALUE, b"\0")

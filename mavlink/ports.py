@@ -238,7 +238,7 @@ class LogPort:
     is_quick = True
 
     def __init__(self, spec: LinkSpec) -> None:
-        from mavlink.logs.tlog import packets
+        from mavlink.tlog import packets
 
         self._file = open(spec.place, "rb")  # noqa: SIM115 - closed by close()
         self._packets = packets(self._file, Counter())

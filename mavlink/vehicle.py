@@ -22,25 +22,21 @@ from typing import Any
 
 from mavlink import status as texts
 from mavlink.camera import KeyframeReport
+from mavlink.clock import computer_offset_ns
 from mavlink.companion import HEARD, Companion, CompanionConfig
 from mavlink.control import ScanControl
 from mavlink.decode import READERS
 from mavlink.first_beat import FirstBeats
 from mavlink.framing import Framer, Packet
-from mavlink.history import HistoryConfig
-from mavlink.inbox import Inbox, Job
-from mavlink.link import Link, parse_link
+from mavlink.history import HistoryConfig, LiveHistory
+from mavlink.link import Inbox, Job, Link, parse_link
 from mavlink.link_watch import Trouble
-from mavlink.live_history import LiveHistory
 from mavlink.memory import Memory
-from mavlink.messages import Outgoing
-from mavlink.odometry import Odometry, odometry_message
-from mavlink.packer import Packer
+from mavlink.messages import Outgoing, Packer
 from mavlink.presence import Health, Presence, PresenceConfig
-from mavlink.recorder import Recorder
 from mavlink.signing import Signing, read_key
-from mavlink.status import ComputerLoad
-from mavlink.wall_time import computer_offset_ns
+from mavlink.status import ComputerLoad, Odometry, odometry_message
+from mavlink.tlog import Recorder
 from mavlink.wire import dialect, numbers_of
 
 log = logging.getLogger(__name__)

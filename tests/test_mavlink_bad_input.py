@@ -16,12 +16,12 @@ from typing import Any
 import pytest
 from loopback import until
 
+from mavlink.clock import computer_offset_ns
 from mavlink.control import Phase
 from mavlink.framing import Framer
-from mavlink.recorder import Recorder
 from mavlink.rehearsal import RehearsalVehicle
 from mavlink.signing import timestamp_of
-from mavlink.wall_time import computer_offset_ns
+from mavlink.tlog import Recorder
 from mavlink.wire import dialect
 
 REPEATS = 20

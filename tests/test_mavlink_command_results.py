@@ -16,10 +16,10 @@ from mavlink.command_desk import CommandDesk
 from mavlink.commands import COMMANDS
 from mavlink.companion import Companion, CompanionConfig
 from mavlink.control import Answer, Phase, Result, Work
+from mavlink.first_beat import CAMERA, ONBOARD
 from mavlink.framing import Framer
 from mavlink.history import VehicleHistory
-from mavlink.messages import CAMERA, ONBOARD
-from mavlink.packer import Packer
+from mavlink.messages import Packer
 from mavlink.presence import Presence, PresenceConfig
 from mavlink.rehearsal import RehearsalControl
 from mavlink.wire import COMMAND_CANCEL, dialect, x25crc

@@ -19,7 +19,7 @@ from mavlink.companion import Companion, CompanionConfig
 from mavlink.control import Answer, Phase, Result, Work
 from mavlink.framing import Framer
 from mavlink.history import VehicleHistory
-from mavlink.packer import Packer
+from mavlink.messages import Packer
 from mavlink.parameters import PARAMETERS
 from mavlink.presence import Health, Presence, PresenceConfig
 from mavlink.rehearsal import RehearsalControl

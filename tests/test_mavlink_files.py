@@ -14,9 +14,7 @@ from typing import Any
 import pytest
 
 from mavlink.camera import CameraConfig
-from mavlink.camera_definition import FILE, URI, camera_definition, definition_version
 from mavlink.companion import Companion, CompanionConfig
-from mavlink.component_metadata import ComponentMetadata, ComponentMetadataMessage
 from mavlink.framing import Framer
 from mavlink.ftp import (
     ACK,
@@ -36,6 +34,14 @@ from mavlink.ftp import (
 )
 from mavlink.history import VehicleHistory
 from mavlink.messages import Address
+from mavlink.metadata import (
+    DEFINITION,
+    DEFINITION_URI,
+    ComponentMetadata,
+    ComponentMetadataMessage,
+    camera_definition,
+    definition_version,
+)
 from mavlink.parameters import PARAMETERS
 from mavlink.presence import Presence, PresenceConfig
 from mavlink.rehearsal import RehearsalControl
@@ -206,10 +212,10 @@ class Ends:
 def test_the_camera_names_its_definition_and_serves_it() -> None:
     ends = Ends()
     info: Any = ends.companion.camera.message(259, 0)
-    assert info.cam_definition_uri == URI
+    assert info.cam_definition_uri == DEFINITION_URI
     assert info.cam_definition_version == definition_version(PARAMETERS)
-    head = HEAD.pack(7, 0, OPEN, len(FILE), 0, 0, 0, 0)
-    payload = list((head + FILE.encode()).ljust(251, b"\0"))
+    head = HEAD.pack(7, 0, OPEN, len(DEFINITION), 0, 0, 0, 0)
+    payload = list((head + DEFINITION.encode()).ljust(251, b"\0"))
     message = dialect.MAVLink_file_transfer_protocol_message(0, 1, 100, payload)
     (reply,) = ends.say(message)
     assert (reply.target_system, reply.target_component) == (255, 190)
@@ -281,8 +287,8 @@ def place_of(uri: str, said_by: int) -> tuple[int, str]:
 
 
 def test_the_definition_is_found_when_the_autopilot_passes_it_on_as_its_own() -> None:
-    component, path = place_of(URI, said_by=1)
-    assert (component, path) == (100, FILE)
+    component, path = place_of(DEFINITION_URI, said_by=1)
+    assert (component, path) == (100, DEFINITION)
 
 
 def test_a_client_that_sends_the_whole_address_is_served() -> None:

@@ -21,7 +21,7 @@ from loopback import until
 from scipy.spatial.transform import Rotation
 
 from mavlink.framing import Framer
-from mavlink.logs.tlog import packets
+from mavlink.tlog import packets
 from mavlink.wire import dialect
 from recon.types import Camera
 from service.cameras.camera_file import save_camera

@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavlink.decode import READERS, decode
-from mavlink.framing import Decoder, Framer, check_packet, packet_length
+from mavlink.framing import Decoder, Framer, TelemetryDecoder, check_packet, packet_length
 from mavlink.samples import PositionSample, RangeSample, TerrainSample
-from mavlink.telemetry import TelemetryDecoder
 from mavlink.wire import dialect, numbers_of, x25crc
 
 

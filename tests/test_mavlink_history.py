@@ -11,18 +11,12 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from mavlink import quaternion
-from mavlink.frame_watch import FrameWatch
-from mavlink.gimbal import (
-    GimbalConfig,
-    frame_of_flags,
-    judge_frame,
-    steadiest_frame,
-    to_earth,
-)
-from mavlink.history import M_PER_DEG, HistoryConfig, VehicleHistory
-from mavlink.live_history import LiveHistory
+from mavlink.frame_watch import FrameWatch, judge_frame
+from mavlink.gimbal import GimbalConfig, frame_of_flags, steadiest_frame, to_earth
+from mavlink.history import M_PER_DEG, HistoryConfig, LiveHistory, VehicleHistory
 from mavlink.quaternion import Quaternion
 from mavlink.samples import (
+    F64,
     AccuracySample,
     AttitudeSample,
     GimbalFrame,
@@ -31,7 +25,6 @@ from mavlink.samples import (
     RangeSample,
     TerrainSample,
 )
-from mavlink.state import F64
 from mavlink.track import Track
 
 MS = 1_000_000

@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mavlink import quaternion, turns
+from mavlink import latency, quaternion
 from mavlink.framing import Decoder, Framer
 from mavlink.history import VehicleHistory
 from mavlink.latency import LatencyWatch
-from mavlink.messages import Outgoing
-from mavlink.odometry import Odometry, odometry_message
-from mavlink.packer import Packer
+from mavlink.messages import Outgoing, Packer
 from mavlink.quaternion import Quaternion
 from mavlink.samples import AttitudeSample, GimbalFrame, GimbalSample
+from mavlink.status import Odometry, odometry_message
 
 S = 1_000_000_000
 
@@ -134,13 +133,13 @@ def test_turns_agree_with_scipy() -> None:
     rng = np.random.default_rng(3)
     a, b = (Rotation.random(50, random_state=seed) for seed in (1, 2))
     q = [r.as_quat()[:, [3, 0, 1, 2]] for r in (a, b, a * b, a.inv() * b)]
-    assert np.abs((turns.multiply(q[0], q[1]) * q[2]).sum(axis=1)) == pytest.approx(1.0)
-    vectors = turns.rotation_vectors(turns.multiply(turns.conjugate(q[0]), q[1]))
+    assert np.abs((latency.multiply(q[0], q[1]) * q[2]).sum(axis=1)) == pytest.approx(1.0)
+    vectors = latency.rotation_vectors(latency.multiply(latency.conjugate(q[0]), q[1]))
     assert vectors == pytest.approx((a.inv() * b).as_rotvec(), abs=1e-9)
     source = rng.normal(size=(40, 3))
-    found = turns.best_rotation(source, a[0].apply(source))
+    found = latency.best_rotation(source, a[0].apply(source))
     assert found == pytest.approx(a[0].as_matrix(), abs=1e-9)
-    track = turns.Attitudes(attitudes(20.0))
+    track = latency.Attitudes(attitudes(20.0))
     start, end = np.array([1.013, 2.5, 44.0, -1.0]), np.array([1.213, 2.9, 50.0, 1.0])
     turned, known = track.turns(start, end)
     assert known.tolist() == [True, True, False, False]

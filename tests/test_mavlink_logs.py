@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from mavlink import quaternion
 from mavlink.history import HistoryConfig, VehicleHistory
 from mavlink.logs import TelemetryLog, load_telemetry
-from mavlink.state import F64
+from mavlink.samples import F64
 from mavlink.wire import dialect
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -20,8 +20,8 @@ from mavlink import quaternion
 from mavlink.camera import KeyframeReport
 from mavlink.control import Answer, Result, Work
 from mavlink.framing import Framer
-from mavlink.logs.tlog import packets
 from mavlink.rehearsal import RehearsalVehicle
+from mavlink.tlog import packets
 
 S = 1_000_000_000
 

@@ -11,17 +11,16 @@ from autopilot import attitude, beat, packed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mavlink.autopilot_link import LOOK_NS, RateKeeper
 from mavlink.camera import KeyframeReport
 from mavlink.clock import BootClock, BootCounter, fit_boot
 from mavlink.companion import Companion, CompanionConfig
 from mavlink.control import Answer, Result
 from mavlink.framing import Framer
 from mavlink.history import VehicleHistory
-from mavlink.messages import Address, Outgoing
-from mavlink.packer import Packer
+from mavlink.messages import Address, Outgoing, Packer
 from mavlink.parameters import Parameter
 from mavlink.presence import Health, Presence, PresenceConfig
-from mavlink.rates import LOOK_NS, RateKeeper
 from mavlink.rehearsal import RehearsalControl
 from mavlink.timesync import TimesyncFilter
 from mavlink.wire import CRC_EXTRA, dialect, x25crc

@@ -10,8 +10,7 @@ import pytest
 from autopilot import beat, packed
 
 from mavlink.framing import Framer
-from mavlink.messages import Outgoing
-from mavlink.packer import Packer
+from mavlink.messages import Outgoing, Packer
 from mavlink.signing import Signing, read_key, timestamp_of
 from mavlink.wire import dialect
 

@@ -14,8 +14,8 @@ from loopback import free_port, until
 from mavlink.control import Answer
 from mavlink.link import LinkSpec, parse_link
 from mavlink.logs import load_telemetry
-from mavlink.recorder import Recorder
 from mavlink.rehearsal import RehearsalVehicle
+from mavlink.tlog import Recorder
 from mavlink.vehicle import VehicleConfig
 from mavlink.wire import dialect
 

@@ -13,9 +13,9 @@ from loopback import until
 from scipy.spatial.transform import Rotation
 
 from mavlink.framing import Framer
-from mavlink.odometry import Odometry
 from mavlink.rehearsal import RehearsalVehicle
-from mavlink.state import VehicleState
+from mavlink.samples import VehicleState
+from mavlink.status import Odometry
 from mavlink.wire import dialect
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA

@@ -8,8 +8,8 @@ import time
 import pytest
 from loopback import free_port, until
 
+from mavlink.clock import DIFFER_NS, WallTime, computer_offset_ns
 from mavlink.rehearsal import RehearsalVehicle
-from mavlink.wall_time import DIFFER_NS, WallTime, computer_offset_ns
 from mavlink.wire import dialect
 from service.daemon.scan_run import disagreement, set_since
 

@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
 
-from mavlink.autopilots import is_autopilot
 from mavlink.clock import BootCounter, BootFit, fit_boot
 from mavlink.decode import READERS, decode
-from mavlink.framing import Decoder, Packet, check_packet, packet_length
+from mavlink.first_beat import is_autopilot
+from mavlink.framing import Decoder
 from mavlink.history import HistoryConfig, VehicleHistory
 from mavlink.logs import TelemetryLog, finish
 from mavlink.samples import OF_AUTOPILOT, AttitudeSample, Sample
+from mavlink.tlog import packets
 from mavlink.wire import numbers_of
 
-STAMP = 8
-BLOCK = 1 << 16
-LATEST_USEC = 4_102_444_800 * 10**6  # the year 2100
-STEP_USEC = 3_600 * 10**6  # a longer way between two packets wants confirmation
 HEARTBEAT = 0
 
 WANTED = numbers_of(READERS)
@@ -33,52 +28,6 @@ class _Stream:
     stamps: list[int] = field(default_factory=list)
     samples: list[Sample] = field(default_factory=list)
     boots: list[float | None] = field(default_factory=list)
-
-
-def packets(file: BinaryIO, counts: Counter[str]) -> Iterator[tuple[int, Packet]]:
-    """(unix ns, packet) for each packet of a log; damage is skipped and counted in bytes."""
-    buffer, at, last_usec, ended = bytearray(), 0, None, False
-    while True:
-        length = packet_length(buffer, at + STAMP) if len(buffer) > at + STAMP else None
-        if length is None or at + STAMP + length > len(buffer):
-            if not ended:
-                del buffer[:at]
-                at = 0
-                block = file.read(BLOCK)
-                buffer += block
-                ended = not block
-                continue
-            if at >= len(buffer):
-                return
-            length = 0  # a torn end
-        usec = int.from_bytes(buffer[at : at + STAMP], "big")
-        if length and usec < LATEST_USEC:
-            end = at + STAMP + length
-            packet = check_packet(bytes(buffer[at + STAMP : end]))
-            if packet is not None and _stamp_stands(packet, usec, last_usec, buffer, end):
-                last_usec, at = usec, end
-                yield usec * 1000, packet
-                continue
-            counts["bad_checksums"] += 1
-        counts["skipped_bytes"] += 1
-        at += 1
-
-
-def _stamp_stands(
-    packet: Packet, usec: int, last_usec: int | None, buffer: bytearray, end: int
-) -> bool:
-    """True when the stamp goes on from the last one, or the next stamp goes on from it.
-
-    So a clock that was set in mid-log is followed and a damaged stamp is not. A packet of a
-    kind without a checksum known here must be followed by another one as well.
-    """
-    steady = last_usec is not None and abs(usec - last_usec) < STEP_USEC
-    if steady and packet.known:
-        return True
-    if end + STAMP >= len(buffer):
-        return steady or last_usec is None
-    following = int.from_bytes(buffer[end : end + STAMP], "big")
-    return packet_length(buffer, end + STAMP) != 0 and abs(following - usec) < STEP_USEC
 
 
 def load(path: Path, config: HistoryConfig) -> TelemetryLog:

@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mavlink.clock import agree, computer_offset_ns
 from mavlink.status import WARNING
-from mavlink.wall_time import agree, computer_offset_ns
 from service.config import Config
 from service.daemon.intent import FIRST_RETRY_S, LAST_RETRY_S
 from service.errors import OutsideError
@@ -17,7 +17,7 @@ from service.errors import OutsideError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from mavlink.state import VehicleState
+    from mavlink.samples import VehicleState
     from mavlink.vehicle import VehicleLink
     from recon.types import Keyframe
     from service.cameras.source import CameraSource

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TextIO
 
-from mavlink.state import VehicleState
+from mavlink.samples import VehicleState
 
 log = logging.getLogger(__name__)
 

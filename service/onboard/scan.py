@@ -13,7 +13,7 @@ from threading import Event
 from typing import Any, Protocol
 
 from mavlink.history import VehicleHistory
-from mavlink.state import VehicleState
+from mavlink.samples import VehicleState
 from recon.backends import Backend
 from recon.types import Camera, Frame, Keyframe
 from service.cameras.source import CameraFrame, CameraSource, ahead

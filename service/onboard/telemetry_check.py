@@ -10,8 +10,7 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from mavlink.frame_watch import FrameWatch
-from mavlink.gimbal import FrameVerdict
+from mavlink.frame_watch import FrameVerdict, FrameWatch
 from mavlink.history import VehicleHistory
 from mavlink.latency import LatencyEstimate, LatencyWatch
 from mavlink.quaternion import Quaternion

@@ -1,8 +1,9 @@
-"""Names, ranges and units of our parameters for ground stations: COMPONENT_METADATA and its files.
+"""Files that describe our parameters to ground stations, read over MAVLink FTP.
 
-The message gives the address of ``general.json.xz``, which gives that of ``parameters.json.xz``;
-both are read over MAVLink FTP. See https://mavlink.io/en/services/component_metadata.html. The
-files are made once and do not change while the service runs, as that protocol asks.
+COMPONENT_METADATA gives the address of ``general.json.xz``, which gives that of
+``parameters.json.xz`` (https://mavlink.io/en/services/component_metadata.html). They do not
+change while the service runs, as that protocol asks. The camera definition makes a ground
+station show the same parameters as camera settings.
 """
 
 from __future__ import annotations
@@ -10,12 +11,14 @@ from __future__ import annotations
 import json
 import lzma
 import struct
+import zlib
 from collections.abc import Sequence
 from typing import Any
+from xml.sax.saxutils import escape, quoteattr
 
 from mavlink.camera import CameraConfig
+from mavlink.first_beat import CAMERA, ONBOARD
 from mavlink.ftp import file_crc, file_uri
-from mavlink.messages import ONBOARD
 from mavlink.parameters import Parameter
 from mavlink.wire import dialect
 
@@ -96,3 +99,43 @@ def _parameter(p: Parameter) -> dict[str, object]:
         named = [{"value": k, "description": name} for k, name in enumerate(p.options)]
         return described | {"decimalPlaces": 0, "increment": 1, "values": named}
     return described | {"decimalPlaces": 2, "increment": p.step}
+
+
+DEFINITION = "camera.xml"
+DEFINITION_URI = file_uri(CAMERA, DEFINITION)
+
+
+def camera_definition(vendor: str, model: str, table: Sequence[Parameter]) -> bytes:
+    """The XML of a camera with these parameters; its version is :func:`definition_version`."""
+    body = "".join(_described(parameter) for parameter in table)
+    version = definition_version(table)
+    return (
+        '<?xml version="1.0" encoding="UTF-8" ?>\n<mavlinkcamera>\n'
+        f'  <definition version="{version}">\n'
+        f"    <model>{escape(model)}</model>\n    <vendor>{escape(vendor)}</vendor>\n"
+        "  </definition>\n  <parameters>\n"
+        f"{body}  </parameters>\n</mavlinkcamera>\n"
+    ).encode()
+
+
+def definition_version(table: Sequence[Parameter]) -> int:
+    """1 to 65535, another one whenever the parameters change: ground stations keep the file."""
+    body = "".join(_described(parameter) for parameter in table)
+    return zlib.crc32(body.encode()) & 0xFFFF or 1
+
+
+def _described(p: Parameter) -> str:
+    attributes = f'name={quoteattr(p.name)} type="float" default="{p.default:g}"'
+    if not p.options:
+        attributes += f' min="{p.low:g}" max="{p.high:g}" step="{p.step:g}"'
+        if p.unit:
+            attributes += f" unit={quoteattr(p.unit)}"
+    lines = [f"    <parameter {attributes}>", f"      <description>{escape(p.text)}</description>"]
+    if p.options:
+        lines.append("      <options>")
+        lines += [
+            f'        <option name={quoteattr(name)} value="{k}" />'
+            for k, name in enumerate(p.options)
+        ]
+        lines.append("      </options>")
+    return "\n".join([*lines, "    </parameter>\n"])
