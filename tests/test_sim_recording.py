@@ -21,8 +21,8 @@ from recon.types import F64
 from service.cameras.camera_file import load_camera
 from service.cli import app
 from service.errors import InputError
-from service.sim.mosaic import patchwork
-from service.sim.surface_file import read_surface, write_surface
+from service.sim.picture import patchwork
+from service.sim.truth import read_surface, write_surface
 
 SMALL = [
     "--size", "320x180", "--fps", "5", "--duration-s", "4", "--height-m", "40",

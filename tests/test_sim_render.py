@@ -13,7 +13,7 @@ from recon.types import F64, Camera
 from service.sim import picture, scene, shapes
 from service.sim.noise import fractal2, hash01, normal
 from service.sim.render import Look, Renderer, camera_rays
-from service.sim.terrain import Area
+from service.sim.scene import Area
 
 CAMERA = Camera(
     np.array([[240.0, 0, 161.0], [0, 241.0, 88.0], [0, 0, 1]]),

@@ -20,10 +20,9 @@ from service.errors import InputError
 from service.exports.glb import glb
 from service.georeference import LocalFrame
 from service.scans.las import write_laz
-from service.sim.above import options_of, view_from_above
+from service.sim.deliverable_scoring import options_of, view_from_above
 from service.sim.recording import Faults, SimulationOptions
-from service.sim.surface_file import read_surface
-from service.sim.truth import heights_below, read_truth
+from service.sim.truth import heights_below, read_surface, read_truth
 
 TRUTH_AT = LocalFrame(47.3977, 8.5456, 488.0)
 SCAN_AT = LocalFrame(47.3980, 8.5450, 540.0)  # another origin, 33 m north and 45 m west

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 
 from recon import metrics
@@ -23,11 +24,12 @@ from recon.metrics import Fit
 from recon.surface import triangle_grid
 from recon.surface.picture_shift import patch_shifts
 from recon.surface.triangle_grid import TriangleGrid
-from recon.types import F32, F64, Array
+from recon.types import F32, F64, U8, Array, Camera
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.sim.above import view_from_above
-from service.sim.truth import Truth, heights_below, short
+from service.sim.recording import SimulationOptions, prepare
+from service.sim.render import Look, Renderer
+from service.sim.truth import Truth, heights_below, read_surface, short
 
 log = logging.getLogger(__name__)
 
@@ -289,3 +291,46 @@ _READERS: dict[str, tuple[str, Callable[[Path, Truth, F64, Fits], dict[str, Any]
     "copc": ("cloud.copc.laz", _cloud),
 }
 """Kind to its usual name in the scan folder and what measures it."""
+
+
+HEIGHT_M = 200_000.0
+"""Of the eye: relief of 20 m at 500 m from the middle is displaced by 5 cm."""
+
+
+def view_from_above(
+    truth: Path, west_m: float, north_m: float, cell_m: float, shape: tuple[int, int]
+) -> U8:
+    """(rows, cols, 3) BGR of the place that ``truth`` was made of, north up, in its own ENU.
+
+    The place is laid out anew from ``params.json`` and must agree with ``surface.ply``.
+    Raises InputError where it does not, or where its ground was made of photographs, which
+    the truth does not hold.
+    """
+    try:
+        options = options_of(json.loads((truth / "params.json").read_text())["options"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{truth / 'params.json'}: does not say how the place is made") from error
+    if options.photos is not None:
+        raise InputError(f"{truth}: the ground was made of photographs, which are not kept there")
+    simulation = prepare(options)
+    scene = simulation.scene
+    vertices, triangles = read_surface(truth / "surface.ply")
+    same = vertices.shape == scene.vertices.shape and triangles.shape == scene.triangles.shape
+    if not (same and np.abs(vertices - scene.vertices).max() < 0.01):
+        raise InputError(f"{truth}: made by another version of simulate; fly it again")
+    rows, cols = shape
+    focal = HEIGHT_M / cell_m
+    K = np.array([[focal, 0.0, 0.5 * (cols - 1)], [0.0, focal, 0.5 * (rows - 1)], [0, 0, 1.0]])
+    camera = Camera(K, np.zeros(5), (cols, rows))
+    T = np.eye(4)
+    T[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    T[:3, 3] = west_m + 0.5 * cols * cell_m, north_m - 0.5 * rows * cell_m, HEIGHT_M
+    return Renderer(scene, simulation.renderer.picture, camera).frame(T, 0, Look(0.0, 0.0, 1.0))
+
+
+def options_of(values: dict[str, Any]) -> SimulationOptions:
+    """The options that ``params.json`` holds; values it does not know take their defaults.
+
+    Raises ValueError for unfit values.
+    """
+    return msgspec.convert(values, SimulationOptions, dec_hook=lambda kind, value: kind(value))

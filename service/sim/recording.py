@@ -22,11 +22,11 @@ from service.georeference import LocalFrame
 from service.sim import flight as flights
 from service.sim import picture, scene
 from service.sim.flight import Flight, FlightPlan, SensorNoise, Sensors
-from service.sim.mosaic import patchwork
+from service.sim.picture import patchwork
 from service.sim.render import Look, Renderer
-from service.sim.surface_file import write_surface
+from service.sim.scene import Area
 from service.sim.telemetry import TelemetryOptions, packets, write_tlog
-from service.sim.terrain import Area
+from service.sim.truth import write_surface
 
 log = logging.getLogger(__name__)
 
