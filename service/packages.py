@@ -27,7 +27,7 @@ EXTRAS = {
     "rasterio": "ground",
     "starlette": "ground",
     "torch": "gpu",
-    "trimesh": "dev",
+    "trimesh": "ground",
     "uvicorn": "ground",
     "websockets": "ground",
 }
