@@ -12,7 +12,7 @@ import pytest
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from service.bench import BenchOptions, gpu_floor
 from service.bench import gpu as bench_gpu
-from service.bench.gpu_floor import Floor, propagation_work
+from service.bench.gpu import Floor, propagation_work
 from service.cli import main
 
 pytest.importorskip("torch")

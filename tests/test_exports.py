@@ -17,7 +17,7 @@ from recon.types import F64
 from service.cli import app
 from service.errors import InputError
 from service.exports import EXPORTERS
-from service.exports.copc import octree
+from service.exports.clouds import octree
 from service.exports.view import ExportOptions, ScanView, export
 from service.georeference import LocalFrame
 

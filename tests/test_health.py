@@ -24,8 +24,7 @@ from service.daemon.machine import CoreLoad, Machine, computer_load, read_machin
 from service.daemon.runtime import Daemon
 from service.errors import InputError, OutsideError
 from service.init_system import Notifier
-from service.scans.claim import Claim
-from service.scans.retention import close_open_scans, make_room
+from service.scans.retention import Claim, close_open_scans, make_room
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 

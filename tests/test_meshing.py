@@ -15,7 +15,7 @@ from recon.surface.raster import Grid, Raster, smoothed
 from recon.types import F32, PointCloud
 from service.cli import app
 from service.errors import InputError
-from service.exports.glb import glb
+from service.exports.model import glb
 
 if TYPE_CHECKING:
     from conftest import HouseFlight

@@ -14,8 +14,7 @@ from loopback import free_port
 from pymavlink import mavutil, mavwp  # type: ignore[import-untyped]
 from typer.testing import CliRunner
 
-from recon.surface.coverage import CoverageMap
-from recon.surface.footprints import Footprint
+from recon.surface.coverage import CoverageMap, Footprint
 from recon.types import F64, DepthMap
 from service.cli import app
 from service.errors import InputError

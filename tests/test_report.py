@@ -19,8 +19,7 @@ from recon.types import PosePrior
 from service.onboard.graph_figures import graph_figures
 from service.scans.coverage import coverage_of
 from service.scans.folder import write_deliverables
-from service.scans.report import sensor_constants
-from service.scans.report_consistency import consistency
+from service.scans.report import consistency, sensor_constants
 from service.scans.report_map import map_figure, position_covariance
 from service.scans.track import latest
 from service.stream.records import PoseRecord, unpack_covariance, unpack_motion

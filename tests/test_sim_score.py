@@ -17,9 +17,9 @@ from recon.surface.meshing import Mesh
 from recon.types import F64, PointCloud
 from service.cli import app
 from service.errors import InputError
-from service.exports.glb import glb
+from service.exports.model import glb
 from service.georeference import LocalFrame
-from service.scans.las import write_laz
+from service.scans.fused_cloud import write_laz
 from service.sim.deliverable_scoring import options_of, view_from_above
 from service.sim.recording import Faults, SimulationOptions
 from service.sim.truth import heights_below, read_surface, read_truth

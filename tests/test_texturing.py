@@ -12,10 +12,8 @@ from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh, cut, height_mesh
 from recon.surface.raster import Grid, Raster
 from recon.surface.texture_atlas import BORDER_PX, lay_out, pack
-from recon.surface.texture_colour import fading, levels
-from recon.surface.texture_labels import choose, energy, face_neighbours
 from recon.surface.texture_views import CANDIDATES, Sightings, TextureView, consistent, look
-from recon.surface.texturing import texture
+from recon.surface.texturing import choose, energy, face_neighbours, fading, levels, texture
 from recon.types import F64, U8, Array
 
 NADIR = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])

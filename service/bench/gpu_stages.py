@@ -26,7 +26,7 @@ from recon.stereo.depth_fusion import FusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.tracking.matching import MatchingConfig, harris_grid
 from recon.types import U8, Array, StereoPair
-from service.bench.gpu_floor import LABELS, SIZE, Stage, ground, propagation_work
+from service.bench.gpu import LABELS, SIZE, Stage, ground, propagation_work
 
 PAIRS = 4
 REACH = 8

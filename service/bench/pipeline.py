@@ -20,6 +20,7 @@ from recon import se3
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import F32, F64, U8, Camera, DepthMap, DisparityMap, Registration
 from service.bench import BenchOptions, BenchResult
+from service.onboard.scan import Scan
 
 SIZE = (1280, 720)
 K: F64 = np.array([[960.0, 0, 639.5], [0, 960.0, 359.5], [0, 0, 1.0]])
@@ -157,3 +158,62 @@ class SgbmBackend:
         """Ours."""
         found: Registration = self._ours.register(source, target, T_target_source, config)
         return found
+
+
+def run_memory(options: BenchOptions) -> list[BenchResult]:
+    """Resident memory and milliseconds a frame at the end, against the first tenth."""
+    frames = max(200, int(options.rounds / 3.0 * FPS) * 10)
+    with tempfile.TemporaryDirectory() as folder:
+        short, video = Path(folder) / "short.mp4", Path(folder) / "flight.mp4"
+        make_video(short, 120)
+        _fly(short, Path(folder) / "warm", _Watch())  # what compilers need is not the flight's
+        make_video(video, frames)
+        watch = _Watch()
+        summary = _fly(video, Path(folder) / "scan", watch)
+    note = f"{summary['frames']} frames, {summary['keyframes']} keyframes"
+    early, late = watch.tenth(0), watch.tenth(9)
+    return [
+        BenchResult(
+            "memory", "resident at the end of the flight", late[0], "MiB",
+            peer="after a tenth of it", peer_value=early[0], note=note,
+        ),
+        BenchResult(
+            "memory", "a frame in the last tenth", late[1], "ms",
+            peer="in the second tenth", peer_value=watch.tenth(1)[1],
+        ),
+    ]  # fmt: skip
+
+
+class _Watch:
+    """Resident memory and time after every frame."""
+
+    def __init__(self) -> None:
+        self._seen: list[tuple[float, float]] = []  # s, MiB
+
+    def __call__(self, scan: Scan) -> None:
+        self._seen.append((time.perf_counter(), resident_mib()))
+
+    def tenth(self, index: int) -> tuple[float, float]:
+        """Memory in MiB at the end of a tenth of the flight, and its ms a frame."""
+        first, last = (int(n * len(self._seen) / 10) for n in (index, index + 1))
+        part = self._seen[first:last]
+        return part[-1][1], 1e3 * (part[-1][0] - part[0][0]) / (len(part) - 1)
+
+
+def _fly(video: Path, folder: Path, watch: _Watch) -> dict[str, int]:
+    from recon.backends import load_backend
+    from service.cameras import open_camera
+    from service.config import load_config
+    from service.onboard.scan import ScanInputs, create_store
+
+    config = load_config(None, ["scan.assumed_agl_m=60"])
+    source = open_camera(str(video))
+    camera = Camera(K, np.zeros(5), SIZE)
+    inputs = ScanInputs(source, camera, config, load_backend("cpu"), folder, "bench", 0)
+    store = create_store(inputs)
+    scan = Scan(inputs, store)
+    scan.run(Event(), watch)
+    summary = scan.close()
+    source.close()
+    store.close()
+    return summary

@@ -24,7 +24,7 @@ from service.daemon.warm_up import is_warm
 from service.daemon.writing import ClosingWatch, Writings
 from service.errors import InputError, SkyreliefError
 from service.onboard.datalink import DaemonLink
-from service.scans.claim import Claim
+from service.scans.retention import Claim
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -7,9 +7,9 @@ writes ``out`` whole or not at all. The next kind is one file and one line in EX
 from __future__ import annotations
 
 EXPORTERS: dict[str, tuple[str, str, str]] = {
-    "ply": ("service.exports.points:write_ply", "cloud.ply", "Fused cloud, binary PLY, UTM."),
-    "laz": ("service.exports.points:write_laz_file", "cloud.laz", "Fused cloud, LAZ 1.4."),
-    "copc": ("service.exports.copc:write_copc", "cloud.copc.laz", "Cloud-optimised LAZ."),
+    "ply": ("service.exports.clouds:write_ply", "cloud.ply", "Fused cloud, binary PLY, UTM."),
+    "laz": ("service.exports.clouds:write_laz_file", "cloud.laz", "Fused cloud, LAZ 1.4."),
+    "copc": ("service.exports.clouds:write_copc", "cloud.copc.laz", "Cloud-optimised LAZ."),
     "dsm": ("service.exports.rasters:write_dsm", "dsm.tif", "Surface model, GeoTIFF (COG)."),
     "ortho": ("service.exports.rasters:write_ortho", "ortho.tif", "Orthophoto, GeoTIFF (COG)."),
     "contours": (
@@ -18,7 +18,7 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
         "Height contours, GeoJSON.",
     ),
     "coverage": (
-        "service.exports.coverage:write_coverage",
+        "service.exports.rasters:write_coverage",
         "coverage.tif",
         "Views, sigma, height, COG.",
     ),
@@ -29,7 +29,7 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
         "colmap",
         "Keyframes as a COLMAP text model with pictures.",
     ),
-    "3dtiles": ("service.exports.tiles:write_tiles", "3dtiles", "Point tiles for Cesium."),
+    "3dtiles": ("service.exports.clouds:write_tiles", "3dtiles", "Point tiles for Cesium."),
     "glb": ("service.exports.model:write_glb", "mesh.glb", "Textured mesh, binary glTF."),
     "mcap": ("service.exports.recording:write_mcap", "flight.mcap", "Recording for Foxglove."),
 }

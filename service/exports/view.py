@@ -17,8 +17,7 @@ from service.errors import InputError
 from service.exports import EXPORTERS
 from service.georeference import LocalFrame
 from service.packages import needing
-from service.scans.fused_cloud import FusedCloud, fused_cloud
-from service.scans.las import placed
+from service.scans.fused_cloud import FusedCloud, fused_cloud, placed
 from service.scans.track import latest, local_frame
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore

@@ -12,7 +12,7 @@ from pathlib import Path
 from service.errors import InputError, OutsideError
 from service.ground.folder_import import is_regular
 from service.ground.placing import scan_folder
-from service.scans.claim import Claim
+from service.scans.retention import Claim
 from service.stream.naming import check_name
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore

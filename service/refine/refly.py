@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.surface.footprints import Footprint
+from recon.surface.coverage import Footprint
 from recon.surface.raster import Grid
 from recon.types import F64, Array, Bool
 from service.errors import InputError

@@ -22,8 +22,14 @@ import cv2
 import numpy as np
 
 from recon.graph.ledger import Ledger, Rows
-from recon.surface.coverage import CoverageGrid, CoverageMap, usual_cell_m
-from recon.surface.footprints import PLACE, Footprint, footprint_of
+from recon.surface.coverage import (
+    PLACE,
+    CoverageGrid,
+    CoverageMap,
+    Footprint,
+    footprint_of,
+    usual_cell_m,
+)
 from recon.types import U8, Array, DepthMap
 from service.errors import OutsideError
 from service.georeference import LocalFrame
@@ -155,7 +161,7 @@ class LiveCoverage:
     def __init__(
         self, store: ScanStore, cell_m: float | None = None, ledger: Ledger | None = None
     ) -> None:
-        """``ledger`` takes rows of :data:`recon.surface.footprints.PLACE`; memory when left out."""
+        """``ledger`` takes rows of :data:`recon.surface.coverage.PLACE`; memory when left out."""
         self._store = store
         self._cell_m, self._ledger = cell_m, ledger
         self._map: CoverageMap | None = None

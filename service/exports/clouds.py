@@ -1,4 +1,8 @@
-"""Cloud-optimised LAZ (COPC 1.0): an octree whose upper levels are thinned samples."""
+"""The fused cloud as PLY, LAZ, COPC and 3D Tiles.
+
+COPC 1.0 is an octree in a LAZ file whose upper levels are thinned samples. 3D Tiles are placed on
+the globe for Cesium and three.js viewers.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +15,50 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.types import F64
+from service.exports.flight import writing_folder
 from service.exports.view import ExportOptions, ScanView
-from service.scans.las import SCALE_M, las_header, point_record
+from service.scans.fused_cloud import SCALE_M, las_header, point_record, write_laz
 from service.scans.writing import writing
 
 if TYPE_CHECKING:
     import copclib
     import laspy
+
+PLY_TYPES = [
+    ("x", "<f8", "double"),
+    ("y", "<f8", "double"),
+    ("z", "<f8", "double"),
+    ("red", "u1", "uchar"),
+    ("green", "u1", "uchar"),
+    ("blue", "u1", "uchar"),
+    ("sigma_m", "<f4", "float"),
+    ("views", "u1", "uchar"),
+]
+
+
+def write_ply(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """Binary PLY in UTM metres (doubles: single precision steps by half a metre there)."""
+    cloud = scan.fused.cloud
+    rows = np.zeros(len(cloud), np.dtype([(name, kind) for name, kind, _ in PLY_TYPES]))
+    rows["x"], rows["y"], rows["z"] = scan.xyz_m.T
+    rows["red"], rows["green"], rows["blue"] = cloud.rgb.T
+    rows["sigma_m"], rows["views"] = cloud.sigma_m, cloud.views
+    crs = "local ENU metres" if scan.frame is None else f"EPSG:{scan.frame.epsg}, AMSL metres"
+    head = ["ply", "format binary_little_endian 1.0", f"comment {crs}"]
+    head += [f"element vertex {len(cloud)}"]
+    head += [f"property {kind} {name}" for name, _, kind in PLY_TYPES]
+    head += ["end_header", ""]
+    with writing(out) as part, open(part, "wb") as file:
+        file.write("\n".join(head).encode("ascii"))
+        file.write(rows.tobytes())
+
+
+def write_laz_file(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """LAZ, or plain LAS where the name ends so."""
+    laz = out.suffix.lower() != ".las"
+    with writing(out) as part:
+        write_laz(part, scan.fused.cloud, scan.frame, scan.store.header.started_unix_ns, laz)
+
 
 I64 = npt.NDArray[np.int64]
 
@@ -115,3 +156,32 @@ def _nodes(
     for part in np.split(order, starts[1:]):
         x, y, z = (int(v) for v in node[part[0]])
         yield (depth, x, y, z), rows[part]
+
+
+EARTH_CENTRED = 4978
+
+
+def write_tiles(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """A folder with ``tileset.json`` and its point tiles, in earth-centred metres.
+
+    Heights go in as they are, above mean sea level: a globe with ellipsoidal terrain shows
+    the cloud lower or higher by the geoid's height.
+    """
+    from py3dtiles.convert import convert
+    from pyproj import CRS
+
+    frame = scan.needs_place("3D Tiles")
+    with writing_folder(out) as part, tempfile.TemporaryDirectory() as work:
+        las = Path(work) / "cloud.las"
+        write_laz(las, scan.fused.cloud, frame, scan.store.header.started_unix_ns, laz=False)
+        convert(
+            las,
+            outfolder=part,
+            overwrite=True,
+            jobs=1,
+            crs_in=CRS.from_epsg(frame.epsg),
+            crs_out=CRS.from_epsg(EARTH_CENTRED),
+            force_crs_in=True,
+            pyproj_always_xy=True,
+            rgb=True,
+        )
