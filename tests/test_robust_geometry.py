@@ -195,7 +195,7 @@ def test_no_other_module_calls_opencv_on_measured_points() -> None:
         for call in calls
         if f"cv2.{call}" in path.read_text(encoding="utf-8")
     ]
-    allowed = ("recon/tracking/robust_geometry.py", "service/bench/pose.py")
+    allowed = ("recon/tracking/robust_geometry.py", "service/bench/tracking.py")
     assert [o for o in offenders if not o.startswith(allowed)] == []
 
 

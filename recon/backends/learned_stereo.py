@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.backends.onnx_backend import OnnxBackend, open_session
+from recon.backends.onnx_backend import ORT_ERRORS, OnnxBackend, open_session
 from recon.stereo.belief_propagation import BeliefPropagationConfig, believe
 from recon.stereo.matching_cost import check_pair
 from recon.types import F32, U8, DisparityMap
@@ -107,7 +107,7 @@ class LearnedStereoBackend(OnnxBackend):
         given = {self.config.left: self._image(left), self.config.right: self._image(right)}
         try:
             (raw,) = self._model.run([self.config.disparity], given)
-        except Exception as error:  # ONNX Runtime's own exceptions share no base class
+        except ORT_ERRORS as error:
             raise RuntimeError(str(error)) from error
         plane = np.asarray(raw, np.float32).squeeze()
         if plane.shape != (self.config.height, self.config.width):

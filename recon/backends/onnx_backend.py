@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import onnxruntime  # type: ignore[import-untyped]
+from onnxruntime.capi import onnxruntime_pybind11_state  # type: ignore[import-untyped]
 
 from recon.backends.onnx_dense import stereo_model, tap_windows, upsampling_model
 from recon.backends.room import place, pyramid_levels, room
@@ -22,6 +23,17 @@ PROVIDERS = ("TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecution
 """Fastest first; ONNX Runtime falls back along the list."""
 
 KEPT_SESSIONS = 8
+
+ORT_ERRORS: tuple[type[Exception], ...] = (
+    RuntimeError,
+    ValueError,
+    *(
+        kind
+        for kind in vars(onnxruntime_pybind11_state).values()
+        if isinstance(kind, type) and issubclass(kind, Exception)
+    ),
+)
+"""What ONNX Runtime raises; its own exceptions share no base class."""
 
 ENGINE_NAME_DIGITS = 16
 
@@ -105,7 +117,7 @@ class OnnxBackend:
     def _run(self, key: Any, given: dict[str, Array]) -> tuple[Array, Array]:
         try:
             first, second = self._sessions[key].run(None, given)
-        except Exception as error:  # ONNX Runtime's own exceptions share no base class
+        except ORT_ERRORS as error:
             raise RuntimeError(str(error)) from error
         return first, second
 
@@ -138,6 +150,6 @@ def open_session(model: bytes, providers: list[str], engines: str | None = None)
     chosen = provider_options(providers, model, engines)
     try:
         return onnxruntime.InferenceSession(model, options, providers=chosen)
-    except Exception as error:  # ONNX Runtime's own exceptions share no base class
+    except ORT_ERRORS as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(f"ONNX Runtime cannot use the model: {first}") from error

@@ -157,7 +157,7 @@ def _geometry(mesh: Mesh, textured: bool) -> Any:
     from trimesh.visual.material import PBRMaterial
 
     xyz = mesh.vertices_m[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
-    made = Trimesh(xyz, mesh.faces, process=False)
+    made: Any = Trimesh(xyz, mesh.faces, process=False)
     if textured and mesh.uv is not None:
         uv = mesh.uv.astype(np.float64)
         uv[:, 1] = 1.0 - uv[:, 1]  # trimesh counts v upwards
