@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from service.bench import BenchOptions, gpu_floor
+from service.bench import BenchOptions, gpu
 from service.bench import gpu as bench_gpu
 from service.bench.gpu import Floor, propagation_work
 from service.cli import main
@@ -29,7 +29,7 @@ def test_every_stage_is_measured_beside_its_floor(
     """Small pictures here; the figures are those of ``skyrelief bench gpu``."""
     from service.bench import gpu_stages
 
-    for module in (bench_gpu, gpu_stages, gpu_floor):
+    for module in (bench_gpu, gpu_stages, gpu):
         monkeypatch.setattr(module, "SIZE", (96, 54))
     for guide in ("GUIDE", "GUIDE_ON_DEVICE"):
         monkeypatch.setattr(bench_gpu, guide, (192, 108))
@@ -40,7 +40,7 @@ def test_every_stage_is_measured_beside_its_floor(
     )  # fmt: skip
     device = str(request.config.getoption("--device"))
     for table in ("COPY_MB", "PRODUCT"):
-        monkeypatch.setattr(gpu_floor, table, {device: 16})
+        monkeypatch.setattr(gpu, table, {device: 16})
     results = bench_gpu.run(BenchOptions(rounds=1, warm_up=0, device=device))
     on_device = {r.what: r for r in results if r.peer == "floor of the device"}
     for stage in STAGES:
@@ -81,7 +81,7 @@ def test_a_fused_kernel_has_lines_of_its_own(monkeypatch: pytest.MonkeyPatch) ->
     from recon.backends.torch_kernels import Kernels
     from service.bench import gpu_stages
 
-    for module in (bench_gpu, gpu_stages, gpu_floor):
+    for module in (bench_gpu, gpu_stages, gpu):
         monkeypatch.setattr(module, "SIZE", (96, 54))
 
     def bilateral(px: Any, sure: Any, taps: Any, guide: Any, true: Any, config: Any) -> Any:
