@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from conftest import HouseFlight
 
-from service.ground import files_due
+from service.ground.received import begin_files, end_files, folders_due, mark_due, write_left
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.scans.folder import CLOUD, CSV, PREVIEW, TUM, write_deliverables
 from service.stream.session import SessionConfig
@@ -130,20 +130,20 @@ def test_files_that_a_killed_station_left_are_written_at_the_next_start(
 ) -> None:
     folder = tmp_path / "drone-1" / "test-1"
     house.flown(folder).close()
-    files_due.mark(folder)
+    mark_due(folder)
     if killed == "while writing":
-        files_due.begin(folder)
-    assert files_due.left(tmp_path) == [folder]
+        begin_files(folder)
+    assert folders_due(tmp_path) == [folder]
     station = Receiver(ReceiverConfig(tmp_path, SessionConfig(mode="peer")))
     station.start()
     try:
         for _ in range(1200):
-            if not files_due.left(tmp_path):
+            if not folders_due(tmp_path):
                 break
             time.sleep(0.1)
     finally:
         station.close()
-    assert files_due.left(tmp_path) == []
+    assert folders_due(tmp_path) == []
     names = {path.name for path in folder.iterdir()}
     assert {CLOUD, TUM, CSV, PREVIEW, "scan.json", "report.html"} <= names
     assert not {".files-due", ".files-begun"} & names
@@ -153,13 +153,13 @@ def test_what_comes_while_files_are_written_is_due_again(
     tmp_path: Path, house: HouseFlight
 ) -> None:
     folder = tmp_path / "drone-1" / "test-1"
-    files_due.mark(folder)  # of a folder that is gone: nothing happens
+    mark_due(folder)  # of a folder that is gone: nothing happens
     with house.flown(folder) as store:
-        files_due.mark(folder)
-        files_due.begin(folder)
-        files_due.mark(folder)
+        mark_due(folder)
+        begin_files(folder)
+        mark_due(folder)
         write_deliverables(folder, store, {})
-        files_due.end(folder)
-    assert files_due.left(tmp_path) == [folder]
-    files_due.write_left(folder)
-    assert files_due.left(tmp_path) == []
+        end_files(folder)
+    assert folders_due(tmp_path) == [folder]
+    write_left(folder)
+    assert folders_due(tmp_path) == []

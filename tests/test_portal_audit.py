@@ -19,7 +19,7 @@ from portal_client import ONE, TOKEN, Client, FakeOperator, flown_store, serving
 from test_listener import Clock
 
 from service.errors import InputError
-from service.ground.audit import AuditLog, Pace
+from service.ground.guard import AuditLog, Pace
 from service.ground.library import Library
 from service.ground.portal import Portal, PortalConfig, open_portal
 from service.ground.tokens import KEPT, Tokens, kept_token, parse_tokens

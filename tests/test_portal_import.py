@@ -17,8 +17,8 @@ pytest.importorskip("websockets")
 from portal_client import ONE, Client, flown_store, serving
 
 from service.errors import OutsideError
-from service.ground.folder_import import copy_files
 from service.ground.library import ConflictError, Library
+from service.ground.storage import copy_files
 
 if TYPE_CHECKING:
     from conftest import HouseFlight

@@ -25,7 +25,7 @@ pytest.importorskip("websockets")
 
 from portal_client import ONE, TOKEN, Client, flown_store, serving
 
-from service.ground import limits
+from service.ground import guard
 from service.ground.portal import Portal, PortalConfig
 from service.stream.session import SessionConfig, open_session
 from service.workers import Workers
@@ -116,7 +116,7 @@ def test_a_body_is_bounded_by_what_is_read(client: Client) -> None:
 def test_a_body_that_does_not_come_is_given_up(
     client: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "BODY_S", 0.2)
+    monkeypatch.setattr(guard, "BODY_S", 0.2)
     answer = answer_to(client, f"PATCH {ONE} HTTP/1.1", b"2\r\n{}\r\n")
     assert answer.startswith(b"HTTP/1.1 408 ")
 
@@ -127,8 +127,8 @@ def test_a_reader_that_stops_reading_is_dropped(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    caplog.set_level(logging.DEBUG, "service.ground.limits")
-    monkeypatch.setattr(limits, "STALL_S", 0.2)
+    caplog.set_level(logging.DEBUG, "service.ground.guard")
+    monkeypatch.setattr(guard, "STALL_S", 0.2)
     with open(store / "drone-1/test-1/cloud.ply", "wb") as file:
         file.truncate(200_000_000)
     with socket.create_connection(address_of(client)) as one:

@@ -36,8 +36,7 @@ def ctl(
 ) -> None:
     """Start, stop, watch and steer a scan from the ground."""
     _check(action, metres, timeout)
-    from service.ground.operator import Operator
-    from service.ground.orders import order, status
+    from service.ground.operator import Operator, order, status
 
     with Operator(connect, system, timeout) as operator:
         if action == "watch":

@@ -18,8 +18,7 @@ from typing import Any, Protocol
 from service.errors import OutsideError, SkyreliefError
 from service.ground.disk_share import DiskShare
 from service.ground.inbox import Batch, Inbox
-from service.ground.intake import FINE, SILENCE_S, SMALL, ScanIntake
-from service.ground.introduction import Introduction
+from service.ground.intake import FINE, SILENCE_S, SMALL, Introduction, ScanIntake
 from service.ground.received import ReceivedScan
 from service.stream.messages import Ask, count, pack_ask, pack_held, unpack_head
 from service.stream.naming import ROOT

@@ -1,21 +1,185 @@
-"""Who may use the portal: this machine for reading, holders of a token for the rest.
+"""Who may use the portal, how much of it one request may hold, and the audit log of changes.
 
-Every change, and every refused one, leaves a line in the audit log.
+This machine may read, holders of a token may do the rest. Every change, and every refused one,
+leaves a line in the audit log.
 """
 
 from __future__ import annotations
 
+import asyncio
+import json
+import logging
+import os
+import threading
+import time
+from collections.abc import Awaitable, Callable
+from datetime import datetime, timezone
+from pathlib import Path
 from typing import Any
 
+from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 from starlette.responses import JSONResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from service.ground.audit import NOTED, AuditLog, Pace
-from service.ground.limits import CLOSE, LARGEST_BODY_BYTES
 from service.ground.tokens import Tokens
-from service.listener import host_name, is_loopback
+from service.listener import BoundedListener, Peer, host_name, is_loopback
+
+log = logging.getLogger(__name__)
+
+FILE = "audit.jsonl"
+LARGEST_BYTES = 8_000_000
+LONGEST_TEXT = 200
+NOTED = "skyrelief.change"
+"""Where a request's scope holds what its endpoint has noted."""
+
+
+class AuditLog:
+    """Appends lines of JSON to ``audit.jsonl`` (mode 600); the file before it is ``.1``.
+
+    A disk that takes no line stops no order: it is logged.
+    """
+
+    def __init__(self, folder: Path, largest_bytes: int = LARGEST_BYTES) -> None:
+        self.path = folder / FILE
+        self._largest_bytes = largest_bytes
+        self._lock = threading.Lock()
+
+    def write(self, who: str, where: str, action: str, status: int, **details: Any) -> None:
+        """One line; texts are cut to 200 letters."""
+        now = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
+        entry = {"time": now, "who": who, "from": where, "action": action, "status": status}
+        entry |= {name: _short(value) for name, value in details.items()}
+        line = json.dumps(entry) + "\n"
+        try:
+            with self._lock:
+                self._append(line.encode())
+        except OSError as error:
+            log.warning("%s takes no line (%s): %s", self.path, error.strerror, line.strip())
+
+    def _append(self, line: bytes) -> None:
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+        handle = os.open(self.path, flags, 0o600)
+        try:
+            os.write(handle, line)
+            size = os.fstat(handle).st_size
+        finally:
+            os.close(handle)
+        if size > self._largest_bytes:
+            os.replace(self.path, self.path.with_name(f"{FILE}.1"))
+
+
+class Pace:
+    """A token bucket: ``burst`` at once, then ``rate_hz`` a second."""
+
+    def __init__(
+        self, rate_hz: float, burst: int, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._rate_hz, self._burst, self._clock = rate_hz, float(burst), clock
+        self._left, self._at = float(burst), clock()
+
+    def take(self) -> bool:
+        """Whether one more is allowed now."""
+        now = self._clock()
+        self._left = min(self._burst, self._left + (now - self._at) * self._rate_hz)
+        self._at = now
+        if self._left < 1.0:
+            return False
+        self._left -= 1.0
+        return True
+
+
+def note(connection: HTTPConnection, action: str, **details: Any) -> None:
+    """Say what a changing request is about, for its line in the audit log."""
+    noted = connection.scope.get(NOTED)
+    if noted is not None:
+        noted |= {"action": action, **details}
+
+
+def _short(value: Any) -> Any:
+    """``value`` as a line of the log holds it."""
+    if value is None or isinstance(value, (bool, int, float)):
+        return value
+    if isinstance(value, (list, tuple)):
+        return [_short(item) for item in value[:20]]
+    return str(value)[:LONGEST_TEXT]
+
+
+LARGEST_BODY_BYTES = 65_536
+BODY_S = 10.0
+"""A request's whole body comes within this time."""
+STALL_S = 120.0
+"""A reader that has taken nothing for so long is gone."""
+CLOSE = {"connection": "close"}
+
+
+class _StalledError(Exception):
+    """The other end has stopped reading."""
+
+
+class Limits:
+    """The outermost ASGI layer: bounds every request and marks it as served at the listener."""
+
+    def __init__(self, app: ASGIApp, listener: BoundedListener) -> None:
+        self._app, self._listener = app, listener
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        peer: Peer | None = scope.get("client") and tuple(scope["client"])
+        self._listener.begin(peer)
+        try:
+            if scope["type"] == "http":
+                await self._app(scope, bounded_receive(receive), _bounded_send(send))
+            else:
+                await self._app(scope, receive, _bounded_send(send))
+        except _StalledError:
+            log.debug("%s has stopped reading", peer)
+            self._listener.drop(peer)
+            await asyncio.wait_for(_gone(receive), STALL_S)
+        finally:
+            self._listener.end(peer)
+
+
+def bounded_receive(receive: Receive) -> Receive:
+    """``receive`` of one HTTP request that ends a body too large or too slow with 413 or 408."""
+    seen, complete, deadline = 0, False, asyncio.get_running_loop().time() + BODY_S
+
+    async def bounded() -> Message:
+        nonlocal seen, complete
+        if complete:  # what comes now is the end of the connection
+            return await receive()
+        remaining = deadline - asyncio.get_running_loop().time()
+        try:
+            message = await asyncio.wait_for(receive(), remaining)
+        except asyncio.TimeoutError:
+            raise HTTPException(408, "the request's body did not come in time", CLOSE) from None
+        seen += len(message.get("body", b""))
+        complete = not message.get("more_body", False)
+        if seen > LARGEST_BODY_BYTES:
+            raise HTTPException(413, "the request is too large", CLOSE)
+        return message
+
+    return bounded
+
+
+def _bounded_send(send: Send) -> Callable[[Message], Awaitable[None]]:
+    async def bounded(message: Message) -> None:
+        try:
+            await asyncio.wait_for(send(message), STALL_S)
+        except asyncio.TimeoutError:
+            raise _StalledError from None
+
+    return bounded
+
+
+async def _gone(receive: Receive) -> None:
+    """Return once the server has noticed that the connection is closed."""
+    while (await receive())["type"] not in ("http.disconnect", "websocket.disconnect"):
+        pass
+
 
 COOKIE = "skyrelief"
 WHO = "skyrelief.who"

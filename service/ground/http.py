@@ -30,14 +30,12 @@ from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
 from service.errors import InputError, OutsideError
-from service.ground.audit import AuditLog, Pace, note
-from service.ground.guard import WHO, Guard
-from service.ground.jobs import Jobs
+from service.ground.guard import WHO, AuditLog, Guard, Pace, note
 from service.ground.library import ConflictError, Library
-from service.ground.live_socket import serve_live
+from service.ground.live import serve_live
 from service.ground.openapi import DOCUMENT
 from service.ground.scan_files import file_routes
-from service.ground.state import PortalState, names_of, state_of
+from service.ground.state import Jobs, PortalState, names_of, state_of
 from service.ground.tokens import Tokens
 from service.ground.vehicle import Vehicle
 

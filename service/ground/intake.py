@@ -1,7 +1,8 @@
 """The ground's side of the datalink for one scan, without sockets or clocks.
 
-It knows what the drone says it has, stores what comes, and says what to ask for: what was
-not on its way a moment ago, small records first, then the newest and coarsest.
+A scan that a drone names gets a folder for a valid header only (:class:`Introduction`). From then
+on :class:`ScanIntake` knows what the drone says it has, stores what comes, and says what to ask
+for: what was not on its way a moment ago, small records first, then the newest and coarsest.
 """
 
 from __future__ import annotations
@@ -14,9 +15,65 @@ from itertools import islice
 from service.stream import layer
 from service.stream.messages import Ask, Assembler, Head, Held, Numbers, missing, parse
 from service.stream.ranges import MAX_RANGES, RangeSet
+from service.stream.records import ScanHeader, header_from_json
 from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
+
+HEADER_REST_S = 1.0
+"""From one request for the header to the next."""
+MAX_KEPT_BYTES = 1 << 18
+"""Items that may come before the header."""
+
+
+class Introduction:
+    """Asks for the header of one scan and waits for it. Times are the caller's, in seconds."""
+
+    def __init__(self, drone: str, name: str) -> None:
+        self.drone, self.name = drone, name
+        self.head: Head | None = None
+        self.seen_at = 0.0
+        self.number, self.record = 0, b""  # the header as it came
+        self.kept: list[bytes] = []  # messages of items that wait for the header
+        self._kept_bytes = 0
+        self._assembler = Assembler()
+        self._ask_at = 0.0
+
+    def on_head(self, head: Head, now: float) -> None:
+        """The drone says what it has."""
+        self.head, self.seen_at = head, now
+
+    def next_ask(self, now: float) -> RangeSet | None:
+        """The number of the header to ask for now, if any."""
+        wanted = None if self.head is None else self.head.numbers.get("header")
+        if not wanted or now < self._ask_at:
+            return None
+        self._ask_at = now + HEADER_REST_S
+        return wanted
+
+    def on_items(self, message: bytes, now: float) -> ScanHeader | None:
+        """The scan's header once it is whole, valid and says the drone and scan of its key."""
+        wanted = RangeSet() if self.head is None else self.head.numbers.get("header", RangeSet())
+        for part in parse(message):
+            if part.kind != "header":
+                self._keep(message)
+                return None
+            if part.number not in wanted or part.crc != part.number:
+                continue
+            record = self._assembler.add(part, now)
+            header = None if record is None else header_from_json(record)
+            if record is None or header is None:
+                continue
+            if (header.drone, header.name) == (self.drone, self.name):
+                self.number, self.record = part.number, record
+                return header
+        return None
+
+    def _keep(self, message: bytes) -> None:
+        if self._kept_bytes + len(message) <= MAX_KEPT_BYTES:
+            self._kept_bytes += len(message)
+            self.kept.append(message)
+
 
 SMALL, FINE = range(2)
 """The two requests that may be under way: small records and coarse layers; fine layers."""

@@ -21,10 +21,9 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import InputError, OutsideError, SkyreliefError
-from service.ground.folder_import import OTHER_FILES, STORE_FILES, copy_files, is_regular
 from service.ground.mcap_import import header_in, store_from_mcap
-from service.ground.placing import run_folder
 from service.ground.scan_facts import facts_of, labels_in
+from service.ground.storage import OTHER_FILES, STORE_FILES, copy_files, is_regular, run_folder
 from service.scans.folder import SUMMARY, write_deliverables
 from service.scans.writing import writing
 from service.stream.records import ScanHeader

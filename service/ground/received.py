@@ -1,4 +1,8 @@
-"""A scan that is being received: its state, and its deliverables."""
+"""A scan that is being received: its state, its deliverables, and which are yet to be written.
+
+A mark in the scan's folder says that it grew since its files were written. It moves aside while
+they are written and goes with them, so a kill at any time leaves one of the two.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +13,53 @@ from statistics import median
 from typing import Any
 
 from service.errors import InputError
-from service.ground import files_due
 from service.ground.intake import ScanIntake
+from service.ground.storage import is_regular
+from service.scans.folder import files_due, write_deliverables
 from service.stream.naming import ROOT
+from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
+
+MARK, BEGUN = ".files-due", ".files-begun"
+
+
+def mark_due(folder: Path) -> None:
+    """The scan in ``folder`` has grown."""
+    try:
+        (folder / MARK).touch()
+    except OSError as error:  # a full disk is reported where the scan itself is written
+        log.debug("%s: %s", folder, error)
+
+
+def begin_files(folder: Path) -> None:
+    """Its files are being written; what comes from now on marks it again."""
+    try:
+        (folder / MARK).replace(folder / BEGUN)
+    except OSError as error:
+        log.debug("%s: %s", folder, error)
+
+
+def end_files(folder: Path) -> None:
+    """Writing has ended; the mark stays where the disk refused a file."""
+    if not files_due(folder):
+        (folder / BEGUN).unlink(missing_ok=True)
+
+
+def folders_due(store: Path) -> list[Path]:
+    """The folders with files yet to be written, those of the newest scans first."""
+    found = {path.parent for name in (MARK, BEGUN) for path in store.glob(f"*/*/{name}")}
+    sound = [folder for folder in found if is_regular(folder / "scan.db")]
+    return sorted(sound, key=lambda folder: folder.name, reverse=True)
+
+
+def write_left(folder: Path) -> None:
+    """Write the files that a former process could not. Raises what that raises."""
+    begin_files(folder)
+    with ScanStore.open(folder / "scan.db") as store:
+        write_deliverables(folder, store, {})
+    end_files(folder)
+    log.info("%s: files written that a former process had left", folder)
 
 
 @dataclass(slots=True, eq=False)
@@ -46,7 +92,7 @@ class ReceivedScan:
     def grew(self) -> None:
         """Something new was stored: its files are due, also for the next process."""
         if not self.unwritten:
-            files_due.mark(self.folder)
+            mark_due(self.folder)
         self.changed = self.unwritten = True
 
     @property
@@ -87,8 +133,6 @@ def deliver(scan: ReceivedScan) -> None:
 
     Raises InputError that names those which could not be made, OutsideError for the disk.
     """
-    from service.scans.folder import write_deliverables
-
     failed = write_deliverables(scan.folder, scan.intake.store, {})["failed"]
     if failed:
         why = "; ".join(f"{name} ({reason})" for name, reason in failed.items())

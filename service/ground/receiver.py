@@ -23,12 +23,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.errors import InputError, SkyreliefError
-from service.ground import files_due
 from service.ground.drone import DroneReceiver, Limits
 from service.ground.drones import STALL_S, Drones
-from service.ground.placing import scan_folder
-from service.ground.received import ReceivedScan, deliver
-from service.ground.replies import CHANNEL, Replies
+from service.ground.inbox import CHANNEL, Replies
+from service.ground.received import (
+    ReceivedScan,
+    begin_files,
+    deliver,
+    end_files,
+    folders_due,
+    write_left,
+)
+from service.ground.storage import scan_folder
 from service.stream.naming import ROOT, place_of, station_name
 from service.stream.session import SessionConfig, check_endpoints, open_session
 from service.stream.tunnel import TunnelIntake
@@ -309,7 +315,7 @@ class Receiver:
 
     def _write_all(self, worker: Worker) -> None:
         """Write what is asked for, and in between what a former process left."""
-        left = deque(files_due.left(self._config.store))
+        left = deque(folders_due(self._config.store))
         while True:
             try:
                 scan = self._writes.get(block=not left)
@@ -318,13 +324,13 @@ class Receiver:
                 if worker.stop.is_set():
                     left.clear()  # for the next process
                 else:
-                    guarded(f"files of {folder}", partial(files_due.write_left, folder))
+                    guarded(f"files of {folder}", partial(write_left, folder))
                 continue
             if scan is None:
                 return
-            files_due.begin(scan.folder)
+            begin_files(scan.folder)
             scan.trouble = guarded(f"deliverables of {scan.folder}", partial(deliver, scan))
-            files_due.end(scan.folder)
+            end_files(scan.folder)
             scan.is_written, scan.is_writing = True, False
             drone = self._drones.present(scan.drone)
             if drone is not None:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import msgspec
 
 from service.errors import InputError
-from service.ground.folder_import import is_regular
+from service.ground.storage import is_regular
 from service.stream.store import ScanStore
 
 LARGEST_JSON_BYTES = 4_000_000

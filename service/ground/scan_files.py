@@ -12,8 +12,8 @@ from starlette.routing import Route
 
 from recon.types import U8, Bool
 from service.errors import InputError
-from service.ground.folder_import import is_regular
 from service.ground.state import names_of, state_of
+from service.ground.storage import is_regular
 from service.stream.store import ScanStore
 
 TILE = re.compile(r"[A-Za-z0-9_]{1,80}\.(json|pnts|b3dm|glb)")

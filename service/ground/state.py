@@ -1,18 +1,73 @@
-"""What the portal's endpoints share, and how they find it."""
+"""What the portal's endpoints share: the library, the exports in the background, the vehicle."""
 
 from __future__ import annotations
 
+import logging
+import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from starlette.requests import HTTPConnection
 
-from service.ground.jobs import Jobs
+from service.errors import InputError, SkyreliefError
+from service.exports import EXPORTERS
+from service.exports.view import ExportOptions, ScanView, export
 from service.ground.library import Library
 from service.ground.vehicle import Vehicle
 from service.scans.coverage import LiveCoverages
+
+log = logging.getLogger(__name__)
+
+MOST_WAITING = 20
+KEPT = 100
+
+
+class Jobs:
+    """A queue of exports; each job is a dict of id, kind, state, file and error."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(1, "exports")
+        self._lock = threading.Lock()
+        self._jobs: list[tuple[Path, dict[str, Any]]] = []
+
+    def start(self, folder: Path, kind: str) -> dict[str, Any]:
+        """Queue an export. InputError for an unknown kind or a full queue."""
+        if kind not in EXPORTERS:
+            raise InputError(f"kind is one of {', '.join(EXPORTERS)}")
+        with self._lock:
+            waiting = [j for _, j in self._jobs if j["state"] in ("waiting", "running")]
+            if len(waiting) >= MOST_WAITING:
+                raise InputError("too many deliverables are waiting; try again later")
+            job = {"kind": kind, "state": "waiting", "queued_unix_s": time.time(), "error": None}
+            self._jobs = [*self._jobs[-KEPT:], (folder, job)]
+        self._pool.submit(self._run, folder, job)
+        return dict(job)
+
+    def of(self, folder: Path) -> list[dict[str, Any]]:
+        """The jobs of a scan, the oldest first."""
+        with self._lock:
+            return [dict(job) for place, job in self._jobs if place == folder]
+
+    def busy(self, folder: Path) -> bool:
+        """True while a deliverable of this scan is waiting or being made."""
+        return any(job["state"] in ("waiting", "running") for job in self.of(folder))
+
+    def _run(self, folder: Path, job: dict[str, Any]) -> None:
+        job["state"] = "running"
+        try:
+            with ScanView(folder) as scan:
+                job["file"] = export(scan, job["kind"], None, ExportOptions()).name
+            job["state"] = "done"
+        except SkyreliefError as error:
+            job |= {"state": "failed", "error": str(error)}
+        finally:
+            if job["state"] == "running":  # our own fault; the pool keeps the traceback
+                job |= {"state": "failed", "error": "failed; see the log"}
+                log.exception("export of %s to %s", folder, job["kind"])
 
 
 @dataclass(slots=True, eq=False)

@@ -1,25 +1,145 @@
-"""Scans from an aircraft's storage, taken into a ground station's after landing."""
+"""The folders of a ground station's store, and scans copied into them from a card.
+
+The card may come from a stranger: regular files of known names only, as many bytes as fit. Nothing
+in it is followed, nothing on it is written, and what was a pipe, a device or a symbolic link is
+left out.
+"""
 
 from __future__ import annotations
 
 import logging
+import os
 import shutil
+import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from service.errors import InputError, OutsideError
-from service.ground.folder_import import is_regular
-from service.ground.placing import scan_folder
 from service.scans.retention import Claim
-from service.stream.naming import check_name
+from service.stream.naming import check_name, split_scan_name
 from service.stream.records import ScanHeader
-from service.stream.store import ScanStore
+from service.stream.store import ScanStore, header_of
 
 log = logging.getLogger(__name__)
 
-FILES = ("scan.db", "scan.db-wal")
+MAX_RUNS = 100
+"""Folders of scans of the same drone and time; more are not made."""
+
+
+def scan_folder(store: Path, drone: str, name: str) -> Path:
+    """The folder of a drone's scan, called as on the datalink, whether it is there or not.
+
+    The first run of a scan gets the scan's own name, further runs ``<scan>-2`` and so on.
+    Raises InputError when there are MAX_RUNS already.
+    """
+    scan_id, run_id = split_scan_name(name)
+    return run_folder(store / drone, scan_id, (drone, scan_id, run_id))
+
+
+def run_folder(drone: Path, scan: str, identity: tuple[str, str, str]) -> Path:
+    """The folder in ``drone`` of the scan with that identity; ``scan`` is what it is called.
+
+    Raises InputError when there are MAX_RUNS of others already.
+    """
+    places = [drone / scan, *(drone / f"{scan}-{n}" for n in range(2, MAX_RUNS + 1))]
+    free = [place for place in places if not (place / "scan.db").exists()]
+    for place in places:
+        if place not in free:
+            header = header_of(place / "scan.db")
+            if header is not None and header.identity == identity:
+                return place
+    if not free:
+        raise InputError(f"{drone} holds {MAX_RUNS} runs of {scan}; move some away to take in more")
+    return free[0]
+
+
+STORE_FILES = ("scan.db", "scan.db-wal")
+OTHER_FILES = ("coverage.json", "library.json", "telemetry.csv", "link.tlog", "camera.refined.yaml")
+"""Worth copying though no deliverable; 3D Tiles can be made again."""
+
+KEPT_FREE, KEPT_FREE_BYTES = 0.1, 2 << 30
+"""An import leaves free this share of the store's disk, but no more than these bytes."""
+
+BLOCK_BYTES = 1 << 20
+
+
+def is_regular(path: Path) -> bool:
+    """Whether ``path`` is a regular file and no link to one."""
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+def copy_files(
+    source: Path, target: Path, names: Iterable[str], room_bytes: int | None = None
+) -> set[str]:
+    """Copy the regular files called ``names`` from one folder to another; those there were.
+
+    ``room_bytes`` bounds the copy; by default a tenth of the disk, at most 2 GiB, stays free.
+    Raises InputError when ``source`` is no folder, OutsideError for too little room and for a
+    failing disk.
+    """
+    try:
+        folder = os.open(source, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{_short(source)} is no folder that can be read") from error
+    files: dict[str, int] = {}
+    try:
+        for name in names:
+            handle = _open_regular(folder, name)
+            if handle is not None:
+                files[name] = handle
+        sizes = {name: os.fstat(handle).st_size for name, handle in files.items()}
+        _check_room(sum(sizes.values()), target, room_bytes)
+        for name, handle in files.items():
+            _copy(handle, target / name, sizes[name])
+    except OSError as error:
+        raise OutsideError(f"cannot copy {_short(source)} to {target} ({error})") from error
+    finally:
+        for handle in (folder, *files.values()):
+            os.close(handle)
+    return set(files)
+
+
+def _open_regular(folder: int, name: str) -> int | None:
+    """A descriptor of a regular file in ``folder``; None for a missing file and anything else."""
+    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        handle = os.open(name, flags, dir_fd=folder)
+    except OSError:
+        return None
+    if stat.S_ISREG(os.fstat(handle).st_mode):
+        return handle
+    os.close(handle)
+    return None
+
+
+def _check_room(size: int, target: Path, room_bytes: int | None) -> None:
+    if room_bytes is None:
+        disk = shutil.disk_usage(target)
+        room_bytes = disk.free - min(int(KEPT_FREE * disk.total), KEPT_FREE_BYTES)
+    if size > room_bytes:
+        raise OutsideError(
+            f"the scan has {size / 1e6:.0f} MB, the store has room for "
+            f"{max(room_bytes, 0) / 1e6:.0f} MB; delete scans or use another disk"
+        )
+
+
+def _copy(handle: int, target: Path, size: int) -> None:
+    """The first ``size`` bytes; a file that grows meanwhile takes no more."""
+    with open(target, "xb") as out:
+        while size > 0 and (block := os.read(handle, min(BLOCK_BYTES, size))):
+            out.write(block)
+            size -= len(block)
+
+
+def _short(path: Path) -> str:
+    return str(path)[:200]
+
+
 TAKING = ".taking-"
 """Begins the name of a folder that a card's scan is copied to."""
 
@@ -31,7 +151,7 @@ def take_in(store: Path, folder: Path) -> list[Path]:
     What came by radio or network before is kept and completed. Raises InputError when there is
     no scan, OutsideError when the disk is full.
     """
-    paths = [folder / FILES[0], *sorted(folder.glob(f"*/{FILES[0]}"))]
+    paths = [folder / STORE_FILES[0], *sorted(folder.glob(f"*/{STORE_FILES[0]}"))]
     paths = [path for path in paths if is_regular(path)]
     if not paths:
         raise InputError(f"{folder} holds no scan; it should hold scan.db, or folders that do")
@@ -40,13 +160,13 @@ def take_in(store: Path, folder: Path) -> list[Path]:
 
 def _take(store: Path, folder: Path) -> Path:
     with _workplace(store) as place:
-        for name in FILES:
+        for name in STORE_FILES:
             if is_regular(folder / name):
                 shutil.copyfile(folder / name, place / name, follow_symlinks=False)
-        with ScanStore.open(place / FILES[0]) as source:
+        with ScanStore.open(place / STORE_FILES[0]) as source:
             header = source.header
             drone, scan = check_name(header.drone, "drone"), check_name(header.name, "scan")
-            path = scan_folder(store, drone, scan) / FILES[0]
+            path = scan_folder(store, drone, scan) / STORE_FILES[0]
             with _open(path, header) as target:
                 news = merge(source, target)
                 _deliver(path.parent, target)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from service.errors import InputError, OutsideError
-from service.ground.orders import order
+from service.ground.operator import order
 from service.workers import Worker, Workers
 
 if TYPE_CHECKING:

@@ -168,7 +168,7 @@ def test_health_page_answers_as_described(tmp_path: Path, record: Row) -> None:
 def test_portal_answers_as_described(tmp_path: Path, record: Row) -> None:
     """Requests made from the served description, right and wrong: never a fault of ours."""
     schemathesis = pytest.importorskip("schemathesis")
-    from service.ground.audit import AuditLog
+    from service.ground.guard import AuditLog
     from service.ground.http import portal_app
     from service.ground.tokens import Tokens
 
