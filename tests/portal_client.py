@@ -1,4 +1,7 @@
-"""What the tests of the portal share: a client, a store with a scan, a vehicle's other end."""
+"""What the tests of the portal share: a client, a store with a scan, a vehicle's other end.
+
+A test that imports it is skipped where the portal's packages are missing.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import pytest
+
+pytest.importorskip("starlette")
+pytest.importorskip("uvicorn")
+pytest.importorskip("websockets")
+
+from service.bench.browser import Browser, chromium
+from service.ground.http import PAGE
 from service.ground.portal import Portal, PortalConfig
 from service.scans.folder import write_deliverables
 
@@ -19,6 +30,11 @@ if TYPE_CHECKING:
 TOKEN = "a-token-of-enough-letters"
 ONE = "/api/scans/drone-1/test-1"
 """The scan of :func:`flown_store`."""
+NEEDS = [
+    pytest.mark.skipif(not chromium(), reason="needs Chromium"),
+    pytest.mark.skipif(not (PAGE / "index.html").is_file(), reason="needs the built page"),
+]
+"""Marks of a test in a real browser."""
 
 
 class Client:
@@ -94,3 +110,24 @@ class FakeOperator:
 
     def __exit__(self, *_: object) -> None:
         self.closed = True
+
+
+@pytest.fixture
+def store(tmp_path: Path, house: HouseFlight) -> Path:
+    """A library with one scan."""
+    return flown_store(tmp_path / "scans", house)
+
+
+@pytest.fixture
+def client(store: Path) -> Iterator[Client]:
+    """Of a portal on ``store``."""
+    with serving(store) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """One Chromium for all tests of a file."""
+    one = Browser(tmp_path_factory.mktemp("chromium"))
+    yield one
+    one.close()

@@ -7,7 +7,6 @@ import struct
 import threading
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,12 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from loopback import until
-
-pytest.importorskip("starlette")
-pytest.importorskip("uvicorn")
-pytest.importorskip("websockets")
-
-from portal_client import TOKEN, Client, FakeOperator, flown_store, serving
+from portal_client import TOKEN, Client, FakeOperator, client, store
 
 from recon import se3
 from service.errors import InputError, OutsideError
@@ -37,16 +31,7 @@ from service.stream.store import ScanStore
 if TYPE_CHECKING:
     from conftest import HouseFlight
 
-
-@pytest.fixture
-def store(tmp_path: Path, house: HouseFlight) -> Path:
-    return flown_store(tmp_path / "scans", house)
-
-
-@pytest.fixture
-def client(store: Path) -> Iterator[Client]:
-    with serving(store) as client:
-        yield client
+__all__ = ["client", "store"]  # the fixtures
 
 
 def test_the_list_shows_the_scan(client: Client, store: Path) -> None:

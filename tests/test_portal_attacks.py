@@ -5,33 +5,18 @@ from __future__ import annotations
 import os
 import socket
 import urllib.request
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-
-pytest.importorskip("starlette")
-pytest.importorskip("uvicorn")
-pytest.importorskip("websockets")
-
-from portal_client import ONE, TOKEN, Client, flown_store, serving
+from portal_client import ONE, TOKEN, Client, client, store
 
 from service.ground.portal import Portal, PortalConfig
 
 if TYPE_CHECKING:
     from conftest import HouseFlight
 
-
-@pytest.fixture
-def store(tmp_path: Path, house: HouseFlight) -> Path:
-    return flown_store(tmp_path / "scans", house)
-
-
-@pytest.fixture
-def client(store: Path) -> Iterator[Client]:
-    with serving(store) as client:
-        yield client
+__all__ = ["client", "store"]  # the fixtures
 
 
 @pytest.mark.parametrize(

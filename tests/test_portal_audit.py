@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from loopback import until
-
-pytest.importorskip("starlette")
-pytest.importorskip("uvicorn")
-pytest.importorskip("websockets")
-
-from portal_client import ONE, TOKEN, Client, FakeOperator, flown_store, serving
+from portal_client import ONE, TOKEN, Client, FakeOperator, client, store
 from test_listener import Clock
 
 from service.errors import InputError
@@ -26,18 +20,9 @@ from service.ground.tokens import KEPT, Tokens, kept_token, parse_tokens
 from service.ground.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from conftest import HouseFlight
+    pass
 
-
-@pytest.fixture
-def store(tmp_path: Path, house: HouseFlight) -> Path:
-    return flown_store(tmp_path / "scans", house)
-
-
-@pytest.fixture
-def client(store: Path) -> Iterator[Client]:
-    with serving(store) as client:
-        yield client
+__all__ = ["client", "store"]  # the fixtures
 
 
 def lines_of(store: Path) -> list[dict[str, Any]]:

@@ -9,20 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-
-pytest.importorskip("starlette")
-pytest.importorskip("uvicorn")
-pytest.importorskip("websockets")
-
-from browsing import NEEDS, TOKEN, browser
 from loopback import free_port
+from portal_client import NEEDS, TOKEN, browser, flown_store
 
 from mavlink.rehearsal import RehearsalVehicle
 from service.bench.browser import Browser
 from service.exports.view import ExportOptions, ScanView, export
 from service.ground.portal import Portal, PortalConfig
 from service.ground.vehicle import Vehicle
-from service.scans.folder import write_deliverables
 from service.stream.codec import encode
 from service.stream.records import Repose
 from service.stream.store import ScanStore
@@ -36,10 +30,7 @@ __all__ = ["browser"]  # the fixture
 
 @pytest.fixture
 def scans(tmp_path: Path, house: HouseFlight) -> Path:
-    folder = tmp_path / "drone-1" / "test-1"
-    with house.flown(folder) as scan:
-        write_deliverables(folder, scan, {})
-    return tmp_path
+    return flown_store(tmp_path, house)
 
 
 @pytest.fixture

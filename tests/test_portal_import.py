@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-
-pytest.importorskip("starlette")
-pytest.importorskip("uvicorn")
-pytest.importorskip("websockets")
-
-from portal_client import ONE, Client, flown_store, serving
+from portal_client import ONE, Client, client, store
 
 from service.errors import OutsideError
 from service.ground.library import ConflictError, Library
@@ -23,16 +18,7 @@ from service.ground.storage import copy_files
 if TYPE_CHECKING:
     from conftest import HouseFlight
 
-
-@pytest.fixture
-def store(tmp_path: Path, house: HouseFlight) -> Path:
-    return flown_store(tmp_path / "scans", house)
-
-
-@pytest.fixture
-def client(store: Path) -> Iterator[Client]:
-    with serving(store) as client:
-        yield client
+__all__ = ["client", "store"]  # the fixtures
 
 
 @pytest.fixture

@@ -12,18 +12,12 @@ import subprocess
 import sys
 import threading
 import urllib.request
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from loopback import free_port, until
-
-pytest.importorskip("starlette")
-pytest.importorskip("uvicorn")
-pytest.importorskip("websockets")
-
-from portal_client import ONE, TOKEN, Client, flown_store, serving
+from portal_client import ONE, TOKEN, Client, client, store
 
 from service.ground import guard
 from service.ground.portal import Portal, PortalConfig
@@ -31,18 +25,9 @@ from service.stream.session import SessionConfig, open_session
 from service.workers import Workers
 
 if TYPE_CHECKING:
-    from conftest import HouseFlight
+    pass
 
-
-@pytest.fixture
-def store(tmp_path: Path, house: HouseFlight) -> Path:
-    return flown_store(tmp_path / "scans", house)
-
-
-@pytest.fixture
-def client(store: Path) -> Iterator[Client]:
-    with serving(store) as client:
-        yield client
+__all__ = ["client", "store"]  # the fixtures
 
 
 def address_of(client: Client) -> tuple[str, int]:

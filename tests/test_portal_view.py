@@ -13,13 +13,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import pytest
-
-pytest.importorskip("starlette")
-pytest.importorskip("uvicorn")
-pytest.importorskip("websockets")
-
-from browsing import NEEDS, TOKEN, browser
 from loopback import free_port
+from portal_client import NEEDS, TOKEN, browser
 
 from mavlink.control import Answer, Result
 from mavlink.rehearsal import RehearsalVehicle
