@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from mavlink.framing import Decoder, Framer
-from mavlink.link import Link, parse_link
-from mavlink.vehicle import VehicleLink
-from mavlink.wire import dialect
+from mavlink.component.vehicle import VehicleLink
+from mavlink.wire.dialect import dialect
+from mavlink.wire.framing import Decoder, Framer
+from mavlink.wire.link import Link, parse_link
 from service.errors import InputError
 from service.stream.radio_messages import MAX_BYTES, PAYLOAD_TYPE
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mavlink.wire import dialect
+from mavlink.wire.dialect import dialect
 
 AUTOPILOT = (1, 1)
 

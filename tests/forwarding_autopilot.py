@@ -10,8 +10,8 @@ from typing import Any
 
 from autopilot import beat, packed
 
-from mavlink.framing import Decoder, Framer, Packet
-from mavlink.wire import dialect
+from mavlink.wire.dialect import dialect
+from mavlink.wire.framing import Decoder, Framer, Packet
 
 CAMERA_INFORMATION, LOAD_STATUS, METADATA = 259, 390, 397
 ARDUPILOT_DROPS = frozenset({LOAD_STATUS, METADATA})

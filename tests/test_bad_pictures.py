@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mavlink.samples import VehicleState
+from mavlink.telemetry.samples import VehicleState
 from recon import se3
 from recon.backends import load_backend
 from recon.types import F64, U8, Camera, Frame, Keyframe

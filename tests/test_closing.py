@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from loopback import until
 
-from mavlink.control import Phase
+from mavlink.component.control import Phase
 from service.config import load_config
 from service.daemon import runtime
 from service.daemon.machine import KEPT_EACH, fill_small_caches, give_back, one_pool

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mavlink.samples import VehicleState
+from mavlink.telemetry.samples import VehicleState
 from service.onboard.frame_tags import COLUMNS, FILE, FrameTags
 
 STATE = VehicleState(

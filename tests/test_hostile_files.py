@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mavlink.logs import load_telemetry
+from mavlink.telemetry.logs import load_telemetry
 from service.cameras import open_camera, video
 from service.cameras.camera_file import load_camera
 from service.config import load_config

@@ -21,10 +21,10 @@ from hypothesis.stateful import (
 )
 from loopback import until
 
-from mavlink.control import Phase, Result
-from mavlink.framing import Framer
-from mavlink.presence import Health
-from mavlink.wire import dialect
+from mavlink.component.control import Phase, Result
+from mavlink.component.presence import Health
+from mavlink.wire.dialect import dialect
+from mavlink.wire.framing import Framer
 from recon.backends.cpu import CpuBackend
 from service.cameras.camera_file import load_camera
 from service.config import load_config

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from vehicles_around import GENERIC, QUADROTOR, Net, Vehicle
 
-from mavlink.wire import dialect
+from mavlink.wire.dialect import dialect
 
 S = 1_000_000_000
 MS = 1_000_000

@@ -16,13 +16,13 @@ from typing import Any
 import pytest
 from loopback import until
 
-from mavlink.clock import computer_offset_ns
-from mavlink.control import Phase
-from mavlink.framing import Framer
-from mavlink.rehearsal import RehearsalVehicle
-from mavlink.signing import timestamp_of
-from mavlink.tlog import Recorder
-from mavlink.wire import dialect
+from mavlink.component.control import Phase
+from mavlink.component.rehearsal import RehearsalVehicle
+from mavlink.telemetry.clock import computer_offset_ns
+from mavlink.wire.dialect import dialect
+from mavlink.wire.framing import Framer
+from mavlink.wire.signing import timestamp_of
+from mavlink.wire.tlog import Recorder
 
 REPEATS = 20
 STATION = (255, 190)

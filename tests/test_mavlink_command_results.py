@@ -11,18 +11,18 @@ from typing import Any
 
 import pytest
 
-from mavlink.camera import CameraConfig
-from mavlink.command_desk import CommandDesk
-from mavlink.commands import COMMANDS
-from mavlink.companion import Companion, CompanionConfig
-from mavlink.control import Answer, Phase, Result, Work
-from mavlink.first_beat import CAMERA, ONBOARD
-from mavlink.framing import Framer
-from mavlink.history import VehicleHistory
-from mavlink.messages import Packer
-from mavlink.presence import Presence, PresenceConfig
-from mavlink.rehearsal import RehearsalControl
-from mavlink.wire import COMMAND_CANCEL, dialect, x25crc
+from mavlink.component.camera import CameraConfig
+from mavlink.component.command_desk import CommandDesk
+from mavlink.component.commands import COMMANDS
+from mavlink.component.companion import Companion, CompanionConfig
+from mavlink.component.control import Answer, Phase, Result, Work
+from mavlink.component.presence import Presence, PresenceConfig
+from mavlink.component.rehearsal import RehearsalControl
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.wire.dialect import COMMAND_CANCEL, dialect, x25crc
+from mavlink.wire.first_beat import CAMERA, ONBOARD
+from mavlink.wire.framing import Framer
+from mavlink.wire.messages import Packer
 
 S = 1_000_000_000
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "operators.md"

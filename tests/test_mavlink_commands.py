@@ -12,19 +12,19 @@ from typing import Any
 
 import pytest
 
-from mavlink.camera import CameraConfig, KeyframeReport
-from mavlink.command_desk import Command
-from mavlink.commands import COMMANDS
-from mavlink.companion import Companion, CompanionConfig
-from mavlink.control import Answer, Phase, Result, Work
-from mavlink.framing import Framer
-from mavlink.history import VehicleHistory
-from mavlink.messages import Packer
-from mavlink.parameters import PARAMETERS
-from mavlink.presence import Health, Presence, PresenceConfig
-from mavlink.rehearsal import RehearsalControl
-from mavlink.status import ComputerLoad
-from mavlink.wire import COMMAND_CANCEL, dialect, x25crc
+from mavlink.component.camera import CameraConfig, KeyframeReport
+from mavlink.component.command_desk import Command
+from mavlink.component.commands import COMMANDS
+from mavlink.component.companion import Companion, CompanionConfig
+from mavlink.component.control import Answer, Phase, Result, Work
+from mavlink.component.parameters import PARAMETERS
+from mavlink.component.presence import Health, Presence, PresenceConfig
+from mavlink.component.rehearsal import RehearsalControl
+from mavlink.component.status import ComputerLoad
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.wire.dialect import COMMAND_CANCEL, dialect, x25crc
+from mavlink.wire.framing import Framer
+from mavlink.wire.messages import Packer
 
 S = 1_000_000_000
 MS = 1_000_000

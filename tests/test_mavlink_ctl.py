@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 from loopback import free_port
 
-from mavlink.camera import KeyframeReport
-from mavlink.framing import Framer
-from mavlink.rehearsal import RehearsalVehicle
-from mavlink.wire import dialect
+from mavlink.component.camera import KeyframeReport
+from mavlink.component.rehearsal import RehearsalVehicle
+from mavlink.wire.dialect import dialect
+from mavlink.wire.framing import Framer
 
 
 def run_ctl(port: int, *arguments: str) -> subprocess.CompletedProcess[str]:

@@ -13,10 +13,9 @@ from typing import Any
 
 import pytest
 
-from mavlink.camera import CameraConfig
-from mavlink.companion import Companion, CompanionConfig
-from mavlink.framing import Framer
-from mavlink.ftp import (
+from mavlink.component.camera import CameraConfig
+from mavlink.component.companion import Companion, CompanionConfig
+from mavlink.component.ftp import (
     ACK,
     BURST,
     CRC32,
@@ -32,9 +31,7 @@ from mavlink.ftp import (
     TERMINATE,
     FileServer,
 )
-from mavlink.history import VehicleHistory
-from mavlink.messages import Address
-from mavlink.metadata import (
+from mavlink.component.metadata import (
     DEFINITION,
     DEFINITION_URI,
     ComponentMetadata,
@@ -42,10 +39,13 @@ from mavlink.metadata import (
     camera_definition,
     definition_version,
 )
-from mavlink.parameters import PARAMETERS
-from mavlink.presence import Presence, PresenceConfig
-from mavlink.rehearsal import RehearsalControl
-from mavlink.wire import dialect, x25crc
+from mavlink.component.parameters import PARAMETERS
+from mavlink.component.presence import Presence, PresenceConfig
+from mavlink.component.rehearsal import RehearsalControl
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.wire.dialect import dialect, x25crc
+from mavlink.wire.framing import Framer
+from mavlink.wire.messages import Address
 
 STATION = Address(255, 190)
 CONTENT = random.Random(1).randbytes(20_000)

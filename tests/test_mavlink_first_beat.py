@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 from loopback import free_port, until
 
-from mavlink.first_beat import FirstBeats, heartbeat_packet
-from mavlink.framing import Framer, Packet
-from mavlink.memory import Memory, remembered_system
-from mavlink.rehearsal import RehearsalControl, RehearsalVehicle
-from mavlink.vehicle import VehicleConfig, VehicleLink
-from mavlink.wire import dialect
+from mavlink.component.memory import Memory, remembered_system
+from mavlink.component.rehearsal import RehearsalControl, RehearsalVehicle
+from mavlink.component.vehicle import VehicleConfig, VehicleLink
+from mavlink.wire.dialect import dialect
+from mavlink.wire.first_beat import FirstBeats, heartbeat_packet
+from mavlink.wire.framing import Framer, Packet
 
 
 @pytest.mark.parametrize("component", [191, 100])
@@ -65,8 +65,8 @@ def test_the_vehicle_link_takes_over_port_token_and_numbers() -> None:
 
 def test_it_imports_neither_the_dialect_nor_arrays() -> None:
     program = (
-        "import sys, service.cli, service.commands.run, service.config, mavlink.first_beat"
-        ", mavlink.memory\n"
+        "import sys, service.cli, service.commands.run, service.config, mavlink.wire.first_beat"
+        ", mavlink.component.memory\n"
         "print(*sorted({'numpy', 'pymavlink', 'rich', 'zenoh', 'cv2'} & set(sys.modules)))"
     )
     root = Path(__file__).resolve().parents[1]

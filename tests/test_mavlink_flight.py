@@ -20,9 +20,9 @@ import pytest
 from loopback import until
 from scipy.spatial.transform import Rotation
 
-from mavlink.framing import Framer
-from mavlink.tlog import packets
-from mavlink.wire import dialect
+from mavlink.wire.dialect import dialect
+from mavlink.wire.framing import Framer
+from mavlink.wire.tlog import packets
 from recon.types import Camera
 from service.cameras.camera_file import save_camera
 from service.config import load_config

@@ -11,10 +11,10 @@ from autopilot import attitude, packed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink.decode import READERS, decode
-from mavlink.framing import Decoder, Framer, TelemetryDecoder, check_packet, packet_length
-from mavlink.samples import PositionSample, RangeSample, TerrainSample
-from mavlink.wire import dialect, numbers_of, x25crc
+from mavlink.telemetry.decode import READERS, decode
+from mavlink.telemetry.samples import PositionSample, RangeSample, TerrainSample
+from mavlink.wire.dialect import dialect, numbers_of, x25crc
+from mavlink.wire.framing import Decoder, Framer, TelemetryDecoder, check_packet, packet_length
 
 
 def mixture(rng: random.Random, count: int) -> tuple[bytes, int]:

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from mavlink import quaternion
-from mavlink.frame_watch import FrameWatch, judge_frame
-from mavlink.gimbal import GimbalConfig, frame_of_flags, steadiest_frame, to_earth
-from mavlink.history import M_PER_DEG, HistoryConfig, LiveHistory, VehicleHistory
-from mavlink.quaternion import Quaternion
-from mavlink.samples import (
+from mavlink.telemetry import quaternion
+from mavlink.telemetry.frame_watch import FrameWatch, judge_frame
+from mavlink.telemetry.gimbal import GimbalConfig, frame_of_flags, steadiest_frame, to_earth
+from mavlink.telemetry.history import M_PER_DEG, HistoryConfig, LiveHistory, VehicleHistory
+from mavlink.telemetry.quaternion import Quaternion
+from mavlink.telemetry.samples import (
     F64,
     AccuracySample,
     AttitudeSample,
@@ -25,7 +25,7 @@ from mavlink.samples import (
     RangeSample,
     TerrainSample,
 )
-from mavlink.track import Track
+from mavlink.telemetry.track import Track
 
 MS = 1_000_000
 S = 1_000_000_000

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mavlink import latency, quaternion
-from mavlink.framing import Decoder, Framer
-from mavlink.history import VehicleHistory
-from mavlink.latency import LatencyWatch
-from mavlink.messages import Outgoing, Packer
-from mavlink.quaternion import Quaternion
-from mavlink.samples import AttitudeSample, GimbalFrame, GimbalSample
-from mavlink.status import Odometry, odometry_message
+from mavlink.component.status import Odometry, odometry_message
+from mavlink.telemetry import latency, quaternion
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.telemetry.latency import LatencyWatch
+from mavlink.telemetry.quaternion import Quaternion
+from mavlink.telemetry.samples import AttitudeSample, GimbalFrame, GimbalSample
+from mavlink.wire.framing import Decoder, Framer
+from mavlink.wire.messages import Outgoing, Packer
 
 S = 1_000_000_000
 

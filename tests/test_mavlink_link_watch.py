@@ -13,11 +13,11 @@ from autopilot import beat, packed
 from loopback import free_port, until
 from vehicles_around import Net, Vehicle
 
-from mavlink.control import Phase
-from mavlink.link_watch import WatchConfig
-from mavlink.presence import Health
-from mavlink.rehearsal import RehearsalControl
-from mavlink.wire import dialect
+from mavlink.component.control import Phase
+from mavlink.component.link_watch import WatchConfig
+from mavlink.component.presence import Health
+from mavlink.component.rehearsal import RehearsalControl
+from mavlink.wire.dialect import dialect
 from service.config import load_config
 from service.daemon.diagnosis import BAD, NOTE, Finding, examine_links
 

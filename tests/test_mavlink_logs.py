@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mavlink import quaternion
-from mavlink.history import HistoryConfig, VehicleHistory
-from mavlink.logs import TelemetryLog, load_telemetry
-from mavlink.samples import F64
-from mavlink.wire import dialect
+from mavlink.telemetry import quaternion
+from mavlink.telemetry.history import HistoryConfig, VehicleHistory
+from mavlink.telemetry.logs import TelemetryLog, load_telemetry
+from mavlink.telemetry.samples import F64
+from mavlink.wire.dialect import dialect
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 TURN = Path(__file__).parent / "data" / "mavlink" / "arducopter_turn.tlog"

@@ -16,12 +16,12 @@ import pytest
 from forwarding_autopilot import ForwardingAutopilot
 from loopback import free_port, until
 
-from mavlink import quaternion
-from mavlink.camera import KeyframeReport
-from mavlink.control import Answer, Result, Work
-from mavlink.framing import Framer
-from mavlink.rehearsal import RehearsalVehicle
-from mavlink.tlog import packets
+from mavlink.component.camera import KeyframeReport
+from mavlink.component.control import Answer, Result, Work
+from mavlink.component.rehearsal import RehearsalVehicle
+from mavlink.telemetry import quaternion
+from mavlink.wire.framing import Framer
+from mavlink.wire.tlog import packets
 
 S = 1_000_000_000
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from mavlink.commands import (
+from mavlink.component.commands import (
     BASELINE,
     CLEAR_MAP,
     COMMANDS,
@@ -16,8 +16,8 @@ from mavlink.commands import (
     START,
     STOP,
 )
-from mavlink.gimbal import YAW_FRAMES
-from mavlink.parameters import PARAMETERS
+from mavlink.component.parameters import PARAMETERS
+from mavlink.telemetry.gimbal import YAW_FRAMES
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -11,19 +11,19 @@ from autopilot import attitude, beat, packed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink.autopilot_link import LOOK_NS, RateKeeper
-from mavlink.camera import KeyframeReport
-from mavlink.clock import BootClock, BootCounter, fit_boot
-from mavlink.companion import Companion, CompanionConfig
-from mavlink.control import Answer, Result
-from mavlink.framing import Framer
-from mavlink.history import VehicleHistory
-from mavlink.messages import Address, Outgoing, Packer
-from mavlink.parameters import Parameter
-from mavlink.presence import Health, Presence, PresenceConfig
-from mavlink.rehearsal import RehearsalControl
-from mavlink.timesync import TimesyncFilter
-from mavlink.wire import CRC_EXTRA, dialect, x25crc
+from mavlink.component.autopilot_link import LOOK_NS, RateKeeper
+from mavlink.component.camera import KeyframeReport
+from mavlink.component.companion import Companion, CompanionConfig
+from mavlink.component.control import Answer, Result
+from mavlink.component.parameters import Parameter
+from mavlink.component.presence import Health, Presence, PresenceConfig
+from mavlink.component.rehearsal import RehearsalControl
+from mavlink.telemetry.clock import BootClock, BootCounter, fit_boot
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.telemetry.timesync import TimesyncFilter
+from mavlink.wire.dialect import CRC_EXTRA, dialect, x25crc
+from mavlink.wire.framing import Framer
+from mavlink.wire.messages import Address, Outgoing, Packer
 
 MS = 1_000_000
 S = 1_000_000_000

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 from loopback import free_port, until
 
-from mavlink.framing import Framer
-from mavlink.rehearsal import RehearsalVehicle
-from mavlink.signing import Signing
-from mavlink.wire import dialect
+from mavlink.component.rehearsal import RehearsalVehicle
+from mavlink.wire.dialect import dialect
+from mavlink.wire.framing import Framer
+from mavlink.wire.signing import Signing
 
 
 def test_pymavlink_over_tcp_and_the_link_comes_back() -> None:

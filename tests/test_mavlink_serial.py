@@ -9,9 +9,9 @@ from pathlib import Path
 
 from loopback import until
 
-from mavlink.framing import Framer
-from mavlink.rehearsal import RehearsalVehicle
-from mavlink.wire import dialect
+from mavlink.component.rehearsal import RehearsalVehicle
+from mavlink.wire.dialect import dialect
+from mavlink.wire.framing import Framer
 
 
 def plug(path: Path) -> int:

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from autopilot import beat, packed
 
-from mavlink.framing import Framer
-from mavlink.messages import Outgoing, Packer
-from mavlink.signing import Signing, read_key, timestamp_of
-from mavlink.wire import dialect
+from mavlink.wire.dialect import dialect
+from mavlink.wire.framing import Framer
+from mavlink.wire.messages import Outgoing, Packer
+from mavlink.wire.signing import Signing, read_key, timestamp_of
 
 S = 1_000_000_000
 KEY = bytes(range(32))

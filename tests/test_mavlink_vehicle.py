@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 from loopback import free_port, until
 
-from mavlink.control import Answer
-from mavlink.link import LinkSpec, parse_link
-from mavlink.logs import load_telemetry
-from mavlink.rehearsal import RehearsalVehicle
-from mavlink.tlog import Recorder
-from mavlink.vehicle import VehicleConfig
-from mavlink.wire import dialect
+from mavlink.component.control import Answer
+from mavlink.component.rehearsal import RehearsalVehicle
+from mavlink.component.vehicle import VehicleConfig
+from mavlink.telemetry.logs import load_telemetry
+from mavlink.wire.dialect import dialect
+from mavlink.wire.link import LinkSpec, parse_link
+from mavlink.wire.tlog import Recorder
 
 S = 1_000_000_000
 

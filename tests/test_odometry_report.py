@@ -12,11 +12,11 @@ import pytest
 from loopback import until
 from scipy.spatial.transform import Rotation
 
-from mavlink.framing import Framer
-from mavlink.rehearsal import RehearsalVehicle
-from mavlink.samples import VehicleState
-from mavlink.status import Odometry
-from mavlink.wire import dialect
+from mavlink.component.rehearsal import RehearsalVehicle
+from mavlink.component.status import Odometry
+from mavlink.telemetry.samples import VehicleState
+from mavlink.wire.dialect import dialect
+from mavlink.wire.framing import Framer
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
 from recon.graph.trajectory import Placed

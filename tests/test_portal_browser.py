@@ -12,7 +12,7 @@ import pytest
 from loopback import free_port
 from portal_client import NEEDS, TOKEN, browser, flown_store
 
-from mavlink.rehearsal import RehearsalVehicle
+from mavlink.component.rehearsal import RehearsalVehicle
 from service.bench.browser import Browser
 from service.exports.view import ExportOptions, ScanView, export
 from service.ground.portal import Portal, PortalConfig

@@ -16,8 +16,8 @@ import pytest
 from loopback import free_port
 from portal_client import NEEDS, TOKEN, browser
 
-from mavlink.control import Answer, Result
-from mavlink.rehearsal import RehearsalVehicle
+from mavlink.component.control import Answer, Result
+from mavlink.component.rehearsal import RehearsalVehicle
 from recon.types import U8
 from service.bench.browser import Browser, Page
 from service.ground.portal import Portal, PortalConfig

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from pymavlink.dialects.v20 import common as dialect  # type: ignore[import-untyped]
 
-from mavlink.decode import decode
-from mavlink.history import VehicleHistory
-from mavlink.samples import AccuracySample, PositionSample
+from mavlink.telemetry.decode import decode
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.telemetry.samples import AccuracySample, PositionSample
 from service.config import CameraConfig, FusionConfig, ScanConfig
 from service.onboard.rig import Rig
 

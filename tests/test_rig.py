@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mavlink.samples import VehicleState
+from mavlink.telemetry.samples import VehicleState
 from recon.frames import rotation_from_rpy, rpy_from_rotation
 from recon.se3 import quaternion_from_rotation
 from recon.types import F64

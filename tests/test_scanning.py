@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from loopback import until
 
-from mavlink.control import Phase
+from mavlink.component.control import Phase
 from recon.backends.cpu import CpuBackend
 from service.cameras.camera_file import load_camera
 from service.config import load_config

@@ -14,7 +14,7 @@ from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from mavlink.logs import load_telemetry
+from mavlink.telemetry.logs import load_telemetry
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
 from recon.se3 import rotation_from_quaternion
 from recon.types import F64

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from loopback import until
 
-from mavlink.rehearsal import RehearsalControl
-from mavlink.vehicle import VehicleConfig, VehicleLink
+from mavlink.component.rehearsal import RehearsalControl
+from mavlink.component.vehicle import VehicleConfig, VehicleLink
 from service.config import Config
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig

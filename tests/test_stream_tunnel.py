@@ -16,11 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from loopback import until
 
-from mavlink.framing import Framer
-from mavlink.presence import Health
-from mavlink.rehearsal import RehearsalControl
-from mavlink.vehicle import VehicleConfig, VehicleLink
-from mavlink.wire import dialect
+from mavlink.component.presence import Health
+from mavlink.component.rehearsal import RehearsalControl
+from mavlink.component.vehicle import VehicleConfig, VehicleLink
+from mavlink.wire.dialect import dialect
+from mavlink.wire.framing import Framer
 from recon import se3
 from recon.types import DepthMap, Keyframe, Pose
 from service.config import Config, DatalinkConfig

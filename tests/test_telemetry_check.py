@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mavlink.gimbal import GimbalConfig
-from mavlink.history import HistoryConfig, VehicleHistory
-from mavlink.quaternion import Quaternion
-from mavlink.samples import AttitudeSample, GimbalFrame, GimbalSample
+from mavlink.telemetry.gimbal import GimbalConfig
+from mavlink.telemetry.history import HistoryConfig, VehicleHistory
+from mavlink.telemetry.quaternion import Quaternion
+from mavlink.telemetry.samples import AttitudeSample, GimbalFrame, GimbalSample
 from recon.frames import R_GIMBAL_CAMERA
 from recon.tracking.odometry import Tracked
 from service.config import CameraConfig

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from loopback import until
 
-from mavlink.framing import Framer
-from mavlink.parameters import PARAMETERS
-from mavlink.wire import dialect
+from mavlink.component.parameters import PARAMETERS
+from mavlink.wire.dialect import dialect
+from mavlink.wire.framing import Framer
 from recon.types import Camera
 from service.cameras.images import open_images
 from service.config import Config, load_config

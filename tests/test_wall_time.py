@@ -8,9 +8,9 @@ import time
 import pytest
 from loopback import free_port, until
 
-from mavlink.clock import DIFFER_NS, WallTime, computer_offset_ns
-from mavlink.rehearsal import RehearsalVehicle
-from mavlink.wire import dialect
+from mavlink.component.rehearsal import RehearsalVehicle
+from mavlink.telemetry.clock import DIFFER_NS, WallTime, computer_offset_ns
+from mavlink.wire.dialect import dialect
 from service.daemon.scan_run import disagreement, set_since
 
 S = 1_000_000_000

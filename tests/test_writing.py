@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from loopback import until
 
-from mavlink.control import Result, Work
+from mavlink.component.control import Result, Work
 from service.daemon import writing
 from service.daemon.writing import Writings
 from service.errors import OutsideError

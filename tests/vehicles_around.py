@@ -6,13 +6,13 @@ from typing import Any
 
 from autopilot import packed
 
-from mavlink.companion import Companion, CompanionConfig
-from mavlink.framing import Framer
-from mavlink.history import VehicleHistory
-from mavlink.link_watch import WatchConfig
-from mavlink.presence import Presence, PresenceConfig
-from mavlink.rehearsal import RehearsalControl
-from mavlink.wire import dialect
+from mavlink.component.companion import Companion, CompanionConfig
+from mavlink.component.link_watch import WatchConfig
+from mavlink.component.presence import Presence, PresenceConfig
+from mavlink.component.rehearsal import RehearsalControl
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.wire.dialect import dialect
+from mavlink.wire.framing import Framer
 
 S = 1_000_000_000
 GENERIC, ARDUPILOT = 0, 3

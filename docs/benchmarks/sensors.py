@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
-from mavlink.logs import load_telemetry
+from mavlink.telemetry.logs import load_telemetry
 from recon import metrics
 from recon.types import F64
 from service.cli import app

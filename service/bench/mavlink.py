@@ -20,8 +20,8 @@ from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import Any
 
-from mavlink.framing import Decoder, Framer
-from mavlink.wire import dialect
+from mavlink.wire.dialect import dialect
+from mavlink.wire.framing import Decoder, Framer
 from service.bench import BenchOptions, BenchResult
 
 S = 1_000_000_000
@@ -246,9 +246,9 @@ def _burn(done: Any) -> None:
 
 
 def _vehicle(mode: str, port: int, seconds: float) -> None:
-    from mavlink.presence import Health
-    from mavlink.rehearsal import RehearsalControl
-    from mavlink.vehicle import VehicleConfig, VehicleLink
+    from mavlink.component.presence import Health
+    from mavlink.component.rehearsal import RehearsalControl
+    from mavlink.component.vehicle import VehicleConfig, VehicleLink
 
     vehicle = VehicleLink(VehicleConfig(links=(f"udpout:127.0.0.1:{port}",)), RehearsalControl())
     vehicle.start()
@@ -285,7 +285,7 @@ def _multiply(stop: threading.Event) -> None:
 
 def _measure_cost(vehicle: Any, seconds: float) -> None:
     """Print the share of a core that the links cost, and the delay from sending to the stamp."""
-    from mavlink.presence import Health
+    from mavlink.component.presence import Health
 
     delays: list[float] = []
     link = vehicle._links[0]

@@ -20,11 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mavlink.framing import Framer
-from mavlink.presence import Health
-from mavlink.rehearsal import RehearsalControl
-from mavlink.vehicle import VehicleConfig, VehicleLink
-from mavlink.wire import dialect
+from mavlink.component.presence import Health
+from mavlink.component.rehearsal import RehearsalControl
+from mavlink.component.vehicle import VehicleConfig, VehicleLink
+from mavlink.wire.dialect import dialect
+from mavlink.wire.framing import Framer
 from recon import se3
 from recon.types import F64, DepthMap, Keyframe, Pose
 from service.bench.link_emulator import free_port

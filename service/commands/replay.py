@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from mavlink.logs import TelemetryLog
+    from mavlink.telemetry.logs import TelemetryLog
     from recon.types import Camera
     from service.cameras.source import CameraSource
     from service.config import Config
@@ -68,9 +68,9 @@ def _load_model(path: Path | None, config: Config) -> Camera | None:
 
 
 def _load_telemetry(path: Path | None, config: Config) -> TelemetryLog | None:
-    from mavlink.gimbal import GimbalConfig
-    from mavlink.history import HistoryConfig
-    from mavlink.logs import load_telemetry
+    from mavlink.telemetry.gimbal import GimbalConfig
+    from mavlink.telemetry.history import HistoryConfig
+    from mavlink.telemetry.logs import load_telemetry
     from service.errors import InputError
 
     if path is None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from mavlink.first_beat import FirstBeats
+    from mavlink.wire.first_beat import FirstBeats
     from service.config import Config
     from service.daemon.runtime import Daemon
     from service.errors import InputError
@@ -68,8 +68,8 @@ def _first_beats(config: Config) -> FirstBeats | None:
     """Heartbeats before everything else; None where they must be signed, or there is no link."""
     import random
 
-    from mavlink.first_beat import FirstBeats
-    from mavlink.memory import remembered_system
+    from mavlink.component.memory import remembered_system
+    from mavlink.wire.first_beat import FirstBeats
 
     mavlink = config.mavlink
     if mavlink.signing_key or not mavlink.links:

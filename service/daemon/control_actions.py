@@ -9,7 +9,16 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from mavlink.control import ACCEPTED, Answer, Handled, Phase, Power, Result, ScanStatus, Work
+from mavlink.component.control import (
+    ACCEPTED,
+    Answer,
+    Handled,
+    Phase,
+    Power,
+    Result,
+    ScanStatus,
+    Work,
+)
 from service.daemon.machine import existing
 from service.daemon.scanning import Scanning
 from service.daemon.vehicle_config import with_parameter
@@ -29,7 +38,7 @@ NO_PHOTO = {
 
 
 class ControlActions:
-    """The scanning service as commands see it: :class:`mavlink.control.ScanControl`."""
+    """The scanning service as commands see it: :class:`mavlink.component.control.ScanControl`."""
 
     def __init__(self, scanning: Scanning, restart: Callable[[], None]) -> None:
         """``restart`` ends the service, which the init system starts again."""

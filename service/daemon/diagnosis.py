@@ -18,7 +18,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavlink.clock import EARLIEST_UNIX_S
+from mavlink.telemetry.clock import EARLIEST_UNIX_S
 from service.compute.threading_layer import REMEDY, kernels_may_overlap
 from service.config import Config, keys, load_config
 from service.daemon.machine import existing, read_machine
@@ -28,7 +28,7 @@ from service.errors import InputError, SkyreliefError
 from service.packages import unusable_packages
 
 if TYPE_CHECKING:
-    from mavlink.link_watch import LinkFound
+    from mavlink.component.link_watch import LinkFound
     from recon.types import Camera
 
 CORE = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "pymavlink", "eclipse-zenoh")
@@ -347,7 +347,7 @@ def _of_service(heard: dict[str, Any]) -> Iterator[Finding]:
 
 
 def _by_listening(config: Config, listen_s: float) -> Iterator[Finding]:
-    from mavlink.link_watch import LinkProbe
+    from mavlink.component.link_watch import LinkProbe
 
     mavlink = config.mavlink
     watch = watch_config(config, wait_s=listen_s / 2, ground_wait_s=listen_s / 2)

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any
 
-from mavlink.control import Phase
-from mavlink.status import CRITICAL, INFO, WARNING
+from mavlink.component.control import Phase
+from mavlink.component.status import CRITICAL, INFO, WARNING
 from service.config import ComputeConfig
 from service.daemon.machine import Machine
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mavlink.status import ComputerLoad
+    from mavlink.component.status import ComputerLoad
 
 THROTTLED_NOW = 0b1111  # Raspberry Pi: under-voltage, frequency capped, throttled, soft limit
 
@@ -87,7 +87,7 @@ class CoreLoad:
 
 def computer_load(machine: Machine, cores: tuple[int, ...], keep_free_mib: float) -> ComputerLoad:
     """The readings as the operator's ground station gets them over MAVLink."""
-    from mavlink.status import ComputerLoad
+    from mavlink.component.status import ComputerLoad
 
     def used(free: float | None, total: float | None) -> int | None:
         return None if free is None or total is None else round(total - free)

@@ -15,11 +15,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mavlink.control import Phase
-from mavlink.first_beat import FirstBeats
-from mavlink.presence import Health
-from mavlink.status import CRITICAL, NOTICE, WARNING
-from mavlink.vehicle import VehicleLink
+from mavlink.component.control import Phase
+from mavlink.component.presence import Health
+from mavlink.component.status import CRITICAL, NOTICE, WARNING
+from mavlink.component.vehicle import VehicleLink
+from mavlink.wire.first_beat import FirstBeats
 from service.compute.threading_layer import kernels_may_overlap
 from service.config import Config, reload
 from service.daemon.control_actions import ControlActions

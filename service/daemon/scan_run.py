@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavlink.clock import agree, computer_offset_ns
-from mavlink.status import WARNING
+from mavlink.component.status import WARNING
+from mavlink.telemetry.clock import agree, computer_offset_ns
 from service.config import Config
 from service.daemon.intent import FIRST_RETRY_S, LAST_RETRY_S
 from service.errors import OutsideError
@@ -17,8 +17,8 @@ from service.errors import OutsideError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from mavlink.samples import VehicleState
-    from mavlink.vehicle import VehicleLink
+    from mavlink.component.vehicle import VehicleLink
+    from mavlink.telemetry.samples import VehicleState
     from recon.types import Keyframe
     from service.cameras.source import CameraSource
     from service.daemon.frame_gate import FrameGate

@@ -12,9 +12,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavlink.control import ACCEPTED, Answer, Phase, Result, Work
-from mavlink.status import CRITICAL, WARNING
-from mavlink.vehicle import VehicleLink
+from mavlink.component.control import ACCEPTED, Answer, Phase, Result, Work
+from mavlink.component.status import CRITICAL, WARNING
+from mavlink.component.vehicle import VehicleLink
 from service.config import Config
 from service.daemon.intent import Intent, Resumption, Wanted
 from service.daemon.load_shedding import Level, lowered

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mavlink.companion import CompanionConfig
-from mavlink.gimbal import YAW_FRAMES, GimbalConfig
-from mavlink.history import HistoryConfig
-from mavlink.link_watch import WatchConfig
-from mavlink.parameters import YAW_FRAME
-from mavlink.presence import PresenceConfig
-from mavlink.signing import read_key
-from mavlink.vehicle import VehicleConfig
+from mavlink.component.companion import CompanionConfig
+from mavlink.component.link_watch import WatchConfig
+from mavlink.component.parameters import YAW_FRAME
+from mavlink.component.presence import PresenceConfig
+from mavlink.component.vehicle import VehicleConfig
+from mavlink.telemetry.gimbal import YAW_FRAMES, GimbalConfig
+from mavlink.telemetry.history import HistoryConfig
+from mavlink.wire.signing import read_key
 from service.config import Config, change
 from service.errors import InputError
 
@@ -83,7 +83,7 @@ TUNABLES: dict[str, Tunable] = {
         "camera.latency", lambda v: "auto" if v else "fixed", lambda v: float(v == "auto")
     ),
 }
-"""The next parameter is a line here and one in :data:`mavlink.parameters.PARAMETERS`."""
+"""The next parameter is a line here and one in :data:`mavlink.component.parameters.PARAMETERS`."""
 
 
 def with_parameter(config: Config, name: str, value: float) -> Config:

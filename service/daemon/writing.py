@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavlink.control import ACCEPTED, Answer, Result, Work
+from mavlink.component.control import ACCEPTED, Answer, Result, Work
 from service.compute.threading_layer import kernels_may_overlap
 
 if TYPE_CHECKING:

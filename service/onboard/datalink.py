@@ -12,7 +12,7 @@ from service.config import Config
 from service.errors import SkyreliefError
 
 if TYPE_CHECKING:
-    from mavlink.vehicle import VehicleLink
+    from mavlink.component.vehicle import VehicleLink
     from service.onboard.scan import Datalink
     from service.radio import VehicleRadio
     from service.stream.store import ScanStore

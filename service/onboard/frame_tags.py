@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TextIO
 
-from mavlink.samples import VehicleState
+from mavlink.telemetry.samples import VehicleState
 
 log = logging.getLogger(__name__)
 

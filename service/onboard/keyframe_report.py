@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mavlink.camera import KeyframeReport
+from mavlink.component.camera import KeyframeReport
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
 from recon.se3 import quaternion_from_rotation
 from recon.types import F64

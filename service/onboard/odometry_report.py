@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mavlink.samples import VehicleState
-from mavlink.status import Odometry
+from mavlink.component.status import Odometry
+from mavlink.telemetry.samples import VehicleState
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
 from recon.types import F64

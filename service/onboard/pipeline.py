@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mavlink.samples import VehicleState
+from mavlink.telemetry.samples import VehicleState
 from recon import se3
 from recon.backends import Backend, MatchingBackend
 from recon.camera_model import Undistorter, scaled

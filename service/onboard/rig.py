@@ -8,7 +8,7 @@ from enum import Enum
 
 import numpy as np
 
-from mavlink.samples import VehicleState
+from mavlink.telemetry.samples import VehicleState
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy, rpy_from_rotation
 from recon.types import F64, PosePrior

@@ -12,8 +12,8 @@ from pathlib import Path
 from threading import Event
 from typing import Any, Protocol
 
-from mavlink.history import VehicleHistory
-from mavlink.samples import VehicleState
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.telemetry.samples import VehicleState
 from recon.backends import Backend
 from recon.types import Camera, Frame, Keyframe
 from service.cameras.source import CameraFrame, CameraSource, ahead

@@ -10,11 +10,11 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from mavlink.frame_watch import FrameVerdict, FrameWatch
-from mavlink.history import VehicleHistory
-from mavlink.latency import LatencyEstimate, LatencyWatch
-from mavlink.quaternion import Quaternion
-from mavlink.samples import GimbalFrame
+from mavlink.telemetry.frame_watch import FrameVerdict, FrameWatch
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.telemetry.latency import LatencyEstimate, LatencyWatch
+from mavlink.telemetry.quaternion import Quaternion
+from mavlink.telemetry.samples import GimbalFrame
 from recon.frames import R_GIMBAL_CAMERA
 from recon.se3 import quaternion_from_rotation
 from recon.tracking.odometry import Tracked

@@ -273,7 +273,7 @@ class _Refinement:
         path = self.options.telemetry or self.folder / LINK_LOG
         if self.frame is None or (self.options.telemetry is None and not path.is_file()):
             return []
-        from mavlink.logs import load_telemetry
+        from mavlink.telemetry.logs import load_telemetry
 
         try:
             history = load_telemetry(path).history

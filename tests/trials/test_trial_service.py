@@ -36,7 +36,7 @@ from trial_rig import (
     with_site,
 )
 
-from mavlink.control import Phase
+from mavlink.component.control import Phase
 from service.config import load_config
 from service.daemon.runtime import Daemon
 from service.daemon.scan_run import ScanRun

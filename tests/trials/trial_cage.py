@@ -99,7 +99,7 @@ def _serve(folder: Path) -> None:
 
     import service.cli
 
-    for package in ("recon", "mavlink.logs", *(f"service.{name}" for name in PRELOADED)):
+    for package in ("recon", "mavlink.telemetry.logs", *(f"service.{name}" for name in PRELOADED)):
         for found in pkgutil.walk_packages(import_module(package).__path__, f"{package}."):
             if not any(name in found.name for name in LATE):
                 with contextlib.suppress(ImportError):

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 
-from mavlink.decode import decode as decode_message
-from mavlink.framing import Framer
-from mavlink.ftp import parse_request
-from mavlink.logs import load_telemetry
-from mavlink.wire import dialect as our_dialect
+from mavlink.component.ftp import parse_request
+from mavlink.telemetry.decode import decode as decode_message
+from mavlink.telemetry.logs import load_telemetry
+from mavlink.wire.dialect import dialect as our_dialect
+from mavlink.wire.framing import Framer
 from recon.types import DepthMap, Keyframe, Pose
 from service.cameras.camera_file import load_camera
 from service.config import load_config

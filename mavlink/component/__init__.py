@@ -1,0 +1,1 @@
+"""What we are on the network: the onboard computer and the camera."""

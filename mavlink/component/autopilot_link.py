@@ -1,0 +1,235 @@
+"""What passes between us and the autopilot: telemetry into the history, clocks, rates, TIMESYNC.
+
+It follows the autopilot that ``Presence`` has chosen; what another vehicle said before is dropped.
+A new link carries little until asked, and a ground station may slow
+streams down for all, so messages that come too slowly are asked for again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from mavlink.component import status as texts
+from mavlink.component.presence import Presence
+from mavlink.telemetry.clock import BootClock, WallTime
+from mavlink.telemetry.decode import decode
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.telemetry.samples import OF_AUTOPILOT
+from mavlink.telemetry.timesync import EVERYONE, TimesyncFilter
+from mavlink.wire.dialect import dialect
+from mavlink.wire.first_beat import ONBOARD
+from mavlink.wire.framing import Packet
+from mavlink.wire.messages import Address, Outbox
+
+S = 1_000_000_000
+LOST_NS = 5 * S
+
+
+class AutopilotLink:
+    """One autopilot at a time. ``say`` gets severity and text for the operator."""
+
+    def __init__(
+        self,
+        presence: Presence,
+        history: VehicleHistory,
+        outbox: Outbox,
+        wanted_hz: Mapping[str, float],
+        say: Callable[[int, str], None],
+    ) -> None:
+        self.link: int | None = None  # on which the autopilot was heard last
+        self.samples = 0  # taken into the history
+        self.timesync, self.wall_time = TimesyncFilter(), WallTime()
+        self._presence, self._history, self._outbox, self._say = presence, history, outbox, say
+        self._rates = RateKeeper(wanted_hz)
+        self._clocks: dict[int, BootClock] = {}  # component of our system to its boot clock
+        self._followed = (presence.system, presence.autopilot)
+        self._is_lost = False
+
+    # In.
+
+    def hear_telemetry(self, name: str, message: Any, packet: Packet, now_ns: int) -> None:
+        """Take in a message that :mod:`mavlink.telemetry.decode` reads."""
+        if packet.system != self._presence.system:
+            return
+        autopilot = self._presence.autopilot
+        if autopilot is not None and packet.component == autopilot[1]:
+            self._rates.heard(name)
+        sample = decode(message)
+        speaker = 1 if autopilot is None else autopilot[1]
+        if sample is None or (packet.component != speaker and isinstance(sample, OF_AUTOPILOT)):
+            return
+        self.samples += 1
+        if sample.boot_ms is None:
+            self._history.add(sample, now_ns)
+            return
+        clock = self._clocks.setdefault(packet.component, BootClock())
+        reboots = clock.reboots
+        time_ns = clock.time_of(sample.boot_ms, now_ns)
+        if clock.reboots != reboots:
+            self._rebooted(packet.component)
+        self._history.add(sample, time_ns)
+
+    def follow(self) -> None:
+        """Drop what another vehicle, or another component, said."""
+        (system, autopilot), before = self._followed, self._followed
+        self._followed = (self._presence.system, self._presence.autopilot)
+        if self._followed == before or (self._followed[0] == system and autopilot is None):
+            return
+        self._clocks.clear()
+        self._start_over()
+
+    def _start_over(self) -> None:
+        self._history.clear()
+        self.timesync.reset()
+        self._rates.restart()
+
+    def _rebooted(self, component: int) -> None:
+        autopilot = self._presence.autopilot
+        if autopilot is None or component != autopilot[1]:
+            return
+        self._start_over()
+        self._say(texts.WARNING, "Autopilot restarted; telemetry starts over")
+
+    def hear_system_time(self, message: Any, packet: Packet, now_ns: int) -> None:
+        """Take in a SYSTEM_TIME."""
+        if (packet.system, packet.component) == self._presence.autopilot:
+            self._rates.heard("SYSTEM_TIME")
+            self.wall_time.hear(message.time_unix_usec, now_ns)
+
+    def hear_timesync(self, message: Any, packet: Packet, link: int, now_ns: int) -> None:
+        """Take in a TIMESYNC: a question of the autopilot, or anyone's answer to ours."""
+        is_autopilot = (packet.system, packet.component) == self._presence.autopilot
+        if message.tc1 == 0:  # a question; we answer with our own time since boot
+            reply = dialect.MAVLink_timesync_message(now_ns, message.ts1)
+            if is_autopilot:
+                self._outbox.put(ONBOARD, reply, link)
+            return
+        round_trip_ns = self.timesync.round_trip_of(message.ts1, now_ns)
+        if round_trip_ns is not None:
+            self._presence.answered(packet.system, packet.component, round_trip_ns)
+        if is_autopilot and self.timesync.answer(message.tc1, message.ts1, now_ns):
+            clock = self._clocks.setdefault(packet.component, BootClock())
+            clock.set_timesync(self.timesync.offset_ns)
+
+    # Out.
+
+    def tick(self, now_ns: int) -> None:
+        """Ask for the time and for messages that come too slowly; report a loss."""
+        autopilot, seen = self._presence.autopilot, self._presence.autopilot_seen_ns
+        if autopilot is None or seen is None:
+            if self._presence.others(now_ns):
+                self._ask_time(now_ns)
+            return
+        is_lost = now_ns - seen > LOST_NS
+        if is_lost and not self._is_lost:
+            self._say(texts.WARNING, "Telemetry of the autopilot is lost")
+        elif self._is_lost and not is_lost:
+            self._rates.restart()
+            self._say(texts.NOTICE, "Telemetry of the autopilot is back")
+        self._is_lost = is_lost
+        if is_lost:
+            return
+        for message in self._rates.tick(*autopilot, now_ns):
+            self._outbox.put(ONBOARD, message)
+        self._ask_time(now_ns)
+
+    def _ask_time(self, now_ns: int) -> None:
+        """Ask our autopilot; or every one, where the answers say which vehicle is ours."""
+        target, link = EVERYONE, None
+        autopilot = self._presence.autopilot
+        if autopilot is not None and not self._presence.others(now_ns):
+            target, link = Address(*autopilot), self.link
+        request = self.timesync.request(now_ns, target)
+        if request is not None:
+            self._outbox.put(ONBOARD, request, link)
+
+    def next_timers(self, now_ns: int) -> list[int]:
+        """When :meth:`tick` has something to do, in ns."""
+        if self._presence.autopilot is not None:
+            return [self.timesync.next_timer(), self._rates.next_timer()]
+        return [self.timesync.next_timer()] if self._presence.others(now_ns) else []
+
+    def boot_clock(self) -> BootClock | None:
+        """The autopilot's clock; None before it was heard."""
+        autopilot = self._presence.autopilot
+        return None if autopilot is None else self._clocks.get(autopilot[1])
+
+
+WANTED_HZ: Mapping[str, float] = {
+    "ATTITUDE_QUATERNION": 50.0,
+    "GLOBAL_POSITION_INT": 20.0,
+    "GIMBAL_DEVICE_ATTITUDE_STATUS": 20.0,
+    "DISTANCE_SENSOR": 10.0,
+    "GPS_RAW_INT": 2.0,
+    "TERRAIN_REPORT": 2.0,
+    "SYSTEM_TIME": 1.0,
+}
+NUMBERS = {kind.msgname: number for number, kind in dialect.mavlink_map.items()}
+LOOK_NS = 10 * S
+ENOUGH = 0.6  # of the rate wanted
+PATIENCE = 5  # requests without a single message before we ask only rarely
+RARELY = 12  # looks between two such requests
+
+
+@dataclass(slots=True)
+class _Want:
+    number: int
+    hz: float
+    heard: int = 0
+    futile: int = 0
+    wait: int = 0
+
+
+class RateKeeper:
+    """Counts what comes and says which SET_MESSAGE_INTERVAL to send."""
+
+    def __init__(self, wanted_hz: Mapping[str, float] = WANTED_HZ) -> None:
+        unknown = [name for name in wanted_hz if name not in NUMBERS]
+        if unknown:
+            raise ValueError(f"no MAVLink message is called {unknown[0]}")
+        self._wants = {n: _Want(NUMBERS[n], hz) for n, hz in wanted_hz.items()}
+        self._looked_ns: int | None = None
+
+    def heard(self, name: str) -> None:
+        """Count a message of the autopilot."""
+        want = self._wants.get(name)
+        if want is not None:
+            want.heard += 1
+
+    def restart(self) -> None:
+        """Ask for everything again at the next look, as after a reboot."""
+        self._looked_ns = None
+        for want in self._wants.values():
+            want.heard = want.futile = want.wait = 0
+
+    def tick(self, system: int, component: int, now_ns: int) -> list[Any]:
+        """COMMAND_LONGs to the autopilot for what comes too slowly; none between looks."""
+        if self._looked_ns is not None and now_ns - self._looked_ns < LOOK_NS:
+            return []
+        passed_s = math.inf if self._looked_ns is None else (now_ns - self._looked_ns) / S
+        self._looked_ns = now_ns
+        return [
+            dialect.MAVLink_command_long_message(
+                system, component, 511, 0, want.number, round(1e6 / want.hz), 0, 0, 0, 0, 0
+            )
+            for want in self._wants.values()
+            if self._must_ask(want, passed_s)
+        ]
+
+    def _must_ask(self, want: _Want, passed_s: float) -> bool:
+        heard, want.heard = want.heard, 0
+        if heard and heard >= ENOUGH * want.hz * passed_s:
+            want.futile = 0
+            return False
+        want.futile = 0 if heard else want.futile + 1
+        if want.futile <= PATIENCE:
+            return True
+        want.wait = (want.wait + 1) % RARELY
+        return want.wait == 0
+
+    def next_timer(self) -> int:
+        """When :meth:`tick` looks again, in ns."""
+        return 0 if self._looked_ns is None else self._looked_ns + LOOK_NS

@@ -1,0 +1,278 @@
+"""The scan as a MAVLink camera (component 100, camera protocol v2).
+
+Recording is scanning; a photo is one keyframe. The camera's status is sent before and after
+every keyframe that was asked for, or a ground station's button would stay busy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from mavlink.component.control import ACCEPTED, Answer, Handled, Result, ScanControl, Work
+from mavlink.wire.dialect import dialect
+from mavlink.wire.first_beat import CAMERA
+from mavlink.wire.messages import Address, Outbox, Streams
+
+S = 1_000_000_000
+CAP_VIDEO, CAP_IMAGE, CAP_IMAGE_IN_VIDEO, CAP_VIDEO_IN_IMAGE, CAP_STREAM = 1, 2, 8, 16, 256
+CAPTURE_STATUS = 262
+SHOT_TIMEOUT_NS = 10 * S
+KEPT = 500  # keyframes that can be asked for again
+UNKNOWN_I32 = 0
+
+
+@dataclass(frozen=True, slots=True)
+class CameraConfig:
+    """What the camera says of itself."""
+
+    vendor: str = "skyrelief"
+    model: str = "3D scan"
+    version: tuple[int, int, int] = (0, 1, 0)
+    focal_mm: float = math.nan
+    sensor_mm: tuple[float, float] = (math.nan, math.nan)
+    size_px: tuple[int, int] = (0, 0)
+    gimbal_device: int = 0
+    definition_uri: str = ""
+    definition_version: int = 0
+    stream_uri: str = ""  # of a live picture, when we offer one
+    stream_hz: float = 0.0
+    min_interval_s: float = 0.2
+
+    def __post_init__(self) -> None:
+        if len(self.vendor) > 31 or len(self.model) > 31:
+            raise ValueError("camera vendor and model may have 31 characters at most")
+        if len(self.definition_uri) > 139 or len(self.stream_uri) > 159:
+            raise ValueError("camera definition and stream addresses are too long for MAVLink")
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeReport:
+    """A keyframe as the operator's ground station shows it; unknown parts are None."""
+
+    unix_us: int = 0
+    lat_deg: float | None = None
+    lon_deg: float | None = None
+    alt_amsl_m: float | None = None
+    alt_agl_m: float | None = None
+    q_ned_camera_wxyz: tuple[float, float, float, float] | None = None  # of the head, FRD
+    ok: bool = True
+    url: str = ""
+
+
+class CameraComponent:
+    """The camera's messages, shots and series. ``now`` is our time in ns."""
+
+    def __init__(
+        self,
+        config: CameraConfig,
+        control: ScanControl,
+        outbox: Outbox,
+        streams: Streams,
+        boot_ms: Callable[[], int],
+        now: Callable[[], int],
+    ) -> None:
+        self.config = config
+        self._control = control
+        self._outbox = outbox
+        self._streams = streams
+        self._boot_ms = boot_ms
+        self._now = now
+        self._count = 0
+        self._kept: deque[tuple[int, int, KeyframeReport]] = deque(maxlen=KEPT)  # index, boot ms
+        self._shots: deque[tuple[Address, float]] = deque(maxlen=64)
+        self._waiting: deque[int] = deque()  # times at which shots are given up
+        self._series: tuple[float, int] | None = None  # interval in s, how many are left (0: any)
+        self._next_shot_ns = 0
+        streams.add(CAMERA, CAPTURE_STATUS, -1, self.send_capture_status)
+
+    # What commands ask for.
+
+    def stream_status(self, hz: float) -> None:
+        """Send CAMERA_CAPTURE_STATUS at a rate; 0 ends it."""
+        interval = -1 if hz <= 0.0 else max(20_000, round(1e6 / max(hz, 1e-3)))
+        self._streams.set_interval(CAMERA, CAPTURE_STATUS, interval)
+
+    def is_new_shot(self, source: Address, sequence: float) -> bool:
+        """True the first time a numbered shot of a sender comes."""
+        if (source, sequence) in self._shots:
+            return False
+        self._shots.append((source, sequence))
+        return True
+
+    def shoot(self) -> Handled:
+        """Ask for one keyframe; the picture is reported when it is there."""
+        handled = self._control.capture_keyframe()
+        if isinstance(handled, Work) or handled.result is Result.ACCEPTED:
+            self._waiting.append(self._now() + SHOT_TIMEOUT_NS)
+            self.send_capture_status()
+        return handled
+
+    def shoot_every(self, interval_s: float, count: int) -> Handled:
+        """Start a series; the first shot is taken now. A count of 0 goes on until stopped."""
+        first = self.shoot()
+        if isinstance(first, Answer) and first.result is not Result.ACCEPTED:
+            return first
+        self._series = (interval_s, count - 1 if count else 0) if count != 1 else None
+        self._next_shot_ns = self._now() + round(interval_s * S)
+        return ACCEPTED
+
+    def stop_shooting(self) -> None:
+        """End the series."""
+        self._series = None
+        self.send_capture_status()
+
+    def reset_image_log(self) -> None:
+        """Start counting keyframes at zero again."""
+        self._count = 0
+        self._kept.clear()
+
+    # What the service tells.
+
+    def report(self, keyframe: KeyframeReport) -> int:
+        """Tell everyone of a keyframe; its index comes back."""
+        index = self._count
+        self._count += 1
+        boot_ms = self._boot_ms()
+        self._kept.append((index, boot_ms, keyframe))
+        self._outbox.put(CAMERA, self._image_captured(index, boot_ms, keyframe))
+        if self._waiting:
+            self._waiting.popleft()
+            self.send_capture_status()
+        return index
+
+    def tick(self, now_ns: int) -> None:
+        """Take the next shot of a series; give up shots that never came."""
+        while self._waiting and now_ns >= self._waiting[0]:
+            self._waiting.popleft()
+            failed = KeyframeReport(ok=False)
+            self._outbox.put(CAMERA, self._image_captured(self._count, self._boot_ms(), failed))
+            self.send_capture_status()
+        if self._series is None or now_ns < self._next_shot_ns:
+            return
+        interval_s, left = self._series
+        self._next_shot_ns = max(now_ns, self._next_shot_ns + round(interval_s * S))
+        self._series = None if left == 1 else (interval_s, max(0, left - 1))
+        handled = self.shoot()
+        if isinstance(handled, Answer) and handled.result is not Result.ACCEPTED:
+            self._series = None
+
+    def next_timer(self) -> int | None:
+        """When :meth:`tick` has something to do, in ns."""
+        times = [self._waiting[0]] if self._waiting else []
+        if self._series is not None:
+            times.append(self._next_shot_ns)
+        return min(times, default=None)
+
+    # Messages.
+
+    def message(self, number: int, index: int) -> object | None:
+        """The message asked for by its number; None when we have no such message."""
+        if number == 263:
+            kept = next((kept for kept in self._kept if kept[0] == index), None)
+            return None if kept is None else self._image_captured(*kept)
+        if number in (269, 270) and not self.config.stream_uri:
+            return None
+        maker = self._MAKERS.get(number)
+        return None if maker is None else maker(self)
+
+    def send_capture_status(self) -> None:
+        """Send CAMERA_CAPTURE_STATUS to everyone."""
+        self._outbox.put(CAMERA, self._capture_status())
+
+    def _information(self) -> object:
+        c = self.config
+        flags = CAP_VIDEO | CAP_IMAGE | CAP_IMAGE_IN_VIDEO | CAP_VIDEO_IN_IMAGE
+        flags |= CAP_STREAM if c.stream_uri else 0
+        major, minor, patch = c.version
+        return dialect.MAVLink_camera_information_message(
+            self._boot_ms(),
+            list(c.vendor.encode().ljust(32, b"\0")),
+            list(c.model.encode().ljust(32, b"\0")),
+            patch << 16 | minor << 8 | major,
+            c.focal_mm,
+            *c.sensor_mm,
+            *c.size_px,
+            0,
+            flags,
+            c.definition_version,
+            c.definition_uri.encode(),
+            c.gimbal_device,
+        )
+
+    def _settings(self) -> object:
+        return dialect.MAVLink_camera_settings_message(self._boot_ms(), 1, math.nan, math.nan)
+
+    def _storage(self) -> object:
+        status = self._control.status()
+        total, free = status.storage_total_mib, status.storage_free_mib
+        known = total > 0.0
+        return dialect.MAVLink_storage_information_message(
+            self._boot_ms(),
+            1,
+            1,
+            2 if known else 3,  # ready, or not supported
+            total,
+            max(0.0, total - free),
+            free,
+            math.nan,
+            math.nan,
+            254 if known else 0,  # a kind of storage without a name of its own
+            b"scans",
+        )
+
+    def _capture_status(self) -> object:
+        status = self._control.status()
+        busy, series = bool(self._waiting), self._series is not None
+        image_status = (3 if busy else 2) if series else int(busy)
+        return dialect.MAVLink_camera_capture_status_message(
+            self._boot_ms(),
+            image_status,
+            int(status.is_recording),
+            0.0 if self._series is None else self._series[0],
+            status.recording_ms & 0xFFFFFFFF,
+            status.storage_free_mib,
+            self._count,
+        )
+
+    def _stream_information(self) -> object:
+        c = self.config
+        return dialect.MAVLink_video_stream_information_message(
+            1, 1, 0, 1, c.stream_hz, *c.size_px, 0, 0, 0, b"scan", c.stream_uri.encode()
+        )
+
+    def _stream_status(self) -> object:
+        c = self.config
+        return dialect.MAVLink_video_stream_status_message(1, 1, c.stream_hz, *c.size_px, 0, 0, 0)
+
+    def _image_captured(self, index: int, boot_ms: int, k: KeyframeReport) -> object:
+        return dialect.MAVLink_camera_image_captured_message(
+            boot_ms,
+            max(0, k.unix_us),
+            0,
+            _scaled(k.lat_deg, 1e7),
+            _scaled(k.lon_deg, 1e7),
+            _scaled(k.alt_amsl_m, 1e3),
+            _scaled(k.alt_agl_m, 1e3),
+            list(k.q_ned_camera_wxyz or (math.nan,) * 4),
+            index & 0x7FFFFFFF,
+            int(k.ok),
+            k.url.encode()[:204],
+        )
+
+    _MAKERS = {  # noqa: RUF012
+        259: _information,
+        260: _settings,
+        261: _storage,
+        262: _capture_status,
+        269: _stream_information,
+        270: _stream_status,
+    }
+
+
+def _scaled(value: float | None, scale: float) -> int:
+    if value is None or not math.isfinite(value):
+        return UNKNOWN_I32
+    return max(-(2**31), min(2**31 - 1, round(value * scale)))

@@ -1,0 +1,228 @@
+"""The command protocol: each call is checked, carried out once and answered.
+
+The rules are those of the MAVLink command service: an answer at once, IN_PROGRESS while
+bounded work runs and a final answer after it, TEMPORARILY_REJECTED for the same command while
+one runs, UNSUPPORTED for what is not known. Clients do not count their retransmissions
+reliably, so a repetition is known by its content: the last command carried out
+is answered again, not carried out again, when it comes again within its window. A stop is
+carried out every time, also while other work of the same command runs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from mavlink.component.control import Answer, Handled, Result, Work
+from mavlink.component.status import INFO, WARNING
+from mavlink.wire.dialect import dialect
+from mavlink.wire.messages import Address, Outbox
+
+INT_UNSET = 0x7FFFFFFF
+PROGRESS_EVERY_NS = 500_000_000
+WORK_LIMIT_NS = 180_000_000_000
+S = 1_000_000_000
+BUSY = Answer(Result.TEMPORARILY_REJECTED, "busy")
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """A command as it came; parameters that were not set are NaN."""
+
+    number: int
+    params: tuple[float, float, float, float, float, float, float]
+    source: Address
+    target: Address
+    link: int
+
+    def param(self, k: int, default: float) -> float:
+        """Parameter k (1 to 7), or the default when it was not set."""
+        value = self.params[k - 1]
+        return value if math.isfinite(value) else default
+
+    @property
+    def is_broadcast(self) -> bool:
+        """True when the asker did not say which component."""
+        return self.target.component == 0
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What carries out a command."""
+
+    components: frozenset[int]  # of ours that take it
+    window_s: float  # how long a repetition is a retransmission; 0 for questions
+    handle: Callable[[Call, Any], Handled | None]  # None: it is not meant for this component
+
+
+def decode_call(message: Any, link: int) -> Call | None:
+    """The call in a COMMAND_LONG or COMMAND_INT; None for any other message."""
+    kind = message.get_type()
+    if kind == "COMMAND_LONG":
+        last = (message.param5, message.param6, message.param7)
+    elif kind == "COMMAND_INT":
+        x, y = (math.nan if v == INT_UNSET else float(v) for v in (message.x, message.y))
+        last = (x, y, message.z)
+    else:
+        return None
+    first = (message.param1, message.param2, message.param3, message.param4)
+    return Call(
+        message.command,
+        (*first, *last),
+        Address(message.get_srcSystem(), message.get_srcComponent()),
+        Address(message.target_system, message.target_component),
+        link,
+    )
+
+
+def _key(call: Call) -> tuple[object, ...]:
+    """Equal for a call and its repetition; NaN, which equals nothing, goes by its name."""
+    return (call.source, call.number, *map(str, call.params))
+
+
+@dataclass(slots=True)
+class _Running:
+    call: Call
+    key: tuple[object, ...]
+    window_ns: int
+    work: Work
+    until_ns: int
+    next_report_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Done:
+    key: tuple[object, ...]
+    answer: Answer
+    until_ns: int
+
+
+class CommandDesk:
+    """Takes calls for our components and answers them through an outbox."""
+
+    def __init__(
+        self,
+        commands: Mapping[int, Command],
+        outbox: Outbox,
+        host: Any,
+        say: Callable[[int, str], None],
+        is_stop: Callable[[Call], bool],
+    ) -> None:
+        """``say`` gets the severity and text of answers."""
+        self._commands, self._is_stop = commands, is_stop
+        self._outbox = outbox
+        self._host = host
+        self._say = say
+        self._running: dict[tuple[int, int], _Running] = {}  # (component, number)
+        self._last: _Done | None = None  # of either component: they act on one scan
+
+    def receive(self, call: Call, components: tuple[int, ...], now_ns: int) -> None:
+        """Carry out a call for one of our components (which the caller has checked)."""
+        command = self._commands.get(call.number)
+        if call.is_broadcast:
+            mine = [c for c in components if command is not None and c in command.components]
+            if not mine:
+                return  # somebody else's; two refusals from us would only mislead the asker
+            component = mine[0]
+        else:
+            component = call.target.component
+        if command is None or component not in command.components:
+            self._answer(component, call, Answer(Result.UNSUPPORTED))
+            return
+        self._carry_out(component, command, call, now_ns)
+
+    def _carry_out(self, component: int, command: Command, call: Call, now_ns: int) -> None:
+        key = (component, *_key(call))
+        running = self._running.get((component, call.number))
+        is_stop = self._is_stop(call)
+        if running is not None and not is_stop:
+            self._answer_while(running, component, call, key)
+            return
+        last = self._last
+        if last is not None and not is_stop and last.key == key and now_ns < last.until_ns:
+            self._answer(component, call, Answer(last.answer.result))
+            return
+        handled = command.handle(call, self._host)
+        if running is not None and isinstance(handled, Work):
+            self._answer_while(running, component, call, key)
+        elif handled is None:
+            if not call.is_broadcast:
+                self._answer(component, call, Answer(Result.DENIED))
+        elif isinstance(handled, Work):
+            window_ns = int(command.window_s * S)
+            limit_ns, report_ns = now_ns + WORK_LIMIT_NS, now_ns + PROGRESS_EVERY_NS
+            running = _Running(call, key, window_ns, handled, limit_ns, report_ns)
+            self._start(component, running, now_ns)
+        else:
+            self._answer(component, call, handled)
+            self._remember(key, handled, now_ns, int(command.window_s * S))
+
+    def _answer_while(
+        self, running: _Running, component: int, call: Call, key: tuple[object, ...]
+    ) -> None:
+        """Answer by how the work of this command goes; the end of only one can be reported."""
+        if running.key == key:
+            self._progress(component, call, running.work)
+        else:
+            self._answer(component, call, BUSY)
+
+    def _remember(
+        self, key: tuple[object, ...], answer: Answer, now_ns: int, window_ns: int
+    ) -> None:
+        """A question leaves no trace, so that it does not hide what was done before it."""
+        if window_ns:
+            self._last = _Done(key, answer, now_ns + window_ns)
+
+    def _start(self, component: int, running: _Running, now_ns: int) -> None:
+        call, work = running.call, running.work
+        self._last = None
+        self._running[(component, call.number)] = running
+        if work.answer is None:
+            self._progress(component, call, work)
+        self.tick(now_ns)
+
+    def cancel(self, number: int, source: Address, now_ns: int) -> bool:
+        """Ask running work of this number to end; True when there was some."""
+        found = [r for (_, n), r in self._running.items() if n == number]
+        for running in found:
+            running.work.cancel()
+        self.tick(now_ns)
+        return bool(found)
+
+    def tick(self, now_ns: int) -> None:
+        """Tell askers how their work goes on, and how it ended."""
+        for (component, number), running in list(self._running.items()):
+            answer = running.work.answer
+            if answer is None and now_ns >= running.until_ns:
+                running.work.cancel()
+                answer = Answer(Result.FAILED, "took too long")
+            if answer is not None:
+                del self._running[(component, number)]
+                if running.work.cancelled and answer.result is Result.ACCEPTED:
+                    answer = Answer(Result.CANCELLED)
+                self._answer(component, running.call, answer)
+                self._remember(running.key, answer, now_ns, running.window_ns)
+            elif now_ns >= running.next_report_ns:
+                running.next_report_ns = now_ns + PROGRESS_EVERY_NS
+                self._progress(component, running.call, running.work)
+
+    def next_timer(self) -> int | None:
+        """When :meth:`tick` has something to do, in ns; None when nothing runs."""
+        return min((r.next_report_ns for r in self._running.values()), default=None)
+
+    def _progress(self, component: int, call: Call, work: Work) -> None:
+        percent = min(99, int(100 * work.fraction))
+        self._ack(component, call, Result.IN_PROGRESS, percent)
+
+    def _answer(self, component: int, call: Call, answer: Answer) -> None:
+        self._ack(component, call, answer.result, 255)
+        if answer.text:
+            self._say(INFO if answer.result is Result.ACCEPTED else WARNING, answer.text)
+
+    def _ack(self, component: int, call: Call, result: Result, progress: int) -> None:
+        message = dialect.MAVLink_command_ack_message(
+            call.number, int(result), progress, 0, call.source.system, call.source.component
+        )
+        self._outbox.put(component, message, call.link)

@@ -1,0 +1,285 @@
+"""The commands that our components carry out: a function each, a line in :data:`COMMANDS`.
+
+Windows: for so long the same call again is a retransmission. Questions have none; they may be
+asked again at will.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from mavlink.component.command_desk import Call, Command
+from mavlink.component.control import ACCEPTED, Answer, Handled, Phase, Power, Result
+from mavlink.wire.first_beat import CAMERA, ONBOARD
+
+if TYPE_CHECKING:
+    from mavlink.component.companion import Companion
+
+MAX_SERIES_INTERVAL_S = 3600.0
+MAX_SHOTS = 100_000
+MIN_MESSAGE_US, MAX_MESSAGE_US = 20_000, 3.6e9
+GET_MESSAGE_INTERVAL = 510
+PAUSE, RESUME, CLEAR_MAP, BASELINE, FINALISE, SELF_TEST, START, STOP = range(1, 9)
+"""Actions of USER_1, its param 1."""
+
+STOPS: dict[int, tuple[int, tuple[float, ...]]] = {
+    2501: (0, ()),
+    2001: (0, ()),
+    200: (4, (0.0,)),
+    31010: (1, (FINALISE, STOP)),
+}
+"""Commands that stop: number to the parameter that says so and its values (0: always)."""
+
+
+def is_stop(call: Call) -> bool:
+    """True for a call that stops something: it is carried out however often it comes."""
+    k, values = STOPS.get(call.number, (1, ()))
+    return k == 0 or call.param(k, math.nan) in values
+
+
+# The scan.
+
+
+def start_scan(call: Call, host: Companion) -> Handled:
+    """VIDEO_START_CAPTURE: start a scan, or end its pause; starting twice is one start.
+
+    Param 2 asks for CAMERA_CAPTURE_STATUS at that rate in Hz (0: none).
+    """
+    return _start(host, call.param(2, 0.0))
+
+
+def stop_scan(call: Call, host: Companion) -> Handled:
+    """VIDEO_STOP_CAPTURE: close the scan; accepted also when nothing runs: it is stopped."""
+    return _stop(host, host.control.stop_scan)
+
+
+def control_video(call: Call, host: Companion) -> Handled:
+    """DO_CONTROL_VIDEO, the old way to start (param 4 = 1 or 2) and stop (0) recording."""
+    recording = call.param(4, -1.0)
+    if recording in (1.0, 2.0):
+        return _start(host)
+    if recording == 0.0:
+        return _stop(host, host.control.stop_scan)
+    return Answer(Result.DENIED, "DO_CONTROL_VIDEO: param 4 must be 0, 1 or 2")
+
+
+def _start(host: Companion, status_hz: float = 0.0) -> Handled:
+    """Start a scan unless one takes frames, and send the camera's status at a rate."""
+    phase = host.control.status().phase
+    host.camera.stream_status(status_hz)
+    handled = ACCEPTED if phase is Phase.SCANNING else host.control.start_scan()
+    host.camera.send_capture_status()
+    return handled
+
+
+def _stop(host: Companion, how: Callable[[], Handled]) -> Handled:
+    """End the scan, its retries, the series of keyframes and the stream of the camera's status.
+
+    ``how`` is the control's way to stop. It is called whatever its state is: a scan may be
+    wanted although none runs.
+    """
+    host.camera.stream_status(0.0)
+    handled = how()
+    host.camera.stop_shooting()
+    return handled
+
+
+def set_baseline(call: Call, host: Companion) -> Handled:
+    """DO_SET_CAM_TRIGG_DIST: its distance is the virtual stereo baseline.
+
+    Param 1: metres, 0 lets it follow the altitude; param 3 = 1 takes a keyframe now.
+    """
+    answer = host.parameters.change("SR_BASELINE_M", call.param(1, 0.0))
+    if answer.result is Result.ACCEPTED and call.param(3, 0.0) == 1.0:
+        host.camera.shoot()
+    return answer
+
+
+def user(call: Call, host: Companion) -> Handled:
+    """USER_1 to the onboard computer: what no standard command says, by param 1.
+
+    1 pause, 2 resume, 3 clear the map, 4 baseline of param 2 metres (0: automatic),
+    5 finalise, 6 self-test, 7 start a scan, 8 stop it.
+    """
+    control, action = host.control, call.param(1, 0.0)
+    if action in (PAUSE, RESUME):
+        if not control.status().is_recording:
+            return Answer(Result.TEMPORARILY_REJECTED, "no scan is running")
+        return control.pause() if action == PAUSE else control.resume()
+    if action == CLEAR_MAP:
+        return control.clear_map()
+    if action == BASELINE:
+        return host.parameters.change("SR_BASELINE_M", call.param(2, 0.0))
+    if action == SELF_TEST:
+        if control.status().phase is not Phase.IDLE:
+            return Answer(Result.TEMPORARILY_REJECTED, "stop the scan before the self-test")
+        return control.self_test()
+    if action == START:
+        return _start(host)
+    if action in (FINALISE, STOP):
+        return _stop(host, control.finalise if action == FINALISE else control.stop_scan)
+    return Answer(Result.DENIED, "unknown action of USER_1; 1 to 8 are known")
+
+
+# Keyframes.
+
+
+def start_capture(call: Call, host: Companion) -> Handled:
+    """IMAGE_START_CAPTURE: one keyframe now, or several at an interval.
+
+    Param 2: interval in s, param 3: count (0: until stopped), param 4: sequence. A single shot
+    with a sequence number is taken once however often it comes. Without a number a repetition
+    within a moment is the same call heard on two links.
+    """
+    interval_s, count = call.param(2, 0.0), call.param(3, 1.0)
+    if not 0.0 <= interval_s <= MAX_SERIES_INTERVAL_S or not 0.0 <= count <= MAX_SHOTS:
+        return Answer(Result.DENIED, "photo refused: interval or count is out of range")
+    if count == 1.0:
+        sequence = call.param(4, 0.0)
+        if sequence > 0.0 and not host.camera.is_new_shot(call.source, sequence):
+            return ACCEPTED
+        return host.camera.shoot()
+    if interval_s < host.camera.config.min_interval_s:
+        return Answer(Result.DENIED, "photo refused: the interval is too short")
+    return host.camera.shoot_every(interval_s, int(count))
+
+
+def stop_capture(call: Call, host: Companion) -> Handled:
+    """IMAGE_STOP_CAPTURE: end a series of keyframes; accepted when there is none."""
+    host.camera.stop_shooting()
+    return ACCEPTED
+
+
+def digicam(call: Call, host: Companion) -> Handled:
+    """DO_DIGICAM_CONTROL: one keyframe when param 5 = 1 (ArduPilot's CAM1_TYPE=5 sends it).
+
+    Zoom, focus and session are not ours.
+    """
+    return host.camera.shoot() if call.param(5, 0.0) == 1.0 else Answer(Result.UNSUPPORTED)
+
+
+# The computer and its storage.
+
+
+def reboot(call: Call, host: Companion) -> Handled | None:
+    """PREFLIGHT_REBOOT_SHUTDOWN of the companion; refused unless the vehicle is disarmed.
+
+    Param 2: 1 reboots, 2 shuts down; param 3 = 1 with param 4 = 191 restarts the service.
+    """
+    action = {1.0: Power.REBOOT, 2.0: Power.SHUT_DOWN}.get(call.param(2, 0.0))
+    if action is None and call.param(3, 0.0) == 1.0 and call.param(4, 0.0) == ONBOARD:
+        action = Power.RESTART_SERVICE
+    if action is None:
+        return None  # for the autopilot or another component
+    return _unless_disarmed(host, action.value) or host.control.power(action)
+
+
+def erase(call: Call, host: Companion) -> Handled:
+    """STORAGE_FORMAT: erase the finished scans; refused while one runs or unless disarmed.
+
+    Param 1: storage (1, or 0 for all), param 2 = 1 erases, param 3 = 1 resets the count.
+    """
+    if call.param(1, 0.0) not in (0.0, 1.0) or call.param(2, 0.0) != 1.0:
+        return Answer(Result.DENIED, "erase refused: storage 1 and param 2 = 1 are needed")
+    if host.control.status().phase is not Phase.IDLE:
+        return Answer(Result.TEMPORARILY_REJECTED, "erase refused while scanning")
+    refusal = _unless_disarmed(host, "erase")
+    if refusal is not None:
+        return refusal
+    if call.param(3, 0.0) == 1.0:
+        host.camera.reset_image_log()
+    return host.control.erase_scans()
+
+
+def _unless_disarmed(host: Companion, what: str) -> Answer | None:
+    """The refusal; None where the autopilot said a moment ago that it is disarmed."""
+    if host.presence.is_armed:
+        return Answer(Result.TEMPORARILY_REJECTED, f"{what} refused while armed")
+    if not host.is_disarmed:
+        text = f"{what} refused: no autopilot says that it is disarmed"
+        return Answer(Result.TEMPORARILY_REJECTED, text)
+    return None
+
+
+def reset_settings(call: Call, host: Companion) -> Handled:
+    """RESET_CAMERA_SETTINGS: every parameter to its default (param 1 = 1); not while scanning."""
+    if call.param(1, 0.0) != 1.0:
+        return Answer(Result.DENIED, "reset refused: param 1 must be 1")
+    if host.control.status().phase is not Phase.IDLE:
+        return Answer(Result.TEMPORARILY_REJECTED, "reset refused while scanning")
+    host.parameters.reset()
+    return ACCEPTED
+
+
+# Questions.
+
+
+def request_message(call: Call, host: Companion) -> Handled | None:
+    """REQUEST_MESSAGE: send the message of a number (param 1) from the component asked.
+
+    UNSUPPORTED when that one has no such message. Where all are asked it comes from the first
+    that has it.
+    """
+    asked = (CAMERA, ONBOARD) if call.is_broadcast else (call.target.component,)
+    number = int(call.param(1, -1.0))
+    index = int(max(-1.0, min(2.0**31, call.param(2, 0.0))))
+    if any(host.send_requested(c, number, index, call.link) for c in asked):
+        return ACCEPTED
+    return None if call.is_broadcast else Answer(Result.UNSUPPORTED)
+
+
+CAMERA_MESSAGES = {521: 259, 522: 260, 525: 261, 527: 262, 2504: 269, 2505: 270}
+"""Older questions about the camera, of older ground stations: command to message."""
+
+
+def request_camera(call: Call, host: Companion) -> Handled:
+    """Send the message that the command stands for; 525 puts the answer flag in param 2."""
+    flag = 2 if call.number == 525 else 1
+    if call.number not in (2504, 2505) and call.param(flag, 1.0) != 1.0:
+        return ACCEPTED  # asked for nothing
+    sent = host.send_requested(CAMERA, CAMERA_MESSAGES[call.number], 0, call.link)
+    return ACCEPTED if sent else Answer(Result.UNSUPPORTED)
+
+
+def message_interval(call: Call, host: Companion) -> Handled | None:
+    """SET_MESSAGE_INTERVAL and GET_MESSAGE_INTERVAL for the messages that we can repeat.
+
+    Param 1: message, param 2: interval in us, 0 for the default, -1 for never.
+    """
+    if call.is_broadcast:
+        return None
+    component, number = call.target.component, int(call.param(1, -1.0))
+    if not host.streams.can_repeat(component, number):
+        return Answer(Result.UNSUPPORTED)
+    if call.number == GET_MESSAGE_INTERVAL:
+        host.streams.send_interval(component, number, call.link)
+        return ACCEPTED
+    interval_us = call.param(2, 0.0)
+    if 0.0 < interval_us < MIN_MESSAGE_US or interval_us > MAX_MESSAGE_US:
+        return Answer(Result.DENIED)
+    host.streams.set_interval(component, number, int(interval_us))
+    return ACCEPTED
+
+
+_CAMERA, _ONBOARD = frozenset({CAMERA}), frozenset({ONBOARD})
+
+COMMANDS: dict[int, Command] = {
+    2500: Command(_CAMERA, 3.0, start_scan),
+    2501: Command(_CAMERA, 3.0, stop_scan),
+    200: Command(_CAMERA, 3.0, control_video),
+    206: Command(_CAMERA | _ONBOARD, 3.0, set_baseline),
+    31010: Command(_ONBOARD, 3.0, user),
+    2000: Command(_CAMERA, 0.3, start_capture),
+    2001: Command(_CAMERA, 3.0, stop_capture),
+    203: Command(_CAMERA, 0.3, digicam),
+    246: Command(_ONBOARD, 3.0, reboot),
+    526: Command(_CAMERA, 3.0, erase),
+    529: Command(_CAMERA, 3.0, reset_settings),
+    512: Command(_CAMERA | _ONBOARD, 0.0, request_message),
+    **{number: Command(_CAMERA, 0.0, request_camera) for number in CAMERA_MESSAGES},
+    511: Command(_CAMERA | _ONBOARD, 0.0, message_interval),
+    GET_MESSAGE_INTERVAL: Command(_CAMERA | _ONBOARD, 0.0, message_interval),
+}
+"""MAV_CMD to what carries it out. The next command is one function and one line."""

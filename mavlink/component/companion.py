@@ -1,0 +1,313 @@
+"""The companion computer on the vehicle's network: packets in, messages out.
+
+No sockets and no clocks: ``receive(link, packet, now_ns)``, ``tick(now_ns)``, ``take()`` and
+``next_timer()``. :mod:`mavlink.component.vehicle` puts it on real links.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from mavlink.component import status as texts
+from mavlink.component.autopilot_link import WANTED_HZ, AutopilotLink
+from mavlink.component.camera import CAPTURE_STATUS, CameraComponent, CameraConfig, KeyframeReport
+from mavlink.component.command_desk import CommandDesk, decode_call
+from mavlink.component.commands import COMMANDS, is_stop
+from mavlink.component.control import Answer, Result, ScanControl
+from mavlink.component.ftp import FileServer
+from mavlink.component.link_watch import LinkWatch, WatchConfig
+from mavlink.component.metadata import (
+    DEFINITION,
+    DEFINITION_URI,
+    ComponentMetadata,
+    camera_definition,
+    definition_version,
+)
+from mavlink.component.metadata import NUMBER as METADATA
+from mavlink.component.parameters import YAW_FRAME, ExtendedParameters, Parameters, with_defaults
+from mavlink.component.presence import Presence
+from mavlink.component.status import ComputerLoad, StatusTexts, computer_status, motion_values
+from mavlink.telemetry.decode import READERS
+from mavlink.telemetry.gimbal import YAW_FRAMES
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.wire.dialect import COMMAND_CANCEL, numbers_of
+from mavlink.wire.first_beat import CAMERA, ONBOARD
+from mavlink.wire.framing import Decoder, Packet, TelemetryDecoder
+from mavlink.wire.messages import Address, Outbox, Outgoing, Streams
+
+S = 1_000_000_000
+MS = 1_000_000
+COMPONENTS = (ONBOARD, CAMERA)
+HEARTBEAT, SYSTEM_TIME, FILE_TRANSFER, TIMESYNC = 0, 2, 110, 111
+LOAD_STATUS, MOTION = 390, 251
+SERVED = (
+    "HEARTBEAT",
+    "SYSTEM_TIME",
+    "COMMAND_LONG",
+    "COMMAND_INT",
+    "FILE_TRANSFER_PROTOCOL",
+    "TIMESYNC",
+    "PARAM_REQUEST_READ",
+    "PARAM_REQUEST_LIST",
+    "PARAM_SET",
+    "PARAM_EXT_REQUEST_READ",
+    "PARAM_EXT_REQUEST_LIST",
+    "PARAM_EXT_SET",
+)
+HEARD = numbers_of((*READERS, *SERVED)) | {COMMAND_CANCEL}
+"""Numbers of the messages with which :meth:`Companion.receive` does something."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompanionConfig:
+    """What the companion asks for and offers."""
+
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    parameters: Mapping[str, float] = field(default_factory=dict)  # defaults of this aircraft
+    wanted_hz: Mapping[str, float] = field(default_factory=lambda: dict(WANTED_HZ))
+    watch: WatchConfig = field(default_factory=WatchConfig)
+    load_every_s: float = 2.0
+    motion_every_s: float = 1.0
+
+
+class Companion:
+    """Everything that our two components say and do, apart from their heartbeats."""
+
+    def __init__(
+        self,
+        config: CompanionConfig,
+        control: ScanControl,
+        presence: Presence,
+        history: VehicleHistory,
+        now_ns: int,
+        kept_parameters: Mapping[str, float] | None = None,
+        unix_us: Callable[[], int] = lambda: 0,
+    ) -> None:
+        self.config = config
+        self.control = control
+        self.presence = presence
+        self.history = history
+        self.counts: Counter[str] = Counter()
+        self.load: ComputerLoad | None = None  # not measured yet
+        self._unix_us = unix_us
+        self._listeners: dict[str, list[Callable[[Any], None]]] = {}
+        self._start_ns = self._now_ns = now_ns
+        self._outbox = Outbox()
+        self._decoder, self._telemetry = Decoder(), TelemetryDecoder(READERS)
+        self.autopilot = AutopilotLink(presence, history, self._outbox, config.wanted_hz, self.say)
+        self.streams = Streams(self._outbox)
+        self.texts = StatusTexts(self._outbox)
+        self.parameters = Parameters(
+            self._outbox,
+            self._parameter_changed,
+            kept_parameters,
+            with_defaults(config.parameters),
+        )
+        self._extended = ExtendedParameters(self.parameters, self._outbox)
+        table = self.parameters.table
+        definition = camera_definition(config.camera.vendor, config.camera.model, table)
+        self._metadata = ComponentMetadata(config.camera, table)
+        self._files = FileServer({DEFINITION: definition, **self._metadata.files})
+        self.camera = CameraComponent(
+            _with_definition(config.camera, definition_version(table)),
+            control,
+            self._outbox,
+            self.streams,
+            self._boot_ms,
+            lambda: self._now_ns,
+        )
+        self.desk = CommandDesk(COMMANDS, self._outbox, self, self._answer, is_stop)
+        self.streams.add(ONBOARD, LOAD_STATUS, round(config.load_every_s * 1e6), self._send_load)
+        self.streams.add(ONBOARD, MOTION, round(config.motion_every_s * 1e6), self._send_motion)
+        self.watch = LinkWatch(config.watch, presence, now_ns)
+        self._is_recording, self._watch_ns = False, now_ns
+
+    # In.
+
+    def receive(self, link: int, packet: Packet, now_ns: int) -> None:
+        """Take in one packet that arrived on a link at ``now_ns`` (monotonic)."""
+        self._now_ns = max(self._now_ns, now_ns)
+        self.counts["packets"] += 1
+        self.presence.count(packet.system, packet.component)
+        if packet.message_id == COMMAND_CANCEL:
+            self._cancel(packet, now_ns)
+            return
+        message = self._telemetry.message(packet) or self._decoder.message(packet)
+        if message is None:
+            self.counts["not understood"] += 1
+            return
+        name = message.get_type()
+        for listener in self._listeners.get(name, ()):
+            listener(message)
+        if packet.message_id == HEARTBEAT:
+            self.presence.hear(message, now_ns)
+            self.autopilot.follow()
+            if (packet.system, packet.component) == self.presence.autopilot:
+                self.autopilot.link = link
+        elif name in READERS:
+            self.autopilot.hear_telemetry(name, message, packet, now_ns)
+        elif name.startswith("COMMAND_"):
+            self._hear_command(message, link, now_ns)
+        elif name.startswith("PARAM_"):
+            self._hear_parameter(message, name)
+        elif packet.message_id == SYSTEM_TIME:
+            self.autopilot.hear_system_time(message, packet, now_ns)
+        elif packet.message_id == FILE_TRANSFER:
+            self._hear_file_request(message, link)
+        elif packet.message_id == TIMESYNC:
+            self.autopilot.hear_timesync(message, packet, link, now_ns)
+        self.watch.hear(packet, message, now_ns)  # by now it is known whose heartbeat it was
+
+    def _hear_command(self, message: Any, link: int, now_ns: int) -> None:
+        call = decode_call(message, link)
+        if call is None or not self._is_for_us(call.target):
+            return
+        self.counts["commands"] += 1
+        self.desk.receive(call, COMPONENTS, now_ns)
+
+    @property
+    def is_disarmed(self) -> bool:
+        """True only where the autopilot said so a moment ago."""
+        return self.presence.is_disarmed(self._now_ns)
+
+    def _is_for_us(self, target: Address) -> bool:
+        ours = target.system in (0, self.presence.system)
+        return ours and (target.component == 0 or target.component in COMPONENTS)
+
+    def _cancel(self, packet: Packet, now_ns: int) -> None:
+        # uint16 command, uint8 target system, uint8 target component; zeros at the end are cut.
+        payload = packet.data[10 : 10 + packet.data[1]] if packet.data[0] == 0xFD else b""
+        payload = payload.ljust(4, b"\0")
+        number = payload[0] | payload[1] << 8
+        if self._is_for_us(Address(payload[2], payload[3])):
+            self.desk.cancel(number, Address(packet.system, packet.component), now_ns)
+
+    def _hear_parameter(self, message: Any, name: str) -> None:
+        target = getattr(message, "target_system", None)
+        if target is None or target not in (0, self.presence.system):
+            return
+        extended = name.startswith("PARAM_EXT_")
+        if message.target_component not in (0, CAMERA if extended else ONBOARD):
+            return
+        answer = (self._extended if extended else self.parameters).receive(message)
+        if isinstance(answer, Answer) and answer.text:
+            self._answer(texts.WARNING, answer.text)
+
+    def _hear_file_request(self, message: Any, link: int) -> None:
+        target = Address(message.target_system, message.target_component)
+        if target.component == 0 or not self._is_for_us(target):
+            return
+        self._files.serve(message, link, self._outbox)
+
+    def _parameter_changed(self, name: str, value: float) -> Answer:
+        answer = self.control.parameter_changed(name, value)
+        if name == YAW_FRAME and answer.result is Result.ACCEPTED:
+            self._set_yaw_frame(value)
+        return answer
+
+    def announce_kept(self) -> None:
+        """Tell the service the parameters that were kept from an earlier run."""
+        for name, value in self.parameters.kept().items():
+            answer = self._parameter_changed(name, value)
+            if answer.result is not Result.ACCEPTED:
+                self.parameters.forget(name)
+
+    def _set_yaw_frame(self, value: float) -> None:
+        gimbal = replace(self.history.config.gimbal, yaw_frame=YAW_FRAMES[round(value)])
+        self.history.set_gimbal(gimbal)
+
+    # Out.
+
+    def take(self) -> list[Outgoing]:
+        """Messages to send now, in order."""
+        return self._outbox.take()
+
+    def tick(self, now_ns: int) -> None:
+        """Do what time asks for."""
+        self._now_ns = max(self._now_ns, now_ns)
+        self.presence.look(now_ns)
+        self.autopilot.follow()
+        for text in self.presence.take_news():
+            self.say(texts.WARNING, text)
+        self.camera.tick(now_ns)
+        self.desk.tick(now_ns)
+        self.streams.tick(now_ns)
+        self.texts.tick(now_ns)
+        self.autopilot.tick(now_ns)
+        self._watch_links(now_ns)
+
+    def _watch_links(self, now_ns: int) -> None:
+        if now_ns < self._watch_ns:
+            return
+        self._watch_ns = now_ns + S
+        was_recording, self._is_recording = self._is_recording, self.control.status().is_recording
+        for text in self.watch.news(now_ns, self._is_recording and not was_recording):
+            self.say(texts.WARNING, text)
+        self.presence.is_ready = not any(t.is_grave for t in self.watch.troubles(now_ns))
+
+    def next_timer(self) -> int:
+        """When :meth:`tick` should be called next, in ns."""
+        times = [
+            t
+            for t in (self.camera.next_timer(), self.desk.next_timer(), self.streams.next_timer())
+            if t is not None
+        ]
+        return min([*times, *self.autopilot.next_timers(self._now_ns), self._now_ns + S])
+
+    def say(self, severity: int, text: str, is_answer: bool = False) -> None:
+        """Send a text to the operator; one that answers a command is never held back."""
+        self.texts.say(severity, text, self._now_ns, is_answer)
+
+    def _answer(self, severity: int, text: str) -> None:
+        self.say(severity, text, is_answer=True)
+
+    def report(self, keyframe: KeyframeReport) -> int:
+        """Tell of a keyframe; its index comes back."""
+        return self.camera.report(keyframe)
+
+    def send(self, message: Any) -> None:
+        """Send a message of the onboard computer to everyone."""
+        self._outbox.put(ONBOARD, message)
+
+    def listen(self, name: str, listener: Callable[[Any], None]) -> None:
+        """Call back with every message of a name, whoever sends it."""
+        self._listeners.setdefault(name, []).append(listener)
+
+    def send_requested(self, component: int, number: int, index: int, link: int) -> bool:
+        """Send a message that was asked for; False when the component has no such message."""
+        if component == CAMERA:
+            message = self.camera.message(number, index)
+        elif number == METADATA:
+            message = self._metadata.message(self._boot_ms())
+        elif number == LOAD_STATUS and self.load is not None:
+            message = computer_status(self.load, self._unix_us(), self._boot_ms())
+        else:
+            message = None
+        if message is None:
+            return False
+        if number == CAPTURE_STATUS:
+            self.camera.send_capture_status()  # everyone's button follows it
+        else:
+            self._outbox.put(component, message, link)
+        return True
+
+    def _send_load(self) -> None:
+        if self.load is not None:
+            self.send(computer_status(self.load, self._unix_us(), self._boot_ms()))
+
+    def _send_motion(self) -> None:
+        for message in motion_values(self.control.status(), self._boot_ms()):
+            self.send(message)
+
+    def _boot_ms(self) -> int:
+        return ((self._now_ns - self._start_ns) // MS) & 0xFFFFFFFF
+
+
+def _with_definition(camera: CameraConfig, version: int) -> CameraConfig:
+    """The camera with our own definition, unless it names another."""
+    if camera.definition_uri:
+        return camera
+    return replace(camera, definition_uri=DEFINITION_URI, definition_version=version)

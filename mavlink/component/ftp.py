@@ -1,0 +1,180 @@
+"""MAVLink FTP, reading only: a few small files (camera definition, metadata) out of memory.
+
+Payload of FILE_TRANSFER_PROTOCOL, little endian: u16 sequence, u8 session, u8 opcode, u8 size,
+u8 opcode answered, u8 burst complete, u8 padding, u32 offset, 239 bytes of data.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from mavlink.wire.dialect import dialect
+from mavlink.wire.messages import Address, Outbox
+
+HEAD = struct.Struct("<HBBBBBBI")
+ROOM = 239
+PAYLOAD = 251
+TERMINATE, RESET, LIST, OPEN, READ = 1, 2, 3, 4, 5
+CRC32, BURST = 14, 15
+ACK, NAK = 128, 129
+BAD_SIZE, BAD_SESSION, NO_SESSIONS, END, UNKNOWN, PROTECTED, NOT_FOUND = 3, 4, 5, 6, 7, 9, 10
+WRITING = frozenset({6, 7, 8, 9, 10, 11, 12, 13})
+MAX_SESSIONS = 8
+MAX_CLIENTS = 16
+BURST_PACKETS = 20
+SELECTOR = re.compile(r"^/?\[;comp=\d{1,3}\]")
+"""What an address has before the path; some clients send it along with the path."""
+
+
+def file_uri(component: int, name: str) -> str:
+    """The address of a file of one of our components, also for who heard of it from another.
+
+    An autopilot may pass on what we say as its own, so the component is always named.
+    """
+    return f"mftp://[;comp={component}]{name}"
+
+
+def file_crc(data: bytes) -> int:
+    """MAVLink's CRC32, which starts at zero and is not inverted at the end."""
+    return zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One request of a client."""
+
+    sequence: int
+    session: int
+    opcode: int
+    size: int
+    offset: int
+    data: bytes
+
+
+def parse_request(payload: bytes) -> Request | None:
+    """The request in a payload; None when it is none."""
+    if len(payload) < HEAD.size:
+        return None
+    sequence, session, opcode, size, _, _, _, offset = HEAD.unpack_from(payload)
+    return Request(sequence, session, opcode, size, offset, payload[HEAD.size :][:ROOM])
+
+
+class FileServer:
+    """Serves files by name; every answer is a full payload."""
+
+    def __init__(self, files: Mapping[str, bytes]) -> None:
+        self._files = dict(files)
+        self._sessions: dict[int, tuple[Address, bytes]] = {}
+        self._last: dict[Address, tuple[int, list[bytes]]] = {}  # for answers that were lost
+
+    def answer(self, payload: bytes, source: Address) -> list[bytes]:
+        """The answers to a request; none to what is no request."""
+        request = parse_request(payload)
+        if request is None or request.opcode in (0, ACK, NAK):
+            return []
+        last = self._last.get(source)
+        if last is not None and last[0] == request.sequence and request.opcode != BURST:
+            return last[1]
+        answers = self._serve(request, source)
+        if source in self._last or len(self._last) < MAX_CLIENTS:
+            self._last[source] = (request.sequence, answers)
+        return answers
+
+    def serve(self, message: Any, link: int, outbox: Outbox) -> None:
+        """Answer a FILE_TRANSFER_PROTOCOL message that is meant for one of our components."""
+        source = Address(message.get_srcSystem(), message.get_srcComponent())
+        for payload in self.answer(bytes(message.payload), source):
+            reply = dialect.MAVLink_file_transfer_protocol_message(
+                0, source.system, source.component, list(payload)
+            )
+            outbox.put(message.target_component, reply, link)
+
+    def _serve(self, r: Request, source: Address) -> list[bytes]:
+        if r.size > ROOM:
+            return [_nak(r, BAD_SIZE)]
+        if r.opcode == RESET:
+            self._sessions = {n: s for n, s in self._sessions.items() if s[0] != source}
+            return [_ack(r, b"")]
+        if r.opcode == LIST:
+            return [self._list(r)]
+        if r.opcode in (OPEN, CRC32):
+            return [self._by_name(r, source)]
+        if r.opcode in WRITING:
+            return [_nak(r, PROTECTED)]
+        if r.opcode not in (TERMINATE, READ, BURST):
+            return [_nak(r, UNKNOWN)]
+        return self._by_session(r, source)
+
+    def _list(self, r: Request) -> bytes:
+        if _name(r).strip("/.") != "":
+            return _nak(r, NOT_FOUND)
+        entries = [f"F{n}\t{len(f)}\0".encode() for n, f in sorted(self._files.items())]
+        if r.offset >= len(entries):
+            return _nak(r, END)
+        data = b""
+        for entry in entries[r.offset :]:
+            if len(data) + len(entry) > ROOM:
+                break
+            data += entry
+        return _ack(r, data)
+
+    def _by_name(self, r: Request, source: Address) -> bytes:
+        file = self._files.get(_name(r).lstrip("/"))
+        if file is None:
+            return _nak(r, NOT_FOUND)
+        if r.opcode == CRC32:
+            return _ack(r, file_crc(file).to_bytes(4, "little"))
+        free = next((n for n in range(MAX_SESSIONS) if n not in self._sessions), None)
+        if free is None:
+            return _nak(r, NO_SESSIONS)
+        self._sessions[free] = (source, file)
+        return _ack(r, len(file).to_bytes(4, "little"), session=free)
+
+    def _by_session(self, r: Request, source: Address) -> list[bytes]:
+        owner, file = self._sessions.get(r.session, (None, b""))
+        if owner != source:
+            return [_nak(r, BAD_SESSION)]
+        if r.opcode == TERMINATE:
+            del self._sessions[r.session]
+            return [_ack(r, b"")]
+        if r.offset >= len(file):
+            return [_nak(r, END)]
+        room = r.size or ROOM
+        if r.opcode == READ:
+            return [_ack(r, file[r.offset : r.offset + room])]
+        end = min(len(file), r.offset + BURST_PACKETS * room)
+        return [
+            _ack(r, file[at : min(at + room, end)], k, at, last=at + room >= end)
+            for k, at in enumerate(range(r.offset, end, room))
+        ]
+
+
+def _name(r: Request) -> str:
+    path = r.data[: r.size].partition(b"\0")[0].decode("ascii", "replace")
+    return SELECTOR.sub("", path)
+
+
+def _ack(
+    r: Request,
+    data: bytes,
+    step: int = 0,
+    offset: int | None = None,
+    last: bool = False,
+    session: int | None = None,
+) -> bytes:
+    at = r.offset if offset is None else offset
+    number = r.session if session is None else session
+    head = HEAD.pack(
+        (r.sequence + 1 + step) & 0xFFFF, number, ACK, len(data), r.opcode, int(last), 0, at
+    )
+    return (head + data).ljust(PAYLOAD, b"\0")
+
+
+def _nak(r: Request, error: int) -> bytes:
+    head = HEAD.pack((r.sequence + 1) & 0xFFFF, r.session, NAK, 1, r.opcode, 0, 0, r.offset)
+    return (head + bytes((error,))).ljust(PAYLOAD, b"\0")

@@ -1,0 +1,282 @@
+"""What is missing on the links although they are open, each with the setting to change.
+
+ArduPilot does not forward a ground station's heartbeats to a port whose traffic stays private, so
+a ground station that is never heard is the sign that it does not hear us either. PX4 decides for
+each direction alone; there the sign is that no ground station ever asks our camera anything.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from mavlink.component.autopilot_link import WANTED_HZ, AutopilotLink
+from mavlink.component.presence import Health, Presence, PresenceConfig
+from mavlink.telemetry.decode import READERS
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.wire.dialect import numbers_of
+from mavlink.wire.first_beat import TYPES
+from mavlink.wire.framing import MAGIC_V1, Decoder, Framer, Packet
+from mavlink.wire.link import Inbox, Link, parse_link
+from mavlink.wire.messages import Outbox, Packer
+from mavlink.wire.signing import Signing, read_key
+
+S = 1_000_000_000
+TYPE_GCS = 6
+GIMBAL = numbers_of(("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS"))
+TO_ONE = numbers_of(
+    (
+        "COMMAND_LONG",
+        "COMMAND_INT",
+        "FILE_TRANSFER_PROTOCOL",
+        "PARAM_REQUEST_LIST",
+        "PARAM_REQUEST_READ",
+        "PARAM_SET",
+        "PARAM_EXT_REQUEST_LIST",
+        "PARAM_EXT_REQUEST_READ",
+        "PARAM_EXT_SET",
+    )
+)
+"""Messages that name the component they are for."""
+ASK_WAIT_S = 60.0
+PX4 = 12  # MAV_AUTOPILOT
+
+SILENT = (
+    "No autopilot heard: check mavlink.links, SERIALn_PROTOCOL and SERIALn_BAUD (PX4: MAV_n_CONFIG)"
+)
+MAVLINK_1 = "The autopilot sends MAVLink 1: set SERIALn_PROTOCOL = 2 (PX4: MAV_PROTO_VER = 2)"
+NO_GIMBAL = (
+    "No gimbal angles: set up the mount (MNT1_TYPE; PX4: MNT_MODE_OUT), or camera.mount = fixed"
+)
+NO_GROUND = (
+    "No ground station is heard: SERIALn_OPTIONS must not hold 1024 (PX4: set MAV_n_FORWARD = 1)"
+)
+UNANSWERED = (
+    "Commands come, but our answers stay here: remove 1024 from SERIALn_OPTIONS"
+    " (PX4: set MAV_n_FORWARD = 1)"
+)
+NEVER_ASKED = (
+    "A ground station is heard but never asks our camera: set MAV_n_FORWARD = 1 for this port"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """Something that a flight misses."""
+
+    what: str  # autopilot, mavlink 1, gimbal or ground
+    text: str
+    is_known: bool = False  # another text has named it already
+    is_grave: bool = True  # we are not ready to fly with it
+
+
+@dataclass(frozen=True)
+class WatchConfig:
+    """What is expected on the links, and for how long it is waited for."""
+
+    gimbal: bool | None = None  # True: a flight needs its angles; None: they are welcome
+    wait_s: float = 10.0
+    ground_wait_s: float = 60.0  # ground stations come later, and go out of range
+
+
+class LinkWatch:
+    """Fed with every packet that is heard; ``presence`` says whose vehicle we are on."""
+
+    def __init__(self, config: WatchConfig, presence: Presence, now_ns: int) -> None:
+        self._config, self._presence = config, presence
+        self._first_autopilot_ns: int | None = None
+        self._modern_ns = self._old_ns = self._gimbal_ns = -(1 << 62)  # never
+        self._start_ns = self._ground_ns = now_ns
+        self._asked_ns: int | None = None  # a ground station named one of our components
+        self._is_ground_heard = False
+        self._announced: frozenset[str] = frozenset()
+
+    def hear(self, packet: Packet, message: Any, now_ns: int) -> None:
+        """Take in one packet and the message in it."""
+        system = self._presence.system
+        if (packet.system, packet.component) == self._presence.autopilot:
+            if self._first_autopilot_ns is None:
+                self._first_autopilot_ns = now_ns
+            if packet.data[0] == MAGIC_V1:
+                self._old_ns = now_ns
+            else:
+                self._modern_ns = now_ns
+        if packet.message_id in GIMBAL and packet.system == system:
+            self._gimbal_ns = now_ns
+        elif packet.message_id == 0 and message.type == TYPE_GCS:
+            self._is_ground_heard, self._ground_ns = True, now_ns
+        elif packet.message_id in TO_ONE and packet.system != system:
+            is_ours = message.target_component in TYPES
+            self._asked_ns = now_ns if is_ours else self._asked_ns
+
+    def troubles(self, now_ns: int) -> tuple[Trouble, ...]:
+        """What is missing now, the gravest first."""
+        found = (self._autopilot(now_ns) or self._telemetry(now_ns), self._ground(now_ns))
+        return tuple(trouble for trouble in found if trouble is not None)
+
+    def _is_stale(self, since_ns: int, wait_s: float, now_ns: int) -> bool:
+        return now_ns - max(since_ns, self._start_ns) >= wait_s * S
+
+    def _autopilot(self, now_ns: int) -> Trouble | None:
+        seen_ns = self._presence.autopilot_seen_ns
+        since_ns = self._start_ns if seen_ns is None else seen_ns
+        if not self._is_stale(since_ns, self._config.wait_s, now_ns):
+            return None
+        others = self._presence.others(now_ns)
+        if not others:
+            return Trouble("autopilot", SILENT)
+        names = ", ".join(map(str, others))
+        given = self._presence.config.system
+        if given is None:
+            text = f"Several autopilots ({names}): set mavlink.system_id"
+            return Trouble("autopilot", text, is_known=True)
+        text = f"No autopilot of system {given}, but of {names}: correct mavlink.system_id"
+        return Trouble("autopilot", text)
+
+    def _telemetry(self, now_ns: int) -> Trouble | None:
+        """What the autopilot that is heard does not send."""
+        first_ns, wait_s = self._first_autopilot_ns, self._config.wait_s
+        if first_ns is None or not self._is_stale(first_ns, wait_s, now_ns):
+            return None
+        if self._old_ns > self._modern_ns and self._is_stale(self._modern_ns, wait_s, now_ns):
+            return Trouble("mavlink 1", MAVLINK_1)
+        if self._config.gimbal is False or not self._is_stale(self._gimbal_ns, wait_s, now_ns):
+            return None
+        return Trouble("gimbal", NO_GIMBAL, is_grave=bool(self._config.gimbal))
+
+    def _ground(self, now_ns: int) -> Trouble | None:
+        wait_s, asked_ns = self._config.ground_wait_s, self._asked_ns
+        if self._is_stale(self._ground_ns, wait_s, now_ns):
+            is_asked = asked_ns is not None and not self._is_stale(asked_ns, wait_s, now_ns)
+            text = UNANSWERED if is_asked and not self._is_ground_heard else NO_GROUND
+            return Trouble("ground", text)
+        is_late = self._is_stale(self._start_ns, ASK_WAIT_S, now_ns)
+        if asked_ns is None and is_late and self._presence.firmware == PX4:
+            return Trouble("ground", NEVER_ASKED, is_grave=False)
+        return None
+
+    def news(self, now_ns: int, is_start: bool) -> Sequence[str]:
+        """Texts for the operator: each trouble when it begins, and all when a scan starts."""
+        troubles = self.troubles(now_ns)
+        before = frozenset() if is_start else self._announced
+        self._announced = frozenset(t.what for t in troubles)
+        return [t.text for t in troubles if t.what not in before and not t.is_known]
+
+
+STEP_S = 0.02
+BACKLOG = 10_000
+HEARTBEAT, SYSTEM_TIME, TIMESYNC = 0, 2, 111
+
+
+@dataclass(frozen=True, slots=True)
+class LinkFound:
+    """What was heard on one link."""
+
+    name: str
+    is_up: bool
+    packets: dict[int, int]  # by system id
+    skipped_bytes: int
+    last_error: str
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What a look found."""
+
+    links: tuple[LinkFound, ...]
+    autopilot: tuple[int, int] | None  # system and component
+    troubles: tuple[Trouble, ...]
+
+
+class LinkProbe:
+    """A short look at the links. ValueError for a link or key that cannot be.
+
+    It says who we are and asks the autopilot for its telemetry, as the service does, because a
+    port may carry nothing before. It carries out no command.
+    """
+
+    def __init__(
+        self,
+        links: Sequence[str],
+        system: int | None,
+        watch: WatchConfig,
+        signing_key: Path | None = None,
+    ) -> None:
+        signing = None if signing_key is None else Signing(read_key(signing_key), 0)
+        now_ns = time.monotonic_ns()
+        self._presence = Presence(PresenceConfig(system), secrets.randbits(32) or 1, now_ns)
+        self._outbox = Outbox()
+        history = VehicleHistory()
+        self._autopilot = AutopilotLink(
+            self._presence, history, self._outbox, WANTED_HZ, lambda severity, text: None
+        )
+        self._watch = LinkWatch(watch, self._presence, now_ns)
+        self._decoder = Decoder()
+        self._inbox: Inbox[tuple[int, Packet, int]] = Inbox(BACKLOG)
+        specs = [parse_link(text) for text in links]
+        self._framers = [Framer() for _ in specs]
+        self._packers = [Packer(i, signing) for i in range(len(specs))]
+        self._counts: list[Counter[int]] = [Counter() for _ in specs]
+        self._links = [Link(spec, partial(self._on_data, i)) for i, spec in enumerate(specs)]
+
+    def look(self, seconds: float) -> Found:
+        """Listen and ask for so long; what was found."""
+        for link in self._links:
+            link.start()
+        end_ns = time.monotonic_ns() + round(seconds * S)
+        while time.monotonic_ns() < end_ns:
+            self._step(time.monotonic_ns())
+            time.sleep(STEP_S)
+        found = self._found(time.monotonic_ns())
+        for link in self._links:
+            link.stop()
+        return found
+
+    def _on_data(self, index: int, data: bytes, now_ns: int) -> None:
+        for packet in self._framers[index].feed(data):
+            self._inbox.gather((index, packet, now_ns))
+
+    def _step(self, now_ns: int) -> None:
+        for index, packet, heard_ns in self._inbox.take(0.0)[0]:
+            self._counts[index][packet.system] += 1
+            self._hear(index, packet, heard_ns)
+        self._presence.confirm(Health.STANDBY, now_ns)
+        self._presence.look(now_ns)
+        self._autopilot.follow()
+        self._autopilot.tick(now_ns)
+        for outgoing in (*self._presence.due(now_ns), *self._outbox.take()):
+            for packer, link in zip(self._packers, self._links, strict=True):
+                data = packer.pack(self._presence.system, outgoing, time.time_ns())
+                if data is not None:
+                    link.write(data)
+
+    def _hear(self, index: int, packet: Packet, now_ns: int) -> None:
+        message = self._decoder.message(packet)
+        if message is None:
+            return
+        self._presence.count(packet.system, packet.component)
+        if packet.message_id == HEARTBEAT:
+            self._presence.hear(message, now_ns)
+            self._autopilot.follow()
+        elif packet.message_id == TIMESYNC:
+            self._autopilot.hear_timesync(message, packet, index, now_ns)
+        elif packet.message_id == SYSTEM_TIME:
+            self._autopilot.hear_system_time(message, packet, now_ns)
+        elif message.get_type() in READERS:
+            self._autopilot.hear_telemetry(message.get_type(), message, packet, now_ns)
+        self._watch.hear(packet, message, now_ns)
+
+    def _found(self, now_ns: int) -> Found:
+        links = tuple(
+            LinkFound(
+                link.spec.name, link.is_up, dict(counts), framer.skipped_bytes, link.last_error
+            )
+            for link, counts, framer in zip(self._links, self._counts, self._framers, strict=True)
+        )
+        return Found(links, self._presence.autopilot, self._watch.troubles(now_ns))

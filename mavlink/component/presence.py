@@ -1,0 +1,377 @@
+"""Heartbeats of our two components, tied to the health of the service, and who else is there.
+
+Of several vehicles, the one that we are on answers our TIMESYNC questions sooner than others
+whose messages it forwards; where no autopilot answers, it is the one that says most. Where that
+does not decide either, nobody is followed and the operator is asked for ``mavlink.system_id``.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from mavlink.wire.dialect import dialect
+from mavlink.wire.first_beat import CAMERA, NO_AUTOPILOT, ONBOARD, TYPES, is_autopilot
+from mavlink.wire.messages import Outgoing
+
+S = 1_000_000_000
+PERIOD_NS = S
+ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
+RECENT_NS = 3 * S  # an armed state older than this is not known any more
+
+
+class Health(IntEnum):
+    """MAV_STATE of our components."""
+
+    BOOT = 1
+    NOT_READY = 2  # MAV_STATE_CALIBRATING, "not flight-ready": the links lack something
+    STANDBY = 3
+    ACTIVE = 4
+    CRITICAL = 5
+
+
+@dataclass(frozen=True, slots=True)
+class PresenceConfig:
+    """Our place on the network."""
+
+    system: int | None = None  # None: that of the vehicle that we are connected to
+    latch_s: float = 3.0  # how long the vehicle of the last flight is waited for before others
+    stale_s: float = 5.0  # health not confirmed for longer is CRITICAL
+    dead_s: float = 20.0  # not confirmed for longer: no heartbeat any more
+    boot_s: float = 120.0  # the same for a service that has not come up
+
+    def __post_init__(self) -> None:
+        if self.system is not None and not 1 <= self.system <= 255:
+            raise ValueError(f"system id is {self.system}; it must be 1 to 255, or none given")
+        if not 0.0 < self.stale_s < self.dead_s:
+            raise ValueError("presence needs 0 < stale_s < dead_s")
+
+
+class Presence:
+    """What we say of ourselves every second, and what others say. Safe between threads."""
+
+    def __init__(
+        self,
+        config: PresenceConfig,
+        token: int,
+        now_ns: int,
+        first_ns: int | None = None,
+        remembered: int | None = None,
+    ) -> None:
+        """The first heartbeat is due at ``first_ns``, or now; ``remembered``: the last system."""
+        self.config = config
+        self._token = token  # in custom_mode: tells our echo from another companion
+        self._lock = threading.Lock()
+        self._health = Health.BOOT
+        self._confirmed_ns = now_ns
+        self._next_ns = now_ns if first_ns is None else first_ns
+        self._autopilots = Autopilots(config.system, remembered, config.latch_s)
+        self._intruder = False
+        self.is_ready = True  # the links have what a flight needs
+        self._news: list[str] = []
+
+    @property
+    def system(self) -> int:
+        """The system id that we use."""
+        return self._autopilots.system
+
+    @property
+    def proven_system(self) -> int | None:
+        """The system id to remember; None until the evidence speaks for one."""
+        autopilots = self._autopilots
+        return autopilots.system if autopilots.is_proven else None
+
+    @property
+    def autopilot(self) -> tuple[int, int] | None:
+        """(system, component) of our autopilot; None before it was heard."""
+        followed = self._autopilots.followed
+        return None if followed is None else (followed.system, followed.component)
+
+    @property
+    def firmware(self) -> int | None:
+        """MAV_AUTOPILOT of our autopilot; None before it was heard."""
+        followed = self._autopilots.followed
+        return None if followed is None else followed.firmware
+
+    @property
+    def autopilot_seen_ns(self) -> int | None:
+        """When the autopilot's heartbeat was heard last."""
+        followed = self._autopilots.followed
+        return None if followed is None else followed.seen_ns
+
+    @property
+    def is_certain(self) -> bool:
+        """False while our autopilot was only the first that was heard: it may be another's."""
+        return self._autopilots.is_certain
+
+    @property
+    def is_armed(self) -> bool:
+        """True while the autopilot says so."""
+        followed = self._autopilots.followed
+        return followed is not None and followed.is_armed
+
+    def is_disarmed(self, now_ns: int) -> bool:
+        """True only where what is certainly our autopilot said so a moment ago."""
+        followed = self._autopilots.followed
+        if followed is None or followed.is_armed or not self.is_certain:
+            return False
+        return now_ns - followed.seen_ns <= RECENT_NS
+
+    def others(self, now_ns: int) -> list[int]:
+        """The systems of autopilots that are heard but not followed."""
+        with self._lock:
+            return self._autopilots.others(now_ns)
+
+    def confirm(self, health: Health, now_ns: int) -> None:
+        """The service is alive and this is its state; to be said again every few seconds."""
+        with self._lock:
+            self._health = health
+            self._confirmed_ns = now_ns
+
+    def health(self, now_ns: int) -> Health | None:
+        """What the heartbeat says now; None once the service must be taken for dead."""
+        with self._lock:
+            return self._state(now_ns)
+
+    def _state(self, now_ns: int) -> Health | None:
+        silent = (now_ns - self._confirmed_ns) / S
+        if self._health is Health.BOOT:
+            return Health.BOOT if silent < self.config.boot_s else None
+        if silent < self.config.stale_s:
+            is_waiting = self._health is Health.STANDBY and not self.is_ready
+            return Health.NOT_READY if is_waiting else self._health
+        return Health.CRITICAL if silent < self.config.dead_s else None
+
+    def due(self, now_ns: int) -> list[Outgoing]:
+        """The heartbeats to send now; the first call gives them at once."""
+        with self._lock:
+            if now_ns < self._next_ns:
+                return []
+            late = now_ns - self._next_ns
+            self._next_ns = now_ns + PERIOD_NS - (late if late < PERIOD_NS else 0)
+            state = self._state(now_ns)
+            if state is None:
+                return []
+            return [Outgoing(c, self._heartbeat(c, state)) for c in (ONBOARD, CAMERA)]
+
+    def _heartbeat(self, component: int, state: Health) -> Any:
+        kind = TYPES[component]
+        return dialect.MAVLink_heartbeat_message(kind, NO_AUTOPILOT, 0, self._token, int(state), 3)
+
+    def next_timer(self) -> int:
+        """When :meth:`due` has something again, in ns."""
+        return self._next_ns
+
+    def hear(self, message: Any, now_ns: int) -> None:
+        """Take in anyone's heartbeat."""
+        system, component = message.get_srcSystem(), message.get_srcComponent()
+        with self._lock:
+            if is_autopilot(component, message):
+                armed = bool(message.base_mode & ARMED)
+                self._autopilots.hear(system, component, armed, now_ns, message.autopilot)
+            elif system == self.system and component in TYPES:
+                self._hear_namesake(component, message.custom_mode)
+
+    def count(self, system: int, component: int) -> None:
+        """Count a message of someone."""
+        with self._lock:
+            self._autopilots.count(system, component)
+
+    def answered(self, system: int, component: int, round_trip_ns: int) -> None:
+        """Take in someone's answer to one of our TIMESYNC questions."""
+        with self._lock:
+            self._autopilots.answered(system, component, round_trip_ns)
+
+    def look(self, now_ns: int) -> None:
+        """Compare the autopilots that are heard, when it is time."""
+        with self._lock:
+            self._autopilots.look(now_ns)
+
+    def _hear_namesake(self, component: int, token: int) -> None:
+        if token == self._token or self._intruder:
+            return
+        self._intruder = True
+        self._news.append(f"Another companion uses component {component} of this vehicle")
+
+    def take_news(self) -> list[str]:
+        """What the operator must know, each once."""
+        with self._lock:
+            news, self._news = self._news, []
+            return self._autopilots.take_news() + news
+
+
+MS = 1_000_000
+AUTOPILOT1 = 1  # MAV_COMP_ID_AUTOPILOT1
+LOOK_NS = 3 * S  # how long evidence is gathered before it is compared
+PRESENT_NS = 5 * S  # an autopilot heard within this time takes part in a comparison
+ENOUGH_ANSWERS = 2  # of TIMESYNC within one look
+NEARER, NEARER_NS = 3, 5 * MS  # a round trip shorter by this factor and this much decides
+LOUDER, LOUD = 4, 8  # so many times as many messages decide, from this many on
+PROVEN_LOOKS = 10  # looks in a row that must speak against an autopilot that was proven ours
+
+
+@dataclass(slots=True)
+class Autopilot:
+    """One system's autopilot and what speaks for it in the current look."""
+
+    system: int
+    component: int
+    firmware: int = 0  # MAV_AUTOPILOT
+    seen_ns: int = 0
+    is_armed: bool = False
+    messages: int = 0
+    answers: int = 0
+    round_trip_ns: int = 0  # the shortest
+
+    def forget_evidence(self) -> None:
+        """Start a new look."""
+        self.messages = self.answers = self.round_trip_ns = 0
+
+
+class Autopilots:
+    """Every autopilot heard, at most one per system id, and the one that is followed."""
+
+    def __init__(self, given: int | None, remembered: int | None, wait_s: float) -> None:
+        """``given`` is never left; ``remembered`` is waited for ``wait_s`` before others."""
+        self.given = given
+        self.remembered = remembered
+        self.followed: Autopilot | None = None
+        self.is_proven = False  # nothing spoke for another vehicle
+        self._wait_ns = round(wait_s * S)
+        self._heard: dict[int, Autopilot] = {}
+        self._first_ns: int | None = None
+        self._look_ns = 0
+        self._against = 0  # looks in a row that spoke for another vehicle
+        self._is_unclear = False
+        self._news: list[str] = []
+
+    @property
+    def system(self) -> int:
+        """The system id to use: the one followed, or the most likely one."""
+        if self.followed is not None and self.given is None:
+            return self.followed.system
+        return self.given or self.remembered or 1
+
+    @property
+    def is_certain(self) -> bool:
+        """False while the one followed was only the first that was heard."""
+        followed = self.followed
+        expected = followed is not None and followed.system in (self.given, self.remembered)
+        return followed is None or self.is_proven or expected
+
+    def hear(
+        self, system: int, component: int, is_armed: bool, now_ns: int, firmware: int = 0
+    ) -> None:
+        """Take in an autopilot's heartbeat; component 1 goes before others of its system."""
+        known = self._heard.get(system)
+        if known is None or (known.component != component and component == AUTOPILOT1):
+            fresh = self._heard[system] = Autopilot(system, component)
+            if known is not None and self.followed is known:
+                self.followed = fresh
+            known = fresh
+        elif known.component != component:
+            return
+        known.seen_ns, known.is_armed, known.firmware = now_ns, is_armed, firmware
+        if self._first_ns is None:
+            self._first_ns, self._look_ns = now_ns, now_ns + LOOK_NS
+        if self.followed is None and self._may_follow(system, now_ns):
+            self.followed = known
+
+    def _may_follow(self, system: int, now_ns: int) -> bool:
+        """True where the first heartbeat is enough."""
+        if self.given is not None:
+            return system == self.given
+        if self._is_unclear or self._first_ns is None:
+            return False
+        expected = self.remembered in (None, system)
+        return expected or now_ns - self._first_ns >= self._wait_ns
+
+    def count(self, system: int, component: int) -> None:
+        """Count a message; only those of autopilots speak for a vehicle."""
+        known = self._heard.get(system)
+        if known is not None and known.component == component:
+            known.messages += 1
+
+    def answered(self, system: int, component: int, round_trip_ns: int) -> None:
+        """Take in an answer to one of our TIMESYNC questions."""
+        known = self._heard.get(system)
+        if known is None or known.component != component:
+            return
+        shortest = min(known.round_trip_ns, round_trip_ns) if known.answers else round_trip_ns
+        known.answers, known.round_trip_ns = known.answers + 1, shortest
+
+    def look(self, now_ns: int) -> None:
+        """Compare the evidence when it is time; follow another vehicle if it speaks for that."""
+        if self.given is not None or self._first_ns is None or now_ns < self._look_ns:
+            return
+        self._look_ns = now_ns + LOOK_NS
+        present = [a for a in self._heard.values() if now_ns - a.seen_ns < PRESENT_NS]
+        if present:
+            self._decide(present)
+        for autopilot in self._heard.values():
+            autopilot.forget_evidence()
+
+    def _decide(self, present: Sequence[Autopilot]) -> None:
+        best = clear_winner(present)
+        followed = self.followed
+        if best is None:
+            if self._expected_among(present) is None and not self.is_proven:
+                self._give_up(present)
+            return
+        if best is followed:
+            answers = best.answers >= ENOUGH_ANSWERS
+            self.is_proven |= answers or self.remembered in (None, best.system)
+            self._against = 0
+            return
+        self._against += 1
+        if followed is None or not self.is_proven or self._against >= PROVEN_LOOKS:
+            self._follow(best)
+
+    def _expected_among(self, present: Sequence[Autopilot]) -> Autopilot | None:
+        """The remembered vehicle, where it is there; it decides a draw."""
+        expected = next((a for a in present if a.system == self.remembered), None)
+        if expected is not None and self.followed is not expected and not self.is_proven:
+            self._follow(expected)
+        return expected
+
+    def _follow(self, autopilot: Autopilot) -> None:
+        if self.followed is not None:
+            self._news.append(f"Following system {autopilot.system}, not {self.followed.system}")
+        self.followed, self._against = autopilot, 0
+        self.is_proven = self._is_unclear = False
+
+    def _give_up(self, present: Sequence[Autopilot]) -> None:
+        self.followed = None
+        if not self._is_unclear:
+            names = ", ".join(str(a.system) for a in sorted(present, key=lambda a: a.system))
+            self._news.append(f"Several autopilots ({names}): set mavlink.system_id")
+        self._is_unclear = True
+
+    def take_news(self) -> list[str]:
+        """What the operator must know, each once."""
+        news, self._news = self._news, []
+        return news
+
+    def others(self, now_ns: int) -> list[int]:
+        """The systems of present autopilots that are not followed, ascending."""
+        present = (a for a in self._heard.values() if now_ns - a.seen_ns < PRESENT_NS)
+        return sorted(a.system for a in present if a is not self.followed)
+
+
+def clear_winner(present: Sequence[Autopilot]) -> Autopilot | None:
+    """The autopilot that we are connected to by all evidence; None where it does not decide."""
+    if len(present) == 1:
+        return present[0]
+    answering = [a for a in present if a.answers >= ENOUGH_ANSWERS]
+    if len(answering) == 1:
+        return answering[0]
+    if answering:
+        near, far = sorted(answering, key=lambda a: a.round_trip_ns)[:2]
+        apart_ns = far.round_trip_ns - near.round_trip_ns
+        is_nearer = apart_ns >= NEARER_NS and far.round_trip_ns >= NEARER * near.round_trip_ns
+        return near if is_nearer else None
+    loud, quiet = sorted(present, key=lambda a: -a.messages)[:2]
+    return loud if loud.messages >= max(LOUD, LOUDER * quiet.messages) else None

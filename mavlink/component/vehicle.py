@@ -1,0 +1,384 @@
+"""The vehicle as the service uses it: links, two components, history, all in one object.
+
+Threads: two per link, one for the protocol, one for heartbeats. Everything that the service
+calls here returns at once; ``ScanControl`` is asked in the protocol's thread.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import secrets
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from mavlink.component import status as texts
+from mavlink.component.camera import KeyframeReport
+from mavlink.component.companion import HEARD, Companion, CompanionConfig
+from mavlink.component.control import ScanControl
+from mavlink.component.link_watch import Trouble
+from mavlink.component.memory import Memory
+from mavlink.component.presence import Health, Presence, PresenceConfig
+from mavlink.component.status import ComputerLoad, Odometry, odometry_message
+from mavlink.telemetry.clock import computer_offset_ns
+from mavlink.telemetry.decode import READERS
+from mavlink.telemetry.history import HistoryConfig, LiveHistory
+from mavlink.wire.dialect import dialect, numbers_of
+from mavlink.wire.first_beat import FirstBeats
+from mavlink.wire.framing import Framer, Packet
+from mavlink.wire.link import Inbox, Job, Link, parse_link
+from mavlink.wire.messages import Outgoing, Packer
+from mavlink.wire.signing import Signing, read_key
+from mavlink.wire.tlog import Recorder
+
+log = logging.getLogger(__name__)
+
+S = 1_000_000_000
+SAVE_EVERY_NS = 30 * S
+TELEMETRY = numbers_of(READERS)
+BACKLOG = 10_000  # packets waiting for the protocol's thread
+STUCK_NS = 10 * S
+TUNNEL_ROOM = 128
+BEAT_NICE = -10  # needs LimitNICE or root; without it the thread runs like the others
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleConfig:
+    """Links and how we behave on them."""
+
+    links: tuple[str, ...] = ()
+    presence: PresenceConfig = field(default_factory=PresenceConfig)
+    companion: CompanionConfig = field(default_factory=CompanionConfig)
+    history: HistoryConfig = field(default_factory=lambda: HistoryConfig(keep_s=120.0))
+    signing_key: Path | None = None  # 32 bytes, mode 600
+    odometry: bool = False  # send our motion estimate to the autopilot
+    state_dir: Path | None = None  # keeps parameters, signing time and the vehicle's system id
+
+    def __post_init__(self) -> None:
+        for link in self.links:
+            parse_link(link)
+
+
+@dataclass(frozen=True, slots=True)
+class LinkReport:
+    """How one link does."""
+
+    name: str
+    is_up: bool
+    opened: int
+    received_bytes: int
+    sent_bytes: int
+    packets: int
+    skipped_bytes: int
+    last_error: str
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleReport:
+    """How the connection to the vehicle does."""
+
+    links: tuple[LinkReport, ...]
+    system: int
+    autopilot: tuple[int, int] | None
+    is_certain: bool  # False while it was only the first that was heard: maybe another vehicle's
+    autopilot_age_s: float | None
+    is_armed: bool
+    timesync_round_trip_ms: float | None
+    unverified: int  # packets refused for their signature
+    dropped: int  # packets that the protocol's thread could not take in time
+    troubles: tuple[Trouble, ...]  # what is missing although the links are open
+
+
+class VehicleLink:
+    """Start it, feed it with health, and read ``history``."""
+
+    def __init__(
+        self, config: VehicleConfig, control: ScanControl, first: FirstBeats | None = None
+    ) -> None:
+        """``first`` has opened the links of ``config`` already and speaks on them."""
+        self.config = config
+        links = None if first is None else first.hand_over()
+        now_ns = time.monotonic_ns()
+        self.history = LiveHistory(config.history)
+        self.recorder = Recorder()
+        self._memory = Memory(config.state_dir)
+        self._signing = self._make_signing()
+        self.presence = Presence(
+            config.presence,
+            new_token() if first is None else first.token,
+            now_ns,
+            None if first is None else round(first.next_s * S),
+            self._memory.system,
+        )
+        self._companion = Companion(
+            config.companion,
+            control,
+            self.presence,
+            self.history,
+            now_ns,
+            self._memory.parameters,
+            lambda: (time.monotonic_ns() + self.unix_offset_ns()) // 1000,
+        )
+        self._inbox: Inbox[tuple[int, Packet, int]] = Inbox(BACKLOG)
+        self._heard = set(HEARD)  # numbers of messages; nothing is done with others
+        self._stop = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._alive_ns = now_ns
+        self._is_served = True  # something was done that may have set a timer
+        specs = [parse_link(text) for text in config.links]
+        self._framers = [Framer() for _ in specs]
+        sequence = 0 if first is None else first.sequence
+        self._packers = [Packer(i, self._signing, sequence) for i in range(len(specs))]
+        self._links = links or [Link(spec, _nobody) for spec in specs]
+        for i, link in enumerate(self._links):
+            link.hand_to(partial(self._on_data, i))
+
+    def _make_signing(self) -> Signing | None:
+        if self.config.signing_key is None:
+            return None
+        return Signing(read_key(self.config.signing_key), self._memory.signing_timestamp)
+
+    # The service's side.
+
+    def start(self) -> None:
+        """Open the links; the first heartbeat goes out before anything else."""
+        self._do(self._companion.announce_kept)
+        for target in (self._beat, self._run):
+            thread = threading.Thread(target=target, name=f"mavlink {target.__name__}", daemon=True)
+            self._threads.append(thread)
+            thread.start()
+        for link in self._links:
+            link.start()
+
+    def stop(self) -> None:
+        """Say what is left to say, then close everything."""
+        self._stop.set()
+        self._do(lambda: None)
+        for thread in self._threads:
+            thread.join(timeout=5.0)
+        for link in self._links:
+            link.stop()
+        self.recorder.close()
+        self._save()
+
+    def set_health(self, health: Health) -> None:
+        """Confirm that the service lives; call it at least every second."""
+        self.presence.confirm(health, time.monotonic_ns())
+
+    def set_load(self, load: ComputerLoad) -> None:
+        """The companion's load, for the operator."""
+        self._companion.load = load
+
+    def statustext(self, text: str, severity: int = texts.INFO, is_answer: bool = False) -> None:
+        """Send a text to the operator; repetitions are held back, except of answers."""
+        self._served(lambda: self._companion.say(severity, text, is_answer))
+
+    def report_keyframe(self, keyframe: KeyframeReport) -> None:
+        """Tell ground stations of a keyframe."""
+        self._served(lambda: self._companion.report(keyframe))
+
+    def send_tunnel(self, payload_type: int, payload: bytes) -> None:
+        """Send up to 128 bytes to everyone by TUNNEL; ValueError when there are more."""
+        if len(payload) > TUNNEL_ROOM:
+            raise ValueError(f"a TUNNEL holds {TUNNEL_ROOM} bytes, got {len(payload)}")
+        padded = list(payload.ljust(TUNNEL_ROOM, b"\0"))
+        message = dialect.MAVLink_tunnel_message(0, 0, payload_type, len(payload), padded)
+        self._do(lambda: self._companion.send(message))
+
+    def listen(self, name: str, listener: Callable[[Any], None]) -> None:
+        """Call back, in the protocol's thread, with every message of a name such as TUNNEL."""
+        self._heard |= numbers_of([name])
+        self._do(lambda: self._companion.listen(name, listener))
+
+    def report_odometry(self, odometry: Odometry, time_ns: int) -> bool:
+        """Send our estimate to the autopilot, stamped with its clock at our monotonic time.
+
+        False, and nothing sent, unless ``odometry`` is switched on and its clock is known.
+        """
+        boot_us = self.boot_time_us(time_ns)
+        if boot_us is None or not self.config.odometry:
+            return False
+        self._do(lambda: self._companion.send(odometry_message(odometry, boot_us)))
+        return True
+
+    def parameter(self, name: str) -> float:
+        """The value of a parameter."""
+        return self._companion.parameters[name]
+
+    def parameters(self) -> dict[str, float]:
+        """Every parameter's value by name."""
+        return self._companion.parameters.values()
+
+    def show_parameters(self, values: Mapping[str, float]) -> None:
+        """Let these hold, as the configuration says by now, and tell ground stations."""
+        self._do(lambda: self._companion.parameters.adopt(values))
+
+    def record(self, path: Path | None, unix_offset_ns: int | None = None) -> None:
+        """Keep a .tlog of all links in a file from now on, stamped with the monotonic clock plus
+        ``unix_offset_ns`` (None: :meth:`unix_offset_ns`); a path of None ends it."""
+        if path is None:
+            self.recorder.close()
+        else:
+            offset_ns = self.unix_offset_ns() if unix_offset_ns is None else unix_offset_ns
+            self.recorder.open(path, offset_ns)
+
+    def unix_offset_ns(self) -> int:
+        """Unix time less our monotonic clock: this computer's, or the autopilot's where the two
+        clocks do not agree."""
+        return self._companion.autopilot.wall_time.correct(computer_offset_ns())
+
+    def boot_time_us(self, time_ns: int) -> int | None:
+        """The autopilot's boot clock in us at one of our monotonic times; None when unknown."""
+        clock = self._companion.autopilot.boot_clock()
+        offset = None if clock is None else clock.offset_ns
+        return None if offset is None else (time_ns - offset) // 1000
+
+    @property
+    def is_serving(self) -> bool:
+        """True while the protocol's thread makes progress."""
+        return time.monotonic_ns() - self._alive_ns < STUCK_NS
+
+    def report(self) -> VehicleReport:
+        """A snapshot for health pages and ``doctor``."""
+        seen = self.presence.autopilot_seen_ns
+        round_trip = self._companion.autopilot.timesync.round_trip_ns
+        return VehicleReport(
+            tuple(
+                LinkReport(
+                    link.spec.name,
+                    link.is_up,
+                    link.opened,
+                    link.received_bytes,
+                    link.sent_bytes,
+                    framer.packets,
+                    framer.skipped_bytes,
+                    link.last_error,
+                )
+                for link, framer in zip(self._links, self._framers, strict=True)
+            ),
+            self.presence.system,
+            self.presence.autopilot,
+            self.presence.is_certain,
+            None if seen is None else (time.monotonic_ns() - seen) / S,
+            self.presence.is_armed,
+            None if round_trip is None else round_trip * 1e-6,
+            0 if self._signing is None else self._signing.refused,
+            self._inbox.dropped,
+            self._companion.watch.troubles(time.monotonic_ns()),
+        )
+
+    # Threads.
+
+    def _on_data(self, index: int, data: bytes, now_ns: int) -> None:
+        for packet in self._framers[index].feed(data):
+            self.recorder.write(packet.data, now_ns)
+            if packet.message_id in TELEMETRY:
+                self._inbox.gather((index, packet, now_ns))
+            elif packet.message_id in self._heard:
+                self._inbox.put(partial(self._hear, index, packet, now_ns))
+
+    def _hear(self, index: int, packet: Packet, now_ns: int) -> None:
+        if self._signing is not None and not self._signing.accepts(packet):
+            return
+        self._companion.receive(index, packet, now_ns)
+        self._is_served = self._is_served or packet.message_id not in TELEMETRY
+
+    def _do(self, job: Job) -> None:
+        self._inbox.put(job)
+
+    def _served(self, job: Job) -> None:
+        """Do a job after which a timer may be nearer."""
+        self._do(job)
+        self._do(self._look_at_timers)
+
+    def _look_at_timers(self) -> None:
+        self._is_served = True
+
+    def _run(self) -> None:
+        """The protocol's thread, the only one that touches the companion."""
+        save_ns = time.monotonic_ns() + SAVE_EVERY_NS
+        timer_ns = 0
+        while not self._stop.is_set():
+            wait_s = (timer_ns - time.monotonic_ns()) / S
+            self._serve(max(1e-4, wait_s))
+            now_ns = self._alive_ns = time.monotonic_ns()
+            if now_ns >= timer_ns or self._is_served:
+                self._is_served = False
+                self._guard(partial(self._companion.tick, now_ns))
+                timer_ns = self._companion.next_timer()
+            self._send(self._companion.take())
+            if now_ns >= save_ns or self._is_stale():
+                save_ns = now_ns + SAVE_EVERY_NS
+                self._save()
+        self._serve(0.0)
+        self._send(self._companion.take())
+
+    def _serve(self, wait_s: float) -> None:
+        """Do the jobs that wait and take in the telemetry."""
+        telemetry, jobs = self._inbox.take(wait_s)
+        for job in jobs:  # first: a heartbeat says whose telemetry follows
+            self._guard(job)
+        for index, packet, now_ns in telemetry:
+            try:
+                self._hear(index, packet, now_ns)
+            except Exception:
+                log.exception("a fault while hearing telemetry")
+
+    def _guard(self, job: Job) -> None:
+        """Do a job; a fault in what the service does on a command must not cost the link."""
+        try:
+            job()
+        except Exception:
+            log.exception("a fault while serving MAVLink")
+
+    def _beat(self) -> None:
+        """The heartbeats' thread, ahead of the others where the system lets us."""
+        if sys.platform == "linux":
+            with contextlib.suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), BEAT_NICE)
+        while not self._stop.is_set():
+            now_ns = time.monotonic_ns()
+            due = self.presence.due(now_ns)
+            if now_ns - self._alive_ns < STUCK_NS:  # else nobody would answer: say nothing
+                self._send(due)
+            self._stop.wait(max(0.001, (self.presence.next_timer() - time.monotonic_ns()) / S))
+
+    def _send(self, messages: list[Outgoing]) -> None:
+        if not messages:
+            return
+        now_ns, unix_ns = time.monotonic_ns(), time.time_ns()
+        system = self.presence.system
+        for outgoing in messages:
+            for i, link in enumerate(self._links):
+                if outgoing.link is not None and outgoing.link != i:
+                    continue
+                data = self._packers[i].pack(system, outgoing, unix_ns)
+                if data is not None:
+                    link.write(data)
+                    self.recorder.write(data, now_ns)
+
+    def _is_stale(self) -> bool:
+        revision = self._companion.parameters.revision
+        return self._memory.is_stale(revision, self.presence.proven_system)
+
+    def _save(self) -> None:
+        parameters = self._companion.parameters
+        timestamp = 0 if self._signing is None else self._signing.timestamp
+        system = self.presence.proven_system
+        self._memory.save(parameters.kept(), parameters.revision, timestamp, system)
+
+
+def new_token() -> int:
+    """What tells our own heartbeats, heard back, from those of another companion."""
+    return secrets.randbits(32) or 1
+
+
+def _nobody(data: bytes, now_ns: int) -> None:
+    """Takes what comes before anyone listens."""

@@ -1,0 +1,1 @@
+"""What the vehicle says: samples, clocks, its recent past, recorded logs."""

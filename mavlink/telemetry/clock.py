@@ -1,0 +1,237 @@
+"""The autopilot's clocks against ours: its boot clock, in a log and live, and unix time.
+
+A message is sampled at ``time_boot_ms`` of its sender and arrives later by an unknown delay,
+never earlier. So the difference of the two clocks is the lower edge of (arrival - boot time).
+What is fused goes by the boot clock; only names and labels rest on unix time, which a computer
+without a battery for its clock or a network gets from the autopilot's GNSS receiver.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+I64 = npt.NDArray[np.int64]
+F64 = npt.NDArray[np.float64]
+
+WRAP_MS = 2**32  # time_boot_ms is a uint32: 49.7 days
+WRAP_EDGE_MS = 600_000
+REBOOT_BACK_MS = 3_000.0  # messages arrive a little out of order; a reboot goes back further
+WINDOW_NS = 5_000_000_000
+MS = 1_000_000
+
+
+class BootCounter:
+    """Makes one sender's ``time_boot_ms`` count on over its 32-bit wrap; notices reboots."""
+
+    def __init__(self) -> None:
+        self.session = 0
+        self._last_ms: float | None = None
+        self._wraps = 0
+
+    def unwrap(self, boot_ms: float) -> float:
+        """Milliseconds since the boot of the current session (``session`` counts reboots)."""
+        value = boot_ms + self._wraps * WRAP_MS
+        if self._last_ms is not None and value < self._last_ms - REBOOT_BACK_MS:
+            value = self._step_back(boot_ms, value)
+        elif self._last_ms is not None and value > self._last_ms + WRAP_MS - WRAP_EDGE_MS:
+            return value - WRAP_MS  # a straggler from before the wrap
+        self._last_ms = value if self._last_ms is None else max(self._last_ms, value)
+        return value
+
+    def _step_back(self, boot_ms: float, value: float) -> float:
+        assert self._last_ms is not None
+        if self._last_ms % WRAP_MS > WRAP_MS - WRAP_EDGE_MS and boot_ms < WRAP_EDGE_MS:
+            self._wraps += 1
+            return value + WRAP_MS
+        self.session += 1
+        self._wraps = 0
+        self._last_ms = None
+        return boot_ms
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BootFit:
+    """``unix = boot + offset(boot)`` of one session of one sender in a log."""
+
+    boot_ns: F64  # (N,) knots, increasing
+    offset_ns: F64  # (N,) relative to ``base_ns``
+    base_ns: int
+    rate: float  # boot seconds per stamp second; 1 unless the log was made in faster time
+    anchor_stamp_ns: int
+    anchor_boot_ns: float
+
+    @property
+    def is_real_time(self) -> bool:
+        """False when the boot clock ran at another rate than the stamps."""
+        return self.rate == 1.0
+
+    def from_boot(self, boot_ns: float) -> int:
+        """Time in ns of the stamps' clock at which the sender's clock read ``boot_ns``."""
+        offset = float(np.interp(boot_ns, self.boot_ns, self.offset_ns))
+        return self.base_ns + round(boot_ns + offset)
+
+    def from_stamp(self, stamp_ns: int) -> int:
+        """The time to use for a message that carries no boot time."""
+        if self.is_real_time:
+            return stamp_ns
+        passed = (stamp_ns - self.anchor_stamp_ns) * self.rate
+        return self.from_boot(self.anchor_boot_ns + passed)
+
+
+def fit_boot(stamp_ns: Sequence[int], boot_ms: Sequence[float]) -> BootFit:
+    """The fit of stamps (ns) and boot times (ms, unwrapped) of one session.
+
+    The offset is the lower edge of stamp - boot in windows of 5 s: a straight line by
+    Theil-Sen when the windows agree with one (clocks drift), else it follows the windows (the
+    stamping computer's clock was set). When the two clocks run at different rates, as in a
+    simulation faster than real time, the boot clock is taken and anchored at the first stamp.
+    """
+    if len(stamp_ns) == 0 or len(stamp_ns) != len(boot_ms):
+        raise ValueError(f"fit_boot needs pairs, got {len(stamp_ns)} and {len(boot_ms)}")
+    base = int(stamp_ns[0])
+    stamps: F64 = (np.asarray(stamp_ns, dtype=np.int64) - base).astype(np.float64)
+    boots: F64 = np.asarray(boot_ms, dtype=np.float64) * MS
+    rate = _rate(stamps, boots)
+    anchor = (base, float(boots[0]))
+    if rate != 1.0:
+        start = np.array([boots[0]])
+        return BootFit(start, -start, base, rate, *anchor)
+    knots, edge = _lower_edge(stamps, boots)
+    line = _line(knots, edge)
+    if np.median(np.abs(edge - line)) < 20 * MS:
+        edge = line
+    return BootFit(knots, edge, base, 1.0, *anchor)
+
+
+def _rate(stamps: F64, boots: F64) -> float:
+    """Boot seconds per stamp second, exactly 1.0 when they agree within 3 percent."""
+    if stamps[-1] - stamps[0] < WINDOW_NS:
+        return 1.0
+    # The median slope over a twentieth of the log: a clock that is set once does not matter.
+    lag = max(1, len(stamps) // 20)
+    ds, db = stamps[lag:] - stamps[:-lag], boots[lag:] - boots[:-lag]
+    use = ds > 0
+    if not use.any():
+        return 1.0
+    rate = float(np.median(db[use] / ds[use]))
+    return 1.0 if abs(rate - 1.0) < 0.03 or rate <= 0.0 else rate
+
+
+def _lower_edge(stamps: F64, boots: F64) -> tuple[F64, F64]:
+    """Boot time and offset of the least delayed message of each window."""
+    order = np.argsort(boots, kind="stable")
+    offsets, boots = (stamps - boots)[order], boots[order]
+    window = ((boots - boots[0]) // WINDOW_NS).astype(np.int64)
+    starts = np.flatnonzero(np.diff(window, prepend=-1))
+    ends = np.append(starts[1:], len(boots))
+    best = np.array([s + int(np.argmin(offsets[s:e])) for s, e in zip(starts, ends, strict=True)])
+    return boots[best], offsets[best]
+
+
+def _line(x: F64, y: F64) -> F64:
+    """Theil-Sen line through the points, at x; a constant for less than four points."""
+    if len(x) < 4:
+        return np.full_like(y, float(np.min(y)))
+    pick = np.linspace(0, len(x) - 1, min(len(x), 200)).astype(np.int64)
+    px, py = x[pick], y[pick]
+    i, j = np.triu_indices(len(px), 1)
+    slope = float(np.median((py[j] - py[i]) / (px[j] - px[i])))
+    result: F64 = slope * x + float(np.median(y - slope * x))
+    return result
+
+
+class BootClock:
+    """Live: one sender's boot clock to our monotonic clock by the least delayed message.
+
+    Two windows of 5 s keep the lower edge fresh while clocks drift. A TIMESYNC offset, when
+    there is one, replaces it (:mod:`mavlink.telemetry.timesync`).
+    """
+
+    def __init__(self) -> None:
+        self._counter = BootCounter()
+        self._window_end_ns = 0
+        self._current_ns: float | None = None
+        self._previous_ns: float | None = None
+        self._timesync_ns: int | None = None
+
+    @property
+    def reboots(self) -> int:
+        """How many times the sender's clock started again."""
+        return self._counter.session
+
+    def time_of(self, boot_ms: float, received_ns: int) -> int:
+        """Our time in ns at which the sender's clock read ``boot_ms``; never after arrival."""
+        reboots = self.reboots
+        boot_ns = self._counter.unwrap(boot_ms) * MS
+        if self.reboots != reboots:
+            self._current_ns = self._previous_ns = self._timesync_ns = None
+        offset = received_ns - boot_ns
+        if received_ns >= self._window_end_ns or self._current_ns is None:
+            self._previous_ns, self._current_ns = self._current_ns, offset
+            self._window_end_ns = received_ns + WINDOW_NS
+        self._current_ns = min(self._current_ns, offset)
+        best = self.offset_ns
+        assert best is not None
+        return min(received_ns, round(boot_ns) + best)
+
+    def set_timesync(self, offset_ns: int | None) -> None:
+        """Take TIMESYNC's offset (ours - boot); None takes it away.
+
+        TIMESYNC's boot time has 64 bits and does not wrap, so the offset may be off by whole
+        turns of the 32-bit counter; the messages' own arrival tells by how many.
+        """
+        self._timesync_ns = None
+        arrived = self.offset_ns
+        if offset_ns is not None and arrived is not None:
+            offset_ns += round((arrived - offset_ns) / (WRAP_MS * MS)) * WRAP_MS * MS
+        self._timesync_ns = offset_ns
+
+    @property
+    def offset_ns(self) -> int | None:
+        """Our clock minus the boot clock; None before anything was heard."""
+        if self._timesync_ns is not None:
+            return self._timesync_ns
+        if self._current_ns is None:
+            return None
+        previous = self._current_ns if self._previous_ns is None else self._previous_ns
+        return round(min(self._current_ns, previous))
+
+
+EARLIEST_UNIX_S = 1_735_689_600  # 2025-01-01: a clock before this was never set
+LATEST_UNIX_S = 4_102_444_800  # 2100-01-01
+DIFFER_NS = 5_000_000_000
+"""Two clocks that differ by less agree: SYSTEM_TIME waits in queues, and whoever sets it may be
+a second or two off."""
+
+
+class WallTime:
+    """Unix time less our monotonic clock, as SYSTEM_TIME last told it."""
+
+    def __init__(self) -> None:
+        self.offset_ns: int | None = None  # None before it was told
+
+    def hear(self, unix_us: int, now_ns: int) -> None:
+        """Take in ``time_unix_usec``, which is 0 or years ago before the first fix."""
+        if EARLIEST_UNIX_S * 1_000_000 <= unix_us < LATEST_UNIX_S * 1_000_000:
+            self.offset_ns = unix_us * 1000 - now_ns
+
+    def correct(self, offset_ns: int) -> int:
+        """The offset to use instead of the computer's own ``offset_ns``: that, or the
+        autopilot's where the two do not agree."""
+        told_ns = self.offset_ns
+        return offset_ns if told_ns is None or agree(offset_ns, told_ns) else told_ns
+
+
+def computer_offset_ns() -> int:
+    """Unix time less the monotonic clock, by this computer's clock alone."""
+    return time.time_ns() - time.monotonic_ns()
+
+
+def agree(offset_ns: int, other_ns: int) -> bool:
+    """True for clocks with these offsets that differ by no more than is usual."""
+    return abs(offset_ns - other_ns) <= DIFFER_NS

@@ -1,0 +1,155 @@
+"""MAVLink messages into samples: one function per message, a table of their names."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from mavlink.telemetry.gimbal import frame_of_flags
+from mavlink.telemetry.quaternion import from_rpy, normalised
+from mavlink.telemetry.samples import (
+    RECEIVER_SIGMA_H_M,
+    RECEIVER_SIGMA_V_M,
+    AccuracySample,
+    AttitudeSample,
+    GimbalFrame,
+    GimbalSample,
+    PositionSample,
+    RangeSample,
+    Sample,
+    TerrainSample,
+)
+
+Message = Any
+"""A message object of a pymavlink dialect."""
+
+DOWNWARD = 25  # MAV_SENSOR_ROTATION_PITCH_270
+HDOP_TO_M = 1.5  # range error of one sigma per unit of HDOP
+UNKNOWN_U16 = 65535
+UNIX_USEC = 10**15  # a time_usec beyond this is unix time, not time since boot
+TERRAIN_MODEL_SIGMA_M = 5.0
+CLEARANCE_SIGMA_M = 1.0
+
+
+def decode(message: Message) -> Sample | None:
+    """The sample in a message; None when it carries none or its values make no sense."""
+    reader = READERS.get(message.get_type())
+    return None if reader is None else reader(message)
+
+
+def _attitude(m: Message) -> Sample | None:
+    if not _finite(m.roll, m.pitch, m.yaw):
+        return None
+    return AttitudeSample(m.time_boot_ms, from_rpy(m.roll, m.pitch, m.yaw))
+
+
+def _attitude_quaternion(m: Message) -> Sample | None:
+    q = normalised((m.q1, m.q2, m.q3, m.q4))
+    return None if q is None else AttitudeSample(m.time_boot_ms, q)
+
+
+def _global_position(m: Message) -> Sample | None:
+    lat, lon = m.lat * 1e-7, m.lon * 1e-7
+    if not plausible_place(lat, lon):
+        return None
+    velocity = (m.vx * 0.01, m.vy * 0.01, m.vz * 0.01)
+    return PositionSample(m.time_boot_ms, lat, lon, m.alt * 1e-3, m.relative_alt * 1e-3, velocity)
+
+
+def _gps_raw(m: Message) -> Sample | None:
+    fix = m.fix_type >= 3
+    sigma_h = m.h_acc * 1e-3 if m.h_acc else _from_dop(m.eph, RECEIVER_SIGMA_H_M)
+    sigma_v = m.v_acc * 1e-3 if m.v_acc else _from_dop(m.epv, RECEIVER_SIGMA_V_M)
+    return AccuracySample(None, fix, sigma_h, sigma_v, m.alt * 1e-3 if fix else None)
+
+
+def _from_dop(dop_cent: int, unknown_m: float) -> float:
+    """Metres, 1 sigma, from a dilution of precision in hundredths; ``unknown_m`` without one."""
+    return unknown_m if dop_cent in (UNKNOWN_U16, 0) else dop_cent * 0.01 * HDOP_TO_M
+
+
+def _distance_sensor(m: Message) -> Sample | None:
+    if m.orientation != DOWNWARD or m.signal_quality == 1:
+        return None
+    if not m.min_distance <= m.current_distance < m.max_distance:
+        return None
+    return RangeSample(m.time_boot_ms, m.current_distance * 0.01)
+
+
+def _rangefinder(m: Message) -> Sample | None:
+    if not math.isfinite(m.distance) or m.distance <= 0.0:
+        return None
+    return RangeSample(None, m.distance)
+
+
+def _terrain_report(m: Message) -> Sample | None:
+    # Without a loaded grid ArduPilot answers with zeros and spacing 0.
+    if m.spacing == 0 or not _finite(m.current_height):
+        return None
+    return TerrainSample(None, m.current_height, TERRAIN_MODEL_SIGMA_M)
+
+
+def _altitude(m: Message) -> Sample | None:
+    # PX4 sends NaN when it does not know the clearance; other senders -1000.
+    if not math.isfinite(m.bottom_clearance) or m.bottom_clearance <= 0.0:
+        return None
+    boot_ms = m.time_usec * 1e-3 if m.time_usec < UNIX_USEC else None
+    return TerrainSample(boot_ms, m.bottom_clearance, CLEARANCE_SIGMA_M)
+
+
+def _device_status(m: Any) -> GimbalSample | None:
+    """The sample in a GIMBAL_DEVICE_ATTITUDE_STATUS (285)."""
+    q = normalised(m.q)
+    if q is None:
+        return None
+    return GimbalSample(m.time_boot_ms, q, frame_of_flags(m.flags), m.get_srcComponent(), 0)
+
+
+def _mount_orientation(m: Any) -> GimbalSample | None:
+    """The sample in a MOUNT_ORIENTATION (265): degrees, earth yaw when it sends one."""
+    if not all(map(math.isfinite, (m.roll, m.pitch))):
+        return None
+    absolute = float(getattr(m, "yaw_absolute", math.nan))
+    # A sender of the short form leaves the extension zero although it points elsewhere.
+    earth = math.isfinite(absolute) and absolute != 0.0
+    yaw = absolute if earth else m.yaw
+    if not math.isfinite(yaw):
+        return None
+    q = from_rpy(*map(math.radians, (m.roll, m.pitch, yaw)))
+    frame = GimbalFrame.EARTH if earth else GimbalFrame.VEHICLE
+    return GimbalSample(m.time_boot_ms, q, frame, m.get_srcComponent(), 1)
+
+
+def _mount_status(m: Any) -> GimbalSample | None:
+    """The sample in an old MOUNT_STATUS (158): hundredths of a degree, vehicle's heading."""
+    roll, pitch, yaw = (math.radians(a * 0.01) for a in (m.pointing_b, m.pointing_a, m.pointing_c))
+    q = from_rpy(roll, pitch, yaw)
+    return GimbalSample(None, q, GimbalFrame.VEHICLE, m.get_srcComponent(), 2)
+
+
+def _finite(*values: float) -> bool:
+    return all(math.isfinite(value) for value in values)
+
+
+def plausible_place(lat_deg: float, lon_deg: float) -> bool:
+    """True for a place on Earth; 0, 0 is what autopilots send before they have one."""
+    if not _finite(lat_deg, lon_deg) or abs(lat_deg) > 90.0 or abs(lon_deg) > 180.0:
+        return False
+    return lat_deg != 0.0 or lon_deg != 0.0
+
+
+READERS: dict[str, Callable[[Message], Sample | None]] = {
+    "ATTITUDE": _attitude,
+    "ATTITUDE_QUATERNION": _attitude_quaternion,
+    "GLOBAL_POSITION_INT": _global_position,
+    "GPS_RAW_INT": _gps_raw,
+    "DISTANCE_SENSOR": _distance_sensor,
+    "RANGEFINDER": _rangefinder,
+    "TERRAIN_REPORT": _terrain_report,
+    "ALTITUDE": _altitude,
+    "GIMBAL_DEVICE_ATTITUDE_STATUS": _device_status,
+    "MOUNT_ORIENTATION": _mount_orientation,
+    "MOUNT_STATUS": _mount_status,
+}
+"""Message name to reader. The next message is one function and one line."""

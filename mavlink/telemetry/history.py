@@ -1,0 +1,451 @@
+"""The vehicle's recent past: samples in, the state at any instant of it out."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mavlink.telemetry.gimbal import GimbalConfig, steadiest_frame, to_earth
+from mavlink.telemetry.quaternion import Quaternion, down_component, multiply, slerp
+from mavlink.telemetry.samples import (
+    RECEIVER_SIGMA_H_M,
+    RECEIVER_SIGMA_V_M,
+    AccuracySample,
+    AttitudeSample,
+    GimbalFrame,
+    GimbalSample,
+    PositionSample,
+    RangeSample,
+    ReceiverAltitude,
+    Sample,
+    TerrainSample,
+    VehicleState,
+)
+from mavlink.telemetry.track import MAX_GAP_NS, Bracket, Row, Track
+
+M_PER_DEG = 111_319.49  # along a meridian, and along the equator
+ACCURACY_GAP_NS = 3_000_000_000
+FRAMES = tuple(GimbalFrame)
+GIMBAL_DEVICES = (154, 171, 172, 173, 174, 175)
+JUDGE_EVERY_NS = 10_000_000_000  # between two looks at what a gimbal's quaternion refers to
+JUDGE_LAG_NS = 3_000_000_000
+JUDGED_SAMPLES = 600
+
+
+@dataclass(frozen=True, slots=True)
+class HistoryConfig:
+    """How long samples are kept and how far they are trusted (1 sigma)."""
+
+    keep_s: float = math.inf
+    gimbal: GimbalConfig = field(default_factory=GimbalConfig)
+    sigma_tilt_rad: float = 0.01
+    sigma_yaw_rad: float = 0.05
+    sigma_gimbal_rad: float = 0.01
+    sigma_h_m: float = RECEIVER_SIGMA_H_M  # without an accuracy from the GNSS receiver
+    sigma_v_m: float = RECEIVER_SIGMA_V_M
+    angular_acceleration_rad_s2: float = 1.5  # between samples the attitude may bend this much
+    acceleration_m_s2: float = 1.0  # the same for a position with velocity at both ends
+
+    def __post_init__(self) -> None:
+        for name in ("keep_s", "sigma_tilt_rad", "sigma_yaw_rad", "sigma_gimbal_rad"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"history {name} is {getattr(self, name)}; it must be positive")
+
+
+class VehicleHistory:
+    """Samples of one vehicle by time; safe for one writer and several readers."""
+
+    def __init__(self, config: HistoryConfig | None = None) -> None:
+        self.config = config or HistoryConfig()
+        self._lock = threading.Lock()
+        self._attitude = Track()  # w x y z
+        self._position = Track()  # lat lon alt relative vn ve vd, NaN where unknown
+        self._accuracy = Track()  # has_fix sigma_h sigma_v alt, NaN where unknown
+        self._range = Track()  # distance
+        self._terrain = Track()  # agl sigma
+        self._gimbals: dict[tuple[int, int], Track] = {}  # (rank, component): w x y z frame
+        self._judged: dict[tuple[int, int], tuple[int, GimbalFrame | None]] = {}  # when
+        self._seen: GimbalFrame | None = None  # by the pictures
+
+    @property
+    def first_ns(self) -> int | None:
+        """Time of the oldest attitude or position."""
+        times = [t.first_ns for t in (self._attitude, self._position) if t.first_ns is not None]
+        return min(times, default=None)
+
+    @property
+    def last_ns(self) -> int | None:
+        """Time of the newest attitude or position."""
+        times = [t.last_ns for t in (self._attitude, self._position) if t.last_ns is not None]
+        return max(times, default=None)
+
+    def covers(self, time_ns: int) -> bool:
+        """True when no stream that still flows may say more of ``time_ns``."""
+        with self._lock:
+            newest = [t.last_ns for t in (self._attitude, self._position, *self._gimbals.values())]
+        flowing = [t for t in newest if t is not None and t > time_ns - MAX_GAP_NS]
+        return all(t >= time_ns for t in flowing)
+
+    def attitudes(self) -> list[tuple[AttitudeSample, int]]:
+        """Every attitude with its time in ns, oldest first."""
+        with self._lock:
+            return [(AttitudeSample(None, _quaternion(r)), t) for t, r in self._attitude.items()]
+
+    def claimed_at(self, time_ns: int) -> tuple[Quaternion, Quaternion] | None:
+        """(the gimbal's quaternion as it was sent, ``q_ned_body``) at an instant, if known."""
+        with self._lock:
+            body = self._attitude.around(time_ns)
+            if body is None:
+                return None
+            q_body = slerp(_quaternion(body.before), _quaternion(body.after), body.fraction)
+            for key in self._gimbal_order():
+                at = self._gimbals[key].around(time_ns)
+                if at is not None:
+                    sent = slerp(_quaternion(at.before), _quaternion(at.after), at.fraction)
+                    return sent, q_body
+        return None
+
+    def _gimbal_order(self) -> list[tuple[int, int]]:
+        """The lowest rank says most; among equals the gimbal itself before its relay."""
+        return sorted(self._gimbals, key=lambda k: (k[0], k[1] not in GIMBAL_DEVICES, k[1]))
+
+    def heads(self, since_ns: int = 0) -> list[tuple[int, Quaternion]]:
+        """The camera head's attitude at every gimbal sample, or the body's without a gimbal."""
+        with self._lock:
+            tracks = self._gimbals.values()
+            times = {t for track in tracks for t, _ in track.items() if t >= since_ns}
+            bodies = [(t, _quaternion(r)) for t, r in self._attitude.items() if t >= since_ns]
+        states = [(t, VehicleHistory.state_at(self, t)) for t in sorted(times)]
+        found = [
+            (t, _quaternion(tuple(map(float, s.q_ned_gimbal_wxyz))))
+            for t, s in states
+            if s is not None and s.q_ned_gimbal_wxyz is not None
+        ]
+        return found or bodies
+
+    def __len__(self) -> int:
+        return len(self._attitude) + len(self._position)
+
+    def add(self, sample: Sample, time_ns: int) -> None:
+        """Put a sample in at its time; order does not matter."""
+        with self._lock:
+            track, row = self._place(sample)
+            track.add(time_ns, row)
+            if math.isfinite(self.config.keep_s):
+                track.forget_before(time_ns - int(self.config.keep_s * 1e9))
+
+    def set_gimbal(self, gimbal: GimbalConfig) -> None:
+        """Read gimbal messages in another way from now on, those already kept as well."""
+        with self._lock:
+            self.config = replace(self.config, gimbal=gimbal)
+
+    def gimbal_frame(self) -> GimbalFrame | None:
+        """What the quaternion of the gimbal that counts is taken to refer to; None without one."""
+        with self._lock:
+            for key in self._gimbal_order():
+                row = self._gimbals[key].last_row
+                if row is not None:
+                    return self._frame(key, FRAMES[int(row[4])])
+        return None
+
+    def trust_pictures(self, frame: GimbalFrame) -> None:
+        """Read the gimbal as the pictures say from now on, unless the configuration says how."""
+        with self._lock:
+            self._seen = frame
+
+    def clear(self) -> None:
+        """Forget everything, as after a reboot of the autopilot."""
+        with self._lock:
+            tracks = (self._attitude, self._position, self._accuracy, self._range, self._terrain)
+            for track in tracks:
+                track.clear()
+            self._gimbals.clear()
+            self._judged.clear()
+
+    def _place(self, sample: Sample) -> tuple[Track, Row]:
+        if isinstance(sample, AttitudeSample):
+            return self._attitude, sample.q_ned_body
+        if isinstance(sample, PositionSample):
+            relative = math.nan if sample.relative_alt_m is None else sample.relative_alt_m
+            velocity = sample.v_ned_m_s or (math.nan, math.nan, math.nan)
+            alt = math.nan if sample.alt_amsl_m is None else sample.alt_amsl_m
+            where = (sample.lat_deg, sample.lon_deg, alt)
+            return self._position, (*where, relative, *velocity)
+        if isinstance(sample, AccuracySample):
+            alt = math.nan if sample.alt_amsl_m is None else sample.alt_amsl_m
+            row = (float(sample.has_fix), sample.sigma_h_m, sample.sigma_v_m, alt)
+            return self._accuracy, row
+        if isinstance(sample, RangeSample):
+            return self._range, (sample.distance_m,)
+        if isinstance(sample, TerrainSample):
+            return self._terrain, (sample.agl_m, sample.sigma_m)
+        if isinstance(sample, GimbalSample):
+            track = self._gimbals.setdefault((sample.rank, sample.component), Track())
+            return track, (*sample.q, float(FRAMES.index(sample.frame)))
+        raise ValueError(f"no place in the history for a {type(sample).__name__}")
+
+    def state_at(self, time_ns: int) -> VehicleState | None:
+        """The state interpolated at ``time_ns``, or None when no part of it is known then.
+
+        Attitude by slerp, position by a cubic through both positions and velocities. Nothing
+        is carried further than 20 ms past the newest sample. Sigmas grow with the square of
+        the distance to the samples on both sides, and a part whose samples are more than one
+        second apart is left out. The height above ground comes from the first of rangefinder,
+        terrain, height above home.
+        """
+        with self._lock:
+            state = _Assembly(time_ns)
+            attitude = self._attitude.around(time_ns)
+            q_body = self._tell_attitude(state, attitude)
+            self._tell_gimbal(state, q_body)
+            relative = self._tell_position(state)
+            self._tell_agl(state, q_body, relative)
+        return state.finish()
+
+    def _tell_attitude(self, state: _Assembly, at: Bracket | None) -> Quaternion | None:
+        if at is None:
+            return None
+        q = slerp(_quaternion(at.before), _quaternion(at.after), at.fraction)
+        bend = self.config.angular_acceleration_rad_s2 * at.curvature_s2
+        state.set("attitude", at.age_ms)
+        state.fields["q_ned_body_wxyz"] = np.array(q)
+        state.fields["sigma_attitude_rad"] = math.hypot(self.config.sigma_tilt_rad, bend)
+        state.fields["sigma_yaw_rad"] = math.hypot(self.config.sigma_yaw_rad, bend)
+        return q
+
+    def _tell_gimbal(self, state: _Assembly, q_body: Quaternion | None) -> None:
+        for key in self._gimbal_order():
+            at = self._gimbals[key].around(state.time_ns)
+            q = None if at is None else self._gimbal_at(key, at, q_body)
+            if at is None or q is None:
+                continue
+            bend = self.config.angular_acceleration_rad_s2 * at.curvature_s2
+            state.set("gimbal", at.age_ms)
+            state.fields["q_ned_gimbal_wxyz"] = np.array(q)
+            state.fields["sigma_gimbal_rad"] = math.hypot(self.config.sigma_gimbal_rad, bend)
+            return
+        mount = self.config.gimbal.mount
+        if mount is not None and q_body is not None:
+            state.set("mount", state.ages["attitude"])
+            state.fields["q_ned_gimbal_wxyz"] = np.array(multiply(q_body, mount))
+            state.fields["sigma_gimbal_rad"] = state.fields["sigma_attitude_rad"]
+
+    def _gimbal_at(
+        self, key: tuple[int, int], at: Bracket, q_body: Quaternion | None
+    ) -> Quaternion | None:
+        """``q_ned_gimbal`` between two samples, along the frame in which the head turned less."""
+        sent = _quaternion(at.before), _quaternion(at.after)
+        frame = self._frame(key, FRAMES[int(at.before[4])])
+        if frame is GimbalFrame.EARTH:
+            return slerp(*sent, at.fraction)
+        ends = self._attitude.around(at.before_ns), self._attitude.around(at.after_ns)
+        if ends[0] is None or ends[1] is None or q_body is None:
+            return None
+        bodies = [slerp(_quaternion(e.before), _quaternion(e.after), e.fraction) for e in ends if e]
+        earth = [to_earth(q, frame, body) for q, body in zip(sent, bodies, strict=True)]
+        if _apart(*sent) < _apart(*earth):
+            return to_earth(slerp(*sent, at.fraction), frame, q_body)
+        return slerp(earth[0], earth[1], at.fraction)
+
+    def _frame(self, key: tuple[int, int], claimed: GimbalFrame) -> GimbalFrame:
+        """What the quaternion refers to.
+
+        By configuration, else by the pictures, else as claimed unless it cannot be.
+        """
+        chosen = self.config.gimbal.yaw_frame
+        if chosen != "auto":
+            return GimbalFrame(chosen)
+        if self._seen is not None:
+            return self._seen
+        if claimed is not GimbalFrame.VEHICLE:
+            return claimed
+        track = self._gimbals[key]
+        newest = track.last_ns or 0
+        looked_ns, better = self._judged.get(key, (0, None))
+        if newest - looked_ns > JUDGE_EVERY_NS:
+            better = self._steadiest(track) or better
+            self._judged[key] = (newest, better)
+        return better or claimed
+
+    def _steadiest(self, track: Track) -> GimbalFrame | None:
+        """Judged on a thinned track: it is done now and then while flying."""
+        sent: list[Quaternion] = []
+        bodies: list[Quaternion] = []
+        samples = track.items()
+        samples = samples[:: max(1, len(samples) // JUDGED_SAMPLES)]
+        for time_ns, row in samples:
+            at = self._attitude.around(time_ns)
+            if at is not None:
+                sent.append(_quaternion(row))
+                bodies.append(slerp(_quaternion(at.before), _quaternion(at.after), at.fraction))
+        if len(samples) < 2:
+            return None
+        spacing_ns = (samples[-1][0] - samples[0][0]) / (len(samples) - 1)
+        return steadiest_frame(sent, bodies, max(1, round(JUDGE_LAG_NS / spacing_ns)))
+
+    def _tell_position(self, state: _Assembly) -> Bracket | None:
+        at = self._position.around(state.time_ns)
+        if at is None:
+            return None
+        accuracy = self._accuracy.around(state.time_ns, ACCURACY_GAP_NS, ACCURACY_GAP_NS)
+        nearest = None if accuracy is None else accuracy.nearer
+        if nearest is not None and not nearest[0]:
+            return at  # no fix: the estimator's place is not worth a tag
+        sigma_h, sigma_v = self.config.sigma_h_m, self.config.sigma_v_m
+        if nearest is not None:
+            sigma_h, sigma_v = nearest[1], nearest[2]
+        bend = self.config.acceleration_m_s2 * at.curvature_s2
+        lat, lon, alt, velocity = _position_at(at)
+        state.set("gnss", at.age_ms)
+        state.fields.update(lat_deg=lat, lon_deg=lon, v_ned_m_s=velocity)
+        state.fields["sigma_h_m"] = math.hypot(sigma_h, bend)
+        if math.isfinite(alt):
+            state.fields["alt_amsl_m"] = alt
+            state.fields["sigma_v_m"] = math.hypot(sigma_v, bend)
+        state.fields["receiver"] = receiver_above(accuracy, self._position)
+        return at
+
+    def _tell_agl(
+        self, state: _Assembly, q_body: Quaternion | None, position: Bracket | None
+    ) -> None:
+        at = self._range.around(state.time_ns)
+        if at is not None and q_body is not None and down_component(q_body) > 0.5:
+            agl = _mix(at, 0) * down_component(q_body)
+            state.set_agl("rangefinder", at.age_ms, agl, 0.1 + 0.02 * agl)
+            return
+        at = self._terrain.around(state.time_ns)
+        if at is not None and _mix(at, 0) >= 0.0:
+            state.set_agl("terrain", at.age_ms, _mix(at, 0), at.before[1])
+            return
+        if position is not None and math.isfinite(position.before[3] + position.after[3]):
+            agl = _mix(position, 3)
+            if agl >= 0.0:
+                state.set_agl("relative", position.age_ms, agl, max(5.0, 0.1 * agl))
+
+
+class _Assembly:
+    """A VehicleState while its parts come together."""
+
+    def __init__(self, time_ns: int) -> None:
+        self.time_ns = time_ns
+        self.ages: dict[str, float] = {}
+        self.fields: dict[str, object] = {}
+
+    def set(self, source: str, age_ms: float) -> None:
+        self.ages[source] = age_ms
+
+    def set_agl(self, source: str, age_ms: float, agl_m: float, sigma_m: float) -> None:
+        self.set(source, age_ms)
+        self.fields["alt_agl_m"] = agl_m
+        # The ground and the climb between samples: a metre per second.
+        self.fields["sigma_agl_m"] = math.hypot(sigma_m, age_ms * 1e-3)
+
+    def finish(self) -> VehicleState | None:
+        if not self.ages:
+            return None
+        parts: dict[str, object] = dict(self.fields)
+        return VehicleState(
+            self.time_ns,
+            age_ms=self.ages,
+            sources=tuple(self.ages),
+            **parts,  # type: ignore[arg-type]
+        )
+
+
+def _quaternion(row: Row) -> Quaternion:
+    return (row[0], row[1], row[2], row[3])
+
+
+def _apart(a: Quaternion, b: Quaternion) -> float:
+    """Grows with the angle between two rotations; 0 when they are the same."""
+    return 1.0 - abs(sum(p * q for p, q in zip(a, b, strict=True)))
+
+
+def _mix(at: Bracket, k: int) -> float:
+    return at.before[k] + (at.after[k] - at.before[k]) * at.fraction
+
+
+def _position_at(at: Bracket) -> tuple[float, float, float, object]:
+    """(lat, lon, alt, v_ned or None) by a cubic Hermite curve when both ends have a velocity."""
+    per_lon = M_PER_DEG * max(1e-6, math.cos(math.radians(at.before[0])))
+    d_lon = (at.after[1] - at.before[1] + 180.0) % 360.0 - 180.0
+    step = (
+        (at.after[0] - at.before[0]) * M_PER_DEG,
+        d_lon * per_lon,
+        -(at.after[2] - at.before[2]),
+    )
+    v0, v1 = at.before[4:7], at.after[4:7]
+    u, h = at.fraction, at.gap_s
+    ned = [_hermite(step[k], v0[k] * h, v1[k] * h, u) for k in range(3)]
+    lat = at.before[0] + ned[0] / M_PER_DEG
+    lon = (at.before[1] + ned[1] / per_lon + 180.0) % 360.0 - 180.0
+    known = all(map(math.isfinite, (*v0, *v1)))
+    velocity = np.array([_mix(at, k) for k in (4, 5, 6)]) if known else None
+    return lat, lon, at.before[2] - ned[2], velocity
+
+
+def _hermite(step: float, m0: float, m1: float, u: float) -> float:
+    """Way covered at fraction u; straight when the velocities contradict the step."""
+    straight = u * step
+    if not (math.isfinite(m0) and math.isfinite(m1)) or not 0.0 <= u <= 1.0:
+        return straight
+    if abs(0.5 * (m0 + m1) - step) > 0.5 + 0.2 * abs(step):
+        return straight
+    h10, h01, h11 = u * (1 - u) ** 2, u * u * (3 - 2 * u), u * u * (u - 1)
+    return h10 * m0 + h01 * step + h11 * m1
+
+
+PATIENCE_S = 0.3  # a little more than the 3.5 Hz of a slow telemetry radio
+
+
+class LiveHistory(VehicleHistory):
+    """A VehicleHistory on the monotonic clock; ``state_at`` may wait for ``patience_s``."""
+
+    def __init__(self, config: HistoryConfig | None = None, patience_s: float = PATIENCE_S) -> None:
+        super().__init__(config)
+        self.patience_s = patience_s
+        self._news = threading.Condition()
+        self._waiting = 0  # readers
+
+    def add(self, sample: Sample, time_ns: int) -> None:
+        """Put a sample in at its time and wake whoever waits for it."""
+        super().add(sample, time_ns)
+        if self._waiting:
+            with self._news:
+                self._news.notify_all()
+
+    def state_at(self, time_ns: int) -> VehicleState | None:
+        """The state at ``time_ns``, as soon as every stream that flows has come past it."""
+        now_s = time.monotonic()
+        end_s = now_s + self.patience_s
+        if time_ns * 1e-9 < end_s:  # what lies further ahead cannot come in time
+            with self._news:
+                self._waiting += 1  # before looking, so that nothing new goes unnoticed
+                while not self.covers(time_ns) and now_s < end_s:
+                    self._news.wait(end_s - now_s)
+                    now_s = time.monotonic()
+                self._waiting -= 1
+        return super().state_at(time_ns)
+
+
+ALTITUDE = 3
+"""Column of the receiver's samples."""
+
+EKF_ALTITUDE = 2
+"""Column of the autopilot's positions."""
+
+
+def receiver_above(accuracy: Bracket | None, positions: Track) -> ReceiverAltitude | None:
+    """The fix nearest in time against the autopilot's altitude then; None without either."""
+    if accuracy is None:
+        return None
+    at = positions.around(accuracy.nearer_ns)
+    if at is None:
+        return None
+    before, after = at.before[EKF_ALTITUDE], at.after[EKF_ALTITUDE]
+    above = accuracy.nearer[ALTITUDE] - (before + (after - before) * at.fraction)
+    return ReceiverAltitude(accuracy.nearer_ns, above) if math.isfinite(above) else None

@@ -1,0 +1,320 @@
+"""The camera's latency, estimated from the rotation its images show.
+
+A frame stamped ``t`` was exposed at ``t - latency``. The turns seen between frames, shifted by
+the latency, must be those of telemetry (VINS calls it ``td``, DOI 10.1109/IROS.2018.8593603):
+those of the head for a gimbal, of the body for a fixed mount. The mount need not be known; the
+rotation between the two sets of axes is solved for as well. Quaternions here are arrays (N, 4),
+w x y z, unit.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from mavlink.telemetry.quaternion import Quaternion, normalised
+from mavlink.telemetry.quaternion import multiply as product
+
+LEAST_WINDOWS = 50  # that do not overlap
+LEAST_CORRELATION = 0.7
+WINDOW_S = 0.2  # turns over less are mostly noise; over more, the latency drowns
+FLOOR_MS = 2.0  # neither exposures nor the stamps of telemetry are known better
+SETTLED_MS = 5.0  # sigma of an estimate that may be believed
+LARGEST_SIGMA_MS = 25.0  # one that is not worth telling
+RIVAL = 1.3  # a second answer, further away than RIVAL_APART_S, must fit worse by so much
+RIVAL_APART_S = 0.15
+KEPT = 2000
+COARSE_S, FINE_S, FINE_STEPS = 0.02, 0.004, 8
+OUTLIER = 4.0  # times the median misfit
+
+
+@dataclass(frozen=True, slots=True)
+class LatencyEstimate:
+    """The latency that fits best."""
+
+    latency_ms: float
+    sigma_ms: float
+    correlation: float  # of the turns seen and those of telemetry at that latency, 0 to 1
+    windows: int  # turns that took part
+
+    @property
+    def is_settled(self) -> bool:
+        """True when it is good enough to be applied."""
+        return self.sigma_ms <= SETTLED_MS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Turns:
+    """What the pictures say: turns over windows of time."""
+
+    start_s: F64  # (N,)
+    end_s: F64  # (N,)
+    rate: F64  # (N, 3) rad/s in the camera's axes at the start
+    overlap: int  # windows that share an instant
+
+    def __len__(self) -> int:
+        return len(self.start_s)
+
+    def only(self, mask: Bool) -> _Turns:
+        """Those of a mask."""
+        return _Turns(self.start_s[mask], self.end_s[mask], self.rate[mask], self.overlap)
+
+
+class LatencyWatch:
+    """Collects turns between frames and says what latency they speak for."""
+
+    def __init__(self, range_ms: tuple[float, float] = (-200.0, 800.0)) -> None:
+        if not range_ms[0] < range_ms[1]:
+            raise ValueError(f"latency range {range_ms} must go upwards")
+        self._range_s = (range_ms[0] * 1e-3, range_ms[1] * 1e-3)
+        self._frames: deque[tuple[int, int, Quaternion]] = deque(maxlen=KEPT)  # run, time, turned
+        self._run = 0
+
+    def add(self, first_ns: int, second_ns: int, q_step: Quaternion) -> None:
+        """Take in ``q_camera(first)_camera(second)`` between two frames, at their stamps.
+
+        Steps that follow on each other are joined. What is no rotation, or goes back in time,
+        is left out.
+        """
+        step = normalised(q_step)
+        if second_ns <= first_ns or step is None:
+            return
+        if not self._frames or self._frames[-1][1] != first_ns:
+            self._run += 1
+            self._frames.append((self._run, first_ns, (1.0, 0.0, 0.0, 0.0)))
+        turned = product(self._frames[-1][2], step)
+        self._frames.append((self._run, second_ns, normalised(turned) or turned))
+
+    def estimate(self, attitudes: Sequence[tuple[int, Quaternion]]) -> LatencyEstimate | None:
+        """The latency by attitudes (time in ns, attitude) over the same time, oldest first.
+
+        None while there are too few frames, too little rotation, or no clear answer.
+        """
+        if len(attitudes) < LEAST_WINDOWS or len(self._frames) < LEAST_WINDOWS:
+            return None
+        track = Attitudes(attitudes)
+        low, high = self._range_s
+        seen = self._turns(track.base_ns, max(WINDOW_S, 2.0 * track.spacing_s))
+        inside = (seen.start_s - high > track.first_s) & (seen.end_s - low < track.last_s)
+        seen = seen.only(inside)
+        if len(seen) < LEAST_WINDOWS * seen.overlap:
+            return None
+        lags = np.arange(low, high + COARSE_S / 2, COARSE_S)
+        fits = [_fit(seen, track, float(lag)) for lag in lags]
+        misfits = np.array([np.inf if fit is None else fit.misfit for fit in fits])
+        k = int(np.argmin(misfits))
+        best = fits[k]
+        if best is None or not 0 < k < len(lags) - 1 or best.correlation < LEAST_CORRELATION:
+            return None
+        far = np.abs(lags - lags[k]) > RIVAL_APART_S
+        if (misfits[far] < RIVAL * best.misfit).any():
+            return None  # two latencies explain the pictures nearly as well
+        return _refine(seen.only(best.good), track, float(lags[k]))
+
+    def _turns(self, base_ns: int, window_s: float) -> _Turns:
+        """Turns over ``window_s`` or a little more, four to a window."""
+        run = np.array([frame[0] for frame in self._frames])
+        time_s: F64 = np.array([(frame[1] - base_ns) * 1e-9 for frame in self._frames])
+        q: F64 = np.array([frame[2] for frame in self._frames], np.float64)
+        i = np.arange(len(run))
+        j = np.minimum(np.searchsorted(time_s, time_s + 0.99 * window_s), len(run) - 1)
+        whole = (run[j] == run[i]) & (time_s[j] - time_s[i] >= 0.99 * window_s)
+        i, j = i[whole], j[whole]
+        stride = max(1, int(np.median(j - i)) // 4) if len(i) else 1
+        i, j = i[::stride], j[::stride]
+        span = (time_s[j] - time_s[i])[:, None]
+        rate = rotation_vectors(multiply(conjugate(q[i]), q[j])) / span
+        overlap = int(np.ceil(np.median((j - i) / stride))) if len(i) else 1
+        return _Turns(time_s[i], time_s[j], rate, overlap)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """Telemetry against the pictures at one latency."""
+
+    ours: F64  # (N, 3) telemetry's rates in the camera's axes
+    rest: F64  # (N, 3) what the pictures saw beyond them
+    known: Bool  # (N,) telemetry is there
+    misfit: float  # mean square of the rest
+    correlation: float
+
+    @property
+    def good(self) -> Bool:
+        """(N,) all but what no noise explains, such as a frame placed wrongly."""
+        size = np.linalg.norm(self.rest, axis=1)
+        good: Bool = self.known & (size <= OUTLIER * np.median(size[self.known]))
+        return good
+
+
+def _fit(seen: _Turns, track: Attitudes, lag_s: float) -> _Fit | None:
+    """None where telemetry says too little."""
+    turns, known = track.turns(seen.start_s - lag_s, seen.end_s - lag_s)
+    if known.sum() < LEAST_WINDOWS:
+        return None
+    ours = turns / (seen.end_s - seen.start_s)[:, None]
+    ours = ours @ best_rotation(ours[known], seen.rate[known]).T
+    rest = seen.rate - ours
+    a, b = ours[known], seen.rate[known]
+    power = float(np.sqrt((a**2).sum() * (b**2).sum()))
+    correlation = float((a * b).sum()) / power if power > 0.0 else 0.0
+    return _Fit(ours, rest, known, float((rest[known] ** 2).sum(axis=1).mean()), correlation)
+
+
+def _refine(seen: _Turns, track: Attitudes, lag_s: float) -> LatencyEstimate | None:
+    """The least weighted misfit near a latency; weights are those of the misfit itself.
+
+    The heading of an autopilot wanders more than its tilt, so each axis counts by how well it
+    fits. The sigma allows for misfits that last (Newey and West, DOI 10.2307/1913610).
+    """
+    start = _fit(seen, track, lag_s)
+    if start is None:
+        return None
+    scatter: F64 = np.cov(start.rest[start.known].T) + 1e-12 * np.eye(3)
+    weight: F64 = np.asarray(np.linalg.inv(scatter), np.float64)
+    lags = lag_s + FINE_S * np.arange(-FINE_STEPS, FINE_STEPS + 1)
+    fits = [_fit(seen, track, float(lag)) for lag in lags]
+    costs = np.array([_cost(fit, weight) for fit in fits])
+    k = int(np.argmin(costs))
+    if not 0 < k < len(lags) - 1:
+        return None
+    before, at, after = fits[k - 1], fits[k], fits[k + 1]
+    bend = costs[k - 1] - 2.0 * costs[k] + costs[k + 1]
+    if before is None or at is None or after is None or not bend > 0.0:
+        return None
+    latency = float(lags[k] - 0.5 * FINE_S * (costs[k + 1] - costs[k - 1]) / bend)
+    slope = (after.ours - before.ours) / (2.0 * FINE_S)
+    known = before.known & at.known & after.known
+    sigma = _sigma(slope[known] @ weight, slope[known], at.rest[known], 2 * seen.overlap)
+    sigma_ms = float(np.hypot(1e3 * sigma, FLOOR_MS))
+    if not sigma_ms <= LARGEST_SIGMA_MS:
+        return None
+    return LatencyEstimate(1e3 * latency, sigma_ms, at.correlation, int(known.sum()))
+
+
+def _cost(fit: _Fit | None, weight: F64) -> float:
+    """Mean weighted square of what telemetry leaves unexplained."""
+    if fit is None:
+        return float("inf")
+    rest = fit.rest[fit.known]
+    return float(np.einsum("ij,jk,ik->i", rest, weight, rest).mean())
+
+
+def _sigma(weighted: F64, slope: F64, rest: F64, lasting: int) -> float:
+    """1 sigma in s of a time found by least squares, for misfits that last some windows."""
+    information = float((weighted * slope).sum())
+    pulls = (weighted * rest).sum(axis=1)
+    variance = float((pulls**2).sum())
+    total = variance
+    for k in range(1, min(lasting, len(pulls) - 1) + 1):
+        total += 2.0 * (1.0 - k / (lasting + 1)) * float((pulls[k:] * pulls[:-k]).sum())
+    return float(np.sqrt(max(total, variance))) / information if information > 0.0 else np.inf
+
+
+F64 = npt.NDArray[np.float64]
+Bool = npt.NDArray[np.bool_]
+
+LONGEST_GAP_S = 0.25
+"""Attitudes further apart say nothing of what was between them."""
+
+FINER = 4
+"""Steps from one attitude to the next."""
+
+
+class Attitudes:
+    """A flight's attitudes, to be asked for the turn between any two instants."""
+
+    def __init__(self, samples: Sequence[tuple[int, Quaternion]]) -> None:
+        """``samples`` are (time in ns, ``q_ned_body``), oldest first; two at least.
+
+        They are averaged over the time between two of them: noise would otherwise be least
+        half-way between two samples, and draw every comparison there.
+        """
+        self.base_ns = samples[0][0]
+        times_s: F64 = np.array([(t - self.base_ns) * 1e-9 for t, _ in samples])
+        q: F64 = np.array([q for _, q in samples], np.float64)
+        flips = np.where(np.einsum("ij,ij->i", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
+        q[1:] *= np.cumprod(flips)[:, None]  # neighbours on the same side, so they can be mixed
+        self.spacing_s = float(np.median(np.diff(times_s)))
+        self._step_s = max(self.spacing_s / FINER, 1e-3)
+        self._grid_s = np.arange(0.0, times_s[-1] + self._step_s, self._step_s)
+        fine, known = _between(times_s, q, self._grid_s)
+        weights = np.concatenate([[0.5], np.ones(FINER - 1), [0.5]]) / FINER
+        self._q = np.stack([np.convolve(fine[:, k], weights, "same") for k in range(4)], axis=1)
+        self._known: Bool = np.convolve(known, weights, "same") > 0.999
+
+    @property
+    def first_s(self) -> float:
+        """Time of the oldest."""
+        return float(self._grid_s[0])
+
+    @property
+    def last_s(self) -> float:
+        """Time of the newest."""
+        return float(self._grid_s[-1])
+
+    def turns(self, start_s: F64, end_s: F64) -> tuple[F64, Bool]:
+        """((N, 3) rotation vectors in rad in the axes at the start, (N,) where they are known).
+
+        Times are seconds since ``base_ns``.
+        """
+        first, ok_first = self._at(start_s)
+        second, ok_second = self._at(end_s)
+        return rotation_vectors(multiply(conjugate(first), second)), ok_first & ok_second
+
+    def _at(self, time_s: F64) -> tuple[F64, Bool]:
+        """(N, 4) attitudes at instants, and where samples are near enough."""
+        i = np.searchsorted(self._grid_s, time_s, "right")
+        inside = (i > 0) & (i < len(self._grid_s))
+        i = np.clip(i, 1, len(self._grid_s) - 1)
+        u = np.clip((time_s - self._grid_s[i - 1]) / self._step_s, 0.0, 1.0)[:, None]
+        q = (1.0 - u) * self._q[i - 1] + u * self._q[i]
+        known = inside & self._known[i - 1] & self._known[i]
+        return q / np.linalg.norm(q, axis=1, keepdims=True), known
+
+
+def _between(times_s: F64, q: F64, at_s: F64) -> tuple[F64, Bool]:
+    """(N, 4) attitudes on straight lines between samples, and where samples are near enough.
+
+    Between samples so near a straight line is a slerp to a thousandth of the turn.
+    """
+    i = np.clip(np.searchsorted(times_s, at_s, "right"), 1, len(times_s) - 1)
+    gap = times_s[i] - times_s[i - 1]
+    u = (at_s - times_s[i - 1]) / np.maximum(gap, 1e-9)
+    mixed = q[i - 1] + np.clip(u, 0.0, 1.0)[:, None] * (q[i] - q[i - 1])
+    return mixed, (u > -1e-9) & (u < 1.0 + 1e-9) & (gap < LONGEST_GAP_S)
+
+
+def conjugate(q: F64) -> F64:
+    """(N, 4) the opposite rotations."""
+    return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
+
+
+def multiply(a: F64, b: F64) -> F64:
+    """(N, 4) rotations: b first, then a."""
+    w, v = a[:, :1], a[:, 1:]
+    p, r = b[:, :1], b[:, 1:]
+    scalar = w * p - np.einsum("ij,ij->i", v, r)[:, None]
+    return np.concatenate([scalar, w * r + p * v + np.cross(v, r)], axis=1)
+
+
+def rotation_vectors(q: F64) -> F64:
+    """(N, 3) axis times angle in rad, the shorter way round."""
+    q = np.where(q[:, :1] < 0.0, -q, q)
+    length = np.linalg.norm(q[:, 1:], axis=1)
+    angle = 2.0 * np.arctan2(length, q[:, 0])
+    scale = np.where(length > 1e-12, angle / np.maximum(length, 1e-12), 2.0)
+    return np.asarray(q[:, 1:] * scale[:, None])
+
+
+def best_rotation(source: F64, target: F64) -> F64:
+    """(3, 3) rotation R with ``target ~ R source`` for (N, 3) vectors.
+
+    Kabsch, DOI 10.1107/S0567739476001873.
+    """
+    u, _, vt = np.linalg.svd(target.T @ source)
+    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt)) or 1.0])
+    return np.asarray(u @ turn @ vt)

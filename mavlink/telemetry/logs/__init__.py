@@ -1,0 +1,66 @@
+"""Recorded telemetry: a log of any kind into a vehicle history, ``load_telemetry(path)``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from mavlink.telemetry.history import HistoryConfig, VehicleHistory
+
+READERS: dict[str, str] = {
+    ".tlog": "mavlink.telemetry.logs.tlog:load",
+    ".bin": "mavlink.telemetry.logs.dataflash:load",
+    ".ulg": "mavlink.telemetry.logs.ulog:load",
+    ".srt": "mavlink.telemetry.logs.srt:load",
+}
+"""File name's end (lower case) to ``module:function``. The next kind is one file, one line."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TelemetryLog:
+    """A log's history and what was found on the way."""
+
+    history: VehicleHistory
+    clock: str  # "unix", or "boot" when the log holds no date
+    first_ns: int
+    last_ns: int
+    warnings: tuple[str, ...]
+    counts: Mapping[str, int]  # messages by name, skipped_bytes, bad_checksums
+
+
+def load_telemetry(path: str | Path, config: HistoryConfig | None = None) -> TelemetryLog:
+    """The vehicle history in a .tlog, .BIN, .ulg or DJI .SRT file, on the unix clock in ns.
+
+    ValueError in one line when there is no such file, or when it holds no attitude and no
+    position that can be used. Damaged parts are skipped and counted.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such telemetry file")
+    if path.stat().st_size == 0:
+        raise ValueError(f"{path}: the telemetry file is empty")
+    target = READERS.get(path.suffix.lower())
+    if target is None:
+        kinds = ", ".join(READERS)
+        raise ValueError(f"{path}: not a telemetry file; its name must end in one of {kinds}")
+    module, _, function = target.partition(":")
+    load: Any = getattr(import_module(module), function)
+    log: TelemetryLog = load(path, config or HistoryConfig())
+    return log
+
+
+def finish(
+    path: Path,
+    history: VehicleHistory,
+    counts: Mapping[str, int],
+    warnings: list[str],
+    clock: str = "unix",
+) -> TelemetryLog:
+    """The log around a filled history; ValueError when nothing in it can be used."""
+    first, last = history.first_ns, history.last_ns
+    if first is None or last is None:
+        raise ValueError(f"{path}: no attitude and no position of a vehicle in this log")
+    return TelemetryLog(history, clock, first, last, tuple(warnings), dict(counts))

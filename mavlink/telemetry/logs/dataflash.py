@@ -1,0 +1,145 @@
+"""ArduPilot's onboard log (.BIN), read by pymavlink's DFReader."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from mavlink.telemetry.decode import DOWNWARD, TERRAIN_MODEL_SIGMA_M, plausible_place
+from mavlink.telemetry.history import HistoryConfig, VehicleHistory
+from mavlink.telemetry.logs import TelemetryLog, finish
+from mavlink.telemetry.quaternion import from_rpy
+from mavlink.telemetry.samples import (
+    AccuracySample,
+    AttitudeSample,
+    GimbalFrame,
+    GimbalSample,
+    PositionSample,
+    RangeSample,
+    Sample,
+    TerrainSample,
+)
+
+HEADER = b"\xa3\x95"
+UNIX_FROM_S = 1e9
+FRESH_S = 0.25
+GOOD = 4  # RangeFinder status
+
+
+def load(path: Path, config: HistoryConfig) -> TelemetryLog:
+    """The history in a .BIN log, on GPS time when the log has it, else since boot."""
+    with path.open("rb") as file:
+        if file.read(2) != HEADER:
+            raise ValueError(f"{path}: not an ArduPilot .BIN log")
+    history = VehicleHistory(config)
+    counts: Counter[str] = Counter()
+    reader = _Reader()
+    first_s: float | None = None
+    for message in _messages(path):
+        name = message.get_type()
+        counts[name] += 1
+        sample = reader.sample(name, message)
+        if sample is not None:
+            first_s = message._timestamp if first_s is None else first_s
+            history.add(sample, round(message._timestamp * 1e9))
+    dated = first_s is not None and first_s > UNIX_FROM_S
+    warnings = [] if dated else ["no GPS time in this log: its clock starts at boot"]
+    return finish(path, history, counts, warnings, "unix" if dated else "boot")
+
+
+def _messages(path: Path) -> Iterator[Any]:
+    from pymavlink.DFReader import DFReader_binary  # type: ignore[import-untyped]
+
+    try:
+        log = DFReader_binary(str(path))
+    except Exception as error:  # DFReader raises this class itself
+        raise ValueError(f"{path}: the .BIN log cannot be read ({error})") from error
+    try:
+        while True:
+            try:
+                message = log.recv_match(type=list(_Reader.TABLE))
+            except Exception:
+                return  # torn at this point: what came before stands
+            if message is None:
+                return
+            yield message
+    finally:
+        log.close()
+
+
+class _Reader:
+    """Messages into samples; remembers the last velocity, which has a message of its own."""
+
+    def __init__(self) -> None:
+        self._velocity: tuple[float, tuple[float, float, float]] | None = None
+        self._fix = True
+        self._fix_alt_m: float | None = None
+
+    def sample(self, name: str, m: Any) -> Sample | None:
+        try:
+            return self.TABLE[name](self, m)
+        except (AttributeError, TypeError, ValueError):
+            return None  # a field of another firmware generation is missing
+
+    def _attitude(self, m: Any) -> Sample | None:
+        angles = (m.Roll, m.Pitch, m.Yaw)
+        if not all(map(math.isfinite, angles)):
+            return None
+        return AttitudeSample(None, from_rpy(*map(math.radians, angles)))
+
+    def _ekf_velocity(self, m: Any) -> Sample | None:
+        if getattr(m, "C", 0) == 0:
+            self._velocity = (m._timestamp, (m.VN, m.VE, m.VD))
+        return None
+
+    def _position(self, m: Any) -> Sample | None:
+        if not plausible_place(m.Lat, m.Lng):
+            return None
+        velocity = None
+        if self._velocity is not None and abs(m._timestamp - self._velocity[0]) < FRESH_S:
+            velocity = self._velocity[1]
+        relative = getattr(m, "RelHomeAlt", None)
+        return PositionSample(None, m.Lat, m.Lng, m.Alt, relative, velocity)
+
+    def _gps(self, m: Any) -> Sample | None:
+        self._fix = m.Status >= 3
+        self._fix_alt_m = getattr(m, "Alt", None) if self._fix else None
+        return None if self._fix else AccuracySample(None, False, 1e3, 1e3)
+
+    def _gps_accuracy(self, m: Any) -> Sample | None:
+        return AccuracySample(None, self._fix, m.HAcc, m.VAcc, self._fix_alt_m)
+
+    def _range(self, m: Any) -> Sample | None:
+        if getattr(m, "Orient", DOWNWARD) != DOWNWARD or getattr(m, "Stat", GOOD) != GOOD:
+            return None
+        distance = getattr(m, "Dist", None)
+        distance = m.Dist1 if distance is None else distance
+        return RangeSample(None, distance) if distance > 0.0 else None
+
+    def _terrain(self, m: Any) -> Sample | None:
+        if m.Status != 2:
+            return None
+        return TerrainSample(None, m.CHeight, TERRAIN_MODEL_SIGMA_M)
+
+    def _mount(self, m: Any) -> Sample | None:
+        earth = math.isfinite(m.YawE)
+        yaw = m.YawE if earth else m.YawB
+        if not all(map(math.isfinite, (m.Roll, m.Pitch, yaw))):
+            return None
+        q = from_rpy(*map(math.radians, (m.Roll, m.Pitch, yaw)))
+        return GimbalSample(None, q, GimbalFrame.EARTH if earth else GimbalFrame.VEHICLE, 1, 0)
+
+    TABLE: dict[str, Callable[[_Reader, Any], Sample | None]] = {  # noqa: RUF012
+        "ATT": _attitude,
+        "XKF1": _ekf_velocity,
+        "NKF1": _ekf_velocity,
+        "POS": _position,
+        "GPS": _gps,
+        "GPA": _gps_accuracy,
+        "RFND": _range,
+        "TERR": _terrain,
+        "MNT": _mount,
+    }

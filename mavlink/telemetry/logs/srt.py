@@ -1,0 +1,110 @@
+"""DJI subtitle telemetry (.SRT): one cue per video frame or per second.
+
+The times are the video's own presentation times: the dates in these files are local time of
+an unknown zone. Several layouts are read: ``[latitude: ..] [longitude: ..] [rel_alt: ..
+abs_alt: ..]`` with optional ``[gb_yaw: .. gb_pitch: .. gb_roll: ..]``; ``GPS (lon, lat, n)``
+with ``H`` and ``F.PRY``, ``G.PRY``; ``GPS(lat,lon,..M) BAROMETER:``.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from pathlib import Path
+
+from mavlink.telemetry.decode import plausible_place
+from mavlink.telemetry.history import M_PER_DEG, HistoryConfig, VehicleHistory
+from mavlink.telemetry.logs import TelemetryLog, finish
+from mavlink.telemetry.quaternion import from_rpy
+from mavlink.telemetry.samples import (
+    RECEIVER_SIGMA_H_M,
+    AccuracySample,
+    AttitudeSample,
+    GimbalFrame,
+    GimbalSample,
+    PositionSample,
+)
+
+NUMBER = r"(-?\d+(?:\.\d+)?)"
+CUE = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
+FIELD = re.compile(rf"\b(\w+)\s*:\s*{NUMBER}")
+GPS = re.compile(rf"GPS\s*\(\s*{NUMBER}\s*,\s*{NUMBER}\s*,\s*{NUMBER}\s*(M?)", re.IGNORECASE)
+HEIGHT = re.compile(rf"\bH\s+{NUMBER}\s*m\b")
+PRY = re.compile(rf"\b([FG])\.PRY\s*\(\s*{NUMBER}°?\s*,\s*{NUMBER}°?\s*,\s*{NUMBER}")
+LONGEST_LINE = 4096
+CAMERA = 100  # the component that the head's attitude is filed under
+
+
+def load(path: Path, config: HistoryConfig) -> TelemetryLog:
+    """The history in a DJI subtitle file; its clock is ``video``."""
+    history = VehicleHistory(config)
+    counts: Counter[str] = Counter()
+    time_ns: int | None = None
+    text: list[str] = []
+    with path.open(encoding="utf-8", errors="replace") as file:
+        while line := file.readline(LONGEST_LINE):
+            cue = CUE.match(line.strip())
+            if cue is None:
+                text.append(line)
+                continue
+            _cue(history, counts, time_ns, " ".join(text))
+            text.clear()
+            hours, minutes, seconds, fraction = cue.groups()
+            ms = int(fraction.ljust(3, "0"))
+            whole = int(hours) * 3600 + int(minutes) * 60 + int(seconds)
+            time_ns = (whole * 1000 + ms) * 1_000_000
+    _cue(history, counts, time_ns, " ".join(text))
+    if not counts["cues"]:
+        raise ValueError(f"{path}: not a subtitle file; no cue was found")
+    warnings = [f"{counts['unreadable']} cues without telemetry"] if counts["unreadable"] else []
+    return finish(path, history, counts, warnings, clock="video")
+
+
+def _cue(history: VehicleHistory, counts: Counter[str], time_ns: int | None, text: str) -> None:
+    if time_ns is None:
+        return
+    counts["cues"] += 1
+    fields = {name.lower(): float(value) for name, value in FIELD.findall(text)}
+    place = _place(text, fields)
+    if place is None:
+        counts["unreadable"] += 1
+    else:
+        counts["positions"] += 1
+        history.add(place[0], time_ns)
+        history.add(place[1], time_ns)
+    _attitudes(history, text, fields, time_ns)
+
+
+def _place(text: str, fields: dict[str, float]) -> tuple[PositionSample, AccuracySample] | None:
+    lat, lon = fields.get("latitude"), fields.get("longitude", fields.get("longtitude"))
+    relative = fields.get("rel_alt", fields.get("altitude", fields.get("barometer")))
+    coarse_m = 0.0
+    gps = GPS.search(text)
+    if (lat is None or lon is None) and gps is not None:
+        first, second, _, metres = gps.groups()
+        # Layouts with a unit give latitude first, those with a satellite count longitude.
+        lat, lon = (float(first), float(second)) if metres else (float(second), float(first))
+        if abs(lat) > 90.0:
+            lat, lon = lon, lat
+        coarse_m = 0.3 * M_PER_DEG * 10.0 ** -len(first.partition(".")[2])
+        height = HEIGHT.search(text)
+        relative = relative if height is None else float(height.group(1))
+    if lat is None or lon is None or not plausible_place(lat, lon):
+        return None
+    position = PositionSample(None, lat, lon, fields.get("abs_alt"), relative, None)
+    return position, AccuracySample(None, True, math.hypot(RECEIVER_SIGMA_H_M, coarse_m), 8.0)
+
+
+def _attitudes(history: VehicleHistory, text: str, fields: dict[str, float], time_ns: int) -> None:
+    for which, *angles in PRY.findall(text):
+        pitch, roll, yaw = (math.radians(float(a)) for a in angles)
+        q = from_rpy(roll, pitch, yaw)
+        if which == "F":
+            history.add(AttitudeSample(None, q), time_ns)
+        else:
+            history.add(GimbalSample(None, q, GimbalFrame.EARTH, CAMERA, 0), time_ns)
+    head = [fields.get(name) for name in ("gb_roll", "gb_pitch", "gb_yaw")]
+    if None not in head:
+        q = from_rpy(*(math.radians(a) for a in head if a is not None))
+        history.add(GimbalSample(None, q, GimbalFrame.EARTH, CAMERA, 0), time_ns)

@@ -1,0 +1,1 @@
+"""Bytes and links: packets, signing, ports, the messages that we send."""

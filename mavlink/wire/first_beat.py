@@ -1,0 +1,97 @@
+"""Our two components, and their heartbeats before the heavy imports.
+
+An autopilot may not talk on a serial line until it hears MAVLink, and ArduPilot stops looking
+for a camera a minute after boot. Dialect and arrays take a while to import on a busy machine,
+so these first packets are made by hand. :class:`~mavlink.component.vehicle.VehicleLink` takes over.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from mavlink.wire.link import Link, parse_link
+
+ONBOARD = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
+CAMERA = 100  # MAV_COMP_ID_CAMERA
+TYPES = {ONBOARD: 18, CAMERA: 30}  # MAV_TYPE_ONBOARD_CONTROLLER, MAV_TYPE_CAMERA
+NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
+BOOT = 1  # MAV_STATE
+HEARTBEAT, CRC_EXTRA, VERSION = 0, 50, 3
+PERIOD_S = 1.0
+LONGEST_S = 120.0  # who has not taken over by then is dead, and says so by silence
+
+
+FIRST_DEVICE = 100  # from here on component ids are of cameras, gimbals, computers, receivers ...
+NOT_VEHICLES = frozenset({5, 6, 18, 26, 27, 30, *range(31, 35), *range(36, 43), 44, 48, 49})
+"""MAV_TYPE of antenna trackers, ground stations, onboard computers, gimbals, ADS-B, cameras,
+charging stations, FLARM, servos, Open Drone ID, batteries, parachutes, loggers, OSDs, IMUs, GPS,
+winches, illuminators, grippers and radios."""
+
+
+def is_autopilot(component: int, heartbeat: Any) -> bool:
+    """True for the heartbeat of a vehicle's autopilot, not of any other component."""
+    return (
+        heartbeat.autopilot != NO_AUTOPILOT
+        and heartbeat.type not in NOT_VEHICLES
+        and 0 < component < FIRST_DEVICE
+    )
+
+
+def heartbeat_packet(
+    sequence: int, system: int, component: int, token: int, state: int = BOOT
+) -> bytes:
+    """The MAVLink 2 packet of a HEARTBEAT of one of our components."""
+    payload = struct.pack("<IBBBBB", token, TYPES[component], NO_AUTOPILOT, 0, state, VERSION)
+    head = struct.pack("<BBBBBB", len(payload), 0, 0, sequence & 0xFF, system, component)
+    body = head + HEARTBEAT.to_bytes(3, "little") + payload
+    return b"\xfd" + body + _crc(body + bytes((CRC_EXTRA,))).to_bytes(2, "little")
+
+
+def _crc(data: bytes) -> int:
+    """CRC-16/MCRF4XX."""
+    crc = 0xFFFF
+    for byte in data:
+        step = (byte ^ crc) & 0xFF
+        step = (step ^ step << 4) & 0xFF
+        crc = crc >> 8 ^ step << 8 ^ step << 3 ^ step >> 4
+    return crc
+
+
+class FirstBeats:
+    """Opens links and says once a second that we are booting, until someone takes over."""
+
+    def __init__(self, links: Sequence[str], system: int, token: int) -> None:
+        """Raises ValueError for a link that cannot be."""
+        self.system, self.token = system, token
+        self.sequence = 0  # of the next packet of either component
+        self.next_s = time.monotonic()
+        self.links = [Link(parse_link(text), lambda data, now_ns: None) for text in links]
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="first beats", daemon=True)
+
+    def start(self) -> None:
+        """Open the links and speak."""
+        for link in self.links:
+            link.start()
+        self._thread.start()
+
+    def hand_over(self) -> list[Link]:
+        """The open links; from now on it is the caller who speaks."""
+        self._stop.set()
+        self._thread.join()
+        return self.links
+
+    def _run(self) -> None:
+        end_s = self.next_s + LONGEST_S
+        while not self._stop.is_set() and time.monotonic() < end_s:
+            for component in TYPES:
+                packet = heartbeat_packet(self.sequence, self.system, component, self.token)
+                for link in self.links:
+                    link.write(packet)
+            self.sequence = (self.sequence + 1) & 0xFF
+            self.next_s += PERIOD_S
+            self._stop.wait(max(0.0, self.next_s - time.monotonic()))

@@ -1,0 +1,213 @@
+"""Bytes into whole MAVLink packets, and packets into messages; damage is skipped and counted.
+
+Works on MAVLink 1 and 2. A packet whose checksum fails is not skipped as a whole: the search
+goes on one byte further, so that a packet inside the damage is found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from mavlink.wire.dialect import CRC_EXTRA, dialect, numbers_of, x25crc
+
+MAGIC_V1 = 0xFE
+MAGIC_V2 = 0xFD
+SIGNATURE_LENGTH = 13
+SIGNED = 0x01
+MAX_PACKET = 280
+
+Message = Any
+"""A message object of a pymavlink dialect."""
+
+
+class Packet(NamedTuple):
+    """One packet with a right checksum, or of a kind whose checksum nobody here can know."""
+
+    data: bytes
+    message_id: int
+    system: int
+    component: int
+    known: bool  # its checksum can be, and was, verified
+
+    @property
+    def is_signed(self) -> bool:
+        """True when a signature of 13 bytes ends the packet."""
+        return self.data[0] == MAGIC_V2 and bool(self.data[2] & SIGNED)
+
+
+def packet_length(data: bytes | bytearray, at: int) -> int | None:
+    """Length in bytes of the packet that starts at ``at``; 0 when no packet can start there.
+
+    None when there are too few bytes to say.
+    """
+    if at >= len(data):
+        return None
+    magic = data[at]
+    if magic == MAGIC_V1:
+        return data[at + 1] + 8 if at + 1 < len(data) else None
+    if magic != MAGIC_V2:
+        return 0
+    if at + 2 >= len(data):
+        return None
+    if data[at + 2] & ~SIGNED:
+        return 0  # an incompatible flag that we do not know
+    return data[at + 1] + 12 + (SIGNATURE_LENGTH if data[at + 2] & SIGNED else 0)
+
+
+def check_packet(data: bytes) -> Packet | None:
+    """The packet that fills ``data``, or None when its checksum is wrong."""
+    if data[0] == MAGIC_V1:
+        message_id, system, component, end = data[5], data[3], data[4], len(data)
+    else:
+        message_id = data[7] | data[8] << 8 | data[9] << 16
+        system, component = data[5], data[6]
+        end = len(data) - (SIGNATURE_LENGTH if data[2] & SIGNED else 0)
+    extra = CRC_EXTRA.get(message_id)
+    if extra is None:
+        return Packet(data, message_id, system, component, False)
+    crc = x25crc(data[1 : end - 2] + bytes((extra,))).crc
+    if crc != data[end - 2] | data[end - 1] << 8:
+        return None
+    return Packet(data, message_id, system, component, True)
+
+
+def _starts_whole(data: bytes) -> bool:
+    """True when a whole packet with a right checksum stands at the start."""
+    length = packet_length(data, 0)
+    if not length or length > len(data):
+        return False
+    packet = check_packet(data[:length])
+    return packet is not None and packet.known
+
+
+class Decoder:
+    """Packets into message objects; never raises."""
+
+    def __init__(self) -> None:
+        self._parser = dialect.MAVLink(None)
+        self.undecodable = 0
+
+    def message(self, packet: Packet) -> Message | None:
+        """The message object, or None when the payload cannot be one."""
+        if packet.message_id not in dialect.mavlink_map:
+            return None
+        try:
+            return self._parser.decode(bytearray(packet.data))
+        except (dialect.MAVError, ValueError, TypeError):
+            self.undecodable += 1
+            return None
+
+
+class Framer:
+    """Splits a byte stream into packets; keeps at most one unfinished packet.
+
+    Noise may look like the start of a long packet. It is not waited for when what comes next
+    begins with a whole one, or an order sent once would wait for the next hundred bytes.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self.packets = 0
+        self.skipped_bytes = 0
+        self.bad_checksums = 0
+
+    def feed(self, data: bytes) -> list[Packet]:
+        """The packets completed by ``data``, in order."""
+        buffer = self._buffer
+        if not buffer and packet_length(data, 0) == len(data):  # a datagram, most of the time
+            whole = check_packet(data)
+            if whole is not None:
+                self.packets += 1
+                return [whole]
+        if buffer and _starts_whole(data):  # then what waits is no packet, or lost its end
+            self.skipped_bytes += len(buffer)
+            buffer.clear()
+        buffer += data
+        found: list[Packet] = []
+        at = 0
+        while True:
+            length = packet_length(buffer, at)
+            if length is None or (length and at + length > len(buffer)):
+                break
+            packet = check_packet(bytes(buffer[at : at + length])) if length else None
+            if packet is None:
+                self.bad_checksums += bool(length)
+                self.skipped_bytes += 1
+                at += 1
+            else:
+                found.append(packet)
+                at += length
+        del buffer[:at]
+        self.packets += len(found)
+        return found
+
+
+class Telemetry:
+    """A message with pymavlink's names for its fields."""
+
+    __slots__ = ("__dict__", "_name", "_packet")
+
+    def __init__(self, name: str, packet: Packet, fields: dict[str, Any]) -> None:
+        self._name, self._packet = name, packet
+        self.__dict__ = fields
+
+    def __getattr__(self, name: str) -> Any:
+        """Fields are found before this is asked."""
+        raise AttributeError(f"{self._name} has no field {name}")
+
+    def get_type(self) -> str:
+        """The message's name."""
+        return self._name
+
+    def get_srcSystem(self) -> int:
+        """The system that sent it."""
+        return self._packet.system
+
+    def get_srcComponent(self) -> int:
+        """The component that sent it."""
+        return self._packet.component
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """How a payload is read: numbers in the order of the wire, some of them arrays."""
+
+    name: str
+    unpack: Any
+    size: int
+    fields: tuple[str, ...]
+    arrays: tuple[tuple[int, int], ...]  # where in the fields, how long
+
+    def read(self, payload: bytes) -> dict[str, Any]:
+        """Fields of a payload; zeros at its end may have been cut, newer fields are left out."""
+        if len(payload) != self.size:
+            payload = payload[: self.size].ljust(self.size, b"\0")
+        values = list(self.unpack(payload))
+        for at, length in self.arrays:
+            values[at : at + length] = [values[at : at + length]]
+        return dict(zip(self.fields, values, strict=True))
+
+
+class TelemetryDecoder:
+    """Reads the messages of some names."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        """The messages must be of numbers alone, without texts."""
+        self._plans = {number: _plan(dialect.mavlink_map[number]) for number in numbers_of(names)}
+
+    def message(self, packet: Packet) -> Telemetry | None:
+        """The message in a packet with a right checksum; None when it is none of them."""
+        plan = self._plans.get(packet.message_id)
+        if plan is None:
+            return None
+        data = packet.data
+        start = 10 if data[0] == MAGIC_V2 else 6
+        return Telemetry(plan.name, packet, plan.read(data[start : start + data[1]]))
+
+
+def _plan(kind: Any) -> _Plan:
+    arrays = tuple((at, n) for at, n in enumerate(kind.array_lengths) if n)
+    fields = tuple(kind.ordered_fieldnames)
+    return _Plan(kind.msgname, kind.unpacker.unpack, kind.unpacker.size, fields, arrays)

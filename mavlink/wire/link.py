@@ -1,0 +1,194 @@
+"""Links to the outside: reopened forever, stamped at the read, never waited for.
+
+:class:`Inbox` takes what comes to the protocol's thread. Waking a thread costs more than what a
+telemetry message wants done, so messages that nobody waits for are gathered for a moment. They
+carry their own stamps; nothing is lost by it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from mavlink.wire.ports import PORTS, LinkSpec, Port, parse_link
+
+__all__ = ["Link", "LinkSpec", "parse_link"]
+
+log = logging.getLogger(__name__)
+
+BACKOFF_S = (0.2, 5.0)
+QUEUE = 512
+KEPT_WHILE_DOWN = 8  # older messages for a link that is down are stale
+
+
+class Link:
+    """A port that is opened again whenever it fails, with a reading and a writing thread.
+
+    ``on_data(data, monotonic_ns)`` is called in the reading thread for whatever comes.
+    """
+
+    def __init__(self, spec: LinkSpec, on_data: Callable[[bytes, int], None]) -> None:
+        self.spec = spec
+        self._on_data = on_data
+        self._stop = threading.Event()
+        self._wake = threading.Condition()
+        self._waiting: deque[bytes] = deque(maxlen=QUEUE)
+        self._port: Port | None = None
+        self._threads: list[threading.Thread] = []
+        self.opened = 0  # how many times
+        self.sent_bytes = 0
+        self.received_bytes = 0
+        self.last_error = ""
+
+    @property
+    def is_up(self) -> bool:
+        """True while the port is open."""
+        return self._port is not None
+
+    def hand_to(self, on_data: Callable[[bytes, int], None]) -> None:
+        """Let another one take what comes from now on."""
+        self._on_data = on_data
+
+    def start(self) -> None:
+        """Start both threads, unless they run."""
+        if self._threads:
+            return
+        for target in (self._read, self._write):
+            thread = threading.Thread(
+                target=target, name=f"mavlink {self.spec.name} {target.__name__}", daemon=True
+            )
+            self._threads.append(thread)
+            thread.start()
+
+    def stop(self) -> None:
+        """Send what waits, close the port and end both threads."""
+        deadline = time.monotonic() + 0.5
+        while self._waiting and self.is_up and time.monotonic() < deadline:
+            time.sleep(0.01)
+        self._stop.set()
+        with self._wake:
+            self._wake.notify_all()
+        for thread in self._threads:
+            thread.join(timeout=5.0)
+
+    def write(self, data: bytes) -> None:
+        """Send or queue data; never waits. The oldest give way on a link that takes nothing."""
+        port = self._port
+        if port is not None and port.is_quick:
+            port.write(data)
+            self.sent_bytes += len(data)
+            return
+        with self._wake:
+            self._waiting.append(data)
+            while self._port is None and len(self._waiting) > KEPT_WHILE_DOWN:
+                self._waiting.popleft()
+            self._wake.notify()
+
+    def _read(self) -> None:
+        pause_s = BACKOFF_S[0]
+        while not self._stop.is_set():
+            try:
+                port = PORTS[self.spec.kind](self.spec)
+            except (OSError, ValueError) as error:
+                self._complain(error)
+                self._stop.wait(pause_s)
+                pause_s = min(BACKOFF_S[1], 2.0 * pause_s)
+                continue
+            pause_s = BACKOFF_S[0]
+            self._serve(port)
+            self._stop.wait(pause_s)
+
+    def _serve(self, port: Port) -> None:
+        self.opened += 1
+        self.last_error = ""
+        log.info("link %s is open", self.spec.name)
+        with self._wake:
+            self._port = port
+            self._wake.notify_all()
+        try:
+            while not self._stop.is_set() and self._port is port:
+                data = port.read()
+                if data:
+                    now_ns = time.monotonic_ns()
+                    self.received_bytes += len(data)
+                    self._on_data(data, now_ns)
+        except OSError as error:
+            self._complain(error)
+        finally:
+            with self._wake:
+                self._port = None
+            with contextlib.suppress(OSError):
+                port.close()
+
+    def _complain(self, error: Exception) -> None:
+        text = str(error) or type(error).__name__
+        if text != self.last_error:
+            log.warning("link %s: %s; trying again", self.spec.name, text)
+        self.last_error = text
+
+    def _write(self) -> None:
+        while not self._stop.is_set():
+            with self._wake:
+                while not self._stop.is_set() and not (self._waiting and self._port):
+                    self._wake.wait(0.5)
+                if self._stop.is_set():
+                    return
+                port, data = self._port, self._waiting.popleft()
+            if port is None:
+                continue
+            try:
+                port.write(data)
+                self.sent_bytes += len(data)
+            except OSError as error:
+                self._complain(error)
+                with self._wake:
+                    if self._port is port:
+                        self._port = None  # the reading thread opens it again
+
+
+GATHER_S = 0.04
+
+Job = Callable[[], object]
+T = TypeVar("T")
+
+
+class Inbox(Generic[T]):
+    """A bounded queue from many threads to one, of jobs and of telemetry."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._jobs: deque[Job] = deque()
+        self._telemetry: deque[T] = deque()
+        self._wake = threading.Condition()
+        self.dropped = 0
+
+    def put(self, job: Job) -> None:
+        """Add a job and wake who takes it; dropped, and counted, when too many wait."""
+        with self._wake:
+            if len(self._jobs) >= self._limit:
+                self.dropped += 1
+                return
+            self._jobs.append(job)
+            self._wake.notify()
+
+    def gather(self, telemetry: T) -> None:
+        """Add telemetry, to be taken within a moment; dropped when too much waits."""
+        if len(self._telemetry) >= self._limit:
+            self.dropped += 1
+            return
+        self._telemetry.append(telemetry)
+
+    def take(self, timeout_s: float) -> tuple[list[T], list[Job]]:
+        """The telemetry and the jobs that wait, after waiting for a job for a moment at most."""
+        with self._wake:
+            if not self._jobs:
+                self._wake.wait(min(GATHER_S, timeout_s))
+            jobs = list(self._jobs)
+            self._jobs.clear()
+        telemetry = [self._telemetry.popleft() for _ in range(len(self._telemetry))]
+        return telemetry, jobs

@@ -1,0 +1,139 @@
+"""Outgoing messages: who says what to whom, repeated at an interval, packed for a link."""
+
+from __future__ import annotations
+
+import logging
+import struct
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from mavlink.wire.dialect import dialect, x25crc
+from mavlink.wire.framing import SIGNED
+from mavlink.wire.signing import Signing
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """A component of a system; 0 means all."""
+
+    system: int
+    component: int
+
+
+@dataclass(frozen=True, slots=True)
+class Outgoing:
+    """A message from one of our components, for one link or (None) for all."""
+
+    component: int
+    message: Any
+    link: int | None = None
+
+
+class Outbox:
+    """Messages waiting to be packed; the oldest give way when nobody takes them."""
+
+    def __init__(self, limit: int = 2000) -> None:
+        self._waiting: deque[Outgoing] = deque(maxlen=limit)
+
+    def put(self, component: int, message: Any, link: int | None = None) -> None:
+        """Queue a message of one of our components."""
+        self._waiting.append(Outgoing(component, message, link))
+
+    def take(self) -> list[Outgoing]:
+        """Everything queued since the last call, in order."""
+        taken = list(self._waiting)
+        self._waiting.clear()
+        return taken
+
+
+log = logging.getLogger(__name__)
+
+
+class Packer:
+    """Packs for one link; safe between threads. Each component counts its own packets."""
+
+    def __init__(self, link: int, signing: Signing | None = None, sequence: int = 0) -> None:
+        self._link = link
+        self._sequence = sequence  # of the first packet of each component
+        self._signing = signing
+        self._lock = threading.Lock()
+        self._encoders: dict[tuple[int, int], Any] = {}
+        self.refused = 0
+
+    def pack(self, system: int, outgoing: Outgoing, unix_ns: int) -> bytes | None:
+        """The packet; None (and a count) when a value does not fit its field."""
+        with self._lock:
+            key = (system, outgoing.component)
+            encoder = self._encoders.get(key)
+            if encoder is None:
+                encoder = self._encoders[key] = dialect.MAVLink(None, *key)
+                encoder.seq = self._sequence
+            try:
+                data = bytes(outgoing.message.pack(encoder))
+            except (struct.error, ValueError, TypeError, OverflowError) as error:
+                self.refused += 1
+                log.error("%s cannot be sent: %s", outgoing.message.get_type(), error)
+                return None
+            encoder.seq = (encoder.seq + 1) % 256
+            if self._signing is None:
+                return data
+            flagged = _with_signed_flag(data, outgoing.message.crc_extra)
+            return self._signing.sign(flagged, self._link, unix_ns)
+
+
+def _with_signed_flag(data: bytes, crc_extra: int) -> bytes:
+    """The packet saying that a signature follows, and its checksum for that."""
+    body = data[:2] + bytes((data[2] | SIGNED,)) + data[3:-2]
+    crc: int = x25crc(body[1:] + bytes((crc_extra,))).crc
+    return body + crc.to_bytes(2, "little")
+
+
+@dataclass(slots=True)
+class _Stream:
+    default_us: int  # -1: not sent unless asked
+    interval_us: int
+    send: Callable[[], None]
+    next_ns: int
+
+
+class Streams:
+    """A table of (component, message number) with an interval and a sender each."""
+
+    def __init__(self, outbox: Outbox) -> None:
+        self._outbox = outbox
+        self._streams: dict[tuple[int, int], _Stream] = {}
+
+    def add(self, component: int, number: int, default_us: int, send: Callable[[], None]) -> None:
+        """Make a message repeatable."""
+        self._streams[(component, number)] = _Stream(default_us, default_us, send, 0)
+
+    def can_repeat(self, component: int, number: int) -> bool:
+        """True for a message that was added."""
+        return (component, number) in self._streams
+
+    def set_interval(self, component: int, number: int, interval_us: int) -> None:
+        """0 is the default interval, -1 (any negative) switches the stream off."""
+        stream = self._streams[(component, number)]
+        stream.interval_us = stream.default_us if interval_us == 0 else max(-1, interval_us)
+        stream.next_ns = 0
+
+    def send_interval(self, component: int, number: int, link: int) -> None:
+        """Answer with MESSAGE_INTERVAL."""
+        interval = self._streams[(component, number)].interval_us
+        message = dialect.MAVLink_message_interval_message(number, interval)
+        self._outbox.put(component, message, link)
+
+    def tick(self, now_ns: int) -> None:
+        """Send what is due."""
+        for stream in self._streams.values():
+            if stream.interval_us > 0 and now_ns >= stream.next_ns:
+                stream.next_ns = now_ns + stream.interval_us * 1000
+                stream.send()
+
+    def next_timer(self) -> int | None:
+        """When :meth:`tick` has something to do, in ns."""
+        running = [s.next_ns for s in self._streams.values() if s.interval_us > 0]
+        return min(running, default=None)

@@ -1,0 +1,278 @@
+"""Ports to the outside: serial, UDP, TCP, and recorded logs; the only I/O of this package.
+
+A link is named as pymavlink does it:
+
+``serial:/dev/serial/by-id/NAME:921600``, ``udpin:0.0.0.0:14550`` (also ``udp:``),
+``udpout:192.168.1.2:14550``, ``tcp:HOST:PORT``, ``tcpin:0.0.0.0:5760``; and for the bench
+``tlog:PATH``, a recorded log at the pace at which it was recorded.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+READ_S = 0.2  # how long a read may block
+LONGEST = 65536
+PEER_NS = 60_000_000_000  # a UDP peer not heard for longer is forgotten
+MAX_PEERS = 8
+BAUD = 57600
+KINDS = ("serial", "udp", "udpin", "udpout", "tcp", "tcpin", "tlog")
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSpec:
+    """A link's address."""
+
+    kind: str
+    place: str  # device or host
+    number: int  # baud rate or port
+
+    @property
+    def name(self) -> str:
+        """The address as it is written."""
+        number = f":{self.number}" if self.number else ""
+        return f"{self.kind}:{self.place}{number}"
+
+
+def parse_link(text: str) -> LinkSpec:
+    """The address in a link's notation; ValueError says what is wrong with it."""
+    if text.startswith("/dev/"):
+        text = "serial:" + text.replace(",", ":")
+    kind, _, rest = text.partition(":")
+    if kind == "tlog" and rest:
+        return LinkSpec(kind, rest, 0)
+    place, _, number = rest.rpartition(":")
+    if kind not in KINDS:
+        raise ValueError(f"link {text!r}: use one of {', '.join(KINDS)}, as udpin:0.0.0.0:14550")
+    if kind == "serial" and not number.isdigit():
+        place, number = rest, str(BAUD)
+    if not place or not number.isdigit() or not int(number):
+        raise ValueError(f"link {text!r}: needs a place and a number, as {kind}:PLACE:NUMBER")
+    if kind != "serial" and int(number) > 65535:
+        raise ValueError(f"link {text!r}: no such port")
+    return LinkSpec("udpin" if kind == "udp" else kind, place, int(number))
+
+
+class Port(Protocol):
+    """An open link. Failures are OSErrors."""
+
+    is_quick: bool  # writing never waits, so whoever has something to send may do it
+
+    def read(self) -> bytes:
+        """What came; empty when nothing did within ``READ_S``."""
+
+    def write(self, data: bytes) -> None:
+        """Send to everyone at the other end."""
+
+    def close(self) -> None:
+        """Free it."""
+
+
+class SerialPort:
+    """A serial line."""
+
+    is_quick = False
+
+    def __init__(self, spec: LinkSpec) -> None:
+        import serial
+
+        self._line = serial.Serial(
+            spec.place, spec.number, timeout=READ_S, write_timeout=1.0, exclusive=True
+        )
+
+    def read(self) -> bytes:
+        """What came."""
+        try:
+            first: bytes = self._line.read(1)
+            return first + self._line.read(self._line.in_waiting) if first else b""
+        except TypeError as error:  # pyserial's way to say that it was closed meanwhile
+            raise OSError("closed") from error
+
+    def write(self, data: bytes) -> None:
+        """Send."""
+        try:
+            self._line.write(data)
+        except TypeError as error:
+            raise OSError("closed") from error
+
+    def close(self) -> None:
+        """Free the line."""
+        self._line.close()
+
+
+class UdpPort:
+    """Datagrams: to a fixed place (out), or to those who were heard (in)."""
+
+    is_quick = True
+
+    def __init__(self, spec: LinkSpec) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._buffer = memoryview(bytearray(LONGEST))
+        self._peers: dict[tuple[str, int], int] = {}
+        self._fixed: tuple[str, int] | None = None
+        try:
+            self._socket.settimeout(READ_S)
+            if spec.kind == "udpout":
+                self._fixed = (socket.gethostbyname(spec.place), spec.number)
+            else:
+                self._socket.bind((spec.place, spec.number))
+        except OSError:
+            self._socket.close()
+            raise
+
+    def read(self) -> bytes:
+        """The next datagram."""
+        try:
+            if self._fixed is not None:
+                return self._socket.recv(LONGEST)
+            length, peer = self._socket.recvfrom_into(self._buffer)
+        except (TimeoutError, ConnectionRefusedError):
+            return b""
+        if peer in self._peers or len(self._peers) < MAX_PEERS:
+            self._peers[peer] = time.monotonic_ns()
+        return bytes(self._buffer[:length])
+
+    def write(self, data: bytes) -> None:
+        """Send to all; a peer that is not there is no failure of the link."""
+        now = time.monotonic_ns()
+        for peer, heard in list(self._peers.items()):
+            if now - heard > PEER_NS:
+                self._peers.pop(peer, None)
+        for peer in [self._fixed] if self._fixed else list(self._peers):
+            with contextlib.suppress(OSError):
+                self._socket.sendto(data, peer)
+
+    def close(self) -> None:
+        """Free the socket."""
+        self._socket.close()
+
+
+class TcpPort:
+    """A connection to a server."""
+
+    is_quick = False
+
+    def __init__(self, spec: LinkSpec) -> None:
+        self._socket = socket.create_connection((spec.place, spec.number), timeout=3.0)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def read(self) -> bytes:
+        """What came."""
+        if not select.select([self._socket], [], [], READ_S)[0]:
+            return b""
+        data = self._socket.recv(LONGEST)
+        if not data:
+            raise ConnectionResetError("closed by the other end")
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send."""
+        self._socket.sendall(data)
+
+    def close(self) -> None:
+        """Free the socket."""
+        self._socket.close()
+
+
+class TcpServerPort:
+    """A server for a few clients at once."""
+
+    is_quick = False
+
+    def __init__(self, spec: LinkSpec) -> None:
+        self._server = socket.create_server((spec.place, spec.number))
+        self._clients: list[socket.socket] = []
+
+    def read(self) -> bytes:
+        """What came from any client."""
+        ready = select.select([self._server, *self._clients], [], [], READ_S)[0]
+        data = b""
+        for source in ready:
+            if source is self._server:
+                client, _ = self._server.accept()
+                client.settimeout(1.0)
+                if len(self._clients) < MAX_PEERS:
+                    self._clients.append(client)
+                else:
+                    client.close()
+                continue
+            try:
+                got = source.recv(LONGEST)
+            except OSError:
+                got = b""
+            if not got:
+                self._drop(source)
+            data += got
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send to every client."""
+        for client in list(self._clients):
+            try:
+                client.sendall(data)
+            except OSError:
+                self._drop(client)
+
+    def _drop(self, client: socket.socket) -> None:
+        with contextlib.suppress(ValueError):
+            self._clients.remove(client)
+        client.close()
+
+    def close(self) -> None:
+        """Free all sockets."""
+        for client in list(self._clients):
+            self._drop(client)
+        self._server.close()
+
+
+class LogPort:
+    """A recorded .tlog as if it came in now; what is sent goes nowhere."""
+
+    is_quick = True
+
+    def __init__(self, spec: LinkSpec) -> None:
+        from mavlink.wire.tlog import packets
+
+        self._file = open(spec.place, "rb")  # noqa: SIM115 - closed by close()
+        self._packets = packets(self._file, Counter())
+        self._next = next(self._packets, None)
+        self._ahead_ns = 0 if self._next is None else time.monotonic_ns() - self._next[0]
+
+    def read(self) -> bytes:
+        """The next packet when its time has come."""
+        if self._next is None:
+            time.sleep(READ_S)
+            return b""
+        wait_s = (self._next[0] + self._ahead_ns - time.monotonic_ns()) * 1e-9
+        if wait_s > 0.0:
+            time.sleep(min(wait_s, READ_S))
+        if wait_s > READ_S:
+            return b""
+        data = self._next[1].data
+        self._next = next(self._packets, None)
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Nobody listens."""
+
+    def close(self) -> None:
+        """Free the file."""
+        self._file.close()
+
+
+PORTS: dict[str, Callable[[LinkSpec], Port]] = {
+    "serial": SerialPort,
+    "udpin": UdpPort,
+    "udpout": UdpPort,
+    "tcp": TcpPort,
+    "tcpin": TcpServerPort,
+    "tlog": LogPort,
+}
+"""Kind of link to its port. The next kind is one class and one line."""

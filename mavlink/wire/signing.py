@@ -1,0 +1,103 @@
+"""MAVLink 2 signing: 13 bytes after a packet (link, 48-bit time, 48 bits of SHA-256).
+
+A packet is taken when its signature is right and its time is newer than the last one of its
+stream (link, system, component), and, for a new stream, not more than a minute behind ours.
+The stream's time only moves on packets that were verified.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import threading
+from pathlib import Path
+
+from mavlink.wire.framing import SIGNATURE_LENGTH, Packet
+
+EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01
+UNIT_PER_S = 100_000  # a unit of 10 us
+LATE = 60 * UNIT_PER_S
+MAX_STREAMS = 256
+UNSIGNED_ALLOWED = frozenset({109})  # RADIO_STATUS: radios cannot sign
+KEY_LENGTH = 32
+LARGEST = 2**48 - 1
+
+
+def read_key(path: Path) -> bytes:
+    """The 32-byte key in a file (raw, or 64 hex digits) that only its owner may read."""
+    if not path.is_file():
+        raise ValueError(f"{path}: no such signing key file")
+    if path.stat().st_mode & 0o077:
+        raise ValueError(f"{path}: others may read the signing key; chmod 600 it")
+    raw = path.read_bytes()
+    if len(raw) == KEY_LENGTH:
+        return raw
+    try:
+        key = bytes.fromhex(raw.decode("ascii").strip())
+    except ValueError:
+        key = b""
+    if len(key) != KEY_LENGTH:
+        raise ValueError(f"{path}: a signing key is 32 bytes, or 64 hex digits")
+    return key
+
+
+def timestamp_of(unix_ns: int) -> int:
+    """Signing time (10 us since 2015) of a unix time in ns."""
+    return max(0, (unix_ns - EPOCH_UNIX_S * 10**9) // 10_000)
+
+
+def sign(packet: bytes, key: bytes, link: int, timestamp: int) -> bytes:
+    """The signed packet of one whose signed flag and checksum are already right."""
+    tail = bytes((link & 0xFF,)) + timestamp.to_bytes(6, "little")
+    return packet + tail + _digest(key, packet + tail)
+
+
+def _digest(key: bytes, data: bytes) -> bytes:
+    return hashlib.sha256(key + data).digest()[:6]
+
+
+class Signing:
+    """One key, the times of the streams heard with it, our own time. Safe between threads."""
+
+    def __init__(self, key: bytes, timestamp: int = 0) -> None:
+        if len(key) != KEY_LENGTH:
+            raise ValueError(f"a signing key has {KEY_LENGTH} bytes, got {len(key)}")
+        self._key = key
+        self._lock = threading.Lock()
+        self._streams: dict[tuple[int, int, int], int] = {}
+        self.timestamp = timestamp  # of the newest packet sent or verified; keep it over restarts
+        self.refused = 0
+
+    def sign(self, packet: bytes, link: int, unix_ns: int) -> bytes:
+        """The packet with our signature; times strictly grow even when the clock steps back."""
+        with self._lock:
+            self.timestamp = min(LARGEST, max(self.timestamp + 1, timestamp_of(unix_ns)))
+            return sign(packet, self._key, link, self.timestamp)
+
+    def accepts(self, packet: Packet) -> bool:
+        """True when the packet may be believed."""
+        with self._lock:
+            if self._verify(packet):
+                return True
+        self.refused += 1
+        return False
+
+    def _verify(self, packet: Packet) -> bool:
+        if not packet.is_signed:
+            return packet.message_id in UNSIGNED_ALLOWED
+        data = packet.data
+        link = data[-SIGNATURE_LENGTH]
+        timestamp = int.from_bytes(data[-12:-6], "little")
+        stream = (link, packet.system, packet.component)
+        last = self._streams.get(stream)
+        if last is not None and timestamp <= last:
+            return False
+        if last is None and timestamp + LATE < self.timestamp:
+            return False
+        if not hmac.compare_digest(_digest(self._key, data[:-6]), data[-6:]):
+            return False
+        if last is None and len(self._streams) >= MAX_STREAMS:
+            return False
+        self._streams[stream] = timestamp
+        self.timestamp = max(self.timestamp, timestamp)
+        return True
