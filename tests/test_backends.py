@@ -11,11 +11,12 @@ from __future__ import annotations
 from importlib.util import find_spec
 
 import cv2
+import dense_reference as reference
 import numpy as np
 import pytest
 
 from recon import se3
-from recon.backends import BACKENDS, Backend, load_backend, reference
+from recon.backends import BACKENDS, Backend, load_backend
 from recon.clouds.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.matching_cost import MatchingCostConfig, matching_cost

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import cv2
+import dense_reference as reference
 import numpy as np
 import pytest
 
-from recon.backends import reference
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.matching_cost import COST_UNIT, MatchingCostConfig, census, matching_cost
 from recon.stereo.message_passing import propagate

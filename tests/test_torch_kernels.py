@@ -12,11 +12,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import dense_reference as reference
 import numpy as np
 import pytest
 
 from recon import se3
-from recon.backends import reference
 from recon.clouds.registration import IcpConfig, register_projective
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.matching_cost import matching_cost

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import cv2
+import dense_reference as reference
 import numpy as np
 import pytest
 
-from recon.backends import reference
 from recon.stereo.upsampling import UpsamplingConfig, upsample
 from recon.types import U8, DisparityMap
 

@@ -37,7 +37,6 @@ from service.errors import InputError
 from service.georeference import LocalFrame
 from service.onboard.rig import Rig
 from service.refine import own_camera
-from service.refine.carried_frames import grown, moved_frames
 from service.refine.control_points import (
     Candidate,
     Pictures,
@@ -47,7 +46,7 @@ from service.refine.control_points import (
     screen,
 )
 from service.refine.refinement_figures import in_words, told
-from service.refine.revisions import Revisions, copy_store
+from service.refine.revisions import Revisions, copy_store, grown, moved_frames
 from service.refine.stored_loops import StoredLoops, loose
 from service.refine.survey_file import read_survey
 from service.scans.folder import write_deliverables

@@ -20,9 +20,8 @@ import msgspec
 import numpy as np
 
 from recon import metrics
-from recon.metrics import Fit
+from recon.metrics import Fit, patch_shifts
 from recon.surface import triangle_grid
-from recon.surface.picture_shift import patch_shifts
 from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F32, F64, U8, Array, Camera
 from service.errors import InputError
