@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import onnxruntime  # type: ignore[import-untyped]
 from onnxruntime.capi import onnxruntime_pybind11_state  # type: ignore[import-untyped]
 
 from recon.backends.onnx_dense import stereo_model, tap_windows, upsampling_model
-from recon.backends.room import place, pyramid_levels, room
+from recon.backends.room import kept, place, pyramid_levels, room
 from recon.stereo.belief_propagation import BeliefPropagationConfig, believe
 from recon.stereo.matching_cost import check_pair
 from recon.stereo.upsampling import UpsamplingConfig, check_guide, guide_at_taps, upsample
@@ -68,12 +69,13 @@ class OnnxBackend:
         *size, label_room = room(h, w, labels)
         levels = pyramid_levels(h, w, config)
         key = ("stereo", *size, label_room, levels, config)
-        if key not in self._sessions:
-            self._open(key, stereo_model((size[0], size[1]), label_room, config, levels))
+        session = self._session(
+            key, lambda: stereo_model((size[0], size[1]), label_room, config, levels)
+        )
         given = {name: np.empty(size, np.uint8) for name in ("left", "right")}
         place(given["left"], left)
         place(given["right"], right)
-        px, confidence = self._run(key, {**given, "true": np.array([h, w, labels])})
+        px, confidence = _run(session, {**given, "true": np.array([h, w, labels])})
         return believe(left, px[:h, :w].copy(), confidence[:h, :w].copy(), config)
 
     def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
@@ -84,8 +86,7 @@ class OnnxBackend:
         (h, w), (H, W) = coarse.px.shape, guide.shape[:2]
         small, large = room(h, w, 1)[:2], room(H, W, 1)[:2]
         key = ("upsample", small, large, config)
-        if key not in self._sessions:
-            self._open(key, upsampling_model(small, large, config, fixed=False))
+        session = self._session(key, lambda: upsampling_model(small, large, config, fixed=False))
         given: dict[str, Array] = {
             "px": np.empty(small, np.float32),
             "confidence": np.empty(small, np.float32),
@@ -95,7 +96,7 @@ class OnnxBackend:
         arrays: list[Array] = [coarse.px, coarse.confidence, guide_at_taps(guide, (h, w)), guide]
         for name, array in zip(given, arrays, strict=True):
             place(given[name], array)
-        px, sure = self._run(key, given | tap_windows((h, w), (H, W), small, large, config))
+        px, sure = _run(session, given | tap_windows((h, w), (H, W), small, large, config))
         return DisparityMap(px[:H, :W].copy(), sure[:H, :W].copy())
 
     def register(
@@ -106,20 +107,22 @@ class OnnxBackend:
 
         return register_projective(source, target, T_target_source, config)
 
-    def _open(self, key: Any, model: bytes) -> None:
-        while len(self._sessions) >= KEPT_SESSIONS:
-            self._sessions.pop(next(iter(self._sessions)))
-        try:
-            self._sessions[key] = open_session(model, self.providers, self.engines)
-        except ValueError as error:  # our own model: it is the device that cannot
-            raise RuntimeError(str(error)) from error
+    def _session(self, key: Any, model: Callable[[], bytes]) -> Any:
+        def opened() -> Any:
+            try:
+                return open_session(model(), self.providers, self.engines)
+            except ValueError as error:  # our own model: it is the device that cannot
+                raise RuntimeError(str(error)) from error
 
-    def _run(self, key: Any, given: dict[str, Array]) -> tuple[Array, Array]:
-        try:
-            first, second = self._sessions[key].run(None, given)
-        except ORT_ERRORS as error:
-            raise RuntimeError(str(error)) from error
-        return first, second
+        return kept(self._sessions, key, KEPT_SESSIONS, opened)
+
+
+def _run(session: Any, given: dict[str, Array]) -> tuple[Array, Array]:
+    try:
+        first, second = session.run(None, given)
+    except ORT_ERRORS as error:
+        raise RuntimeError(str(error)) from error
+    return first, second
 
 
 def provider_options(

@@ -7,10 +7,25 @@ almost every pair; here sizes are rounded up, and the true ones go along as numb
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import Array
 
 ROOM_PX, ROOM_LABELS = 32, 8
+
+Key = TypeVar("Key")
+Built = TypeVar("Built")
+
+
+def kept(cache: dict[Key, Built], key: Key, limit: int, build: Callable[[], Built]) -> Built:
+    """What ``cache`` holds for ``key``, built when new; beyond ``limit`` the oldest go."""
+    if key not in cache:
+        while len(cache) >= limit:
+            cache.pop(next(iter(cache)))
+        cache[key] = build()
+    return cache[key]
 
 
 def room(height: int, width: int, labels: int) -> tuple[int, int, int]:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from recon.backends import DenseStages
-from recon.backends.room import pyramid_levels, room
+from recon.backends.room import kept, pyramid_levels, room
 from recon.backends.torch_depth import DensePath, JointBilateral
 from recon.backends.torch_kernels import PLAIN, Kernels
 from recon.backends.torch_plan import Part, Plan, part, read
@@ -141,10 +141,6 @@ class TorchBackend:
     ) -> list[Array]:
         """The float32 results of the operation called ``key`` on ``arrays``."""
         with torch.inference_mode():
-            if key not in self._plans:
-                while len(self._plans) >= KEPT_PLANS:
-                    self._plans.pop(next(iter(self._plans)))
-                self._plans[key] = Plan(self.device, build(), parts)
-            plan = self._plans[key]
+            plan = kept(self._plans, key, KEPT_PLANS, lambda: Plan(self.device, build(), parts))
             plan.upload(arrays)
             return read(plan.run())

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.backends.room import pyramid_levels, room
+from recon.backends.room import kept, pyramid_levels, room
 from recon.backends.torch_kernels import PLAIN, Kernels
 from recon.backends.torch_plan import Plan, part, read
 from recon.backends.torch_stereo import DenseStereo, believe, drop_unseen
@@ -85,15 +85,15 @@ class DensePath:
         fine = None if pair.guide is None else room(pair.guide.shape[0], pair.guide.shape[1], 1)[:2]
         levels = pyramid_levels(h, w, self.matching)
         key = (space, fine, levels, size_px)
-        if key not in self._plans:
-            while len(self._plans) >= KEPT_PLANS:
-                self._plans.pop(next(iter(self._plans)))
+
+        def build() -> Plan:
             stage = PairDepthStage(self, space[2], levels, size_px)
             shapes = [space[:2]] * 4 + [(*(fine or (0, 0)), 3), (5,), (14,)]
             given = _inputs(pair, np.eye(3))
             parts = [part(a, s) for a, s in zip(given, shapes, strict=True)]
-            self._plans[key] = Plan(self.device, stage, parts)
-        return self._plans[key]
+            return Plan(self.device, stage, parts)
+
+        return kept(self._plans, key, KEPT_PLANS, build)
 
 
 class PairDepthStage(torch.nn.Module):
@@ -222,16 +222,13 @@ def _shares(room: int, fine_room: int, taps: Tensor, fine: Tensor) -> Tensor:
     return (overlap.clamp(min=0) / step).float()
 
 
-GEOMETRY = 14
-"""float64 numbers of a pair: homography to the left picture (9), plane (3), slope, f B."""
-
-
 def reproject(
     px: Tensor, confidence: Tensor, geometry: Tensor, true: Tensor, size_px: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
     """Depth and sigma in metres, float32, on the keyframe's grid of ``size_px`` (w, h).
 
-    As :func:`recon.stereo.reprojection.reproject`. ``geometry`` (14,) float64; ``true`` (4,) is the
+    As :func:`recon.stereo.reprojection.reproject`. ``geometry`` (14,) float64 is the
+    homography to the left image (9), the plane (3), slope and f B; ``true`` (4,) is the
     size h, w of the pair and that of ``px``, which may be a larger array.
     """
     u = torch.arange(size_px[0], device=px.device, dtype=torch.float64)[None, :]

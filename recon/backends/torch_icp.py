@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.backends.room import kept
 from recon.backends.torch_kernels import PLAIN, Kernels
 from recon.backends.torch_plan import Plan, part
 from recon.backends.torch_surface import (
@@ -60,12 +61,12 @@ class DeviceIcp:
         given = [*_inputs(source), *_inputs(target), start]
         key = (source.depth_m.shape, target.depth_m.shape, config)
         with torch.inference_mode():
-            if key not in self._plans:
-                while len(self._plans) >= KEPT_PLANS:
-                    self._plans.pop(next(iter(self._plans)))
-                stage = _descent(config, self._kernels)
-                self._plans[key] = Plan(self.device, stage, [part(a) for a in given])
-            plan = self._plans[key]
+            plan = kept(
+                self._plans, key, KEPT_PLANS,
+                lambda: Plan(
+                    self.device, _descent(config, self._kernels), [part(a) for a in given]
+                ),
+            )  # fmt: skip
             plan.upload(given)
             told = plan.run()[0].cpu().numpy()
         return _concluded(told, start, config)

@@ -18,6 +18,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from recon.backends.room import kept
 from recon.backends.torch_matching import Found, Refined, harris_cells, refine, search
 from recon.backends.torch_plan import Plan, part
 from recon.backends.torch_surface import median, solve
@@ -122,11 +123,10 @@ class TorchMatcher:
     def _plan(
         self, key: Any, build: Callable[[], Callable[..., tuple[Tensor, ...]]], given: list[Array]
     ) -> Plan:
-        if key not in self._plans:
-            while len(self._plans) >= KEPT_PLANS:
-                self._plans.pop(next(iter(self._plans)))
-            self._plans[key] = Plan(self.device, build(), [part(x) for x in given])
-        return self._plans[key]
+        return kept(
+            self._plans, key, KEPT_PLANS,
+            lambda: Plan(self.device, build(), [part(x) for x in given]),
+        )  # fmt: skip
 
     def _room(self, shapes: Shapes) -> tuple[Tensor, Tensor]:
         """Where the pictures of a run lie: graphs read them from a place that never moves."""
