@@ -33,6 +33,7 @@ BENCHMARKS: dict[str, str] = {
     "codec": "service.bench.codec:run",
     "link": "service.bench.link:run",
     "portal": "service.bench.portal:run",
+    "real": "service.bench.real:run",
 }
 """Name to ``module:function``; imported when it runs."""
 

@@ -99,6 +99,9 @@ def _replay(
     from service.scans.folder import write_deliverables
 
     notes: list[str] = []
+    assumed: tuple[str, ...] = ()
+    if camera is None and getattr(source, "camera", None) is None:
+        assumed = ("lens",)
     camera = _told_camera(source, notes) if camera is None else _fitted(camera, source, notes)
     epoch_ns = _epoch(source, log, video_epoch, notes)
     scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(epoch_ns / 1e9))
@@ -115,6 +118,7 @@ def _replay(
         epoch_ns,
         history=log.history if log is not None else None,
         notes=tuple(notes),
+        assumed=assumed,
         extra={"backend": chosen.name, "source": source.description},
     )
     store = create_store(inputs)

@@ -39,13 +39,20 @@ class Times(msgspec.Struct):
     started_unix_s: UnixTime
 
 
+class TrustFacts(msgspec.Struct):
+    """How far a scan can be trusted, and why not further."""
+
+    level: Annotated[str, msgspec.Meta(max_length=40)]
+    reasons: Annotated[list[Note], msgspec.Meta(max_length=100)]
+
+
 class Facts(msgspec.Struct):
     """The part of a summary that the list shows."""
 
     times: Times
     finished: bool
     counts: Annotated[dict[str, Count], msgspec.Meta(max_length=100)]
-    quality: Annotated[dict[str, Figure | None], msgspec.Meta(max_length=100)]
+    quality: Annotated[dict[str, Figure | TrustFacts | None], msgspec.Meta(max_length=100)]
     notes: Annotated[list[Note], msgspec.Meta(max_length=1000)]
     origin: Origin | None = None
     failed: Annotated[dict[str, Note], msgspec.Meta(max_length=100)] = {}

@@ -177,6 +177,10 @@ class Rig:
         """False when the scan's scale rests on :data:`ASSUMED_AGL_M`."""
         return self._agl(state, tag)[2] is not HeightSource.ASSUMED
 
+    def attitude_known(self, state: VehicleState | None, tag: GeoTag | None) -> bool:
+        """False when the view direction is the nominal mount's."""
+        return self._rotation(state, tag)[1] < MOUNT_TILT_SIGMA_RAD
+
 
 def _is_at_rest(state: VehicleState) -> bool:
     """True where telemetry says that the vehicle stands on the ground."""

@@ -70,6 +70,7 @@ class ScanInputs:
     unix_offset_ns: int = 0  # history's clock to unix time
     history: VehicleHistory | None = None
     notes: tuple[str, ...] = ()
+    assumed: tuple[str, ...] = ()  # of "lens"
     extra: dict[str, Any] = field(default_factory=dict)  # goes into scan.json
     latency_ms: float | None = None  # the camera's as an earlier scan found it
     tell: Callable[[str], None] = log.warning  # the operator
@@ -126,7 +127,7 @@ class Scan:
         self.watch = GraphWatch(dense.trajectory.graph, dense.lock, inputs.tell)
         self.tracking = TrackingWatch(inputs.tell)
         self.tags = FrameTags(inputs.folder / TAGS) if inputs.history is not None else None
-        self.tagged = self.odd_sized = self.heights = 0
+        self.tagged = self.odd_sized = self.heights = self.attitudes = 0
         self._started = time.monotonic()
 
     def feed(self, frame: CameraFrame) -> Step | None:
@@ -145,6 +146,7 @@ class Scan:
         if self.tags is not None:
             self.tags.write(exposed_ns + inputs.unix_offset_ns, state)
         self.heights += self.pipeline.rig.height_known(state, frame.geotag)
+        self.attitudes += self.pipeline.rig.attitude_known(state, frame.geotag)
         step = self.pipeline.step(
             Frame(frame.image, exposed_ns, frame.seq, inputs.camera), state, frame.geotag
         )
@@ -194,11 +196,21 @@ class Scan:
             "seconds": round(elapsed, 2),
             "warnings": [*self.inputs.notes, *self.inputs.source.warnings, *self._doubts()],
         }
+        extra["assumed"] = self._assumed()
         summary = self.recorder.close(redacted(extra | self.inputs.extra))
         self.pipeline.dense.close()
         summary["clouds_per_second"] = round(summary["clouds"] / elapsed, 2)
         self.store.finish(summary)
         return summary
+
+    def _assumed(self) -> list[str]:
+        """What nothing measured in this scan, of "lens", "view" and "height"."""
+        out = list(self.inputs.assumed)
+        if self.attitudes == 0:
+            out.append("view")
+        if self.heights == 0 and self.pipeline.rig.georeference == "none":
+            out.append("height")
+        return out
 
     def _doubts(self) -> list[str]:
         """What the reader of this scan must know."""
@@ -209,7 +221,7 @@ class Scan:
         if self.inputs.history is not None and self.tagged == 0 and self.recorder.frames:
             out.append("no frame lies inside the telemetry: poses rest on vision alone")
         frames = self.recorder.frames
-        if frames and self.heights == 0 and self.pipeline.rig.georeference == "none":
+        if frames and "height" in self._assumed():
             out.append(
                 f"no telemetry: the scale assumes {ASSUMED_AGL_M:g} m above ground; "
                 "set scan.assumed_agl_m to the true height"

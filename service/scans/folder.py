@@ -30,6 +30,7 @@ from service.scans.inspection import middle_keyframe, stages
 from service.scans.preview import blank_preview, draw_preview
 from service.scans.report import report_html
 from service.scans.track import csv_table, latest, local_frame, tum_lines
+from service.scans.trust import slope_deg, trust_of
 from service.scans.writing import writing
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.store import ScanStore
@@ -226,7 +227,8 @@ def _summary(
             "points_before_fusion": fused.points_in,
             "poses": len(poses),
         },
-        "quality": _quality(fused, raster, poses),
+        "quality": _quality(fused, raster, poses)
+        | {"trust": trust_of(extra, header.georeference, slope_deg(fused.cloud.xyz_m))},
         "notes": notes,
         "run": redacted(extra),
     }
@@ -285,4 +287,6 @@ def _key_figures(summary: dict[str, Any]) -> list[str]:
         ]
     figures.append(f"{quality['distance_m']:.0f} m flown")
     name = summary["id"].encode("ascii", "replace").decode()
-    return [f"{name}   {place}", ",  ".join(figures)]
+    trust = quality["trust"]
+    words = f"{trust['level']}: {'; '.join(trust['reasons'])}" if trust["reasons"] else ""
+    return [f"{name}   {place}", ",  ".join(figures), *([words] if words else [])]

@@ -107,7 +107,9 @@ def _flown(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[tuple[s
 
 def _accuracy(summary: dict[str, Any], raster: Raster | None) -> list[tuple[str, str]]:
     quality, counts = summary["quality"], summary["counts"]
+    trust = quality["trust"]
     rows = [
+        ("trust", "; ".join([trust["level"], *trust["reasons"]])),
         ("points", f"{counts['points']} from {counts['keyframes']} keyframes"),
         ("area", f"{quality['area_m2']:.0f} m2"),
         ("voxel", f"{quality['voxel_m']:.3f} m"),

@@ -1,0 +1,325 @@
+"""Real flights: what a replayed scan shows of its own quality, and its truth where there is one.
+
+Each set is a folder below ``--data``; a set that is not there is left out. No figure needs a
+simulator. Seams compare the surfaces of two visits, targets are surveyed, the log is the
+autopilot's. A flight that cannot be reconstructed has no figure but its trust.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pyproj import Transformer
+
+from recon import se3
+from recon.graph.track_alignment import umeyama
+from recon.types import F64, DepthMap
+from service.bench import BenchOptions, BenchResult
+from service.cameras import open_camera
+from service.errors import InputError, OutsideError
+from service.refine.control_points import Pictures, candidates_of
+from service.refine.revisions import Revisions
+from service.refine.survey_file import Sighting, SurveyPoint
+from service.scans.track import latest, local_frame
+from service.scans.trust import Trust
+from service.stream.store import ScanStore
+
+REVISIT = 6
+"""Keyframes apart that see the same ground are two visits of it."""
+
+SEAM_POINTS, SEAM_PAIRS = 400, 400
+MIN_OVERLAP = 0.2
+MIN_TARGET_DISTANCE_M = 10.0
+BOARD = ("--pattern", "9x6", "--square-m", "0.03")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Flight:
+    """A replayed set."""
+
+    data: Path  # the set's folder
+    source: str
+    scan: Path  # the scan folder
+    summary: dict[str, Any]  # scan.json
+
+
+Check = Callable[[Flight], Iterator[tuple[str, float, str]]]
+"""Yields (figure, value, unit)."""
+
+
+@dataclass(frozen=True, slots=True)
+class RealSet:
+    """A set: where it lies, how it is replayed, and what is known of it."""
+
+    name: str
+    source: str
+    telemetry: str = ""
+    boards: str = ""  # folder of chessboards by the same camera
+    settings: tuple[str, ...] = ()
+    checks: tuple[Check, ...] = field(default=())
+
+
+def run(options: BenchOptions) -> list[BenchResult]:
+    """Replay every set that is there, and measure. Raises InputError when there is none."""
+    if options.data is None:
+        raise InputError("bench real needs --data with the folder that holds the real sets")
+    there = [one for one in SETS if (options.data / one.source).exists()]
+    if not there:
+        raise InputError(f"{options.data} holds none of {', '.join(s.name for s in SETS)}")
+    results = []
+    for one in there:
+        with tempfile.TemporaryDirectory(prefix="skyrelief-real-") as folder:
+            flight = _replayed(one, options, Path(folder))
+            for check in (_placed, seams, *one.checks):
+                for what, value, unit in check(flight):
+                    results.append(BenchResult("real", f"{one.name}: {what}", value, unit))
+    return results
+
+
+def _replayed(one: RealSet, options: BenchOptions, folder: Path) -> Flight:
+    assert options.data is not None
+    source = options.data / one.source
+    words = ["replay", str(source), "--out", str(folder / "scan"), "--backend", options.backend]
+    if one.telemetry:
+        words += ["--telemetry", str(options.data / one.telemetry)]
+    if one.boards:
+        model = folder / "camera.yaml"
+        _skyrelief("calibrate", str(options.data / one.boards), *BOARD, "--out", str(model))
+        words += ["--camera-model", str(model)]
+    for setting in one.settings:
+        words += ["--set", setting]
+    _skyrelief(*words)
+    data = options.data / one.source.split("/")[0]
+    summary = json.loads((folder / "scan" / "scan.json").read_text(encoding="utf-8"))
+    return Flight(data, str(source), folder / "scan", summary)
+
+
+def _skyrelief(*words: str) -> str:
+    """What a command prints. Raises OutsideError with its last line when it fails."""
+    start = "from service.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", start, *words], capture_output=True, text=True)
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ["no output"])[-1]
+        raise OutsideError(f"skyrelief {words[0]} of {words[1]} failed: {last}")
+    return done.stdout
+
+
+# ---- what needs no truth -------------------------------------------------------------------
+
+
+def _placed(flight: Flight) -> Iterator[tuple[str, float, str]]:
+    run = flight.summary["run"]
+    with ScanStore.open(flight.scan / "scan.db") as store:
+        placed = sum("vision" in pose.sources for pose in latest(store.poses()))
+    yield "frames placed by vision", 100.0 * placed / max(run["frames"], 1), "%"
+    yield "unbroken stretches", float(run["segments"]), ""
+    level = Trust(flight.summary["quality"]["trust"]["level"])
+    yield f"trust: {level.value}", float(list(Trust).index(level)), ""
+    yield "points", flight.summary["counts"]["points"] / 1e6, "M"
+
+
+def seams(flight: Flight) -> Iterator[tuple[str, float, str]]:
+    """How far two visits of the same ground lie apart, in metres and in the sigmas they claim."""
+    maps = _maps(flight)
+    rng = np.random.default_rng(1)
+    pairs = [(a, b) for a in range(len(maps)) for b in range(a + REVISIT, len(maps))]
+    rng.shuffle(pairs)
+    apart: list[F64] = []
+    ratio: list[F64] = []
+    for a, b in pairs:
+        found = _apart(maps[a], maps[b], rng)
+        if found is None:
+            continue
+        apart.append(found[0])
+        ratio.append(found[0] / found[1])
+        if len(apart) == SEAM_PAIRS:
+            break
+    if apart:
+        yield "seams, median", float(np.median(np.abs(np.concatenate(apart)))), "m"
+        sigmas = float(np.median(np.abs(np.concatenate(ratio)))) / 0.6745
+        yield "seams, robust rms over the claimed sigma", sigmas, ""
+
+
+def _maps(flight: Flight) -> list[DepthMap]:
+    """The depth images that the cloud is made of."""
+    left_out = flight.summary["run"]["apart"]
+    with ScanStore.open(flight.scan / "scan.db") as store:
+        return [
+            keyframe.depth
+            for keyframe in store.keyframes()
+            if not any(first <= keyframe.seq <= last for first, last in left_out)
+        ]
+
+
+def _apart(a: DepthMap, b: DepthMap, rng: np.random.Generator) -> tuple[F64, F64] | None:
+    """Depth differences of a's points in b (n,) and the sigmas of them; None without overlap."""
+    known = np.flatnonzero(np.isfinite(a.depth_m))
+    if not len(known):
+        return None
+    some = rng.choice(known, min(SEAM_POINTS, len(known)), replace=False)
+    v, u = np.divmod(some, a.depth_m.shape[1])
+    z = a.depth_m.ravel()[some].astype(np.float64)
+    rays = np.stack([u, v, np.ones(len(u))], axis=1) @ np.linalg.inv(a.K).T
+    p = se3.transform(se3.inverse(b.T_world_camera) @ a.T_world_camera, rays * z[:, None])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        q = p @ b.K.T
+        at = np.rint(q[:, :2] / q[:, 2:])
+    h, w = b.depth_m.shape
+    inside = (p[:, 2] > 0) & np.all((at >= 0) & (at < (w, h)), axis=1)
+    cols, rows = at[inside].astype(int).T
+    there = b.depth_m[rows, cols]
+    both = np.isfinite(there)
+    if both.sum() < MIN_OVERLAP * len(some):
+        return None
+    sigma = np.hypot(a.sigma_m.ravel()[some][inside][both], b.sigma_m[rows, cols][both])
+    return (p[inside, 2] - there)[both], sigma.astype(np.float64)
+
+
+# ---- what needs some -----------------------------------------------------------------------
+
+
+def from_log(flight: Flight) -> Iterator[tuple[str, float, str]]:
+    """Horizontal distance of the delivered track to the fixes that it was replayed with."""
+    from mavlink.telemetry.logs import load_telemetry
+
+    (path,) = flight.data.glob("*.tlog")
+    history = load_telemetry(path).history
+    with ScanStore.open(flight.scan / "scan.db") as store:
+        frame, poses = local_frame(store.header), latest(store.poses())
+    if frame is None:
+        return
+    off = []
+    for pose in poses:
+        state = history.state_at(pose.time_unix_ns)
+        if state is not None and state.lat_deg is not None and state.lon_deg is not None:
+            fix = np.array([[state.lat_deg, state.lon_deg, 0.0]])
+            off.append(frame.to_enu(fix)[0, :2] - pose.T_world_camera[:2, 3])
+    yield from _of_fixes(np.array(off).reshape(-1, 2))
+
+
+def from_tags(flight: Flight) -> Iterator[tuple[str, float, str]]:
+    """Horizontal distance of the delivered track to the positions in the images' tags."""
+    with ScanStore.open(flight.scan / "scan.db") as store:
+        frame, poses = local_frame(store.header), latest(store.poses())
+        start = store.header.started_unix_ns
+    if frame is None:
+        return
+    placed = {_tick(pose.time_unix_ns - start): pose for pose in poses}
+    off = []
+    for image in open_camera(flight.source):
+        pose = placed.get(_tick(image.time_ns))
+        if pose is not None and image.geotag is not None:
+            fix = np.array([[image.geotag.lat_deg, image.geotag.lon_deg, 0.0]])
+            off.append(frame.to_enu(fix)[0, :2] - pose.T_world_camera[:2, 3])
+    yield from _of_fixes(np.array(off).reshape(-1, 2))
+
+
+def _of_fixes(off: F64) -> Iterator[tuple[str, float, str]]:
+    if len(off):
+        yield "track to fixes, horizontal rms", float(np.sqrt((off**2).sum(axis=1).mean())), "m"
+
+
+def level_ground(flight: Flight) -> Iterator[tuple[str, float, str]]:
+    """How far points of ground that is nearly flat lie from one plane, robustly."""
+    points = []
+    for depth in _maps(flight):
+        known = np.flatnonzero(np.isfinite(depth.depth_m))[::97]
+        v, u = np.divmod(known, depth.depth_m.shape[1])
+        rays = np.stack([u, v, np.ones(len(u))], axis=1) @ np.linalg.inv(depth.K).T
+        local = rays * depth.depth_m.ravel()[known][:, None]
+        points.append(se3.transform(depth.T_world_camera, local))
+    if not points:
+        return
+    xyz = np.concatenate(points)
+    weight = np.ones(len(xyz))
+    A = np.c_[xyz[:, :2] - xyz[:, :2].mean(axis=0), np.ones(len(xyz))]
+    for _ in range(10):
+        plane = np.linalg.lstsq(A * weight[:, None], xyz[:, 2] * weight, rcond=None)[0]
+        r = xyz[:, 2] - A @ plane
+        weight = 1.0 / (1.0 + (r / (2.0 * np.median(np.abs(r)) + 1e-9)) ** 2)
+    yield "flat ground, robust sigma about a plane", 1.4826 * float(np.median(np.abs(r))), "m"
+    yield "flat ground, slope", float(np.degrees(np.arctan(np.hypot(*plane[:2])))), "deg"
+
+
+def targets(flight: Flight) -> Iterator[tuple[str, float, str]]:
+    """Distances between surveyed targets, scaled by their median, and their horizontal rms."""
+    with ScanStore.open(flight.scan / "scan.db") as store, Revisions(store) as revisions:
+        states = [s for seq in store.seqs() if (s := revisions.keyframe_state(seq)) is not None]
+        start = store.header.started_unix_ns
+        scan = Pictures(states, revisions.frames(), store.header.camera, revisions.keyframe, None)
+        times = {image.name: image.time_ns for image in open_camera(flight.source)}
+        placed = {_tick(frame.time_unix_ns - start) for frame in scan.frames}
+        surveyed = _surveyed(flight.data / "gcp_list_1600px.txt", times, placed, start)
+        found = candidates_of([point for point, _ in surveyed.values()], scan, "targets")
+    mapped = {c.point.name: c.before_m for c in found if c.before_m is not None}
+    pairs = [
+        (np.linalg.norm(mapped[a] - mapped[b]), np.linalg.norm(surveyed[a][1] - surveyed[b][1]))
+        for a, b in combinations(mapped, 2)
+    ]
+    ratio = np.array([m / s for m, s in pairs if s > MIN_TARGET_DISTANCE_M])
+    yield "targets found", float(len(mapped)), ""
+    if len(ratio):
+        off = np.abs(ratio / np.median(ratio) - 1.0)
+        yield "distances between targets, median error", 100.0 * float(np.median(off)), "%"
+        yield "distances between targets, largest error", 100.0 * float(off.max()), "%"
+        yield "targets, horizontal rms after a similarity", _flat_rms(mapped, surveyed), "m"
+
+
+def _surveyed(
+    path: Path, times: dict[str, int], placed: set[int], start_ns: int
+) -> dict[str, tuple[SurveyPoint, F64]]:
+    """Targets with marks in images that were placed, and their (2,) east and north."""
+    lines = path.read_text(encoding="ascii").splitlines()
+    to_globe = Transformer.from_crs(lines[0].strip(), "EPSG:4326", always_xy=True)
+    out: dict[str, tuple[SurveyPoint, F64]] = {}
+    for number, line in enumerate(lines[1:], 2):
+        east, north, _, u, v, image, name = line.split()
+        if image not in times or _tick(times[image]) not in placed:
+            continue
+        seconds = (start_ns + times[image]) / 1e9
+        mark = Sighting(number, time_unix_s=seconds, uv_px=(float(u), float(v)))
+        lon, lat = to_globe.transform(float(east), float(north))
+        before = out[name][0].sightings if name in out else ()
+        point = SurveyPoint(name, lat, lon, 0.0, 0.03, 1.0, False, number, (*before, mark))
+        out[name] = point, np.array([float(east), float(north)])
+    return out
+
+
+def _tick(time_ns: int) -> int:
+    """A time in whole milliseconds; the poses' own are rounded to less."""
+    return round(time_ns / 1e6)
+
+
+def _flat_rms(mapped: dict[str, F64], surveyed: dict[str, tuple[SurveyPoint, F64]]) -> float:
+    names = list(mapped)
+    ours = np.array([[*mapped[n][:2], 0.0] for n in names])
+    true = np.array([[*surveyed[n][1], 0.0] for n in names])
+    true -= true.mean(axis=0)
+    scale, R, t = umeyama(ours, true, np.ones(len(ours)), level=True)
+    off = scale * ours @ R.T + t - true
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
+SETS = (
+    RealSet("Caliterra", "caliterra_nadir/frames", checks=(from_tags,)),
+    RealSet("Caliterra, video without tags", "caliterra_nadir/caliterra_0p5fps.mp4"),
+    RealSet(
+        "CMAC",
+        "cuav_cmac_20180805/frames",
+        telemetry="cuav_cmac_20180805/flight.tlog",
+        boards="cuav_cmac_20180805/calibration",
+        checks=(from_log, level_ground),
+    ),
+    RealSet("COPR", "copr_kap_gcp/images", checks=(targets,)),
+    RealSet("AP Hill", "aphill_orbit_fmv/aphill_240_1fps_crf32.mp4"),
+    RealSet("Karma", "gopro_karma_clip/karma.mp4"),
+)

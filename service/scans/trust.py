@@ -1,0 +1,86 @@
+"""How far a scan can be trusted: ``quality.trust`` of scan.json, a level with its reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from recon.types import Array
+
+LENS = "the lens is assumed: shapes bend; calibrate the camera"
+VIEW = "the view direction is assumed,"
+
+MAX_SCALE_SIGMA = 0.05
+"""A scale less certain than this is not a measurement."""
+
+MAX_SLOPE_DEG = 30.0
+"""A site that leans by more, where the view direction is assumed, was not seen from above."""
+
+MIN_PLACED_SHARE = 0.5
+"""Of the frames: below it vision was lost for most of the flight."""
+
+
+class Trust(Enum):
+    """From the most to the least that may be measured in a scan."""
+
+    GEOREFERENCED = "georeferenced"  # positions and distances
+    SCALED = "scaled"  # distances, at no known place
+    RELATIVE = "relative"  # shapes, of unknown size
+    DOUBTFUL = "doubtful"  # not even the shape is certain
+
+
+def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) -> dict[str, Any]:
+    """The level as ``level`` and what limits it as ``reasons``, both for scan.json.
+
+    Args:
+        run: what the scan's run noted: ``assumed``, ``scale``, ``frames``, ``frames_tracked``,
+            ``segments``. What it lacks, or holds in another form, limits nothing.
+        georeference: of the scan's header; "none" without.
+        slope_deg: of the plane through the cloud.
+    """
+    assumed = run.get("assumed")
+    assumed = assumed if isinstance(assumed, list) else []
+    scale_sigma = _number(run.get("scale"), "sigma")
+    doubts = [LENS] if "lens" in assumed else []
+    if "view" in assumed and slope_deg > MAX_SLOPE_DEG:
+        doubts.append(f"{VIEW} and the site leans by {slope_deg:.0f} degrees")
+    frames, tracked = _number(run, "frames"), _number(run, "frames_tracked")
+    if frames and tracked is not None and tracked < MIN_PLACED_SHARE * (frames - 1):
+        doubts.append(f"vision placed only {tracked:.0f} of {frames:.0f} frames")
+    if doubts:
+        return _said(Trust.DOUBTFUL, doubts)
+    if "height" in assumed:
+        return _said(Trust.RELATIVE, ["the size follows from an assumed height above ground"])
+    if scale_sigma is not None and scale_sigma > MAX_SCALE_SIGMA:
+        return _said(Trust.RELATIVE, [f"the scale is known to {scale_sigma:.0%} only"])
+    if georeference == "none":
+        return _said(Trust.SCALED, ["no positions: the scan has its own origin and heading"])
+    return _said(Trust.GEOREFERENCED, [])
+
+
+def _said(level: Trust, reasons: list[str]) -> dict[str, Any]:
+    return {"level": level.value, "reasons": reasons}
+
+
+def _number(document: Any, key: str) -> float | None:
+    value = document.get(key) if isinstance(document, Mapping) else None
+    return float(value) if isinstance(value, int | float) else None
+
+
+def slope_deg(xyz_m: Array) -> float:
+    """The angle in degrees between the plane through points (N, 3) and the horizontal.
+
+    The normal is the direction of least spread; 0 for fewer than three points.
+    """
+    if len(xyz_m) < 3:
+        return 0.0
+    some = xyz_m[:: max(1, len(xyz_m) // 20_000)].astype(np.float64)
+    for _ in range(3):
+        about = some - np.median(some, axis=0)
+        normal = np.linalg.eigh(about.T @ about)[1][:, 0]
+        off = np.abs(about @ normal)
+        some = some[off <= 3.0 * np.median(off)] if np.median(off) > 0 else some
+    return float(np.degrees(np.arccos(min(1.0, abs(normal[2])))))

@@ -1,0 +1,54 @@
+"""The benchmark over real flights, on a few of the demo's own stills."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.bench import BenchOptions
+from service.bench.keyframes import make_keyframe
+from service.bench.real import _apart, run
+from service.errors import InputError
+
+STILLS = sorted((Path(__file__).parents[1] / "demo" / "caliterra" / "frames").glob("*.jpg"))
+
+
+def test_a_few_real_stills_are_placed_and_measured(tmp_path: Path) -> None:
+    frames = tmp_path / "caliterra_nadir" / "frames"
+    frames.mkdir(parents=True)
+    for still in STILLS[:5]:
+        shutil.copy(still, frames)
+    figures = {
+        r.what.removeprefix("Caliterra: "): r.value for r in run(BenchOptions(data=tmp_path))
+    }
+    assert figures["frames placed by vision"] >= 80.0
+    assert figures["unbroken stretches"] == 1
+    assert figures["points"] > 0.05
+    assert figures["track to fixes, horizontal rms"] < 20.0
+    assert any(name.startswith("trust: ") for name in figures)
+
+
+@pytest.mark.parametrize("data", [None, "empty"])
+def test_without_a_set_it_says_what_it_needs(tmp_path: Path, data: str | None) -> None:
+    with pytest.raises(InputError, match=r"--data|none of Caliterra"):
+        run(BenchOptions(data=None if data is None else tmp_path))
+
+
+def test_a_shifted_surface_shows_as_a_seam() -> None:
+    depth = make_keyframe(0).depth
+    above = make_keyframe(0).depth
+    lifted = type(depth)(
+        depth.depth_m,
+        depth.sigma_m,
+        depth.views,
+        depth.K,
+        depth.T_world_camera + np.array([[0, 0, 0, 0]] * 2 + [[0, 0, 0, 0.5], [0, 0, 0, 0]]),
+    )
+    found = _apart(above, lifted, np.random.default_rng(0))
+    assert found is not None
+    off, sigma = found
+    assert np.median(off) == pytest.approx(0.5, abs=0.05)
+    assert np.median(sigma) == pytest.approx(np.sqrt(2) * np.nanmedian(depth.sigma_m), rel=0.1)

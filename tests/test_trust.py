@@ -1,0 +1,61 @@
+"""How far a scan can be trusted, from what its run noted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.scans.trust import slope_deg, trust_of
+
+SURE: dict[str, Any] = {
+    "assumed": [],
+    "scale": {"sigma": 0.01},
+    "frames": 100,
+    "frames_tracked": 99,
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "georeference", "level", "reason"),
+    [
+        ({}, "gnss", "georeferenced", ""),
+        ({}, "none", "scaled", "no positions"),
+        ({"assumed": ["height"]}, "none", "relative", "assumed height"),
+        ({"scale": {"sigma": 0.2}}, "gnss", "relative", "20%"),
+        ({"assumed": ["lens"]}, "gnss", "doubtful", "lens"),
+        ({"assumed": ["height", "view"]}, "none", "relative", "assumed height"),
+        ({"frames_tracked": 40}, "gnss", "doubtful", "40 of 100"),
+    ],
+)
+def test_the_weakest_fact_sets_the_level(
+    changes: dict[str, Any], georeference: str, level: str, reason: str
+) -> None:
+    found = trust_of(SURE | changes, georeference)
+    assert found["level"] == level
+    assert [bool(reason)] == [bool(found["reasons"])]
+    assert all(reason in text for text in found["reasons"])
+
+
+def test_a_site_that_leans_was_not_seen_from_above() -> None:
+    leaning = trust_of(SURE | {"assumed": ["view"]}, "gnss", 60.0)
+    assert leaning["level"] == "doubtful" and "60 degrees" in leaning["reasons"][0]
+    assert trust_of(SURE | {"assumed": ["view"]}, "gnss", 10.0)["level"] == "georeferenced"
+    assert trust_of(SURE, "gnss", 60.0)["level"] == "georeferenced"
+
+
+@pytest.mark.parametrize("angle", [0.0, 20.0, 80.0])
+def test_the_slope_of_a_site_is_found_in_spite_of_towers(angle: float) -> None:
+    rng = np.random.default_rng(2)
+    flat = np.c_[rng.uniform(-50, 50, (4000, 2)), rng.normal(0, 0.2, 4000)]
+    flat[::40, 2] += 15.0
+    a = np.radians(angle)
+    turn = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    assert slope_deg(flat @ turn.T) == pytest.approx(angle, abs=1.0)
+    assert slope_deg(flat[:2]) == 0.0
+
+
+@pytest.mark.parametrize("run", [{}, {"assumed": 3, "scale": [], "frames": "x"}])
+def test_a_run_that_notes_nothing_limits_nothing(run: dict[str, Any]) -> None:
+    assert trust_of(run, "gnss")["level"] == "georeferenced"
