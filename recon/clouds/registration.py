@@ -1,14 +1,13 @@
-"""Alignment of point clouds (the paper's ICP, section 2.3).
+"""Alignment of depth images (the paper's ICP, section 2.3).
 
 Depth images are aligned by projective point-to-plane ICP (Blais and Levine 1995,
 doi:10.1109/34.400574; Chen and Medioni 1992): a source point's partner is the surface element
-of the pixel it projects to, so no tree is searched. Loose clouds go to small_gicp.
+of the pixel it projects to, so no tree is searched.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,7 +21,6 @@ __all__ = [
     "IcpConfig",
     "Surface",
     "conclude",
-    "register_clouds",
     "register_projective",
     "register_surfaces",
 ]
@@ -30,8 +28,6 @@ __all__ = [
 
 # Variance that the residuals do not show: edges half seen, errors of the normals; measured.
 _UNSEEN_VARIANCE = 1.5
-# Neighbours of a loose cloud share the points that their normals are made from; measured.
-_CLOUD_CORRELATION = 1.4
 
 AREA_SIGMAS, AREA_LAGS = 4.685, 12
 """Residuals beyond so many sigmas say nothing of how neighbours err; the longest distance asked."""
@@ -57,8 +53,6 @@ class IcpConfig:
     max_turn_rad: float = 0.1
     weak_slope: float = 0.02  # rms slope of the ground that a direction needs to be observed
     unknown_sigma_m: float = 10.0  # given to directions that are not observed
-    max_distance_m: float = 2.0  # between partners of loose clouds
-    threads: int = 2  # of small_gicp
 
     def __post_init__(self) -> None:
         """Raise ValueError when a parameter makes no sense."""
@@ -69,8 +63,8 @@ class IcpConfig:
         shares = (self.gate_share, self.edge_share, self.max_rms_share, self.max_step_share)
         if min(shares) <= 0 or not 0 < self.min_inlier_share <= 1:
             raise ValueError("shares must be positive, min_inlier_share at most 1")
-        if self.weak_slope <= 0 or self.unknown_sigma_m <= 0 or self.max_distance_m <= 0:
-            raise ValueError("weak_slope, unknown_sigma_m and max_distance_m must be positive")
+        if self.weak_slope <= 0 or self.unknown_sigma_m <= 0:
+            raise ValueError("weak_slope and unknown_sigma_m must be positive")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,13 +131,6 @@ class _Problem:
         """(4, 4) left correction in the target frame; weak directions stay put."""
         part = np.where(self.strong, self.gradient / np.maximum(self.values, 1e-30), 0.0)
         return self._about_centre(-self.vectors @ part)
-
-    def without_weak(self, change: F64) -> F64:
-        """(4, 4) ``change`` less its part in the directions that the surface leaves open."""
-        w = se3.so3_log(change[:3, :3])
-        shift = change[:3, :3] @ self.centre + change[:3, 3] - self.centre
-        part = self.vectors.T @ (np.concatenate([w, shift]) / self.unit)
-        return self._about_centre(self.vectors @ np.where(self.strong, part, 0.0))
 
     def _about_centre(self, scaled_twist: F64) -> F64:
         twist = self.unit * scaled_twist
@@ -316,73 +303,3 @@ def _covariance(problem: _Problem, config: IcpConfig) -> tuple[F64, F64]:
 
 def _unit_rows(rows: F64) -> F64:
     return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-30))
-
-
-def register_clouds(
-    source_m: F64, target_m: F64, T_init: F64, config: IcpConfig | None = None
-) -> Registration:
-    """The motion that lays the loose points ``source_m`` (N, 3) onto ``target_m`` (M, 3).
-
-    Generalised ICP by small_gicp, for submaps and loops. ``T_init`` (4, 4) is the start. Points
-    that are not finite are left out. Verdicts as in :func:`register_projective`.
-    """
-    import small_gicp
-
-    config = config or IcpConfig()
-    clouds = [np.asarray(c, np.float64) for c in (source_m, target_m)]
-    if any(c.ndim != 2 or c.shape[1] != 3 for c in clouds) or np.shape(T_init) != (4, 4):
-        raise ValueError("clouds must be (N, 3) and T_init (4, 4)")
-    source, target = (c[np.isfinite(c).all(axis=1)] for c in clouds)
-    if min(len(source), len(target)) < 50:
-        return _no_overlap(T_init, 0)
-    # Both clouds are moved to the origin: voxels are numbered from there, and few digits lost.
-    to_source = se3.compose(np.eye(3), source.mean(axis=0))
-    to_target = se3.compose(np.eye(3), target.mean(axis=0))
-    start = se3.inverse(to_target) @ T_init @ to_source
-    (a, _), (b, tree) = (
-        small_gicp.preprocess_points(
-            se3.transform(se3.inverse(move), points),
-            downsampling_resolution=config.max_distance_m / 4,
-            num_threads=config.threads,
-        )
-        for points, move in ((source, to_source), (target, to_target))
-    )
-    result = small_gicp.align(
-        b, a, tree, start, registration_type="GICP", num_threads=config.threads,
-        max_correspondence_distance=config.max_distance_m, max_iterations=40,
-    )  # fmt: skip
-    local = np.asarray(result.T_target_source, np.float64)
-    problem = _cloud_problem(a, b, tree, local, config)
-    # Where the surface leaves a direction open, sliding along it never ends, and is no fault.
-    if problem is None or not (result.converged or not problem.strong.all()):
-        return _no_overlap(T_init, int(result.iterations))
-    local = problem.without_weak(local @ se3.inverse(start)) @ start
-    problem = _cloud_problem(a, b, tree, local, config) or problem
-    limits = 0.25 * config.max_distance_m, config.max_distance_m
-    judged = _judged(problem, local, start, int(a.size()), limits, int(result.iterations), config)
-    A = se3.adjoint(to_target)
-    return replace(
-        judged,
-        T_target_source=to_target @ local @ se3.inverse(to_source),
-        covariance=_CLOUD_CORRELATION * A @ judged.covariance @ A.T,
-        weak_directions=_unit_rows(judged.weak_directions @ A.T),
-    )
-
-
-def _cloud_problem(a: Any, b: Any, tree: Any, T: F64, config: IcpConfig) -> _Problem | None:
-    """The point-to-plane problem of small_gicp's clouds ``a`` (source) and ``b`` at ``T``."""
-    points = se3.transform(T, np.asarray(a.points(), np.float64)[:, :3])
-    nearest, squared = tree.batch_nearest_neighbor_search(points)
-    near = np.asarray(squared) < config.max_distance_m**2
-    partners = np.asarray(nearest)[near]
-    n_b = np.asarray(b.normals(), np.float64)[partners, :3]
-    n_a = np.asarray(a.normals(), np.float64)[near, :3] @ T[:3, :3].T
-    agree = np.sum(n_a * n_b, axis=1)
-    n_a *= np.sign(agree)[:, None]
-    rows = np.ones((1, len(n_a), 10), np.float32)
-    rows[0, :, 0:3], rows[0, :, 3:6], rows[0, :, 6:9] = n_b, n_a, points[near]
-    gap = np.sum((points[near] - np.asarray(b.points(), np.float64)[partners, :3]) * n_b, axis=1)
-    size = np.where(np.abs(agree) > 0.707, gap, icp_kernels.UNMATCHED).astype(np.float32)[None]
-    centre = points.mean(axis=0)
-    lever = float(np.sqrt(np.mean(np.sum((points - centre) ** 2, axis=1))))
-    return _weighed(size, rows, centre, max(lever, 1e-6), True, config)
