@@ -237,18 +237,15 @@ def test_the_whole_path_equals_the_stages(device: str, guide: int) -> None:
 
 
 def test_what_the_path_does_not_do_is_said(device: str) -> None:
-    """No pair, the guided filter, filled occlusions."""
+    """No pair, filled occlusions."""
     from recon.backends.torch_depth import DensePath
 
     with pytest.raises(ValueError, match="no stereo pair"):
         path = DensePath(device, BeliefPropagationConfig(), UpsamplingConfig(), ALL)
         path.depth([], K, SIZE, np.eye(4))
-    for matching, upsampling in (
-        (BeliefPropagationConfig(fill_occluded=True), UpsamplingConfig()),
-        (BeliefPropagationConfig(), UpsamplingConfig(method="guided")),
-    ):
-        with pytest.raises(ValueError, match="neither fills"):
-            DensePath(device, matching, upsampling, ALL)
+    filling = BeliefPropagationConfig(fill_occluded=True)
+    with pytest.raises(ValueError, match="does not fill"):
+        DensePath(device, filling, UpsamplingConfig(), ALL)
 
 
 def test_the_backend_gives_the_path_to_the_service_and_falls_back(device: str) -> None:
@@ -265,8 +262,8 @@ def test_the_backend_gives_the_path_to_the_service_and_falls_back(device: str) -
     found = backend.fused_depth([pair], K, SIZE, np.eye(4), stages)
     assert found is not None
     close(found.depth_m, by_stages([pair], stages.matching).depth_m, 1e-3, 0.99)
-    guided = replace(stages, upsampling=UpsamplingConfig(method="guided"))
-    assert backend.fused_depth([pair], K, SIZE, np.eye(4), guided) is None
+    filling = replace(stages, matching=BeliefPropagationConfig(fill_occluded=True))
+    assert backend.fused_depth([pair], K, SIZE, np.eye(4), filling) is None
 
     def lost(*given: object) -> None:
         raise RuntimeError("CUDA error: device lost")

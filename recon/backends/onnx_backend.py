@@ -14,7 +14,7 @@ from recon.backends.onnx_dense import stereo_model, tap_windows, upsampling_mode
 from recon.backends.room import kept, place, pyramid_levels, room
 from recon.stereo.belief_propagation import BeliefPropagationConfig, believe
 from recon.stereo.matching_cost import check_pair
-from recon.stereo.upsampling import UpsamplingConfig, check_guide, guide_at_taps, upsample
+from recon.stereo.upsampling import UpsamplingConfig, check_guide, guide_at_taps
 from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration
 
 if TYPE_CHECKING:
@@ -81,8 +81,6 @@ class OnnxBackend:
     def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
         """``coarse`` (h, w) at the size of ``guide`` (H, W, 3), values unscaled; Eq. 2."""
         check_guide(coarse, guide)
-        if config.method != "bilateral":
-            return upsample(coarse, guide, config)
         (h, w), (H, W) = coarse.px.shape, guide.shape[:2]
         small, large = room(h, w, 1)[:2], room(H, W, 1)[:2]
         key = ("upsample", small, large, config)

@@ -17,7 +17,7 @@ from recon.backends.torch_plan import Part, Plan, part, read
 from recon.backends.torch_stereo import DenseStereo
 from recon.stereo.belief_propagation import BeliefPropagationConfig, believe
 from recon.stereo.matching_cost import check_pair
-from recon.stereo.upsampling import UpsamplingConfig, check_guide, guide_at_taps, upsample
+from recon.stereo.upsampling import UpsamplingConfig, check_guide, guide_at_taps
 from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration, StereoPair
 
 if TYPE_CHECKING:
@@ -84,8 +84,6 @@ class TorchBackend:
     def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
         """``coarse`` (h, w) at the size of ``guide`` (H, W, 3), values unscaled; Eq. 2."""
         check_guide(coarse, guide)
-        if config.method != "bilateral":
-            return upsample(coarse, guide, config)
         (h, w), (H, W) = coarse.px.shape, guide.shape[:2]
         small, large = room(h, w, 1)[:2], room(H, W, 1)[:2]
         given = (
@@ -122,7 +120,7 @@ class TorchBackend:
         stages: DenseStages,
     ) -> DepthMap | None:
         """Depth of a keyframe without leaving the device; None for what is not done there."""
-        if stages.matching.fill_occluded or stages.upsampling.method != "bilateral":
+        if stages.matching.fill_occluded:
             return None
         if self._path is None or self._path[0] != stages:
             path = DensePath(

@@ -32,8 +32,7 @@ KEPT_PLANS = 8
 class DensePath:
     """``device`` is "cuda" or "cpu"; one path serves one thread at a time.
 
-    Only exact upsampling is done here: ``upsampling.method`` must be "bilateral", and
-    ``matching.fill_occluded`` off, else ValueError.
+    ``matching.fill_occluded`` must be off, else ValueError.
     """
 
     def __init__(
@@ -45,8 +44,8 @@ class DensePath:
         messages: torch.dtype = torch.int16,
         kernels: Kernels = PLAIN,
     ) -> None:
-        if matching.fill_occluded or upsampling.method != "bilateral":
-            raise ValueError("the path on the device neither fills nor uses the guided filter")
+        if matching.fill_occluded:
+            raise ValueError("the path on the device does not fill occlusions")
         self.device = device
         self.matching = matching
         self.upsampling = upsampling

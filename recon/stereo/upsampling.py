@@ -1,9 +1,7 @@
 """Disparity at the resolution of a guidance image: joint bilateral upsampling (Eq. 2).
 
 Kopf et al., https://doi.org/10.1145/1276377.1276497. The taps lie on the coarse grid, the
-range kernel compares the guide at the fine pixel with the guide at the tap. The faster
-guided filter is that of He and Sun, https://arxiv.org/abs/1505.00996, fitted on the coarse
-grid and applied on the fine one.
+range kernel compares the guide at the fine pixel with the guide at the tap.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ from numba import njit, prange, types
 from numba.extending import intrinsic
 
 from recon.stereo.matching_cost import plain
-from recon.types import F32, U8, Bool, DisparityMap
+from recon.types import F32, U8, DisparityMap
 
 I32 = npt.NDArray[np.int32]
 
@@ -55,21 +53,16 @@ class UpsamplingConfig:
     ``diameter_px`` coarse pixels.
     """
 
-    method: str = "bilateral"  # "bilateral" (exact) or "guided" (fast)
     filter_px: float = 15.0
     range_sigma: float = 15.0  # grey levels
     diameter_px: int = 10  # coarse pixels
     min_support: float = 0.5  # share of the weight that must fall on known taps
-    guided_radius_px: int = 4  # coarse pixels, of the guided filter
-    guided_epsilon: float = 4.0  # grey levels; edges below it are smoothed
 
     def __post_init__(self) -> None:
-        if self.method not in ("bilateral", "guided"):
-            raise ValueError(f"method is 'bilateral' or 'guided', not {self.method!r}")
-        if not (self.filter_px > 0 and self.range_sigma > 0 and self.guided_epsilon > 0):
-            raise ValueError("filter_px, range_sigma and guided_epsilon must be positive")
-        if not 2 <= self.diameter_px <= 64 or not 1 <= self.guided_radius_px <= 64:
-            raise ValueError("diameter_px is 2 to 64 and guided_radius_px 1 to 64")
+        if not (self.filter_px > 0 and self.range_sigma > 0):
+            raise ValueError("filter_px and range_sigma must be positive")
+        if not 2 <= self.diameter_px <= 64:
+            raise ValueError(f"diameter_px is 2 to 64, not {self.diameter_px}")
         if not 0 <= self.min_support <= 1:
             raise ValueError(f"min_support is a share, 0 to 1, not {self.min_support}")
 
@@ -86,13 +79,6 @@ def upsample(coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> Dispa
     ``config.min_support`` of its weight falls on known ones. Raises ValueError for bad shapes.
     """
     check_guide(coarse, guide)
-    if config.method == "guided":
-        return _guided(coarse, guide, config)
-    return _joint_bilateral(coarse, guide, config)
-
-
-def _joint_bilateral(coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
-    """Eq. 2 with every tap of the window."""
     shape = (guide.shape[0], guide.shape[1])
     h, w = coarse.px.shape
     scale = float(np.sqrt(0.5 * np.log2(np.e)) / config.range_sigma)
@@ -332,47 +318,3 @@ def _bilateral(
                 v = top + y
                 _finish(sums[y], np.float32(min_support), out[v, first:last], sure[v, first:last])
             top += rows
-
-
-def _guided(coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
-    """Local linear model of the disparity in the guide's brightness, applied at full size."""
-    h, w = coarse.px.shape
-    height, width = guide.shape[:2]
-    grey = np.asarray(cv2.cvtColor(guide, cv2.COLOR_BGR2GRAY))
-    small = np.asarray(cv2.resize(grey, (w, h), interpolation=cv2.INTER_AREA), np.float32)
-    known = np.isfinite(coarse.px)
-    weight = np.where(known, np.maximum(coarse.confidence, 1e-3), 0).astype(np.float32)
-    slope, offset, sure = _linear_fit(
-        small, np.where(known, coarse.px, 0).astype(np.float32), weight, config
-    )
-    size = (width, height)
-    support = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
-    full_slope = cv2.resize(slope, size, interpolation=cv2.INTER_LINEAR)
-    px = cv2.resize(offset, size, interpolation=cv2.INTER_LINEAR)
-    px = np.asarray(px + full_slope * grey)
-    unknown: Bool = np.asarray(support) < max(config.min_support, 1e-3)
-    px[unknown] = np.nan
-    confidence = cv2.resize(sure, size, interpolation=cv2.INTER_LINEAR)
-    confidence[unknown] = 0
-    return DisparityMap(np.asarray(px, np.float32), np.asarray(confidence, np.float32))
-
-
-def _linear_fit(guide: F32, px: F32, weight: F32, config: UpsamplingConfig) -> tuple[F32, F32, F32]:
-    """Slope, offset and confidence of the weighted fit about each coarse pixel."""
-    side = (2 * config.guided_radius_px + 1,) * 2
-
-    def mean(image: npt.NDArray[np.float32]) -> F32:
-        return np.asarray(cv2.blur(image, side, borderType=cv2.BORDER_REFLECT), np.float32)
-
-    total = np.maximum(mean(weight), 1e-9)
-    m_guide = mean(weight * guide) / total
-    m_px = mean(weight * px) / total
-    variance = np.maximum(mean(weight * guide * guide) / total - m_guide * m_guide, 0)
-    covariance = mean(weight * guide * px) / total - m_guide * m_px
-    slope = covariance / (variance + config.guided_epsilon**2)
-    offset = m_px - slope * m_guide
-    return (
-        (mean(weight * slope) / total).astype(np.float32),
-        (mean(weight * offset) / total).astype(np.float32),
-        np.minimum(total, 1).astype(np.float32),
-    )

@@ -181,11 +181,10 @@ GUIDES = ((720, 1280), (1520, 2704))
 
 
 def run_upsampling(options: BenchOptions) -> list[BenchResult]:
-    """Milliseconds to each guide size, exact and guided.
+    """Milliseconds to each guide size.
 
-    OpenCV without contrib has no joint filter: the peer of the exact one is its bilateral
-    filter of the guide itself, with the paper's diameter 10 and sigmas 15, which reads as
-    many taps a pixel; the peer of the guided one is plain linear resizing of the same map.
+    OpenCV without contrib has no joint filter: the peer is its bilateral filter of the guide
+    itself, with the paper's diameter 10 and sigmas 15, which reads as many taps a pixel.
     """
     backend = choose_backend(options.backend)
     rng = np.random.default_rng(3)
@@ -194,7 +193,6 @@ def run_upsampling(options: BenchOptions) -> list[BenchResult]:
     results = []
     for height, width in GUIDES:
         guide = rng.integers(0, 256, (height, width, 3), np.uint8)
-        size = (width, height)
         what = f"{COARSE[1]}x{COARSE[0]} to {width}x{height}"
         results.append(
             compare(
@@ -204,17 +202,6 @@ def run_upsampling(options: BenchOptions) -> list[BenchResult]:
                 options,
                 "OpenCV bilateralFilter d 10",
                 partial(cv2.bilateralFilter, guide, 10, 15, 15),
-                note=backend.name,
-            )
-        )
-        results.append(
-            compare(
-                "upsample",
-                f"{what}, guided",
-                partial(backend.upsample, coarse, guide, UpsamplingConfig(method="guided")),
-                options,
-                "OpenCV linear resize",
-                partial(cv2.resize, coarse.px, size, interpolation=cv2.INTER_LINEAR),
                 note=backend.name,
             )
         )
