@@ -53,7 +53,8 @@ def peers() -> dict[str, Callable[[DepthMap, DepthMap, F64], F64]]:
     found: dict[str, Callable[[DepthMap, DepthMap, F64], F64]] = {}
     if find_spec("open3d") is not None:
         found["Open3D rgbd_odometry_multi_scale"] = by_open3d
-    found["small_gicp VGICP 1 m"] = by_small_gicp
+    if find_spec("small_gicp") is not None:
+        found["small_gicp VGICP 1 m"] = by_small_gicp
     return found
 
 
