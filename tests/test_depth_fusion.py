@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.stereo.depth_fusion import FusionConfig, fuse
-from recon.stereo.reprojection import PairDepth
+from recon.stereo.reprojection import FusionConfig, PairDepth, fuse
 from recon.types import F32
 
 K = np.array([[100.0, 0, 39.5], [0, 100.0, 29.5], [0, 0, 1]])

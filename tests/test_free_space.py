@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from recon.clouds.cloud_fusion import cloud_of
-from recon.clouds.free_space import MOST_VIEWS, open_above, seen_through, spread
-from recon.clouds.tiles import Tiles
+from recon.clouds.free_space import MOST_VIEWS, Tiles, open_above, seen_through, spread
 from recon.types import F64, DepthMap, PointCloud
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from recon import se3
+from recon.tracking.localisation import OdometryConfig
 from recon.tracking.odometry import Odometry, Tracked
-from recon.tracking.odometry_config import OdometryConfig
 from recon.types import F64, U8, Camera, PosePrior
 
 K = np.array([[400.0, 0, 239.5], [0, 400.0, 179.5], [0, 0, 1]])

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.tracking.sharpness import BlurWatch, sharpness
+from recon.image_quality import BlurWatch, sharpness
 from recon.types import U8
 
 

@@ -272,14 +272,15 @@ def test_result_does_not_depend_on_the_number_of_threads() -> None:
 
 
 def test_read_only_and_strided_images_compile_nothing_new() -> None:
-    from recon.stereo import disparity_selection, message_passing, upsampling
+    from recon.stereo import belief_propagation as labels
+    from recon.stereo import message_passing, upsampling
     from recon.types import DisparityMap
 
     image = np.random.default_rng(0).integers(0, 256, (40, 60), np.uint8)
     guide = np.random.default_rng(1).integers(0, 256, (80, 120, 3), np.uint8)
     kernels = (
-        message_passing._sweeps, message_passing._weights, disparity_selection._select,
-        disparity_selection._check_visibility, upsampling._bilateral, upsampling._fill_taps,
+        message_passing._sweeps, message_passing._weights, labels._select,
+        labels._check_visibility, upsampling._bilateral, upsampling._fill_taps,
     )  # fmt: skip
 
     def once(image: U8, guide: U8, config: BeliefPropagationConfig) -> DisparityMap:

@@ -149,7 +149,7 @@ def test_matching_on_the_device_is_that_of_the_host(
 ) -> None:
     """From one level, two and four: the same points, at the same places to 0.02 px."""
     from recon.backends.torch_tracking import TorchMatcher
-    from recon.tracking.matcher import HostMatcher, Matcher
+    from recon.tracking.matching import HostMatcher, Matcher
 
     A = np.array([[zoom, 0.02], [-0.02, zoom]])
     t = np.array([shift, -0.6 * shift])

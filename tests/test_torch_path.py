@@ -17,9 +17,8 @@ import pytest
 
 from recon.stereo import belief_propagation as compiled
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.depth_fusion import FusionConfig
-from recon.stereo.depth_fusion import fuse as compiled_fuse
-from recon.stereo.reprojection import PairDepth
+from recon.stereo.reprojection import FusionConfig, PairDepth
+from recon.stereo.reprojection import fuse as compiled_fuse
 from recon.stereo.reprojection import reproject as compiled_reproject
 from recon.stereo.upsampling import UpsamplingConfig, guide_at_taps
 from recon.stereo.upsampling import upsample as compiled_upsample

@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.tracking.matcher import Matcher
-from recon.tracking.matching import MatchingConfig
+from recon.tracking.localisation import OdometryConfig
+from recon.tracking.matching import Matcher, MatchingConfig
 from recon.tracking.odometry import Odometry, Tracked
-from recon.tracking.odometry_config import OdometryConfig
 from recon.types import F64, U8, Camera, PosePrior
 from service.compute.backend_choice import FallbackBackend
 from service.config import Config
@@ -121,7 +120,7 @@ def test_the_pipeline_tracks_on_its_backend(device: str) -> None:
     from recon.backends import load_backend
     from recon.backends.torch_backend import TorchBackend
     from recon.backends.torch_tracking import TorchMatcher
-    from recon.tracking.matcher import HostMatcher
+    from recon.tracking.matching import HostMatcher
 
     own = Pipeline(CAMERA, Config(), FallbackBackend(TorchBackend(device))).odometry._matcher
     assert isinstance(getattr(own, "_own", None), TorchMatcher)

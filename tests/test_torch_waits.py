@@ -16,7 +16,7 @@ import pytest
 
 from recon.clouds.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.depth_fusion import FusionConfig
+from recon.stereo.reprojection import FusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.tracking.matching import MatchingConfig
 from recon.types import U8, DepthMap, StereoPair

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.tracking.keyframe_window import OdometryKeyframe
-from recon.tracking.landmarks import Landmarks
+from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
 from recon.tracking.matching import Pyramid
 from recon.tracking.odometry import Tracked
 from recon.types import PosePrior

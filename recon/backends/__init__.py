@@ -13,14 +13,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.depth_fusion import FusionConfig
+from recon.stereo.reprojection import FusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 
 if TYPE_CHECKING:
     from recon.backends.torch_kernels import Kernels
     from recon.clouds.registration import IcpConfig
-    from recon.tracking.matcher import Matcher
+    from recon.tracking.matching import Matcher
 
 
 class Backend(Protocol):

@@ -15,8 +15,7 @@ from onnx import TensorProto
 
 from recon.backends.onnx_graph import Graph, Value
 from recon.backends.room import pyramid_levels
-from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.disparity_selection import NOISE, RADIUS, SURE_EVIDENCE
+from recon.stereo.belief_propagation import NOISE, RADIUS, SURE_EVIDENCE, BeliefPropagationConfig
 from recon.stereo.matching_cost import CENSUS_RADIUS, COST_UNIT
 from recon.stereo.message_passing import FULL_WEIGHT
 from recon.stereo.upsampling import MIN_CONFIDENCE, RANGE_FLOOR, UpsamplingConfig, window
@@ -244,7 +243,7 @@ def _select(
     graph: Graph, belief: Value, cost: Value, size: tuple[int, int], labels: int, pair: _Pair,
     config: BeliefPropagationConfig,
 ) -> tuple[Value, Value]:  # fmt: skip
-    """Labels and confidence (h, w), as :func:`recon.stereo.disparity_selection.select`."""
+    """Labels and confidence (h, w), as :func:`recon.stereo.belief_propagation.select`."""
     w = size[1]
     index = np.arange(labels, dtype=np.float32)[:, None, None]
     partner = np.arange(w, dtype=np.float32)[None, None, :] - index - config.min_disparity

@@ -20,8 +20,7 @@ from recon.backends.torch_kernels import PLAIN, Kernels
 from recon.backends.torch_plan import Plan, part, read
 from recon.backends.torch_stereo import DenseStereo, believe, drop_unseen
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.depth_fusion import FusionConfig
-from recon.stereo.reprojection import LABEL_SIGMA_PX
+from recon.stereo.reprojection import LABEL_SIGMA_PX, FusionConfig
 from recon.stereo.reprojection import MIN_CONFIDENCE as MIN_REPROJECTED
 from recon.stereo.upsampling import MIN_CONFIDENCE, RANGE_FLOOR, UpsamplingConfig
 from recon.types import F64, Array, DepthMap, StereoPair
@@ -281,7 +280,7 @@ def _label(
 def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Tensor, Tensor]:
     """Depth, sigma and number of views (h, w) float32 of pairs (P, h, w); no view: NaN.
 
-    As :func:`recon.stereo.depth_fusion.fuse`: inverse depth of the largest group that agrees.
+    As :func:`recon.stereo.reprojection.fuse`: inverse depth of the largest group that agrees.
     """
     z, e = depth.double(), sigma.double()
     usable = (z > 0) & (e < config.most_sigma_share * z)

@@ -1,6 +1,6 @@
 """Harris corners and the zero-mean SSD search in torch (paper section 2.3, Eq. 4-5).
 
-The same answers as :mod:`recon.tracking.harris` and :mod:`recon.tracking.patch_search`, all
+The same answers as :mod:`recon.tracking.matching` and :mod:`recon.tracking.patch_search`, all
 points at once and without leaving the device. Images are (H, W) uint8, points (N, 2) float64
 pixels of their level, inverse warps (N, 4): rows of the 2x2 matrix that takes an offset in b to
 one in a.

@@ -17,8 +17,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from recon.backends.torch_kernels import PLAIN, Kernels, Sweep
-from recon.stereo.belief_propagation import SPECKLE_STEP, BeliefPropagationConfig
-from recon.stereo.disparity_selection import NOISE, RADIUS, SURE_EVIDENCE
+from recon.stereo.belief_propagation import (
+    NOISE,
+    RADIUS,
+    SPECKLE_STEP,
+    SURE_EVIDENCE,
+    BeliefPropagationConfig,
+)
 from recon.stereo.matching_cost import CENSUS_RADIUS, COST_UNIT
 from recon.stereo.message_passing import FULL_WEIGHT
 
@@ -211,7 +216,7 @@ def _outgoing(
 def select(
     belief: Tensor, cost: Tensor, true: Tensor, config: BeliefPropagationConfig
 ) -> tuple[Tensor, Tensor]:
-    """Labels and confidence, as :func:`recon.stereo.disparity_selection.select`."""
+    """Labels and confidence, as :func:`recon.stereo.belief_propagation.select`."""
     room_for, _, w = belief.shape
     index = torch.arange(room_for, device=belief.device)[:, None, None]
     column = torch.arange(w, device=belief.device)[None, None, :]

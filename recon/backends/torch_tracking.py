@@ -44,7 +44,7 @@ Shapes = tuple[tuple[int, int], ...]
 
 
 class TorchMatcher:
-    """A :class:`recon.tracking.matcher.Matcher` for one thread at a time."""
+    """A :class:`recon.tracking.matching.Matcher` for one thread at a time."""
 
     def __init__(self, device: str) -> None:
         self.device = device
@@ -281,7 +281,7 @@ def _consensus(
     """(N, 2) affine trend of ``residual`` over ``uv``, and () True if most good points see it.
 
     Reweighted from the median with a tolerance that narrows, as
-    :func:`recon.tracking.affine_trend.affine_trend`.
+    :func:`recon.tracking.matching.affine_trend`.
     """
     X = torch.cat([torch.ones_like(uv[:, :1]), uv / 1000], 1)
     start = torch.stack([median(residual[:, k], good) for k in (0, 1)])

@@ -1,30 +1,35 @@
 """Stereo by hierarchical min-sum belief propagation on a grid (paper section 2.2, Eq. 1).
 
 The energy is the matching cost plus a truncated linear smoothness, weaker where the image has
-an edge; messages pass through the
-lower envelope of Felzenszwalb and Huttenlocher, https://doi.org/10.1007/s11263-006-7899-4,
-coarse to fine, on a checkerboard: an iteration updates the pixels of one colour from those of
-the other. :mod:`recon.stereo.message_passing` does that; here labels become a disparity map:
-between labels by the matching cost about the winner, and unknown where nothing speaks for it.
+an edge; messages pass through the lower envelope of Felzenszwalb and Huttenlocher,
+https://doi.org/10.1007/s11263-006-7899-4, coarse to fine, on a checkerboard: an iteration
+updates the pixels of one colour from those of the other (:mod:`recon.stereo.message_passing`).
+
+Here labels become a disparity map, unknown where nothing speaks for a label. Between labels the
+offset is that of a V through the matching cost, summed over 7x7, of the winner and its two
+neighbours: on slanted textured planes its bias stays below 0.06 px, against 0.14 px of a
+parabola through the same costs and 0.3 px of one through the beliefs.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
 
-from recon.stereo.disparity_selection import check_visibility, select
 from recon.stereo.matching_cost import (
     COST_UNIT,
     MatchingCostConfig,
+    Workspace,
     check_pair,
     matching_cost,
     plain,
 )
 from recon.stereo.message_passing import MAX_TRUNCATION, Smoothness, propagate
-from recon.stereo.workspace import Workspace
 from recon.types import F32, U8, DisparityMap
 
 _space = Workspace()
@@ -128,3 +133,245 @@ def _drop_speckles(px: F32, smallest: int) -> None:
     coarse = np.ascontiguousarray(labels, np.int16)
     cv2.filterSpeckles(coarse, unknown, smallest, SPECKLE_STEP)
     px[coarse == unknown] = np.nan
+
+
+I16 = npt.NDArray[np.int16]
+
+RADIUS = 3
+"""Of the window whose summed cost places the minimum between labels."""
+
+SURE_EVIDENCE = 0.6
+"""Evidence of a well textured match; confidence grows up to it."""
+
+FILLED_CONFIDENCE = 0.05
+"""Confidence of a pixel that only its neighbours speak for."""
+
+_CHUNK = 16
+NOISE = 0.2 * COST_UNIT
+"""Mean cost below which a window is taken for plain."""
+
+
+def select(
+    data: I16, messages: I16, cost: I16, min_disparity: int, truncation: int, min_evidence: float
+) -> tuple[F32, F32]:
+    """Real-valued labels (h, w) and their confidence, 0 to 1; 0 where not believed.
+
+    ``data`` and ``messages`` come from :func:`recon.stereo.message_passing.propagate` for ``cost``
+    (h, L, w). Evidence is how far the winner's cost lies below the mean over the labels that
+    are seen, relative to that mean: about 0.1 for unrelated images, 0.6 for texture. Not
+    believed are winners with less than ``min_evidence`` and those that tie with another
+    label. NaN are those whose partner lies outside the right image.
+    """
+    height, _, width = cost.shape
+    px = np.empty((height, width), np.float32)
+    confidence = np.empty((height, width), np.float32)
+    _select(data, messages, cost, min_disparity, truncation, float(min_evidence), px, confidence)
+    return px, confidence
+
+
+def check_visibility(
+    px: F32, confidence: F32, min_disparity: int, tolerance: float, fill: bool
+) -> None:
+    """NaN, in place, where the right view would see a nearer surface (by ``tolerance`` labels).
+
+    Only believed labels (confidence above 0) hide others. With ``fill`` a hidden pixel takes
+    the farther of the nearest believed labels of its row, at ``FILLED_CONFIDENCE``, unless its
+    partner would lie outside the right image; so does an unknown strip to the left of a nearer
+    surface that is no wider than the step in disparity. What is neither believed nor filled
+    becomes NaN.
+    """
+    _check_visibility(px, confidence, min_disparity, float(tolerance), bool(fill))
+
+
+@njit(cache=True, nogil=True)
+def _add_row(cost: Any, v: int, sign: Any, sums: Any) -> None:  # pragma: no cover - compiled
+    """Add or take away a row of costs; rows beyond the image count as nothing."""
+    height, labels, width = cost.shape
+    if 0 <= v < height:
+        for label in range(labels):
+            row = cost[v, label]
+            out = sums[label, RADIUS : RADIUS + width]
+            for u in range(width):
+                out[u] += np.int16(sign * row[u])
+
+
+@njit(cache=True, nogil=True)
+def _window_costs(
+    sums: Any, min_disparity: int, box: Any, mean: Any
+) -> None:  # pragma: no cover - compiled
+    """Summed cost (L, w) of a row, and its mean over the labels that each pixel sees."""
+    labels, width = box.shape
+    mean[:] = np.float32(0)
+    for label in range(labels):
+        out = box[label]
+        out[:] = 0
+        for k in range(2 * RADIUS + 1):
+            source = sums[label, k : k + width]
+            for u in range(width):
+                out[u] += np.int32(source[u])
+        shift = label + min_disparity
+        for u in range(max(0, min(shift, width)), max(0, min(width, width + shift))):
+            mean[u] += np.float32(out[u])
+    for u in range(width):
+        seen = min(labels - 1, u - min_disparity) - max(0, u - min_disparity - width + 1) + 1
+        mean[u] /= np.float32(max(seen, 1))
+
+
+@njit(cache=True, nogil=True)
+def _best_labels(
+    data: Any, messages: Any, v: int, parity: int, belief: Any, best: Any, low: Any, second: Any
+) -> None:  # pragma: no cover - compiled
+    """Winner, its belief and that of the best label not beside it, of one parity of a row."""
+    _, _, labels, cells = data.shape
+    count = cells - 1
+    low[:] = 32767
+    for label in range(labels):
+        b = belief[label, :count]
+        d = data[v, parity, label, :count]
+        m0 = messages[0, v + 2, parity, label, :count]
+        m1 = messages[1, v, parity, label, :count]
+        m2 = messages[2, v + 1, 1 - parity, label, parity : parity + count]
+        for i in range(count):
+            b[i] = np.int16(np.int16(d[i] + m0[i]) + np.int16(m1[i] + m2[i]))
+        m3 = messages[3, v + 1, 1 - parity, label]
+        if parity == 1:
+            for i in range(count):
+                b[i] += m3[i]
+        else:
+            for i in range(1, count):
+                b[i] += m3[i - 1]
+        for i in range(count):
+            better = b[i] < low[i]
+            low[i] = b[i] if better else low[i]
+            best[i] = np.int16(label) if better else best[i]
+    second[:] = 32767
+    for label in range(labels):
+        b = belief[label]
+        for i in range(count):
+            beside = abs(np.int16(best[i] - np.int16(label))) <= 1
+            second[i] = second[i] if beside else min(second[i], b[i])
+
+
+@njit(cache=True, nogil=True)
+def _offset(box: Any, label: int, u: int) -> Any:  # pragma: no cover - compiled
+    """Where between the labels the summed cost is least: an equiangular V, -0.5 to 0.5."""
+    if label == 0 or label == box.shape[0] - 1:
+        return np.float32(0)
+    a = np.float32(box[label - 1, u] - box[label, u])
+    b = np.float32(box[label + 1, u] - box[label, u])
+    steep = max(a, b)
+    if steep <= 0:
+        return np.float32(0)
+    return min(max((a - b) / (np.float32(2) * steep), np.float32(-0.5)), np.float32(0.5))
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _select(
+    data: Any,
+    messages: Any,
+    cost: Any,
+    min_disparity: int,
+    truncation: int,
+    min_evidence: float,
+    px: Any,
+    confidence: Any,
+) -> None:  # pragma: no cover - compiled
+    height, labels, width = cost.shape
+    cells = data.shape[3]
+    window = np.float32((2 * RADIUS + 1) ** 2)
+    for chunk in prange((height + _CHUNK - 1) // _CHUNK):
+        first = chunk * _CHUNK
+        sums = np.zeros((labels, width + 2 * RADIUS), np.int16)
+        box = np.empty((labels, width), np.int32)
+        mean = np.empty(width, np.float32)
+        belief = np.empty((labels, cells), np.int16)
+        best = np.zeros(cells, np.int16)
+        low = np.empty(cells, np.int16)
+        second = np.empty(cells, np.int16)
+        for v in range(first - RADIUS, first + RADIUS):
+            _add_row(cost, v, 1, sums)
+        for v in range(first, min(first + _CHUNK, height)):
+            _add_row(cost, v + RADIUS, 1, sums)
+            _window_costs(sums, min_disparity, box, mean)
+            _add_row(cost, v - RADIUS, -1, sums)
+            for parity in range(2):
+                _best_labels(data, messages, v, parity, belief, best, low, second)
+                for i in range((width + 1 - parity) // 2):
+                    u = 2 * i + parity
+                    label = np.int64(best[i])
+                    partner = u - label - min_disparity
+                    evidence = (mean[u] - box[label, u]) / (mean[u] + window * np.float32(NOISE))
+                    margin = np.float32(second[i] - low[i]) / np.float32(2 * truncation)
+                    confidence[v, u] = 0
+                    if partner < 0 or partner >= width:
+                        px[v, u] = np.nan
+                        continue
+                    px[v, u] = np.float32(label) + _offset(box, label, u)
+                    if margin > 0 and (evidence >= min_evidence or min_evidence <= 0):
+                        sure = max(evidence, np.float32(0.01)) / np.float32(SURE_EVIDENCE)
+                        confidence[v, u] = min(np.float32(1), margin) * min(np.float32(1), sure)
+
+
+@njit(cache=True, nogil=True)
+def _check_visibility(
+    px: Any, confidence: Any, min_disparity: int, tolerance: float, fill: bool
+) -> None:  # pragma: no cover - compiled
+    height, width = px.shape
+    for v in range(height):
+        row = px[v]
+        nearest = np.full(width, np.float32(-np.inf), np.float32)
+        hidden = np.zeros(width, np.bool_)
+        for u in range(width):
+            if confidence[v, u] > 0:
+                partner = u - int(row[u] + np.float32(0.5)) - min_disparity
+                if 0 <= partner < width:
+                    nearest[partner] = max(nearest[partner], row[u])
+        for u in range(width):
+            if not np.isnan(row[u]):
+                partner = u - int(row[u] + np.float32(0.5)) - min_disparity
+                hidden[u] = 0 <= partner < width and nearest[partner] > row[u] + tolerance
+        for u in range(width):
+            if hidden[u] or confidence[v, u] <= 0:
+                row[u] = np.nan
+                confidence[v, u] = 0
+        if fill:
+            _mark_strips(row, hidden, tolerance)
+            _fill_row(row, confidence[v], hidden, min_disparity)
+
+
+@njit(cache=True, nogil=True)
+def _mark_strips(row: Any, hidden: Any, tolerance: float) -> None:  # pragma: no cover - compiled
+    """Also hidden: an unknown strip left of a nearer surface, no wider than the step hides."""
+    last = -1
+    for u in range(row.shape[0]):
+        if not np.isnan(row[u]):
+            if 0 <= last < u - 1:
+                step = row[u] - row[last]
+                if step > tolerance and u - last - 1 <= step + 2:
+                    hidden[last + 1 : u] = True
+            last = u
+
+
+@njit(cache=True, nogil=True)
+def _fill_row(
+    row: Any, confidence: Any, hidden: Any, min_disparity: int
+) -> None:  # pragma: no cover - compiled
+    """Give hidden pixels the farther of the nearest known labels to their left and right."""
+    width = row.shape[0]
+    known = np.float32(np.nan)
+    farther = np.full(width, np.float32(np.inf), np.float32)
+    for u in range(width):
+        if hidden[u]:
+            if not np.isnan(known):
+                farther[u] = known
+        elif not np.isnan(row[u]):
+            known = row[u]
+    known = np.float32(np.nan)
+    for u in range(width - 1, -1, -1):
+        if hidden[u]:
+            label = min(farther[u], known) if not np.isnan(known) else farther[u]
+            if np.isfinite(label) and 0 <= u - int(label + np.float32(0.5)) - min_disparity < width:
+                row[u] = label
+                confidence[u] = FILLED_CONFIDENCE
+        elif not np.isnan(row[u]):
+            known = row[u]

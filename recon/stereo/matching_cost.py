@@ -7,6 +7,7 @@ propagation runs on SIMD lanes of 16 bits; ``COST_UNIT`` of them are one label o
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -194,3 +195,21 @@ def _cost_volume(
                 cost[v, label, u] = best[u]
             for u in range(max(min(width, width + shift), 0), width):
                 cost[v, label, u] = best[u]
+
+
+I16 = npt.NDArray[np.int16]
+
+
+class Workspace(threading.local):
+    """One set of int16 arrays per thread, by name; each keeps the shape it was last taken in."""
+
+    def __init__(self) -> None:
+        self._kept: dict[str, I16] = {}
+
+    def take(self, name: str, shape: tuple[int, ...]) -> I16:
+        """The array of that name: zeros when its shape is new, else as the last user left it."""
+        array = self._kept.get(name)
+        if array is None or array.shape != shape:
+            array = np.zeros(shape, np.int16)
+            self._kept[name] = array
+        return array

@@ -15,7 +15,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import scaled_K
-from recon.stereo.exposure import stretch
+from recon.image_quality import stretch
 from recon.types import F64, U8, Bool, DepthMap, DisparityMap, StereoPair
 
 

@@ -7,7 +7,7 @@ new frame (Eq. 6-7), and the two are averaged.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -16,10 +16,36 @@ from recon import se3
 from recon.tracking import matching, pnp, prediction, robust_geometry, two_view
 from recon.tracking.common_view import CommonView, FeatureCache, common_view
 from recon.tracking.keyframe_window import Incoming, OdometryKeyframe
-from recon.tracking.matcher import Matcher
-from recon.tracking.motion import Motion
-from recon.tracking.odometry_config import OdometryConfig
+from recon.tracking.matching import Matcher
+from recon.tracking.prediction import Motion
 from recon.types import F64, Bool, Camera, PosePrior
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryConfig:
+    """Parameters of the odometry; angles are in rad, shares are of the image width."""
+
+    base_to_height: float = 0.1  # motion between keyframes over the distance to the ground
+    least_base_to_height: float = 0.03  # under it two frames are not triangulated
+    window: int = 8  # keyframes adjusted together
+    search_share: float = 0.03  # ZSSD search radius around a good prediction
+    wide_search_share: float = 0.09  # and around a poor one
+    min_tracks: int = 40  # fewer inliers: lost
+    min_track_share: float = 0.25  # of the corners that should be visible
+    tracked_landmarks: int = 300  # enough for a pose; keyframes match all their corners
+    max_tilt_error_rad: float = 0.35  # vision against attitude: more is a false solution
+    loose_px: float = 6.0  # gate of a second try: a rolling shutter bends pictures that much
+    lost_after: int = 8  # frames in a row without a pose before a new segment starts
+    still_gap_s: float = 0.7  # frames further apart are stills: no motion model holds
+    matching: matching.MatchingConfig = field(default_factory=matching.MatchingConfig)
+    pnp: pnp.PnpConfig = field(default_factory=pnp.PnpConfig)
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.least_base_to_height <= self.base_to_height < 1.0:
+            raise ValueError("0 < least_base_to_height <= base_to_height < 1 must hold")
+        if self.window < 3:
+            raise ValueError(f"window must hold 3 keyframes or more, got {self.window}")
+
 
 RECALLED = 4
 """Newest keyframes that a frame is compared with by features."""
@@ -305,3 +331,76 @@ def _averaged(left: pnp.PnpResult, right: pnp.PnpResult) -> pnp.PnpResult:
     """The right view's pose averaged with the left's, both of one frame in one map."""
     mean = pnp.average_left_right(left, right, np.eye(4))
     return replace(right, T_camera_points=mean.T_camera_points, covariance=mean.covariance)
+
+
+class FirstViews:
+    """Matches the first frame's corners by what is likely: as in the frame before, by
+    telemetry, by the features that both images share."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: matching.MatchingConfig,
+        radius_px: float,
+        matcher: Matcher,
+        features: FeatureCache,
+    ) -> None:
+        self._matcher = matcher
+        self._K, self._config, self._radius_px = camera.K, config, radius_px
+        self._features = features
+        self._drift = np.eye(3)  # from the first frame's pixels to the last one's
+
+    def begin(self) -> None:
+        """Forget the segment before."""
+        self._drift = np.eye(3)
+
+    def match(
+        self, new: Incoming, first: OdometryKeyframe, R_b_a: F64 | None, still: bool
+    ) -> tuple[F64, Bool]:
+        """(N, 2) pixels and (N,) success of the first frame's corners in a new frame.
+
+        ``R_b_a`` (3, 3) is the turn by telemetry; ``still`` pictures are far apart in time.
+        """
+        best: tuple[F64, Bool] | None = None
+        for guess in self._guesses(new, first, R_b_a, still):
+            found = self._matcher.match(
+                first.pyramid,
+                first.uv.astype(np.float32),
+                new.pyramid,
+                guess.uv.astype(np.float32),
+                guess.radius_px,
+                guess.warp.astype(np.float32),
+                self._config,
+            )
+            if best is None or found.ok.sum() > best[1].sum():
+                best = (found.uv_px.astype(np.float64), found.ok)
+            if best[1].sum() > 0.5 * len(first.uv):
+                self._drift = prediction.common_affine(first.uv[best[1]], best[0][best[1]])
+                break
+        if best is None:
+            return first.uv, np.zeros(len(first.uv), np.bool_)
+        return best
+
+    def _guesses(
+        self, new: Incoming, first: OdometryKeyframe, R_b_a: F64 | None, still: bool
+    ) -> Iterator[prediction.Prediction]:
+        """Where the corners went, best first."""
+        if not still:
+            yield prediction.by_homography(self._drift, first.uv, self._radius_px)
+        if R_b_a is not None:
+            H = self._by_telemetry(new, first, R_b_a)
+            yield prediction.by_homography(H, first.uv, self._radius_px)
+        here = self._features.of(new.seq, new.grey)
+        view = common_view(self._features.of(first.seq, first.pyramid.levels[0]), here)
+        if view is not None:
+            yield view.predict(first.uv, self._radius_px)
+
+    def _by_telemetry(self, new: Incoming, first: OdometryKeyframe, R_b_a: F64) -> F64:
+        """(3, 3) homography of level ground by attitude, and by position and height if known."""
+        a, b = first.prior, new.prior
+        height, t = b.agl_m or 0.0, np.zeros(3)
+        if b.position_m is not None and a.position_m is not None and height > 0:
+            assert a.R_world_camera is not None
+            t = R_b_a @ a.R_world_camera.T @ (a.position_m - b.position_m) / height
+        n = first.T_camera_odom[:3, 2]  # up, seen from the camera
+        return np.asarray(self._K @ (R_b_a - np.outer(t, n)) @ np.linalg.inv(self._K))

@@ -8,23 +8,128 @@ centres are at integers; level ``l`` of a pyramid holds the pixel (u, v) at (u, 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from numba import njit, prange
 
-from recon.tracking import harris, patch_search
-from recon.tracking.affine_trend import affine_trend
+from recon.tracking import patch_search
 from recon.types import F32, F64, U8, Bool
 
-__all__ = [
-    "Corners",
-    "Matches",
-    "MatchingConfig",
-    "Pyramid",
-    "harris_grid",
-    "match",
-]
+
+@njit(cache=True, nogil=True, fastmath=True)
+def affine_trend(uv: Any, moves: Any, first: Any, tolerance: float, trend: Any) -> None:
+    """Fill ``trend`` (3, 2): ``moves`` (N, 2) as 1, u / 1000, v / 1000 times it, robustly.
+
+    Reweighted from ``first`` (2,) with a tolerance that narrows from eightfold to itself.
+    """
+    trend[:] = 0.0
+    trend[0, 0], trend[0, 1] = first[0], first[1]
+    row = np.empty(3)
+    for sharpness in (0.125, 0.25, 0.5, 1.0, 1.0):
+        H, g = 1e-6 * np.eye(3), np.zeros((3, 2))
+        for p in range(uv.shape[0]):
+            row[0], row[1], row[2] = 1.0, uv[p, 0] / 1000, uv[p, 1] / 1000
+            du, dv = moves[p, 0], moves[p, 1]
+            for k in range(3):
+                du -= row[k] * trend[k, 0]
+                dv -= row[k] * trend[k, 1]
+            share = (du * du + dv * dv) * (sharpness / tolerance) ** 2
+            weight = 1.0 / ((1.0 + share) * (1.0 + share))
+            for k in range(3):
+                g[k, 0] += weight * row[k] * moves[p, 0]
+                g[k, 1] += weight * row[k] * moves[p, 1]
+                for m in range(3):
+                    H[k, m] += weight * row[k] * row[m]
+        trend[:] = np.linalg.solve(H, g)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _window_products(image: Any, row0: int, row1: int, sums: Any) -> None:
+    """Fill ``sums`` (3, rows, W) with Ix^2, Iy^2, Ix Iy under the binomial window w of Eq. 4."""
+    H, W = image.shape
+    rows = row1 - row0
+    products = np.zeros((3, rows + 4, W), np.float32)
+    for r in range(rows + 4):
+        y = row0 - 2 + r
+        if y < 1 or y >= H - 1:
+            continue
+        up, mid, down = image[y - 1], image[y], image[y + 1]
+        for x in range(1, W - 1):
+            a, c = np.float32(up[x - 1]), np.float32(up[x + 1])
+            g, i = np.float32(down[x - 1]), np.float32(down[x + 1])
+            d, f = np.float32(mid[x - 1]), np.float32(mid[x + 1])
+            gx = np.float32(0.125) * (c - a + np.float32(2) * (f - d) + i - g)
+            gy = np.float32(0.125) * (
+                g - a + np.float32(2) * (np.float32(down[x]) - np.float32(up[x])) + i - c
+            )
+            products[0, r, x] = gx * gx
+            products[1, r, x] = gy * gy
+            products[2, r, x] = gx * gy
+    line = np.zeros(W, np.float32)
+    for k in range(3):
+        for r in range(rows):
+            p0, p1, p2, p3, p4 = (
+                products[k, r],
+                products[k, r + 1],
+                products[k, r + 2],
+                products[k, r + 3],
+                products[k, r + 4],
+            )
+            for x in range(W):
+                line[x] = p0[x] + p4[x] + np.float32(4) * (p1[x] + p3[x]) + np.float32(6) * p2[x]
+            out = sums[k, r]
+            for x in range(2, W - 2):
+                out[x] = np.float32(1.0 / 256) * (
+                    line[x - 2]
+                    + line[x + 2]
+                    + np.float32(4) * (line[x - 1] + line[x + 1])
+                    + np.float32(6) * line[x]
+                )
+
+
+@njit(cache=True, nogil=True, fastmath=True, parallel=True)
+def harris_cells(
+    image: Any, mask: Any, columns: int, rows: int, margin: int, k: float, found: Any
+) -> None:
+    """Fill ``found`` (rows, columns, 3) with u, v and R of each cell's best local maximum.
+
+    R is zero where the cell has none. ``mask`` is (H, W) uint8 or (0, 0) for none.
+    """
+    H, W = image.shape
+    masked = mask.shape[0] == H
+    kk = np.float32(k)
+    for j in prange(rows):
+        y0, y1 = max(H * j // rows, margin), min(H * (j + 1) // rows, H - margin)
+        if y1 <= y0:
+            continue
+        sums = np.zeros((3, y1 - y0 + 2, W), np.float32)
+        _window_products(image, y0 - 1, y1 + 1, sums)
+        response = sums[0]
+        for r in range(y1 - y0 + 2):
+            for x in range(W):
+                a, b, c = sums[0, r, x], sums[1, r, x], sums[2, r, x]
+                # Eq. (5)
+                response[r, x] = a * b - c * c - kk * (a + b) * (a + b)
+        for i in range(columns):
+            x0, x1 = max(W * i // columns, margin), min(W * (i + 1) // columns, W - margin)
+            best, bx, by = np.float32(0), 0, 0
+            for r in range(1, y1 - y0 + 1):
+                for x in range(x0, x1):
+                    if response[r, x] > best and (not masked or mask[y0 + r - 1, x] != 0):
+                        best, bx, by = response[r, x], x, r
+            # The maximum of the cell may be the flank of a corner in the next cell.
+            peak = best > 0 and bx > 0 and bx < W - 1
+            if peak:
+                for dy in range(-1, 2):
+                    for dx in range(-1, 2):
+                        if response[by + dy, bx + dx] > best:
+                            peak = False
+            if peak:
+                found[j, i, 0], found[j, i, 1], found[j, i, 2] = bx, y0 + by - 1, best
+
 
 FAR = 1e6
 """px; stands for a prediction that is not a number."""
@@ -117,7 +222,7 @@ def harris_grid(gray: U8, config: MatchingConfig, mask: U8 | None = None) -> Cor
             side = 2 * margin + 1
             allowed = np.asarray(cv2.erode(mask, np.ones((side, side), np.uint8)), np.uint8)
     cells = np.zeros((config.grid, config.grid, 3), np.float32)
-    harris.harris_cells(
+    harris_cells(
         np.ascontiguousarray(gray),
         allowed,
         config.grid,
@@ -321,3 +426,43 @@ def _repeats(search: _Search, uv: F64, ok: Bool, coarse: F64, fine: F64) -> Bool
     if not vague.any():
         return vague
     return np.asarray(vague & ~search.at(1, uv, vague, 8).distinct(search.config.ambiguity))
+
+
+class Matcher(Protocol):
+    """What the odometry asks of pictures."""
+
+    def pyramid(self, gray: U8, levels: int) -> Pyramid:
+        """The pyramid of ``gray`` (H, W), held where this matcher works."""
+        ...
+
+    def corners(self, pyramid: Pyramid, config: MatchingConfig, mask: U8 | None) -> Corners:
+        """As :func:`recon.tracking.harris_grid`, of the pyramid's first level."""
+        ...
+
+    def match(
+        self, pyramid_a: Pyramid, uv_a: npt.ArrayLike, pyramid_b: Pyramid,
+        uv_b_predicted: npt.ArrayLike, radius_px: float, warp: npt.ArrayLike | None,
+        config: MatchingConfig,
+    ) -> Matches:  # fmt: skip
+        """As :func:`match`."""
+        ...
+
+
+class HostMatcher:
+    """The compiled kernels of the processor."""
+
+    def pyramid(self, gray: U8, levels: int) -> Pyramid:
+        """See :class:`Matcher`."""
+        return Pyramid.build(gray, levels)
+
+    def corners(self, pyramid: Pyramid, config: MatchingConfig, mask: U8 | None) -> Corners:
+        """See :class:`Matcher`."""
+        return harris_grid(pyramid.levels[0], config, mask)
+
+    def match(
+        self, pyramid_a: Pyramid, uv_a: npt.ArrayLike, pyramid_b: Pyramid,
+        uv_b_predicted: npt.ArrayLike, radius_px: float, warp: npt.ArrayLike | None,
+        config: MatchingConfig,
+    ) -> Matches:  # fmt: skip
+        """See :class:`Matcher`."""
+        return match(pyramid_a, uv_a, pyramid_b, uv_b_predicted, radius_px, warp, config)

@@ -18,19 +18,18 @@ import numpy as np
 from recon import se3
 from recon.tracking import matching, prediction, two_view
 from recon.tracking.common_view import FeatureCache
-from recon.tracking.first_views import FirstViews
 from recon.tracking.keyframe_window import (
+    I64,
     Incoming,
+    Landmarks,
     OdometryKeyframe,
     adjust_window,
     landmarks,
     triangulate,
 )
-from recon.tracking.landmarks import I64, Landmarks
-from recon.tracking.localisation import Bridge, Localiser, Located
-from recon.tracking.matcher import HostMatcher, Matcher
-from recon.tracking.motion import Motion
-from recon.tracking.odometry_config import OdometryConfig
+from recon.tracking.localisation import Bridge, FirstViews, Localiser, Located, OdometryConfig
+from recon.tracking.matching import HostMatcher, Matcher
+from recon.tracking.prediction import Motion
 from recon.types import F64, U8, Bool, Camera, PosePrior
 
 OVERDUE = 1.3

@@ -1,4 +1,4 @@
-"""Where a keyframe's corners should be in a new frame, and how two frames differ."""
+"""Where the camera and a keyframe's corners should be in a new frame, and how two frames differ."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import numpy as np
 from recon import se3
 from recon.camera_model import rays
 from recon.tracking import robust_geometry, two_view
-from recon.tracking.keyframe_window import OdometryKeyframe
-from recon.tracking.landmarks import I64
+from recon.tracking.keyframe_window import I64, OdometryKeyframe
 from recon.types import F64, Bool, PosePrior
 
 MIN_MEASURED = 12
@@ -154,3 +153,41 @@ def fresh_corners(corners: F64, kept: F64, size_px: tuple[int, int], grid: int) 
     taken[cell[:, 1], cell[:, 0]] = True
     cell = (corners / size_px * grid).astype(np.int64).clip(0, grid - 1)
     return np.asarray(corners[~taken[cell[:, 1], cell[:, 0]]])
+
+
+STEADY_S = 0.3
+"""Velocities of frames closer than this are averaged with those before."""
+
+
+class Motion:
+    """A camera that goes on as it went, and turns as telemetry says. Odometry's own units."""
+
+    def __init__(self, time_ns: int, T_odom_camera: F64, prior: PosePrior) -> None:
+        """At rest there; ``prior`` is telemetry's word of that moment."""
+        self._last = (time_ns, T_odom_camera, prior)
+        self._velocity = np.zeros(3)
+
+    def update(self, time_ns: int, T_odom_camera: F64, prior: PosePrior) -> None:
+        """Take in the next frame's pose (4, 4)."""
+        last_ns, T_last, _ = self._last
+        if time_ns > last_ns:
+            dt = (time_ns - last_ns) * 1e-9
+            velocity = (T_odom_camera[:3, 3] - T_last[:3, 3]) / dt
+            keep = 0.5 if dt < STEADY_S and np.any(self._velocity) else 0.0
+            self._velocity = keep * self._velocity + (1 - keep) * velocity
+        self._last = (time_ns, T_odom_camera, prior)
+
+    def correct(self, T_odom_camera: F64) -> None:
+        """The last frame's pose was adjusted; the velocity stays."""
+        time_ns, _, prior = self._last
+        self._last = (time_ns, T_odom_camera, prior)
+
+    def ahead(self, time_ns: int, prior: PosePrior) -> tuple[F64, F64 | None, float]:
+        """T_odom_camera (4, 4) expected then, the turn R_new_last of telemetry, and seconds."""
+        last_ns, T_last, last_prior = self._last
+        dt = (time_ns - last_ns) * 1e-9
+        R = T_last[:3, :3]
+        turn = relative_rotation(last_prior, prior)
+        if turn is not None:
+            R = R @ turn.T
+        return se3.compose(R, T_last[:3, 3] + self._velocity * dt), turn, dt

@@ -22,7 +22,7 @@ from recon.backends.torch_stereo import DenseStereo, believe, drop_unseen
 from recon.backends.torch_tracking import TorchMatcher
 from recon.clouds.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.depth_fusion import FusionConfig
+from recon.stereo.reprojection import FusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.tracking.matching import MatchingConfig, harris_grid
 from recon.types import U8, Array, StereoPair

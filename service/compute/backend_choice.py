@@ -25,8 +25,7 @@ from recon.backends import (
 )
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.upsampling import UpsamplingConfig
-from recon.tracking.matcher import HostMatcher, Matcher
-from recon.tracking.matching import Corners, Matches, MatchingConfig, Pyramid
+from recon.tracking.matching import Corners, HostMatcher, Matcher, Matches, MatchingConfig, Pyramid
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 from service.errors import InputError, OutsideError
 
@@ -133,11 +132,11 @@ class FallbackMatcher:
         self._own = backend.device_matcher()
 
     def pyramid(self, gray: U8, levels: int) -> Pyramid:
-        """See :class:`recon.tracking.matcher.Matcher`."""
+        """See :class:`recon.tracking.matching.Matcher`."""
         return self._run(lambda m: m.pyramid(gray, levels))
 
     def corners(self, pyramid: Pyramid, config: MatchingConfig, mask: U8 | None) -> Corners:
-        """See :class:`recon.tracking.matcher.Matcher`."""
+        """See :class:`recon.tracking.matching.Matcher`."""
         return self._run(lambda m: m.corners(pyramid, config, mask))
 
     def match(
@@ -145,7 +144,7 @@ class FallbackMatcher:
         uv_b_predicted: npt.ArrayLike, radius_px: float, warp: npt.ArrayLike | None,
         config: MatchingConfig,
     ) -> Matches:  # fmt: skip
-        """See :class:`recon.tracking.matcher.Matcher`."""
+        """See :class:`recon.tracking.matching.Matcher`."""
         return self._run(
             lambda m: m.match(pyramid_a, uv_a, pyramid_b, uv_b_predicted, radius_px, warp, config)
         )

@@ -22,8 +22,7 @@ from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.graph.riders import KEYFRAME
 from recon.graph.trajectory import Trajectory
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.depth_fusion import FusionConfig, fuse
-from recon.stereo.reprojection import PairDepth, reproject
+from recon.stereo.reprojection import FusionConfig, PairDepth, fuse, reproject
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.stereo.virtual_stereo import (
     Refusal,

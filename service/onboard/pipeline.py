@@ -21,12 +21,11 @@ from recon.graph.dead_reckoning import carried
 from recon.graph.fix_average import FixAverage
 from recon.graph.trajectory import Placed
 from recon.graph.travel import Odometer
-from recon.stereo.exposure import stretch
+from recon.image_quality import BlurWatch, stretch
 from recon.stereo.virtual_stereo import View
 from recon.tracking.keyframe_window import landmarks
+from recon.tracking.localisation import OdometryConfig
 from recon.tracking.odometry import Odometry, Tracked
-from recon.tracking.odometry_config import OdometryConfig
-from recon.tracking.sharpness import BlurWatch
 from recon.types import U8, Camera, Frame, Keyframe, PosePrior
 from service.cameras.source import GeoTag
 from service.compute.side_by_side import SideBySide

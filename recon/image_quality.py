@@ -1,4 +1,4 @@
-"""How sharp a picture is beside those before it: blurred frames make poor stereo views."""
+"""Contrast and sharpness: dark images are stretched, blurred ones make poor stereo views."""
 
 from __future__ import annotations
 
@@ -7,7 +7,31 @@ from collections import deque
 import cv2
 import numpy as np
 
-from recon.types import U8
+from recon.types import U8, Bool
+
+WANTED_SPREAD = 45.0
+"""Standard deviation in grey levels that a picture of a well-lit scene has."""
+
+MOST_GAIN = 8.0
+"""Beyond it noise is all that grows."""
+
+
+def stretch(grey: U8, seen: Bool | None = None) -> U8:
+    """The picture (H, W) with its contrast raised to that of a well-lit scene.
+
+    One gain for the whole picture, so that places are not moved; a picture with contrast
+    enough comes back as it is. ``seen`` (H, W) says which pixels count.
+    """
+    sample = grey[::4, ::4] if seen is None else grey[::4, ::4][seen[::4, ::4]]
+    if sample.size == 0:
+        return grey
+    spread = float(sample.std())
+    if spread >= WANTED_SPREAD:
+        return grey
+    gain = min(WANTED_SPREAD / max(spread, 1e-3), MOST_GAIN)
+    levels = (np.arange(256) - float(sample.mean())) * gain + 128.0
+    table = np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+    return np.asarray(cv2.LUT(grey, table), np.uint8)
 
 
 def sharpness(grey: U8) -> float:
