@@ -29,16 +29,6 @@ class Camera:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
-    """One picture of the camera, as it came (still distorted)."""
-
-    image: U8  # (H, W, 3) BGR
-    time_ns: int  # mid-exposure; companion monotonic live, unix nanoseconds in a replay
-    seq: int
-    camera: Camera
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Travel:
     """A velocity integrated since the start of an unbroken run of readings."""
 
@@ -69,6 +59,16 @@ class PosePrior:
     is_agl_measured: bool = True  # False: above the take-off point, or assumed
     velocity_m_s: F64 | None = None  # (3,) ENU, of the vehicle
     travel: Travel | None = None  # the velocity integrated up to this moment
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One image of the camera, still distorted, and what telemetry says of its instant."""
+
+    image: U8  # (H, W, 3) BGR
+    time_ns: int  # mid-exposure; companion monotonic live, unix nanoseconds in a replay
+    seq: int
+    prior: PosePrior
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import resource
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from recon import se3
 from recon.types import F64
 from service.errors import OutsideError
 from service.onboard.anchorage import Anchorage, Carriers, Key, Told, ToldFrames
-from service.onboard.pipeline import Pipeline
 
 RNG = np.random.default_rng(4)
 
@@ -107,18 +105,3 @@ def test_carriers_keep_their_places_when_they_settle() -> None:
         assert np.array_equal(new.T_odom_camera, old.T_odom_camera)
         assert isinstance(new.key, Refined) == (new.seq >= 70)
     assert carriers.of(Anchorage(0, Refined(0, 7, np.eye(4)), np.eye(4))) is None
-
-
-def test_views_that_gave_way_are_let_go() -> None:
-    """Live, a view that was never reconstructed must not be held with its pictures."""
-    pipeline: Any = Pipeline.__new__(Pipeline)
-    key = Refined(0, 0, np.eye(4))
-    pipeline._views = {
-        seq: SimpleNamespace(seq=seq, key=key, T_key_camera=np.eye(4)) for seq in (1, 3, 5, 7)
-    }
-    done = SimpleNamespace(view=SimpleNamespace(seq=5))
-    pipeline._jobs = SimpleNamespace(finished=lambda everything: [(done, None)])
-    pipeline._carriers = Carriers()
-    pipeline.odometry = SimpleNamespace(keyframes=[], segment=0)
-    assert pipeline._collect() == ()
-    assert list(pipeline._views) == [7]

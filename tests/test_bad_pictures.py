@@ -19,6 +19,8 @@ from recon.backends import load_backend
 from recon.types import F64, U8, Camera, Frame, Keyframe
 from service.config import load_config
 from service.onboard.pipeline import Pipeline
+from service.onboard.rig import Rig
+from service.onboard.stages import build_stages
 
 K: F64 = np.array([[400.0, 0, 239.5], [0, 400.0, 134.5], [0, 0, 1]])
 CAMERA = Camera(K, np.zeros(5), (480, 270))
@@ -61,13 +63,14 @@ def state(i: int) -> VehicleState:
 
 def fly(pictures: list[U8]) -> tuple[list[Keyframe], Counter[str], Pipeline]:
     config = load_config(None, ["scan.assumed_agl_m=60", "compute.upsample=false"])
-    pipeline = Pipeline(CAMERA, config, load_backend("cpu"))
+    pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu")))
+    rig = Rig(config.camera, config.scan, config.fusion)
     keyframes: list[Keyframe] = []
     for i, picture in enumerate(pictures):
-        frame = Frame(picture, i * 40_000_000, i, CAMERA)
-        keyframes += pipeline.step(frame, state(i)).keyframes
+        frame = Frame(picture, i * 40_000_000, i, rig.prior(state(i), None))
+        keyframes += pipeline.step(frame).keyframes
     keyframes += pipeline.finish().keyframes
-    return keyframes, pipeline.all_refusals(), pipeline
+    return keyframes, pipeline.refusals(), pipeline
 
 
 def off_the_plane(keyframe: Keyframe) -> float:
@@ -117,7 +120,7 @@ def test_the_clean_flight_gives_the_plane(clean: list[U8]) -> None:
 def test_spoiled_frames_make_no_false_surface(clean: list[U8], spoil: Callable[[U8], U8]) -> None:
     pictures = [spoil(p) if 25 <= i < 29 else p for i, p in enumerate(clean)]
     keyframes, reasons, pipeline = fly(pictures)
-    assert len(keyframes) >= 4 and pipeline.odometry.segment == 0
+    assert len(keyframes) >= 4 and pipeline.segments == 1
     assert all(off_the_plane(k) < 0.01 for k in keyframes)
     if spoil is over_exposed:
         assert sum(reasons.values()) >= 4, reasons
@@ -150,7 +153,8 @@ def test_water_that_never_looks_the_same_gives_nothing() -> None:
 def test_telemetry_goes_on_where_vision_was_lost(clean: list[U8]) -> None:
     """Fixes that are 3 m off when the pictures end do not throw the camera there."""
     config = load_config(None, ["compute.upsample=false"])
-    pipeline = Pipeline(CAMERA, config, load_backend("cpu"))
+    pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu")))
+    rig = Rig(config.camera, config.scan, config.fusion)
     metre_east = 1.0 / (111_319.49 * np.cos(np.radians(47.0)))
     seen: list[tuple[int, F64]] = []
     lost: list[tuple[int, F64]] = []
@@ -160,7 +164,7 @@ def test_telemetry_goes_on_where_vision_was_lost(clean: list[U8]) -> None:
             state(i), lat_deg=47.0, lon_deg=8.0 + (STEP_M * i + off_m) * metre_east,
             alt_amsl_m=500.0 + HEIGHT_M, sigma_h_m=1.0, sigma_v_m=1.5, sigma_yaw_rad=0.03,
         )  # fmt: skip
-        step = pipeline.step(Frame(picture, i * 40_000_000, i, CAMERA), told)
+        step = pipeline.step(Frame(picture, i * 40_000_000, i, rig.prior(told, None)))
         if step.placed is not None:
             kept = seen if step.anchor is not None else lost
             kept.append((i, step.placed.T_world_camera[:3, 3]))

@@ -17,11 +17,11 @@ from recon import se3
 from recon.backends.cpu import CpuBackend
 from recon.graph.pose_graph import PoseGraph
 from recon.graph.trajectory import Trajectory
-from recon.types import F64, PosePrior
+from recon.types import F64, Camera, PosePrior
 from service.config import Config
-from service.onboard.dense import Dense
 from service.onboard.graph_aside import GraphAside
 from service.onboard.graph_figures import graph_figures
+from service.onboard.stages import build_stages
 
 STEP_M, HEIGHT_M, SCALE = 6.0, 60.0, 1.3
 MOTION = np.diag([1e-4**2] * 3 + [0.01**2] * 3)
@@ -77,11 +77,10 @@ def _same_in_one_process() -> PoseGraph:
 
 @pytest.mark.parametrize("is_live", [True, False])
 def test_a_live_flight_has_it_and_a_replay_has_not(is_live: bool) -> None:
-    dense = Dense(Config(), CpuBackend(), 0.05, aside=is_live)
-    try:
-        assert isinstance(dense.trajectory.graph, GraphAside if is_live else PoseGraph)
-    finally:
-        dense.close()
+    camera = Camera(np.array([[200.0, 0, 160], [0, 200, 90], [0, 0, 1]]), np.zeros(5), (320, 180))
+    stages = build_stages(camera, Config(), CpuBackend(), live=is_live)
+    with stages.resources:
+        assert isinstance(stages.chain.graph, GraphAside if is_live else PoseGraph)
 
 
 def test_its_result_is_that_of_the_graph_itself(aside: GraphAside) -> None:

@@ -20,7 +20,7 @@ from recon.tracking.odometry import Odometry, Tracked
 from recon.types import F64, U8, Camera, PosePrior
 from service.compute.backend_choice import FallbackBackend
 from service.config import Config
-from service.onboard.pipeline import Pipeline
+from service.onboard.stages import build_stages
 
 torch = pytest.importorskip("torch")
 
@@ -122,8 +122,10 @@ def test_the_pipeline_tracks_on_its_backend(device: str) -> None:
     from recon.backends.torch_tracking import TorchMatcher
     from recon.tracking.matching import HostMatcher
 
-    own = Pipeline(CAMERA, Config(), FallbackBackend(TorchBackend(device))).odometry._matcher
+    own = build_stages(
+        CAMERA, Config(), FallbackBackend(TorchBackend(device))
+    ).track.odometry._matcher
     assert isinstance(getattr(own, "_own", None), TorchMatcher)
     assert isinstance(
-        Pipeline(CAMERA, Config(), load_backend("cpu")).odometry._matcher, HostMatcher
+        build_stages(CAMERA, Config(), load_backend("cpu")).track.odometry._matcher, HostMatcher
     )

@@ -11,24 +11,27 @@ from recon.tracking.matching import Pyramid
 from recon.tracking.odometry import Tracked
 from recon.types import PosePrior
 from service.config import ScanConfig
-from service.onboard.viewpoints import Offer, Viewpoint, Viewpoints, frames_apart
+from service.onboard.anchorage import Anchorage
+from service.onboard.viewpoints import Viewpoint, Viewpoints, frames_apart
 
 
-def frame(seq: int, x_m: float, state: str, segment: int = 0, blurred: bool = False) -> Offer:
+def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> Viewpoint:
     T = se3.compose(np.eye(3), np.array([x_m, 0.0, 50.0]))
     key = OdometryKeyframe(
         seq, seq, segment, se3.inverse(T), np.eye(6), PosePrior(), Pyramid(()),
         np.zeros((0, 2)), np.zeros(0, np.int64), Landmarks(),
     )  # fmt: skip
     picture = np.zeros((32, 32, 3), np.uint8)
-    tracked = Tracked(state, segment, T, np.eye(6))
-    return Offer(seq, seq, picture, tracked, key, PosePrior(), blurred)
+    anchor = Anchorage(seq, key, np.eye(4))
+    return Viewpoint(seq, seq, PosePrior(), picture, picture[..., 0], key, anchor, blurred)
 
 
 def offer(
     views: Viewpoints, seq: int, x_m: float, state: str, segment: int = 0, blurred: bool = False
 ) -> Viewpoint | None:
-    return views.offer(frame(seq, x_m, state, segment, blurred))
+    taken = frame(seq, x_m, segment, blurred)
+    tracked = Tracked(state, segment, taken.T_odom_camera, np.eye(6))
+    return taken if views.offer(taken, tracked) else None
 
 
 def test_automatic_takes_the_odometrys_keyframes() -> None:
@@ -117,12 +120,12 @@ def test_the_last_frame_of_a_stretch_becomes_a_view_when_it_shows_more() -> None
         for j in range(10):
             state = "tracked" if j else "keyframe" if i else "started"
             assert (offer(views, 10 * i + j, 5.0 * i + 0.5 * j, state) is None) == (j > 0)
-    assert views.end_stretch(frame(20, 10.4, "tracked")) is None
-    assert views.end_stretch(frame(28, 14.0, "tracked", blurred=True)) is None
-    last = views.end_stretch(frame(28, 14.0, "tracked"))
-    assert last is not None and [v.seq for v in views.partners(last)] == [23, 20, 10, 0]
-    assert views.end_stretch(None) is None and len(views.partners(last)) == 4
+    assert not views.end_stretch(frame(20, 10.4))
+    assert not views.end_stretch(frame(28, 14.0, blurred=True))
+    last = frame(28, 14.0)
+    assert views.end_stretch(last) and [v.seq for v in views.partners(last)] == [23, 20, 10, 0]
+    assert not views.end_stretch(None) and len(views.partners(last)) == 4
     fixed = Viewpoints(ScanConfig(baseline=2.0))
     for i in range(3):
         offer(fixed, i, 2.5 * i, "tracked" if i else "started")
-    assert fixed.end_stretch(frame(3, 6.5, "tracked")) is None
+    assert not fixed.end_stretch(frame(3, 6.5))

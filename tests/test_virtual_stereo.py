@@ -8,7 +8,7 @@ import pytest
 from recon import se3
 from recon.stereo.reprojection import reproject
 from recon.stereo.virtual_stereo import (
-    Refusal,
+    PairRejection,
     View,
     VirtualStereoConfig,
     _homography,
@@ -28,7 +28,7 @@ def view(seq: int, centre: tuple[float, float, float], turn: tuple[float, float,
     R = se3.so3_exp(np.array(turn)) @ np.diag([1.0, -1, -1])
     rng = np.random.default_rng(seq)
     picture: U8 = rng.integers(0, 255, (H, W, 3), dtype=np.uint8)
-    return View(seq, seq, picture, picture[..., 0].copy(), K, se3.compose(R, np.array(centre)))
+    return View(picture, picture[..., 0].copy(), K, se3.compose(R, np.array(centre)))
 
 
 def ground(rng: np.random.Generator, n: int = 500, relief: float = 6.0) -> F64:
@@ -107,7 +107,7 @@ def test_refusals_name_their_reason() -> None:
         assert found is not None and found.reason == reason
     good = view(1, (5.0, 0.0, 60.0), (0.0, 0.0, 0.0))
     assert check_pair(a, good, 60.0, CONFIG) is None
-    assert isinstance(rectify(a, good, np.zeros((3, 3)), CONFIG), Refusal)
+    assert isinstance(rectify(a, good, np.zeros((3, 3)), CONFIG), PairRejection)
 
 
 def test_relief_widens_the_window() -> None:

@@ -24,22 +24,22 @@ class VirtualStereoConfig:
     """Parameters of pair selection and rectification."""
 
     base_to_height: float = 0.1  # wanted baseline over distance
-    least_base_to_height: float = 0.03
-    most_base_to_height: float = 0.45
-    least_overlap: float = 0.4  # share of the left view that the right one sees
+    min_base_to_height: float = 0.03
+    max_base_to_height: float = 0.45
+    min_overlap: float = 0.4  # share of the left view that the right one sees
     width_px: int = 320  # of the stereo views, along the picture's width
     guide_width_px: int = 1280  # of the picture that guides the upsampling
     guided: bool = True  # make the picture that guides the upsampling
     labels: int = 16  # the fewest; relief may widen it
-    most_labels: int = 96
+    max_labels: int = 96
     margin_labels: float = 3.0  # on either side of the relief that the landmarks show
     epipole_margin: float = 1.3  # the epipole must be this many half pictures away
 
     def __post_init__(self) -> None:
-        if not 0 < self.least_base_to_height < self.most_base_to_height:
-            raise ValueError("0 < least_base_to_height < most_base_to_height must hold")
-        if self.labels < 4 or self.most_labels < self.labels:
-            raise ValueError("4 <= labels <= most_labels must hold")
+        if not 0 < self.min_base_to_height < self.max_base_to_height:
+            raise ValueError("0 < min_base_to_height < max_base_to_height must hold")
+        if self.labels < 4 or self.max_labels < self.labels:
+            raise ValueError("4 <= labels <= max_labels must hold")
         if self.width_px < 32 or self.guide_width_px < self.width_px:
             raise ValueError("32 <= width_px <= guide_width_px must hold")
 
@@ -48,17 +48,15 @@ class VirtualStereoConfig:
 class View:
     """A posed picture without distortion that may become a left or right view."""
 
-    seq: int
-    time_ns: int
     bgr: U8 | None  # (H, W, 3); only a left view that guides the upsampling needs it
-    grey: U8  # (H, W) the same
+    gray: U8  # (H, W) the same
     K: F64  # (3, 3) px of that picture
     T_odom_camera: F64  # (4, 4)
     seen: U8 | None = None  # (H, W) zero where the picture has nothing; None: all of it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Refusal:
+class PairRejection:
     """Why two views do not make a stereo pair."""
 
     reason: str
@@ -66,7 +64,7 @@ class Refusal:
 
 def check_pair(
     left: View, right: View, depth_m: float, config: VirtualStereoConfig
-) -> Refusal | None:
+) -> PairRejection | None:
     """The reason why the views make no stereo pair, or None when they do.
 
     ``depth_m`` is the median distance of what the left view sees.
@@ -75,18 +73,18 @@ def check_pair(
     t = T_left_right[:3, 3]
     base = float(np.linalg.norm(t))
     if not depth_m > 0:
-        return Refusal("depth unknown")
-    if base < config.least_base_to_height * depth_m:
-        return Refusal("baseline too short")
-    if base > config.most_base_to_height * depth_m:
-        return Refusal("baseline too long")
-    H, W = left.grey.shape
+        return PairRejection("depth unknown")
+    if base < config.min_base_to_height * depth_m:
+        return PairRejection("baseline too short")
+    if base > config.max_base_to_height * depth_m:
+        return PairRejection("baseline too long")
+    H, W = left.gray.shape
     reach = np.hypot(W, H) / 2 / left.K[0, 0]
     for axis in (t, T_left_right[:3, :3].T @ t):  # seen from the left and from the right view
         if np.hypot(axis[0], axis[1]) < config.epipole_margin * reach * abs(axis[2]):
-            return Refusal("flying along the line of sight")
-    if _overlap(T_left_right, left.K, (W, H), depth_m) < config.least_overlap:
-        return Refusal("too little overlap")
+            return PairRejection("flying along the line of sight")
+    if _overlap(T_left_right, left.K, (W, H), depth_m) < config.min_overlap:
+        return PairRejection("too little overlap")
     return None
 
 
@@ -109,7 +107,7 @@ def rectify(
     points_m: F64,
     config: VirtualStereoConfig,
     relief_m: tuple[float, float] = (0.0, 0.0),
-) -> StereoPair | Refusal:
+) -> StereoPair | PairRejection:
     """The rectified pair of two views with its disparity window, or why there is none.
 
     Args:
@@ -119,28 +117,28 @@ def rectify(
             plane; widens the window.
     """
     if len(points_m) < 8:
-        return Refusal("depth unknown")
-    refusal = check_pair(left, right, float(np.median(points_m[:, 2])), config)
-    if refusal is not None:
-        return refusal
+        return PairRejection("depth unknown")
+    rejection = check_pair(left, right, float(np.median(points_m[:, 2])), config)
+    if rejection is not None:
+        return rejection
     T_left_right = se3.inverse(left.T_odom_camera) @ right.T_odom_camera
     base = float(np.linalg.norm(T_left_right[:3, 3]))
     R_rect_left = _rectifying_rotation(T_left_right)
     K, size = _rectified_intrinsics(left, R_rect_left, config.width_px)
     window = _disparity_window(points_m @ R_rect_left.T, K, base, config, relief_m)
-    if isinstance(window, Refusal):
+    if isinstance(window, PairRejection):
         return window
     plane, labels = window
     R_rect_right = R_rect_left @ T_left_right[:3, :3]
     scale = max(1.0, config.guide_width_px / config.width_px)
-    left_grey, left_seen = _stereo_view(left, R_rect_left, K, size, None)
-    right_grey, right_seen = _stereo_view(right, R_rect_right, K, size, plane)
+    left_gray, left_seen = _stereo_view(left, R_rect_left, K, size, None)
+    right_gray, right_seen = _stereo_view(right, R_rect_right, K, size, plane)
     guide = None
     if config.guided and left.bgr is not None:
         guide = _warp(left.bgr, left, R_rect_left, K, size, scale)
     return StereoPair(
-        left=left_grey,
-        right=right_grey,
+        left=left_gray,
+        right=right_gray,
         baseline_m=base,
         K=K,
         labels=labels,
@@ -183,7 +181,7 @@ def _rectified_intrinsics(
     left: View, R_rect_left: F64, width_px: int
 ) -> tuple[F64, tuple[int, int]]:
     """Intrinsics and (w, h) of a rectified picture that holds the whole left view."""
-    H, W = left.grey.shape
+    H, W = left.gray.shape
     s = width_px / W
     corners = np.array([[0, 0, 1], [W - 1, 0, 1], [0, H - 1, 1], [W - 1, H - 1, 1.0]])
     ray = corners @ np.linalg.inv(left.K).T @ R_rect_left.T
@@ -201,7 +199,7 @@ def _disparity_window(
     base: float,
     config: VirtualStereoConfig,
     relief_m: tuple[float, float],
-) -> tuple[F64, int] | Refusal:
+) -> tuple[F64, int] | PairRejection:
     """Disparity plane of label 0 and the number of labels, from points in the rectified view."""
     points = points[points[:, 2] > 0]
     u = K[0, 0] * points[:, 0] / points[:, 2] + K[0, 2]
@@ -209,7 +207,7 @@ def _disparity_window(
     d = K[0, 0] * base / points[:, 2]
     plane, residual = _fit_plane(u, v, d)
     if abs(plane[0]) > 0.7:
-        return Refusal("ground too steep to rectify")
+        return PairRejection("ground too steep to rectify")
     depth = float(np.median(points[:, 2]))
     per_metre = float(np.median(d)) / depth  # disparity per metre towards the camera, near it
     low, high = np.percentile(residual, [1.0, 99.0])
@@ -218,8 +216,8 @@ def _disparity_window(
     high = max(float(high), near * per_metre * depth / (depth - near))
     need = (high - low) / (1.0 - plane[0]) + 2 * config.margin_labels
     labels = int(np.ceil(need / 16) * 16) if need > config.labels else config.labels
-    if labels > config.most_labels:
-        return Refusal("relief too large for the baseline")
+    if labels > config.max_labels:
+        return PairRejection("relief too large for the baseline")
     spare = 0.5 * (labels - 1 - need) * (1.0 - plane[0])
     offset = low - config.margin_labels * (1.0 - plane[0]) - spare
     return plane + np.array([0.0, 0.0, offset]), labels
@@ -261,7 +259,7 @@ def _seen(
     view: View, R_rect_view: F64, K: F64, size: tuple[int, int], plane: F64 | None = None
 ) -> Bool:
     """(h, w) True where the rectified picture shows something, a pixel inside the border."""
-    H, W = view.grey.shape
+    H, W = view.gray.shape
     rim = int(np.ceil(1.0 + view.K[0, 0] / K[0, 0]))
     inside = np.zeros((H, W), np.uint8)
     inside[rim:-rim, rim:-rim] = 1 if view.seen is None else view.seen[rim:-rim, rim:-rim]
@@ -302,11 +300,11 @@ def _warp(
 def _stereo_view(
     view: View, R_rect_view: F64, K: F64, size: tuple[int, int], plane: F64 | None
 ) -> tuple[U8, Bool]:
-    """Grey rectified view (h, w), averaged down from twice its size, and where it is seen."""
+    """Gray rectified view (h, w), averaged down from twice its size, and where it is seen."""
     seen = _seen(view, R_rect_view, K, size, plane)
-    double = _warp(view.grey, view, R_rect_view, K, size, 2.0, plane)
-    grey = np.asarray(cv2.resize(double, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return stretch(grey, seen), seen
+    double = _warp(view.gray, view, R_rect_view, K, size, 2.0, plane)
+    gray = np.asarray(cv2.resize(double, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return stretch(gray, seen), seen
 
 
 def plane_relief(depth: DepthMap, known: tuple[float, float]) -> tuple[float, float]:

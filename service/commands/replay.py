@@ -218,7 +218,7 @@ def _stop_on_signals() -> Event:
 def _progress(scan: Scan) -> None:
     r = scan.recorder
     print(
-        f"\r{r.frames} frames, {scan.pipeline.dense.pairs} pairs, {r.keyframes} keyframes, "
+        f"\r{r.frames} frames, {scan.pipeline.pairs} pairs, {r.keyframes} keyframes, "
         f"{r.points / 1e6:.2f} M points, {r.distance_m:.0f} m flown ",
         end="",
         file=sys.stderr,

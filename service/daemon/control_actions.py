@@ -101,7 +101,7 @@ class ControlActions:
             return Answer(Result.TEMPORARILY_REJECTED, f"photo refused: {NO_PHOTO[phase]}")
         if scan is None:
             return Answer(Result.TEMPORARILY_REJECTED, "photo refused: the camera is being opened")
-        scan.pipeline.viewpoints.take_next()
+        scan.pipeline.take_next()
         return ACCEPTED
 
     def clear_map(self) -> Handled:
@@ -109,7 +109,7 @@ class ControlActions:
         scan = self._scanning.scan
         if scan is None:
             return Answer(Result.DENIED, "no scan is running")
-        scan.pipeline.dense.forget_map()
+        scan.pipeline.reset_map()
         return ACCEPTED
 
     def self_test(self) -> Handled:

@@ -190,7 +190,7 @@ class Daemon:
                 "points": scan.recorder.points,
                 "camera_latency_ms": status.camera_latency_ms,
                 "camera_latency_sigma_ms": status.camera_latency_sigma_ms,
-            } | scan.pipeline.dense.held
+            } | scan.pipeline.held
         return {
             "ok": health is not Health.CRITICAL,
             "state": self.scanning.phase.value if self.actions.is_ready else "starting",

@@ -246,7 +246,7 @@ def tell_keyframe(vehicle: VehicleLink, scan: Scan, keyframe: Keyframe) -> None:
     agl_m = None if state is None else state.alt_agl_m
     time_ns = keyframe.time_ns + inputs.unix_offset_ns
     T = keyframe.pose.T_world_camera
-    vehicle.report_keyframe(keyframe_report(time_ns, T, scan.pipeline.rig.frame, agl_m))
+    vehicle.report_keyframe(keyframe_report(time_ns, T, scan.rig.frame, agl_m))
 
 
 def disagreement(offset_ns: int) -> list[str]:

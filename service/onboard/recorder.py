@@ -14,7 +14,7 @@ from recon.types import F64, Keyframe
 from service.onboard.anchorage import Told, ToldFrames
 from service.onboard.graph_figures import graph_figures
 from service.onboard.pipeline import Pipeline, Step
-from service.onboard.rig import attitude_of
+from service.onboard.rig import Rig, attitude_of
 from service.scans.inspection import save_debug
 from service.stream.codec import CodecConfig, encode
 from service.stream.records import PoseRecord, Repose
@@ -31,12 +31,14 @@ class Recorder:
         self,
         store: ScanStore,
         pipeline: Pipeline,
+        rig: Rig,
         clock_offset_ns: int = 0,
         on_keyframe: Callable[[Keyframe], None] | None = None,
     ) -> None:
         """``clock_offset_ns`` takes the frames' clock to unix time."""
         self._on_keyframe = on_keyframe
-        self.store, self.pipeline = store, pipeline
+        self.store, self.pipeline, self._rig = store, pipeline, rig
+        self._chain, self._is_settled = pipeline.stages.chain, pipeline.stages.track.is_settled
         self.points = self.keyframes = self.frames = self.chunk_bytes = 0
         self.states: Counter[str] = Counter()
         self.distance_m = self.speed_m_s = self.turn_rate_rad_s = 0.0
@@ -57,7 +59,7 @@ class Recorder:
             return
         position = step.placed.T_world_camera[:3, 3]
         told = Told(time_ns + self._offset_ns, step.anchor, position, agl_m, step.is_view)
-        self._told.add(told, self.pipeline.is_settled)
+        self._told.add(told, self._is_settled)
         self.last = self._record(told, step.placed)
         self.store.add_pose(self.last)
 
@@ -69,8 +71,8 @@ class Recorder:
 
     def close(self, extra: dict[str, Any]) -> dict[str, Any]:
         """Close the scan, which is flushed; return its summary."""
-        summary = self.summary() | {"graph": graph_figures(self.pipeline.dense.trajectory.graph)}
-        summary["apart"] = [list(ends) for ends in self.pipeline.apart()]
+        summary = self.summary() | {"graph": graph_figures(self._chain.graph)}
+        summary["apart"] = [list(ends) for ends in self._chain.apart()]
         summary |= extra
         self.store.finish(summary)
         return summary
@@ -80,7 +82,7 @@ class Recorder:
         self._last, self.distance_m = None, 0.0
         for told in self._told.corrigible():
             assert told.anchor is not None
-            record = self._record(told, self.pipeline.place(told.anchor))
+            record = self._record(told, self._chain.place(told.anchor))
             if np.linalg.norm(record.T_world_camera[:3, 3] - told.position_m) > TOLD_M:
                 self.store.add_pose(record)
 
@@ -91,29 +93,29 @@ class Recorder:
             "frames": self.frames,
             "frames_tracked": self.states["tracked"] + self.states["keyframe"],
             "frames_lost": self.states["lost"],
-            "segments": pipeline.odometry.segment + 1,
-            "pairs": pipeline.dense.pairs,
-            "clouds": pipeline.dense.pairs,  # one per stereo pair, Eq. 3
+            "segments": pipeline.segments,
+            "pairs": pipeline.pairs,
+            "clouds": pipeline.pairs,  # one per stereo pair, Eq. 3
             "keyframes": self.keyframes,
             "points": self.points,
             "chunk_bytes": self.chunk_bytes,
             "distance_m": round(self.distance_m, 2),
-            "georeference": pipeline.rig.georeference,
+            "georeference": self._rig.georeference,
             "scale": self._scale(),
-            "stage_ms": {k: round(v, 2) for k, v in pipeline.stopwatch.mean_ms().items()},
-            "refusals": dict(pipeline.all_refusals()),
+            "stage_ms": {k: round(v, 2) for k, v in pipeline.stages.stopwatch.mean_ms().items()},
+            "refusals": dict(pipeline.refusals()),
             "drops": self._drops(),
-            "registrations": dict(pipeline.dense.registrations),
+            "registrations": dict(pipeline.stages.register.verdicts),
         }
 
     def _drops(self) -> dict[str, int]:
         """What was not used, by reason."""
         late = {"newer views came faster": self.pipeline.dropped} if self.pipeline.dropped else {}
-        return dict(self.pipeline.all_refusals()) | late
+        return dict(self.pipeline.refusals()) | late
 
     def _scale(self) -> dict[str, Any]:
         """What the metric scale rests on, and its relative sigma."""
-        found = self.pipeline.dense.trajectory.similarity(max(self.pipeline.odometry.segment, 0))
+        found = self._chain.trajectory.similarity(max(self.pipeline.segments - 1, 0))
         if found is None:
             return {"from": "first telemetry", "sigma": None}
         return {
@@ -123,7 +125,7 @@ class Recorder:
 
     def _write_origin(self) -> None:
         """The origin goes into the header once the first position is known."""
-        frame = self.pipeline.rig.frame
+        frame = self._rig.frame
         if frame is None or self._origin_written:
             return
         self.store.update_header(
@@ -131,31 +133,31 @@ class Recorder:
             origin_lon_deg=frame.lon_deg,
             origin_alt_amsl_m=frame.alt_amsl_m,
             epsg=frame.epsg,
-            georeference=self.pipeline.rig.georeference,
+            georeference=self._rig.georeference,
         )
         self._origin_written = True
 
     def _write_keyframes(self, step: Step) -> None:
         for keyframe in step.keyframes:
-            with self.pipeline.stopwatch("encode"):
+            with self.pipeline.stages.stopwatch("encode"):
                 layers = encode(keyframe, keyframe.time_ns + self._offset_ns, self._codec)
-            with self.pipeline.stopwatch("store"):
+            with self.pipeline.stages.stopwatch("store"):
                 self.store.add_keyframe(keyframe.seq, layers)
             self.keyframes += 1
             self.points += int((keyframe.fresh & np.isfinite(keyframe.depth.depth_m)).sum())
             self.chunk_bytes += sum(map(len, layers))
             if self._on_keyframe is not None:
                 self._on_keyframe(keyframe)
-        if self.pipeline.dense.debug and step.keyframes:
-            save_debug(self.store.path.parent, step.keyframes[-1].seq, self.pipeline.dense.debug)
-        with self.pipeline.dense.lock:
+        if self.pipeline.stages.debug and step.keyframes:
+            save_debug(self.store.path.parent, step.keyframes[-1].seq, self.pipeline.stages.debug)
+        with self._chain.lock:
             moved = [self._repose(placed) for placed in step.moved]
         if moved:
             self.store.add_reposes(moved)
 
     def _repose(self, placed: Placed) -> Repose:
         """The correction of a keyframe, whose depth was made with the scale first told."""
-        told, scale = self.pipeline.dense.trajectory.telling(placed.seq)
+        told, scale = self._chain.trajectory.telling(placed.seq)
         return Repose(
             placed.seq, told - 1, placed.T_world_camera, placed.scale / scale, placed.covariance
         )
@@ -173,7 +175,7 @@ class Recorder:
         self._last = (told.time_ns, T)
         self.speed_m_s, self.turn_rate_rad_s = speed, turn
         lat = lon = alt = None
-        frame = self.pipeline.rig.frame
+        frame = self._rig.frame
         if frame is not None:
             lat, lon, alt = (float(x) for x in frame.to_geodetic(T[None, :3, 3])[0])
         return PoseRecord(

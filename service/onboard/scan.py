@@ -15,6 +15,7 @@ from typing import Any, Protocol
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import VehicleState
 from recon.backends import Backend
+from recon.graph.travel import Odometer
 from recon.types import Camera, Frame, Keyframe
 from service.cameras.source import CameraFrame, CameraSource, ahead
 from service.config import Config
@@ -24,7 +25,8 @@ from service.onboard.frame_tags import FrameTags
 from service.onboard.graph_watch import GraphWatch
 from service.onboard.pipeline import Pipeline, Step
 from service.onboard.recorder import Recorder
-from service.onboard.rig import ASSUMED_AGL_M
+from service.onboard.rig import ASSUMED_AGL_M, Rig
+from service.onboard.stages import build_stages
 from service.onboard.telemetry_check import TelemetryCheck
 from service.onboard.tracking_watch import TrackingWatch
 from service.redaction import public_configuration, redacted
@@ -110,21 +112,19 @@ class Scan:
     def __init__(self, inputs: ScanInputs, store: ScanStore) -> None:
         self.inputs, self.store, self.source = inputs, store, inputs.source
         self.epoch_ns = inputs.epoch_ns
+        config, live, pages = inputs.config, inputs.source.is_live, inputs.folder / PAGES
         self.pipeline = Pipeline(
-            inputs.camera,
-            inputs.config,
-            inputs.backend,
-            live=inputs.source.is_live,
-            pages=inputs.folder / PAGES,
+            build_stages(inputs.camera, config, inputs.backend, live=live, pages=pages)
         )
+        self.rig, self._odometer = Rig(config.camera, config.scan, config.fusion), Odometer()
         self.recorder = Recorder(
-            store, self.pipeline, inputs.unix_offset_ns, on_keyframe=inputs.on_keyframe
+            store, self.pipeline, self.rig, inputs.unix_offset_ns, inputs.on_keyframe
         )
         self.check = TelemetryCheck(
             inputs.config.camera, inputs.history, inputs.tell, inputs.latency_ms
         )
-        dense = self.pipeline.dense
-        self.watch = GraphWatch(dense.trajectory.graph, dense.lock, inputs.tell)
+        chain = self.pipeline.stages.chain
+        self.watch = GraphWatch(chain.graph, chain.lock, inputs.tell)
         self.tracking = TrackingWatch(inputs.tell)
         self.tags = FrameTags(inputs.folder / TAGS) if inputs.history is not None else None
         self.tagged = self.odd_sized = self.heights = self.attitudes = 0
@@ -145,11 +145,10 @@ class Scan:
         self.tagged += state is not None
         if self.tags is not None:
             self.tags.write(exposed_ns + inputs.unix_offset_ns, state)
-        self.heights += self.pipeline.rig.height_known(state, frame.geotag)
-        self.attitudes += self.pipeline.rig.attitude_known(state, frame.geotag)
-        step = self.pipeline.step(
-            Frame(frame.image, exposed_ns, frame.seq, inputs.camera), state, frame.geotag
-        )
+        self.heights += self.rig.height_known(state, frame.geotag)
+        self.attitudes += self.rig.attitude_known(state, frame.geotag)
+        prior = self._odometer.take(exposed_ns, self.rig.prior(state, frame.geotag))
+        step = self.pipeline.step(Frame(frame.image, exposed_ns, frame.seq, prior))
         self.check.add(time_ns, step.tracked)
         self.tracking.look(step.tracked, time_ns)
         if step.keyframes:
@@ -198,7 +197,7 @@ class Scan:
         }
         extra["assumed"] = self._assumed()
         summary = self.recorder.close(redacted(extra | self.inputs.extra))
-        self.pipeline.dense.close()
+        self.pipeline.close()
         summary["clouds_per_second"] = round(summary["clouds"] / elapsed, 2)
         self.store.finish(summary)
         return summary
@@ -208,7 +207,7 @@ class Scan:
         out = list(self.inputs.assumed)
         if self.attitudes == 0:
             out.append("view")
-        if self.heights == 0 and self.pipeline.rig.georeference == "none":
+        if self.heights == 0 and self.rig.georeference == "none":
             out.append("height")
         return out
 
@@ -226,15 +225,15 @@ class Scan:
                 f"no telemetry: the scale assumes {ASSUMED_AGL_M:g} m above ground; "
                 "set scan.assumed_agl_m to the true height"
             )
-        apart = self.pipeline.apart()
+        apart = self.pipeline.stages.chain.apart()
         if apart:
             out.append(
-                f"left out of the cloud: {len(apart)} of {self.pipeline.odometry.segment + 1} "
+                f"left out of the cloud: {len(apart)} of {self.pipeline.segments} "
                 "stretches of the flight, which neither fixes nor a place seen twice tie to the "
                 "rest; fly with GNSS or more overlap"
             )
         if frames and self.recorder.keyframes == 0:
-            top = self.pipeline.all_refusals().most_common(2)
+            top = self.pipeline.refusals().most_common(2)
             why = "; ".join(f"{reason} ({n})" for reason, n in top) or "too few frames"
             out.append(f"nothing was reconstructed: {why}")
         return out

@@ -1,4 +1,4 @@
-"""The map of known surface, with the parts flown long ago on disk.
+"""The map of known surface: what of a view is new, with the parts flown long ago on disk.
 
 A mission of hours sees more voxels than a companion computer should hold. Tiles that no view
 has touched for longest go to files, and come back before a view looks at their ground again.
@@ -13,8 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from recon.clouds.disagreement import Disagreement
 from recon.clouds.voxel_map import I64, VoxelMap, VoxelMapConfig, Voxels, tile_of, tiles_under
-from recon.types import Bool, DepthMap
+from recon.types import F32, F64, Bool, DepthMap
+from service.compute.stopwatch import Stopwatch
+from service.onboard.viewpoints import StereoCandidate
 
 log = logging.getLogger(__name__)
 
@@ -108,3 +111,58 @@ class PagedMap:
 
     def _path(self, tile: int) -> Path:
         return self.folder / f"{tile}.npz"
+
+
+class SurfaceMap:
+    """Compares each view with the surface known before, and remembers it.
+
+    :meth:`clear` may be called from another thread.
+    """
+
+    def __init__(
+        self, pages: Path | None, max_voxels: int, resolution_m: float, stopwatch: Stopwatch
+    ) -> None:
+        """``pages``: see :class:`PagedMap`; None: forget the oldest when memory is full."""
+        self._pages, self._max_voxels, self._resolution_m = pages, max_voxels, resolution_m
+        self._stopwatch = stopwatch
+        self._map: VoxelMap | PagedMap | None = None
+        self._disagreement, self._segment = Disagreement(), -1
+
+    def __call__(
+        self, view: StereoCandidate, depth: DepthMap, T_map_camera: F64
+    ) -> tuple[F32, Bool]:
+        """((h, w) sigma widened by what views disagree, (h, w) surface that is new or better)."""
+        with self._stopwatch("map"):
+            if view.segment != self._segment:
+                self._disagreement.forget()
+                self._segment = view.segment
+            in_map = replace(depth, T_world_camera=T_map_camera)
+            wider = np.float32(self._disagreement.take(in_map))
+            in_map = replace(in_map, sigma_m=in_map.sigma_m * wider)
+            known = self._map
+            if known is None:
+                known = self._map = self._empty(depth)
+            fresh = known.fresh(in_map)
+            known.insert(in_map, fresh)
+            return in_map.sigma_m, fresh
+
+    def _empty(self, depth: DepthMap) -> VoxelMap | PagedMap:
+        """A map as fine as the first view."""
+        ground_m = float(np.nanmedian(depth.depth_m)) / depth.K[0, 0]
+        fine = VoxelMapConfig(voxel_m=max(2.0 * ground_m, self._resolution_m, 1e-3))
+        if self._pages is None:
+            return VoxelMap(fine)
+        return PagedMap(fine, self._pages, self._max_voxels)
+
+    @property
+    def held(self) -> dict[str, int]:
+        """Voxels in memory and tiles on disk."""
+        known = self._map
+        tiles = known.tiles_on_disk if isinstance(known, PagedMap) else 0
+        return {"map_voxels": 0 if known is None else len(known), "map_tiles_on_disk": tiles}
+
+    def clear(self) -> None:
+        """Reset the map: all surface counts as unseen."""
+        known, self._map = self._map, None
+        if isinstance(known, PagedMap):
+            known.close()

@@ -1,0 +1,165 @@
+"""The chain of keyframes: the pose graph, loops, and the frames that keyframes carry."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from recon import se3
+from recon.graph.alignment import height_above, height_below
+from recon.graph.dead_reckoning import carried
+from recon.graph.keyframe_graph import KeyframeGraph
+from recon.graph.trajectory import Placed, Trajectory
+from recon.tracking.odometry import Tracked
+from recon.types import F64, DepthMap, Keyframe, PosePrior
+from service.compute.stopwatch import Stopwatch
+from service.onboard.anchorage import Anchorage, Carriers, Key
+from service.onboard.loops import LoopSearch
+from service.onboard.pieces import Pieces
+from service.onboard.viewpoints import StereoCandidate, UndistortedFrame
+
+FARTHEST_M = 1e6
+"""From the scan's origin."""
+
+
+class Motion(NamedTuple):
+    """The step of the camera from the keyframe before, in units of the odometry."""
+
+    T_before_camera: F64 | None  # (4, 4); None where the chain begins again
+    covariance: F64  # (6, 6) left perturbation; of the pose itself where the chain begins
+
+
+class Chain:
+    """Where keyframes are in the world, and by them every frame.
+
+    :meth:`add` and :meth:`map_pose` belong to the thread that reconstructs, the rest to the one
+    that tracks; the trajectory is read and written under :attr:`lock`.
+    """
+
+    def __init__(
+        self,
+        trajectory: Trajectory,
+        carriers: Carriers,
+        is_settled: Callable[[Key], bool],
+        rejected: Counter[str],
+        stopwatch: Stopwatch,
+    ) -> None:
+        """``is_settled`` says which keyframes the odometry adjusts no longer."""
+        self.trajectory, self.lock = trajectory, threading.Lock()
+        self.loops: LoopSearch | None = None
+        self._carriers, self._is_settled = carriers, is_settled
+        self._rejected, self._stopwatch = rejected, stopwatch
+        self._pieces = Pieces()
+        self._T_map = np.eye(4)  # of the last keyframe
+        self._seen: tuple[PosePrior, Placed, int] | None = None  # what vision placed last
+
+    @property
+    def graph(self) -> KeyframeGraph:
+        """Read it under :attr:`lock`."""
+        return self.trajectory.graph
+
+    @property
+    def held(self) -> dict[str, int]:
+        """Views that are remembered for loops, and keyframes in the graph."""
+        views = 0 if self.loops is None else len(self.loops)
+        return {"loop_views": views, "graph_keyframes": len(self.graph)}
+
+    # ---- keyframes ---------------------------------------------------------------------
+
+    def add(self, view: StereoCandidate, motion: Motion, depth: DepthMap | None) -> Placed | None:
+        """Append a view and look for loops; None without depth, or where no drone flies."""
+        T_odom, step = view.view.T_odom_camera, motion.T_before_camera
+        self._T_map = T_odom if step is None else self._T_map @ step
+        up = T_odom[2, :3]
+        below = height_below(depth, up) if depth is not None else None
+        height = (below, 0.0) if below is not None else height_above(view.points, up)
+        with self.lock:
+            self.trajectory.add(
+                view.seq, view.segment, self._T_map, view.prior, height, view.time_ns,
+                motion.covariance,
+            )  # fmt: skip
+        if depth is None:
+            return None
+        if self.loops is not None:
+            with self._stopwatch("loops"):
+                self.loops.look(view.seq, view.segment, view.view.gray, view.view.K, depth)
+        with self.lock:
+            placed = self.trajectory.place(view.seq)
+            if not np.abs(placed.T_world_camera[:3, 3]).max() < FARTHEST_M:
+                self._rejected["placed beyond all reach"] += 1
+                return None
+            self.trajectory.tell(placed)
+        return placed
+
+    def map_pose(self, seq: int) -> F64:
+        """(4, 4) T_map_camera of a keyframe in its segment's chain."""
+        return self.trajectory.map_pose(seq)
+
+    def reconstructed(self, view: StereoCandidate, keyframe: Keyframe | None) -> None:
+        """Let a view of the chain carry frames from now on."""
+        self._carriers.add(view.anchor)
+        if keyframe is not None:
+            points = int(np.count_nonzero(keyframe.fresh & np.isfinite(keyframe.depth.depth_m)))
+            self._pieces.add(keyframe.seq, view.segment, points, view.prior)
+
+    def settle(self) -> None:
+        """Drop what is kept of keyframes that the odometry adjusts no longer."""
+        self._carriers.settle(self._is_settled)
+
+    def corrections(self, final: bool = False) -> tuple[Placed, ...]:
+        """Keyframes published before whose pose is better now; they count as published."""
+        with self.lock:
+            moved = self.trajectory.moved(final)
+            for placed in moved:
+                self.trajectory.tell(placed)
+        return tuple(moved)
+
+    def apart(self) -> list[tuple[int, int]]:
+        """First and last keyframe of each stretch that nothing ties to the rest of the scan."""
+        with self.lock:
+            return self._pieces.apart(self.graph)
+
+    # ---- frames ------------------------------------------------------------------------
+
+    def follow(self, image: UndistortedFrame, anchor: Anchorage) -> Placed:
+        """A tracked frame in the world."""
+        placed = self.place(anchor)
+        self._seen = image.prior, placed, anchor.key.segment
+        return placed
+
+    def place(self, anchor: Anchorage) -> Placed:
+        """A frame in the world, carried by the chain's keyframe at or before it."""
+        T_odom_camera = anchor.T_odom_camera
+        carrier = self._carriers.of(anchor)
+        if carrier is None:
+            return Placed(anchor.key.seq, T_odom_camera, 1.0, np.eye(6), ("vision",))
+        moved = se3.inverse(carrier.T_odom_camera) @ T_odom_camera
+        with self.lock:
+            return self.trajectory.ride(carrier.seq, moved)
+
+    def by_telemetry(self, image: UndistortedFrame, tracked: Tracked) -> Placed | None:
+        """A lost frame where telemetry alone says the camera is; None without attitude, heading
+        or position.
+
+        Telemetry is off by as much as it was when vision was lost, so that the track goes on.
+        """
+        prior = image.prior
+        R, position, sigma = prior.R_world_camera, prior.position_m, prior.sigma_position_m
+        if tracked.state != "lost" or R is None or position is None or sigma is None:
+            return None
+        if prior.sigma_yaw_rad > 1.0:
+            return None
+        T = se3.compose(R, position)
+        if self._seen is not None:
+            before, seen, segment = self._seen
+            with self.lock:
+                is_aligned = self.trajectory.similarity(segment) is not None
+            if is_aligned:
+                T = carried(before, prior, seen.T_world_camera, None, 0.0)
+        tilt, yaw = prior.sigma_tilt_rad, prior.sigma_yaw_rad
+        covariance = np.diag(np.square([tilt, tilt, yaw, *sigma]))
+        return Placed(image.seq, T, 1.0, covariance, ("attitude", "gnss", "dead reckoning"))
