@@ -197,9 +197,6 @@ def _cost_volume(
                 cost[v, label, u] = best[u]
 
 
-I16 = npt.NDArray[np.int16]
-
-
 class Workspace(threading.local):
     """One set of int16 arrays per thread, by name; each keeps the shape it was last taken in."""
 
