@@ -192,7 +192,7 @@ def test_pictures_come_from_the_video_at_the_keyframes_times(
         np.testing.assert_allclose(view.K, K)
     late = pictures.video_pictures(keyframes, header, tmp_path, header.started_unix_ns + 3 * 10**9)
     assert [v.bgra.shape[0] for v in late] == [90, 90, 90, 180, 180]  # the rest from the store
-    monkeypatch.setattr(pictures, "MOST_BYTES", 5 * 4 * 160 * 90)
+    monkeypatch.setattr(pictures, "MAX_BYTES", 5 * 4 * 160 * 90)
     small = pictures.video_pictures(keyframes, header, tmp_path, None)
     assert {v.bgra.shape[:2] for v in small} == {(90, 160)}
     np.testing.assert_allclose(small[0].K[0, 0], 140.0)

@@ -45,11 +45,11 @@ def warm_up() -> None:
 
     rng = np.random.default_rng(0)
     guide = rng.integers(0, 256, (180, 320, 3), np.uint8)  # rows enough for several threads
-    grey = np.ascontiguousarray(guide[:, :, 0])
+    gray = np.ascontiguousarray(guide[:, :, 0])
     backend = CpuBackend()
     for fill in (False, True):
         matching = BeliefPropagationConfig(fill_occluded=fill)
-        found = backend.belief_propagation(grey, grey, 4, matching)
+        found = backend.belief_propagation(gray, gray, 4, matching)
     backend.upsample(found, guide, UpsamplingConfig())
     depth = DepthMap(
         np.full((64, 96), 50, np.float32),

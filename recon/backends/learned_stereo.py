@@ -28,8 +28,8 @@ class LearnedStereoConfig:
     right: str = "right"
     disparity: str = "disparity"
     layout: str = "nchw"  # or "nhwc"
-    channels: int = 3  # 1 or 3; grey is repeated
-    scale: float = 1 / 255  # of the grey levels, before mean and deviation
+    channels: int = 3  # 1 or 3; gray is repeated
+    scale: float = 1 / 255  # of the gray levels, before mean and deviation
     mean: float = 0.0
     deviation: float = 1.0
     disparity_scale: float = 1.0  # pixels per unit of its output; negative turns the sign
@@ -117,11 +117,11 @@ class LearnedStereoBackend(OnnxBackend):
             )
         return np.asarray(plane[:h, :w] * np.float32(self.config.disparity_scale))
 
-    def _image(self, grey: U8) -> Any:
+    def _image(self, gray: U8) -> Any:
         """The image as the model takes it; a smaller one is continued by its border."""
         c = self.config
-        pad = ((0, c.height - grey.shape[0]), (0, c.width - grey.shape[1]))
-        level = (np.pad(grey, pad, mode="edge").astype(np.float32) * c.scale - c.mean) / c.deviation
+        pad = ((0, c.height - gray.shape[0]), (0, c.width - gray.shape[1]))
+        level = (np.pad(gray, pad, mode="edge").astype(np.float32) * c.scale - c.mean) / c.deviation
         axis = 1 if c.layout == "nchw" else 3
         image = np.repeat(np.expand_dims(level[None], axis), c.channels, axis=axis)
         return np.ascontiguousarray(image, np.float32)

@@ -97,7 +97,7 @@ def _matching_cost(
     h, w = size
     bits_left, bits_right = _census(graph, left, size), _census(graph, right, size)
     lift = np.array([0], np.int64)
-    grey_left, grey_right = (graph.op("Unsqueeze", image, lift) for image in (left, right))
+    gray_left, gray_right = (graph.op("Unsqueeze", image, lift) for image in (left, right))
     layers = []
     for label in range(labels):
         shift = label + config.min_disparity
@@ -107,9 +107,9 @@ def _matching_cost(
             continue
         here, there = (first, last), (first - shift, last - shift)
         bits = (bits_left.part(2, *here) - bits_right.part(2, *there)).abs().sum(0)
-        grey = (grey_left.part(2, *here) - grey_right.part(2, *there)).abs()
+        gray = (gray_left.part(2, *here) - gray_right.part(2, *there)).abs()
         seen = bits.at_most(float(c.census_truncation)) * float(round(c.census_weight * COST_UNIT))
-        seen = seen + grey.at_most(float(c.difference_truncation)) * float(
+        seen = seen + gray.at_most(float(c.difference_truncation)) * float(
             round(c.difference_weight * COST_UNIT)
         )
         partner = np.arange(first - shift, last - shift, dtype=np.float32)

@@ -154,7 +154,7 @@ class JointBilateral(torch.nn.Module):
     def forward(
         self, px: Tensor, confidence: Tensor, taps: Tensor, guide: Tensor, true: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """``taps`` (h, w, 3) and ``guide`` (H, W, 3) in grey levels; ``true`` (4,) h, w, H, W."""
+        """``taps`` (h, w, 3) and ``guide`` (H, W, 3) in gray levels; ``true`` (4,) h, w, H, W."""
         if self.kernel is not None:
             return self.kernel(px, confidence, taps, guide, true, self.config)
         layers = tap_layers(px, confidence, taps)

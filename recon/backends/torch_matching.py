@@ -83,7 +83,7 @@ class Found:
     uv: Tensor  # (N, 2) px in b; as predicted where nothing could be compared
     score: Tensor  # (N,) correlation, NO_SCORE where nothing could be compared
     second: Tensor  # (N,) correlation of the next separate peak
-    contrast: Tensor  # (N,) grey levels, of the patch of a
+    contrast: Tensor  # (N,) gray levels, of the patch of a
 
 
 def search(
@@ -186,7 +186,7 @@ class Refined:
 
     uv: Tensor  # (N, 2) px in b
     score: Tensor  # (N,) correlation, NO_SCORE when it was lost
-    contrast_a: Tensor  # (N,) grey levels, of the patch in a
+    contrast_a: Tensor  # (N,) gray levels, of the patch in a
     contrast_b: Tensor  # (N,) and where it was found
 
 

@@ -35,7 +35,7 @@ MAX_SHORT_TRUNCATION = 1024
 
 
 class DenseStereo(torch.nn.Module):
-    """Grey images (h, w) in 0 to 255 to labels and their confidence, two (h, w).
+    """Gray images (h, w) in 0 to 255 to labels and their confidence, two (h, w).
 
     ``labels`` is the room for them, ``levels`` counts those of the pyramid; ``messages`` is the
     type of costs and messages, torch.int16 (where they fit) or torch.float32. The kernel of
@@ -285,9 +285,9 @@ def matching_cost(
             continue
         there = slice(first - shift, last - shift)
         bits = (bits_left[:, :, first:last] - bits_right[:, :, there]).abs().sum(0)
-        grey = (left[:, first:last] - right[:, there]).abs()
+        gray = (left[:, first:last] - right[:, there]).abs()
         seen = bits.clamp(max=c.census_truncation) * round(c.census_weight * COST_UNIT)
-        seen = seen + grey.clamp(max=c.difference_truncation) * round(
+        seen = seen + gray.clamp(max=c.difference_truncation) * round(
             c.difference_weight * COST_UNIT
         )
         partner = column[first:last] - shift
@@ -324,7 +324,7 @@ def believe(
 
 
 def _contrast(image: Tensor) -> Tensor:
-    """Standard deviation of the grey levels in 9x9, (h, w) float64; sums are exact."""
+    """Standard deviation of the gray levels in 9x9, (h, w) float64; sums are exact."""
     r = CONTRAST_PX // 2
     wide = F.pad(image.float()[None], (r, r, r, r), mode="replicate")
 

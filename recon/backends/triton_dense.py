@@ -83,7 +83,7 @@ def _ones(word):
 @triton.jit(do_not_specialize=["labels", "height", "width", "first"])
 def _cost(
     left, right, words, true, cost, labels, height, width, first, most_bits, bit_weight,
-    most_grey, grey_weight, unseen, far, PIXELS: tl.constexpr,
+    most_gray, gray_weight, unseen, far, PIXELS: tl.constexpr,
 ):  # fmt: skip
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     plane = height * width
@@ -92,7 +92,7 @@ def _cost(
     rows, columns = tl.load(true).to(tl.int32), tl.load(true + 1).to(tl.int32)
     count = tl.load(true + 2).to(tl.int32)
     own = here & (v < rows) & (u < columns)
-    grey = tl.load(left + at, mask=here, other=0.0)
+    gray = tl.load(left + at, mask=here, other=0.0)
     low = tl.load(words + at, mask=here, other=0)
     high = tl.load(words + plane + at, mask=here, other=0)
     best = tl.full((PIXELS,), 0.0, tl.float32) + far
@@ -105,8 +105,8 @@ def _cost(
         a = tl.load(words + 2 * plane + there, mask=seen, other=0) ^ low
         b = tl.load(words + 3 * plane + there, mask=seen, other=0) ^ high
         bits = tl.minimum(_ones(a) + _ones(b), most_bits) * bit_weight
-        apart = tl.abs(grey - tl.load(right + there, mask=seen, other=0.0))
-        value = bits.to(tl.float32) + tl.minimum(apart, most_grey) * grey_weight
+        apart = tl.abs(gray - tl.load(right + there, mask=seen, other=0.0))
+        value = bits.to(tl.float32) + tl.minimum(apart, most_gray) * gray_weight
         value = tl.where(seen, value, far)
         best = tl.minimum(best, value)
         tl.store(cost + label * plane + at, value, mask=here)

@@ -31,10 +31,10 @@ TILE = 64
 CELL_SAMPLES = 4.0
 """A cell is about so many pixels of a keyframe wide on the ground."""
 
-MOST_TILES = 5_000
+MAX_TILES = 5_000
 """Tiles at most (20 million cells, 400 MB); what lies beyond them is counted."""
 
-MOST_CELLS = 25_000_000
+MAX_CELLS = 25_000_000
 """Of the rectangle about all tiles (500 MB); of a larger one only its middle is shown."""
 
 LONGEST_CELLS = 1 << 15
@@ -112,13 +112,13 @@ def usual_cell_m(depth: DepthMap) -> float | None:
 
 
 def _near(keys: I64) -> I64:
-    """The (N, 2) tiles whose rectangle has at most MOST_CELLS: all, or those about the middle.
+    """The (N, 2) tiles whose rectangle has at most MAX_CELLS: all, or those about the middle.
 
     A track that went astray must not ask for a grid from here to the moon.
     """
-    if float(np.prod((np.ptp(keys, axis=0) + 1.0) * TILE)) <= MOST_CELLS:
+    if float(np.prod((np.ptp(keys, axis=0) + 1.0) * TILE)) <= MAX_CELLS:
         return keys
-    half = (int(np.sqrt(MOST_CELLS)) // TILE - 1) // 2
+    half = (int(np.sqrt(MAX_CELLS)) // TILE - 1) // 2
     middle = keys[np.abs(keys - np.median(keys, axis=0)).sum(axis=1).argmin()]
     return np.asarray(keys[np.all(np.abs(keys - middle) <= half, axis=1)])
 
@@ -134,7 +134,7 @@ class CoverageMap:
         if not (np.isfinite(cell_m) and cell_m > 0):
             raise ValueError(f"cell_m is {cell_m}, must be positive")
         self.cell_m = float(cell_m)
-        self.refused = 0  # tiles beyond MOST_TILES, and footprints too large to be one
+        self.refused = 0  # tiles beyond MAX_TILES, and footprints too large to be one
         self._tiles: dict[Tile, _Cells] = {}
         self._ledger: Ledger = MemoryLedger(PLACE) if ledger is None else ledger
         self._seqs, self._rows = array("q"), array("q")  # keyframes in order, and their rows
@@ -272,7 +272,7 @@ class CoverageMap:
         corners = place.corners_m / self.cell_m - 0.5  # whole numbers at cell centres
         low = np.floor(corners.min(axis=0)).astype(int)
         size = np.ceil(corners.max(axis=0)).astype(int) - low + 1
-        if size.max() > LONGEST_CELLS or size[0] * size[1] > MOST_CELLS:
+        if size.max() > LONGEST_CELLS or size[0] * size[1] > MAX_CELLS:
             self.refused += 1
             return
         mask = np.zeros((size[1], size[0]), np.uint8)
@@ -314,15 +314,15 @@ class CoverageMap:
 
     @staticmethod
     def _tiles_of(cells: Array) -> set[Tile]:
-        """The tiles with points; none where they are scattered over more than MOST_TILES."""
+        """The tiles with points; none where they are scattered over more than MAX_TILES."""
         tile = cells // TILE
         low, high = tile.min(axis=0), tile.max(axis=0)
         if np.prod((high - low + 1).astype(np.float64)) > 1 << 20:  # a stray point far away
             there = np.unique(tile, axis=0)
-            return set() if len(there) > MOST_TILES else {(int(i), int(j)) for i, j in there}
+            return set() if len(there) > MAX_TILES else {(int(i), int(j)) for i, j in there}
         rows = int(high[1] - low[1]) + 1
         there = np.flatnonzero(np.bincount((tile[:, 0] - low[0]) * rows + tile[:, 1] - low[1]))
-        if len(there) > MOST_TILES:
+        if len(there) > MAX_TILES:
             return set()
         return {(int(low[0]) + int(k) // rows, int(low[1]) + int(k) % rows) for k in there}
 
@@ -346,7 +346,7 @@ class CoverageMap:
         """The tile of a key, made when missing; None when there are too many."""
         found = self._tiles.get(key)
         if found is None:
-            if len(self._tiles) >= MOST_TILES:
+            if len(self._tiles) >= MAX_TILES:
                 self.refused += 1
                 return None
             found = self._tiles[key] = _Cells()

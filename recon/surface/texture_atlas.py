@@ -22,7 +22,7 @@ I64 = npt.NDArray[np.int64]
 BORDER_PX = 2
 """Texels around a chart that carry its colours on, for filtering and the first mip levels."""
 
-MOST_SCALE = 2.0
+MAX_SCALE = 2.0
 CELL_PX = 4
 """Side of the square that holds a triangle which no view sees."""
 
@@ -70,12 +70,12 @@ def lay_out(
 
 
 def _scale_for(uv: F64) -> float:
-    """1, or up to MOST_SCALE where a middling triangle would cover fewer than four texels."""
+    """1, or up to MAX_SCALE where a middling triangle would cover fewer than four texels."""
     if not len(uv):
         return 1.0
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     area = 0.5 * float(np.median(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])))
-    return float(np.clip(np.sqrt(4.0 / max(area, 1e-9)), 1.0, MOST_SCALE))
+    return float(np.clip(np.sqrt(4.0 / max(area, 1e-9)), 1.0, MAX_SCALE))
 
 
 def _charts(label: I32, neighbours: I32) -> I32:

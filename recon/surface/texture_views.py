@@ -30,7 +30,7 @@ LARGEST_GRID = 4000
 CANDIDATES = 6
 """Views kept per triangle, the finest."""
 
-LEAST_COSINE = 0.1
+MIN_COSINE = 0.1
 """Flatter than this a view says nothing of a triangle."""
 
 EDGE_PX = 1.0
@@ -89,7 +89,7 @@ def look(
         faces = np.flatnonzero(inside[mesh.faces].all(axis=1))
         towards = view.T_world_camera[:3, 3] - middle[faces]
         facing = np.einsum("ij,ij->i", normal[faces], towards)
-        faces = faces[facing > LEAST_COSINE * 2.0 * area[faces] * np.linalg.norm(towards, axis=1)]
+        faces = faces[facing > MIN_COSINE * 2.0 * area[faces] * np.linalg.norm(towards, axis=1)]
         faces = faces[_free(reach, view, middle[faces], tolerance)]
         middle_px = _projected(view, middle[faces])[0]
         resolution = np.sqrt(_doubled_area(px[mesh.faces[faces]]) / (2.0 * area[faces]))

@@ -222,7 +222,7 @@ def _settle(view: I32, cost: F32, neighbours: I32, penalty: float, slot: I32) ->
 
 HUBER_LEVELS = 8.0
 ROUNDS = 5
-MOST_SAMPLES = 300_000
+MAX_SAMPLES = 300_000
 PULL = 0.004
 """Weight of gain 1 and offset 0 for each view, as a share of its observations."""
 
@@ -255,7 +255,7 @@ def _pairs(found: Sightings) -> tuple[I32, I32, F64, F64]:
     parts = []
     for k in range(1, found.view.shape[1]):
         rows = np.flatnonzero(found.view[:, k] >= 0)
-        rows = rows[:: max(1, -(-len(rows) // (MOST_SAMPLES // (found.view.shape[1] - 1))))]
+        rows = rows[:: max(1, -(-len(rows) // (MAX_SAMPLES // (found.view.shape[1] - 1))))]
         parts.append((rows, k))
     a = np.concatenate([found.view[rows, 0] for rows, _ in parts])
     b = np.concatenate([found.view[rows, k] for rows, k in parts])

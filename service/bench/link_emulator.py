@@ -27,7 +27,7 @@ SOCKET_BYTES = 4096
 """Receive buffer of the relay: what a sender's system holds is in the sender's buffer."""
 ESTABLISHED = 1
 """State of an open connection in TCP_INFO."""
-FIRST_WAIT_S, LEAST_WAIT_S = 1.0, 0.2
+FIRST_WAIT_S, MIN_WAIT_S = 1.0, 0.2
 """TCP's first wait for an answer to a call, and the least for data."""
 
 
@@ -97,7 +97,7 @@ class _Pipe:
     @property
     def wait_s(self) -> float:
         """TCP's first wait for the acknowledgement of data."""
-        return max(LEAST_WAIT_S, 3 * self._model.delay_s)
+        return max(MIN_WAIT_S, 3 * self._model.delay_s)
 
     def send(self, size: int, now: float, stream: bool) -> float | None:
         """When ``size`` bytes come out at the far end; None for a datagram that is lost."""

@@ -80,8 +80,8 @@ def _ground(length_px: int) -> U8:
         layer = rng.normal(0, 1, shape).astype(np.float32)
         out += cv2.resize(layer, size, interpolation=cv2.INTER_CUBIC)
     out = (out - out.mean()) / out.std() * 40 + 120
-    grey = np.clip(out, 0, 255).astype(np.uint8)
-    return np.stack([grey, grey, grey], axis=-1)
+    gray = np.clip(out, 0, 255).astype(np.uint8)
+    return np.stack([gray, gray, gray], axis=-1)
 
 
 def _photograph(ground: U8, T_world_camera: F64) -> U8:

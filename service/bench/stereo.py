@@ -93,7 +93,7 @@ def scene(width: int, height: int, labels: int) -> tuple[U8, U8]:
 
 
 def semi_global(labels: int, mode: int = 0) -> Any:
-    """OpenCV's matcher, dense, for grey images; its number of disparities is a multiple of 16."""
+    """OpenCV's matcher, dense, for gray images; its number of disparities is a multiple of 16."""
     return cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=-(-labels // 16) * 16,

@@ -18,7 +18,7 @@ from service.bench import BenchOptions, BenchResult, compare
 SIZE = (720, 1280)
 SHIFT_PX = np.array([23.4, -17.7])
 RADIUS_PX = 38.0  # what the odometry searches around a fair prediction
-NOISE = 2.0  # grey levels
+NOISE = 2.0  # gray levels
 
 
 def run(options: BenchOptions) -> list[BenchResult]:

@@ -18,7 +18,7 @@ from service.errors import InputError, SkyreliefError
 from service.scans.folder import SUMMARY
 from service.stream.records import ScanHeader
 
-MOST_BYTES = 1_500_000_000
+MAX_BYTES = 1_500_000_000
 """All pictures of one tile together; more are made smaller."""
 
 SAME_TIME_NS = 5_000_000
@@ -90,7 +90,7 @@ def video_pictures(
         )
     start = header.started_unix_ns if epoch_ns is None else epoch_ns
     undistort = Undistorter(camera)
-    shrink = min(1.0, (MOST_BYTES / (4.0 * np.prod(camera.size_px) * len(keyframes))) ** 0.5)
+    shrink = min(1.0, (MAX_BYTES / (4.0 * np.prod(camera.size_px) * len(keyframes))) ** 0.5)
     times = np.array([k.time_ns for k in keyframes], np.int64)
     found: dict[int, TextureView] = {}
     try:

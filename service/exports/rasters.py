@@ -33,7 +33,7 @@ MAX_CONTOURS = 5000
 """Heights at which contours are drawn: every metre up to the highest mountains."""
 OPEN_STEP_M = 2
 SIDEWAYS_DEG = 15.0
-MOST_OPEN_M, MOST_OPEN_SIDEWAYS_M = 4, 6
+MAX_OPEN_M, MAX_OPEN_SIDEWAYS_M = 4, 6
 """Free air above a cell that is asked for at most: trees and eaves hang over higher up as well,
 but every metre costs ground at the border of the survey. Looking sideways one sees more of
 the ground below them."""
@@ -59,7 +59,7 @@ def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
 def _open_to_the_sky(scan: ScanView, raster: Raster) -> Raster:
     """``raster`` where the air above was seen to be free, as high as things stand on this site."""
     sideways = float(np.median(scan.off_nadir_deg)) > SIDEWAYS_DEG
-    highest = min(standing_height(raster), MOST_OPEN_SIDEWAYS_M if sideways else MOST_OPEN_M)
+    highest = min(standing_height(raster), MAX_OPEN_SIDEWAYS_M if sideways else MAX_OPEN_M)
     heights_m = [float(m) for m in range(OPEN_STEP_M, math.ceil(highest) + 1, OPEN_STEP_M)]
     if not heights_m:
         return raster

@@ -29,13 +29,13 @@ FAR_M = 50.0
 STEP_M = 15.0
 """A height off by more than this with the place right is another height reference."""
 
-MOST_VIEWS = 6
+MAX_VIEWS = 6
 """A point given in the cloud's coordinates is tied to so many keyframes that see it best."""
 
-MOST_TRIPLES = 400
+MAX_TRIPLES = 400
 
 
-LEAST_SPAN = 0.5
+MIN_SPAN = 0.5
 """Of the track's length, that control points should span."""
 
 
@@ -190,7 +190,7 @@ def _in_map(seen: Sighting, number: int, scan: Pictures, where: str) -> list[Mar
             f"{where}: no surface at x,y,z; give coordinates of the cloud as it was delivered "
             "before any refinement"
         )
-    return sorted(found, key=lambda m: m.sigma_depth_m)[:MOST_VIEWS]
+    return sorted(found, key=lambda m: m.sigma_depth_m)[:MAX_VIEWS]
 
 
 # ---- whom to believe -----------------------------------------------------------------------------
@@ -269,7 +269,7 @@ def clustered(candidates: Sequence[Candidate], places_m: F64) -> str:
     along = np.linalg.svd(about, full_matrices=False)[2][0]
     flown = float(np.ptp(places_m[:, :2] @ along))
     span = float(np.ptp(np.array(points)[:, :2] @ along))
-    if span >= LEAST_SPAN * flown:
+    if span >= MIN_SPAN * flown:
         return ""
     return (
         f"the control points span {span:.0f} m of {flown:.0f} m flown: away from them the map "
@@ -329,7 +329,7 @@ def place_by_survey(
     mapped = np.array([c.before_m for c in voters])
     best = None
     most = np.zeros(len(voters), np.bool_)
-    for triple in list(combinations(range(len(voters)), 3))[:MOST_TRIPLES]:
+    for triple in list(combinations(range(len(voters)), 3))[:MAX_TRIPLES]:
         found = placed_by_points(mapped[list(triple)], surveyed[list(triple)])
         if found is None or not 1e-3 < found[0] < 1e3:
             continue

@@ -38,13 +38,13 @@ REACH = 3
 ACROSS = 8
 """And in so many others that show the same ground, those that are turned most to it."""
 
-LEAST_SHOWN = 0.3
+MIN_SHOWN = 0.3
 """Of a picture's ground, that such another picture shows."""
 
 SEARCH_SHARE = 0.05
 """Of the picture's width about the predicted place."""
 
-LEAST_SHARE = 0.5
+MIN_SHARE = 0.5
 """Of the keyframes, whose pictures the video must hold."""
 
 CORNERS = matching.MatchingConfig(grid=16)
@@ -59,7 +59,7 @@ def camera_of(header: ScanHeader) -> Camera:
 
 
 def pictures_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dict[int, U8]:
-    """Grey pictures by the position of the moment in ``times_ns`` they show.
+    """Gray pictures by the position of the moment in ``times_ns`` they show.
 
     ``video`` is a recording or a folder of stills.
     """
@@ -72,7 +72,7 @@ def pictures_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dic
             k = int(np.argmin(apart))
             if apart[k] <= WITHIN_S * 1e9 and k not in found:
                 found[k] = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
-    if len(found) < max(3, LEAST_SHARE * len(wanted)):
+    if len(found) < max(3, MIN_SHARE * len(wanted)):
         raise InputError(
             f"{video}: holds pictures of {len(found)} of {len(wanted)} keyframes; give the video "
             "that the scan was made of"
@@ -133,7 +133,7 @@ def _overlapping(
             there = se3.transform(se3.inverse(poses[other]), grounds[position])
             uv = project(camera.K, there)
             shown = (there[:, 2] > 0) & (uv >= 0).all(axis=1) & (uv < (W, H)).all(axis=1)
-            if other not in beside and shown.mean() >= LEAST_SHOWN:
+            if other not in beside and shown.mean() >= MIN_SHOWN:
                 R = poses[k][:3, :3].T @ poses[other][:3, :3]
                 turned.append((-float(np.linalg.norm(se3.so3_log(R))), other))
         across = [other for _, other in sorted(turned)[:ACROSS]]

@@ -64,9 +64,9 @@ log = logging.getLogger(__name__)
 LINK_LOG = "link.tlog"
 """What the daemon keeps of the flight's telemetry beside a scan."""
 
-LEAST_SIGMA_SCALE = 0.003
+MIN_SIGMA_SCALE = 0.003
 BY_SURVEY = "control points"
-MOST_REFUSALS = 0.4
+MAX_REFUSALS = 0.4
 """Of the control points; when more contradict the rest, nobody knows which half is right."""
 
 
@@ -254,7 +254,7 @@ class _Refinement:
         """Raise InputError when control points were given and none, or too few, hold."""
         control = [c for c in candidates if not c.point.is_check]
         refused = [c for c in control if not c.usable]
-        if control and len(refused) > MOST_REFUSALS * len(control):
+        if control and len(refused) > MAX_REFUSALS * len(control):
             told = "; ".join(f"{c.point.name}: {c.why_not}" for c in refused[:4])
             raise InputError(
                 f"{self.options.gcp}: {len(refused)} of {len(control)} control points do not "
@@ -332,7 +332,7 @@ class _Refinement:
         usual = BatchConfig()
         if not sigma or self.header.georeference == BY_SURVEY:
             return usual
-        return replace(usual, sigma_scale=max(float(sigma), LEAST_SIGMA_SCALE))
+        return replace(usual, sigma_scale=max(float(sigma), MIN_SIGMA_SCALE))
 
     # ---- adjustment --------------------------------------------------------------------------
 
@@ -342,7 +342,7 @@ class _Refinement:
             Point(np.zeros(3) if c.surveyed_m is None else c.surveyed_m, c.sigma_m)
             for c in candidates
         ]
-        most = int(MOST_REFUSALS * sum(not c.point.is_check for c in candidates))
+        most = int(MAX_REFUSALS * sum(not c.point.is_check for c in candidates))
         while True:
             used = [c for c in candidates if c.usable and not c.point.is_check]
             marks = [m for c in used for m in c.marks]

@@ -23,7 +23,7 @@ from service.errors import InputError
 from service.georeference import LocalFrame
 from service.scans.coverage import Coverage
 
-MOST_LINES = 150
+MAX_LINES = 150
 TAKEOFF, WAYPOINT, RETURN, SPEED = 22, 16, 20, 178
 VIDEO_START, VIDEO_STOP, PHOTO_START, PHOTO_STOP = 2500, 2501, 2000, 2001
 AMSL, MISSION, RELATIVE = 0, 2, 3  # MAV_FRAME
@@ -235,7 +235,7 @@ def suggest(
     ``relative`` to home by the height above ground flown.
 
     Raises InputError when the scan has no place on the globe, holds too few keyframes, or the
-    weak areas would take more than MOST_LINES lines.
+    weak areas would take more than MAX_LINES lines.
     """
     if not 0.0 <= overlap <= 0.9:
         raise InputError(f"overlap {overlap:g} is not 0 to 0.9")
@@ -250,9 +250,9 @@ def suggest(
         return None
     groups = [lines_over(cells, swath, overlap) for cells in patches]
     count = sum(map(len, groups))
-    if count > MOST_LINES:
+    if count > MAX_LINES:
         raise InputError(
-            f"{count} lines would be needed, more than {MOST_LINES}; raise --sigma-m, lower "
+            f"{count} lines would be needed, more than {MAX_LINES}; raise --sigma-m, lower "
             "--views or fly the whole area again"
         )
     begin = coverage.footprints[-1].camera_m[:2]

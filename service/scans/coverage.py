@@ -42,10 +42,10 @@ from service.stream.store import ScanStore
 log = logging.getLogger(__name__)
 
 PICTURE, FIGURES = "coverage.png", "coverage.json"
-LEAST_VIEWS = 3
+MIN_VIEWS = 3
 """Pictures of a place below which it counts as weak: two alone can agree on what is wrong."""
 
-MOST_SIGMAS = 3.0
+MAX_SIGMAS = 3.0
 """A surface is weak where its sigma is this many times the scan's median."""
 
 GAP, SELDOM, UNSURE = (70, 60, 220), (60, 160, 245), (90, 220, 245)  # BGR
@@ -196,7 +196,7 @@ class LiveCoverage:
         if layer is None or not layer.known.any():
             return None
         places = self._map.places()
-        limits = Limits(LEAST_VIEWS, MOST_SIGMAS * float(np.median(layer.sigma_m[layer.known])))
+        limits = Limits(MIN_VIEWS, MAX_SIGMAS * float(np.median(layer.sigma_m[layer.known])))
         return Coverage(layer, local_frame(self._store.header), places, limits)
 
     def _revision(self, seq: int) -> int:

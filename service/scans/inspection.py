@@ -70,9 +70,9 @@ def load_debug(path: Path) -> dict[str, Array] | None:
             f"{path} cannot be read ({error}); replay with keep_debug again"
         ) from error
     for name, array in arrays.items():
-        grey = name.startswith("raw") and array.ndim == 2  # a drone without colour
+        gray = name.startswith("raw") and array.ndim == 2  # a drone without colour
         if (
-            (array.ndim != DEBUG_KEYS[name] and not grey)
+            (array.ndim != DEBUG_KEYS[name] and not gray)
             or array.dtype.kind not in "fu"
             or not array.size
         ):
@@ -184,6 +184,6 @@ def _fitted(panel: Panel) -> U8:
 
 
 def _bgr(image: Array) -> U8:
-    """Any 8-bit grey or colour image as BGR."""
+    """Any 8-bit gray or colour image as BGR."""
     image = np.asarray(image, np.uint8)
     return image if image.ndim == 3 else np.dstack([image] * 3)

@@ -17,7 +17,7 @@ from service.scans.coverage import BEST, GAP, SELDOM, UNSURE, Coverage
 from service.stream.records import PoseRecord
 
 WIDTH_PX, LARGEST_HEIGHT_PX = 860, 900
-MOST_ELLIPSES = 40
+MAX_ELLIPSES = 40
 SIGMAS = 2.0
 SMALLEST_ELLIPSE_PX = 5.0
 TRACK, LOOP, WAITING = "#20252b", "#1a5fd0", "#d08a1a"
@@ -100,7 +100,7 @@ def _polyline(px: F64, colour: str) -> str:
 def _ellipses(poses: Sequence[PoseRecord], view: _View) -> tuple[list[str], int]:
     """Ellipses of the horizontal place at some keyframes, and how many times enlarged."""
     keys = [p for p in poses if p.keyframe_seq is not None] or list(poses)
-    keys = keys[:: max(1, -(-len(keys) // MOST_ELLIPSES))]
+    keys = keys[:: max(1, -(-len(keys) // MAX_ELLIPSES))]
     shapes = [np.linalg.eigh(position_covariance(p)[:2, :2]) for p in keys]
     usual = SIGMAS * float(np.median([np.sqrt(max(v[1], 0.0)) for v, _ in shapes]))
     grown = 1

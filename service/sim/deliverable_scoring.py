@@ -36,7 +36,7 @@ REACH_M = 5.0
 COVERED_WITHIN_M = 0.5
 ORTHO_REACH_M = 3.0
 SAMPLE_SPACING_M = 0.25
-MOST_POINTS = 300_000
+MAX_POINTS = 300_000
 
 Fits = dict[str, Fit]
 
@@ -137,7 +137,7 @@ def _ortho(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
 
 
 def _true_picture(image: _Raster, shape: tuple[int, int], truth: Truth) -> F32:
-    """(rows, cols) grey of the true place, rendered at half the cells and laid on the file's."""
+    """(rows, cols) gray of the true place, rendered at half the cells and laid on the file's."""
     row, col = np.indices(shape).reshape(2, -1)
     ground = image.places(col, row, np.full(len(col), truth.frame.alt_amsl_m))
     step = 0.5 * image.cell_m
@@ -212,7 +212,7 @@ def _cloud(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
     except (laspy.errors.LaspyException, RuntimeError, ValueError, OSError) as error:
         raise InputError(f"{path}: cannot be read ({short(error)})") from error
     out: dict[str, Any] = {"epsg": None if crs is None else crs.to_epsg(), "points": len(points)}
-    step = max(1, -(-len(points) // MOST_POINTS))
+    step = max(1, -(-len(points) // MAX_POINTS))
     places = _enu(crs, points[::step], truth.frame)
     for name, fit in fits.items():
         distance, signed = metrics.distances(fit.points(places), truth.surface, REACH_M)

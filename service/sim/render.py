@@ -52,7 +52,7 @@ def camera_rays(camera: Camera) -> F64:
 class Look:
     """What happens to the light on its way to the file."""
 
-    noise: float = 1.5  # sensor noise, grey levels, 1 sigma
+    noise: float = 1.5  # sensor noise, gray levels, 1 sigma
     vignette: float = 0.12  # share of light lost in the corners
     exposure: float = 1.0  # gain
 

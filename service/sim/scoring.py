@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 REACH_M = 5.0
 COMPLETE_WITHIN_M = 0.5
 DSM_CELL_M = 0.25
-MOST_POINTS = 300_000
+MAX_POINTS = 300_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +115,7 @@ def _fits(scan: ScanResult, truth: Truth, at_truth: F64, known: Any) -> dict[str
 
 def _surface_part(scan: ScanResult, truth: Truth, fit: Fit) -> dict[str, Any]:
     """Errors of the cloud after one fit, and how honest its sigmas are."""
-    step = max(1, -(-len(scan.points) // MOST_POINTS))
+    step = max(1, -(-len(scan.points) // MAX_POINTS))
     points = fit.points(scan.points[::step])
     distance, signed = metrics.distances(points, truth.surface, REACH_M)
     out: dict[str, Any] = asdict(metrics.surface_errors(distance, signed, REACH_M))
