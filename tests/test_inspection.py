@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from recon.types import Array
 from service.cli import app
 from service.errors import InputError
-from service.scans.inspection import (
+from service.scans.drawing import (
     DEBUG_KEYS,
     anaglyph,
     coloured,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon.surface.raster import Grid, Raster
-from service.scans.preview import BACKGROUND, MARGIN, TRACK, blank_preview, draw_preview
+from service.scans.drawing import BACKGROUND, MARGIN, TRACK, blank_preview, draw_preview
 
 
 def raster(rows: int, cols: int, cell_m: float = 1.0) -> Raster:

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import onnxruntime  # type: ignore[import-untyped]
 from onnxruntime.capi import onnxruntime_pybind11_state  # type: ignore[import-untyped]
 
+from recon.backends.cpu import CpuBackend
 from recon.backends.onnx_dense import stereo_model, tap_windows, upsampling_model
 from recon.backends.room import kept, place, pyramid_levels, room
 from recon.stereo.belief_propagation import BeliefPropagationConfig, believe
 from recon.stereo.matching_cost import check_pair
 from recon.stereo.upsampling import UpsamplingConfig, check_guide, guide_at_taps
-from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration
-
-if TYPE_CHECKING:
-    from recon.clouds.registration import IcpConfig
+from recon.types import U8, Array, DisparityMap
 
 PROVIDERS = ("TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider")
 """Fastest first; ONNX Runtime falls back along the list."""
@@ -39,14 +37,13 @@ ORT_ERRORS: tuple[type[Exception], ...] = (
 ENGINE_NAME_DIGITS = 16
 
 
-class OnnxBackend:
+class OnnxBackend(CpuBackend):
     """Builds one model per shape and keeps its session; needs no torch.
 
     Shapes are few, see :mod:`recon.backends.room`.
 
     TensorRT builds an engine of each model, which takes minutes; ``engines`` is the folder that
-    keeps them between starts (None: nothing is kept). ICP is the compiled one: it is not part
-    of the dense stage.
+    keeps them between starts (None: nothing is kept). ICP is the compiled one.
     """
 
     name = "onnx"
@@ -96,14 +93,6 @@ class OnnxBackend:
             place(given[name], array)
         px, sure = _run(session, given | tap_windows((h, w), (H, W), small, large, config))
         return DisparityMap(px[:H, :W].copy(), sure[:H, :W].copy())
-
-    def register(
-        self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
-    ) -> Registration:
-        """Projective point-to-plane ICP from the given start."""
-        from recon.clouds.registration import register_projective
-
-        return register_projective(source, target, T_target_source, config)
 
     def _session(self, key: Any, model: Callable[[], bytes]) -> Any:
         def opened() -> Any:

@@ -11,14 +11,14 @@ import tempfile
 import time
 from pathlib import Path
 from threading import Event
-from typing import Any
 
 import cv2
 import numpy as np
 
 from recon import se3
+from recon.backends.cpu import CpuBackend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.types import F32, F64, U8, Camera, DepthMap, DisparityMap, Registration
+from recon.types import F32, F64, U8, Camera, DisparityMap
 from service.bench import BenchOptions, BenchResult
 from service.onboard.scan import Scan
 
@@ -93,16 +93,13 @@ def _photograph(ground: U8, T_world_camera: F64) -> U8:
 
 def _path(video: Path, folder: Path, upsample: bool, sgbm: bool) -> dict[str, float]:
     """Clouds and frames a second of one run, and the process's memory at its end."""
-    from recon.backends import load_backend
     from service.cameras import open_camera
     from service.config import load_config
     from service.onboard.scan import Scan, ScanInputs, create_store
 
     flags = [f"compute.upsample={str(upsample).lower()}", "compute.pairs=30"]
     config = load_config(None, [*flags, "scan.assumed_agl_m=60"])
-    backend: Any = load_backend("cpu")
-    if sgbm:
-        backend = SgbmBackend(backend)
+    backend = SgbmBackend() if sgbm else CpuBackend()
     source = open_camera(str(video))
     camera = Camera(K, np.zeros(5), SIZE)
     inputs = ScanInputs(source, camera, config, backend, folder, "bench", 0)
@@ -130,13 +127,10 @@ def resident_mib() -> float:
     return pages * 4096 / 2**20
 
 
-class SgbmBackend:
+class SgbmBackend(CpuBackend):
     """OpenCV's SGBM behind the backend's protocol; the rest is ours."""
 
-    name, device = "sgbm", "cpu"
-
-    def __init__(self, ours: Any) -> None:
-        self._ours = ours
+    name = "sgbm"
 
     def belief_propagation(
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
@@ -146,18 +140,6 @@ class SgbmBackend:
         px: F32 = matcher.compute(left, right).astype(np.float32) / np.float32(16)
         px[px < 0] = np.nan
         return DisparityMap(px, np.where(np.isfinite(px), 1.0, 0.0).astype(np.float32))
-
-    def upsample(self, coarse: DisparityMap, guide: U8, config: Any) -> DisparityMap:
-        """Ours."""
-        found: DisparityMap = self._ours.upsample(coarse, guide, config)
-        return found
-
-    def register(
-        self, source: DepthMap, target: DepthMap, T_target_source: F64, config: Any
-    ) -> Registration:
-        """Ours."""
-        found: Registration = self._ours.register(source, target, T_target_source, config)
-        return found
 
 
 def run_memory(options: BenchOptions) -> list[BenchResult]:
@@ -201,7 +183,6 @@ class _Watch:
 
 
 def _fly(video: Path, folder: Path, watch: _Watch) -> dict[str, int]:
-    from recon.backends import load_backend
     from service.cameras import open_camera
     from service.config import load_config
     from service.onboard.scan import ScanInputs, create_store
@@ -209,7 +190,7 @@ def _fly(video: Path, folder: Path, watch: _Watch) -> dict[str, int]:
     config = load_config(None, ["scan.assumed_agl_m=60"])
     source = open_camera(str(video))
     camera = Camera(K, np.zeros(5), SIZE)
-    inputs = ScanInputs(source, camera, config, load_backend("cpu"), folder, "bench", 0)
+    inputs = ScanInputs(source, camera, config, CpuBackend(), folder, "bench", 0)
     store = create_store(inputs)
     scan = Scan(inputs, store)
     scan.run(Event(), watch)

@@ -30,7 +30,7 @@ def inspect(
     import numpy as np
 
     from service.exports.view import ScanView
-    from service.scans.inspection import middle_keyframe, stages
+    from service.scans.drawing import middle_keyframe, stages
     from service.scans.writing import writing
 
     with ScanView(scan_dir) as scan:

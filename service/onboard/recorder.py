@@ -15,7 +15,7 @@ from service.onboard.anchorage import Told, ToldFrames
 from service.onboard.graph_figures import graph_figures
 from service.onboard.pipeline import Pipeline, Step
 from service.onboard.rig import Rig, attitude_of
-from service.scans.inspection import save_debug
+from service.scans.drawing import save_debug
 from service.stream.codec import CodecConfig, encode
 from service.stream.records import PoseRecord, Repose
 from service.stream.store import ScanStore

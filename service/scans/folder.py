@@ -25,9 +25,8 @@ from service.georeference import LocalFrame
 from service.redaction import public_configuration, redacted
 from service.scans.coverage import PICTURE as COVERAGE
 from service.scans.coverage import write_coverage_files
+from service.scans.drawing import blank_preview, draw_preview, middle_keyframe, stages
 from service.scans.fused_cloud import DEFAULT_VOXEL_M, FusedCloud, fused_cloud, write_laz
-from service.scans.inspection import middle_keyframe, stages
-from service.scans.preview import blank_preview, draw_preview
 from service.scans.report import report_html
 from service.scans.track import csv_table, latest, local_frame, tum_lines
 from service.scans.trust import slope_deg, trust_of

@@ -18,7 +18,7 @@ import numpy as np
 from recon.surface.raster import Raster, grid_over
 from recon.types import F32, U8, PointCloud
 from service.scans.coverage import Coverage
-from service.scans.inspection import coloured
+from service.scans.drawing import coloured
 from service.scans.report_map import loop_pairs, map_figure, position_covariance
 from service.stream.records import PoseRecord
 

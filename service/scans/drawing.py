@@ -1,0 +1,364 @@
+"""Pictures of a scan: from above, and every stage of one keyframe (the paper's Figure 2).
+
+From above there are two panels, colour and height over shaded relief, both north-up at the same
+scale, with the track, a scale bar, a north arrow and the key figures in a line below.
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from recon.surface.raster import Grid, Raster, fill_holes, hillshade, smoothed
+from recon.types import F32, F64, U8, Array, Bool, Keyframe
+from service.errors import InputError
+
+BACKGROUND = (250, 248, 246)  # BGR
+INK = (40, 36, 32)
+TRACK = (40, 60, 235)
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+MARGIN = 16
+LINE_PX = 24
+
+
+def draw_preview(
+    raster: Raster,
+    track_m: F64,
+    lines: Sequence[str],
+    largest_px: int = 1400,
+    height_of_zero_m: float = 0.0,
+) -> U8:
+    """(h, w, 3) BGR picture of ``raster`` with the (N, 2 or 3) track in the raster's frame.
+
+    Each panel's longer side is at most ``largest_px``; ``lines`` are the key figures.
+    ``height_of_zero_m`` is added to the heights written.
+    """
+    shown = fill_holes(raster)
+    shade = _relief(shown)
+    colour = _fit(_colour_panel(shown, shade), largest_px)
+    height = _fit(_height_panel(shown, shade), largest_px)
+    scale = _scale(raster.grid.shape, largest_px)
+    for panel in (colour, height):
+        _draw_track(panel, raster.grid, track_m, scale)
+        _draw_scale_bar(panel, raster.grid.cell_m / scale)
+        _draw_north(panel)
+    _draw_height_legend(height, shown, height_of_zero_m)
+    h, w = colour.shape[:2]
+    stacked = w > 1.3 * h
+    gap = np.full((MARGIN, w, 3) if stacked else (h, MARGIN, 3), BACKGROUND, np.uint8)
+    both = np.concatenate([colour, gap, height], axis=0 if stacked else 1)
+    return _with_lines(both, lines)
+
+
+def blank_preview(lines: Sequence[str]) -> U8:
+    """The picture of a scan without any surface: only its key figures."""
+    return _with_lines(np.full((120, 640, 3), BACKGROUND, np.uint8), lines)
+
+
+def _relief(raster: Raster) -> F32:
+    """Shading of the smoothed surface, about 1 on level ground; NaN where unknown."""
+    level = math.sin(math.radians(45.0))
+    shade = hillshade(smoothed(raster).height_m, raster.grid.cell_m)
+    return np.asarray(shade / level, np.float32)
+
+
+def _colour_panel(raster: Raster, shade: F32) -> U8:
+    """Colour times shading, softened so that the picture stays readable."""
+    light = np.clip(0.6 + 0.4 * np.nan_to_num(shade, nan=1.0), 0.0, 1.25)
+    bright = float(np.percentile(raster.rgb[raster.known], 98)) if raster.known.any() else 255.0
+    gain = float(np.clip(230.0 / max(bright, 1.0), 1.0, 2.0))
+    bgr = gain * raster.rgb[..., ::-1] * light[..., None]
+    return _on_background(np.clip(bgr, 0, 255).astype(np.float32), raster.known)
+
+
+def _height_panel(raster: Raster, shade: F32) -> U8:
+    """Height as hue times shading."""
+    low, high = _height_range(raster)
+    unit = (np.nan_to_num(raster.height_m, nan=low) - low) / (high - low)
+    tone = np.clip(np.rint(255 * unit), 0, 255).astype(np.uint8)
+    bgr = cv2.applyColorMap(tone, cv2.COLORMAP_VIRIDIS).astype(np.float32)
+    light = np.clip(np.nan_to_num(shade, nan=1.0), 0.15, 1.3)
+    return _on_background(
+        np.clip((0.25 * 255 + 0.75 * bgr) * light[..., None], 0, 255), raster.known
+    )
+
+
+def _height_range(raster: Raster) -> tuple[float, float]:
+    """Heights of the ends of the colour scale: 2nd and 98th percentile, at least 1 m apart."""
+    known = raster.height_m[raster.known]
+    low, high = (float(p) for p in np.percentile(known, [2, 98]))
+    middle = 0.5 * (low + high)
+    half = max(0.5 * (high - low), 0.5)
+    return middle - half, middle + half
+
+
+def _on_background(bgr: F64 | F32, known: Bool) -> U8:
+    return np.asarray(np.where(known[..., None], bgr, np.array(BACKGROUND)), np.uint8)
+
+
+def _fit(panel: U8, largest_px: int) -> U8:
+    """The panel at a size good to look at: enlarged in whole steps, or reduced by area."""
+    h, w = panel.shape[:2]
+    scale = _scale((h, w), largest_px)
+    if scale >= 1.0:
+        return _at_least(panel.repeat(int(scale), axis=0).repeat(int(scale), axis=1))
+    size = (max(1, round(w * scale)), max(1, round(h * scale)))
+    return _at_least(np.asarray(cv2.resize(panel, size, interpolation=cv2.INTER_AREA), np.uint8))
+
+
+def _scale(shape: tuple[int, int], largest_px: int) -> float:
+    """Picture pixels per cell: a whole number up to 8, or less than one."""
+    scale = largest_px / max(shape)
+    return float(min(int(scale), 8)) if scale >= 1.0 else scale
+
+
+def _at_least(panel: U8, smallest_px: int = 160) -> U8:
+    """The panel with background to its right and below, so that the labels have room."""
+    h, w = panel.shape[:2]
+    if min(h, w) >= smallest_px:
+        return panel
+    out = np.full((max(h, smallest_px), max(w, smallest_px), 3), BACKGROUND, np.uint8)
+    out[:h, :w] = panel
+    return out
+
+
+def _draw_track(panel: U8, grid: Grid, track_m: F64, scale: float) -> None:
+    """The way flown, with a ring where it began."""
+    if not len(track_m):
+        return
+    px = (grid.pixels(track_m[:, :2]) + 0.5) * scale
+    path = np.rint(np.clip(px, -1e6, 1e6) * 8).astype(np.int32)
+    cv2.polylines(panel, [path[:, None]], False, TRACK, 1, cv2.LINE_AA, shift=3)
+    x, y = (round(float(v)) for v in np.clip(px[0], -1e6, 1e6))
+    cv2.circle(panel, (x, y), 5, TRACK, 1, cv2.LINE_AA)
+
+
+def _draw_scale_bar(panel: U8, metres_per_px: float) -> None:
+    """A bar of 1, 2 or 5 times a power of ten metres, about a fifth of the panel wide."""
+    target = panel.shape[1] * metres_per_px / 5.0
+    power = 10.0 ** math.floor(math.log10(target))
+    length_m = max(m * power for m in (1.0, 2.0, 5.0) if m * power <= target)
+    length_px = round(length_m / metres_per_px)
+    x, y = 12, panel.shape[0] - 14
+    for colour, thick in ((BACKGROUND, 5), (INK, 2)):
+        cv2.line(panel, (x, y), (x + length_px, y), colour, thick, cv2.LINE_AA)
+    _text(panel, f"{length_m:g} m", (x, y - 8), 0.45)
+
+
+def _draw_north(panel: U8) -> None:
+    x, y = panel.shape[1] - 20, 14
+    for colour, thick in ((BACKGROUND, 5), (INK, 2)):
+        cv2.arrowedLine(panel, (x, y + 26), (x, y), colour, thick, cv2.LINE_AA, tipLength=0.35)
+    _text(panel, "N", (x - 5, y + 42), 0.45)
+
+
+def _draw_height_legend(panel: U8, raster: Raster, height_of_zero_m: float) -> None:
+    """The colour scale with its two heights."""
+    low, high = _height_range(raster)
+    length = min(120, panel.shape[0] // 3)
+    tones = np.linspace(255, 0, length).astype(np.uint8)[:, None].repeat(10, axis=1)
+    bar = 0.25 * 255 + 0.75 * cv2.applyColorMap(tones, cv2.COLORMAP_VIRIDIS).astype(np.float32)
+    panel[12 : 12 + length, 12:22] = bar.astype(np.uint8)
+    _text(panel, f"{high + height_of_zero_m:.1f} m", (28, 22), 0.4)
+    _text(panel, f"{low + height_of_zero_m:.1f} m", (28, 12 + length), 0.4)
+
+
+def _text(image: U8, text: str, at: tuple[int, int], size: float) -> None:
+    """Dark letters on a light label, readable on any ground."""
+    (w, h), below = cv2.getTextSize(text, FONT, size, 1)
+    x, y = at
+    cv2.rectangle(image, (x - 2, y - h - 2), (x + w + 1, y + below), BACKGROUND, cv2.FILLED)
+    cv2.putText(image, text, at, FONT, size, INK, 1, cv2.LINE_AA)
+
+
+def _with_lines(picture: U8, lines: Sequence[str]) -> U8:
+    """The picture in a margin, wide enough for the lines of text below it."""
+    widest = max((cv2.getTextSize(t, FONT, 0.5, 1)[0][0] for t in lines), default=0)
+    h, w = picture.shape[:2]
+    size = (h + 2 * MARGIN + LINE_PX * len(lines) + 6, max(w, widest) + 2 * MARGIN, 3)
+    out = np.full(size, BACKGROUND, np.uint8)
+    out[MARGIN : MARGIN + h, MARGIN : MARGIN + w] = picture
+    for n, text in enumerate(lines):
+        at = (MARGIN, h + 2 * MARGIN + 10 + LINE_PX * n)
+        cv2.putText(out, text, at, FONT, 0.5, INK, 1, cv2.LINE_AA)
+    return out
+
+
+PANEL_PX = 480
+TITLE_PX = 26
+GAP_PX = 10
+DEBUG_KEYS = {
+    "raw_left": 3,
+    "raw_right": 3,
+    "rect_left": 2,
+    "rect_right": 2,
+    "disparity": 2,
+    "upsampled": 2,
+    "depth_m": 2,
+    "sigma_m": 2,
+    "bgr": 3,
+}
+"""What ``debug/keyframe_NNNNNN.npz`` holds, and how many dimensions each array has."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panel:
+    """One picture with its title."""
+
+    title: str
+    image: U8  # (h, w, 3) BGR
+
+
+def debug_path(folder: Path, seq: int) -> Path:
+    """Where the stages of keyframe ``seq`` are kept when ``scan.keep_debug`` is on."""
+    return folder / "debug" / f"keyframe_{seq:06d}.npz"
+
+
+def save_debug(folder: Path, seq: int, arrays: dict[str, Array]) -> Path:
+    """Keep the stages of a keyframe for ``skyrelief inspect``; those of DEBUG_KEYS are read."""
+    path = debug_path(folder, seq)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    kept: dict[str, Any] = {name: arrays[name] for name in DEBUG_KEYS if name in arrays}
+    np.savez_compressed(path, **kept)
+    return path
+
+
+def load_debug(path: Path) -> dict[str, Array] | None:
+    """The arrays of DEBUG_KEYS in ``path``; None when there is no such file.
+
+    Raises InputError when the file is not what ``save_debug`` writes.
+    """
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays: dict[str, Array] = {k: file[k] for k in DEBUG_KEYS if k in file.files}
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise InputError(
+            f"{path} cannot be read ({error}); replay with keep_debug again"
+        ) from error
+    for name, array in arrays.items():
+        gray = name.startswith("raw") and array.ndim == 2  # a drone without colour
+        if (
+            (array.ndim != DEBUG_KEYS[name] and not gray)
+            or array.dtype.kind not in "fu"
+            or not array.size
+        ):
+            raise InputError(f"{path}: {name} is {array.dtype}{array.shape}, not an image")
+    return arrays
+
+
+def middle_keyframe(folder: Path, seqs: Sequence[int]) -> int | None:
+    """Number of a keyframe in the middle, of those with every stage kept if there are any."""
+    kept = [seq for seq in seqs if debug_path(folder, seq).is_file()]
+    some = kept or list(seqs)
+    return some[len(some) // 2] if some else None
+
+
+def stages(folder: Path, scan_id: str, keyframe: Keyframe) -> tuple[U8, bool]:
+    """One picture of a keyframe's stages (the paper's Figure 2), and whether all were kept."""
+    arrays = load_debug(debug_path(folder, keyframe.seq))
+    panels = keyframe_panels(keyframe) if arrays is None else debug_panels(arrays)
+    return sheet(panels, f"{scan_id}: keyframe {keyframe.seq}"), arrays is not None
+
+
+def debug_panels(arrays: dict[str, Array]) -> list[Panel]:
+    """The stages in the order of the paper's figure; a stage that was not kept is left out."""
+    out = []
+    for name, title in (("raw_left", "raw, left"), ("raw_right", "raw, right")):
+        if name in arrays:
+            out.append(Panel(title, _bgr(arrays[name])))
+    for name, title in (("rect_left", "rectified, left"), ("rect_right", "rectified, right")):
+        if name in arrays:
+            out.append(Panel(title, _bgr(arrays[name])))
+    if "rect_left" in arrays and "rect_right" in arrays:
+        out.append(Panel("anaglyph", anaglyph(arrays["rect_left"], arrays["rect_right"])))
+    for name, title in (
+        ("disparity", "belief propagation, label"),
+        ("upsampled", "upsampled, label"),
+    ):
+        if name in arrays:
+            out.append(coloured(title, arrays[name], "px"))
+    if "depth_m" in arrays:
+        out.append(coloured("depth", arrays["depth_m"], "m"))
+    if "sigma_m" in arrays:
+        out.append(coloured("sigma", arrays["sigma_m"], "m", cv2.COLORMAP_MAGMA))
+    if "bgr" in arrays:
+        out.append(Panel("colour of the points", _bgr(arrays["bgr"])))
+    return out
+
+
+def keyframe_panels(keyframe: Keyframe) -> list[Panel]:
+    """What the store holds of a keyframe: colour, depth, sigma and views."""
+    depth = keyframe.depth
+    views = np.where(np.isfinite(depth.depth_m), depth.views.astype(np.float32), np.nan)
+    return [
+        Panel("colour of the points", keyframe.bgr),
+        coloured("depth", depth.depth_m, "m"),
+        coloured("sigma", depth.sigma_m, "m", cv2.COLORMAP_MAGMA),
+        coloured("stereo pairs that agree", views, ""),
+    ]
+
+
+def anaglyph(left: Array, right: Array) -> U8:
+    """(h, w, 3) BGR: the left view in red, the right in green and blue (cyan)."""
+    right = right[: left.shape[0], : left.shape[1]]
+    return np.dstack([right, right, left]).astype(np.uint8)
+
+
+def coloured(title: str, values: Array, unit: str, colours: int = cv2.COLORMAP_TURBO) -> Panel:
+    """Values in colour between their 1st and 99th percentile; unknown pixels stay light."""
+    known = np.isfinite(values)
+    if not known.any():
+        blank = np.full((*values.shape, 3), BACKGROUND, np.uint8)
+        return Panel(f"{title}: nothing known", blank)
+    low, high = (float(p) for p in np.percentile(values[known], [1, 99]))
+    span = max(high - low, 1e-9)
+    tone = np.clip((np.where(known, values, low) - low) / span * 255, 0, 255).astype(np.uint8)
+    image = cv2.applyColorMap(tone, colours)
+    image[~known] = BACKGROUND
+    share = 100.0 * float(known.mean())
+    text = f"{title} {low:.2f} to {high:.2f} {unit}".rstrip()
+    return Panel(f"{text}, {share:.0f} % known", np.asarray(image, np.uint8))
+
+
+def sheet(panels: Sequence[Panel], heading: str, columns: int = 3) -> U8:
+    """(h, w, 3) BGR: the panels in rows, each with its title above it."""
+    fitted = [_fitted(panel) for panel in panels]
+    rows = [fitted[n : n + columns] for n in range(0, len(fitted), columns)]
+    width = columns * PANEL_PX + (columns + 1) * GAP_PX
+    heights = [max(f.shape[0] for f in row) + GAP_PX for row in rows]
+    out = np.full((TITLE_PX + 2 * GAP_PX + sum(heights), width, 3), BACKGROUND, np.uint8)
+    cv2.putText(out, heading, (GAP_PX, 24), FONT, 0.6, INK, 1, cv2.LINE_AA)
+    y = TITLE_PX + 2 * GAP_PX
+    for row, height in zip(rows, heights, strict=True):
+        for n, one in enumerate(row):
+            x = GAP_PX + n * (PANEL_PX + GAP_PX)
+            out[y : y + one.shape[0], x : x + PANEL_PX] = one
+        y += height
+    return out
+
+
+def _fitted(panel: Panel) -> U8:
+    """The panel at PANEL_PX wide, its title above it."""
+    h, w = panel.image.shape[:2]
+    size = (PANEL_PX, max(1, round(h * PANEL_PX / w)))
+    how = cv2.INTER_AREA if w > PANEL_PX else cv2.INTER_NEAREST
+    image = cv2.resize(panel.image, size, interpolation=how)
+    out = np.full((size[1] + TITLE_PX, PANEL_PX, 3), BACKGROUND, np.uint8)
+    cv2.putText(out, panel.title, (2, 18), FONT, 0.48, INK, 1, cv2.LINE_AA)
+    out[TITLE_PX:] = image
+    return out
+
+
+def _bgr(image: Array) -> U8:
+    """Any 8-bit gray or colour image as BGR."""
+    image = np.asarray(image, np.uint8)
+    return image if image.ndim == 3 else np.dstack([image] * 3)
