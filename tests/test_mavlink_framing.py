@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from mavlink.telemetry.decode import READERS, decode
 from mavlink.telemetry.samples import PositionSample, RangeSample, TerrainSample
-from mavlink.wire.dialect import dialect, numbers_of, x25crc
-from mavlink.wire.framing import Decoder, Framer, TelemetryDecoder, check_packet, packet_length
+from mavlink.wire.dialect import dialect, x25crc
+from mavlink.wire.framing import Decoder, Framer, check_packet, packet_length
 
 
 def mixture(rng: random.Random, count: int) -> tuple[bytes, int]:
@@ -53,7 +53,7 @@ def test_a_damaged_packet_does_not_take_the_next_one_along() -> None:
     first[1] = 200  # claims to be longer than it is
     framer = Framer()
     found = framer.feed(bytes(first) + second * 30)
-    assert len(found) == 30 and framer.bad_checksums >= 1
+    assert len(found) == 30 and framer.skipped_bytes >= 1
 
 
 def test_an_order_does_not_wait_behind_noise_that_looks_like_a_start() -> None:
@@ -86,11 +86,12 @@ def test_length_and_check_take_any_bytes(data: bytes, at: int) -> None:
 
 
 @pytest.mark.parametrize("version", ["v1", "v2"])
-def test_telemetry_reads_as_pymavlink_does(version: str) -> None:
+def test_messages_of_numbers_read_as_pymavlink_does(version: str) -> None:
     rng = random.Random(5)
-    ours, theirs = TelemetryDecoder(READERS), Decoder()
-    for number in sorted(numbers_of(READERS)):
-        kind = dialect.mavlink_map[number]
+    ours, theirs = Decoder(), dialect.MAVLink(None)
+    for number, kind in sorted(dialect.mavlink_map.items()):
+        if "char" in kind.fieldtypes or kind.unpacker.size > 255:
+            continue
         if version == "v1" and number > 255:
             continue
         for cut in (0, 1, 7):
@@ -102,17 +103,15 @@ def test_telemetry_reads_as_pymavlink_does(version: str) -> None:
                 head = bytes((0xFD, len(payload), 0, 0, 3, 1, 154)) + number.to_bytes(3, "little")
             crc = x25crc(head[1:] + payload + bytes((kind.crc_extra,))).crc
             (packet,) = Framer().feed(head + payload + crc.to_bytes(2, "little"))
-            mine, other = ours.message(packet), theirs.message(packet)
+            mine, other = ours.message(packet), theirs.decode(bytearray(packet.data))
             assert mine is not None and other is not None
             assert mine.get_type() == other.get_type()
             assert mine.get_srcSystem() == 1 and mine.get_srcComponent() == 154
             for field in kind.ordered_fieldnames:
                 a, b = np.array(getattr(mine, field)), np.array(getattr(other, field))
                 np.testing.assert_array_equal(a, b)
-            with pytest.raises(AttributeError, match="no field"):
+            with pytest.raises(AttributeError, match="not_there"):
                 _ = mine.not_there
-    beat = bytes(dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(dialect.MAVLink(None)))
-    assert ours.message(Framer().feed(beat)[0]) is None
 
 
 def test_samples_make_sense_or_there_are_none() -> None:

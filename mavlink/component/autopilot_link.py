@@ -15,7 +15,7 @@ from typing import Any
 from mavlink.component import status as texts
 from mavlink.component.presence import Presence
 from mavlink.telemetry.clock import BootClock, WallTime
-from mavlink.telemetry.decode import decode
+from mavlink.telemetry.decode import READERS, decode
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import OF_AUTOPILOT
 from mavlink.telemetry.timesync import EVERYONE, TimesyncFilter
@@ -40,7 +40,6 @@ class AutopilotLink:
         say: Callable[[int, str], None],
     ) -> None:
         self.link: int | None = None  # on which the autopilot was heard last
-        self.samples = 0  # taken into the history
         self.timesync, self.wall_time = TimesyncFilter(), WallTime()
         self._presence, self._history, self._outbox, self._say = presence, history, outbox, say
         self._rates = RateKeeper(wanted_hz)
@@ -50,8 +49,22 @@ class AutopilotLink:
 
     # In.
 
-    def hear_telemetry(self, name: str, message: Any, packet: Packet, now_ns: int) -> None:
-        """Take in a message that :mod:`mavlink.telemetry.decode` reads."""
+    def hear(self, message: Any, packet: Packet, link: int, now_ns: int) -> None:
+        """Take in anyone's message that may say something of the autopilot or its clocks."""
+        name = message.get_type()
+        if name in READERS:
+            self._hear_telemetry(name, message, packet, now_ns)
+        elif name == "HEARTBEAT":
+            self._presence.hear(message, now_ns)
+            self.follow()
+            if (packet.system, packet.component) == self._presence.autopilot:
+                self.link = link
+        elif name == "SYSTEM_TIME":
+            self._hear_system_time(message, packet, now_ns)
+        elif name == "TIMESYNC":
+            self._hear_timesync(message, packet, link, now_ns)
+
+    def _hear_telemetry(self, name: str, message: Any, packet: Packet, now_ns: int) -> None:
         if packet.system != self._presence.system:
             return
         autopilot = self._presence.autopilot
@@ -61,7 +74,6 @@ class AutopilotLink:
         speaker = 1 if autopilot is None else autopilot[1]
         if sample is None or (packet.component != speaker and isinstance(sample, OF_AUTOPILOT)):
             return
-        self.samples += 1
         if sample.boot_ms is None:
             self._history.add(sample, now_ns)
             return
@@ -93,14 +105,13 @@ class AutopilotLink:
         self._start_over()
         self._say(texts.WARNING, "Autopilot restarted; telemetry starts over")
 
-    def hear_system_time(self, message: Any, packet: Packet, now_ns: int) -> None:
-        """Take in a SYSTEM_TIME."""
+    def _hear_system_time(self, message: Any, packet: Packet, now_ns: int) -> None:
         if (packet.system, packet.component) == self._presence.autopilot:
             self._rates.heard("SYSTEM_TIME")
             self.wall_time.hear(message.time_unix_usec, now_ns)
 
-    def hear_timesync(self, message: Any, packet: Packet, link: int, now_ns: int) -> None:
-        """Take in a TIMESYNC: a question of the autopilot, or anyone's answer to ours."""
+    def _hear_timesync(self, message: Any, packet: Packet, link: int, now_ns: int) -> None:
+        """A question of the autopilot, or anyone's answer to ours."""
         is_autopilot = (packet.system, packet.component) == self._presence.autopilot
         if message.tc1 == 0:  # a question; we answer with our own time since boot
             reply = dialect.MAVLink_timesync_message(now_ns, message.ts1)

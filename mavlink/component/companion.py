@@ -6,7 +6,6 @@ No sockets and no clocks: ``receive(link, packet, now_ns)``, ``tick(now_ns)``, `
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -35,13 +34,12 @@ from mavlink.telemetry.gimbal import YAW_FRAMES
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.wire.dialect import COMMAND_CANCEL, numbers_of
 from mavlink.wire.first_beat import CAMERA, ONBOARD
-from mavlink.wire.framing import Decoder, Packet, TelemetryDecoder
+from mavlink.wire.framing import Decoder, Packet
 from mavlink.wire.messages import Address, Outbox, Outgoing, Streams
 
 S = 1_000_000_000
 MS = 1_000_000
 COMPONENTS = (ONBOARD, CAMERA)
-HEARTBEAT, SYSTEM_TIME, FILE_TRANSFER, TIMESYNC = 0, 2, 110, 111
 LOAD_STATUS, MOTION = 390, 251
 SERVED = (
     "HEARTBEAT",
@@ -90,13 +88,12 @@ class Companion:
         self.control = control
         self.presence = presence
         self.history = history
-        self.counts: Counter[str] = Counter()
         self.load: ComputerLoad | None = None  # not measured yet
         self._unix_us = unix_us
         self._listeners: dict[str, list[Callable[[Any], None]]] = {}
         self._start_ns = self._now_ns = now_ns
         self._outbox = Outbox()
-        self._decoder, self._telemetry = Decoder(), TelemetryDecoder(READERS)
+        self._decoder = Decoder()
         self.autopilot = AutopilotLink(presence, history, self._outbox, config.wanted_hz, self.say)
         self.streams = Streams(self._outbox)
         self.texts = StatusTexts(self._outbox)
@@ -130,42 +127,29 @@ class Companion:
     def receive(self, link: int, packet: Packet, now_ns: int) -> None:
         """Take in one packet that arrived on a link at ``now_ns`` (monotonic)."""
         self._now_ns = max(self._now_ns, now_ns)
-        self.counts["packets"] += 1
         self.presence.count(packet.system, packet.component)
         if packet.message_id == COMMAND_CANCEL:
             self._cancel(packet, now_ns)
             return
-        message = self._telemetry.message(packet) or self._decoder.message(packet)
+        message = self._decoder.message(packet)
         if message is None:
-            self.counts["not understood"] += 1
             return
         name = message.get_type()
         for listener in self._listeners.get(name, ()):
             listener(message)
-        if packet.message_id == HEARTBEAT:
-            self.presence.hear(message, now_ns)
-            self.autopilot.follow()
-            if (packet.system, packet.component) == self.presence.autopilot:
-                self.autopilot.link = link
-        elif name in READERS:
-            self.autopilot.hear_telemetry(name, message, packet, now_ns)
-        elif name.startswith("COMMAND_"):
+        self.autopilot.hear(message, packet, link, now_ns)
+        if name.startswith("COMMAND_"):
             self._hear_command(message, link, now_ns)
         elif name.startswith("PARAM_"):
             self._hear_parameter(message, name)
-        elif packet.message_id == SYSTEM_TIME:
-            self.autopilot.hear_system_time(message, packet, now_ns)
-        elif packet.message_id == FILE_TRANSFER:
+        elif name == "FILE_TRANSFER_PROTOCOL":
             self._hear_file_request(message, link)
-        elif packet.message_id == TIMESYNC:
-            self.autopilot.hear_timesync(message, packet, link, now_ns)
         self.watch.hear(packet, message, now_ns)  # by now it is known whose heartbeat it was
 
     def _hear_command(self, message: Any, link: int, now_ns: int) -> None:
         call = decode_call(message, link)
         if call is None or not self._is_for_us(call.target):
             return
-        self.counts["commands"] += 1
         self.desk.receive(call, COMPONENTS, now_ns)
 
     @property

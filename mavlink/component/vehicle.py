@@ -32,9 +32,9 @@ from mavlink.telemetry.decode import READERS
 from mavlink.telemetry.history import HistoryConfig, LiveHistory
 from mavlink.wire.dialect import dialect, numbers_of
 from mavlink.wire.first_beat import FirstBeats
-from mavlink.wire.framing import Framer, Packet
+from mavlink.wire.framing import Packet
 from mavlink.wire.link import Inbox, Job, Link, parse_link
-from mavlink.wire.messages import Outgoing, Packer
+from mavlink.wire.messages import LinkReport, Links, Outgoing
 from mavlink.wire.signing import Signing, read_key
 from mavlink.wire.tlog import Recorder
 
@@ -64,20 +64,6 @@ class VehicleConfig:
     def __post_init__(self) -> None:
         for link in self.links:
             parse_link(link)
-
-
-@dataclass(frozen=True, slots=True)
-class LinkReport:
-    """How one link does."""
-
-    name: str
-    is_up: bool
-    opened: int
-    received_bytes: int
-    sent_bytes: int
-    packets: int
-    skipped_bytes: int
-    last_error: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,13 +118,9 @@ class VehicleLink:
         self._threads: list[threading.Thread] = []
         self._alive_ns = now_ns
         self._is_served = True  # something was done that may have set a timer
-        specs = [parse_link(text) for text in config.links]
-        self._framers = [Framer() for _ in specs]
+        opened = links or [Link(parse_link(text)) for text in config.links]
         sequence = 0 if first is None else first.sequence
-        self._packers = [Packer(i, self._signing, sequence) for i in range(len(specs))]
-        self._links = links or [Link(spec, _nobody) for spec in specs]
-        for i, link in enumerate(self._links):
-            link.hand_to(partial(self._on_data, i))
+        self._links = Links(opened, self._on_packet, self._signing, sequence)
 
     def _make_signing(self) -> Signing | None:
         if self.config.signing_key is None:
@@ -154,8 +136,7 @@ class VehicleLink:
             thread = threading.Thread(target=target, name=f"mavlink {target.__name__}", daemon=True)
             self._threads.append(thread)
             thread.start()
-        for link in self._links:
-            link.start()
+        self._links.start()
 
     def stop(self) -> None:
         """Say what is left to say, then close everything."""
@@ -163,8 +144,7 @@ class VehicleLink:
         self._do(lambda: None)
         for thread in self._threads:
             thread.join(timeout=5.0)
-        for link in self._links:
-            link.stop()
+        self._links.stop()
         self.recorder.close()
         self._save()
 
@@ -250,19 +230,7 @@ class VehicleLink:
         seen = self.presence.autopilot_seen_ns
         round_trip = self._companion.autopilot.timesync.round_trip_ns
         return VehicleReport(
-            tuple(
-                LinkReport(
-                    link.spec.name,
-                    link.is_up,
-                    link.opened,
-                    link.received_bytes,
-                    link.sent_bytes,
-                    framer.packets,
-                    framer.skipped_bytes,
-                    link.last_error,
-                )
-                for link, framer in zip(self._links, self._framers, strict=True)
-            ),
+            self._links.report(),
             self.presence.system,
             self.presence.autopilot,
             self.presence.is_certain,
@@ -276,13 +244,12 @@ class VehicleLink:
 
     # Threads.
 
-    def _on_data(self, index: int, data: bytes, now_ns: int) -> None:
-        for packet in self._framers[index].feed(data):
-            self.recorder.write(packet.data, now_ns)
-            if packet.message_id in TELEMETRY:
-                self._inbox.gather((index, packet, now_ns))
-            elif packet.message_id in self._heard:
-                self._inbox.put(partial(self._hear, index, packet, now_ns))
+    def _on_packet(self, index: int, packet: Packet, now_ns: int) -> None:
+        self.recorder.write(packet.data, now_ns)
+        if packet.message_id in TELEMETRY:
+            self._inbox.gather((index, packet, now_ns))
+        elif packet.message_id in self._heard:
+            self._inbox.put(partial(self._hear, index, packet, now_ns))
 
     def _hear(self, index: int, packet: Packet, now_ns: int) -> None:
         if self._signing is not None and not self._signing.accepts(packet):
@@ -353,16 +320,9 @@ class VehicleLink:
     def _send(self, messages: list[Outgoing]) -> None:
         if not messages:
             return
-        now_ns, unix_ns = time.monotonic_ns(), time.time_ns()
-        system = self.presence.system
-        for outgoing in messages:
-            for i, link in enumerate(self._links):
-                if outgoing.link is not None and outgoing.link != i:
-                    continue
-                data = self._packers[i].pack(system, outgoing, unix_ns)
-                if data is not None:
-                    link.write(data)
-                    self.recorder.write(data, now_ns)
+        now_ns = time.monotonic_ns()
+        for data in self._links.send(self.presence.system, messages):
+            self.recorder.write(data, now_ns)
 
     def _is_stale(self) -> bool:
         revision = self._companion.parameters.revision
@@ -378,7 +338,3 @@ class VehicleLink:
 def new_token() -> int:
     """What tells our own heartbeats, heard back, from those of another companion."""
     return secrets.randbits(32) or 1
-
-
-def _nobody(data: bytes, now_ns: int) -> None:
-    """Takes what comes before anyone listens."""

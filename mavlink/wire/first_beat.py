@@ -69,7 +69,7 @@ class FirstBeats:
         self.system, self.token = system, token
         self.sequence = 0  # of the next packet of either component
         self.next_s = time.monotonic()
-        self.links = [Link(parse_link(text), lambda data, now_ns: None) for text in links]
+        self.links = [Link(parse_link(text)) for text in links]
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="first beats", daemon=True)
 

@@ -6,11 +6,10 @@ goes on one byte further, so that a packet inside the damage is found.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections import Counter
 from typing import Any, NamedTuple
 
-from mavlink.wire.dialect import CRC_EXTRA, dialect, numbers_of, x25crc
+from mavlink.wire.dialect import CRC_EXTRA, dialect, x25crc
 
 MAGIC_V1 = 0xFE
 MAGIC_V2 = 0xFD
@@ -82,80 +81,14 @@ def _starts_whole(data: bytes) -> bool:
     return packet is not None and packet.known
 
 
-class Decoder:
-    """Packets into message objects; never raises."""
-
-    def __init__(self) -> None:
-        self._parser = dialect.MAVLink(None)
-        self.undecodable = 0
-
-    def message(self, packet: Packet) -> Message | None:
-        """The message object, or None when the payload cannot be one."""
-        if packet.message_id not in dialect.mavlink_map:
-            return None
-        try:
-            return self._parser.decode(bytearray(packet.data))
-        except (dialect.MAVError, ValueError, TypeError):
-            self.undecodable += 1
-            return None
-
-
-class Framer:
-    """Splits a byte stream into packets; keeps at most one unfinished packet.
-
-    Noise may look like the start of a long packet. It is not waited for when what comes next
-    begins with a whole one, or an order sent once would wait for the next hundred bytes.
-    """
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-        self.packets = 0
-        self.skipped_bytes = 0
-        self.bad_checksums = 0
-
-    def feed(self, data: bytes) -> list[Packet]:
-        """The packets completed by ``data``, in order."""
-        buffer = self._buffer
-        if not buffer and packet_length(data, 0) == len(data):  # a datagram, most of the time
-            whole = check_packet(data)
-            if whole is not None:
-                self.packets += 1
-                return [whole]
-        if buffer and _starts_whole(data):  # then what waits is no packet, or lost its end
-            self.skipped_bytes += len(buffer)
-            buffer.clear()
-        buffer += data
-        found: list[Packet] = []
-        at = 0
-        while True:
-            length = packet_length(buffer, at)
-            if length is None or (length and at + length > len(buffer)):
-                break
-            packet = check_packet(bytes(buffer[at : at + length])) if length else None
-            if packet is None:
-                self.bad_checksums += bool(length)
-                self.skipped_bytes += 1
-                at += 1
-            else:
-                found.append(packet)
-                at += length
-        del buffer[:at]
-        self.packets += len(found)
-        return found
-
-
-class Telemetry:
-    """A message with pymavlink's names for its fields."""
+class NumbersMessage:
+    """A message of numbers alone, with pymavlink's names for its fields."""
 
     __slots__ = ("__dict__", "_name", "_packet")
 
     def __init__(self, name: str, packet: Packet, fields: dict[str, Any]) -> None:
         self._name, self._packet = name, packet
         self.__dict__ = fields
-
-    def __getattr__(self, name: str) -> Any:
-        """Fields are found before this is asked."""
-        raise AttributeError(f"{self._name} has no field {name}")
 
     def get_type(self) -> str:
         """The message's name."""
@@ -170,44 +103,80 @@ class Telemetry:
         return self._packet.component
 
 
-@dataclass(frozen=True, slots=True)
-class _Plan:
-    """How a payload is read: numbers in the order of the wire, some of them arrays."""
+class Decoder:
+    """Packets into message objects; never raises.
 
-    name: str
-    unpack: Any
-    size: int
-    fields: tuple[str, ...]
-    arrays: tuple[tuple[int, int], ...]  # where in the fields, how long
+    Hundreds of telemetry messages come every second, and most of what pymavlink does with them
+    (the checksum, the header, the message's own bytes) is done already or is not asked for. So
+    messages of numbers alone are read here.
+    """
 
-    def read(self, payload: bytes) -> dict[str, Any]:
-        """Fields of a payload; zeros at its end may have been cut, newer fields are left out."""
-        if len(payload) != self.size:
-            payload = payload[: self.size].ljust(self.size, b"\0")
-        values = list(self.unpack(payload))
-        for at, length in self.arrays:
-            values[at : at + length] = [values[at : at + length]]
-        return dict(zip(self.fields, values, strict=True))
+    def __init__(self) -> None:
+        self._parser = dialect.MAVLink(None)
+        self._arrays: dict[int, list[tuple[int, int]]] = {}  # where in the fields, how long
 
-
-class TelemetryDecoder:
-    """Reads the messages of some names."""
-
-    def __init__(self, names: Iterable[str]) -> None:
-        """The messages must be of numbers alone, without texts."""
-        self._plans = {number: _plan(dialect.mavlink_map[number]) for number in numbers_of(names)}
-
-    def message(self, packet: Packet) -> Telemetry | None:
-        """The message in a packet with a right checksum; None when it is none of them."""
-        plan = self._plans.get(packet.message_id)
-        if plan is None:
+    def message(self, packet: Packet) -> Message | None:
+        """The message object, or None when the payload cannot be one."""
+        kind = dialect.mavlink_map.get(packet.message_id)
+        if kind is None:
             return None
-        data = packet.data
-        start = 10 if data[0] == MAGIC_V2 else 6
-        return Telemetry(plan.name, packet, plan.read(data[start : start + data[1]]))
+        if "char" not in kind.fieldtypes:
+            return NumbersMessage(kind.msgname, packet, self._fields(kind, packet.data))
+        try:
+            return self._parser.decode(bytearray(packet.data))
+        except (dialect.MAVError, ValueError, TypeError):
+            return None
+
+    def _fields(self, kind: Any, data: bytes) -> dict[str, Any]:
+        """Zeros at a payload's end may have been cut; newer fields after it are left out."""
+        start, size = 10 if data[0] == MAGIC_V2 else 6, kind.unpacker.size
+        payload = data[start : start + min(data[1], size)]
+        values = list(kind.unpacker.unpack(payload.ljust(size, b"\0")))
+        arrays = self._arrays.get(kind.id)
+        if arrays is None:
+            arrays = self._arrays[kind.id] = [(k, n) for k, n in enumerate(kind.array_lengths) if n]
+        for at, length in arrays:
+            values[at : at + length] = [values[at : at + length]]
+        return dict(zip(kind.ordered_fieldnames, values, strict=True))
 
 
-def _plan(kind: Any) -> _Plan:
-    arrays = tuple((at, n) for at, n in enumerate(kind.array_lengths) if n)
-    fields = tuple(kind.ordered_fieldnames)
-    return _Plan(kind.msgname, kind.unpacker.unpack, kind.unpacker.size, fields, arrays)
+class Framer:
+    """Splits a byte stream into packets; keeps at most one unfinished packet.
+
+    Noise may look like the start of a long packet. It is not waited for when what comes next
+    begins with a whole one, or an order sent once would wait for the next hundred bytes.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self.packets: Counter[int] = Counter()  # by system id
+        self.skipped_bytes = 0
+
+    def feed(self, data: bytes) -> list[Packet]:
+        """The packets completed by ``data``, in order."""
+        buffer = self._buffer
+        if not buffer and packet_length(data, 0) == len(data):  # a datagram, most of the time
+            whole = check_packet(data)
+            if whole is not None:
+                self.packets[whole.system] += 1
+                return [whole]
+        if buffer and _starts_whole(data):  # then what waits is no packet, or lost its end
+            self.skipped_bytes += len(buffer)
+            buffer.clear()
+        buffer += data
+        found: list[Packet] = []
+        at = 0
+        while True:
+            length = packet_length(buffer, at)
+            if length is None or (length and at + length > len(buffer)):
+                break
+            packet = check_packet(bytes(buffer[at : at + length])) if length else None
+            if packet is None:
+                self.skipped_bytes += 1
+                at += 1
+            else:
+                found.append(packet)
+                self.packets[packet.system] += 1
+                at += length
+        del buffer[:at]
+        return found

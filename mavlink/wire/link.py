@@ -32,9 +32,11 @@ class Link:
     ``on_data(data, monotonic_ns)`` is called in the reading thread for whatever comes.
     """
 
-    def __init__(self, spec: LinkSpec, on_data: Callable[[bytes, int], None]) -> None:
+    def __init__(
+        self, spec: LinkSpec, on_data: Callable[[bytes, int], None] = lambda data, now_ns: None
+    ) -> None:
         self.spec = spec
-        self._on_data = on_data
+        self.on_data = on_data
         self._stop = threading.Event()
         self._wake = threading.Condition()
         self._waiting: deque[bytes] = deque(maxlen=QUEUE)
@@ -49,10 +51,6 @@ class Link:
     def is_up(self) -> bool:
         """True while the port is open."""
         return self._port is not None
-
-    def hand_to(self, on_data: Callable[[bytes, int], None]) -> None:
-        """Let another one take what comes from now on."""
-        self._on_data = on_data
 
     def start(self) -> None:
         """Start both threads, unless they run."""
@@ -116,7 +114,7 @@ class Link:
                 if data:
                     now_ns = time.monotonic_ns()
                     self.received_bytes += len(data)
-                    self._on_data(data, now_ns)
+                    self.on_data(data, now_ns)
         except OSError as error:
             self._complain(error)
         finally:

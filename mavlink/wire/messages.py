@@ -1,17 +1,20 @@
-"""Outgoing messages: who says what to whom, repeated at an interval, packed for a link."""
+"""Outgoing messages: who says what to whom, at which interval; packed and sent on the links."""
 
 from __future__ import annotations
 
 import logging
 import struct
 import threading
+import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from mavlink.wire.dialect import dialect, x25crc
-from mavlink.wire.framing import SIGNED
+from mavlink.wire.framing import SIGNED, Framer, Packet
+from mavlink.wire.link import Link
 from mavlink.wire.signing import Signing
 
 
@@ -61,10 +64,9 @@ class Packer:
         self._signing = signing
         self._lock = threading.Lock()
         self._encoders: dict[tuple[int, int], Any] = {}
-        self.refused = 0
 
     def pack(self, system: int, outgoing: Outgoing, unix_ns: int) -> bytes | None:
-        """The packet; None (and a count) when a value does not fit its field."""
+        """The packet; None when a value does not fit its field."""
         with self._lock:
             key = (system, outgoing.component)
             encoder = self._encoders.get(key)
@@ -74,7 +76,6 @@ class Packer:
             try:
                 data = bytes(outgoing.message.pack(encoder))
             except (struct.error, ValueError, TypeError, OverflowError) as error:
-                self.refused += 1
                 log.error("%s cannot be sent: %s", outgoing.message.get_type(), error)
                 return None
             encoder.seq = (encoder.seq + 1) % 256
@@ -137,3 +138,78 @@ class Streams:
         """When :meth:`tick` has something to do, in ns."""
         running = [s.next_ns for s in self._streams.values() if s.interval_us > 0]
         return min(running, default=None)
+
+
+@dataclass(frozen=True, slots=True)
+class LinkReport:
+    """How one link does."""
+
+    name: str
+    is_up: bool
+    opened: int  # how many times
+    received_bytes: int
+    sent_bytes: int
+    packets: dict[int, int]  # by system id
+    skipped_bytes: int
+    last_error: str
+
+
+class Links:
+    """All links: packets in, in the threads that read them; messages out."""
+
+    def __init__(
+        self,
+        links: Sequence[Link],
+        on_packet: Callable[[int, Packet, int], None],
+        signing: Signing | None = None,
+        sequence: int = 0,
+    ) -> None:
+        """``on_packet`` gets the link's index, the packet and its monotonic time in ns."""
+        self._links, self._on_packet = links, on_packet
+        self._framers = [Framer() for _ in links]
+        self._packers = [Packer(i, signing, sequence) for i in range(len(links))]
+        for i, link in enumerate(links):
+            link.on_data = partial(self._on_data, i)
+
+    def start(self) -> None:
+        """Open them."""
+        for link in self._links:
+            link.start()
+
+    def stop(self) -> None:
+        """Close them."""
+        for link in self._links:
+            link.stop()
+
+    def _on_data(self, index: int, data: bytes, now_ns: int) -> None:
+        for packet in self._framers[index].feed(data):
+            self._on_packet(index, packet, now_ns)
+
+    def send(self, system: int, messages: Sequence[Outgoing]) -> list[bytes]:
+        """Send each message on the links that it is for; the packets sent."""
+        unix_ns, sent = time.time_ns(), []
+        for outgoing in messages:
+            for i, link in enumerate(self._links):
+                if outgoing.link is not None and outgoing.link != i:
+                    continue
+                data = self._packers[i].pack(system, outgoing, unix_ns)
+                if data is not None:
+                    link.write(data)
+                    sent.append(data)
+        return sent
+
+    def report(self) -> tuple[LinkReport, ...]:
+        """How each does."""
+        return tuple(
+            LinkReport(
+                link.spec.name,
+                link.is_up,
+                link.opened,
+                link.received_bytes,
+                link.sent_bytes,
+                dict(framer.packets),
+                framer.skipped_bytes,
+                link.last_error,
+            )
+            for link, framer in zip(self._links, self._framers, strict=True)
+        )

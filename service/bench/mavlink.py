@@ -288,8 +288,8 @@ def _measure_cost(vehicle: Any, seconds: float) -> None:
     from mavlink.component.presence import Health
 
     delays: list[float] = []
-    link = vehicle._links[0]
-    inner = link._on_data
+    link = vehicle._links._links[0]
+    inner = link.on_data
 
     def timed(data: bytes, now_ns: int) -> None:
         if data[7:10] == TIMESYNC:
@@ -297,7 +297,7 @@ def _measure_cost(vehicle: Any, seconds: float) -> None:
             delays.append((now_ns - int.from_bytes(payload[8:], "little")) * 1e-6)
         inner(data, now_ns)
 
-    link._on_data = timed
+    link.on_data = timed
     _report(delays, seconds, lambda: vehicle.set_health(Health.ACTIVE))
 
 

@@ -28,7 +28,7 @@ from service.errors import InputError, SkyreliefError
 from service.packages import unusable_packages
 
 if TYPE_CHECKING:
-    from mavlink.component.link_watch import LinkFound
+    from mavlink.wire.messages import LinkReport
     from recon.types import Camera
 
 CORE = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "pymavlink", "eclipse-zenoh")
@@ -372,7 +372,7 @@ def _by_listening(config: Config, listen_s: float) -> Iterator[Finding]:
             yield _trouble(trouble.what, trouble.text, trouble.is_grave)
 
 
-def _why_silent(link: LinkFound) -> str:
+def _why_silent(link: LinkReport) -> str:
     if not link.is_up:
         return f"does not open: {link.last_error}" if link.last_error else "does not open"
     if link.skipped_bytes:

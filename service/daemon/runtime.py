@@ -210,7 +210,7 @@ class Daemon:
         report = self.vehicle.report()
         figures = {
             "links_up": sum(link.is_up for link in report.links),
-            "packets": sum(link.packets for link in report.links),
+            "packets": sum(sum(link.packets.values()) for link in report.links),
             "skipped_bytes": sum(link.skipped_bytes for link in report.links),
             "dropped": report.dropped,
             "unverified": report.unverified,
