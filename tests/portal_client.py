@@ -19,7 +19,7 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 pytest.importorskip("websockets")
 
-from service.bench.browser import Browser, chromium
+from service.bench.portal import Browser, chromium
 from service.ground.http import PAGE
 from service.ground.portal import Portal, PortalConfig
 from service.scans.folder import write_deliverables

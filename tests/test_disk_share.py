@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import pytest
 
-from service.ground.disk_share import DiskShare, QuotaError, folder_bytes
+from service.ground.storage import DiskShare, QuotaError, folder_bytes
 
 
 class Usage(NamedTuple):

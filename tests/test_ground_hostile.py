@@ -258,12 +258,12 @@ def test_poses_stop_at_the_reserve_and_go_on_when_there_is_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Poses and coarse layers count too, and a scan in the making says why it does not grow."""
-    from service.ground import disk_share
+    from service.ground import storage
 
     free = [1_000_000]
     usage = type("Usage", (), {"total": 10_000_000, "free": property(lambda _: free[0])})
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage())
-    monkeypatch.setattr(disk_share, "LOOK_S", 0.0)
+    monkeypatch.setattr(storage, "LOOK_S", 0.0)
     monkeypatch.setattr(drone_module, "FULL_DISK_REST_S", 0.3)
     onboard = ScanStore.create(tmp_path / "a.db", ScanHeader("scan-1", "red", 1))
     with serving(tmp_path / "ground") as (ground, endpoint):

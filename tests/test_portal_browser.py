@@ -13,7 +13,7 @@ from loopback import free_port
 from portal_client import NEEDS, TOKEN, browser, flown_store
 
 from mavlink.component.rehearsal import RehearsalVehicle
-from service.bench.browser import Browser
+from service.bench.portal import Browser
 from service.exports.view import ExportOptions, ScanView, export
 from service.ground.portal import Portal, PortalConfig
 from service.ground.vehicle import Vehicle

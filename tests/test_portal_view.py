@@ -19,7 +19,7 @@ from portal_client import NEEDS, TOKEN, browser
 from mavlink.component.control import Answer, Result
 from mavlink.component.rehearsal import RehearsalVehicle
 from recon.types import U8
-from service.bench.browser import Browser, Page
+from service.bench.portal import Browser, Page
 from service.ground.portal import Portal, PortalConfig
 from service.ground.vehicle import Vehicle
 from service.scans.folder import write_deliverables

@@ -22,7 +22,7 @@ from service.bench.keyframes import make_keyframe, strip
 from service.bench.link_emulator import LinkEmulator, LinkModel, free_port
 from service.config import DatalinkConfig
 from service.ground.received import ReceivedScan
-from service.ground.receiver import Receiver, ReceiverConfig
+from service.ground.receiver import ReceiverConfig
 from service.stream import codec
 from service.stream.link import DatalinkSender
 from service.stream.records import PoseRecord, ScanHeader, pack_pose
@@ -301,8 +301,8 @@ def _produce(trial: Trial, drones: Sequence[_Drone], began: float) -> None:
             drone.made["pose", drone.store.add_pose(pose)] = now
 
 
-class _WatchedReceiver(Receiver):
-    """A receiver that notes when each item is stored, and writes no deliverables."""
+class _WatchedReceiver(radio.BareReceiver):
+    """A receiver that notes when each item is stored."""
 
     def __init__(self, config: ReceiverConfig) -> None:
         super().__init__(config)
@@ -315,10 +315,6 @@ class _WatchedReceiver(Receiver):
             self.came.setdefault((scan.drone, kind, number), time.monotonic())
 
         scan.intake.store.listen(came)
-
-    def write(self, scan: ReceivedScan) -> None:
-        """Write nothing."""
-        scan.unwritten, scan.is_writing, scan.is_written = False, False, True
 
 
 def _coarse_share(drone: _Drone, ground: _WatchedReceiver) -> float:

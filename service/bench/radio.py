@@ -142,7 +142,7 @@ def _fly(folder: Path) -> RadioOutcome:
     vehicle = VehicleLink(VehicleConfig(links=(radio.names[0],)), RehearsalControl())
     vehicle.start()
     session = SessionConfig(mode="router", listen=(f"tcp/127.0.0.1:{free_port()}",))
-    receiver = _Receiver(ReceiverConfig(folder / "ground", session))
+    receiver = BareReceiver(ReceiverConfig(folder / "ground", session))
     receiver.start()
 
     def heard(payload: bytes) -> None:
@@ -171,7 +171,7 @@ def _fly(folder: Path) -> RadioOutcome:
         return _outcome(onboard, ground, flight, sent)
 
 
-class _Receiver(Receiver):
+class BareReceiver(Receiver):
     """A receiver that writes no deliverables."""
 
     def write(self, scan: ReceivedScan) -> None:

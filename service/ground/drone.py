@@ -12,14 +12,13 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from service.errors import OutsideError, SkyreliefError
-from service.ground.disk_share import DiskShare
 from service.ground.inbox import Batch, Inbox
 from service.ground.intake import FINE, SILENCE_S, SMALL, Introduction, ScanIntake
 from service.ground.received import ReceivedScan
+from service.ground.storage import DiskShare
 from service.stream.messages import Ask, count, pack_ask, pack_held, unpack_head
 from service.stream.naming import ROOT
 from service.stream.radio_messages import RADIO_NOTE
@@ -27,6 +26,9 @@ from service.stream.ranges import RangeSet
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 from service.workers import Worker
+
+if TYPE_CHECKING:
+    from service.ground.receiver import Receiver
 
 log = logging.getLogger(__name__)
 
@@ -59,45 +61,10 @@ class Limits:
     reserve_bytes: int | None = None  # that stay free on the disk; None: by its size
 
 
-class Station(Protocol):
-    """What a drone's worker needs of the receiver."""
-
-    name: str
-    limits: Limits
-
-    @property
-    def max_open(self) -> int:
-        """Scans that one drone may have open now."""
-
-    def folder(self, drone: str, name: str) -> Path:
-        """Where a scan is kept."""
-
-    def put(self, key: str, payload: bytes) -> None:
-        """Publish; nothing happens while there is no session."""
-
-    def get(
-        self,
-        key: str,
-        payload: bytes,
-        on_message: Callable[[bytes], object],
-        on_end: Callable[[], object],
-    ) -> None:
-        """Ask a drone; both callbacks come from another thread."""
-
-    def write(self, scan: ReceivedScan) -> None:
-        """Have the scan's deliverables written."""
-
-    def opened(self, scan: ReceivedScan) -> None:
-        """A scan was opened."""
-
-    def note_news(self) -> None:
-        """Something new was stored."""
-
-
 class DroneReceiver:
     """Receives the scans of one drone, with :meth:`run` on a worker."""
 
-    def __init__(self, drone: str, station: Station) -> None:
+    def __init__(self, drone: str, station: Receiver) -> None:
         self.drone = drone
         self.inbox = Inbox()
         self.heard_at = time.monotonic()

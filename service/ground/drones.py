@@ -8,11 +8,14 @@ import threading
 import time
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from service.ground.drone import DRONE_TIMEOUT_S, DroneReceiver, Station
+from service.ground.drone import DRONE_TIMEOUT_S, DroneReceiver
 from service.ground.received import ReceivedScan
 from service.workers import Worker, Workers
+
+if TYPE_CHECKING:
+    from service.ground.receiver import Receiver
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +46,7 @@ class _Member:
 class Drones:
     """The table of drones. Safe between threads, but for :meth:`retire` and :meth:`close`."""
 
-    def __init__(self, station: Station, workers: Workers) -> None:
+    def __init__(self, station: Receiver, workers: Workers) -> None:
         self._station, self._workers = station, workers
         self._lock = threading.Lock()
         self._members: dict[str, _Member] = {}

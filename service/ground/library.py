@@ -7,7 +7,6 @@ given by people live in ``library.json`` beside it and are never used as paths.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import re
 import shutil
@@ -16,13 +15,14 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.ground.mcap_import import header_in, store_from_mcap
-from service.ground.scan_facts import facts_of, labels_in
+from service.ground.scan_facts import Labels, facts_of, labels_in
 from service.ground.storage import OTHER_FILES, STORE_FILES, copy_files, is_regular, run_folder
 from service.scans.folder import SUMMARY, write_deliverables
 from service.scans.writing import writing
@@ -63,15 +63,6 @@ FILES: dict[str, str] = {
     "preview.jpg": "preview",
 }
 """Files of a scan folder that may be downloaded, and what they are."""
-
-
-@dataclass(frozen=True, slots=True)
-class Labels:
-    """What people wrote about a scan."""
-
-    title: str = ""
-    tags: tuple[str, ...] = ()
-    edition: int = 0  # counts the changes
 
 
 class ConflictError(InputError):
@@ -165,7 +156,7 @@ class Library:
                 old.edition + 1,
             )
             with writing(folder / LABELS) as part:
-                part.write_text(json.dumps(asdict(new)))
+                part.write_bytes(msgspec.json.encode(new))
         return new
 
     def delete(self, drone: str, scan: str) -> str:
@@ -314,7 +305,7 @@ def _title(title: Any) -> str:
 
 
 def _tags(tags: Any) -> tuple[str, ...]:
-    if not isinstance(tags, list) or len(tags) > MOST_TAGS:
+    if not isinstance(tags, (list, tuple)) or len(tags) > MOST_TAGS:
         raise InputError(f"tags are a list of at most {MOST_TAGS} texts")
     return tuple(dict.fromkeys(_title(tag) for tag in tags if tag))
 

@@ -23,9 +23,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.errors import InputError, SkyreliefError
-from service.ground.drone import DroneReceiver, Limits
+from service.ground.drone import Limits
 from service.ground.drones import STALL_S, Drones
-from service.ground.inbox import CHANNEL, Replies
+from service.ground.inbox import CHANNEL, Inbox, Replies
 from service.ground.received import (
     ReceivedScan,
     begin_files,
@@ -183,8 +183,8 @@ class Receiver:
         heads = session.declare_subscriber(f"{ROOT}/*/*/head", channel)
         items = session.declare_subscriber(f"{ROOT}/*/*/item/*/*", channel)
         pumps = [
-            self.workers.start("heads", lambda _: self._pump(heads, self._on_head)),
-            self.workers.start("items", lambda _: self._pump(items, self._on_item)),
+            self.workers.start("heads", lambda _: self._pump(heads, Inbox.put_head)),
+            self.workers.start("items", lambda _: self._pump(items, Inbox.put_item)),
         ]
         self._session = session
         self._opened.set()
@@ -209,7 +209,7 @@ class Receiver:
     def _pump(
         self,
         subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]],
-        take: Callable[[DroneReceiver, str, bytes], bool],
+        put: Callable[[Inbox, str, bytes], bool],
     ) -> None:
         """Hand on each message until the subscriber ends."""
         for sample in subscriber:
@@ -218,13 +218,7 @@ class Receiver:
             if place is None or drone is None:
                 self._dropped += 1
                 continue
-            take(drone, place[1], sample.payload.to_bytes())
-
-    def _on_head(self, drone: DroneReceiver, scan: str, payload: bytes) -> bool:
-        return drone.inbox.put_head(scan, payload)
-
-    def _on_item(self, drone: DroneReceiver, scan: str, payload: bytes) -> bool:
-        return drone.inbox.put_item(scan, payload)
+            put(drone.inbox, place[1], sample.payload.to_bytes())
 
     def _look_around(self, session: zenoh.Session, now: float) -> None:
         """Have the drones that are there say at once what they have."""

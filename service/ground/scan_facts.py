@@ -13,6 +13,7 @@ import msgspec
 
 from service.errors import InputError
 from service.ground.storage import is_regular
+from service.small_file import read_small
 from service.stream.store import ScanStore
 
 LARGEST_JSON_BYTES = 4_000_000
@@ -71,17 +72,17 @@ class _Schema(msgspec.Struct):
     schema: int
 
 
-class StoredLabels(msgspec.Struct):
-    """What ``library.json`` holds."""
+class Labels(msgspec.Struct, frozen=True):
+    """What people wrote about a scan; ``library.json`` holds it."""
 
-    title: str
-    tags: list[str]
-    edition: Count = 0
+    title: str = ""
+    tags: tuple[str, ...] = ()
+    edition: Count = 0  # counts the changes
 
 
-def labels_in(path: Path) -> StoredLabels:
-    """The labels in ``path``; ValueError, RecursionError or OSError when they are unfit."""
-    return msgspec.json.decode(_small(path), type=StoredLabels)
+def labels_in(path: Path) -> Labels:
+    """The labels in ``path``; InputError, ValueError, RecursionError or OSError for unfit ones."""
+    return msgspec.json.decode(_small(path), type=Labels)
 
 
 def facts_of(source: Path | ScanStore) -> dict[str, Any]:
@@ -123,11 +124,7 @@ def _from_store(store: ScanStore) -> Facts:
 
 
 def _small(path: Path) -> bytes:
-    """The content of a small file; ValueError when it is not small."""
+    """The content of a small file. Raises InputError when it is not small, or a link."""
     if not is_regular(path):
-        raise ValueError(f"{path.name} is no regular file")
-    with open(path, "rb") as file:
-        data = file.read(LARGEST_JSON_BYTES + 1)
-    if len(data) > LARGEST_JSON_BYTES:
-        raise ValueError(f"{path.name} is too large")
-    return data
+        raise InputError(f"{path.name} is no regular file")
+    return read_small(path, LARGEST_JSON_BYTES, "file of a scan")
