@@ -408,6 +408,13 @@ def test_the_page_takes_the_token_into_a_cookie(client: Client) -> None:
 def test_the_interface_is_described(client: Client) -> None:
     status, document, _ = client.ask("/api/openapi.json")
     assert status == 200 and document["openapi"].startswith("3.")
+    one = document["paths"]["/api/scans/{drone}/{scan}"]
+    assert set(one) == {"parameters", "get", "patch", "delete"}
+    assert "security" in one["patch"] and "requestBody" in one["patch"]
+    assert "security" not in one["get"] and "requestBody" not in one["delete"]
+    order = document["components"]["schemas"]["VehicleOrder"]["properties"]["action"]
+    assert "baseline" in order["enum"]
+    assert {"/api/scans", "/api/vehicle", "/api/import", "/metrics"} <= set(document["paths"])
     assert "/api/scans/{drone}/{scan}/live" in document["paths"]
 
 

@@ -10,7 +10,7 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 from starlette.applications import Starlette
@@ -30,14 +30,14 @@ from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
 from service.errors import InputError, OutsideError
-from service.ground.guard import WHO, AuditLog, Guard, Pace, note
+from service.exports import EXPORTERS
+from service.ground.guard import CHANGING, WHO, AuditLog, Guard, Pace, note
 from service.ground.library import ConflictError, Library
 from service.ground.live import serve_live
-from service.ground.openapi import DOCUMENT
 from service.ground.scan_files import file_routes
 from service.ground.state import Jobs, PortalState, names_of, state_of
 from service.ground.tokens import Tokens
-from service.ground.vehicle import Vehicle
+from service.ground.vehicle import BUTTONS, Vehicle
 
 T = TypeVar("T")
 
@@ -75,7 +75,7 @@ class LabelChange(msgspec.Struct, forbid_unknown_fields=True):
 class ExportOrder(msgspec.Struct, forbid_unknown_fields=True):
     """A deliverable to make."""
 
-    kind: str
+    kind: Annotated[str, msgspec.Meta(extra_json_schema={"enum": list(EXPORTERS)})]
 
 
 class ImportOrder(msgspec.Struct, forbid_unknown_fields=True):
@@ -87,8 +87,10 @@ class ImportOrder(msgspec.Struct, forbid_unknown_fields=True):
 class VehicleOrder(msgspec.Struct, forbid_unknown_fields=True):
     """An order to the companion."""
 
-    action: str
-    metres: float | None = None
+    action: Annotated[str, msgspec.Meta(extra_json_schema={"enum": list(BUTTONS)})]
+    metres: (
+        Annotated[float, msgspec.Meta(extra_json_schema={"minimum": 0, "maximum": 1000})] | None
+    ) = None
 
 
 def portal_app(
@@ -117,9 +119,10 @@ def portal_app(
         Route("/api/status", _status),
         Route("/api/vehicle", _figures, methods=["GET"]),
         Route("/api/vehicle", _order, methods=["POST"]),
-        Route("/api/openapi.json", lambda _: JSONResponse(DOCUMENT)),
         Route("/metrics", _metrics),
     ]
+    document = _description(routes)
+    routes.append(Route("/api/openapi.json", lambda _: JSONResponse(document)))
     if PAGE.is_dir():
         routes.append(Mount("/assets", StaticFiles(directory=PAGE / "assets", check_dir=False)))
     app = Starlette(
@@ -129,6 +132,45 @@ def portal_app(
     app.state.portal = state
     app.state.order_pace = Pace(ORDERS_HZ, ORDERS_AT_ONCE)
     return Guard(app, tokens, local, audit)
+
+
+def _description(routes: list[Any]) -> dict[str, Any]:
+    """The routes as an OpenAPI document: what a docstring says, and the bodies that are sent."""
+    _, schemas = msgspec.json.schema_components(
+        BODIES.values(), ref_template="#/components/schemas/{name}"
+    )
+    token = {"token": {"type": "http", "scheme": "bearer"}}
+    paths: dict[str, dict[str, Any]] = {}
+    for route in routes:
+        if not route.endpoint.__doc__:
+            continue
+        parameters = [
+            {"name": name, "in": "path", "required": True, "schema": {"type": "string"}}
+            for name in route.param_convertors
+        ]
+        path = paths.setdefault(route.path_format, {"parameters": parameters} if parameters else {})
+        methods = {"GET"} if isinstance(route, WebSocketRoute) else route.methods - {"HEAD"}
+        path |= {method.lower(): _operation(route.endpoint, method) for method in methods}
+    return {
+        "openapi": "3.1.0",
+        "info": {"title": "skyrelief portal", "version": "1"},
+        "components": {"securitySchemes": token, "schemas": schemas},
+        "paths": paths,
+    }
+
+
+def _operation(endpoint: Callable[..., Any], method: str) -> dict[str, Any]:
+    """One operation; a change needs the token."""
+    answers = {"2XX": {"description": "done"}}
+    out: dict[str, Any] = {"summary": " ".join(str(endpoint.__doc__).split()), "responses": answers}
+    if method in CHANGING:
+        out["security"] = [{"token": []}]
+        answers["401"] = {"description": "the token is missing"}
+        answers["413"] = {"description": "the request is too large"}
+    if endpoint in BODIES:
+        schema = {"$ref": f"#/components/schemas/{BODIES[endpoint].__name__}"}
+        out["requestBody"] = {"required": True, "content": {"application/json": {"schema": schema}}}
+    return out
 
 
 def _said(request: HTTPConnection, error: Exception) -> Response:
@@ -162,10 +204,12 @@ def _page(request: Request) -> Response:
 
 
 def _scans(request: Request) -> Response:
+    """All scans, the newest first."""
     return JSONResponse(state_of(request).library.scans())
 
 
 def _scan(request: Request) -> Response:
+    """One scan with its files and jobs."""
     state, names = state_of(request), names_of(request)
     entry = state.library.entry(*names)
     entry["jobs"] = state.jobs.of(state.library.folder(*names))
@@ -173,6 +217,7 @@ def _scan(request: Request) -> Response:
 
 
 async def _label(request: Request) -> Response:
+    """Rename or tag. With the edition that was seen: 409 when it is no longer the last."""
     drone, scan = names_of(request)
     note(request, "rename", scan=f"{drone}/{scan}")
     change = await _body(request, LabelChange)
@@ -187,6 +232,7 @@ async def _label(request: Request) -> Response:
 
 
 def _delete(request: Request) -> Response:
+    """Move a scan to the bin; its name there."""
     state, (drone, scan) = state_of(request), names_of(request)
     note(request, "delete", scan=f"{drone}/{scan}")
     for entry in state.progress():
@@ -199,6 +245,7 @@ def _delete(request: Request) -> Response:
 
 
 async def _export(request: Request) -> Response:
+    """Make a deliverable in the background; the job."""
     state, (drone, scan) = state_of(request), names_of(request)
     note(request, "export", scan=f"{drone}/{scan}")
     kind = (await _body(request, ExportOrder)).kind
@@ -207,10 +254,12 @@ async def _export(request: Request) -> Response:
 
 
 def _bin(request: Request) -> Response:
+    """Names of deleted scans."""
     return JSONResponse(state_of(request).library.bin())
 
 
 def _restore(request: Request) -> Response:
+    """Bring a scan back; its drone and scan."""
     name = request.path_params["name"]
     note(request, "restore", name=name)
     drone, scan = state_of(request).library.restore(name)
@@ -218,6 +267,8 @@ def _restore(request: Request) -> Response:
 
 
 async def _import(request: Request) -> Response:
+    """Copy the known files of a scan folder, or an MCAP, of this machine in; 409 while another
+    import runs."""
     note(request, "import")
     folder = (await _body(request, ImportOrder)).folder
     note(request, "import", folder=folder)
@@ -229,6 +280,7 @@ async def _import(request: Request) -> Response:
 
 
 def _status(request: Request) -> Response:
+    """What is being received."""
     state = state_of(request)
     return JSONResponse(
         {
@@ -240,12 +292,13 @@ def _status(request: Request) -> Response:
 
 
 def _figures(request: Request) -> Response:
+    """Battery, satellites, speed, height, distance from home."""
     vehicle = state_of(request).vehicle
     return JSONResponse({"connected": None} if vehicle is None else vehicle.figures())
 
 
 async def _order(request: Request) -> Response:
-    """An order to the vehicle; the answer is the companion's own."""
+    """Give an order to the companion; 429 when they come too fast, but for stop."""
     note(request, "order")
     wanted = await _body(request, VehicleOrder)
     note(request, wanted.action, metres=wanted.metres)
@@ -272,7 +325,7 @@ def _quoted(text: str) -> str:
 
 
 async def _live(socket: WebSocket) -> None:
-    """Messages of :mod:`service.ground.live` until the browser goes away."""
+    """WebSocket: chunks, corrections and track as they come."""
     state = state_of(socket)
     try:
         folder = state.library.folder(*names_of(socket))
@@ -297,3 +350,12 @@ async def _live(socket: WebSocket) -> None:
     finally:
         state.live_views -= 1
         state.views_without_token -= without_token
+
+
+BODIES: dict[Callable[..., Any], type[msgspec.Struct]] = {
+    _label: LabelChange,
+    _export: ExportOrder,
+    _import: ImportOrder,
+    _order: VehicleOrder,
+}
+"""What is sent to the endpoints that take a body."""
