@@ -71,7 +71,6 @@ class SelfCalibrated:
 
     camera: Camera
     sigma_focal: float  # as a share
-    sigma_centre_px: float
     sigma_k: tuple[float, float]
     sigma_p: tuple[float, float]
     rms_before_px: float  # of the sightings' robust middle, with the camera given
@@ -153,7 +152,7 @@ class _Bundle:
         camera = self._camera(model)
         focal = float(max(sigma[0], sigma[1]) / model[0])
         return SelfCalibrated(
-            camera, focal, float(max(sigma[3], sigma[4])), (float(sigma[5]), float(sigma[6])),
+            camera, focal, (float(sigma[5]), float(sigma[6])),
             (float(sigma[7]), float(sigma[8])),
             _middle(self._errors_px(self._start)), _middle(self._errors_px(found)),
             self._errors_px(found),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -202,7 +202,12 @@ def test_the_average_of_left_and_right_is_better_than_either() -> None:
         left = pnp.solve(s.points, s.uv, K)
         right = pnp.solve(s.points, seen + rng.normal(size=seen.shape) * 0.3, K)
         assert left is not None and right is not None
-        mean = pnp.average_left_right(left, right, T_left_right)
+        A = se3.adjoint(T_left_right)
+        moved = replace(
+            right, T_camera_points=T_left_right @ right.T_camera_points,
+            covariance=A @ right.covariance @ A.T,
+        )  # fmt: skip
+        mean = pnp.average_left_right(left, moved)
         left_error.append(np.linalg.norm(centre(left.T_camera_points) - centre(s.T)))
         right_error.append(
             np.linalg.norm(centre(T_left_right @ right.T_camera_points) - centre(s.T))
@@ -219,13 +224,13 @@ def test_a_left_and_right_that_disagree_say_so() -> None:
     left = pnp.solve(s.points, s.uv, K)
     assert left is not None
     wrong = se3.compose(np.eye(3), np.array([0.5, 0.0, 0.0]))
-    agreed = pnp.average_left_right(left, left, np.eye(4))
-    torn = pnp.average_left_right(left, left, wrong)
-    assert agreed.disagreement == pytest.approx(0.0, abs=1e-6)
-    assert torn.disagreement > 50
+    agreed = pnp.average_left_right(left, left)
+    np.testing.assert_allclose(agreed.covariance, 0.5 * left.covariance, rtol=1e-6)
+    off = replace(left, T_camera_points=wrong @ left.T_camera_points)
+    torn = pnp.average_left_right(left, off)
     assert np.trace(torn.covariance) > 50 * np.trace(agreed.covariance)
-    loose = pnp.average_left_right(left, left, wrong, np.eye(6))
-    assert loose.disagreement < 1.0
+    unsure = pnp.average_left_right(left, replace(off, covariance=off.covariance + np.eye(6)))
+    assert np.trace(unsure.covariance) < 1.1 * np.trace(left.covariance)
 
 
 def test_wrong_shapes_and_parameters_are_named() -> None:

@@ -46,8 +46,3 @@ def test_a_blurred_frame_among_sharp_ones_is_told() -> None:
 def test_a_recording_that_is_soft_throughout_is_taken_as_it_is() -> None:
     watch = BlurWatch()
     assert not any(watch.blurred(motion_blur(scene(i), 15)) for i in range(12))
-
-
-def test_nonsense_parameters_are_refused() -> None:
-    with pytest.raises(ValueError, match="least_share"):
-        BlurWatch(least_share=1.5)

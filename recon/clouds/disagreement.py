@@ -21,19 +21,14 @@ NORMAL_MEDIAN = 0.6745
 """Median of the absolute value of a normal variable of unit sigma."""
 
 
-@dataclass(frozen=True, slots=True)
-class DisagreementConfig:
-    """What is compared, and how far sigmas may be widened."""
+IMAGES, ROWS = 32, 24
+"""The last images are remembered, by so many rows of samples each."""
 
-    images: int = 32  # the last ones are remembered
-    samples: int = 24  # rows of samples of each
-    least_common: int = 60  # samples of two images that show the same ground
-    largest: float = 5.0  # factor; more is a pose gone wrong and not a wider sigma
+MIN_COMMON = 60
+"""Samples of two images that show the same ground, at least."""
 
-    def __post_init__(self) -> None:
-        """Raise ValueError when a parameter makes no sense."""
-        if min(self.images, self.samples, self.least_common) < 1 or self.largest < 1.0:
-            raise ValueError(f"all must be at least 1, got {self}")
+MAX_FACTOR = 5.0
+"""More is a pose gone wrong and not a wider sigma."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,9 +42,8 @@ class _Samples:
 class Disagreement:
     """Compares each new depth image with the last ones; all in one world."""
 
-    def __init__(self, config: DisagreementConfig | None = None) -> None:
-        self.config = config or DisagreementConfig()
-        self._earlier: deque[_Samples] = deque(maxlen=self.config.images)
+    def __init__(self) -> None:
+        self._earlier: deque[_Samples] = deque(maxlen=IMAGES)
 
     def forget(self) -> None:
         """Compare with nothing before: the world is another one now."""
@@ -64,38 +58,38 @@ class Disagreement:
         """
         found = [self._apart(depth, one) for one in self._earlier]
         ratios = [ratio for ratio in found if ratio is not None]
-        samples = _samples(depth, self.config.samples)
+        samples = _samples(depth)
         if len(samples.sigma_m):
             self._earlier.append(samples)
         if not ratios:
             return 1.0
         factor = float(np.sqrt(np.mean(np.square(ratios))))
-        return float(np.clip(factor, 1.0, self.config.largest))
+        return float(np.clip(factor, 1.0, MAX_FACTOR))
 
     def _apart(self, depth: DepthMap, one: _Samples) -> float | None:
         """Robust normalised difference along z; None with too little in common."""
         h, w = depth.depth_m.shape
         here = se3.transform(se3.inverse(depth.T_world_camera), one.points.astype(np.float64))
         ahead = here[:, 2] > 1e-3
-        if np.count_nonzero(ahead) < self.config.least_common:
+        if np.count_nonzero(ahead) < MIN_COMMON:
             return None
         uv = np.rint(project(depth.K, here[ahead]))
         inside = (uv[:, 0] >= 0) & (uv[:, 1] >= 0) & (uv[:, 0] < w) & (uv[:, 1] < h)
-        if np.count_nonzero(inside) < self.config.least_common:
+        if np.count_nonzero(inside) < MIN_COMMON:
             return None
         u, v = uv[inside].astype(np.int64).T
         z = depth.depth_m[v, u]
         known = np.isfinite(z) & (depth.views[v, u] >= 2)
-        if np.count_nonzero(known) < self.config.least_common:
+        if np.count_nonzero(known) < MIN_COMMON:
             return None
         there, sigma = here[ahead][inside][known, 2], one.sigma_m[ahead][inside][known]
         off = np.abs(there - z[known]) / np.hypot(sigma, depth.sigma_m[v, u][known])
         return float(np.median(off)) / NORMAL_MEDIAN
 
 
-def _samples(depth: DepthMap, rows: int) -> _Samples:
+def _samples(depth: DepthMap) -> _Samples:
     """Surface that two pairs or more saw, every so many pixels."""
-    step = max(1, depth.depth_m.shape[0] // rows)
+    step = max(1, depth.depth_m.shape[0] // ROWS)
     z, sigma = depth.depth_m[::step, ::step], depth.sigma_m[::step, ::step]
     v, u = np.nonzero(np.isfinite(z) & (depth.views[::step, ::step] >= 2))
     uv = np.column_stack([u, v]).astype(np.float64) * step

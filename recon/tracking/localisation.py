@@ -197,7 +197,7 @@ class Localiser:
         left = self.pose_from(keyframes[-2], new.pyramid, T, share, least, most)
         if isinstance(left, str):
             return found
-        return replace(found, pose=_averaged(left.pose, found.pose))
+        return replace(found, pose=pnp.average_left_right(left.pose, found.pose))
 
     def _starts(
         self, new: Incoming, keyframes: Sequence[OdometryKeyframe], motion: Motion, lost: bool
@@ -325,12 +325,6 @@ class Localiser:
             cosine = (seen @ key.prior.R_world_camera[2]) @ prior.R_world_camera[2]
             off = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
         return off < self.config.max_tilt_error_rad
-
-
-def _averaged(left: pnp.PnpResult, right: pnp.PnpResult) -> pnp.PnpResult:
-    """The right view's pose averaged with the left's, both of one frame in one map."""
-    mean = pnp.average_left_right(left, right, np.eye(4))
-    return replace(right, T_camera_points=mean.T_camera_points, covariance=mean.covariance)
 
 
 class FirstViews:

@@ -7,7 +7,7 @@ the reprojection and the residuals that remain.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,8 +15,6 @@ import numpy as np
 from recon import se3
 from recon.tracking import robust_geometry
 from recon.types import F64, Bool
-
-__all__ = ["PnpAverage", "PnpConfig", "PnpResult", "average_left_right", "solve"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,15 +54,6 @@ class PnpResult:
     def inlier_share(self) -> float:
         """Share of the points given that the pose explains."""
         return float(np.mean(self.inliers))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PnpAverage:
-    """One pose from two."""
-
-    T_camera_points: F64  # (4, 4) m of the left camera
-    covariance: F64  # (6, 6) left perturbation in the left camera's frame
-    disagreement: float  # chi-square of the difference over its 6 degrees of freedom
 
 
 def solve(
@@ -206,25 +195,16 @@ def reprojection_covariance(xyz_m: F64, K: F64, variance_px2: float) -> F64 | No
     return np.asarray(np.linalg.inv(normal) / np.outer(scale, scale) * variance_px2)
 
 
-def average_left_right(
-    left: PnpResult,
-    right: PnpResult,
-    T_left_right: F64,
-    covariance_left_right: F64 | None = None,
-) -> PnpAverage:
-    """The left camera's pose from the poses of both pictures (paper: they are averaged).
+def average_left_right(left: PnpResult, right: PnpResult) -> PnpResult:
+    """The right result with its pose averaged with the left's (paper: they are averaged).
 
-    ``T_left_right`` (4, 4) is the known motion between the two, with ``covariance_left_right``
-    (6, 6) as a left perturbation in the left frame. When the two disagree by more than their
-    covariances allow, the covariance of the mean grows with the disagreement.
+    Both are poses of one image by the points of another view each. When the two disagree by
+    more than their covariances allow, the covariance of the mean grows with the disagreement.
     """
-    A = se3.adjoint(T_left_right)
-    T_other = T_left_right @ right.T_camera_points
-    covariance_other = A @ right.covariance @ A.T
-    if covariance_left_right is not None:
-        covariance_other = covariance_other + covariance_left_right
-    T, covariance = se3.average(left.T_camera_points, left.covariance, T_other, covariance_other)
-    difference = se3.log(T_other @ se3.inverse(left.T_camera_points))
-    spread = left.covariance + covariance_other
+    T, covariance = se3.average(
+        left.T_camera_points, left.covariance, right.T_camera_points, right.covariance
+    )
+    difference = se3.log(right.T_camera_points @ se3.inverse(left.T_camera_points))
+    spread = left.covariance + right.covariance
     disagreement = float(difference @ np.linalg.solve(spread, difference)) / 6.0
-    return PnpAverage(T, covariance * max(1.0, disagreement), disagreement)
+    return replace(right, T_camera_points=T, covariance=covariance * max(1.0, disagreement))

@@ -22,6 +22,7 @@ from recon.types import F64, U8, Camera, PosePrior
 from service.config import ScanConfig, parse_baseline
 from service.onboard.anchorage import Anchorage
 
+KEPT = 6
 LAST_VIEW_SHARE = 0.1
 """A stretch's last frame becomes a view when it is this share of a usual step further on."""
 
@@ -84,14 +85,14 @@ class StereoCandidate:
 class Viewpoints:
     """Selects views from tracked frames and remembers the last few as partners."""
 
-    def __init__(self, config: ScanConfig, partners: int = 4, kept: int = 6) -> None:
-        """``kept`` views are remembered; at most ``partners`` pair up with one of them.
+    def __init__(self, config: ScanConfig, partners: int = 4) -> None:
+        """At most ``partners`` of the last :data:`KEPT` views pair up with one of them.
 
         With more partners than the neighbouring views can be, tracked frames between them
         become partners too.
         """
-        self._kept: deque[Viewpoint] = deque(maxlen=kept)
-        self._between: deque[Viewpoint] = deque(maxlen=8 * partners if partners > kept - 2 else 0)
+        self._kept: deque[Viewpoint] = deque(maxlen=KEPT)
+        self._between: deque[Viewpoint] = deque(maxlen=8 * partners if partners > KEPT - 2 else 0)
         self._recent: deque[Viewpoint] = deque(maxlen=6)  # a quarter of a step apart
         self._extra: tuple[Viewpoint, list[Viewpoint]] | None = None  # a last view's partner
         self._most_partners = partners
