@@ -19,7 +19,7 @@ from recon.graph.loop_book import Edge
 from recon.types import F64, PosePrior
 from service.cameras.camera_file import save_camera
 from service.cli import app
-from service.onboard.pieces import Pieces
+from service.onboard.chain import Pieces
 
 NOWHERE = PosePrior()
 PLACED = PosePrior(np.eye(3), 0.02, 0.1, np.zeros(3), np.ones(3))

@@ -71,7 +71,7 @@ def stereo(
 def open_matcher(backend: str, model: Path | None) -> Backend:
     """The backend of that name, or the operator's learned model."""
     if model is not None:
-        from service.compute.learned_model import load_learned_model
+        from service.compute.opening import load_learned_model
 
         return load_learned_model(model)
     from service.compute.backend_choice import choose_backend

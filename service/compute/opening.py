@@ -1,15 +1,24 @@
-"""The backend that a configuration asks for."""
+"""The backend that a configuration asks for, or the learned model that it declares.
+
+A model is an ONNX file and a TOML beside it, which names the file (``model = "net.onnx"``,
+relative to itself) and gives the fields of
+:class:`recon.backends.learned_stereo.LearnedStereoConfig` that differ from their defaults.
+"""
 
 from __future__ import annotations
 
+from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import msgspec
 
 from service.config import ComputeConfig
-from service.errors import InputError
+from service.errors import InputError, OutsideError
 
 if TYPE_CHECKING:
     from recon.backends import Backend
+    from recon.backends.learned_stereo import LearnedStereoBackend
 
 
 def open_backend(config: ComputeConfig, picture_px: tuple[int, int] | None = None) -> Backend:
@@ -29,8 +38,6 @@ def open_backend(config: ComputeConfig, picture_px: tuple[int, int] | None = Non
             f"compute.model runs on ONNX Runtime: compute.backend must be onnx or auto, "
             f"not {config.backend}"
         )
-    from service.compute.learned_model import load_learned_model
-
     learned = load_learned_model(Path(config.model))
     width = config.stereo_width
     height = 0 if picture_px is None else round(width * picture_px[1] / picture_px[0])
@@ -41,3 +48,38 @@ def open_backend(config: ComputeConfig, picture_px: tuple[int, int] | None = Non
             f"but they would be {found}; set compute.stereo_width"
         )
     return FallbackBackend(learned)
+
+
+def load_learned_model(declaration: Path) -> LearnedStereoBackend:
+    """The model declared in a TOML file, checked and ready to run.
+
+    TensorRT's engine of it, where there is TensorRT, is kept between starts.
+
+    Raises InputError, with what was expected and what was found, when declaration and model
+    do not fit, and OutsideError when ONNX Runtime is missing.
+    """
+    try:
+        from recon.backends.learned_stereo import LearnedStereoBackend, LearnedStereoConfig
+    except ImportError as error:
+        raise OutsideError(f"a learned model needs ONNX Runtime: {error}") from error
+    from service.compute.backend_choice import engine_folder
+
+    try:
+        given = msgspec.toml.decode(declaration.read_bytes(), type=dict[str, Any])
+        model = declaration.parent / str(given.pop("model", ""))
+        known = {f.name: f for f in fields(LearnedStereoConfig)}
+        strange = sorted(set(given) - set(known))
+        missing = sorted(n for n, f in known.items() if f.default is MISSING and n not in given)
+        if strange or missing or not model.is_file():
+            raise InputError(
+                f"{declaration}: "
+                + (f"unknown {', '.join(strange)}; known are model, {', '.join(known)}" if strange
+                   else f"{', '.join(missing)} must be given" if missing
+                   else f"model = {model.name!r} is no file beside it")
+            )  # fmt: skip
+        config = LearnedStereoConfig(**given)
+        return LearnedStereoBackend(model.read_bytes(), config, engine_folder())
+    except OSError as error:
+        raise InputError(f"{declaration}: cannot be read: {error.strerror}") from error
+    except (msgspec.DecodeError, ValueError, TypeError) as error:
+        raise InputError(f"{declaration}: {error}") from error

@@ -232,14 +232,14 @@ def odometry_reporter(
     """What tells the autopilot how it moves, where that is wanted."""
     if not config.mavlink.odometry:
         return None
-    from service.onboard.odometry_report import OdometryReport
+    from service.onboard.vehicle_reports import OdometryReport
 
     return OdometryReport(config.camera, vehicle.report_odometry).tell
 
 
 def tell_keyframe(vehicle: VehicleLink, scan: Scan, keyframe: Keyframe) -> None:
     """Tell ground stations of a keyframe, at the pose that it has now."""
-    from service.onboard.keyframe_report import keyframe_report
+    from service.onboard.vehicle_reports import keyframe_report
 
     inputs = scan.inputs
     state = vehicle.history.state_at(keyframe.time_ns)

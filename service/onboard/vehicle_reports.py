@@ -1,4 +1,4 @@
-"""Our own estimate of the vehicle's motion, frame by frame, for its autopilot."""
+"""What the autopilot and the ground station are told of frames: odometry and keyframes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 
+from mavlink.component.camera import KeyframeReport
 from mavlink.component.status import Odometry
 from mavlink.telemetry.samples import VehicleState
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
 from recon.types import F64
 from service.config import CameraConfig
+from service.georeference import LocalFrame
 from service.onboard.pipeline import Step
 
 LONGEST_STEP_S = 0.5  # between two poses that give a velocity
@@ -95,3 +97,15 @@ def _covariance(covariance: F64) -> list[list[float]]:
     turn[:3, 3:] = turn[3:, :3] = R_ENU_NED.T
     rows: list[list[float]] = (turn @ covariance @ turn.T).tolist()
     return rows
+
+
+def keyframe_report(
+    time_unix_ns: int, T_world_camera: F64, frame: LocalFrame | None, agl_m: float | None
+) -> KeyframeReport:
+    """Its place on the globe and the attitude of its head; no place without a georeference."""
+    R_ned_head = R_ENU_NED.T @ T_world_camera[:3, :3] @ R_GIMBAL_CAMERA.T
+    w, x, y, z = (float(v) for v in se3.quaternion_from_rotation(np.asarray(R_ned_head)))
+    lat = lon = alt = None
+    if frame is not None:
+        lat, lon, alt = (float(v) for v in frame.to_geodetic(T_world_camera[None, :3, 3])[0])
+    return KeyframeReport(time_unix_ns // 1000, lat, lon, alt, agl_m, (w, x, y, z))

@@ -25,8 +25,8 @@ from recon.tracking.odometry import Tracked
 from recon.types import F64
 from service.config import CameraConfig
 from service.onboard.anchorage import Anchorage
-from service.onboard.odometry_report import OdometryReport
 from service.onboard.pipeline import Step
+from service.onboard.vehicle_reports import OdometryReport
 
 S = 1_000_000_000
 BODY = Rotation.from_euler("ZYX", [0.7, 0.05, -0.1])  # q_ned_body
