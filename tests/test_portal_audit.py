@@ -13,10 +13,9 @@ from portal_client import ONE, TOKEN, Client, FakeOperator, client, store
 from test_listener import Clock
 
 from service.errors import InputError
-from service.ground.guard import AuditLog, Pace
+from service.ground.guard import KEPT, AuditLog, Pace, Tokens, kept_token, parse_tokens
 from service.ground.library import Library
 from service.ground.portal import Portal, PortalConfig, open_portal
-from service.ground.tokens import KEPT, Tokens, kept_token, parse_tokens
 from service.ground.vehicle import Vehicle
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from recon import se3
 from recon.types import Bool, DepthMap, Keyframe, Pose
-from service.stream import layer, planes
+from service.stream import codec, planes
 from service.stream.codec import CodecConfig, decode, encode
 from service.stream.records import (
     PoseRecord,
@@ -125,7 +125,7 @@ def test_masking_saves_in_proportion() -> None:
 
 def test_nothing_fresh_is_a_small_valid_layer() -> None:
     layers = encode(keyframe(np.zeros((H, W), bool)), 0)
-    assert all(len(data) == layer.HEADER_BYTES for data in layers)
+    assert all(len(data) == codec.HEADER_BYTES for data in layers)
     back = decode(layers)
     assert back is not None and not back.fresh.any() and back.depth.depth_m.shape == (H, W)
 
@@ -172,7 +172,7 @@ def test_any_bytes_never_raise(data: bytes) -> None:
 
 def resealed(data: bytes) -> bytes:
     """``data`` with a checksum that holds, so that damage reaches the decoders behind it."""
-    at = layer.HEADER_BYTES - 4
+    at = codec.HEADER_BYTES - 4
     crc = zlib.crc32(data[at + 4 :], zlib.crc32(data[:at]))
     return data[:at] + struct.pack("<I", crc) + data[at + 4 :]
 
@@ -187,12 +187,12 @@ def test_damage_behind_a_valid_checksum_never_raises(
     data: bytes, hits: list[tuple[float, int]], in_header: bool
 ) -> None:
     damaged = bytearray(data)
-    reach = layer.HEADER_BYTES + 60 if in_header else len(data)
+    reach = codec.HEADER_BYTES + 60 if in_header else len(data)
     for where, value in hits:
         damaged[min(int(where * reach), len(data) - 1)] = value
     back = decode([resealed(bytes(damaged))])
     if back is not None:
-        assert back.depth.depth_m.size <= layer.MAX_PIXELS
+        assert back.depth.depth_m.size <= codec.MAX_PIXELS
 
 
 def test_an_embedded_picture_that_lies_about_its_size_is_not_opened() -> None:

@@ -19,7 +19,7 @@ from recon.surface.coverage import CoverageMap, usual_cell_m
 from recon.surface.raster import grid_over
 from recon.types import F64, DepthMap
 from service.errors import InputError
-from service.stream import codec, layer
+from service.stream import codec
 from service.stream.records import (
     Repose,
     ScanHeader,
@@ -80,8 +80,8 @@ def fine(house: HouseFlight) -> bytes:
 def test_a_layer_that_no_camera_made_is_dropped(
     fine: bytes, at: int, kind: str, values: tuple[float, ...]
 ) -> None:
-    assert layer.peek(sealed_layer(fine, 58, "3d", 1.0, 2.0, 3.0)) is not None
-    assert layer.peek(sealed_layer(fine, at, kind, *values)) is None
+    assert codec.peek(sealed_layer(fine, 58, "3d", 1.0, 2.0, 3.0)) is not None
+    assert codec.peek(sealed_layer(fine, at, kind, *values)) is None
 
 
 @pytest.mark.parametrize(

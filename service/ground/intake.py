@@ -12,7 +12,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from itertools import islice
 
-from service.stream import layer
+from service.stream import codec
 from service.stream.messages import Ask, Assembler, Head, Held, Numbers, missing, parse
 from service.stream.ranges import MAX_RANGES, RangeSet
 from service.stream.records import ScanHeader, header_from_json
@@ -191,7 +191,7 @@ class ScanIntake:
         """Whether a layer is the item that its parts named."""
         if not kind.startswith("k"):
             return True
-        head = layer.peek(record)
+        head = codec.peek(record)
         return head is not None and (f"k{head.layer}", head.seq) == (kind, number)
 
     def _give_up(self, kind: str, number: int) -> None:

@@ -23,7 +23,7 @@ from service.errors import InputError
 from service.exports.recording import POINT
 from service.ground.mcap_records import messages
 from service.stream import codec
-from service.stream.layer import MAX_PIXELS, MAX_SIDE_PX
+from service.stream.codec import MAX_PIXELS, MAX_SIDE_PX
 from service.stream.naming import split_scan_name
 from service.stream.planes import picture_size
 from service.stream.records import PoseRecord, ScanHeader, read_header

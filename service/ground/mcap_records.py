@@ -18,7 +18,7 @@ from typing import IO, Any, cast
 from service.errors import InputError
 from service.exports.recording import POINT
 from service.packages import needing
-from service.stream.layer import MAX_PIXELS
+from service.stream.codec import MAX_PIXELS
 from service.stream.validity import MAX_TIME_NS
 
 SMALL_BYTES = 65_536

@@ -11,9 +11,16 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import InputError, OutsideError
-from service.ground.guard import LARGEST_BODY_BYTES, AuditLog, Limits
+from service.ground.guard import (
+    LARGEST_BODY_BYTES,
+    AuditLog,
+    Limits,
+    Tokens,
+    kept_token,
+    parse_tokens,
+    read_tokens,
+)
 from service.ground.http import portal_app
-from service.ground.tokens import Tokens, kept_token, parse_tokens, read_tokens
 from service.ground.vehicle import Vehicle
 from service.listener import (
     BoundedListener,

@@ -22,7 +22,7 @@ from recon.types import F64, DepthMap, Keyframe
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.onboard.rig import attitude_of
-from service.stream import layer
+from service.stream import codec
 from service.stream.database import Database, Statement, blob, json_object
 from service.stream.records import (
     PoseRecord,
@@ -103,7 +103,7 @@ class Revisions:
         """The unrefined state of a keyframe; None when nothing of it can be read."""
         data = self._store.chunk(seq, 0) or self._store.chunk(seq, 1)
         keyframe = None if data is not None else self._store.keyframe(seq)
-        head = None if data is None else layer.unpack(data)
+        head = None if data is None else codec.unpack(data)
         base = self._base(seq)
         if head is not None:
             time_ns, T, covariance = (

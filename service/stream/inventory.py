@@ -5,8 +5,8 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 
+from service.stream.codec import MAX_LAYERS
 from service.stream.database import Database
-from service.stream.layer import MAX_LAYERS
 from service.stream.ranges import RangeSet, is_number
 
 Listener = Callable[[str, int], None]

@@ -18,7 +18,7 @@ from typing import Any
 
 from recon.types import Keyframe
 from service.errors import InputError
-from service.stream import codec, layer
+from service.stream import codec
 from service.stream.database import (
     SCHEMA_VERSION,
     Database,
@@ -45,8 +45,8 @@ from service.stream.records import (
 )
 from service.stream.validity import summary_from_json
 
-_NOT_TOO_LARGE = f"LENGTH(data) <= {layer.MAX_LAYER_BYTES}"
-_IS_LAYER = f"typeof(layer) = 'integer' AND layer BETWEEN 0 AND {layer.MAX_LAYERS - 1}"
+_NOT_TOO_LARGE = f"LENGTH(data) <= {codec.MAX_LAYER_BYTES}"
+_IS_LAYER = f"typeof(layer) = 'integer' AND layer BETWEEN 0 AND {codec.MAX_LAYERS - 1}"
 MAX_HELD_PEERS = 8
 """Ground stations whose holdings are kept."""
 
@@ -178,7 +178,7 @@ class ScanStore:
         Over the quota only the coarse layer is kept. Raises ValueError for bytes that are no
         layer of this keyframe, OutsideError when the disk is full.
         """
-        heads = [layer.peek(data) for data in layers]
+        heads = [codec.peek(data) for data in layers]
         if any(head is None or head.seq != seq for head in heads):
             raise ValueError(f"not the layers of keyframe {seq}")
         with self._lock:
@@ -189,7 +189,7 @@ class ScanStore:
 
     def add_chunk(self, data: bytes) -> bool:
         """Store one coded layer; False when it is there already, unsound or over the quota."""
-        head = layer.peek(data)
+        head = codec.peek(data)
         if head is None:
             return False
         with self._lock:
@@ -199,7 +199,7 @@ class ScanStore:
             return self._put_chunks([data]) > 0
 
     def _put_chunks(self, layers: Sequence[bytes]) -> int:
-        heads = [head for data in layers if (head := layer.peek(data)) is not None]
+        heads = [head for data in layers if (head := codec.peek(data)) is not None]
         sql = "INSERT OR IGNORE INTO chunks VALUES (?, ?, ?, ?, ?, ?, ?)"
         with self._lock:
             fresh = [
@@ -435,7 +435,7 @@ def header_of(path: Path) -> ScanHeader | None:
     return header if isinstance(header, ScanHeader) else None
 
 
-def _chunk_row(head: layer.LayerHead, data: bytes) -> tuple[Any, ...]:
+def _chunk_row(head: codec.LayerHead, data: bytes) -> tuple[Any, ...]:
     return (
         head.seq,
         head.layer,

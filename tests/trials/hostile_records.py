@@ -19,7 +19,7 @@ import numpy as np
 
 from recon import se3
 from service.bench.keyframes import make_keyframe
-from service.stream import codec, layer, radio_messages
+from service.stream import codec, radio_messages
 from service.stream.messages import CODES, Part, split, split_in
 from service.stream.radio_tiles import tiles_of
 from service.stream.records import PoseRecord, Repose, ScanHeader, pack_pose, pack_repose
@@ -132,7 +132,7 @@ def sound_layers() -> tuple[bytes, ...]:
 
 def hostile_layers() -> Iterator[tuple[str, bytes]]:
     """Layers with a sound checksum that say what no camera ever saw."""
-    opened = layer.unpack(sound_layers()[-1])
+    opened = codec.unpack(sound_layers()[-1])
     assert opened is not None
     head, sections = opened
 
@@ -143,21 +143,21 @@ def hostile_layers() -> Iterator[tuple[str, bytes]]:
         return K
 
     for focal in (0.002, 0.5, 1.5, 9e5, 1e38, -100.0, 0.0, np.nan, np.inf):
-        yield f"fx = {focal}", layer.pack(replace(head, K=optics(fx=focal)), sections)
+        yield f"fx = {focal}", codec.pack(replace(head, K=optics(fx=focal)), sections)
         both = replace(head, K=optics(fx=focal, fy=focal))
-        yield f"fx = fy = {focal}", layer.pack(both, sections)
+        yield f"fx = fy = {focal}", codec.pack(both, sections)
     for centre in (-1e38, 1e38, 1e6, np.nan):
-        yield f"cx = {centre}", layer.pack(replace(head, K=optics(cx=centre)), sections)
+        yield f"cx = {centre}", codec.pack(replace(head, K=optics(cx=centre)), sections)
     for value in (1e-38, 1e-30, 1e-9, 9999.0, 1e38, -1.0, np.nan):
-        yield f"inverse_min {value}", layer.pack(replace(head, inverse_min=value), sections)
-        yield f"inverse_step {value}", layer.pack(replace(head, inverse_step=value), sections)
+        yield f"inverse_min {value}", codec.pack(replace(head, inverse_min=value), sections)
+        yield f"inverse_step {value}", codec.pack(replace(head, inverse_step=value), sections)
         small = replace(head, inverse_min=value, inverse_step=value)
-        yield f"inverse_min and step {value}", layer.pack(small, sections)
+        yield f"inverse_min and step {value}", codec.pack(small, sections)
     for far in (1e5, 1e7, 1e12, 1e300, -1e308, np.nan, np.inf):
         T = head.T_world_camera.copy()
         T[:3, 3] = far
-        yield f"camera at {far}", layer.pack(replace(head, T_world_camera=T), sections)
-    place = bytearray(layer.pack(head, sections)[58:198])
+        yield f"camera at {far}", codec.pack(replace(head, T_world_camera=T), sections)
+    place = bytearray(codec.pack(head, sections)[58:198])
     for what, at, put in (
         ("no rotation", 24, bytes(32)),
         ("rotation of NaN", 24, np.full(4, np.nan).tobytes()),
@@ -166,7 +166,7 @@ def hostile_layers() -> Iterator[tuple[str, bytes]]:
         ("huge covariance", 56, np.full(21, 3e38, np.float32).tobytes()),
     ):
         changed = bytes(place[:at]) + put + bytes(place[at + len(put) :])
-        yield what, layer.pack(head, sections, changed)
+        yield what, codec.pack(head, sections, changed)
     for what, change in (
         ("empty box", {"box": (0, 0, 0, 0)}),
         ("box outside", {"box": (150, 80, 160, 90)}),
@@ -183,7 +183,7 @@ def hostile_layers() -> Iterator[tuple[str, bytes]]:
         ("first instant", {"time_unix_ns": -(1 << 63)}),
         ("last instant", {"time_unix_ns": (1 << 63) - 1}),
     ):
-        yield what, layer.pack(replace(head, **change), sections)
+        yield what, codec.pack(replace(head, **change), sections)
     bomb = bytes(18) + zlib.compress(bytes(15 << 20), 9)
     wide = np.frombuffer(sections[4], np.uint8).tobytes()
     sof = wide.find(b"\xff\xc0")
@@ -198,7 +198,7 @@ def hostile_layers() -> Iterator[tuple[str, bytes]]:
             ("JPEG of 65535 px", wide),
         ):
             changed_sections = (*sections[:index], data, *sections[index + 1 :])
-            yield f"{name}: {what}", layer.pack(head, changed_sections)
+            yield f"{name}: {what}", codec.pack(head, changed_sections)
 
 
 def hostile_poses() -> Iterator[tuple[str, bytes]]:

@@ -25,7 +25,7 @@ from hostile_records import (
     hostile_reposes,
 )
 
-from service.stream import layer
+from service.stream import codec
 
 Change = Callable[[Path], None]
 
@@ -156,9 +156,9 @@ def _spread(change: Callable[[Any, int], Any]) -> Change:
         db = sqlite3.connect(folder / "scan.db")
         with db:
             for seq, k, data in db.execute("SELECT seq, layer, data FROM chunks").fetchall():
-                opened = layer.unpack(data)
+                opened = codec.unpack(data)
                 assert opened is not None
-                whole = layer.pack(change(opened[0], seq), opened[1])
+                whole = codec.pack(change(opened[0], seq), opened[1])
                 db.execute(
                     "UPDATE chunks SET data = ?, crc = ? WHERE seq = ? AND layer = ?",
                     (whole, zlib.crc32(whole), seq, k),

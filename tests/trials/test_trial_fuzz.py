@@ -168,9 +168,8 @@ def test_health_page_answers_as_described(tmp_path: Path, record: Row) -> None:
 def test_portal_answers_as_described(tmp_path: Path, record: Row) -> None:
     """Requests made from the served description, right and wrong: never a fault of ours."""
     schemathesis = pytest.importorskip("schemathesis")
-    from service.ground.guard import AuditLog
+    from service.ground.guard import AuditLog, Tokens
     from service.ground.http import portal_app
-    from service.ground.tokens import Tokens
 
     token, tried = "a-token-of-the-trials", 0
     headers = {"Authorization": f"Bearer {token}", "Host": "127.0.0.1"}

@@ -17,7 +17,7 @@ from recon.types import DepthMap, Keyframe, Pose
 from service.cameras.camera_file import load_camera
 from service.config import load_config
 from service.errors import SkyreliefError
-from service.stream import codec, layer, messages, plane_coders, planes, radio_messages
+from service.stream import codec, messages, plane_coders, planes, radio_messages
 from service.stream.messages import Assembler, parse, split
 from service.stream.records import PoseRecord, Repose, pack_pose, pack_repose, unpack_pose
 from service.stream.records import unpack_repose as unpack_corrected
@@ -70,7 +70,7 @@ def _radio(_: Path) -> Decoder:
 
 def _keyframe(_: Path) -> Decoder:
     def decode(data: bytes) -> None:
-        layer.unpack(data)
+        codec.unpack(data)
         codec.decode([data])
 
     return decode

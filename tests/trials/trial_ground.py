@@ -34,7 +34,7 @@ from pathlib import Path
 import numpy as np
 from service.bench.keyframes import make_keyframe, strip
 from service.config import DatalinkConfig
-from service.stream import codec, layer
+from service.stream import codec
 from service.stream.link import DatalinkSender
 from service.stream.records import PoseRecord, Repose, ScanHeader
 from service.stream.store import ScanStore
@@ -42,7 +42,7 @@ path, name, config = Path(sys.argv[1]), sys.argv[2], json.loads(sys.argv[3])
 keyframes_hz, poses = 1.2, 7
 size = (320, 180)
 coded = [
-    [layer.unpack(data) for data in codec.encode(make_keyframe(k, size, strip(size, k), 1 + k), 0)]
+    [codec.unpack(data) for data in codec.encode(make_keyframe(k, size, strip(size, k), 1 + k), 0)]
     for k in range(4)
 ]
 run_id = config.pop("run_id")
@@ -59,7 +59,7 @@ while not sys.stdin.buffer.read(1):
         T[:3, :3] = np.diag([1.0, -1.0, -1.0])
         T[:3, 3] = 10 * (seq % 40), 25 * (seq // 40 % 16), 72
         layers = [
-            layer.pack(replace(head, seq=seq, time_unix_ns=time.time_ns(), T_world_camera=T), rest)
+            codec.pack(replace(head, seq=seq, time_unix_ns=time.time_ns(), T_world_camera=T), rest)
             for head, rest in coded[seq % 4]
         ]
         store.add_keyframe(seq, layers)
