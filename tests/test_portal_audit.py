@@ -13,7 +13,7 @@ from portal_client import ONE, TOKEN, Client, FakeOperator, client, store
 from test_listener import Clock
 
 from service.errors import InputError
-from service.ground.guard import KEPT, AuditLog, Pace, Tokens, kept_token, parse_tokens
+from service.ground.guard import TOKEN_FILE, AuditLog, Pace, Tokens, kept_token, parse_tokens
 from service.ground.library import Library
 from service.ground.portal import Portal, PortalConfig, open_portal
 from service.ground.vehicle import Vehicle
@@ -79,7 +79,7 @@ def test_refusals_do_not_flood_the_audit_log(client: Client, store: Path) -> Non
 
 
 def test_the_audit_log_is_bounded_and_a_full_disk_stops_nothing(tmp_path: Path) -> None:
-    log = AuditLog(tmp_path, largest_bytes=1000)
+    log = AuditLog(tmp_path, max_bytes=1000)
     for number in range(101):
         log.write("a", "b", f"c{number}", 200, text="x" * 9999, odd="\ud800", many=["y" * 999])
     files = sorted(tmp_path.iterdir())
@@ -124,9 +124,9 @@ def test_a_made_token_is_kept_over_restarts(tmp_path: Path) -> None:
     second = open_portal("127.0.0.1:0", tmp_path)
     second.close()
     assert first.token == second.token and len(first.token) >= 16
-    assert (tmp_path / KEPT).stat().st_mode & 0o777 == 0o600
+    assert (tmp_path / TOKEN_FILE).stat().st_mode & 0o777 == 0o600
     assert kept_token(tmp_path).strip() == first.token
-    (tmp_path / KEPT).write_text("")
+    (tmp_path / TOKEN_FILE).write_text("")
     with pytest.raises(InputError, match="no token"):
         kept_token(tmp_path)
 

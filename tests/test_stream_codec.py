@@ -208,8 +208,8 @@ def test_an_embedded_picture_that_lies_about_its_size_is_not_opened() -> None:
     )
     at = colour.index(b"\xff\xc0")
     lying = colour[: at + 5] + b"\xff\xff\xff\xff" + colour[at + 9 :]
-    assert planes.picture_size(colour) == (8, 8)
-    assert planes.picture_size(lying) == (65535, 65535)
+    assert planes.image_size(colour) == (8, 8)
+    assert planes.image_size(lying) == (65535, 65535)
     assert planes.decode_colour(lying, 8, 8) is None
 
 

@@ -71,7 +71,7 @@ class Outcome:
 
     delivered: int
     made: int
-    least_share: float  # of the drone that got through least, when the flight ended
+    min_share: float  # of the drone that got through least, when the flight ended
     latency_s: dict[str, list[float]]
     busiest_share: float  # busiest second over the budget, on the wire
     sent_over_stored: float
@@ -133,7 +133,7 @@ def _report(name: str, outcome: Outcome, peer: dict[str, float]) -> list[BenchRe
     rows = [
         (DELIVERED, 100 * outcome.delivered / outcome.made, "%"),
         ("drone and ground find each other after", outcome.found_s, "s"),
-        ("least served drone at the flight's end, coarse layers", 100 * outcome.least_share, "%"),
+        ("least served drone at the flight's end, coarse layers", 100 * outcome.min_share, "%"),
         (BUSIEST, 100 * outcome.busiest_share, "%"),
         ("bytes on the wire per byte stored", outcome.sent_over_stored, ""),
         ("records that came twice", float(outcome.duplicates), ""),
@@ -255,7 +255,7 @@ def fly_plain(trial: Trial) -> Outcome:
     return Outcome(
         delivered=len(came),
         made=len(made),
-        least_share=sum(kind == "k0" for kind, _ in came) / (len(made) / 3),
+        min_share=sum(kind == "k0" for kind, _ in came) / (len(made) / 3),
         latency_s=latency,
         busiest_share=emulator.up.busiest_window_bytes() / (trial.link.rate_kbit_s * 125 * SHARE),
         sent_over_stored=0.0,
@@ -355,7 +355,7 @@ def _outcome(
     return Outcome(
         delivered=delivered,
         made=sum(len(drone.made) for drone in drones),
-        least_share=least,
+        min_share=least,
         latency_s=latency,
         busiest_share=max(d.emulator.up.busiest_window_bytes() for d in drones) / budget,
         sent_over_stored=wire / max(1, stored),

@@ -177,7 +177,7 @@ NOTE = "software rendering (SwiftShader), 1280x800"
 LARGE_PX = (640, 360)
 KEYFRAMES = 44  # of 230,400 points: ten million
 ARRIVALS = 15
-SETTLING, FRAMES, WHOLE_PICTURES = 16, 20, 3
+SETTLING, FRAMES, WHOLE_IMAGES = 16, 20, 3
 TOKEN = "a-token-for-the-benchmark"
 FRAME_TIMES = """new Promise(done => {
   const gl = document.querySelector('.stage canvas').getContext('webgl2');
@@ -314,7 +314,7 @@ def _frame_times(browser: Browser, base: str) -> tuple[list[float], list[float],
     browser.run(FRAME_TIMES % SETTLING)  # until the page knows what this machine can draw
     flying = [float(t) for t in browser.run(FRAME_TIMES % FRAMES)]
     whole, stops = [], []
-    for _ in range(WHOLE_PICTURES):
+    for _ in range(WHOLE_IMAGES):
         total, *ticks = browser.run(ALL_DRAWN % {"points": round(0.99 * points)})
         whole.append(float(total))
         stops.append(max(float(t) for t in ticks))

@@ -205,12 +205,12 @@ def _keyframe(seq: int) -> Keyframe:
     z = np.full((h, w), HEIGHT_M)
     for _ in range(12):  # to where each ray meets the surface
         z = HEIGHT_M - _ground_m(x0 + rays_x * z, -rays_y * z)
-    grey = np.clip(128 + 60 * np.sin((x0 + rays_x * z) / 3), 0, 255).astype(np.uint8)
+    gray = np.clip(128 + 60 * np.sin((x0 + rays_x * z) / 3), 0, 255).astype(np.uint8)
     depth = DepthMap(
         z.astype(np.float32), np.full((h, w), 0.2, np.float32), np.full((h, w), 3, np.uint8), K, T
     )
     fresh = u >= (0 if seq == 0 else w - 1.2 * step_m * FOCAL_PX / HEIGHT_M)
-    bgr = np.stack([grey, grey, grey // 2], axis=-1)
+    bgr = np.stack([gray, gray, gray // 2], axis=-1)
     return Keyframe(seq, 0, depth, bgr, Pose(T, np.eye(6) * 1e-4), fresh)
 
 

@@ -33,12 +33,12 @@ from service.listener import BoundedListener, Peer, host_name, is_loopback
 
 log = logging.getLogger(__name__)
 
-KEPT = "portal-token"
+TOKEN_FILE = "portal-token"
 """Name of the file in the store that holds the token that was made there."""
 
 DEFAULT_NAME = "operator"
-LARGEST_FILE_BYTES = 65_536
-LINE = re.compile(r"(?:([A-Za-z0-9][A-Za-z0-9_-]{0,39})[ \t]+)?([!-~]{1,200})")
+MAX_TOKEN_FILE_BYTES = 65_536
+TOKEN_LINE = re.compile(r"(?:([A-Za-z0-9][A-Za-z0-9_-]{0,39})[ \t]+)?([!-~]{1,200})")
 
 
 class Tokens:
@@ -80,7 +80,7 @@ def parse_tokens(text: str) -> dict[str, str]:
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip() or line.startswith("#"):
             continue
-        found = LINE.fullmatch(line.strip())
+        found = TOKEN_LINE.fullmatch(line.strip())
         name = (found and found[1]) or DEFAULT_NAME
         if found is None or name in out:
             raise InputError(f"line {number} is not TOKEN or NAME TOKEN with a new name")
@@ -98,7 +98,7 @@ def read_tokens(path: Path) -> str:
             mode = os.fstat(handle).st_mode
             if not stat.S_ISREG(mode):
                 raise InputError(f"portal token {path} is no regular file")
-            text = file.read(LARGEST_FILE_BYTES)
+            text = file.read(MAX_TOKEN_FILE_BYTES)
     except (OSError, ValueError) as error:
         raise InputError(f"portal token {path} cannot be read ({error})") from error
     try:
@@ -115,9 +115,9 @@ def kept_token(store: Path) -> str:
 
     Raises OutsideError when it cannot be written there, InputError when it cannot be read.
     """
-    path = store / KEPT
+    path = store / TOKEN_FILE
     if not path.exists():
-        part = store / f".{KEPT}-{secrets.token_hex(4)}"
+        part = store / f".{TOKEN_FILE}-{secrets.token_hex(4)}"
         try:
             store.mkdir(parents=True, exist_ok=True)
             handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
@@ -131,9 +131,9 @@ def kept_token(store: Path) -> str:
     return read_tokens(path)
 
 
-FILE = "audit.jsonl"
-LARGEST_BYTES = 8_000_000
-LONGEST_TEXT = 200
+AUDIT_FILE = "audit.jsonl"
+MAX_AUDIT_BYTES = 8_000_000
+MAX_TEXT = 200
 NOTED = "skyrelief.change"
 """Where a request's scope holds what its endpoint has noted."""
 
@@ -144,9 +144,9 @@ class AuditLog:
     A disk that takes no line stops no order: it is logged.
     """
 
-    def __init__(self, folder: Path, largest_bytes: int = LARGEST_BYTES) -> None:
-        self.path = folder / FILE
-        self._largest_bytes = largest_bytes
+    def __init__(self, folder: Path, max_bytes: int = MAX_AUDIT_BYTES) -> None:
+        self.path = folder / AUDIT_FILE
+        self._max_bytes = max_bytes
         self._lock = threading.Lock()
 
     def write(self, who: str, where: str, action: str, status: int, **details: Any) -> None:
@@ -169,8 +169,8 @@ class AuditLog:
             size = os.fstat(handle).st_size
         finally:
             os.close(handle)
-        if size > self._largest_bytes:
-            os.replace(self.path, self.path.with_name(f"{FILE}.1"))
+        if size > self._max_bytes:
+            os.replace(self.path, self.path.with_name(f"{AUDIT_FILE}.1"))
 
 
 class Pace:
@@ -206,10 +206,10 @@ def _short(value: Any) -> Any:
         return value
     if isinstance(value, (list, tuple)):
         return [_short(item) for item in value[:20]]
-    return str(value)[:LONGEST_TEXT]
+    return str(value)[:MAX_TEXT]
 
 
-LARGEST_BODY_BYTES = 65_536
+MAX_BODY_BYTES = 65_536
 BODY_S = 10.0
 """A request's whole body comes within this time."""
 STALL_S = 120.0
@@ -261,7 +261,7 @@ def bounded_receive(receive: Receive) -> Receive:
             raise HTTPException(408, "the request's body did not come in time", CLOSE) from None
         seen += len(message.get("body", b""))
         complete = not message.get("more_body", False)
-        if seen > LARGEST_BODY_BYTES:
+        if seen > MAX_BODY_BYTES:
             raise HTTPException(413, "the request is too large", CLOSE)
         return message
 
@@ -351,7 +351,7 @@ class Guard:
         length = headers.get("content-length", "0")
         if not (length.isascii() and length.isdigit() and len(length) < 10):
             return 413, "the request is too large"
-        return None if int(length) <= LARGEST_BODY_BYTES else (413, "the request is too large")
+        return None if int(length) <= MAX_BODY_BYTES else (413, "the request is too large")
 
     def _open(self, connection: HTTPConnection) -> RedirectResponse:
         """The page, with a session where the token in the address is right."""

@@ -90,7 +90,7 @@ REST_S = 2.0
 
 BATCH = {"header": 1, "summary": 1, "repose": 64, "pose": 64, "k0": 8}
 """How many items of a kind one request names; the order is that of asking."""
-MOST_FINE = 16
+MAX_FINE = 16
 BRIEF_S, LONG_S = 1.5, 4.0
 """Requests for fine layers name more of them when they are answered sooner, fewer when later,
 so that neither the round trip nor what is newer waits long."""
@@ -266,7 +266,7 @@ class ScanIntake:
         if slot == FINE and now - request.began > LONG_S:
             self._fine_batch = max(1, self._fine_batch // 2)
         elif slot == FINE and request.brought and now - request.began < BRIEF_S:
-            self._fine_batch = min(MOST_FINE, 2 * self._fine_batch)
+            self._fine_batch = min(MAX_FINE, 2 * self._fine_batch)
         if request.brought == 0 and not request.moved:
             self._rest_until[slot] = now + REST_S
 

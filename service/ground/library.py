@@ -34,8 +34,8 @@ LABELS = "library.json"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 """What a drone's and a scan's folder may be called."""
 
-LONGEST_TITLE = 200
-MOST_TAGS = 20
+MAX_TITLE = 200
+MAX_TAGS = 20
 IMPORTING = ".importing-"
 """Begins the name of a folder in the store that an import fills."""
 
@@ -297,16 +297,16 @@ def _files(folder: Path) -> list[dict[str, Any]]:
 
 
 def _title(title: Any) -> str:
-    if not isinstance(title, str) or len(title) > LONGEST_TITLE:
-        raise InputError(f"a title is a text of at most {LONGEST_TITLE} letters")
+    if not isinstance(title, str) or len(title) > MAX_TITLE:
+        raise InputError(f"a title is a text of at most {MAX_TITLE} letters")
     if any(0xD800 <= ord(letter) <= 0xDFFF for letter in title):
         raise InputError("a title holds half a letter (a lone surrogate)")
     return " ".join(title.split())
 
 
 def _tags(tags: Any) -> tuple[str, ...]:
-    if not isinstance(tags, (list, tuple)) or len(tags) > MOST_TAGS:
-        raise InputError(f"tags are a list of at most {MOST_TAGS} texts")
+    if not isinstance(tags, (list, tuple)) or len(tags) > MAX_TAGS:
+        raise InputError(f"tags are a list of at most {MAX_TAGS} texts")
     return tuple(dict.fromkeys(_title(tag) for tag in tags if tag))
 
 

@@ -48,15 +48,15 @@ SIGMA_STEP_M = 0.02
 TRACK_POINTS = 2000
 
 
-def chunk_message(keyframe: Keyframe, layer: int, most_points: int | None = None) -> bytes:
-    """The points of ``keyframe`` as a binary message, thinned to ``most_points``.
+def chunk_message(keyframe: Keyframe, layer: int, max_points: int | None = None) -> bytes:
+    """The points of ``keyframe`` as a binary message, thinned to ``max_points``.
 
     They come in random order, so that a viewer may draw any first part of them.
     """
     depth = keyframe.depth
     local = DepthMap(depth.depth_m, depth.sigma_m, depth.views, depth.K, np.eye(4))
     cloud = cloud_of(local, keyframe.bgr, keyframe.fresh)
-    rows = np.random.default_rng(keyframe.seq).permutation(len(cloud))[:most_points]
+    rows = np.random.default_rng(keyframe.seq).permutation(len(cloud))[:max_points]
     xyz = cloud.xyz_m[rows]
     reach = float(np.abs(xyz).max()) if len(xyz) else 1.0
     unit = max(reach, 1e-3) / 32767.0
@@ -134,7 +134,7 @@ class LiveFeed:
 
     store: ScanStore
     index: StoreIndex
-    most_points: int | None = None  # of one chunk
+    max_points: int | None = None  # of one chunk
     _sent: dict[int, int] = field(default_factory=dict)  # keyframe to the layer sent
     _scale: dict[int, float] = field(default_factory=dict)
     _revision: dict[int, int] = field(default_factory=dict)
@@ -142,19 +142,19 @@ class LiveFeed:
     _finished: bool | None = None
     _more: bool = True  # the last call left something for the next
 
-    def news(self, most_chunks: int = 20) -> Iterator[str | bytes]:
-        """Messages for what has changed; at most ``most_chunks`` keyframes at a time."""
+    def news(self, max_chunks: int = 20) -> Iterator[str | bytes]:
+        """Messages for what has changed; at most ``max_chunks`` keyframes at a time."""
         if not (self.index.changed() or self._more):
             return
         finest = self.index.layers()
         due = [seq for seq, layer in finest.items() if layer > self._sent.get(seq, -2)]
-        self._more = len(due) > most_chunks
-        for seq in due[:most_chunks]:
+        self._more = len(due) > max_chunks
+        for seq in due[:max_chunks]:
             self._sent[seq] = finest[seq]
             keyframe = self.store.keyframe(seq)
             if keyframe is not None:
                 self._note_repose(seq)
-                yield chunk_message(keyframe, finest[seq], self.most_points)
+                yield chunk_message(keyframe, finest[seq], self.max_points)
         poses, reposes = self.index.counts()
         before, self._counts = self._counts, (poses, reposes)
         if reposes != before[1]:
@@ -225,7 +225,7 @@ async def serve_live(socket: WebSocket, folder: Path) -> None:
     try:
         store = await run_in_threadpool(ScanStore.open, folder / "scan.db")
         index = StoreIndex(store.path)
-        feed = LiveFeed(store, index, _most_points(socket))
+        feed = LiveFeed(store, index, _max_points(socket))
         gone = asyncio.create_task(_until_gone(socket))
         while not gone.done():
             for message in await run_in_threadpool(lambda: list(feed.news())):
@@ -241,7 +241,7 @@ async def serve_live(socket: WebSocket, folder: Path) -> None:
             await socket.close()
 
 
-def _most_points(socket: WebSocket) -> int | None:
+def _max_points(socket: WebSocket) -> int | None:
     text = socket.query_params.get("points", "")
     is_number = text.isascii() and text.isdigit() and len(text) < 9
     return min(max(int(text), 100), 1_000_000) if is_number else None

@@ -25,7 +25,7 @@ from service.ground.mcap_records import messages
 from service.stream import codec
 from service.stream.codec import MAX_PIXELS, MAX_SIDE_PX
 from service.stream.naming import split_scan_name
-from service.stream.planes import picture_size
+from service.stream.planes import image_size
 from service.stream.records import PoseRecord, ScanHeader, read_header
 from service.stream.store import ScanStore
 from service.stream.validity import MAX_SIGMA_M, is_pinhole, is_position
@@ -108,7 +108,7 @@ def _add_keyframe(store: ScanStore, parts: dict[str, Any], time_ns: int) -> bool
     K = np.array(camera.K, np.float64).reshape(3, 3)
     if not is_pinhole((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), size[::-1]):
         return False
-    if picture_size(image.data) != size[::-1]:
+    if image_size(image.data) != size[::-1]:
         return False
     bgr = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
     T = _transform(points.pose)

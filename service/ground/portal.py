@@ -12,7 +12,7 @@ from typing import Any
 
 from service.errors import InputError, OutsideError
 from service.ground.guard import (
-    LARGEST_BODY_BYTES,
+    MAX_BODY_BYTES,
     AuditLog,
     Limits,
     Tokens,
@@ -144,7 +144,7 @@ class Portal:
                 log_level="warning",
                 access_log=False,
                 lifespan="off",
-                ws_max_size=LARGEST_BODY_BYTES,
+                ws_max_size=MAX_BODY_BYTES,
                 ssl_certfile=self.config.tls_certificate or None,
                 ssl_keyfile=self.config.tls_key or None,
             )

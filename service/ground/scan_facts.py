@@ -16,9 +16,9 @@ from service.ground.storage import is_regular
 from service.small_file import read_small
 from service.stream.store import ScanStore
 
-LARGEST_JSON_BYTES = 4_000_000
+MAX_JSON_BYTES = 4_000_000
 SCHEMA = 1
-LONGEST_TROUBLE = 500
+MAX_TROUBLE = 500
 
 UnixTime = Annotated[float, msgspec.Meta(ge=-1e11, le=1e11)]
 Figure = Annotated[float, msgspec.Meta(ge=-1e300, le=1e300)]
@@ -64,7 +64,7 @@ class Facts(msgspec.Struct):
         failed = plain.pop("failed")
         if failed:
             why = "; ".join(f"{name} ({reason})" for name, reason in failed.items())
-            plain["trouble"] = f"could not be made: {why}"[:LONGEST_TROUBLE]
+            plain["trouble"] = f"could not be made: {why}"[:MAX_TROUBLE]
         return {**plain.pop("times"), **plain}
 
 
@@ -127,4 +127,4 @@ def _small(path: Path) -> bytes:
     """The content of a small file. Raises InputError when it is not small, or a link."""
     if not is_regular(path):
         raise InputError(f"{path.name} is no regular file")
-    return read_small(path, LARGEST_JSON_BYTES, "file of a scan")
+    return read_small(path, MAX_JSON_BYTES, "file of a scan")

@@ -22,7 +22,7 @@ from service.scans.coverage import LiveCoverages
 
 log = logging.getLogger(__name__)
 
-MOST_WAITING = 20
+MAX_WAITING_JOBS = 20
 KEPT = 100
 
 
@@ -40,7 +40,7 @@ class Jobs:
             raise InputError(f"kind is one of {', '.join(EXPORTERS)}")
         with self._lock:
             waiting = [j for _, j in self._jobs if j["state"] in ("waiting", "running")]
-            if len(waiting) >= MOST_WAITING:
+            if len(waiting) >= MAX_WAITING_JOBS:
                 raise InputError("too many deliverables are waiting; try again later")
             job = {"kind": kind, "state": "waiting", "queued_unix_s": time.time(), "error": None}
             self._jobs = [*self._jobs[-KEPT:], (folder, job)]

@@ -80,12 +80,12 @@ class RateEstimate:
     """
 
     QUEUE_S = 0.5
-    QUEUE_LEAST_BYTES = 8_000
+    MIN_QUEUE_BYTES = 8_000
     FALL = 0.8  # of what came through
     CLIMB, CREEP = 0.05, 0.005  # of the configured rate, per report
     FLOOR = 0.03  # of the configured rate
-    LEAST_S = 0.8  # reports closer together are joined
-    SILENCE_S = 10.0  # after a gap, begin anew
+    MIN_REPORT_S = 0.8  # reports closer together are joined
+    MAX_GAP_S = 10.0  # after a gap, begin anew
     REST = 2  # reports after a fall that are not judged
     PATIENCE = 2  # bad reports in a row before the rate falls
     SAME = 0.6  # a share lost that shrank by less than this did not depend on the rate
@@ -104,7 +104,7 @@ class RateEstimate:
         self._lost_at_fall = 0.0
         self._own_loss = 0.0
 
-    def begin_anew(self) -> None:
+    def restart(self) -> None:
         """Forget what was under way, such as on a connection that died; the rate stays."""
         self._totals.clear()
         self._through.clear()
@@ -113,10 +113,10 @@ class RateEstimate:
     def report(self, sent_bytes: int, received_bytes: int, now: float) -> float:
         """The rate to use, given the totals sent and received so far."""
         passed = now - self._at
-        if passed < self.LEAST_S:
+        if passed < self.MIN_REPORT_S:
             return self.rate_bytes_s
-        if passed > self.SILENCE_S or received_bytes < self._received:
-            self.begin_anew()
+        if passed > self.MAX_GAP_S or received_bytes < self._received:
+            self.restart()
         self._through.append(max(0, received_bytes - self._received) / passed)
         self._at, self._received = now, received_bytes
         self._totals.append((sent_bytes, received_bytes))
@@ -138,7 +138,7 @@ class RateEstimate:
         under_way = [sent - received for sent, received in self._totals]
         queue = under_way[-1] - min(under_way)
         own = self._own_loss * (self._totals[-1][0] - self._totals[0][0])
-        return queue - own > max(self.QUEUE_LEAST_BYTES, self.QUEUE_S * max(self._through))
+        return queue - own > max(self.MIN_QUEUE_BYTES, self.QUEUE_S * max(self._through))
 
     def _judge(self) -> None:
         """Fall, or take what is lost for the link's own."""

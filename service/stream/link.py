@@ -38,7 +38,7 @@ RETRY_S = 1.0
 SILENCE_S = 5.0
 """When stations that were heard fall silent for so long, the session is opened anew: TCP
 waits longer and longer before it tries a dead connection again."""
-FIRST_PATIENCE_S, LEAST_PATIENCE_S = 10.0, 1.5
+FIRST_PATIENCE_S, MIN_PATIENCE_S = 10.0, 1.5
 PATIENCE = 3.0
 """An attempt to open a session may take so many times what the last one took: a fresh call finds
 a link that is back sooner than one whose waits have grown."""
@@ -229,7 +229,7 @@ class DatalinkSender:
         while not self._stop.is_set():
             began = time.monotonic()
             attempt += 1
-            patience = max(PATIENCE * self._opening_s, LEAST_PATIENCE_S)
+            patience = max(PATIENCE * self._opening_s, MIN_PATIENCE_S)
             if attempt % PATIENT_ATTEMPT == 0:  # the link may have become a slower one
                 patience = FIRST_PATIENCE_S
             try:
@@ -318,7 +318,7 @@ class DatalinkSender:
                 self._heard_at = now
         if self._is_looked_for:
             self._is_looked_for = False
-            self._outbox.tell(now)
+            self._outbox.publish_heads(now)
         reports = self._reports.take(now)
         for scan_id, peer, payload in reports:
             held = unpack_held(payload)

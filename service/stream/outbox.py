@@ -311,7 +311,7 @@ class Outbox:
         self._heard.clear()
         self._estimates = dict(list(self._estimates.items())[-MAX_ESTIMATES:])
         for estimate in self._estimates.values():
-            estimate.begin_anew()
+            estimate.restart()
         self._clear_live()
         self._asked = {ASKED: AskedLane(), BACKFILL: AskedLane()}
         self._head = None
@@ -355,7 +355,7 @@ class Outbox:
         replaced = self._asked[ASKED if small else BACKFILL].push(request)
         return [] if replaced is None else [replaced]
 
-    def tell(self, now: float) -> None:
+    def publish_heads(self, now: float) -> None:
         """Send the heads as soon as may be: somebody new looks around."""
         for feed in self._feeds.values():
             feed.head_due = min(feed.head_due, max(now, feed.head_sent + HEAD_AFTER_NEWS_S))
@@ -370,7 +370,7 @@ class Outbox:
             for key in [key for key in self._estimates if key[1] == silent]:
                 del self._estimates[key]
         if not self.listened(now):
-            self.tell(now)
+            self.publish_heads(now)
         self._heard[peer] = now
         return True
 

@@ -90,7 +90,7 @@ def block_means(sigma: F32, block: int) -> F32:
 
 
 @numba.njit(cache=True, nogil=True)
-def block_least(views: U8, known: Bool, block: int, most: int) -> U8:
+def block_min(views: U8, known: Bool, block: int, most: int) -> U8:
     """The least known value in each block, 1 to ``most``; 255 where there is none."""
     h, w = views.shape
     rows, columns = -(-h // block), -(-w // block)

@@ -175,7 +175,7 @@ def decode_sigma(data: bytes, w: int, h: int) -> F32 | None:
 
 def encode_views(planes: Planes) -> bytes:
     """The section of views: one count per block of VIEWS_BLOCK_PX, at most MAX_VIEWS."""
-    least = plane_kernels.block_least(planes.views, planes.known, VIEWS_BLOCK_PX, MAX_VIEWS)
+    least = plane_kernels.block_min(planes.views, planes.known, VIEWS_BLOCK_PX, MAX_VIEWS)
     return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(_fill_back(least, least != 255))))
 
 
@@ -208,7 +208,7 @@ def encode_colour(planes: Planes, quality: int) -> bytes:
 
 def decode_colour(data: bytes, w: int, h: int) -> U8 | None:
     """(h, w, 3) BGR."""
-    if picture_size(data) != (w, h):
+    if image_size(data) != (w, h):
         return None
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
@@ -223,7 +223,7 @@ def _enlarge(blocks: Array, factor: int, w: int, h: int) -> Array:
     return np.repeat(np.repeat(blocks, factor, axis=0), factor, axis=1)[:h, :w]
 
 
-def picture_size(data: bytes) -> tuple[int, int] | None:
+def image_size(data: bytes) -> tuple[int, int] | None:
     """(w, h) that a JPEG or JPEG-LS picture claims in its frame header; None if it has none."""
     at = 2
     if data[:2] != b"\xff\xd8":
@@ -245,7 +245,7 @@ def picture_size(data: bytes) -> tuple[int, int] | None:
 
 def _open_jpeg_ls(data: bytes, w: int, h: int) -> Array | None:
     """(h, w) codes of a JPEG-LS picture of exactly that size and one component."""
-    if picture_size(data) != (w, h):
+    if image_size(data) != (w, h):
         return None
     try:
         codes = imagecodecs.jpegls_decode(data)

@@ -16,7 +16,7 @@ from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
 
-MOST = 20
+MAX_OFFERED = 20
 """How many scans are offered at once, the newest."""
 
 
@@ -35,7 +35,7 @@ def open_undelivered(scans: Path, but: Path | None = None) -> list[ScanStore]:
     """
     out: list[ScanStore] = []
     for path in sorted(scans.glob("*/scan.db"), key=_changed, reverse=True):
-        if len(out) >= MOST:
+        if len(out) >= MAX_OFFERED:
             break
         if but is not None and path.resolve() == but.resolve():
             continue
