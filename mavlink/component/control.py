@@ -34,47 +34,28 @@ ACCEPTED = Answer()
 class Work:
     """A command that takes a while: the service reports, the link tells the asker.
 
-    Safe between threads.
+    Safe between threads. The service looks at ``cancelled``, set once the asker no longer wants
+    it, and finishes.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._fraction = 0.0
-        self._answer: Answer | None = None
-        self._cancelled = False
+        self.fraction = 0.0  # how much is done, 0 to 1
+        self.answer: Answer | None = None  # how it ended; None while it runs
+        self.cancelled = False
 
     def report(self, fraction: float) -> None:
         """Say how much is done, 0 to 1."""
-        with self._lock:
-            self._fraction = min(1.0, max(0.0, fraction))
+        self.fraction = min(1.0, max(0.0, fraction))
 
     def finish(self, answer: Answer = ACCEPTED) -> None:
         """Say how it ended; the first word stands."""
         with self._lock:
-            self._answer = self._answer or answer
+            self.answer = self.answer or answer
 
     def cancel(self) -> None:
-        """Ask for an early end; the service looks at :attr:`cancelled` and finishes."""
-        with self._lock:
-            self._cancelled = True
-
-    @property
-    def cancelled(self) -> bool:
-        """True once the asker no longer wants it."""
-        with self._lock:
-            return self._cancelled
-
-    @property
-    def fraction(self) -> float:
-        """How much is done, 0 to 1."""
-        with self._lock:
-            return self._fraction
-
-    @property
-    def answer(self) -> Answer | None:
-        """How it ended; None while it runs."""
-        with self._lock:
-            return self._answer
+        """Ask for an early end."""
+        self.cancelled = True
 
 
 Handled = Answer | Work

@@ -43,43 +43,33 @@ class RehearsalControl:
         return self.works.get(name, answer)
 
     def status(self) -> ScanStatus:
-        """The snapshot."""
         return self.state
 
     def start_scan(self) -> Handled:
-        """Scan."""
         return self._ask("start_scan", Phase.SCANNING)
 
     def stop_scan(self) -> Handled:
-        """Be idle."""
         return self._ask("stop_scan", Phase.IDLE)
 
     def capture_keyframe(self) -> Handled:
-        """Take note of it."""
         return self._ask("capture_keyframe")
 
     def pause(self) -> Handled:
-        """Pause."""
         return self._ask("pause", Phase.PAUSED)
 
     def resume(self) -> Handled:
-        """Go on."""
         return self._ask("resume", Phase.SCANNING)
 
     def clear_map(self) -> Handled:
-        """Take note of it."""
         return self._ask("clear_map")
 
     def finalise(self) -> Handled:
-        """Be idle."""
         return self._ask("finalise", Phase.IDLE)
 
     def self_test(self) -> Handled:
-        """Take note of it."""
         return self._ask("self_test")
 
     def erase_scans(self) -> Handled:
-        """Take note of it."""
         return self._ask("erase_scans")
 
     def power(self, action: Power) -> Handled:
