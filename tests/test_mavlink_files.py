@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 
-from mavlink.component.camera import CameraConfig
 from mavlink.component.companion import Companion, CompanionConfig
 from mavlink.component.ftp import (
     ACK,
@@ -300,7 +299,7 @@ def test_a_client_that_sends_the_whole_address_is_served() -> None:
 
 
 def test_the_metadata_describes_every_parameter() -> None:
-    metadata = ComponentMetadata(CameraConfig(), PARAMETERS)
+    metadata = ComponentMetadata(PARAMETERS)
     client = Client(FileServer(metadata.files))
     packet = bytes(metadata.message(1234).pack(dialect.MAVLink(None, 1, 191)))
     payload = packet[10:-2].ljust(108, b"\0")

@@ -12,40 +12,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from mavlink.component.control import ACCEPTED, Answer, Handled, Result, ScanControl, Work
+from mavlink.component.metadata import DEFINITION_URI, MODEL, VENDOR, VERSION
 from mavlink.wire.dialect import dialect
 from mavlink.wire.first_beat import CAMERA
 from mavlink.wire.messages import Address, Outbox, Streams
 
 S = 1_000_000_000
-CAP_VIDEO, CAP_IMAGE, CAP_IMAGE_IN_VIDEO, CAP_VIDEO_IN_IMAGE, CAP_STREAM = 1, 2, 8, 16, 256
+CAPABILITIES = 1 | 2 | 8 | 16  # videos, images, each while the other is taken
 CAPTURE_STATUS = 262
 SHOT_TIMEOUT_NS = 10 * S
+MIN_INTERVAL_S = 0.2  # of a series
 KEPT = 500  # keyframes that can be asked for again
 UNKNOWN_I32 = 0
-
-
-@dataclass(frozen=True, slots=True)
-class CameraConfig:
-    """What the camera says of itself."""
-
-    vendor: str = "skyrelief"
-    model: str = "3D scan"
-    version: tuple[int, int, int] = (0, 1, 0)
-    focal_mm: float = math.nan
-    sensor_mm: tuple[float, float] = (math.nan, math.nan)
-    size_px: tuple[int, int] = (0, 0)
-    gimbal_device: int = 0
-    definition_uri: str = ""
-    definition_version: int = 0
-    stream_uri: str = ""  # of a live picture, when we offer one
-    stream_hz: float = 0.0
-    min_interval_s: float = 0.2
-
-    def __post_init__(self) -> None:
-        if len(self.vendor) > 31 or len(self.model) > 31:
-            raise ValueError("camera vendor and model may have 31 characters at most")
-        if len(self.definition_uri) > 139 or len(self.stream_uri) > 159:
-            raise ValueError("camera definition and stream addresses are too long for MAVLink")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,14 +45,14 @@ class CameraComponent:
 
     def __init__(
         self,
-        config: CameraConfig,
+        definition_version: int,
         control: ScanControl,
         outbox: Outbox,
         streams: Streams,
         boot_ms: Callable[[], int],
         now: Callable[[], int],
     ) -> None:
-        self.config = config
+        self._definition_version = definition_version
         self._control = control
         self._outbox = outbox
         self._streams = streams
@@ -103,7 +81,7 @@ class CameraComponent:
         return True
 
     def shoot(self) -> Handled:
-        """Ask for one keyframe; the picture is reported when it is there."""
+        """Ask for one keyframe; the keyframe is reported when it is there."""
         handled = self._control.capture_keyframe()
         if isinstance(handled, Work) or handled.result is Result.ACCEPTED:
             self._waiting.append(self._now() + SHOT_TIMEOUT_NS)
@@ -129,10 +107,10 @@ class CameraComponent:
         self._count = 0
         self._kept.clear()
 
-    # What the service tells.
+    # What the service reports.
 
     def report(self, keyframe: KeyframeReport) -> int:
-        """Tell everyone of a keyframe; its index comes back."""
+        """Publish a keyframe; its index comes back."""
         index = self._count
         self._count += 1
         boot_ms = self._boot_ms()
@@ -173,8 +151,6 @@ class CameraComponent:
         if number == 263:
             kept = next((kept for kept in self._kept if kept[0] == index), None)
             return None if kept is None else self._image_captured(*kept)
-        if number in (269, 270) and not self.config.stream_uri:
-            return None
         maker = self._MAKERS.get(number)
         return None if maker is None else maker(self)
 
@@ -183,23 +159,17 @@ class CameraComponent:
         self._outbox.put(CAMERA, self._capture_status())
 
     def _information(self) -> object:
-        c = self.config
-        flags = CAP_VIDEO | CAP_IMAGE | CAP_IMAGE_IN_VIDEO | CAP_VIDEO_IN_IMAGE
-        flags |= CAP_STREAM if c.stream_uri else 0
-        major, minor, patch = c.version
+        major, minor, patch = VERSION
         return dialect.MAVLink_camera_information_message(
             self._boot_ms(),
-            list(c.vendor.encode().ljust(32, b"\0")),
-            list(c.model.encode().ljust(32, b"\0")),
+            list(VENDOR.encode().ljust(32, b"\0")),
+            list(MODEL.encode().ljust(32, b"\0")),
             patch << 16 | minor << 8 | major,
-            c.focal_mm,
-            *c.sensor_mm,
-            *c.size_px,
-            0,
-            flags,
-            c.definition_version,
-            c.definition_uri.encode(),
-            c.gimbal_device,
+            *(math.nan,) * 3,  # focal length, sensor width and height
+            *(0,) * 3,  # resolution, lens
+            CAPABILITIES,
+            self._definition_version,
+            DEFINITION_URI.encode(),
         )
 
     def _settings(self) -> object:
@@ -237,16 +207,6 @@ class CameraComponent:
             self._count,
         )
 
-    def _stream_information(self) -> object:
-        c = self.config
-        return dialect.MAVLink_video_stream_information_message(
-            1, 1, 0, 1, c.stream_hz, *c.size_px, 0, 0, 0, b"scan", c.stream_uri.encode()
-        )
-
-    def _stream_status(self) -> object:
-        c = self.config
-        return dialect.MAVLink_video_stream_status_message(1, 1, c.stream_hz, *c.size_px, 0, 0, 0)
-
     def _image_captured(self, index: int, boot_ms: int, k: KeyframeReport) -> object:
         return dialect.MAVLink_camera_image_captured_message(
             boot_ms,
@@ -267,8 +227,6 @@ class CameraComponent:
         260: _settings,
         261: _storage,
         262: _capture_status,
-        269: _stream_information,
-        270: _stream_status,
     }
 
 

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from mavlink.component.camera import MIN_INTERVAL_S
 from mavlink.component.command_desk import Call, Command
 from mavlink.component.control import ACCEPTED, Answer, Handled, Phase, Power, Result
 from mavlink.wire.first_beat import CAMERA, ONBOARD
@@ -141,7 +142,7 @@ def start_capture(call: Call, host: Companion) -> Handled:
         if sequence > 0.0 and not host.camera.is_new_shot(call.source, sequence):
             return ACCEPTED
         return host.camera.shoot()
-    if interval_s < host.camera.config.min_interval_s:
+    if interval_s < MIN_INTERVAL_S:
         return Answer(Result.DENIED, "photo refused: the interval is too short")
     return host.camera.shoot_every(interval_s, int(count))
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from mavlink.component import status as texts
 from mavlink.component.autopilot_link import WANTED_HZ, AutopilotLink
-from mavlink.component.camera import CAPTURE_STATUS, CameraComponent, CameraConfig, KeyframeReport
+from mavlink.component.camera import CAPTURE_STATUS, CameraComponent, KeyframeReport
 from mavlink.component.command_desk import CommandDesk, decode_call
 from mavlink.component.commands import COMMANDS, is_stop
 from mavlink.component.control import Answer, Result, ScanControl
@@ -20,7 +20,8 @@ from mavlink.component.ftp import FileServer
 from mavlink.component.link_watch import LinkWatch, WatchConfig
 from mavlink.component.metadata import (
     DEFINITION,
-    DEFINITION_URI,
+    MODEL,
+    VENDOR,
     ComponentMetadata,
     camera_definition,
     definition_version,
@@ -63,7 +64,6 @@ HEARD = numbers_of((*READERS, *SERVED)) | {COMMAND_CANCEL}
 class CompanionConfig:
     """What the companion asks for and offers."""
 
-    camera: CameraConfig = field(default_factory=CameraConfig)
     parameters: Mapping[str, float] = field(default_factory=dict)  # defaults of this aircraft
     wanted_hz: Mapping[str, float] = field(default_factory=lambda: dict(WANTED_HZ))
     watch: WatchConfig = field(default_factory=WatchConfig)
@@ -105,11 +105,11 @@ class Companion:
         )
         self._extended = ExtendedParameters(self.parameters, self._outbox)
         table = self.parameters.table
-        definition = camera_definition(config.camera.vendor, config.camera.model, table)
-        self._metadata = ComponentMetadata(config.camera, table)
+        definition = camera_definition(VENDOR, MODEL, table)
+        self._metadata = ComponentMetadata(table)
         self._files = FileServer({DEFINITION: definition, **self._metadata.files})
         self.camera = CameraComponent(
-            _with_definition(config.camera, definition_version(table)),
+            definition_version(table),
             control,
             self._outbox,
             self.streams,
@@ -288,10 +288,3 @@ class Companion:
 
     def _boot_ms(self) -> int:
         return ((self._now_ns - self._start_ns) // MS) & 0xFFFFFFFF
-
-
-def _with_definition(camera: CameraConfig, version: int) -> CameraConfig:
-    """The camera with our own definition, unless it names another."""
-    if camera.definition_uri:
-        return camera
-    return replace(camera, definition_uri=DEFINITION_URI, definition_version=version)

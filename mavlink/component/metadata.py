@@ -16,17 +16,19 @@ from collections.abc import Sequence
 from typing import Any
 from xml.sax.saxutils import escape, quoteattr
 
-from mavlink.component.camera import CameraConfig
 from mavlink.component.ftp import file_crc, file_uri
 from mavlink.component.parameters import Parameter
 from mavlink.wire.dialect import dialect
 from mavlink.wire.first_beat import CAMERA, ONBOARD
 
+VENDOR, MODEL, VERSION = "skyrelief", "3D scan", (0, 1, 0)
+DEFINITION = "camera.xml"
+DEFINITION_URI = file_uri(CAMERA, DEFINITION)
 NUMBER, CRC_EXTRA = 397, 182
 URI = 100  # bytes
 GENERAL, PARAMETERS = "general.json.xz", "parameters.json.xz"
 TYPE_PARAMETER = 1  # COMP_METADATA_TYPE
-VERSION = 1  # of both formats; ground stations refuse the parameter schema's newer numbers
+FORMAT = 1  # of both formats; ground stations refuse the parameter schema's newer numbers
 XZ = [{"id": lzma.FILTER_LZMA2, "preset": 9, "dict_size": 1 << 16}]
 
 
@@ -50,16 +52,16 @@ class ComponentMetadataMessage(dialect.MAVLink_message):  # type: ignore[misc]
 class ComponentMetadata:
     """The onboard computer's metadata."""
 
-    def __init__(self, camera: CameraConfig, table: Sequence[Parameter]) -> None:
+    def __init__(self, table: Sequence[Parameter]) -> None:
         parameters = _packed(
-            {"version": VERSION, "parameters": [_parameter(parameter) for parameter in table]}
+            {"version": FORMAT, "parameters": [_parameter(parameter) for parameter in table]}
         )
         general = _packed(
             {
-                "version": VERSION,
-                "vendorName": camera.vendor,
-                "modelName": camera.model,
-                "firmwareVersion": ".".join(map(str, camera.version)),
+                "version": FORMAT,
+                "vendorName": VENDOR,
+                "modelName": MODEL,
+                "firmwareVersion": ".".join(map(str, VERSION)),
                 "metadataTypes": [
                     {
                         "type": TYPE_PARAMETER,
@@ -99,10 +101,6 @@ def _parameter(p: Parameter) -> dict[str, object]:
         named = [{"value": k, "description": name} for k, name in enumerate(p.options)]
         return described | {"decimalPlaces": 0, "increment": 1, "values": named}
     return described | {"decimalPlaces": 2, "increment": p.step}
-
-
-DEFINITION = "camera.xml"
-DEFINITION_URI = file_uri(CAMERA, DEFINITION)
 
 
 def camera_definition(vendor: str, model: str, table: Sequence[Parameter]) -> bytes:
