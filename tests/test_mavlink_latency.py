@@ -129,13 +129,13 @@ def test_pictures_that_do_not_fit_the_flight_say_nothing() -> None:
     assert watch.estimate(attitudes(50.0)) is None
 
 
-def test_turns_agree_with_scipy() -> None:
+def test_turns_are_in_the_axes_at_their_start() -> None:
     rng = np.random.default_rng(3)
     a, b = (Rotation.random(50, random_state=seed) for seed in (1, 2))
-    q = [r.as_quat()[:, [3, 0, 1, 2]] for r in (a, b, a * b, a.inv() * b)]
-    assert np.abs((latency.multiply(q[0], q[1]) * q[2]).sum(axis=1)) == pytest.approx(1.0)
-    vectors = latency.rotation_vectors(latency.multiply(latency.conjugate(q[0]), q[1]))
-    assert vectors == pytest.approx((a.inv() * b).as_rotvec(), abs=1e-9)
+    q = [r.as_quat()[:, [3, 0, 1, 2]] for r in (a, b)]
+    assert latency.rotation_vectors(q[0], q[1]) == pytest.approx(
+        (a.inv() * b).as_rotvec(), abs=1e-9
+    )
     source = rng.normal(size=(40, 3))
     found = latency.best_rotation(source, a[0].apply(source))
     assert found == pytest.approx(a[0].as_matrix(), abs=1e-9)

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
-from mavlink.telemetry.quaternion import Quaternion, normalised
-from mavlink.telemetry.quaternion import multiply as product
+from mavlink.telemetry.quaternion import Quaternion, multiply, normalised
 
 LEAST_WINDOWS = 50  # that do not overlap
 LEAST_CORRELATION = 0.7
@@ -86,7 +86,7 @@ class LatencyWatch:
         if not self._frames or self._frames[-1][1] != first_ns:
             self._run += 1
             self._frames.append((self._run, first_ns, (1.0, 0.0, 0.0, 0.0)))
-        turned = product(self._frames[-1][2], step)
+        turned = multiply(self._frames[-1][2], step)
         self._frames.append((self._run, second_ns, normalised(turned) or turned))
 
     def estimate(self, attitudes: Sequence[tuple[int, Quaternion]]) -> LatencyEstimate | None:
@@ -127,7 +127,7 @@ class LatencyWatch:
         stride = max(1, int(np.median(j - i)) // 4) if len(i) else 1
         i, j = i[::stride], j[::stride]
         span = (time_s[j] - time_s[i])[:, None]
-        rate = rotation_vectors(multiply(conjugate(q[i]), q[j])) / span
+        rate = rotation_vectors(q[i], q[j]) / span
         overlap = int(np.ceil(np.median((j - i) / stride))) if len(i) else 1
         return _Turns(time_s[i], time_s[j], rate, overlap)
 
@@ -263,7 +263,7 @@ class Attitudes:
         """
         first, ok_first = self._at(start_s)
         second, ok_second = self._at(end_s)
-        return rotation_vectors(multiply(conjugate(first), second)), ok_first & ok_second
+        return rotation_vectors(first, second), ok_first & ok_second
 
     def _at(self, time_s: F64) -> tuple[F64, Bool]:
         """(N, 4) attitudes at instants, and where samples are near enough."""
@@ -288,26 +288,10 @@ def _between(times_s: F64, q: F64, at_s: F64) -> tuple[F64, Bool]:
     return mixed, (u > -1e-9) & (u < 1.0 + 1e-9) & (gap < LONGEST_GAP_S)
 
 
-def conjugate(q: F64) -> F64:
-    """(N, 4) the opposite rotations."""
-    return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
-
-
-def multiply(a: F64, b: F64) -> F64:
-    """(N, 4) rotations: b first, then a."""
-    w, v = a[:, :1], a[:, 1:]
-    p, r = b[:, :1], b[:, 1:]
-    scalar = w * p - np.einsum("ij,ij->i", v, r)[:, None]
-    return np.concatenate([scalar, w * r + p * v + np.cross(v, r)], axis=1)
-
-
-def rotation_vectors(q: F64) -> F64:
-    """(N, 3) axis times angle in rad, the shorter way round."""
-    q = np.where(q[:, :1] < 0.0, -q, q)
-    length = np.linalg.norm(q[:, 1:], axis=1)
-    angle = 2.0 * np.arctan2(length, q[:, 0])
-    scale = np.where(length > 1e-12, angle / np.maximum(length, 1e-12), 2.0)
-    return np.asarray(q[:, 1:] * scale[:, None])
+def rotation_vectors(first: F64, second: F64) -> F64:
+    """(N, 3) turns in rad from the first to the second (N, 4) attitudes, in the first's axes."""
+    a, b = (Rotation.from_quat(q[:, [1, 2, 3, 0]]) for q in (first, second))
+    return np.asarray((a.inv() * b).as_rotvec())
 
 
 def best_rotation(source: F64, target: F64) -> F64:
