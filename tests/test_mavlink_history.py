@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from mavlink.telemetry import quaternion
 from mavlink.telemetry.frame_watch import FrameWatch, judge_frame
 from mavlink.telemetry.gimbal import GimbalConfig, frame_of_flags, steadiest_frame, to_earth
-from mavlink.telemetry.history import M_PER_DEG, HistoryConfig, LiveHistory, VehicleHistory
+from mavlink.telemetry.history import M_PER_DEG, HistoryConfig, VehicleHistory
 from mavlink.telemetry.quaternion import Quaternion
 from mavlink.telemetry.samples import (
     F64,
@@ -421,7 +421,7 @@ def test_the_pictures_decide_between_frames() -> None:
     assert verdict.frame in (GimbalFrame.BODY, GimbalFrame.SERVO)
     assert set(verdict.refuted) == {GimbalFrame.EARTH, GimbalFrame.VEHICLE}
     assert verdict.rms_rad < 0.006
-    history.trust_pictures(GimbalFrame.EARTH)
+    history.trust_images(GimbalFrame.EARTH)
     assert history.gimbal_frame() is GimbalFrame.EARTH
     history.set_gimbal(GimbalConfig(yaw_frame="servo"))
     assert history.gimbal_frame() is GimbalFrame.SERVO  # the configuration stands
@@ -437,7 +437,7 @@ def test_judging_needs_matching_lists() -> None:
 
 
 def test_a_live_history_waits_for_the_far_side_of_a_frame() -> None:
-    history = LiveHistory(patience_s=5.0)
+    history = VehicleHistory(patience_s=5.0)
     now = time.monotonic_ns()
     for k in range(10):
         history.add(AttitudeSample(None, quaternion.IDENTITY), now - (600 - 50 * k) * MS)
@@ -453,11 +453,11 @@ def test_a_live_history_waits_for_the_far_side_of_a_frame() -> None:
 
 
 def test_a_live_history_does_not_wait_in_vain() -> None:
-    impatient = LiveHistory(patience_s=0.01)
+    impatient = VehicleHistory(patience_s=0.01)
     now = time.monotonic_ns()
     impatient.add(AttitudeSample(None, quaternion.IDENTITY), now - 100 * MS)
     assert impatient.state_at(now - 20 * MS) is None  # nothing comes
-    history = LiveHistory(patience_s=1000.0)  # would stand still for ever if it waited
+    history = VehicleHistory(patience_s=1000.0)  # would stand still for ever if it waited
     history.add(AttitudeSample(None, quaternion.IDENTITY), now)
     assert history.state_at(now) is not None  # there already
     assert history.state_at(now + 2000 * S) is None  # far ahead

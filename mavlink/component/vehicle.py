@@ -29,7 +29,7 @@ from mavlink.component.presence import Health, Presence, PresenceConfig
 from mavlink.component.status import ComputerLoad, Odometry, odometry_message
 from mavlink.telemetry.clock import computer_offset_ns
 from mavlink.telemetry.decode import READERS
-from mavlink.telemetry.history import HistoryConfig, LiveHistory
+from mavlink.telemetry.history import PATIENCE_S, HistoryConfig, VehicleHistory
 from mavlink.wire.dialect import dialect, numbers_of
 from mavlink.wire.first_beat import FirstBeats
 from mavlink.wire.framing import Packet
@@ -92,7 +92,7 @@ class VehicleLink:
         self.config = config
         links = None if first is None else first.hand_over()
         now_ns = time.monotonic_ns()
-        self.history = LiveHistory(config.history)
+        self.history = VehicleHistory(config.history, PATIENCE_S)
         self.recorder = Recorder()
         self._memory = Memory(config.state_dir)
         self._signing = self._make_signing()

@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,7 @@ GIMBAL_DEVICES = (154, 171, 172, 173, 174, 175)
 JUDGE_EVERY_NS = 10_000_000_000  # between two looks at what a gimbal's quaternion refers to
 JUDGE_LAG_NS = 3_000_000_000
 JUDGED_SAMPLES = 600
+PATIENCE_S = 0.3  # live: a little more than the 3.5 Hz of a slow telemetry radio
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +59,19 @@ class HistoryConfig:
 
 
 class VehicleHistory:
-    """Samples of one vehicle by time; safe for one writer and several readers."""
+    """Samples of one vehicle by time; safe for one writer and several readers.
 
-    def __init__(self, config: HistoryConfig | None = None) -> None:
+    Live, on the monotonic clock, a frame is here before the attitude that was sampled after it,
+    and nothing is extrapolated by more than 20 ms. So :meth:`state_at` waits for up to
+    ``patience_s`` until the samples on the far side have come.
+    """
+
+    def __init__(self, config: HistoryConfig | None = None, patience_s: float = 0.0) -> None:
         self.config = config or HistoryConfig()
+        self._patience_s = patience_s
         self._lock = threading.Lock()
+        self._news = threading.Condition()
+        self._waiting = 0  # readers
         self._attitude = Track()  # w x y z
         self._position = Track()  # lat lon alt relative vn ve vd, NaN where unknown
         self._accuracy = Track()  # has_fix sigma_h sigma_v alt, NaN where unknown
@@ -69,7 +79,7 @@ class VehicleHistory:
         self._terrain = Track()  # agl sigma
         self._gimbals: dict[tuple[int, int], Track] = {}  # (rank, component): w x y z frame
         self._judged: dict[tuple[int, int], tuple[int, GimbalFrame | None]] = {}  # when
-        self._seen: GimbalFrame | None = None  # by the pictures
+        self._seen: GimbalFrame | None = None  # by the images
 
     @property
     def first_ns(self) -> int | None:
@@ -101,11 +111,11 @@ class VehicleHistory:
             body = self._attitude.around(time_ns)
             if body is None:
                 return None
-            q_body = slerp(_quaternion(body.before), _quaternion(body.after), body.fraction)
+            q_body = _slerp(body)
             for key in self._gimbal_order():
                 at = self._gimbals[key].around(time_ns)
                 if at is not None:
-                    sent = slerp(_quaternion(at.before), _quaternion(at.after), at.fraction)
+                    sent = _slerp(at)
                     return sent, q_body
         return None
 
@@ -119,7 +129,7 @@ class VehicleHistory:
             tracks = self._gimbals.values()
             times = {t for track in tracks for t, _ in track.items() if t >= since_ns}
             bodies = [(t, _quaternion(r)) for t, r in self._attitude.items() if t >= since_ns]
-        states = [(t, VehicleHistory.state_at(self, t)) for t in sorted(times)]
+        states = [(t, self._state_at(t)) for t in sorted(times)]
         found = [
             (t, _quaternion(tuple(map(float, s.q_ned_gimbal_wxyz))))
             for t, s in states
@@ -137,6 +147,9 @@ class VehicleHistory:
             track.add(time_ns, row)
             if math.isfinite(self.config.keep_s):
                 track.forget_before(time_ns - int(self.config.keep_s * 1e9))
+        if self._waiting:
+            with self._news:
+                self._news.notify_all()
 
     def set_gimbal(self, gimbal: GimbalConfig) -> None:
         """Read gimbal messages in another way from now on, those already kept as well."""
@@ -152,8 +165,8 @@ class VehicleHistory:
                     return self._frame(key, FRAMES[int(row[4])])
         return None
 
-    def trust_pictures(self, frame: GimbalFrame) -> None:
-        """Read the gimbal as the pictures say from now on, unless the configuration says how."""
+    def trust_images(self, frame: GimbalFrame) -> None:
+        """Read the gimbal as the images say from now on, unless the configuration says how."""
         with self._lock:
             self._seen = frame
 
@@ -197,42 +210,62 @@ class VehicleHistory:
         second apart is left out. The height above ground comes from the first of rangefinder,
         terrain, height above home.
         """
+        if self._patience_s:
+            self._await(time_ns)
+        return self._state_at(time_ns)
+
+    def _await(self, time_ns: int) -> None:
+        """Wait until every stream that flows has come past ``time_ns``, or patience is over."""
+        now_s = time.monotonic()
+        end_s = now_s + self._patience_s
+        if time_ns * 1e-9 >= end_s:
+            return  # what lies further ahead cannot come in time
+        with self._news:
+            self._waiting += 1  # before looking, so that nothing new goes unnoticed
+            while not self.covers(time_ns) and now_s < end_s:
+                self._news.wait(end_s - now_s)
+                now_s = time.monotonic()
+            self._waiting -= 1
+
+    def _state_at(self, time_ns: int) -> VehicleState | None:
         with self._lock:
             state = _Assembly(time_ns)
             attitude = self._attitude.around(time_ns)
-            q_body = self._tell_attitude(state, attitude)
-            self._tell_gimbal(state, q_body)
-            relative = self._tell_position(state)
-            self._tell_agl(state, q_body, relative)
+            q_body = self._add_attitude(state, attitude)
+            self._add_gimbal(state, q_body)
+            relative = self._add_position(state)
+            self._add_agl(state, q_body, relative)
         return state.finish()
 
-    def _tell_attitude(self, state: _Assembly, at: Bracket | None) -> Quaternion | None:
+    def _add_attitude(self, state: _Assembly, at: Bracket | None) -> Quaternion | None:
         if at is None:
             return None
-        q = slerp(_quaternion(at.before), _quaternion(at.after), at.fraction)
+        q = _slerp(at)
         bend = self.config.angular_acceleration_rad_s2 * at.curvature_s2
-        state.set("attitude", at.age_ms)
-        state.fields["q_ned_body_wxyz"] = np.array(q)
-        state.fields["sigma_attitude_rad"] = math.hypot(self.config.sigma_tilt_rad, bend)
-        state.fields["sigma_yaw_rad"] = math.hypot(self.config.sigma_yaw_rad, bend)
+        state.set(
+            "attitude",
+            at.age_ms,
+            q_ned_body_wxyz=np.array(q),
+            sigma_attitude_rad=math.hypot(self.config.sigma_tilt_rad, bend),
+            sigma_yaw_rad=math.hypot(self.config.sigma_yaw_rad, bend),
+        )
         return q
 
-    def _tell_gimbal(self, state: _Assembly, q_body: Quaternion | None) -> None:
+    def _add_gimbal(self, state: _Assembly, q_body: Quaternion | None) -> None:
         for key in self._gimbal_order():
             at = self._gimbals[key].around(state.time_ns)
             q = None if at is None else self._gimbal_at(key, at, q_body)
             if at is None or q is None:
                 continue
             bend = self.config.angular_acceleration_rad_s2 * at.curvature_s2
-            state.set("gimbal", at.age_ms)
-            state.fields["q_ned_gimbal_wxyz"] = np.array(q)
-            state.fields["sigma_gimbal_rad"] = math.hypot(self.config.sigma_gimbal_rad, bend)
+            sigma = math.hypot(self.config.sigma_gimbal_rad, bend)
+            state.set("gimbal", at.age_ms, q_ned_gimbal_wxyz=np.array(q), sigma_gimbal_rad=sigma)
             return
         mount = self.config.gimbal.mount
         if mount is not None and q_body is not None:
-            state.set("mount", state.ages["attitude"])
-            state.fields["q_ned_gimbal_wxyz"] = np.array(multiply(q_body, mount))
-            state.fields["sigma_gimbal_rad"] = state.fields["sigma_attitude_rad"]
+            head, sigma = np.array(multiply(q_body, mount)), state.fields["sigma_attitude_rad"]
+            age_ms = state.ages["attitude"]
+            state.set("mount", age_ms, q_ned_gimbal_wxyz=head, sigma_gimbal_rad=sigma)
 
     def _gimbal_at(
         self, key: tuple[int, int], at: Bracket, q_body: Quaternion | None
@@ -245,7 +278,7 @@ class VehicleHistory:
         ends = self._attitude.around(at.before_ns), self._attitude.around(at.after_ns)
         if ends[0] is None or ends[1] is None or q_body is None:
             return None
-        bodies = [slerp(_quaternion(e.before), _quaternion(e.after), e.fraction) for e in ends if e]
+        bodies = [_slerp(e) for e in ends if e]
         earth = [to_earth(q, frame, body) for q, body in zip(sent, bodies, strict=True)]
         if _apart(*sent) < _apart(*earth):
             return to_earth(slerp(*sent, at.fraction), frame, q_body)
@@ -254,7 +287,7 @@ class VehicleHistory:
     def _frame(self, key: tuple[int, int], claimed: GimbalFrame) -> GimbalFrame:
         """What the quaternion refers to.
 
-        By configuration, else by the pictures, else as claimed unless it cannot be.
+        By configuration, else by the images, else as claimed unless it cannot be.
         """
         chosen = self.config.gimbal.yaw_frame
         if chosen != "auto":
@@ -281,13 +314,13 @@ class VehicleHistory:
             at = self._attitude.around(time_ns)
             if at is not None:
                 sent.append(_quaternion(row))
-                bodies.append(slerp(_quaternion(at.before), _quaternion(at.after), at.fraction))
+                bodies.append(_slerp(at))
         if len(samples) < 2:
             return None
         spacing_ns = (samples[-1][0] - samples[0][0]) / (len(samples) - 1)
         return steadiest_frame(sent, bodies, max(1, round(JUDGE_LAG_NS / spacing_ns)))
 
-    def _tell_position(self, state: _Assembly) -> Bracket | None:
+    def _add_position(self, state: _Assembly) -> Bracket | None:
         at = self._position.around(state.time_ns)
         if at is None:
             return None
@@ -300,16 +333,20 @@ class VehicleHistory:
             sigma_h, sigma_v = nearest[1], nearest[2]
         bend = self.config.acceleration_m_s2 * at.curvature_s2
         lat, lon, alt, velocity = _position_at(at)
-        state.set("gnss", at.age_ms)
-        state.fields.update(lat_deg=lat, lon_deg=lon, v_ned_m_s=velocity)
-        state.fields["sigma_h_m"] = math.hypot(sigma_h, bend)
+        state.set(
+            "gnss",
+            at.age_ms,
+            lat_deg=lat,
+            lon_deg=lon,
+            v_ned_m_s=velocity,
+            sigma_h_m=math.hypot(sigma_h, bend),
+            receiver=_receiver_above(accuracy, self._position),
+        )
         if math.isfinite(alt):
-            state.fields["alt_amsl_m"] = alt
-            state.fields["sigma_v_m"] = math.hypot(sigma_v, bend)
-        state.fields["receiver"] = receiver_above(accuracy, self._position)
+            state.fields.update(alt_amsl_m=alt, sigma_v_m=math.hypot(sigma_v, bend))
         return at
 
-    def _tell_agl(
+    def _add_agl(
         self, state: _Assembly, q_body: Quaternion | None, position: Bracket | None
     ) -> None:
         at = self._range.around(state.time_ns)
@@ -333,31 +370,29 @@ class _Assembly:
     def __init__(self, time_ns: int) -> None:
         self.time_ns = time_ns
         self.ages: dict[str, float] = {}
-        self.fields: dict[str, object] = {}
+        self.fields: dict[str, Any] = {}
 
-    def set(self, source: str, age_ms: float) -> None:
+    def set(self, source: str, age_ms: float, **fields: object) -> None:
         self.ages[source] = age_ms
+        self.fields.update(fields)
 
     def set_agl(self, source: str, age_ms: float, agl_m: float, sigma_m: float) -> None:
-        self.set(source, age_ms)
-        self.fields["alt_agl_m"] = agl_m
         # The ground and the climb between samples: a metre per second.
-        self.fields["sigma_agl_m"] = math.hypot(sigma_m, age_ms * 1e-3)
+        self.set(source, age_ms, alt_agl_m=agl_m, sigma_agl_m=math.hypot(sigma_m, age_ms * 1e-3))
 
     def finish(self) -> VehicleState | None:
         if not self.ages:
             return None
-        parts: dict[str, object] = dict(self.fields)
-        return VehicleState(
-            self.time_ns,
-            age_ms=self.ages,
-            sources=tuple(self.ages),
-            **parts,  # type: ignore[arg-type]
-        )
+        ages = self.ages
+        return VehicleState(self.time_ns, age_ms=ages, sources=tuple(ages), **self.fields)
 
 
 def _quaternion(row: Row) -> Quaternion:
     return (row[0], row[1], row[2], row[3])
+
+
+def _slerp(at: Bracket) -> Quaternion:
+    return slerp(_quaternion(at.before), _quaternion(at.after), at.fraction)
 
 
 def _apart(a: Quaternion, b: Quaternion) -> float:
@@ -399,53 +434,12 @@ def _hermite(step: float, m0: float, m1: float, u: float) -> float:
     return h10 * m0 + h01 * step + h11 * m1
 
 
-PATIENCE_S = 0.3  # a little more than the 3.5 Hz of a slow telemetry radio
-
-
-class LiveHistory(VehicleHistory):
-    """A VehicleHistory on the monotonic clock; ``state_at`` may wait for ``patience_s``."""
-
-    def __init__(self, config: HistoryConfig | None = None, patience_s: float = PATIENCE_S) -> None:
-        super().__init__(config)
-        self.patience_s = patience_s
-        self._news = threading.Condition()
-        self._waiting = 0  # readers
-
-    def add(self, sample: Sample, time_ns: int) -> None:
-        """Put a sample in at its time and wake whoever waits for it."""
-        super().add(sample, time_ns)
-        if self._waiting:
-            with self._news:
-                self._news.notify_all()
-
-    def state_at(self, time_ns: int) -> VehicleState | None:
-        """The state at ``time_ns``, as soon as every stream that flows has come past it."""
-        now_s = time.monotonic()
-        end_s = now_s + self.patience_s
-        if time_ns * 1e-9 < end_s:  # what lies further ahead cannot come in time
-            with self._news:
-                self._waiting += 1  # before looking, so that nothing new goes unnoticed
-                while not self.covers(time_ns) and now_s < end_s:
-                    self._news.wait(end_s - now_s)
-                    now_s = time.monotonic()
-                self._waiting -= 1
-        return super().state_at(time_ns)
-
-
-ALTITUDE = 3
-"""Column of the receiver's samples."""
-
-EKF_ALTITUDE = 2
-"""Column of the autopilot's positions."""
-
-
-def receiver_above(accuracy: Bracket | None, positions: Track) -> ReceiverAltitude | None:
+def _receiver_above(accuracy: Bracket | None, positions: Track) -> ReceiverAltitude | None:
     """The fix nearest in time against the autopilot's altitude then; None without either."""
     if accuracy is None:
         return None
     at = positions.around(accuracy.nearer_ns)
     if at is None:
         return None
-    before, after = at.before[EKF_ALTITUDE], at.after[EKF_ALTITUDE]
-    above = accuracy.nearer[ALTITUDE] - (before + (after - before) * at.fraction)
+    above = accuracy.nearer[3] - _mix(at, 2)
     return ReceiverAltitude(accuracy.nearer_ns, above) if math.isfinite(above) else None

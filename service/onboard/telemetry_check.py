@@ -139,7 +139,7 @@ class TelemetryCheck:
             return
         seen = f"Gimbal angles refer to {_WORDS[verdict.frame]} by the pictures"
         if history.config.gimbal.yaw_frame == "auto":
-            history.trust_pictures(verdict.frame)
+            history.trust_images(verdict.frame)
             self._once("frame", f"{seen}: applied")
         else:
             self._once("frame", f"{seen}; {used.value} is set" if used else seen)
