@@ -18,9 +18,8 @@ from mavlink.component.control import Answer, Result
 from mavlink.component.parameters import Parameter
 from mavlink.component.presence import Health, Presence, PresenceConfig
 from mavlink.component.rehearsal import RehearsalControl
-from mavlink.telemetry.clock import BootClock, BootCounter, fit_boot
+from mavlink.telemetry.clock import BootClock, BootCounter, TimesyncFilter, fit_boot
 from mavlink.telemetry.history import VehicleHistory
-from mavlink.telemetry.timesync import TimesyncFilter
 from mavlink.wire.dialect import CRC_EXTRA, dialect, x25crc
 from mavlink.wire.framing import Framer
 from mavlink.wire.messages import Address, Outgoing, Packer

@@ -14,11 +14,10 @@ from typing import Any
 
 from mavlink.component import status as texts
 from mavlink.component.presence import Presence
-from mavlink.telemetry.clock import BootClock, WallTime
+from mavlink.telemetry.clock import EVERYONE, BootClock, TimesyncFilter, WallTime
 from mavlink.telemetry.decode import READERS, decode
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import OF_AUTOPILOT
-from mavlink.telemetry.timesync import EVERYONE, TimesyncFilter
 from mavlink.wire.dialect import dialect
 from mavlink.wire.first_beat import ONBOARD
 from mavlink.wire.framing import Packet
