@@ -324,6 +324,62 @@ def test_a_scan_without_a_place_gets_it_from_three_points(tmp_path: Path) -> Non
     assert json.loads((flight.scan / "scan.json").read_text())["origin"] is None
 
 
+def flat_errors(flight: Flight) -> F64:
+    """(N,) horizontal distances of the keyframes to the truth."""
+    with ScanStore.open(flight.scan / "scan.db") as store:
+        own = store.header
+        assert own.origin_lat_deg is not None and own.origin_lon_deg is not None
+        frame = LocalFrame(own.origin_lat_deg, own.origin_lon_deg, own.origin_alt_amsl_m or 0.0)
+        out = []
+        for k, T in enumerate(flight.truth):
+            found = store.keyframe(10 * k)
+            assert found is not None
+            place = frame.to_geodetic(found.depth.T_world_camera[None, :3, 3])
+            place[0, 2] = FRAME.alt_amsl_m
+            out.append(np.linalg.norm((FRAME.to_enu(place)[0] - T[:3, 3])[:2]))
+    return np.array(out)
+
+
+@pytest.mark.parametrize("placed", [True, False])
+def test_points_without_heights_place_a_scan_horizontally(tmp_path: Path, placed: bool) -> None:
+    flight = fly(tmp_path, placed)
+    rows = flight.survey(SPOTS, alt_amsl_m="")
+    figures = refine(flight.scan, RefineOptions(write_csv(flight.folder / "flat.csv", rows)))
+    assert flat_errors(flight).max() < 0.3
+    assert figures["check"]["rms_h_after_m"] < 0.1 and figures["check"]["rms_v_after_m"] is None
+    assert all(p["after_m"][2] is None for p in figures["points"])
+    assert any("no control point has a height" in note for note in figures["notes"]) != placed
+    assert "vertically" not in json.loads((flight.scan / "scan.json").read_text())["notes"][-1]
+
+
+def test_one_column_less_is_no_fault_and_points_with_heights_still_lift(flight: Flight) -> None:
+    rows = [
+        {k: v for k, v in row.items() if k != "sigma_v_m"} | ({"alt_amsl_m": ""} if flat else {})
+        for row in flight.survey(SPOTS)
+        for flat in [row["name"] in "AB"]
+    ]
+    figures = refine(flight.scan, RefineOptions(write_csv(flight.folder / "some.csv", rows)))
+    assert [p["refused"] for p in figures["points"]] == [None] * len(SPOTS)
+    assert errors(flight).max() < 0.2
+    bare = [{k: v for k, v in row.items() if k != "alt_amsl_m"} for row in rows]
+    undo(flight.scan)
+    refine(flight.scan, RefineOptions(write_csv(flight.folder / "bare.csv", bare)))
+    assert flat_errors(flight).max() < 0.3
+
+
+def test_a_map_of_another_shape_is_not_called_a_line(tmp_path: Path) -> None:
+    flight = fly(tmp_path, placed=False)
+    rows = flight.survey({name: SPOTS[name] for name in "ABDE"})
+    rng = np.random.default_rng(4)
+    moved = {name: rng.normal(0, 3e-4, 2) for name in "ABDE"}  # tens of metres
+    rows = [
+        r | {"lat": r["lat"] + moved[r["name"]][0], "lon": r["lon"] + moved[r["name"]][1]}
+        for r in rows
+    ]
+    with pytest.raises(InputError, match="no three control points have the same distances"):
+        refine(flight.scan, RefineOptions(write_csv(flight.folder / "bent.csv", rows)))
+
+
 @pytest.mark.parametrize(
     ("change", "why"),
     [
@@ -463,7 +519,7 @@ GOOD = "name,keyframe_seq,u_px,v_px,lat,lon,alt_amsl_m\n"
         ("name,lat,lon,alt_amsl_m,height\n", "unknown column 'height'"),
         ("name,lat,lon,alt_amsl_m\n", "neither u_px,v_px nor x,y,z"),
         (GOOD, "no points"),
-        (GOOD + "A,0,10,10,47.39,8.54\n", "line 2: alt_amsl_m is empty"),
+        (GOOD + "A,0,10,10,47.39,,408\n", "line 2: lon is empty"),
         (GOOD + "A,0,10,10,47,39,8.54,408\n", "decimals take a point"),
         (GOOD + "A,0,10,ten,47.39,8.54,408\n", "v_px is 'ten', not a number"),
         (GOOD + "A,0,10,10,97.39,8.54,408\n", "not on the globe"),

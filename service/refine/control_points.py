@@ -13,6 +13,7 @@ import numpy as np
 from recon import se3
 from recon.camera_model import project
 from recon.graph.ground_control import Mark, consenting, map_position, placed_by_points
+from recon.graph.track_alignment import umeyama
 from recon.types import F64, Keyframe
 from service.errors import InputError
 from service.georeference import LocalFrame
@@ -35,6 +36,9 @@ MAX_VIEWS = 6
 MAX_TRIPLES = 400
 
 
+UNKNOWN_HEIGHT_M = 1e4
+"""Sigma of the height of a point that was surveyed horizontally only."""
+
 MIN_SPAN = 0.5
 """Of the track's length, that control points should span."""
 
@@ -56,10 +60,28 @@ class Candidate:
         return not self.why_not
 
     @property
+    def has_height(self) -> bool:
+        """False for a point that was surveyed horizontally only."""
+        return self.point.alt_amsl_m is not None
+
+    @property
     def sigma_m(self) -> F64:
         """(3,) of the survey."""
         p = self.point
-        return np.array([p.sigma_h_m, p.sigma_h_m, p.sigma_v_m])
+        sigma_v_m = p.sigma_v_m if self.has_height else UNKNOWN_HEIGHT_M
+        return np.array([p.sigma_h_m, p.sigma_h_m, sigma_v_m])
+
+    def tolerance_m(self, sigma_mapped_m: float) -> float:
+        """Sigma of a difference between survey and map along what was surveyed."""
+        p = self.point
+        largest = max(p.sigma_h_m, p.sigma_v_m) if self.has_height else p.sigma_h_m
+        return float(np.hypot(largest, sigma_mapped_m))
+
+    def off_m(self, place_m: F64) -> F64:
+        """(3,) from the surveyed place to ``place_m``; 0 along a height that is not known."""
+        assert self.surveyed_m is not None
+        off: F64 = place_m - self.surveyed_m
+        return off if self.has_height else off * (1.0, 1.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,8 +222,10 @@ def screen(candidates: Sequence[Candidate], frame: LocalFrame) -> None:
     """Note against each point what speaks against it: far off, or against all the others."""
     for one in candidates:
         p = one.point
-        place = np.array([[p.lat_deg, p.lon_deg, p.alt_amsl_m]])
+        place = np.array([[p.lat_deg, p.lon_deg, p.alt_amsl_m or frame.alt_amsl_m]])
         one.surveyed_m = frame.to_enu(place)[0]
+    _lift(candidates)
+    for one in candidates:
         if one.usable and one.before_m is not None:
             one.why_not = _far(one, frame)
     voters = [c for c in candidates if c.usable and not c.point.is_check]
@@ -209,7 +233,7 @@ def screen(candidates: Sequence[Candidate], frame: LocalFrame) -> None:
         return
     surveyed = np.array([c.surveyed_m for c in voters])
     mapped = np.array([c.before_m for c in voters])
-    sigma = np.array([np.hypot(c.sigma_m.max(), c.sigma_before_m) for c in voters])
+    sigma = np.array([c.tolerance_m(c.sigma_before_m) for c in voters])
     agree = consenting(surveyed, mapped, sigma)
     usual = np.median((surveyed - mapped)[agree], axis=0)
     if len(voters) == 2 and not agree.all():
@@ -232,6 +256,19 @@ def screen(candidates: Sequence[Candidate], frame: LocalFrame) -> None:
         )
 
 
+def _lift(candidates: Sequence[Candidate]) -> None:
+    """Give points without a surveyed height the map's, shifted as the other points' heights are."""
+    steps = [
+        c.surveyed_m[2] - c.before_m[2]
+        for c in candidates
+        if c.has_height and c.surveyed_m is not None and c.before_m is not None
+    ]
+    step = float(np.median(steps)) if steps else 0.0
+    for one in candidates:
+        if not one.has_height and one.surveyed_m is not None and one.before_m is not None:
+            one.surveyed_m[2] = one.before_m[2] + step
+
+
 def _odd_one(voters: Sequence[Candidate]) -> tuple[Candidate, F64] | None:
     """The point that lies farthest from where a similarity of all others puts it, and its offset.
 
@@ -250,7 +287,7 @@ def _odd_one(voters: Sequence[Candidate]) -> tuple[Candidate, F64] | None:
             return None
         off = surveyed[k] - (found[0] * found[1] @ mapped[k] + found[2])
         away = float(np.linalg.norm(mapped[k] - mapped[others].mean(axis=0)))
-        sigma = float(np.hypot(one.sigma_m.max(), one.sigma_before_m))
+        sigma = one.tolerance_m(one.sigma_before_m)
         ratio = float(np.linalg.norm(off)) / (4.0 * sigma + 0.01 * away + 0.2)
         if ratio > by:
             worst, by = (one, off), ratio
@@ -292,7 +329,7 @@ def _far(one: Candidate, frame: LocalFrame) -> str:
         ):
             if abs(lat) > 90.0:
                 continue
-            there = frame.to_enu(np.array([[lat, lon, p.alt_amsl_m]]))[0]
+            there = frame.to_enu(np.array([[lat, lon, p.alt_amsl_m or frame.alt_amsl_m]]))[0]
             if np.linalg.norm((there - one.before_m)[:2]) < 20.0 * FAR_M:
                 return f"{_metres(flat)} from its place in the map: {hint}"
         return f"{_metres(flat)} from its place in the map: wrong point, zone or sign"
@@ -313,8 +350,9 @@ def place_by_survey(
 ) -> tuple[LocalFrame, float, F64, F64]:
     """Origin, scale, rotation and shift for a scan without a place, from three points or more.
 
-    Points that the largest agreeing set contradicts are noted. Raises InputError when there
-    are too few, or they lie in a line.
+    Points that the largest agreeing set contradicts are noted. Where a height is not known the
+    map's vertical and its zero of heights hold. Raises InputError when there are too few, they
+    lie in a line, or no three agree with the map.
     """
     voters = [c for c in candidates if c.usable and not c.point.is_check]
     if len(voters) < 3:
@@ -322,26 +360,47 @@ def place_by_survey(
             f"the scan has no georeference and only {len(voters)} usable control points; three "
             "that are not in a line can place it"
         )
+    heights = [c.point.alt_amsl_m for c in voters if c.point.alt_amsl_m is not None]
     first = voters[0].point
-    frame = LocalFrame(first.lat_deg, first.lon_deg, first.alt_amsl_m)
-    geodetic = [(c.point.lat_deg, c.point.lon_deg, c.point.alt_amsl_m) for c in voters]
+    frame = LocalFrame(first.lat_deg, first.lon_deg, heights[0] if heights else 0.0)
+    level = len(heights) < len(voters)
+    geodetic = [(c.point.lat_deg, c.point.lon_deg, c.point.alt_amsl_m or 0.0) for c in voters]
     surveyed = frame.to_enu(np.array(geodetic))
     mapped = np.array([c.before_m for c in voters])
-    best = None
-    most = np.zeros(len(voters), np.bool_)
+    best, most = None, np.zeros(len(voters), np.bool_)
     for triple in list(combinations(range(len(voters)), 3))[:MAX_TRIPLES]:
-        found = placed_by_points(mapped[list(triple)], surveyed[list(triple)])
+        found = _placed(mapped[list(triple)], surveyed[list(triple)], level)
         if found is None or not 1e-3 < found[0] < 1e3:
             continue
-        off = np.linalg.norm(found[0] * mapped @ found[1].T + found[2] - surveyed, axis=1)
-        fits = off < 0.02 * np.ptp(surveyed, axis=0).max() + 0.3
+        off = found[0] * mapped @ found[1].T + found[2] - surveyed
+        away = np.linalg.norm(off[:, :2] if level else off, axis=1)
+        fits = away < 0.02 * np.ptp(surveyed[:, :2], axis=0).max() + 0.3
         if best is None or fits.sum() > most.sum():
             best, most = found, fits
-    if best is not None:
-        best = placed_by_points(mapped[most], surveyed[most])
     if best is None:
-        raise InputError("the control points lie in a line; one beside it is needed")
+        raise InputError("the control points lie in a line; one off that line is needed")
+    if most.sum() >= 3:
+        best = _placed(mapped[most], surveyed[most], level)
+    if most.sum() < 3 or best is None:
+        raise InputError(
+            "no three control points have the same distances in the map and in the survey, "
+            "within 2 % of the site; check the marks and the camera model"
+        )
     for one, fits in zip(voters, most, strict=True):
         if not fits:
             one.why_not = "contradicts the other points"
     return frame, *best
+
+
+def _placed(mapped_m: F64, surveyed_m: F64, level: bool) -> tuple[float, F64, F64] | None:
+    """Scale, rotation and shift from map to survey, each (N, 3); None where they leave it open.
+
+    ``level``: not every height is known, so the map's own vertical holds, and its height of zero.
+    """
+    if not level:
+        return placed_by_points(mapped_m, surveyed_m)
+    flat = np.array([1.0, 1.0, 0.0])
+    if np.ptp(mapped_m[:, :2], axis=0).max() < 1e-6:
+        return None
+    scale, R, t = umeyama(mapped_m * flat, surveyed_m * flat, np.ones(len(mapped_m)), level=True)
+    return scale, R, t

@@ -216,6 +216,8 @@ class _Refinement:
     def _place(self, candidates: Sequence[Candidate]) -> None:
         """Give a scan without a place, and without a sure scale, those of the survey."""
         self.frame, scale, R, t = place_by_survey(candidates)
+        if not any(c.has_height for c in candidates if c.usable):
+            self.notes.append("no control point has a height: heights count from the scan's own 0")
         self.grown = scale
         moved = []
         for s in self.states:
@@ -357,8 +359,8 @@ class _Refinement:
                 after = map_position(found.poses, found.scales, one.marks)
                 if after is None or one.surveyed_m is None:
                     continue
-                off = float(np.linalg.norm(after[0] - one.surveyed_m))
-                ratio = off / (5.0 * float(np.hypot(one.sigma_m.max(), after[1])) + 0.3)
+                off = float(np.linalg.norm(one.off_m(after[0])))
+                ratio = off / (5.0 * one.tolerance_m(after[1]) + 0.3)
                 if ratio > by:
                     worst, by, far = one, ratio, off
             refused = sum(not c.usable and not c.point.is_check for c in candidates)

@@ -72,10 +72,11 @@ def _steps(track: Track, found: Adjusted, ahead_m: float) -> dict[str, Any] | No
 def _told_point(one: Candidate, found: Adjusted) -> dict[str, Any]:
     after = map_position(found.poses, found.scales, one.marks)
 
-    def off(place: F64 | None) -> list[float] | None:
+    def off(place: F64 | None) -> list[float | None] | None:
         if place is None or one.surveyed_m is None:
             return None
-        return [_round(v) for v in place - one.surveyed_m]
+        east, north, up = (_round(v) for v in one.off_m(place))
+        return [east, north, up if one.has_height else None]
 
     return {
         "name": one.point.name,
@@ -95,9 +96,10 @@ def _summed(points: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
         return None
     out: dict[str, Any] = {"count": len(kept)}
     for when in ("before", "after"):
-        off = np.array([p[f"{when}_m"] for p in kept])
+        off = np.array([p[f"{when}_m"] for p in kept], np.float64)  # NaN: no height
         out[f"rms_h_{when}_m"] = _round(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1))))
-        out[f"rms_v_{when}_m"] = _round(np.sqrt(np.mean(off[:, 2] ** 2)))
+        up = off[np.isfinite(off[:, 2]), 2]
+        out[f"rms_v_{when}_m"] = _round(np.sqrt(np.mean(up**2))) if len(up) else None
     return out
 
 
@@ -115,8 +117,11 @@ def in_words(figures: dict[str, Any]) -> str:
         parts.append(f"{control['count']} control points")
     text = f"refined as a whole with {', '.join(parts)}"
     if check:
+        up_m = check["rms_v_after_m"]
+        text += f"; {check['count']} check points are off by {check['rms_h_after_m']:.2f} m "
         text += (
-            f"; {check['count']} check points are off by {check['rms_h_after_m']:.2f} m "
-            f"horizontally and {check['rms_v_after_m']:.2f} m vertically (rms)"
+            "horizontally (rms)"
+            if up_m is None
+            else (f"horizontally and {up_m:.2f} m vertically (rms)")
         )
     return text

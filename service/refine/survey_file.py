@@ -1,5 +1,7 @@
 """Surveyed points of a CSV: where they are on the globe, and where pictures or the map have them.
 
+A row without ``alt_amsl_m`` is of a point surveyed horizontally only.
+
 One row is one sighting: ``keyframe_seq`` or ``time`` with ``u_px,v_px`` in the camera's own
 picture, or ``x,y,z`` in the delivered cloud's coordinates. Rows of one name are one point.
 """
@@ -15,11 +17,13 @@ from pathlib import Path
 from service.errors import InputError
 from service.small_file import read_small
 
-PLACE = ("lat", "lon", "alt_amsl_m")
+PLACE = ("lat", "lon")
+HEIGHT = "alt_amsl_m"
 PICTURE = ("u_px", "v_px")
 MAP = ("x", "y", "z")
 COLUMNS = (
-    "name", "keyframe_seq", "time", *PICTURE, *MAP, *PLACE, "sigma_h_m", "sigma_v_m", "role",
+    "name", "keyframe_seq", "time", *PICTURE, *MAP, *PLACE, HEIGHT, "sigma_h_m", "sigma_v_m",
+    "role",
 )  # fmt: skip
 ROLES = ("control", "check")
 USUAL_SIGMA_H_M, USUAL_SIGMA_V_M = 0.03, 0.05
@@ -44,7 +48,7 @@ class SurveyPoint:
     name: str
     lat_deg: float
     lon_deg: float
-    alt_amsl_m: float
+    alt_amsl_m: float | None  # None: surveyed horizontally only
     sigma_h_m: float
     sigma_v_m: float
     is_check: bool
@@ -77,7 +81,7 @@ def read_survey(path: Path) -> list[SurveyPoint]:
     return list(points.values())
 
 
-def _said(p: SurveyPoint) -> tuple[str, float, float, float, float, float, bool]:
+def _said(p: SurveyPoint) -> tuple[str, float, float, float | None, float, float, bool]:
     return p.name, p.lat_deg, p.lon_deg, p.alt_amsl_m, p.sigma_h_m, p.sigma_v_m, p.is_check
 
 
@@ -128,12 +132,13 @@ def _point(path: Path, line: int, row: Mapping[str, str]) -> SurveyPoint:
     name = row.get("name", "")
     if not name:
         raise InputError(f"{where}: no name; give each point one")
-    lat, lon, alt = (_number(where, row, key) for key in PLACE)
+    lat, lon = (_number(where, row, key) for key in PLACE)
+    alt = _number(where, row, HEIGHT) if HEIGHT in row else None
     if not abs(lat) <= 90.0 or not abs(lon) <= 180.0:
         raise InputError(
             f"{where}: lat {lat:g}, lon {lon:g} is not on the globe; degrees, latitude first"
         )
-    if not -1000.0 < alt < 10_000.0:
+    if alt is not None and not -1000.0 < alt < 10_000.0:
         raise InputError(f"{where}: alt_amsl_m {alt:g} is not metres above sea level")
     sigma_h = _number(where, row, "sigma_h_m", USUAL_SIGMA_H_M)
     sigma_v = _number(where, row, "sigma_v_m", USUAL_SIGMA_V_M)
