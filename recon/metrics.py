@@ -279,9 +279,10 @@ def trajectory_errors(scan: F64, truth: F64) -> TrajectoryErrors:
     )
 
 
-LEAST_KNOWN = 0.9
-LEAST_LIKENESS = 0.5
-LEAST_CONTRAST = 1.5
+MIN_KNOWN = 0.9
+MIN_LIKENESS = 0.5
+MIN_CONTRAST = 1.5
+PATCH_PX = 64
 BROAD_PX = 8.0
 
 
@@ -300,35 +301,33 @@ class PatchShifts:
         return len(self.likeness) / self.tried if self.tried else 0.0
 
 
-def patch_shifts(
-    found: F32, truth: F32, known: Bool, reach_px: int, patch_px: int = 64
-) -> PatchShifts:
+def patch_shifts(found: F32, truth: F32, known: Bool, reach_px: int) -> PatchShifts:
     """The displacement of ``found`` against ``truth``, (H, W) each, in patches half overlapping.
 
     Normalised cross-correlation over shifts of up to ``reach_px``, with a parabola through the
     peak. Shading broader than BROAD_PX is taken out of both first. A patch is tried where
     ``known`` holds nearly everywhere and the truth has texture; a peak at the end of the reach
-    or below LEAST_LIKENESS is no match. Raises ValueError when the sizes differ.
+    or below MIN_LIKENESS is no match. Raises ValueError when the sizes differ.
     """
     if found.shape != truth.shape or found.shape != known.shape or found.ndim != 2:
         raise ValueError(f"sizes differ: {found.shape}, {truth.shape}, {known.shape}")
     a, b = (_fine(picture, known) for picture in (found, truth))
     rows, cols = known.shape
     middles, shifts, likenesses, tried = [], [], [], 0
-    for top in range(reach_px, rows - patch_px - reach_px + 1, patch_px // 2):
-        for left in range(reach_px, cols - patch_px - reach_px + 1, patch_px // 2):
-            patch = np.s_[top : top + patch_px, left : left + patch_px]
-            if known[patch].mean() < LEAST_KNOWN or b[patch].std() < LEAST_CONTRAST:
+    for top in range(reach_px, rows - PATCH_PX - reach_px + 1, PATCH_PX // 2):
+        for left in range(reach_px, cols - PATCH_PX - reach_px + 1, PATCH_PX // 2):
+            patch = np.s_[top : top + PATCH_PX, left : left + PATCH_PX]
+            if known[patch].mean() < MIN_KNOWN or b[patch].std() < MIN_CONTRAST:
                 continue
             tried += 1
             around = b[
-                top - reach_px : top + patch_px + reach_px,
-                left - reach_px : left + patch_px + reach_px,
+                top - reach_px : top + PATCH_PX + reach_px,
+                left - reach_px : left + PATCH_PX + reach_px,
             ]
             surface = cv2.matchTemplate(around, a[patch], cv2.TM_CCOEFF_NORMED)
             likeness, shift = _peak(np.asarray(surface, np.float32))
-            if likeness >= LEAST_LIKENESS and np.isfinite(shift).all():
-                middles.append([left + 0.5 * (patch_px - 1), top + 0.5 * (patch_px - 1)])
+            if likeness >= MIN_LIKENESS and np.isfinite(shift).all():
+                middles.append([left + 0.5 * (PATCH_PX - 1), top + 0.5 * (PATCH_PX - 1)])
                 shifts.append(reach_px - shift)
                 likenesses.append(likeness)
     return PatchShifts(

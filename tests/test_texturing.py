@@ -13,7 +13,7 @@ from recon.surface.meshing import Mesh, cut, height_mesh
 from recon.surface.raster import Grid, Raster
 from recon.surface.texture_atlas import BORDER_PX, lay_out, pack
 from recon.surface.texture_views import CANDIDATES, Sightings, TextureView, consistent, look
-from recon.surface.texturing import choose, energy, face_neighbours, fading, levels, texture
+from recon.surface.texturing import PENALTY, choose, face_neighbours, fading, levels, texture
 from recon.types import F64, U8, Array
 
 NADIR = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
@@ -151,6 +151,18 @@ def rows(view: list[list[int]], px: list[list[float]]) -> Sightings:
         out.view[n, : len(view[n])] = view[n]
         out.px_per_m[n, : len(px[n])] = px[n]
     return out
+
+
+def energy(found: Sightings, neighbours: Array, slot: Array) -> float:
+    """What :func:`choose` makes small: data costs plus ``PENALTY`` per edge between views."""
+    seen = slot >= 0
+    rows = np.flatnonzero(seen)
+    best = found.px_per_m[rows, 0]
+    data = float((1.0 - found.px_per_m[rows, slot[rows]] / best).sum())
+    label = np.where(seen, found.view[np.arange(len(slot)), slot], -1)
+    across = label[neighbours]
+    cut = (neighbours >= 0) & (across >= 0) & (label[:, None] >= 0) & (across != label[:, None])
+    return data + 0.5 * PENALTY * float(cut.sum())
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -13,6 +13,8 @@ from recon.types import F32, F64, U8, Bool, PointCloud
 
 I32 = npt.NDArray[np.int32]
 
+TRIM_SHARE = 0.03
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
@@ -25,7 +27,7 @@ class Mesh:
 
 
 def height_mesh(raster: Raster, largest_faces: int = 400_000) -> Mesh:
-    """The raster's surface as one sheet, with texture coordinates into the raster.
+    """The raster's surface as one sheet.
 
     A vertex per known cell, two triangles per four known cells. Above ``largest_faces`` flat
     parts are merged (quadric error by Open3D; without it vertices are clustered). Walls are steep
@@ -59,7 +61,7 @@ def height_mesh(raster: Raster, largest_faces: int = 400_000) -> Mesh:
     vertices, faces = _without_lone_vertices(vertices, faces)
     if len(faces) > largest_faces:
         vertices, faces = _simplified(vertices, faces, largest_faces)
-    return Mesh(vertices, faces, _planar_uv(vertices, raster))
+    return Mesh(vertices, faces)
 
 
 def poisson_mesh(
@@ -67,12 +69,11 @@ def poisson_mesh(
     towards_m: F64,
     spacing_m: float,
     largest_faces: int = 400_000,
-    trim_share: float = 0.03,
 ) -> Mesh:
     """A closed-form surface through an oriented cloud, with colours per vertex.
 
     Screened Poisson (Kazhdan and Hoppe 2013, doi:10.1145/2487228.2487237) by Open3D; the
-    ``trim_share`` of vertices with the least support is cut away, and so is what lies
+    TRIM_SHARE of the vertices with the least support is cut away, and so is what lies
     farther than a few spacings from every point. Above ``largest_faces`` flat parts are merged.
 
     Args:
@@ -97,7 +98,7 @@ def poisson_mesh(
     mesh, support = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(points, depth=depth)
     density: F64 = np.asarray(support)
     far = _distance(np.asarray(mesh.vertices), cloud.xyz_m) > 4.0 * spacing_m
-    loose = (density < np.quantile(density, trim_share)) | far
+    loose = (density < np.quantile(density, TRIM_SHARE)) | far
     mesh.remove_vertices_by_mask(loose.tolist())
     if len(mesh.triangles) > largest_faces:
         mesh = _reduced(mesh, largest_faces)
@@ -114,18 +115,16 @@ def _distance(places: F64, points: F32) -> F64:
     return np.asarray(cKDTree(points).query(places, workers=-1)[0])
 
 
-def _planar_uv(vertices: F64, raster: Raster) -> F32:
-    """(V, 2) places in the raster's picture, seen from above."""
-    rows, cols = raster.grid.shape
-    px = raster.grid.pixels(vertices[:, :2]) + 0.5
-    return np.asarray(px / np.array([cols, rows]), np.float32)
-
-
 def _without_lone_vertices(vertices: F64, faces: I32) -> tuple[F64, I32]:
-    used: Bool = np.zeros(len(vertices), np.bool_)
+    used, faces = _used(len(vertices), faces)
+    return vertices[used], faces
+
+
+def _used(vertices: int, faces: I32) -> tuple[Bool, I32]:
+    """Which of so many vertices the faces use, and the faces numbered by these alone."""
+    used: Bool = np.zeros(vertices, np.bool_)
     used[faces.ravel()] = True
-    number = np.cumsum(used) - 1
-    return vertices[used], number[faces].astype(np.int32)
+    return used, (np.cumsum(used) - 1)[faces].astype(np.int32)
 
 
 def _simplified(vertices: F64, faces: I32, largest_faces: int) -> tuple[F64, I32]:
@@ -208,15 +207,8 @@ def _half(mesh: Mesh, inside_m: F64) -> Mesh:
     if mesh.rgb is not None:
         mean = _between(mesh.rgb[a].astype(np.float64), mesh.rgb[b].astype(np.float64), share)
         rgb = np.concatenate([mesh.rgb, np.rint(mean).astype(np.uint8)])
-    used: Bool = np.zeros(total + len(key), np.bool_)
-    used[faces.ravel()] = True
-    number = np.cumsum(used) - 1
-    return Mesh(
-        np.concatenate(vertices)[used],
-        number[faces].astype(np.int32),
-        None,
-        None if rgb is None else rgb[used],
-    )
+    used, faces = _used(total + len(key), faces)
+    return Mesh(np.concatenate(vertices)[used], faces, None, None if rgb is None else rgb[used])
 
 
 def _between(a: F64, b: F64, share: F64) -> F64:

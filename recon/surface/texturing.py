@@ -122,25 +122,13 @@ def face_neighbours(faces: I32) -> I32:
     return out.reshape(count, 3)
 
 
-def choose(found: Sightings, neighbours: I32, penalty: float = PENALTY) -> I32:
+def choose(found: Sightings, neighbours: I32) -> I32:
     """(F,) the slot of ``found`` chosen for each triangle; -1 where no view sees it."""
     best = np.maximum(found.px_per_m[:, :1], 1e-9)
     cost = np.where(found.view >= 0, 1.0 - found.px_per_m / best, np.float32(1e6))
     return np.asarray(
-        _propagated(found.view, cost.astype(np.float32), neighbours, penalty, ITERATIONS)
+        _propagated(found.view, cost.astype(np.float32), neighbours, PENALTY, ITERATIONS)
     )
-
-
-def energy(found: Sightings, neighbours: I32, slot: I32, penalty: float = PENALTY) -> float:
-    """What :func:`choose` makes small: data costs plus ``penalty`` per edge between views."""
-    seen = slot >= 0
-    rows = np.flatnonzero(seen)
-    best = found.px_per_m[rows, 0]
-    data = float((1.0 - found.px_per_m[rows, slot[rows]] / best).sum())
-    label = np.where(seen, found.view[np.arange(len(slot)), slot], -1)
-    across = label[neighbours]
-    cut = (neighbours >= 0) & (across >= 0) & (label[:, None] >= 0) & (across != label[:, None])
-    return data + 0.5 * penalty * float(cut.sum())
 
 
 @njit(cache=True, nogil=True)

@@ -227,7 +227,6 @@ def suggest(
     overlap: float = 0.6,
     relative: bool = False,
     photos: bool = False,
-    home: tuple[float, float, float] | None = None,
 ) -> Refly | None:
     """A flight over the weak areas; None when nothing is weak.
 
@@ -257,8 +256,7 @@ def suggest(
         )
     begin = coverage.footprints[-1].camera_m[:2]
     lines = [_behind(line, swath) for line in in_order(groups, begin)]
-    if home is None:
-        home = _first_place(coverage, frame, height_m)
+    home = _first_place(coverage, frame, height_m)
     items = _items(lines, frame, swath, relative, photos)
     area = sum(map(len, patches)) * coverage.layer.grid.cell_m**2
     return Refly(

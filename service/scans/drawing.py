@@ -192,6 +192,7 @@ def _with_lines(picture: U8, lines: Sequence[str]) -> U8:
 
 
 PANEL_PX = 480
+COLUMNS = 3
 TITLE_PX = 26
 GAP_PX = 10
 DEBUG_KEYS = {
@@ -329,11 +330,11 @@ def coloured(title: str, values: Array, unit: str, colours: int = cv2.COLORMAP_T
     return Panel(f"{text}, {share:.0f} % known", np.asarray(image, np.uint8))
 
 
-def sheet(panels: Sequence[Panel], heading: str, columns: int = 3) -> U8:
+def sheet(panels: Sequence[Panel], heading: str) -> U8:
     """(h, w, 3) BGR: the panels in rows, each with its title above it."""
     fitted = [_fitted(panel) for panel in panels]
-    rows = [fitted[n : n + columns] for n in range(0, len(fitted), columns)]
-    width = columns * PANEL_PX + (columns + 1) * GAP_PX
+    rows = [fitted[n : n + COLUMNS] for n in range(0, len(fitted), COLUMNS)]
+    width = COLUMNS * PANEL_PX + (COLUMNS + 1) * GAP_PX
     heights = [max(f.shape[0] for f in row) + GAP_PX for row in rows]
     out = np.full((TITLE_PX + 2 * GAP_PX + sum(heights), width, 3), BACKGROUND, np.uint8)
     cv2.putText(out, heading, (GAP_PX, 24), FONT, 0.6, INK, 1, cv2.LINE_AA)

@@ -57,9 +57,9 @@ class Picture:
     sun: F64  # (3,) unit vector towards the sun
 
 
-def sun_direction(elevation_deg: float = 48.0, azimuth_deg: float = 145.0) -> F64:
-    """(3,) unit vector towards the sun; azimuth from north over east."""
-    e, a = np.radians(elevation_deg), np.radians(azimuth_deg)
+def sun_direction() -> F64:
+    """(3,) unit vector towards the sun: 48 degrees up, 145 from north over east."""
+    e, a = np.radians((48.0, 145.0))
     return np.array([np.cos(e) * np.sin(a), np.cos(e) * np.cos(a), np.sin(e)])
 
 
