@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from mavlink.component import status as texts
-from mavlink.component.autopilot_link import WANTED_HZ, AutopilotLink
+from mavlink.component.autopilot_link import AutopilotLink
 from mavlink.component.camera import CAPTURE_STATUS, CameraComponent, KeyframeReport
 from mavlink.component.command_desk import CommandDesk, decode_call
 from mavlink.component.commands import COMMANDS, is_stop
@@ -27,7 +27,7 @@ from mavlink.component.metadata import (
     definition_version,
 )
 from mavlink.component.metadata import NUMBER as METADATA
-from mavlink.component.parameters import YAW_FRAME, ExtendedParameters, Parameters, with_defaults
+from mavlink.component.parameters import YAW_FRAME, Parameters, with_defaults
 from mavlink.component.presence import Presence
 from mavlink.component.status import ComputerLoad, StatusTexts, computer_status, motion_values
 from mavlink.telemetry.decode import READERS
@@ -65,7 +65,6 @@ class CompanionConfig:
     """What the companion asks for and offers."""
 
     parameters: Mapping[str, float] = field(default_factory=dict)  # defaults of this aircraft
-    wanted_hz: Mapping[str, float] = field(default_factory=lambda: dict(WANTED_HZ))
     watch: WatchConfig = field(default_factory=WatchConfig)
     load_every_s: float = 2.0
     motion_every_s: float = 1.0
@@ -94,7 +93,7 @@ class Companion:
         self._start_ns = self._now_ns = now_ns
         self._outbox = Outbox()
         self._decoder = Decoder()
-        self.autopilot = AutopilotLink(presence, history, self._outbox, config.wanted_hz, self.say)
+        self.autopilot = AutopilotLink(presence, history, self._outbox, self.say)
         self.streams = Streams(self._outbox)
         self.texts = StatusTexts(self._outbox)
         self.parameters = Parameters(
@@ -103,7 +102,6 @@ class Companion:
             kept_parameters,
             with_defaults(config.parameters),
         )
-        self._extended = ExtendedParameters(self.parameters, self._outbox)
         table = self.parameters.table
         definition = camera_definition(VENDOR, MODEL, table)
         self._metadata = ComponentMetadata(table)
@@ -176,7 +174,7 @@ class Companion:
         extended = name.startswith("PARAM_EXT_")
         if message.target_component not in (0, CAMERA if extended else ONBOARD):
             return
-        answer = (self._extended if extended else self.parameters).receive(message)
+        answer = self.parameters.receive(message)
         if isinstance(answer, Answer) and answer.text:
             self._answer(texts.WARNING, answer.text)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mavlink.component.autopilot_link import WANTED_HZ, AutopilotLink
+from mavlink.component.autopilot_link import AutopilotLink
 from mavlink.component.presence import Health, Presence, PresenceConfig
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.wire.dialect import numbers_of
@@ -199,7 +199,7 @@ class LinkProbe:
         self._outbox = Outbox()
         history = VehicleHistory()
         self._autopilot = AutopilotLink(
-            self._presence, history, self._outbox, WANTED_HZ, lambda severity, text: None
+            self._presence, history, self._outbox, lambda severity, text: None
         )
         self._watch = LinkWatch(watch, self._presence, now_ns)
         self._decoder = Decoder()

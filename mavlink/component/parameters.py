@@ -20,6 +20,8 @@ from mavlink.wire.first_beat import CAMERA, ONBOARD
 from mavlink.wire.messages import Outbox
 
 REAL32 = 9  # MAV_PARAM_TYPE
+EXTENDED_VALUE = 128  # bytes
+ACK_ACCEPTED, ACK_UNSUPPORTED, ACK_FAILED = 0, 1, 2
 YAW_FRAME = "SR_YAW_FRAME"
 
 
@@ -69,7 +71,7 @@ def with_defaults(values: Mapping[str, float]) -> tuple[Parameter, ...]:
 
 
 class Parameters:
-    """Values of parameters, and the protocol to read and set them."""
+    """Values of parameters, and the protocols to read and set them."""
 
     def __init__(
         self,
@@ -80,59 +82,58 @@ class Parameters:
     ) -> None:
         self._outbox = outbox
         self._on_change = on_change
-        self.table = tuple(table)
-        self._index = {p.name: i for i, p in enumerate(self.table)}
-        self._values = [_real32(p.default) for p in self.table]
+        self._table = {p.name: p for p in table}
+        self._values = {p.name: _real32(p.default) for p in table}
         self.revision = 0  # grows with every change, so that a keeper knows when to save
         for name, value in (kept or {}).items():
-            i = self._index.get(name)
-            if i is not None and self.table[i].accepts(value):
-                self._values[i] = _real32(value)
+            if name in self._table and self._table[name].accepts(value):
+                self._values[name] = _real32(value)
+
+    @property
+    def table(self) -> tuple[Parameter, ...]:
+        """Every parameter with the default that holds now."""
+        return tuple(self._table.values())
 
     def __getitem__(self, name: str) -> float:
-        return self._values[self._index[name]]
+        return self._values[name]
 
     def values(self) -> dict[str, float]:
         """Every value by name."""
-        return {p.name: v for p, v in zip(self.table, self._values, strict=True)}
+        return dict(self._values)
 
     def kept(self) -> dict[str, float]:
         """The values that differ from their defaults, by name."""
-        pairs = zip(self.table, self._values, strict=True)
-        return {p.name: v for p, v in pairs if v != _real32(p.default)}
+        defaults = {p.name: _real32(p.default) for p in self.table}
+        return {name: v for name, v in self._values.items() if v != defaults[name]}
 
     def forget(self, name: str) -> None:
         """Put a value that the service no longer takes back to its default."""
-        i = self._index[name]
-        self._values[i] = _real32(self.table[i].default)
+        self._values[name] = _real32(self._table[name].default)
 
     def adopt(self, values: Mapping[str, float]) -> None:
         """Take other defaults, which hold from now on, and show them."""
-        table = list(self.table)
         for name, value in values.items():
-            i = self._index[name]
-            if table[i].accepts(value):
-                table[i] = replace(table[i], default=value)
-                self._values[i] = _real32(value)
-                self.revision += 1
-                self._send(i)
-        self.table = tuple(table)
+            if self._table[name].accepts(value):
+                self._table[name] = replace(self._table[name], default=value)
+                self._take(name, value)
 
     def change(self, name: str, value: float) -> Answer:
         """Set a value, unless it is out of range or the service refuses it."""
-        i = self._index.get(name)
-        if i is None:
+        parameter = self._table.get(name)
+        if parameter is None:
             return Answer(Result.DENIED, f"no parameter {name}")
-        parameter = self.table[i]
         if not parameter.accepts(value):
             span = f"{parameter.low:g} to {parameter.high:g}"
             return Answer(Result.DENIED, f"{name} refused: {value:g} is not {span}")
         answer = self._on_change(name, value)
-        if answer.result is Result.ACCEPTED and self._values[i] != _real32(value):
-            self._values[i] = _real32(value)
-            self.revision += 1
-            self._send(i)
+        if answer.result is Result.ACCEPTED and self._values[name] != _real32(value):
+            self._take(name, value)
         return answer
+
+    def _take(self, name: str, value: float) -> None:
+        self._values[name] = _real32(value)
+        self.revision += 1
+        self._send(name)
 
     def reset(self) -> None:
         """Every value back to its default."""
@@ -140,91 +141,58 @@ class Parameters:
             self.change(parameter.name, parameter.default)
 
     def receive(self, message: Any) -> Answer | None:
-        """Serve a PARAM_* message that is meant for the onboard computer.
+        """Serve a PARAM_* or PARAM_EXT_* message that is meant for our component.
 
-        The answer of a PARAM_SET, for the operator; None for the rest.
+        The answer of one that sets a value, for the operator; None for the rest.
         """
         kind = message.get_type()
-        if kind == "PARAM_REQUEST_LIST":
-            for i in range(len(self.table)):
-                self._send(i)
-        elif kind == "PARAM_REQUEST_READ":
+        send = self._send_extended if kind.startswith("PARAM_EXT_") else self._send
+        names = list(self._table)
+        if kind.endswith("_REQUEST_LIST"):
+            for name in names:
+                send(name)
+        elif kind.endswith("_REQUEST_READ"):
             i = int(message.param_index)
-            i = self._index.get(text_of(message.param_id), -1) if i < 0 else i
-            if 0 <= i < len(self.table):
-                self._send(i)
+            name = _text(message.param_id) if i < 0 else "".join(names[i : i + 1])
+            if name in self._table:
+                send(name)
         elif kind == "PARAM_SET":
-            name = text_of(message.param_id)
-            before = self.revision
-            answer = self.change(name, message.param_value)
-            if self.revision == before and name in self._index:
-                self._send(self._index[name])  # tells the asker what stands
-            return answer
-        return None
-
-    def _send(self, i: int) -> None:
-        name = self.table[i].name.encode()
-        count = len(self.table)
-        message = dialect.MAVLink_param_value_message(name, self._values[i], REAL32, count, i)
-        self._outbox.put(ONBOARD, message)
-
-
-def _real32(value: float) -> float:
-    rounded: float = struct.unpack("<f", struct.pack("<f", value))[0]
-    return rounded
-
-
-def text_of(raw: str | bytes) -> str:
-    """A parameter's name as it came, without what follows a zero."""
-    text = raw.decode("ascii", "replace") if isinstance(raw, bytes) else raw
-    return text.partition("\0")[0]
-
-
-VALUE = 128
-ACK_ACCEPTED, ACK_UNSUPPORTED, ACK_FAILED = 0, 1, 2
-
-
-class ExtendedParameters:
-    """The protocol's answers."""
-
-    def __init__(self, parameters: Parameters, outbox: Outbox) -> None:
-        self._parameters = parameters
-        self._outbox = outbox
-
-    def receive(self, message: Any) -> Answer | None:
-        """Serve a PARAM_EXT_* message; the answer of a SET, for the operator."""
-        kind = message.get_type()
-        names = [parameter.name for parameter in self._parameters.table]
-        if kind == "PARAM_EXT_REQUEST_LIST":
-            for i in range(len(names)):
-                self._send(i)
-        elif kind == "PARAM_EXT_REQUEST_READ":
-            i = int(message.param_index)
-            if i < 0:
-                name = text_of(message.param_id)
-                i = names.index(name) if name in names else -1
-            if 0 <= i < len(names):
-                self._send(i)
+            return self._set(message)
         elif kind == "PARAM_EXT_SET":
-            return self._set(message, names)
+            return self._set_extended(message)
         return None
 
-    def _set(self, message: Any, names: list[str]) -> Answer:
-        name = text_of(message.param_id)
-        if name not in names or message.param_type != REAL32:
-            self._acknowledge(name, 0.0, ACK_UNSUPPORTED)
-            return Answer(Result.DENIED, f"no parameter {name}")
-        raw = _raw(message)
-        answer = self._parameters.change(name, struct.unpack("<f", raw[:4])[0])
-        accepted = answer.result is Result.ACCEPTED
-        self._acknowledge(name, self._parameters[name], ACK_ACCEPTED if accepted else ACK_FAILED)
+    def _set(self, message: Any) -> Answer:
+        name, before = _text(message.param_id), self.revision
+        answer = self.change(name, message.param_value)
+        if self.revision == before and name in self._table:
+            self._send(name)  # shows the asker the value that holds
         return answer
 
-    def _send(self, i: int) -> None:
-        name = self._parameters.table[i].name
-        value = _packed(self._parameters[name])
-        count = len(self._parameters.table)
-        message = dialect.MAVLink_param_ext_value_message(name.encode(), value, REAL32, count, i)
+    def _set_extended(self, message: Any) -> Answer:
+        name = _text(message.param_id)
+        if name not in self._table or message.param_type != REAL32:
+            self._acknowledge(name, 0.0, ACK_UNSUPPORTED)
+            return Answer(Result.DENIED, f"no parameter {name}")
+        raw: bytes = message._param_value_raw  # pymavlink drops the zeros at its end
+        answer = self.change(name, struct.unpack("<f", raw.ljust(4, b"\0")[:4])[0])
+        accepted = answer.result is Result.ACCEPTED
+        self._acknowledge(name, self[name], ACK_ACCEPTED if accepted else ACK_FAILED)
+        return answer
+
+    def _send(self, name: str) -> None:
+        count, i = len(self._table), list(self._table).index(name)
+        message = dialect.MAVLink_param_value_message(name.encode(), self[name], REAL32, count, i)
+        self._outbox.put(ONBOARD, message)
+
+    def _send_extended(self, name: str) -> None:
+        message = dialect.MAVLink_param_ext_value_message(
+            name.encode(),
+            _packed(self[name]),
+            REAL32,
+            len(self._table),
+            list(self._table).index(name),
+        )
         self._outbox.put(CAMERA, message)
 
     def _acknowledge(self, name: str, value: float, result: int) -> None:
@@ -233,11 +201,16 @@ class ExtendedParameters:
         self._outbox.put(CAMERA, message)
 
 
+def _real32(value: float) -> float:
+    rounded: float = struct.unpack("<f", struct.pack("<f", value))[0]
+    return rounded
+
+
 def _packed(value: float) -> bytes:
-    return struct.pack("<f", value).ljust(VALUE, b"\0")
+    return struct.pack("<f", value).ljust(EXTENDED_VALUE, b"\0")
 
 
-def _raw(message: Any) -> bytes:
-    """The value's own bytes; pymavlink drops the zeros at their end."""
-    value: bytes = message._param_value_raw
-    return value.ljust(VALUE, b"\0")
+def _text(raw: str | bytes) -> str:
+    """A parameter's name as it came, without what follows a zero."""
+    text = raw.decode("ascii", "replace") if isinstance(raw, bytes) else raw
+    return text.partition("\0")[0]
