@@ -117,7 +117,6 @@ class VehicleLink:
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self._alive_ns = now_ns
-        self._is_served = True  # something was done that may have set a timer
         opened = links or [Link(parse_link(text)) for text in config.links]
         sequence = 0 if first is None else first.sequence
         self._links = Links(opened, self._on_packet, self._signing, sequence)
@@ -131,7 +130,7 @@ class VehicleLink:
 
     def start(self) -> None:
         """Open the links; the first heartbeat goes out before anything else."""
-        self._do(self._companion.announce_kept)
+        self._inbox.put(self._companion.announce_kept)
         for target in (self._beat, self._run):
             thread = threading.Thread(target=target, name=f"mavlink {target.__name__}", daemon=True)
             self._threads.append(thread)
@@ -141,7 +140,7 @@ class VehicleLink:
     def stop(self) -> None:
         """Say what is left to say, then close everything."""
         self._stop.set()
-        self._do(lambda: None)
+        self._inbox.put(lambda: None)
         for thread in self._threads:
             thread.join(timeout=5.0)
         self._links.stop()
@@ -158,11 +157,11 @@ class VehicleLink:
 
     def statustext(self, text: str, severity: int = texts.INFO, is_answer: bool = False) -> None:
         """Send a text to the operator; repetitions are held back, except of answers."""
-        self._served(lambda: self._companion.say(severity, text, is_answer))
+        self._inbox.put(lambda: self._companion.say(severity, text, is_answer))
 
     def report_keyframe(self, keyframe: KeyframeReport) -> None:
         """Tell ground stations of a keyframe."""
-        self._served(lambda: self._companion.report(keyframe))
+        self._inbox.put(lambda: self._companion.report(keyframe))
 
     def send_tunnel(self, payload_type: int, payload: bytes) -> None:
         """Send up to 128 bytes to everyone by TUNNEL; ValueError when there are more."""
@@ -170,12 +169,12 @@ class VehicleLink:
             raise ValueError(f"a TUNNEL holds {TUNNEL_ROOM} bytes, got {len(payload)}")
         padded = list(payload.ljust(TUNNEL_ROOM, b"\0"))
         message = dialect.MAVLink_tunnel_message(0, 0, payload_type, len(payload), padded)
-        self._do(lambda: self._companion.send(message))
+        self._inbox.put(lambda: self._companion.send(message))
 
     def listen(self, name: str, listener: Callable[[Any], None]) -> None:
         """Call back, in the protocol's thread, with every message of a name such as TUNNEL."""
         self._heard |= numbers_of([name])
-        self._do(lambda: self._companion.listen(name, listener))
+        self._inbox.put(lambda: self._companion.listen(name, listener))
 
     def report_odometry(self, odometry: Odometry, time_ns: int) -> bool:
         """Send our estimate to the autopilot, stamped with its clock at our monotonic time.
@@ -185,7 +184,7 @@ class VehicleLink:
         boot_us = self.boot_time_us(time_ns)
         if boot_us is None or not self.config.odometry:
             return False
-        self._do(lambda: self._companion.send(odometry_message(odometry, boot_us)))
+        self._inbox.put(lambda: self._companion.send(odometry_message(odometry, boot_us)))
         return True
 
     def parameter(self, name: str) -> float:
@@ -198,7 +197,7 @@ class VehicleLink:
 
     def show_parameters(self, values: Mapping[str, float]) -> None:
         """Let these hold, as the configuration says by now, and tell ground stations."""
-        self._do(lambda: self._companion.parameters.adopt(values))
+        self._inbox.put(lambda: self._companion.parameters.adopt(values))
 
     def record(self, path: Path | None, unix_offset_ns: int | None = None) -> None:
         """Keep a .tlog of all links in a file from now on, stamped with the monotonic clock plus
@@ -255,18 +254,6 @@ class VehicleLink:
         if self._signing is not None and not self._signing.accepts(packet):
             return
         self._companion.receive(index, packet, now_ns)
-        self._is_served = self._is_served or packet.message_id not in TELEMETRY
-
-    def _do(self, job: Job) -> None:
-        self._inbox.put(job)
-
-    def _served(self, job: Job) -> None:
-        """Do a job after which a timer may be nearer."""
-        self._do(job)
-        self._do(self._look_at_timers)
-
-    def _look_at_timers(self) -> None:
-        self._is_served = True
 
     def _run(self) -> None:
         """The protocol's thread, the only one that touches the companion."""
@@ -274,10 +261,9 @@ class VehicleLink:
         timer_ns = 0
         while not self._stop.is_set():
             wait_s = (timer_ns - time.monotonic_ns()) / S
-            self._serve(max(1e-4, wait_s))
+            is_served = self._serve(max(1e-4, wait_s))
             now_ns = self._alive_ns = time.monotonic_ns()
-            if now_ns >= timer_ns or self._is_served:
-                self._is_served = False
+            if now_ns >= timer_ns or is_served:
                 self._guard(partial(self._companion.tick, now_ns))
                 timer_ns = self._companion.next_timer()
             self._send(self._companion.take())
@@ -287,8 +273,8 @@ class VehicleLink:
         self._serve(0.0)
         self._send(self._companion.take())
 
-    def _serve(self, wait_s: float) -> None:
-        """Do the jobs that wait and take in the telemetry."""
+    def _serve(self, wait_s: float) -> bool:
+        """Do the jobs that wait and take in the telemetry; True when a job may have set a timer."""
         telemetry, jobs = self._inbox.take(wait_s)
         for job in jobs:  # first: a heartbeat says whose telemetry follows
             self._guard(job)
@@ -297,6 +283,7 @@ class VehicleLink:
                 self._hear(index, packet, now_ns)
             except Exception:
                 log.exception("a fault while hearing telemetry")
+        return bool(jobs)
 
     def _guard(self, job: Job) -> None:
         """Do a job; a fault in what the service does on a command must not cost the link."""
