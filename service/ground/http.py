@@ -37,6 +37,7 @@ from service.ground.live import serve_live
 from service.ground.scan_files import file_routes
 from service.ground.state import Jobs, PortalState, names_of, state_of
 from service.ground.vehicle import BUTTONS, Vehicle
+from service.workers import Workers
 
 T = TypeVar("T")
 
@@ -99,9 +100,10 @@ def portal_app(
     audit: AuditLog,
     progress: Callable[[], list[dict[str, Any]]] | None = None,
     vehicle: Vehicle | None = None,
+    workers: Workers | None = None,
 ) -> ASGIApp:
     """The portal as an ASGI application; ``local`` when only this machine can reach it."""
-    state = PortalState(Library(store), Jobs(), progress or list, vehicle)
+    state = PortalState(Library(store), Jobs(workers or Workers()), progress or list, vehicle)
     one = "/api/scans/{drone}/{scan}"
     routes: list[Any] = [
         Route("/", _page),

@@ -98,6 +98,7 @@ class Portal:
             AuditLog(config.store),
             progress,
             vehicle,
+            self._workers,
         )
         self._vehicle = vehicle
         self._listener: BoundedListener | None = None

@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from service.exports.view import ExportOptions, ScanView, export
 from service.ground.library import Library
 from service.ground.vehicle import Vehicle
 from service.scans.coverage import LiveCoverages
+from service.workers import Worker, Workers
 
 log = logging.getLogger(__name__)
 
@@ -29,9 +30,11 @@ KEPT = 100
 class Jobs:
     """A queue of exports; each job is a dict of id, kind, state, file and error."""
 
-    def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(1, "exports")
+    def __init__(self, workers: Workers) -> None:
+        self._workers = workers
+        self._worker: Worker | None = None  # while jobs wait
         self._lock = threading.Lock()
+        self._queue: deque[tuple[Path, dict[str, Any]]] = deque()
         self._jobs: list[tuple[Path, dict[str, Any]]] = []
 
     def start(self, folder: Path, kind: str) -> dict[str, Any]:
@@ -44,8 +47,10 @@ class Jobs:
                 raise InputError("too many deliverables are waiting; try again later")
             job = {"kind": kind, "state": "waiting", "queued_unix_s": time.time(), "error": None}
             self._jobs = [*self._jobs[-KEPT:], (folder, job)]
-        self._pool.submit(self._run, folder, job)
-        return dict(job)
+            self._queue.append((folder, job))
+            if self._worker is None or self._worker.is_done:
+                self._worker = self._workers.start("exports", self._work, is_essential=False)
+            return dict(job)
 
     def of(self, folder: Path) -> list[dict[str, Any]]:
         """The jobs of a scan, the oldest first."""
@@ -56,6 +61,16 @@ class Jobs:
         """True while a deliverable of this scan is waiting or being made."""
         return any(job["state"] in ("waiting", "running") for job in self.of(folder))
 
+    def _work(self, _: Worker) -> None:
+        """Make what waits, one after the other."""
+        while True:
+            with self._lock:
+                if not self._queue:
+                    self._worker = None
+                    return
+                folder, job = self._queue.popleft()
+            self._run(folder, job)
+
     def _run(self, folder: Path, job: dict[str, Any]) -> None:
         job["state"] = "running"
         try:
@@ -65,9 +80,8 @@ class Jobs:
         except SkyreliefError as error:
             job |= {"state": "failed", "error": str(error)}
         finally:
-            if job["state"] == "running":  # our own fault; the pool keeps the traceback
+            if job["state"] == "running":  # our own fault; the table of workers logs it
                 job |= {"state": "failed", "error": "failed; see the log"}
-                log.exception("export of %s to %s", folder, job["kind"])
 
 
 @dataclass(slots=True, eq=False)

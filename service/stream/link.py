@@ -257,12 +257,20 @@ class DatalinkSender:
         """Close it on a thread of its own: over a dead link that takes long."""
         self._queries.clear()
         self._asks.clear()
-        closing = threading.Thread(
-            target=_close, args=(session, pumps), name="datalink closing", daemon=True
-        )
-        atexit.register(closing.join, CLOSING_S)
-        closing.start()
-        closing.join(PROMPT_CLOSING_S if self._stop.is_set() else 0.0)
+        closed = threading.Event()
+
+        def wait() -> None:
+            closed.wait(CLOSING_S)
+
+        def close(_: Worker) -> None:
+            _close(session, pumps)
+            atexit.unregister(wait)
+            closed.set()
+
+        atexit.register(wait)
+        self._workers.start("datalink closing", close, is_essential=False)
+        if self._stop.is_set():
+            closed.wait(PROMPT_CLOSING_S)
 
     def _listen(self, session: zenoh.Session) -> list[Worker]:
         """Workers that take what comes. They end with the session.
@@ -389,7 +397,6 @@ def _close(session: zenoh.Session, pumps: list[Worker]) -> None:
         session.close()
     for pump in pumps:
         pump.join()
-    atexit.unregister(threading.current_thread().join)
 
 
 def _rate(budget_kbit_s: float, share: float) -> float:
