@@ -1,16 +1,21 @@
-"""The threads of a process in one table: each is restarted when it fails, and reported.
+"""Every thread and process of the service: one table of rows, and the one place that starts them.
 
-The only place that catches every exception: a fault in one worker is logged with its
-traceback and never ends another one.
+A row says what its workers do, how their queue is bounded, how long they may take without
+progress, and when they are stopped. ``/status`` and ``skyrelief doctor`` show the workers that
+run, each by its row. This is also the only place that catches every exception: a fault in one
+worker is logged with its traceback, never ends another one, and the worker is started again
+where its row says so.
 """
 
 from __future__ import annotations
 
 import logging
+import subprocess
 import threading
 import time
+import weakref
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,16 +29,86 @@ MAX_FAILED = 100
 """Workers that are no longer restarted, kept for the report."""
 PAUSE_S = 0.5
 """From a fault to the restart."""
+DROP, WAIT = "drop oldest", "wait"
+"""What a full queue does: its oldest entry gives way, or whoever fills it waits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One kind of thread or process."""
+
+    name: str  # its workers have this name, or one that begins with it and a blank
+    does: str
+    stop: int = 0  # order of stopping: the lowest first
+    bound: int | None = None  # entries of its queue; None: it has none
+    full: str = ""  # DROP or WAIT
+    deadline_s: float | None = None  # without progress for so long it hangs; None: it may wait
+    restarts: bool = False  # run again after a fault
+    is_essential: bool = False  # without it the process is of no use
+    is_awaited: bool = False  # the process does not end before it
+    starts_itself: str = ""  # why it is not started here
+
+
+_BELOW = "mavlink knows nothing of service"
+_HANG_S, _STALL_S = 20.0, 120.0
+
+ROWS: tuple[Row, ...] = (
+    # A scan, live or replayed.
+    Row("camera", "images of a camera when they are due", 1, 2, DROP),
+    Row("decoder", "images of a recording, decoded ahead", 1, 4, WAIT),
+    Row("gst", "process: a GStreamer pipeline, and what it complains of", 1),
+    Row("scan", "one scan: tracking, map and store", 2, deadline_s=_HANG_S),
+    Row("dense", "reconstruction; a replay waits instead of dropping", 2, 3, DROP, _HANG_S),
+    Row("graph", "the pose graph's process and its pipes", 2, starts_itself="owns its process"),
+    Row("coverage", "coverage.png beside the growing scan", 2),
+    Row("files", "the files of a scan that has ended", 3),
+    # The daemon.
+    Row("backlog", "opens the earlier scans that the ground lacks", 4),
+    Row("backlog closing", "ends the Zenoh session of earlier scans", 4, is_awaited=True),
+    Row("datalink", "the scan to the ground; threads of one Zenoh session", 4, restarts=True,
+        is_essential=True),
+    Row("datalink closing", "ends a Zenoh session; over a dead link that takes long", 4),
+    Row("radio", "the coarse scan over a telemetry radio, both ends", 4, restarts=True,
+        is_essential=True),
+    Row("self-test", "camera and disk, on command", 5),
+    Row("erase", "deletes finished scans, on command", 5),
+    Row("recover", "closes what a crash left open", 5),
+    Row("tidy", "watches the machine, its memory and its disk", 5),
+    Row("first beats", "heartbeats while the rest loads", 6, starts_itself=_BELOW),
+    Row("mavlink", "vehicle, heartbeat, reader and writer of each link", 6, starts_itself=_BELOW),
+    Row("rehearsal", "confirms a restart", 6, starts_itself=_BELOW),
+    Row("health", "/healthz, /status and /metrics; a thread a request", 7, 32, "refuse"),
+    Row("simulated flight", "process: camera and autopilot of sim:", 8, restarts=True),
+    # The ground.
+    Row("receiver", "the session with the drones", 1, None, "", _STALL_S, True, True),
+    Row("heads", "takes what drones announce", 1, restarts=True, is_essential=True),
+    Row("items", "takes what drones send", 1, restarts=True, is_essential=True),
+    Row("replies", "answers that drones wait for", 2, None, "", _STALL_S, True, True),
+    Row("drone", "the scans of one drone", 3, None, "", _STALL_S, True),
+    Row("deliverables", "files of received scans", 4, restarts=True, is_essential=True),
+    Row("exports", "deliverables asked for in the portal", 4, 20, "refuse", is_awaited=True),
+    Row("vehicle", "looks for the vehicle that the portal steers", 5, restarts=True),
+    Row("portal", "the web server", 5, None, "", 60.0, True, True),
+    Row("closing", "keeps the init system waiting while all is closed", 6, restarts=True,
+        is_essential=True),
+)  # fmt: skip
+
+
+def row_of(name: str) -> Row:
+    """The row of a worker's name; KeyError for a worker that is not in the table."""
+    found = [row for row in ROWS if name == row.name or name.startswith(f"{row.name} ")]
+    if not found:
+        raise KeyError(f"no row of ROWS is called {name!r}")
+    return max(found, key=lambda row: len(row.name))
 
 
 @dataclass(slots=True, eq=False)
 class Worker:
-    """One line of the table."""
+    """A thread of the table, while it runs and for a while after."""
 
     name: str
+    row: Row
     work: Callable[[Worker], None]
-    stall_s: float | None  # without a beat for so long it hangs; None: it may block
-    is_essential: bool = True  # the process is of no use without it
     restarts: int = 0
     fault: str = ""  # the last exception, in one line
     has_failed: bool = False  # the budget of restarts is spent
@@ -41,6 +116,13 @@ class Worker:
     beat_at: float = field(default_factory=time.monotonic)
     stop: threading.Event = field(default_factory=threading.Event)
     thread: threading.Thread | None = None
+    depth: Callable[[], int] = lambda: 0  # entries that wait in its queue
+    lag_s: Callable[[], float] = lambda: 0.0  # for which the entry at hand, or the oldest, waits
+
+    @property
+    def thread_id(self) -> int:
+        """Of its thread, as the interpreter counts; 0 before it runs."""
+        return (self.thread.ident if self.thread is not None else None) or 0
 
     def beat(self) -> None:
         """Note that the worker makes progress."""
@@ -48,10 +130,22 @@ class Worker:
 
     @property
     def is_stalled(self) -> bool:
-        """Whether it runs and has not made progress for ``stall_s``."""
-        if self.stall_s is None or self.is_done:
+        """Whether it runs and has not made progress for its row's deadline.
+
+        Only a worker that restarts is judged by its beats; of a scan the daemon judges itself.
+        """
+        if self.row.deadline_s is None or not self.row.restarts or self.is_done:
             return False
-        return time.monotonic() - self.beat_at > self.stall_s
+        return time.monotonic() - self.beat_at > self.row.deadline_s
+
+    @property
+    def state(self) -> str:
+        """failed, done, stalled or running."""
+        if self.has_failed:
+            return "failed"
+        if self.is_done:
+            return "done"
+        return "stalled" if self.is_stalled else "running"
 
     def join(self, timeout_s: float | None = None) -> bool:
         """Ask it to stop and wait for its end; False when it still runs."""
@@ -62,29 +156,53 @@ class Worker:
         thread.join(timeout_s)
         return not thread.is_alive()
 
+    def to_dict(self) -> dict[str, Any]:
+        """For a report: name, state, restarts, last fault, and what its row bounds."""
+        return {
+            "name": self.name,
+            "state": self.state,
+            "restarts": self.restarts,
+            "fault": self.fault,
+            "waiting": self.depth(),
+            "lag_s": round(self.lag_s(), 3),
+        } | _bounds(self.row)
+
+
+def _bounds(row: Row) -> dict[str, Any]:
+    return {
+        "bound": row.bound,
+        "when_full": row.full,
+        "deadline_s": row.deadline_s,
+        "stop": row.stop,
+        "does": row.does,
+    }
+
 
 class Workers:
-    """The table. Safe between threads."""
+    """Workers that one owner starts, watches and ends. Safe between threads."""
 
     def __init__(self, max_restarts: int = MAX_RESTARTS, pause_s: float = PAUSE_S) -> None:
         self._max_restarts, self._pause_s = max_restarts, pause_s
         self._lock = threading.Lock()
         self._workers: list[Worker] = []
+        _ALL.add(self)
 
     def start(
         self,
-        name: str,
+        row: str | Row,
         work: Callable[[Worker], None],
-        stall_s: float | None = None,
-        is_essential: bool = True,
+        depth: Callable[[], int] = lambda: 0,
+        lag_s: Callable[[], float] = lambda: 0.0,
     ) -> Worker:
-        """Run ``work(worker)`` on a thread until it returns; after an exception run it again.
+        """Run ``work(worker)`` on a thread until it returns; ``row`` is the worker's name.
 
-        ``work`` ends soon after ``worker.stop`` is set.
+        After an exception it runs again where the row says so. ``work`` ends soon after
+        ``worker.stop`` is set. ``depth`` and ``lag_s`` are of its queue, for the report.
         """
-        worker = Worker(name, work, stall_s, is_essential)
+        name, row = (row, row_of(row)) if isinstance(row, str) else (row.name, row)
+        worker = Worker(name, row, work, depth=depth, lag_s=lag_s)
         worker.thread = threading.Thread(
-            target=self._supervise, args=(worker,), name=name, daemon=True
+            target=self._supervise, args=(worker,), name=name, daemon=not row.is_awaited
         )
         with self._lock:
             failed = [w for w in self._workers if w.has_failed and w.name != name]
@@ -93,31 +211,38 @@ class Workers:
         worker.thread.start()
         return worker
 
+    def every(self, row: str, period_s: float, work: Callable[[], None]) -> Worker:
+        """Run ``work()`` again and again with pauses of ``period_s``, also after faults."""
+
+        def repeat(worker: Worker) -> None:
+            while not worker.stop.wait(period_s):
+                worker.fault = guarded(worker.name, work)
+
+        return self.start(row, repeat)
+
     @property
     def failed(self) -> list[Worker]:
         """Essential workers that are no longer restarted: the process should end."""
-        return [worker for worker in self._table() if worker.has_failed and worker.is_essential]
+        return [w for w in self.table() if w.has_failed and w.row.is_essential]
 
     @property
     def stalled(self) -> list[Worker]:
         """Workers that hang."""
-        return [worker for worker in self._table() if worker.is_stalled]
+        return [worker for worker in self.table() if worker.is_stalled]
 
     def report(self) -> list[dict[str, Any]]:
-        """One entry per worker: name, state, restarts, last fault."""
-        return [
-            {
-                "name": worker.name,
-                "state": _state(worker),
-                "restarts": worker.restarts,
-                "fault": worker.fault,
-            }
-            for worker in self._table()
-        ]
+        """One entry per worker."""
+        return [worker.to_dict() for worker in self.table()]
 
-    def _table(self) -> list[Worker]:
+    def table(self) -> list[Worker]:
+        """The workers that run, have just ended, or failed."""
         with self._lock:
             return list(self._workers)
+
+    def stop(self, patience_s: float = 1.0) -> None:
+        """Stop all in the order of the table; none is waited for longer than ``patience_s``."""
+        for worker in sorted(self.table(), key=lambda worker: worker.row.stop):
+            worker.join(patience_s)
 
     def _supervise(self, worker: Worker) -> None:
         faults: deque[float] = deque()
@@ -125,9 +250,11 @@ class Workers:
             while True:
                 worker.beat()
                 fault = guarded(worker.name, lambda: worker.work(worker))
-                if not fault or worker.stop.is_set():
+                if not fault:
                     return
                 worker.fault = fault
+                if worker.stop.is_set() or not worker.row.restarts:
+                    return
                 now = time.monotonic()
                 faults.append(now)
                 while faults[0] < now - WINDOW_S:
@@ -140,6 +267,58 @@ class Workers:
                 worker.stop.wait(self._pause_s)
         finally:
             worker.is_done = True
+            worker.work = lambda _: None  # lets go of what it worked on
+            worker.depth, worker.lag_s = (lambda: 0), (lambda: 0.0)
+
+
+_ALL: weakref.WeakSet[Workers] = weakref.WeakSet()
+_PROCESSES: list[tuple[str, subprocess.Popen[bytes]]] = []
+
+PROCESS = Workers()
+"""The workers that nobody watches more closely."""
+
+
+def open_process(name: str, command: Sequence[str], **streams: Any) -> subprocess.Popen[bytes]:
+    """Start a process of the table, with the ``streams`` of Popen; its owner ends it."""
+    row_of(name)
+    _PROCESSES[:] = [(n, p) for n, p in _PROCESSES if p.poll() is None]
+    process = subprocess.Popen(command, **streams)
+    _PROCESSES.append((name, process))
+    return process
+
+
+def end_process(process: subprocess.Popen[bytes], patience_s: float = 2.0) -> None:
+    """Ask a process to end, and kill it when it does not."""
+    process.terminate()
+    try:
+        process.wait(timeout=patience_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def running() -> list[dict[str, Any]]:
+    """The threads and processes of this process that run or have failed, in the table's order.
+
+    Threads that start themselves are found by their names.
+    """
+    workers = [w for group in list(_ALL) for w in group.table() if w.has_failed or not w.is_done]
+    ours = {worker.thread for worker in workers}
+    found = [(worker.row, worker.to_dict()) for worker in workers]
+    for name, process in list(_PROCESSES):
+        if process.poll() is None:
+            found.append((row_of(name), _plain(f"{name}, process {process.pid}", row_of(name))))
+    for thread in threading.enumerate():
+        rows = [row for row in ROWS if row.starts_itself and thread.name.startswith(row.name)]
+        if rows and thread not in ours:
+            found.append((rows[0], _plain(thread.name, rows[0])))
+    found.sort(key=lambda pair: ROWS.index(pair[0]) if pair[0] in ROWS else len(ROWS))
+    return [entry for _, entry in found]
+
+
+def _plain(name: str, row: Row) -> dict[str, Any]:
+    """The entry of what runs without a :class:`Worker`."""
+    return Worker(name, row, lambda _: None).to_dict()
 
 
 def guarded(name: str, work: Callable[[], None]) -> str:
@@ -153,11 +332,3 @@ def guarded(name: str, work: Callable[[], None]) -> str:
         log.exception("fault in %s", name)
         return f"{type(error).__name__}: {error}".splitlines()[0][:200]
     return ""
-
-
-def _state(worker: Worker) -> str:
-    if worker.has_failed:
-        return "failed"
-    if worker.is_done:
-        return "done"
-    return "stalled" if worker.is_stalled else "running"

@@ -23,7 +23,7 @@ from loopback import until
 
 from service.cameras import CameraFrame, CameraSource, open_camera
 from service.cameras.live import LiveConfig, LiveSource, StampFilter
-from service.cameras.source import paced
+from service.cameras.source import Paced
 from service.errors import InputError, OutsideError
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs the ffmpeg command")
@@ -176,7 +176,7 @@ def test_live_pictures_are_not_held_back() -> None:
     """A live source that was opened an hour before it is read gives its pictures at once."""
     source = LiveSource(opener(clip(5)), "test", QUICK)
     source._first = (source._first[0], 3600 * 10**9)
-    paces = paced(source)
+    paces = Paced(source)
     frame = next(iter(paces))
     paces.close()
     assert frame.time_ns == 3600 * 10**9
@@ -184,7 +184,7 @@ def test_live_pictures_are_not_held_back() -> None:
 
 def test_waiting_for_a_dead_camera_can_be_ended() -> None:
     source = LiveSource(opener(clip(6), OSError("gone")), "test", QUICK)
-    paces = paced(source)
+    paces = Paced(source)
     frames = iter(paces)
     next(frames)
     threading.Timer(0.5, paces.close).start()
@@ -193,7 +193,7 @@ def test_waiting_for_a_dead_camera_can_be_ended() -> None:
 
 
 @pytest.mark.parametrize("taken", [0, 1, 5])
-@pytest.mark.parametrize("pace", [paced, lambda source: source], ids=["paced", "direct"])
+@pytest.mark.parametrize("pace", [Paced, lambda source: source], ids=["paced", "direct"])
 def test_an_ended_stream_is_let_go_at_once(
     pace: Callable[[CameraSource], CameraSource], taken: int, no_collector: None
 ) -> None:
@@ -227,7 +227,7 @@ def test_a_paced_recording_can_be_ended(tmp_path: Path) -> None:
     path.write_bytes(data)
     recording = open_camera(str(path))
     recording._start_s = -3600  # type: ignore[attr-defined]
-    paces = paced(recording)
+    paces = Paced(recording)
     threading.Timer(0.3, paces.close).start()
     assert list(paces) == []
 

@@ -167,6 +167,18 @@ def test_what_a_running_service_holds_is_asked_of_it(tmp_path: Path) -> None:
         "state": "scanning",
         "frames": 1234,
         "mavlink": {"links_up": 1, "packets": 77},
+        "workers": [
+            {
+                "name": "camera",
+                "state": "running",
+                "restarts": 0,
+                "fault": "",
+                "waiting": 2,
+                "bound": 2,
+                "when_full": "drop oldest",
+                "lag_s": 0.26,
+            },
+        ],
     }
     server = HealthServer("127.0.0.1:0", lambda: status)
     given = [
@@ -184,6 +196,7 @@ def test_what_a_running_service_holds_is_asked_of_it(tmp_path: Path) -> None:
     assert found["mavlink"] == (GOOD, "held by the running service: 1 open, 77 messages heard")
     assert found["camera"] == (GOOD, "in the running scan: 1234 pictures so far")
     assert found["service"] == (GOOD, "skyrelief 9.9 runs here: scanning")
+    assert found["worker"] == (GOOD, "camera: running, 2 of 2 waiting (drop oldest), 0.3 s behind")
     assert worse["mavlink"][0] == NOTE
     assert worse["service"] == (BAD, "skyrelief 9.9 runs here: no picture")
     assert "service" not in findings(*given)  # it ended

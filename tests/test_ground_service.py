@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ from loopback import free_port, until
 from service.commands.ground import _check
 from service.errors import SkyreliefError
 from service.init_system import Notifier
-from service.workers import Worker, Workers
+from service.workers import Worker, Workers, row_of
 
 pytest.importorskip("zenoh")
 
@@ -79,7 +80,7 @@ def test_a_worker_that_hangs_starves_the_watchdog_and_one_that_failed_ends_the_p
         notifier = Notifier(str(tmp_path / "notify"))
         _check(table, notifier)
         assert heard() == "WATCHDOG=1"
-        worker = table.start("deliverables", hangs, stall_s=0.05)
+        worker = table.start(replace(row_of("deliverables"), deadline_s=0.05), hangs)
         until(lambda: table.stalled)
         _check(table, notifier)
         assert heard() == "STATUS=no progress: deliverables"
@@ -87,7 +88,7 @@ def test_a_worker_that_hangs_starves_the_watchdog_and_one_that_failed_ends_the_p
         assert worker.join(10.0)
         _check(table, notifier)
         assert heard() == "WATCHDOG=1"
-        of_a_drone = table.start("drone red", fails, is_essential=False)
+        of_a_drone = table.start("drone red", fails)
         until(lambda: of_a_drone.has_failed)
         _check(table, notifier)
         essential = table.start("receiver", fails)

@@ -27,6 +27,7 @@ from service.init_system import Notifier
 from service.scans.retention import Claim, close_open_scans, make_room
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
+from service.workers import Workers, running
 
 
 def fetch(port: int, path: str) -> tuple[int, str]:
@@ -87,7 +88,13 @@ def asked(port: int, path: str, method: str) -> tuple[int, str]:
 def test_the_description_holds_for_what_the_daemon_says(tmp_path: Path) -> None:
     daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
     found = daemon.snapshot()
-    kinds = {"string": str, "boolean": bool, "integer": int, "object": dict}
+    kinds = {"string": str, "boolean": bool, "integer": int, "object": dict, "array": list}
+    worker = STATUS["properties"]["workers"]["items"]
+    waiting = Workers()
+    waiting.every("coverage", 60.0, lambda: None)
+    entry = next(entry for entry in running() if entry["name"] == "coverage")
+    waiting.stop()
+    assert set(worker["required"]) <= set(entry) == set(worker["properties"])
     for schema, value in ((STATUS, found), (STATUS["properties"]["load"], found["load"])):
         assert set(schema["required"]) <= set(value) <= set(schema["properties"])
         for name, given in value.items():

@@ -10,8 +10,8 @@ from threading import Event
 import numpy as np
 import pytest
 
+from service.background import BackgroundWorker
 from service.cameras import CameraFrame
-from service.compute.side_by_side import SideBySide
 from service.config import load_config
 from service.daemon.frame_gate import FrameGate
 from service.daemon.runtime import COMPILING_S, HUNG_S, Daemon
@@ -48,7 +48,7 @@ def test_work_at_hand_is_timed() -> None:
         assert release.wait(20.0)
         return x
 
-    jobs: SideBySide[int, int] = SideBySide(work, 3, live=True)
+    jobs: BackgroundWorker[int, int] = BackgroundWorker("dense", work, 3, live=True)
     assert jobs.busy_s == 0.0
     jobs.offer(1)
     assert begun.wait(20.0)

@@ -10,15 +10,15 @@ import logging
 import shlex
 import shutil
 import subprocess
-import threading
 from collections.abc import Mapping
 from typing import IO, Any
 
 from service.cameras import reject_options
 from service.cameras.live import OPEN_S, LiveSource
-from service.cameras.source import CameraSource, paced
+from service.cameras.source import CameraSource, Paced
 from service.errors import InputError, OutsideError
 from service.redaction import without_credentials
+from service.workers import PROCESS, Worker, end_process, open_process
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ def open_gst(rest: str, options: Mapping[str, str]) -> CameraSource:
     except ValueError as error:
         raise InputError(f"gst: the pipeline cannot be read: {error}") from error
     description = without_credentials(f"gst:{rest}")
-    return paced(LiveSource(lambda stall_s: _open_command(command, stall_s), description))
+    return Paced(LiveSource(lambda stall_s: _open_command(command, stall_s), description))
 
 
 class _Complaints:
@@ -53,10 +53,9 @@ class _Complaints:
     def __init__(self, pipe: IO[bytes]) -> None:
         self.first = ""
         self._pipe = pipe
-        self._thread = threading.Thread(target=self._read, name="gst complaints", daemon=True)
-        self._thread.start()
+        self._worker = PROCESS.start("gst complaints", self._read)
 
-    def _read(self) -> None:
+    def _read(self, _: Worker) -> None:
         with self._pipe:
             while line := self._pipe.readline(1000):
                 text = line.decode(errors="replace").strip()
@@ -66,7 +65,7 @@ class _Complaints:
 
     def wait(self) -> str:
         """The first complaint of a command that has ended; empty when it had none."""
-        self._thread.join(1.0)
+        self._worker.join(1.0)
         return self.first
 
 
@@ -77,9 +76,8 @@ def _open_command(command: list[str], stall_s: float) -> Any:
     """
     import av
 
-    process = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
+    pipe = subprocess.PIPE
+    process = open_process("gst", command, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe)
     assert process.stdout is not None
     assert process.stderr is not None
     complaints = _Complaints(process.stderr)
@@ -112,11 +110,6 @@ class _CommandContainer:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    process.terminate()
-    try:
-        process.wait(timeout=2.0)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+    end_process(process)
     if process.stdout is not None:
         process.stdout.close()

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 from recon.types import U8
 from service.cameras import reject_options
-from service.cameras.source import CameraFrame, CameraSource, paced
+from service.cameras.source import CameraFrame, CameraSource, Paced
 from service.cameras.video import decoded_pictures, picture_bgr, video_stream
 from service.errors import InputError, OutsideError
 from service.redaction import without_credentials
@@ -272,4 +272,4 @@ def _live(url: str, demuxer: dict[str, str], format_: str | None = None) -> Came
             url, format=format_, options=demuxer, timeout=timeout, metadata_errors="replace"
         )
 
-    return paced(LiveSource(open_container, without_credentials(url)))
+    return Paced(LiveSource(open_container, without_credentials(url)))

@@ -4,14 +4,14 @@ and readers that take them from the camera on a thread of their own."""
 from __future__ import annotations
 
 import time
-from collections import deque
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
-from queue import Full, Queue
-from threading import Condition, Event, Thread
+from threading import Event
 from typing import Protocol, runtime_checkable
 
 from recon.types import U8
+from service.background import Channel
+from service.workers import PROCESS, Worker
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,121 +59,95 @@ class CameraSource(Protocol):
         ...
 
 
-_LOOK_S = 0.1
-"""How often a full reader looks whether it is still wanted."""
+@runtime_checkable
+class Dropping(Protocol):
+    """A source that drops images which are not fetched in time."""
+
+    dropped: int
 
 
 def ahead(source: CameraSource, kept: int = 4) -> Generator[CameraFrame, None, None]:
-    """Every picture of ``source`` in order, at most ``kept`` of them decoded in advance.
+    """Every image of ``source`` in order, at most ``kept`` of them decoded in advance.
 
-    Raises what the source raises. A reader whose pictures are no longer fetched ends soon;
+    Raises what the source raises. A reader whose images are no longer fetched ends soon;
     close the iterator before the source.
     """
-    queue: Queue[CameraFrame | Exception | None] = Queue(kept)
-    unwanted = Event()
-
-    def put(item: CameraFrame | Exception | None) -> bool:
-        while not unwanted.is_set():
-            try:
-                queue.put(item, timeout=_LOOK_S)
-                return True
-            except Full:
-                continue
-        return False
-
-    def read() -> None:
-        try:
-            for frame in source:
-                if not put(frame):
-                    return
-        except Exception as error:  # handed to the thread that iterates
-            put(error)
-            return
-        put(None)
-
-    reader = Thread(target=read, name="decoder", daemon=True)
-    reader.start()
+    queue: Channel[CameraFrame] = Channel(kept, drops=False)
+    reader = _read("decoder", queue, source)
     try:
-        while (item := queue.get()) is not None:
-            if isinstance(item, Exception):
-                raise item
-            yield item
+        yield from queue
     finally:
-        unwanted.set()
+        queue.close()
         reader.join()
 
 
-class Paced:
-    """A source that gives each picture when its presentation time has come, as a camera does.
+def _read(
+    row: str,
+    queue: Channel[CameraFrame],
+    frames: Iterable[CameraFrame],
+    at_end: Callable[[], None] = lambda: None,
+) -> Worker:
+    """Fill ``queue`` with ``frames`` on a thread of its own."""
 
-    A live source is not held back: it is only emptied, so that its newest pictures are used.
-    At most ``kept`` pictures wait; :attr:`dropped` counts those that were too late.
+    def read(_: Worker) -> None:
+        try:
+            queue.fill(frames)
+        finally:
+            at_end()
+
+    return PROCESS.start(row, read, queue.__len__, lambda: queue.lag_s)
+
+
+class Paced:
+    """A source that gives each image when its presentation time has come, as a camera does.
+
+    A live source is not held back: it is only emptied, so that its newest images are used.
+    At most ``kept`` images wait; :attr:`dropped` counts those that were too late.
     """
 
     def __init__(self, source: CameraSource, kept: int = 2) -> None:
         self._source = source
-        self._waiting: deque[CameraFrame] = deque()
-        self._kept = kept
-        self._news = Condition()
-        self._ended = False
+        self._queue: Channel[CameraFrame] = Channel(kept, drops=True)
         self._closed = Event()
-        self._reader: Thread | None = None
-        self._fault: Exception | None = None
-        self.dropped = 0
+        self._reader: Worker | None = None
         self.description, self.size_px = source.description, source.size_px
         self.epoch_unix_ns, self.fps = source.epoch_unix_ns, source.fps
         self.start_monotonic_ns = source.start_monotonic_ns
         self.is_live = True
         self.warnings = source.warnings
 
+    @property
+    def dropped(self) -> int:
+        """Images that nobody took up in time."""
+        return self._queue.dropped
+
     def __iter__(self) -> Iterator[CameraFrame]:
-        self._reader = Thread(target=self._read, name="paced camera", daemon=True)
-        self._reader.start()
-        while True:
-            with self._news:
-                self._news.wait_for(lambda: self._waiting or self._ended or self._closed.is_set())
-                if not self._waiting or self._closed.is_set():
-                    break
-                frame = self._waiting.popleft()
-            yield frame
-        if self._fault is not None:
-            raise self._fault
+        due = self._due()
+
+        def end() -> None:
+            due.close()
+            self._source.close()
+
+        self._reader = _read("camera", self._queue, due, end)
+        yield from self._queue
         if self.dropped:
             self.warnings.append(f"{self.dropped} frames came faster than they could be used")
 
     def close(self) -> None:
-        """End the iteration at once, from any thread, and let go of the source.
+        """End the iteration at once, from any thread, and close the source.
 
-        A recording is let go by the thread that reads it, not under its hands.
+        A recording is closed by the thread that reads it, not under its hands.
         """
-        with self._news:
-            self._closed.set()
-            self._news.notify_all()
-        if self._source.is_live or self._reader is None or not self._reader.is_alive():
+        self._closed.set()
+        self._queue.close()
+        if self._source.is_live or self._reader is None or self._reader.is_done:
             self._source.close()
 
-    def _read(self) -> None:
+    def _due(self) -> Generator[CameraFrame, None, None]:
+        """The images, each when its time has come."""
         start = time.monotonic_ns()
-        try:
-            for frame in self._source:
-                early_s = 1e-9 * (frame.time_ns - (time.monotonic_ns() - start))
-                if self._closed.wait(0.0 if self._source.is_live else max(0.0, early_s)):
-                    break
-                with self._news:
-                    self._waiting.append(frame)
-                    if len(self._waiting) > self._kept:
-                        self._waiting.popleft()
-                        self.dropped += 1
-                    self._news.notify_all()
-        except Exception as error:  # handed to the thread that iterates
-            self._fault = error
-        finally:
-            self._source.close()
-            with self._news:
-                self._ended = True
-                self._news.notify_all()
-
-
-def paced(source: CameraSource) -> CameraSource:
-    """``source`` at its own pace."""
-    return Paced(source)
+        for frame in self._source:
+            early_s = 1e-9 * (frame.time_ns - (time.monotonic_ns() - start))
+            if self._closed.wait(0.0 if self._source.is_live else max(0.0, early_s)):
+                return
+            yield frame

@@ -92,7 +92,7 @@ def _replay(
     realtime: bool,
     as_json: bool,
 ) -> dict[str, Any]:
-    from service.cameras.source import paced
+    from service.cameras.source import Paced
     from service.compute.opening import open_backend
     from service.onboard.datalink import open_datalink
     from service.onboard.scan import Scan, ScanInputs, create_store
@@ -109,7 +109,7 @@ def _replay(
     chosen = open_backend(config.compute, source.size_px)
     notes += log.warnings if log is not None else ()
     inputs = ScanInputs(
-        paced(source) if realtime else source,
+        Paced(source) if realtime else source,
         camera,
         config,
         chosen,

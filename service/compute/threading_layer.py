@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import logging
 import sys
+from collections.abc import Callable
 
 from service.packages import loads
 
@@ -17,6 +18,20 @@ log = logging.getLogger(__name__)
 
 LIBRARIES = ("libtbb.so.12", "libgomp.so.1")
 REMEDY = "apt install libgomp1"
+
+
+def share_cores(threads: int) -> Callable[[], None]:
+    """Give compiled kernels of this thread half of ``threads`` (0: one per core) from now on.
+
+    Returns what gives the other half to the thread that calls it: two that each want all the
+    cores only wait for one another.
+    """
+    import numba
+
+    most = numba.config.NUMBA_NUM_THREADS
+    half = max(1, min(threads or most, most) // 2)
+    numba.set_num_threads(half)
+    return functools.partial(numba.set_num_threads, half)
 
 
 @functools.cache

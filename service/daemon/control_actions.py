@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import shutil
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +22,7 @@ from service.daemon.machine import existing
 from service.daemon.scanning import Scanning
 from service.daemon.vehicle_config import with_parameter
 from service.errors import InputError, OutsideError, SkyreliefError
+from service.workers import PROCESS
 
 LEAST_FREE_MIB = 500.0
 """The self-test fails with less than that on the disk."""
@@ -115,13 +115,13 @@ class ControlActions:
     def self_test(self) -> Handled:
         """Camera and disk, one after the other, off the protocol's thread."""
         work = Work()
-        threading.Thread(target=self._test, args=(work,), name="self-test", daemon=True).start()
+        PROCESS.start("self-test", lambda _: self._test(work))
         return work
 
     def erase_scans(self) -> Handled:
         """Delete the finished scans."""
         work = Work()
-        threading.Thread(target=self._erase, args=(work,), name="erase", daemon=True).start()
+        PROCESS.start("erase", lambda _: self._erase(work))
         return work
 
     def power(self, action: Power) -> Handled:

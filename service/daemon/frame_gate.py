@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Event
 
-from service.cameras.source import CameraFrame, CameraSource
+from service.cameras.source import CameraFrame, CameraSource, Dropping
 from service.daemon.load_shedding import STRIDE, Level
 
 log = logging.getLogger(__name__)
@@ -89,7 +89,7 @@ class FrameGate:
     @property
     def late(self) -> int:
         """Frames that the camera gave and nobody took up in time."""
-        return int(getattr(self._source, "dropped", 0))
+        return self._source.dropped if isinstance(self._source, Dropping) else 0
 
     def close(self) -> None:
         """Close the camera."""

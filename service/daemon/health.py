@@ -9,7 +9,6 @@ import ipaddress
 import json
 import logging
 import socket
-import threading
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -17,6 +16,7 @@ from typing import Any
 from service.errors import OutsideError
 from service.listener import BoundedListener, ListenerLimits, host_name, is_loopback
 from service.redaction import redacted
+from service.workers import PROCESS
 
 log = logging.getLogger(__name__)
 
@@ -45,16 +45,13 @@ class HealthServer:
         self.port = int(listener.getsockname()[1])
         own_names = OwnNames(is_loopback(host.strip("[]")))
         self._server = _Server(listener, _handler(snapshot, own_names))
-        self._thread = threading.Thread(
-            target=self._server.serve_forever, name="health", daemon=True
-        )
-        self._thread.start()
+        self._worker = PROCESS.start("health", lambda _: self._server.serve_forever())
 
     def close(self) -> None:
         """Stop serving."""
         self._server.shutdown()
         self._server.server_close()
-        self._thread.join()
+        self._worker.join()
 
 
 class OwnNames:
@@ -222,6 +219,27 @@ STATUS: dict[str, Any] = {
             "description": "links, packets, age of the telemetry, what is missing (troubles)",
         },
         "machine": {"type": "object", "description": "heat, power, memory, disk: what it tells"},
+        "workers": {
+            "type": "array",
+            "description": "threads and processes that run or have failed",
+            "items": {
+                "type": "object",
+                "required": ["name", "state", "waiting", "lag_s", "bound", "when_full", "stop"],
+                "properties": {
+                    "name": _TEXT,
+                    "state": {**_TEXT, "description": "running, stalled or failed"},
+                    "does": _TEXT,
+                    "restarts": _COUNT,
+                    "fault": {**_TEXT, "description": "the last one; empty: none"},
+                    "waiting": {**_COUNT, "description": "entries in its queue"},
+                    "lag_s": {**_NUMBER, "description": "age of what it is at, or of the oldest"},
+                    "bound": {"type": ["integer", "null"], "description": "of the queue"},
+                    "when_full": {**_TEXT, "description": "drop oldest, wait or refuse"},
+                    "deadline_s": {"type": ["number", "null"], "description": "of progress"},
+                    "stop": {**_COUNT, "description": "order of stopping"},
+                },
+            },
+        },
     },
 }
 

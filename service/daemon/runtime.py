@@ -10,7 +10,6 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -33,13 +32,14 @@ from service.errors import InputError, OutsideError, SkyreliefError
 from service.init_system import Notifier
 from service.scans.retention import close_open_scans, make_room
 from service.version import software
+from service.workers import PROCESS, row_of, running
 
 log = logging.getLogger(__name__)
 
 STUCK_S = 10.0
 """A scan without a processed frame for so long is reported as critical."""
 
-HUNG_S = 20.0
+HUNG_S = row_of("scan").deadline_s or 20.0
 """Work on one frame or view for so long is a hang: the watchdog is no longer fed."""
 
 CLOSING_S = 120.0
@@ -70,6 +70,7 @@ class Daemon:
         self._quit = threading.Event()
         self._fault = fault
         self._landing = LandingWatch()
+        self._cores = CoreLoad()
         self._is_silent = False  # no picture comes, and that was said
         self.scanning = Scanning(config)
         self.load_control = LoadControl(self.scanning)
@@ -94,9 +95,9 @@ class Daemon:
             self._load(notifier)
             self.actions.is_ready = True
             notifier.ready()
-            self._begin(self._tidy)
+            PROCESS.every("tidy", TIDY_S, self._tidy)
             if kernels_may_overlap():
-                self._begin(self._recover)
+                PROCESS.start("recover", lambda _: self._recover())
             else:
                 self._recover()
             self._watch(notifier)
@@ -106,6 +107,7 @@ class Daemon:
             self.vehicle.stop()
             if http is not None:
                 http.close()
+            PROCESS.stop()
             self.scanning.claim.give_up()
 
     def _load(self, notifier: Notifier) -> None:
@@ -124,9 +126,6 @@ class Daemon:
                 log.error("%s; started again in %g s", error, TOLD_S)
                 self._quit.wait(TOLD_S)
             raise
-
-    def _begin(self, work: Callable[[], None]) -> None:
-        threading.Thread(target=work, name=work.__name__[1:], daemon=True).start()
 
     def _watch(self, notifier: Notifier) -> None:
         """Keep the operator and the init system told until :meth:`quit`."""
@@ -203,6 +202,7 @@ class Daemon:
             "load": self.load_control.to_dict(),
             "mavlink": self._mavlink(),
             "machine": read_machine(Path(self.config.scan.folder)).to_dict(),
+            "workers": running(),
         } | {key: value for key, value in figures.items() if math.isfinite(value)}
 
     def _mavlink(self) -> dict[str, Any]:
@@ -243,18 +243,14 @@ class Daemon:
 
     def _tidy(self) -> None:
         """Watch the machine, do less when it cannot keep up, keep room on the disk."""
-        folder = Path(self.config.scan.folder)
-        cores = CoreLoad()
-        while not self._quit.wait(TIDY_S):
-            try:
-                keep_free_mib = self.config.scan.keep_free_mib
-                machine = read_machine(folder)
-                self.vehicle.set_load(computer_load(machine, cores.percent(), keep_free_mib))
-                self.load_control.look(machine)
-                make_room(folder, keep_free_mib, self.scanning.in_the_making)
-                give_back()
-            except Exception:  # a disk that fails must not end the watch over all the rest
-                log.exception("a fault while looking after the machine")
+        if self._quit.is_set():
+            return
+        folder, keep_free_mib = Path(self.config.scan.folder), self.config.scan.keep_free_mib
+        machine = read_machine(folder)
+        self.vehicle.set_load(computer_load(machine, self._cores.percent(), keep_free_mib))
+        self.load_control.look(machine)
+        make_room(folder, keep_free_mib, self.scanning.in_the_making)
+        give_back()
 
     def _health(self) -> Health:
         if self.scanning.fault:

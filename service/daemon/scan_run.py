@@ -107,13 +107,13 @@ class ScanRun:
     def _open_camera(self) -> CameraSource | None:
         """The camera at its own pace, tried until it answers; None when stopped meanwhile."""
         from service.cameras import open_camera
-        from service.cameras.source import paced
+        from service.cameras.source import Paced
 
         wait_s, is_answer = FIRST_RETRY_S, self._is_asked
         while not self.stop.is_set():
             try:
                 source = open_camera(self._host.config.camera.source)
-                return source if source.is_live else paced(source)
+                return source if isinstance(source, Paced) else Paced(source)
             except OutsideError as error:
                 log.warning("%s; trying again in %.1f s", error, wait_s)
                 text = f"Camera: {error}"

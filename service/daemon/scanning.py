@@ -25,6 +25,7 @@ from service.daemon.writing import ClosingWatch, Writings
 from service.errors import InputError, SkyreliefError
 from service.onboard.datalink import DaemonLink
 from service.scans.retention import Claim
+from service.workers import PROCESS, Worker
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -59,7 +60,7 @@ class Scanning:
         self._backend: Backend | None = None
         self._lock = threading.RLock()  # guards the intent, the run and the work of closing it
         self._run: ScanRun | None = None
-        self._thread: threading.Thread | None = None  # of the run
+        self._worker: Worker | None = None  # of the run
         self._closing: Work | None = None  # ends with the run
         self._writings = Writings(lambda text: self.vehicle.statustext(text, WARNING))
         self._watch = ClosingWatch()
@@ -145,10 +146,7 @@ class Scanning:
                 return
             self.fault = ""
             run = self._run = ScanRun(self, is_asked=self.intent.failures == 0)
-            self._thread = threading.Thread(
-                target=self._carry_out, args=(run,), name="scan", daemon=True
-            )
-            self._thread.start()
+            self._worker = PROCESS.start("scan", lambda _: self._carry_out(run), lag_s=self._lag_s)
 
     def fulfilled(self, run: ScanRun) -> None:
         """Note that the run's recording ended by itself: what was wanted is done."""
@@ -209,6 +207,9 @@ class Scanning:
         """Seconds for which one frame or view has been worked on; 0 while the camera is awaited."""
         run = self._run
         return 0.0 if run is None else run.busy_s
+
+    def _lag_s(self) -> float:
+        return self.busy_s
 
     @property
     def progress_s(self) -> float:
@@ -284,12 +285,12 @@ class Scanning:
         """
         with self._lock:
             self.intent.end()
-            thread = self._thread
+            worker = self._worker
         self.stop()
-        while (thread is not None and thread.is_alive()) or self._writings:
+        while (worker is not None and not worker.is_done) or self._writings:
             wait()
-            if thread is not None:
-                thread.join(1.0)
+            if worker is not None:
+                worker.join(1.0)
             self._writings.wait(1.0)
         self.link.rest()
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from mavlink.component.control import ACCEPTED, Answer, Result, Work
 from service.compute.threading_layer import kernels_may_overlap
+from service.workers import PROCESS
 
 if TYPE_CHECKING:
     from service.stream.store import ScanStore
@@ -37,8 +38,7 @@ class Writing:
         self._folder, self._store = folder, store
         self._lock, self._done = threading.Lock(), threading.Event()
         self._left, self._is_left = left, False
-        self._thread = threading.Thread(target=self._write, name="files", daemon=True)
-        self._thread.start()
+        self._worker = PROCESS.start("files", lambda _: self._write())
 
     def wait(self, seconds: float) -> bool:
         """True when it is done, well or not."""
@@ -57,7 +57,7 @@ class Writing:
 
     def marks(self) -> tuple[Any, ...]:
         """What changes when it gets on: uses of the store, bytes of files."""
-        return (self._store.uses(self._thread.ident or 0), sizes(self._folder))
+        return (self._store.uses(self._worker.thread_id), sizes(self._folder))
 
     def _write(self) -> None:
         from service.scans.folder import write_deliverables

@@ -31,8 +31,6 @@ STRANGER_S = 1.0
 """A drone without any scan makes way for another after so long without a message."""
 REFUSAL_S = 60.0
 """From one warning about a drone that is not received to the next."""
-STALL_S = 120.0
-"""A worker without progress for so long hangs."""
 
 
 @dataclass(slots=True, eq=False)
@@ -69,7 +67,7 @@ class Drones:
                 return None
             drone = self._resting.pop(name, None) or DroneReceiver(name, self._station)
             drone.heard_at = time.monotonic()
-            worker = self._workers.start(f"drone {name}", drone.run, STALL_S, False)
+            worker = self._workers.start(f"drone {name}", drone.run)
             self._members[name] = _Member(drone, worker)
             return drone
 

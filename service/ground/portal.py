@@ -33,8 +33,6 @@ from service.workers import Worker, Workers
 log = logging.getLogger(__name__)
 
 MIN_TOKEN_LETTERS = 16
-STALL_S = 60.0
-"""A portal whose event loop does not turn for so long hangs."""
 
 BACKLOG = 64
 """Connections that may wait to be accepted, and that are accepted at once."""
@@ -121,7 +119,7 @@ class Portal:
         if not is_loopback(config.host) and not config.tls:
             log.warning("portal on %s without TLS: the token can be read on the way", config.host)
         self._server = self._new_server(self._listener)
-        self._worker = self._workers.start("portal", self._run, STALL_S)
+        self._worker = self._workers.start("portal", self._run)
 
     def _listen(self, port: int) -> BoundedListener:
         host = self.config.host

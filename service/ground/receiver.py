@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from service.errors import InputError, SkyreliefError
 from service.ground.drone import Limits
-from service.ground.drones import STALL_S, Drones
+from service.ground.drones import Drones
 from service.ground.inbox import CHANNEL, Inbox, Replies
 from service.ground.received import (
     ReceivedScan,
@@ -97,8 +97,8 @@ class Receiver:
         start = self.workers.start
         self._running = [
             start("deliverables", self._write_all),
-            start("replies", self._replies.run, STALL_S),
-            start("receiver", self._run, STALL_S),
+            start("replies", self._replies.run),
+            start("receiver", self._run),
         ]
         while not self._opened.wait(0.1):
             if self._failure is not None:

@@ -49,7 +49,7 @@ class Jobs:
             self._jobs = [*self._jobs[-KEPT:], (folder, job)]
             self._queue.append((folder, job))
             if self._worker is None or self._worker.is_done:
-                self._worker = self._workers.start("exports", self._work, is_essential=False)
+                self._worker = self._workers.start("exports", self._work)
             return dict(job)
 
     def of(self, folder: Path) -> list[dict[str, Any]]:

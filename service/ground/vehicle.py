@@ -53,7 +53,7 @@ class Vehicle:
 
     def start(self) -> None:
         """Begin to look."""
-        self._searching = self._workers.start("vehicle", self._search, is_essential=False)
+        self._searching = self._workers.start("vehicle", self._search)
 
     def close(self) -> None:
         """Close the link."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from service.config import Config
 from service.errors import SkyreliefError
+from service.workers import PROCESS
 
 if TYPE_CHECKING:
     from mavlink.component.vehicle import VehicleLink
@@ -110,10 +111,8 @@ class DaemonLink:
                 return
             self._is_wanted = True
             self._serial += 1
-            thread = threading.Thread(
-                target=self._open_backlog, args=(config, self._serial), name="backlog", daemon=True
-            )
-        thread.start()
+            serial = self._serial
+        PROCESS.start("backlog", lambda _: self._open_backlog(config, serial))
 
     def _open_backlog(self, config: Config, serial: int) -> None:
         """Open it, which may read much of the disk, unless it is no longer wanted by then."""
@@ -135,7 +134,7 @@ class DaemonLink:
             sender, self._backlog = self._backlog, None
         if sender is not None:
             # The process does not end before it has: Zenoh would abort it.
-            threading.Thread(target=sender.close, name="backlog closing").start()
+            PROCESS.start("backlog closing", lambda _: sender.close())
 
     def follow(self, config: Config) -> None:
         """Keep to another budget, also in flight."""

@@ -47,8 +47,9 @@ from recon.types import (
     Pose,
     StereoPair,
 )
-from service.compute.side_by_side import SideBySide
+from service.background import BackgroundWorker
 from service.compute.stopwatch import Stopwatch
+from service.compute.threading_layer import kernels_may_overlap, share_cores
 from service.config import ComputeConfig, Config
 from service.onboard.anchorage import VIEW, Carriers, Key
 from service.onboard.chain import Chain, Motion
@@ -310,7 +311,7 @@ class Stages:
     keyframe: MakeKeyframe
     beside: Callable[
         [Callable[[StereoCandidate], Keyframe | None]],
-        SideBySide[StereoCandidate, Keyframe | None],
+        BackgroundWorker[StereoCandidate, Keyframe | None],
     ]
     stopwatch: Stopwatch
     refused: Counter[str]  # frames and views, by reason; written while tracking
@@ -360,8 +361,10 @@ def build_stages(
 
     def beside(
         work: Callable[[StereoCandidate], Keyframe | None],
-    ) -> SideBySide[StereoCandidate, Keyframe | None]:
-        return SideBySide(work, MAX_WAITING, live, beside=debug is None, threads=compute.threads)
+    ) -> BackgroundWorker[StereoCandidate, Keyframe | None]:
+        if debug is not None or not kernels_may_overlap():
+            return BackgroundWorker(None, work, MAX_WAITING, live)
+        return BackgroundWorker("dense", work, MAX_WAITING, live, share_cores(compute.threads))
 
     return Stages(
         undistort=undistort,

@@ -31,13 +31,13 @@ from recon.surface.coverage import (
     usual_cell_m,
 )
 from recon.types import U8, Array, DepthMap
-from service.errors import OutsideError
 from service.georeference import LocalFrame
 from service.scans.file_ledger import FileLedger
 from service.scans.track import local_frame
 from service.scans.writing import writing
 from service.stream.ranges import RangeSet
 from service.stream.store import ScanStore
+from service.workers import PROCESS, Worker
 
 log = logging.getLogger(__name__)
 
@@ -238,7 +238,6 @@ def write_coverage_files(folder: Path, store: ScanStore) -> Coverage | None:
 
 
 def _write(folder: Path, found: Coverage) -> None:
-
     with writing(folder / PICTURE) as part:
         part.write_bytes(found.png_bytes())
     with writing(folder / FIGURES) as part:
@@ -256,26 +255,21 @@ class CoverageWriter:
         self._ledger = FileLedger(PLACE, self._folder)
         self._live = LiveCoverage(store, ledger=self._ledger)
         self._every_s = every_s
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._work, name="coverage", daemon=True)
+        self._worker: Worker | None = None
 
     def __enter__(self) -> CoverageWriter:
-        self._thread.start()
+        self._worker = PROCESS.every("coverage", self._every_s, self._write)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join()
+        if self._worker is not None:
+            self._worker.join()
         self._ledger.close()
 
-    def _work(self) -> None:
-        while not self._stop.wait(self._every_s):
-            try:
-                found = self._live.refresh()
-                if found is not None:
-                    _write(self._folder, found)
-            except OutsideError as error:
-                log.warning("coverage not written: %s", error)
+    def _write(self) -> None:
+        found = self._live.refresh()
+        if found is not None:
+            _write(self._folder, found)
 
 
 class LiveCoverages:

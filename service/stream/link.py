@@ -268,7 +268,7 @@ class DatalinkSender:
             closed.set()
 
         atexit.register(wait)
-        self._workers.start("datalink closing", close, is_essential=False)
+        self._workers.start("datalink closing", close)
         if self._stop.is_set():
             closed.wait(PROMPT_CLOSING_S)
 

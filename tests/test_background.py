@@ -6,8 +6,9 @@ import threading
 import time
 
 import pytest
+from loopback import until
 
-from service.compute.side_by_side import SideBySide
+from service.background import BackgroundWorker
 
 
 def test_results_come_in_order_and_nothing_is_dropped() -> None:
@@ -15,7 +16,7 @@ def test_results_come_in_order_and_nothing_is_dropped() -> None:
         time.sleep(0.002 * (n % 3))
         return n * n
 
-    jobs = SideBySide(work, most_waiting=2, live=False)
+    jobs = BackgroundWorker("dense", work, 2)
     out = []
     for n in range(30):
         jobs.offer(n)
@@ -32,7 +33,7 @@ def test_live_the_oldest_that_has_not_begun_gives_way() -> None:
         gate.wait(5)
         return n
 
-    jobs = SideBySide(work, most_waiting=2, live=True)
+    jobs = BackgroundWorker("dense", work, 2, live=True)
     for n in range(10):
         jobs.offer(n)
     gate.set()
@@ -45,7 +46,7 @@ def test_a_fault_reaches_the_caller() -> None:
     def work(n: int) -> int:
         raise RuntimeError("no luck")
 
-    jobs = SideBySide(work, most_waiting=2, live=False)
+    jobs = BackgroundWorker("dense", work, 2)
     jobs.offer(1)
     with pytest.raises(RuntimeError, match="no luck"):
         jobs.finished(everything=True)
@@ -54,6 +55,15 @@ def test_a_fault_reaches_the_caller() -> None:
 
 def test_without_a_thread_the_work_is_done_at_once() -> None:
     seen: list[int] = []
-    jobs: SideBySide[int, None] = SideBySide(seen.append, most_waiting=2, live=True, beside=False)
+    jobs: BackgroundWorker[int, None] = BackgroundWorker(None, seen.append, 2, live=True)
     jobs.offer(1)
     assert seen == [1] and len(jobs.finished()) == 1
+
+
+def test_a_worker_that_nobody_closes_ends_with_its_owner() -> None:
+    jobs = BackgroundWorker("dense", str, 2)
+    jobs.offer(1)
+    assert jobs.finished(everything=True) == [(1, "1")]
+    assert any(t.name == "dense" for t in threading.enumerate())
+    del jobs
+    assert until(lambda: not any(t.name == "dense" for t in threading.enumerate()))

@@ -1,0 +1,179 @@
+"""Work and data handed from one thread to another, always bounded."""
+
+from __future__ import annotations
+
+import time
+import weakref
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future
+from functools import partial
+from queue import SimpleQueue
+from threading import Condition
+from typing import Generic, TypeVar
+
+from service.workers import PROCESS, Worker
+
+T = TypeVar("T")
+In = TypeVar("In")
+Out = TypeVar("Out")
+
+
+class Channel(Generic[T]):
+    """A bounded queue between two threads: iterate over it in one, :meth:`fill` it in the other.
+
+    A full one makes the filling thread wait or, where it ``drops``, loses its oldest entry.
+    """
+
+    def __init__(self, bound: int, drops: bool) -> None:
+        self._bound, self._drops = bound, drops
+        self._items: deque[tuple[float, T]] = deque()
+        self._change = Condition()
+        self._is_ended = self._is_closed = False
+        self._fault: Exception | None = None
+        self.dropped = 0
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    @property
+    def lag_s(self) -> float:
+        """Seconds for which the oldest entry has waited."""
+        with self._change:
+            return time.monotonic() - self._items[0][0] if self._items else 0.0
+
+    def fill(self, items: Iterable[T]) -> None:
+        """Put all ``items`` in, then end; what they raise is raised where they are taken."""
+        try:
+            for item in items:
+                if not self._put(item):
+                    break
+        except Exception as error:
+            self._fault = error
+        with self._change:
+            self._is_ended = True
+            self._change.notify_all()
+
+    def _put(self, item: T) -> bool:
+        """Add an entry; False when nobody wants it any more."""
+        with self._change:
+            if not self._drops:
+                self._change.wait_for(lambda: self._is_closed or len(self._items) < self._bound)
+            if self._is_closed:
+                return False
+            self._items.append((time.monotonic(), item))
+            if len(self._items) > self._bound:
+                self._items.popleft()
+                self.dropped += 1
+            self._change.notify_all()
+            return True
+
+    def close(self) -> None:
+        """Want no more: both threads go on at once."""
+        with self._change:
+            self._is_closed = True
+            self._change.notify_all()
+
+    def __iter__(self) -> Iterator[T]:
+        while True:
+            with self._change:
+                self._change.wait_for(lambda: self._items or self._is_ended or self._is_closed)
+                if not self._items or self._is_closed:
+                    break
+                _, item = self._items.popleft()
+                self._change.notify_all()
+            yield item
+        if self._fault is not None:
+            raise self._fault
+
+
+class BackgroundWorker(Generic[In, Out]):
+    """Runs ``work`` on what is offered, on a thread of the table and in order.
+
+    A full queue makes :meth:`offer` wait. Live, the oldest work that has not begun gives way and
+    :attr:`dropped` counts it. Without a row the work is done within :meth:`offer`.
+    """
+
+    def __init__(
+        self,
+        row: str | None,
+        work: Callable[[In], Out],
+        bound: int,
+        live: bool = False,
+        prepare: Callable[[], object] = lambda: None,
+    ) -> None:
+        """``prepare`` is called once on the thread, before any work."""
+        self._work, self._bound, self._live = work, bound, live
+        self._offered: deque[tuple[In, Future[Out]]] = deque()
+        self.dropped = 0
+        self._began_s: list[float] = []  # when the work at hand began, if there is any
+        self._todo: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._worker: Worker | None = None
+        if row is not None:
+            todo, began_s = self._todo, self._began_s
+            self._worker = PROCESS.start(
+                row, lambda _: _run(todo, prepare), todo.qsize, lambda: _since(began_s)
+            )
+            weakref.finalize(self, todo.put, None)  # also where nobody closes it
+
+    @property
+    def busy_s(self) -> float:
+        """Seconds for which the work at hand has been going on; 0 when there is none."""
+        return _since(self._began_s)
+
+    def offer(self, item: In) -> None:
+        """Hand over one piece of work."""
+        future: Future[Out] = Future()
+        self._offered.append((item, future))
+        if self._worker is None:
+            self._do(item, future)
+            return
+        self._todo.put(partial(self._do, item, future))
+        waiting = [future for _, future in self._offered if not future.done()]
+        if len(waiting) <= self._bound + 1:  # one is being worked on
+            return
+        if not self._live:
+            waiting[0].exception()  # waits
+        elif any(future.cancel() for future in waiting[1:]):
+            self.dropped += 1
+
+    def finished(self, everything: bool = False) -> list[tuple[In, Out]]:
+        """What is done, in order; ``everything`` waits for the rest. Raises what work raised."""
+        out = []
+        while self._offered and (everything or self._offered[0][1].done()):
+            item, future = self._offered.popleft()
+            if not future.cancelled():
+                out.append((item, future.result()))
+        return out
+
+    def close(self) -> None:
+        """End the thread; what has not begun is not done."""
+        for _, future in self._offered:
+            future.cancel()
+        self._todo.put(None)
+        if self._worker is not None:
+            self._worker.join()
+
+    def _do(self, item: In, future: Future[Out]) -> None:
+        if not future.set_running_or_notify_cancel():
+            return
+        self._began_s.append(time.monotonic())
+        try:
+            result = self._work(item)
+        except Exception as error:  # raised where the result is taken
+            self._began_s.clear()
+            future.set_exception(error)
+        else:
+            self._began_s.clear()
+            future.set_result(result)
+
+
+def _run(todo: SimpleQueue[Callable[[], None] | None], prepare: Callable[[], object]) -> None:
+    prepare()
+    while (job := todo.get()) is not None:
+        job()
+        del job  # and with it the owner, whose end ends this
+
+
+def _since(began_s: list[float]) -> float:
+    return next((time.monotonic() - began for began in began_s), 0.0)
