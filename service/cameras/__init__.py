@@ -26,6 +26,7 @@ CAMERAS: dict[str, str] = {
     "v4l2": "service.cameras.live:open_v4l2",
     "gst": "service.cameras.gstreamer:open_gst",
     "stream": "service.cameras.live:open_stream",
+    "sim": "service.cameras:open_sim",
 }
 """Word to ``module:function(rest, options) -> CameraSource``; imported on first use."""
 
@@ -63,6 +64,11 @@ def parse_source(source: str) -> tuple[str, str, dict[str, str]]:
         hint = f"did you mean '{near[0]}:'?" if near else f"there are {', '.join(CAMERAS)}"
         raise InputError(f"no camera source '{word}:'; {hint}")
     raise InputError(f"no such file or folder: {source}")
+
+
+def open_sim(rest: str, options: Mapping[str, str]) -> CameraSource:
+    """Refuse: a simulated flight is more than a camera, and only the daemon plays it."""
+    raise InputError("sim: is a whole flight; 'skyrelief run' plays it, for a video 'simulate'")
 
 
 def reject_options(source: str, options: Mapping[str, str], known: tuple[str, ...] = ()) -> None:

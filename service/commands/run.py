@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from mavlink.wire.first_beat import FirstBeats
     from service.config import Config
     from service.daemon.runtime import Daemon
+    from service.daemon.simulated import SimulatedFlight
     from service.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -32,13 +33,17 @@ def run(
 
     one_pool()  # before there are threads
     chosen, fault = _configuration(config, set_ or [])
+    flight = _simulated(chosen)
+    if flight is not None:
+        chosen = flight.configured(chosen)
+        flight.start()
     first = _first_beats(chosen)
     from service.daemon.runtime import Daemon
 
     daemon = Daemon(chosen, first, fault)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: daemon.quit())
-    signal.signal(signal.SIGHUP, lambda *_: _reload(daemon, config, set_ or []))
+    signal.signal(signal.SIGHUP, lambda *_: _reload(daemon, flight, config, set_ or []))
     daemon.run()
 
 
@@ -85,11 +90,23 @@ def _first_beats(config: Config) -> FirstBeats | None:
     return first
 
 
-def _reload(daemon: Daemon, path: Path | None, overrides: list[str]) -> None:
+def _simulated(config: Config) -> SimulatedFlight | None:
+    """The flight that ``camera.source = "sim:"`` asks for."""
+    if not config.camera.source.startswith("sim:"):
+        return None
+    from service.daemon.simulated import SimulatedFlight
+
+    return SimulatedFlight(config.camera.source)
+
+
+def _reload(
+    daemon: Daemon, flight: SimulatedFlight | None, path: Path | None, overrides: list[str]
+) -> None:
     from service.config import load_config
     from service.errors import InputError
 
     try:
-        daemon.reload(load_config(path, overrides))
+        wanted = load_config(path, overrides)
+        daemon.reload(wanted if flight is None else flight.configured(wanted))
     except InputError as error:
         log.error("the configuration stays as it was: %s", error)

@@ -7,11 +7,14 @@ import re
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from service.errors import InputError
+
+if TYPE_CHECKING:
+    from service.sim.live import LiveOptions
 
 VIDEO_TO = "udp://127.0.0.1:5600?pkt_size=1316"
 PAIR = re.compile(r"^(-?[0-9.]+):(-?[0-9.]+)$")
@@ -64,6 +67,7 @@ def simulate(
     video_to: Annotated[str, typer.Option(help="Live: where H.264 in MPEG-TS goes.")] = VIDEO_TO,
     mavlink_to: Annotated[str, typer.Option(help="Live: UDP host:port.")] = "127.0.0.1:14550",
     loop: Annotated[bool, typer.Option("--loop", help="Live: again and again.")] = False,
+    until_stdin_ends: Annotated[bool, typer.Option("--until-stdin-ends", hidden=True)] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Report as one JSON object.")] = False,
 ) -> None:
     """A rendered flight: flight.mp4, flight.tlog, camera.yaml, and truth/ to score against.
@@ -71,8 +75,10 @@ def simulate(
     With --live the flight is then played in real time, as a camera's stream and an autopilot's
     MAVLink; a folder that already holds a flight is played as it is.
     """
+    from service.sim.live import LiveOptions
+
     if live and (out / "flight.mp4").exists():
-        _play(out, video_to, mavlink_to, loop, as_json)
+        _play(out, LiveOptions(video_to, mavlink_to, loop, until_stdin_ends), as_json)
         return
     from service.sim import recording
     from service.sim.flight import FlightPlan, SensorNoise
@@ -114,24 +120,27 @@ def simulate(
     result = recording.write(simulation, out, show)
     if live:
         print(f"{out}: {result['frames']} frames rendered", file=sys.stderr)
-        _play(out, video_to, mavlink_to, loop, as_json)
+        _play(out, LiveOptions(video_to, mavlink_to, loop, until_stdin_ends), as_json)
         return
     _report(out, result, time.monotonic() - started, as_json)
 
 
-def _play(folder: Path, video_to: str, mavlink_to: str, loop: bool, as_json: bool) -> None:
+def _play(folder: Path, options: LiveOptions, as_json: bool) -> None:
     """Play a flight until its end or Ctrl-C."""
-    from service.sim.live import LiveOptions, play
+    from service.sim.live import play
 
-    print(f"playing {folder}: video to {video_to}, MAVLink to {mavlink_to}", file=sys.stderr)
+    where = f"video to {options.video}, MAVLink to {options.mavlink}"
+    print(f"playing {folder}: {where}", file=sys.stderr)
     try:
-        counts = play(folder, LiveOptions(video_to, mavlink_to, loop))
+        counts = play(folder, options)
     except ValueError as error:
         raise InputError(f"simulate --live: {error}") from error
     except KeyboardInterrupt:
         return
     if as_json:
-        print(json.dumps(counts), file=sys.stderr if video_to.startswith("pipe:") else sys.stdout)
+        print(
+            json.dumps(counts), file=sys.stderr if options.video.startswith("pipe:") else sys.stdout
+        )
 
 
 def _pair(text: str, option: str) -> tuple[float, float]:

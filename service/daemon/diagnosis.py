@@ -22,6 +22,7 @@ from mavlink.telemetry.clock import EARLIEST_UNIX_S
 from service.compute.threading_layer import REMEDY, kernels_may_overlap
 from service.config import Config, keys, load_config
 from service.daemon.machine import existing, read_machine
+from service.daemon.simulated import is_simulated
 from service.daemon.vehicle_config import watch_config
 from service.daemon.warm_up import is_warm
 from service.errors import InputError, SkyreliefError
@@ -154,6 +155,9 @@ def _board(config: Config, model: str) -> Iterator[Finding]:
 def _to_fly(config: Config) -> Iterator[Finding]:
     """What the service does not start without, or a flight is poor without."""
     needed = [n for n in ("source", "model") if not getattr(config.camera, n)]
+    if is_simulated(config):
+        yield Finding("to fly", GOOD, "nothing: camera and autopilot are simulated")
+        return
     if needed:
         names = " and ".join(f"camera.{n}" for n in needed)
         yield Finding("to fly", BAD, f"set {names}; the service does not start without")
@@ -206,6 +210,9 @@ def _compute(config: Config) -> Iterator[Finding]:
 def _camera(config: Config, running: dict[str, Any] | None) -> Iterator[Finding]:
     from service.cameras import open_camera
 
+    if is_simulated(config):
+        yield Finding("camera", GOOD, "sim: a simulated flight; 'skyrelief run' plays it")
+        return
     model = None
     if config.camera.model:
         model, finding = _model(config)
@@ -249,6 +256,21 @@ def _service(running: dict[str, Any] | None) -> Iterator[Finding]:
     fault = str(running.get("fault", ""))
     text = f"{running['software']} runs here: {fault or running.get('state', 'unknown')}"
     yield Finding("service", GOOD if running.get("ok") else BAD, text)
+    for worker in running.get("workers", ()):
+        yield _worker(worker)
+
+
+def _worker(worker: dict[str, Any]) -> Finding:
+    """A thread or process of the running service: state, depth and lag."""
+    text = f"{worker['name']}: {worker['state']}"
+    if worker["bound"] is not None:
+        text += f", {worker['waiting']} of {worker['bound']} waiting ({worker['when_full']})"
+    if worker["lag_s"] > 0:
+        text += f", {worker['lag_s']:.1f} s behind"
+    if worker["restarts"] or worker["fault"]:
+        text += f", {worker['restarts']} restarts, last fault: {worker['fault']}"
+    is_well = worker["state"] == "running"
+    return Finding("worker", (NOTE if worker["fault"] else GOOD) if is_well else BAD, text)
 
 
 def _certificate(config: Config) -> Iterator[Finding]:

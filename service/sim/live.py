@@ -11,6 +11,7 @@ import logging
 import select
 import socket
 import struct
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -36,6 +37,7 @@ class LiveOptions:
     video: str = "udp://127.0.0.1:5600?pkt_size=1316"  # any URL of FFmpeg; pipe:1 is stdout
     mavlink: str = "127.0.0.1:14550"  # host:port of UDP
     loop: bool = False
+    until_stdin_ends: bool = False  # also end when standard input does: with who started us
 
     @property
     def mavlink_address(self) -> tuple[str, int]:
@@ -49,7 +51,7 @@ class LiveOptions:
 class MavlinkPlayer:
     """Sends the flight's messages from their components, and answers TIMESYNC."""
 
-    def __init__(self, address: tuple[str, int]) -> None:
+    def __init__(self, address: tuple[str, int], until_stdin_ends: bool = False) -> None:
         """Open the socket; OutsideError when the address cannot be used."""
         from pymavlink.dialects.v20 import common  # type: ignore[import-untyped]
 
@@ -59,12 +61,19 @@ class MavlinkPlayer:
         self._reader = common.MAVLink(None)
         self._requests = common.MAVLink(None)
         self._requests.robust_parsing = True
+        self.has_ended = False
         try:
             self._to = socket.getaddrinfo(*address, socket.AF_INET, socket.SOCK_DGRAM)[0][4]
             self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             self.socket.setblocking(False)
+            self._stdin = [sys.stdin] if until_stdin_ends else []
         except OSError as error:
             raise OutsideError(f"MAVLink to {address[0]}:{address[1]}: {error}") from error
+
+    def listen(self, seconds: float) -> None:
+        """Wait for a request for so long; note when standard input has ended."""
+        ready, _, _ = select.select([self.socket, *self._stdin], [], [], seconds)
+        self.has_ended = self.has_ended or any(stream in ready for stream in self._stdin)
 
     def play(self, packet: bytes, boot_s: float) -> None:
         """Send one packet of the log as if it happened ``boot_s`` after the boot."""
@@ -117,30 +126,38 @@ def play(folder: Path, options: LiveOptions) -> dict[str, int]:
     video, tlog = folder / "flight.mp4", folder / "flight.tlog"
     if not video.exists():
         raise InputError(f"{folder} holds no flight.mp4 to play")
-    player = MavlinkPlayer(options.mavlink_address)
+    player = MavlinkPlayer(options.mavlink_address, options.until_stdin_ends)
     frames = 0
     try:
         while True:
-            frames += _play_once(video, tlog, options.video, player)
-            if not options.loop:
+            frames += _play_once(video, tlog, options, player)
+            if not options.loop or player.has_ended:
                 break
     finally:
         player.close()
     return {"frames": frames, "packets": player.sent, "timesync_answers": player.answered}
 
 
-def _play_once(video: Path, tlog: Path, url: str, player: MavlinkPlayer) -> int:
-    """Play once from the start; returns the number of frames."""
-    frames = 0
+def _play_once(video: Path, tlog: Path, options: LiveOptions, player: MavlinkPlayer) -> int:
+    """Play once from the start; returns the number of frames.
+
+    In a loop without the telemetry before and after the video: a camera that is silent for
+    seconds counts as lost.
+    """
+    frames, url = 0, options.video
     try:
         with av.open(str(video)) as source, av.open(url, "w", format="mpegts") as sink:
             stream = sink.add_stream_from_template(source.streams.video[0])
-            events = heapq.merge(_packets(source), _telemetry(tlog), key=lambda e: e[:2])
+            end_s = (source.duration or 0) / av.time_base
+            telemetry = (e for e in _telemetry(tlog) if not options.loop or 0 <= e[0] <= end_s)
+            events = heapq.merge(_packets(source), telemetry, key=lambda e: e[:2])
             start = None
             for due_s, kind, payload in events:
                 if start is None:
                     start = time.monotonic() + START_DELAY_S - due_s
                 _wait(start, due_s, player)
+                if player.has_ended:
+                    break
                 if kind == TELEMETRY:
                     player.play(payload, due_s + BOOT_BEFORE_VIDEO_S)
                 else:
@@ -156,9 +173,9 @@ def _wait(start: float, due_s: float, player: MavlinkPlayer) -> None:
     """Wait until ``due_s`` of the flight, answering requests meanwhile."""
     while True:
         left = start + due_s - time.monotonic()
-        select.select([player.socket], [], [], max(left, 0.0))
+        player.listen(max(left, 0.0))
         player.answer(time.monotonic() - start + BOOT_BEFORE_VIDEO_S)
-        if start + due_s - time.monotonic() <= 0:
+        if player.has_ended or start + due_s - time.monotonic() <= 0:
             return
 
 

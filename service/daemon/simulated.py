@@ -1,0 +1,163 @@
+"""``camera.source = "sim:"``: a simulated flight in place of a camera and an autopilot.
+
+The flight is rendered once into the state directory, then played again and again by a process
+of its own, ``skyrelief simulate --live --loop``; camera, camera model and MAVLink link of the
+configuration lead to it. ``sim:?size=640x360&fps=10&duration_s=30&seed=1`` are the options.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+from service.cameras import parse_source, reject_options
+from service.config import Config, ScanConfig
+from service.errors import InputError, OutsideError
+from service.init_system import Notifier
+from service.workers import PROCESS, Worker, end_process, open_process
+
+log = logging.getLogger(__name__)
+
+OPERATOR = "udpout:127.0.0.1:14550"
+"""Where ``skyrelief ctl`` and ground stations listen by default."""
+LOOK_S = 0.5
+TELL_EVERY = 25  # frames between two lines of progress
+
+
+class SimulatedFlight:
+    """Camera, autopilot and place of one simulated flight."""
+
+    def __init__(self, source: str) -> None:
+        """The flight that a source ``sim:`` with its options names, rendered if need be.
+
+        InputError for options that cannot be.
+        """
+        _, rest, options = parse_source(source)
+        given = {"size": "640x360", "fps": "10", "duration_s": "30", "seed": "1"}
+        reject_options("sim", options, tuple(given))
+        if rest:
+            raise InputError(f"{source}: write sim: or sim:?size=640x360")
+        self._state = state_folder()
+        given |= options
+        self.folder = self._state / "-".join(["sim", *given.values()]).replace("/", "_")
+        if not (self.folder / "flight.mp4").exists():
+            _render(self.folder, given)
+        self._ports = free_ports(2)
+
+    def configured(self, config: Config) -> Config:
+        """``config`` with this flight as its camera and its autopilot.
+
+        A scan begins at once, unless arming starts it; scans go to the state directory where
+        the default folder cannot be written.
+        """
+        if not is_simulated(config):
+            return config
+        video, telemetry = self._ports
+        camera = dataclasses.replace(
+            config.camera,
+            source=f"stream:udp://127.0.0.1:{video}",
+            model=str(self.folder / "camera.yaml"),
+        )
+        links = (*config.mavlink.links, f"udpin:127.0.0.1:{telemetry}", OPERATOR)
+        scan = config.scan
+        if scan.start == "on-command":
+            scan = dataclasses.replace(scan, start="on-boot")
+        if scan.folder == ScanConfig().folder and not _can_write(Path(scan.folder)):
+            scan = dataclasses.replace(scan, folder=str(self._state / "scans"))
+        mavlink = dataclasses.replace(config.mavlink, links=links)
+        return dataclasses.replace(config, camera=camera, mavlink=mavlink, scan=scan)
+
+    def start(self) -> Worker:
+        """Play the flight until the worker is stopped; it is started again when it fails."""
+        return PROCESS.start("simulated flight", self._play)
+
+    def _play(self, worker: Worker) -> None:
+        video, telemetry = self._ports
+        command = [
+            sys.executable, "-m", "service.cli", "simulate", "--out", str(self.folder), "--live",
+            "--loop", "--video-to", f"udp://127.0.0.1:{video}?pkt_size=1316",
+            "--mavlink-to", f"127.0.0.1:{telemetry}", "--until-stdin-ends",
+        ]  # fmt: skip
+        process = open_process(worker.name, command, stdin=subprocess.PIPE)
+        try:
+            while not worker.stop.wait(LOOK_S):
+                if process.poll() is not None:
+                    raise OutsideError(f"the simulated flight ended, code {process.returncode}")
+        finally:
+            end_process(process)
+            if process.stdin is not None:
+                process.stdin.close()
+
+
+def is_simulated(config: Config) -> bool:
+    """True when the camera is ``sim:``."""
+    return config.camera.source.startswith("sim:")
+
+
+def state_folder() -> Path:
+    """Where the service keeps what it makes: systemd's state directory, or the user's."""
+    if systemd := os.environ.get("STATE_DIRECTORY", "").partition(":")[0]:
+        return Path(systemd)
+    home = os.environ.get("XDG_STATE_HOME", "")
+    return (Path(home) if home else Path.home() / ".local" / "state") / "skyrelief"
+
+
+def free_ports(count: int) -> list[int]:
+    """UDP ports of this machine that nobody uses."""
+    with contextlib.ExitStack() as stack:
+        probes = []
+        for _ in range(count):
+            probe = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            probe.bind(("127.0.0.1", 0))
+            probes.append(probe)
+        return [int(probe.getsockname()[1]) for probe in probes]
+
+
+def _render(folder: Path, given: dict[str, str]) -> None:
+    """Make the flight; a rendering that is cut off leaves none."""
+    from service.sim import recording
+    from service.sim.flight import FlightPlan
+
+    try:
+        W, _, H = given["size"].partition("x")
+        options = recording.SimulationOptions(
+            FlightPlan("legs", float(given["duration_s"]), legs=2),
+            seed=int(given["seed"]),
+            size_px=(int(W), int(H)),
+            fps=float(given["fps"]),
+            depth_frames=0,
+        )
+        simulation = recording.prepare(options)
+    except ValueError as error:
+        raise InputError(f"camera.source sim: {error}") from error
+    notifier = Notifier()
+
+    def tell(done: int, total: int) -> None:
+        if done % TELL_EVERY == 0 or done == total:
+            log.info("rendering the simulated flight: frame %d of %d", done, total)
+            notifier.closing()  # systemd waits for it
+
+    part = folder.with_name(f"{folder.name}.part")
+    try:
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        recording.write(simulation, part, tell)
+        part.rename(folder)
+    except OSError as error:
+        raise OutsideError(f"{folder} cannot be written: {error.strerror or error}") from error
+
+
+def _can_write(folder: Path) -> bool:
+    """True when the folder can be made and written to."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK)
