@@ -23,25 +23,28 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("service.commands.demo:demo", "A real flight through both ends, here."),
     "replay": ("service.commands.replay:replay", "Recorded video through the onboard path."),
     "run": ("service.commands.run:run", "The daemon."),
-    "keys": ("service.commands.keys:keys", "Certificates for a fleet's datalink."),
+    "keys": ("service.commands.setup:keys", "Certificates for a fleet's datalink."),
     "ctl": ("service.commands.ctl:ctl", "Start, stop, watch and steer a scan by MAVLink."),
     "ground": ("service.commands.ground:ground", "Receive scans from drones."),
     "simulate": ("service.commands.simulate:simulate", "A synthetic flight with exact truth."),
-    "score": ("service.commands.score:score", "Compare a scan folder with the truth."),
-    "export": ("service.commands.export:export", "Deliverables of a scan folder."),
-    "mesh": ("service.commands.mesh:mesh", "Offline mesh and texture of a scan folder."),
+    "score": ("service.commands.simulate:score", "Compare a scan folder with the truth."),
+    "export": ("service.commands.deliverables:export", "Deliverables of a scan folder."),
+    "mesh": ("service.commands.deliverables:mesh", "Offline mesh and texture of a scan folder."),
     "refine": ("service.commands.refine:refine", "A finished scan adjusted as a whole."),
-    "refly": ("service.commands.refly:refly", "A mission over what was seen too little of."),
-    "inspect": ("service.commands.inspect:inspect", "Every stage of a keyframe as one picture."),
+    "refly": ("service.commands.refine:refly", "A mission over what was seen too little of."),
+    "inspect": (
+        "service.commands.deliverables:inspect",
+        "Every stage of a keyframe as one picture.",
+    ),
     "calibrate": ("service.commands.calibrate:calibrate", "Camera model from a chessboard."),
     "stereo": ("service.commands.stereo:stereo", "The stereo stage alone."),
-    "export-model": ("service.commands.export_model:export_model", "The dense stage as ONNX."),
-    "config": ("service.commands.config:config", "Check, show or print the configuration."),
-    "doctor": ("service.commands.doctor:doctor", "What works here, what does not."),
-    "warm-up": ("service.commands.warm_up:warm_up", "Compile before the first flight."),
+    "export-model": ("service.commands.stereo:export_model", "The dense stage as ONNX."),
+    "config": ("service.commands.setup:config", "Check, show or print the configuration."),
+    "doctor": ("service.commands.setup:doctor", "What works here, what does not."),
+    "warm-up": ("service.commands.setup:warm_up", "Compile before the first flight."),
     "bench": ("service.commands.bench:bench", "Benchmarks, each against a peer."),
 }
-"""Name to (``module:function``, one line of help). The next command is one file, one line."""
+"""Name to (``module:function``, one line of help). The next command is a function and a line."""
 
 
 class LazyCommands(typer.core.TyperGroup):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from service.commands.config import to_toml
+from service.commands.setup import to_toml
 from service.config import Config, keys, load_config, parse_baseline
 from service.errors import InputError
 

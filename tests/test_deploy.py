@@ -142,7 +142,7 @@ def test_a_named_profile_must_exist(machine: Machine) -> None:
 
 @pytest.mark.parametrize("profile", sorted((ROOT / "deploy" / "profiles").glob("*.toml")))
 def test_profiles_are_configurations(profile: Path) -> None:
-    from service.commands.config import to_toml
+    from service.commands.setup import to_toml
     from service.config import load_config
 
     chosen = load_config(profile)

@@ -1,0 +1,170 @@
+"""``skyrelief export``, ``mesh`` and ``inspect``: files and images of a scan folder."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.errors import InputError
+from service.exports import EXPORTERS
+
+KINDS = "|".join(EXPORTERS)
+
+
+def export(
+    scan_dir: Annotated[Path, typer.Argument(help="scan folder (holds scan.db)")],
+    to: Annotated[list[str], typer.Option("--to", help=f"{KINDS}; may be repeated")],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="file to write; default: in the scan folder")
+    ] = None,
+    voxel_m: Annotated[
+        float | None, typer.Option("--voxel-m", help="fused voxel size; default: pixel on ground")
+    ] = None,
+    cell_m: Annotated[
+        float | None, typer.Option("--cell-m", help="cell of dsm, ortho, contours")
+    ] = None,
+    contour_m: Annotated[float, typer.Option("--contour-m", help="contour interval")] = 1.0,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
+) -> None:
+    """Write deliverables of a scan: clouds, surface model, orthophoto, tiles, mesh, flight."""
+    from service.exports.view import ExportOptions, ScanView
+    from service.exports.view import export as write
+
+    for kind in to:
+        if kind not in EXPORTERS:
+            raise InputError(f"--to {kind}: there are {', '.join(EXPORTERS)}")
+    if out is not None and len(to) > 1:
+        raise InputError("--out names one file; give one --to with it")
+    try:
+        options = ExportOptions(voxel_m, cell_m, contour_m)
+    except ValueError as error:
+        raise InputError(f"export: {error}") from error
+    written = {}
+    with ScanView(scan_dir, voxel_m) as scan:
+        for kind in to:
+            written[kind] = str(write(scan, kind, out, options))
+            if not as_json:
+                print(written[kind])
+    if as_json:
+        print(json.dumps({"scan": str(scan_dir), "written": written}))
+
+
+def mesh(
+    scan_dir: Annotated[Path, typer.Argument(help="scan folder (holds scan.db)")],
+    method: Annotated[str, typer.Option("--method", help="auto, height or poisson")] = "auto",
+    faces: Annotated[int, typer.Option("--faces", min=100, help="triangles at most")] = 400_000,
+    voxel_m: Annotated[
+        float | None, typer.Option("--voxel-m", help="fused voxel size; default: pixel on ground")
+    ] = None,
+    video: Annotated[
+        Path | None,
+        typer.Option(help="the flight's video or folder of pictures; default: as scan.json names"),
+    ] = None,
+    stored: Annotated[
+        bool, typer.Option("--stored", help="texture from the scan's own small pictures")
+    ] = False,
+    video_epoch: Annotated[
+        float | None, typer.Option(help="unix seconds of its start; default: the scan's start")
+    ] = None,
+    tile_points: Annotated[
+        int, typer.Option(min=1000, help="points beyond which the site is cut into tiles")
+    ] = 20_000_000,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Dask scheduler that makes the tiles: tcp://HOST:8786")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="file to write; default: mesh.glb in the folder")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
+) -> None:
+    """Mesh and texture a scan into one binary glTF file."""
+    from service.errors import InputError
+    from service.exports.model import MeshOptions, write_mesh
+    from service.exports.view import ExportOptions, ScanView
+
+    try:
+        options = ExportOptions(
+            voxel_m=voxel_m, progress=lambda text: print(f"mesh: {text}", file=sys.stderr)
+        )
+    except ValueError as error:
+        raise InputError(f"mesh: {error}") from error
+    epoch_ns = None if video_epoch is None else round(video_epoch * 1e9)
+    if stored and video is not None:
+        raise InputError("mesh: give either --video or --stored")
+    how = MeshOptions(method, faces, tile_points, scheduler, video, not stored, epoch_ns)
+    path = out or scan_dir / "mesh.glb"
+    started = time.monotonic()
+    with ScanView(scan_dir, voxel_m) as scan:
+        figures = write_mesh(scan, path, how, options)
+    figures["seconds"] = round(time.monotonic() - started, 1)
+    if as_json:
+        print(json.dumps({"file": str(path)} | figures))
+    else:
+        print(
+            f"{path}: {figures['faces']} triangles in {figures['tiles']} tile(s), "
+            f"{figures['method']}, {figures['seen']:.0%} seen by a picture, "
+            f"{figures['seconds']} s"
+        )
+
+
+def inspect(
+    scan_dir: Annotated[Path, typer.Argument(help="scan folder (holds scan.db)")],
+    keyframe: Annotated[
+        int | None, typer.Option("--keyframe", help="number of the keyframe; default: a middle one")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="PNG to write; default: in the scan folder")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
+) -> None:
+    """Raw and rectified frames, anaglyph, disparity, depth and sigma of a keyframe.
+
+    The stages before the depth are there when the scan was made with
+    --set scan.keep_debug=true; otherwise what the store holds is shown.
+    """
+    import cv2
+    import numpy as np
+
+    from service.exports.view import ScanView
+    from service.scans.drawing import middle_keyframe, stages
+    from service.scans.writing import writing
+
+    with ScanView(scan_dir) as scan:
+        seqs = scan.store.seqs()
+        seq = middle_keyframe(scan_dir, seqs) if keyframe is None else keyframe
+        if not seqs or seq is None:
+            raise InputError(f"{scan_dir} holds no keyframes yet; nothing to inspect")
+        found = scan.store.keyframe(seq) if seq in seqs else None
+        if found is None:
+            raise InputError(f"{scan_dir}: no keyframe {seq}; there are {seqs[0]} to {seqs[-1]}")
+    picture, complete = stages(scan_dir, scan.store.header.scan_id, found)
+    path = out or scan_dir / f"keyframe_{seq:06d}.png"
+    ok, data = cv2.imencode(".png", picture)
+    if not ok:
+        raise InputError(f"{path}: OpenCV cannot write PNG on this machine")
+    with writing(path) as part:
+        part.write_bytes(data.tobytes())
+    known = np.isfinite(found.depth.depth_m)
+    figures = {
+        "keyframe": seq,
+        "picture": str(path),
+        "stages": complete,
+        "points": int(known.sum()),
+        "depth_median_m": round(float(np.median(found.depth.depth_m[known])), 3)
+        if known.any()
+        else None,
+        "sigma_median_m": round(float(np.median(found.depth.sigma_m[known])), 4)
+        if known.any()
+        else None,
+    }
+    if as_json:
+        print(json.dumps(figures))
+        return
+    print(f"{path}: keyframe {seq}, {figures['points']} points")
+    if not complete:
+        print("only what the store holds; replay with --set scan.keep_debug=true for every stage")

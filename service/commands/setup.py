@@ -1,0 +1,173 @@
+"""``skyrelief config``, ``doctor``, ``keys`` and ``warm-up``: what is done before a flight."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from service.config import keys as configuration_keys
+from service.config import load_config
+from service.errors import InputError, OutsideError
+from service.redaction import HIDDEN, public_configuration
+
+ACTIONS = ("check", "show", "default")
+
+
+def config(
+    action: Annotated[str, typer.Argument(help="check, show or default")],
+    file: Annotated[Path | None, typer.Argument(help="configuration file (TOML)")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="section.key=value, may be repeated")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
+) -> None:
+    """Check a configuration file, show what is in force, or print the documented default.
+
+    ``default FILE`` prints the documented default with what FILE sets, such as a board's profile.
+    """
+    if action not in ACTIONS:
+        raise InputError(f"config {action}: there are {', '.join(ACTIONS)}")
+    if action == "check" and file is None:
+        raise InputError("config check: name the file to check")
+    chosen = load_config(file, set_ or [])
+    values = chosen.to_dict()
+    if action == "show":
+        values = public_configuration(values)
+    if as_json:
+        print(json.dumps(values))
+    elif action == "check":
+        print(f"{file}: good")
+    else:
+        if values != chosen.to_dict():
+            print(f"# {HIDDEN}: a secret, which is not shown")
+        print(to_toml(values, documented=action == "default"), end="")
+
+
+def to_toml(values: Mapping[str, Mapping[str, Any]], documented: bool = False) -> str:
+    """A configuration's sections as TOML; a key that is not set stands as a comment."""
+    lines: list[str] = []
+    last = ""
+    for section, field in configuration_keys():
+        if section != last:
+            lines += ["", f"[{section}]"] if lines else [f"[{section}]"]
+            last = section
+        if documented:
+            live = " (may change while running)" if field.metadata["live"] else ""
+            lines.append(f"# {field.metadata['doc']}{live}")
+        value = values[section][field.name]
+        if value is None:
+            lines.append(f"# {field.name} = (not set)")
+        else:
+            lines.append(f"{field.name} = {_toml_value(value)}")
+    return "\n".join(lines) + "\n"
+
+
+def _toml_value(value: Any) -> str:
+    """``value`` in TOML: its strings, numbers, booleans and arrays of them match JSON's."""
+    return json.dumps(value, ensure_ascii=False)
+
+
+INSTALLED = Path("/etc/skyrelief/skyrelief.toml")
+
+
+def doctor(
+    config: Annotated[
+        Path | None, typer.Option(help=f"configuration file; else {INSTALLED} if it is there")
+    ] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="section.key=value, may be repeated")
+    ] = None,
+    listen_s: Annotated[float, typer.Option(help="seconds to listen on the MAVLink links")] = 3.0,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
+) -> None:
+    """Say what works, what does not, and what to do. Exit code 3 when something is bad."""
+    from service.daemon.diagnosis import BAD, examine
+
+    chosen = config or (INSTALLED if INSTALLED.is_file() else None)
+    findings = []
+    for finding in examine(load_config(chosen, set_ or []), listen_s):
+        findings.append(finding)
+        if not as_json:
+            print(f"{finding.verdict}  {finding.what:<13}{finding.text}", flush=True)
+    bad = [finding.what for finding in findings if finding.verdict == BAD]
+    if as_json:
+        print(json.dumps({"ok": not bad, "findings": [asdict(f) for f in findings]}))
+    if bad:
+        raise OutsideError(f"not ready to fly: {', '.join(dict.fromkeys(bad))}")
+
+
+def keys(
+    folder: Annotated[Path, typer.Argument(help="where the fleet's keys are kept")],
+    drone: Annotated[list[str] | None, typer.Option(help="a drone's name; may be repeated")] = None,
+    ground: Annotated[
+        list[str] | None, typer.Option(help="a ground station's name; may be repeated")
+    ] = None,
+    viewer: Annotated[
+        list[str] | None, typer.Option(help="one who may only look; may be repeated")
+    ] = None,
+    revoke: Annotated[
+        str | None, typer.Option(help="a member whose certificate must not be valid any more")
+    ] = None,
+    days: Annotated[int, typer.Option(help="how long the certificates hold", min=1)] = 365,
+    as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
+) -> None:
+    """Make keys for drones, ground stations and viewers; those that exist stay as they are.
+
+    Copy FOLDER/drone/NAME to the drone and FOLDER/ground/NAME to the ground station. Keep
+    FOLDER/authority to yourself: whoever has it can join the fleet. --revoke NAME takes the
+    rights of a drone or viewer; for a ground station all others get new keys.
+    """
+    from service.errors import InputError
+    from service.stream import keys as fleet_keys
+
+    members = {"drone": drone or [], "ground": ground or [], "viewer": viewer or []}
+    if revoke is not None:
+        if any(members.values()):
+            raise InputError("give either --revoke or members to make keys for")
+        _say_revoked(revoke, fleet_keys.revoke(folder, revoke, days), as_json)
+        return
+    if not any(members.values()):
+        raise InputError("name at least one --drone, --ground or --viewer")
+    made = fleet_keys.make_keys(folder, members, days)
+    if as_json:
+        print(json.dumps({"made": [str(path) for path in made]}))
+        return
+    for path in made:
+        print(f"made {path}")
+    if not made:
+        print("all of them have keys already")
+
+
+def _say_revoked(member: str, paths: list[Path], as_json: bool) -> None:
+    """Say what must be copied again before the revocation holds."""
+    if as_json:
+        print(json.dumps({"revoked": member, "copy": [str(path) for path in paths]}))
+        return
+    print(f"revoked {member}; it holds when these are copied and every ground station restarts:")
+    for path in paths:
+        print(f"  {path}")
+
+
+def warm_up(
+    config: Annotated[Path | None, typer.Option(help="configuration file (TOML)")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="section.key=value, may be repeated")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
+) -> None:
+    """Scan a made-up ground once, so that no flight waits for the compilers.
+
+    Run it as the service's user with its NUMBA_CACHE_DIR; the installer does.
+    """
+    from service.daemon.warm_up import warm_up as scan_made_up_ground
+
+    seconds, keyframes = scan_made_up_ground(load_config(config, set_ or []))
+    if as_json:
+        print(json.dumps({"seconds": round(seconds, 2), "keyframes": keyframes}))
+    else:
+        print(f"warm after {seconds:.1f} s: {keyframes} keyframes of a made-up ground")
