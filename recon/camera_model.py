@@ -70,7 +70,6 @@ class Undistorter:
     def __init__(self, camera: Camera) -> None:
         """Build the maps for ``camera``; raises ValueError when it is not a usable model."""
         check_camera(camera)
-        self.distorted = camera
         self.camera = Camera(camera.K, np.zeros(5), camera.size_px)
         self._maps: tuple[npt.NDArray[np.int16], npt.NDArray[np.uint16]] | None = None
         self.valid: U8 = np.full((camera.size_px[1], camera.size_px[0]), 255, np.uint8)

@@ -97,7 +97,6 @@ class StereoPair:
     labels: int
     plane: F64  # (3,) disparity of label 0 as an affine function of the left pixel
     slope: float  # d(disparity) / d(label)
-    T_world_left: F64  # (4, 4) pose of the rectified left camera
     R_left_keyframe: F64  # (3, 3) keyframe camera to rectified left camera
     guide: U8 | None = None  # (H, W, 3) rectified left in colour, at guidance resolution
     left_seen: Bool | None = None  # (h, w) False where the left picture has nothing

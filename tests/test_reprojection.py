@@ -18,7 +18,7 @@ def pair_for(plane: F64, slope: float = 1.0, turn: F64 | None = None) -> StereoP
     """A pair with this disparity plane; the images do not matter here."""
     blank = np.zeros((180, 320), np.uint8)
     R = np.eye(3) if turn is None else turn
-    return StereoPair(blank, blank, BASELINE_M, K, 16, plane, slope, np.eye(4), R)
+    return StereoPair(blank, blank, BASELINE_M, K, 16, plane, slope, R)
 
 
 def labels_of(depth: F64, pair: StereoPair) -> DisparityMap:

@@ -60,7 +60,6 @@ def stereo_pair(height: int, width: int, labels: int, seed: int, guide: int = 4)
         labels=labels,
         plane=np.array([0.01, -0.02, 8.0]),
         slope=0.99,
-        T_world_left=np.eye(4),
         R_left_keyframe=turn,
         guide=np.asarray(cv2.resize(colour, (guide * width, guide * height)), np.uint8)
         if guide

@@ -119,7 +119,7 @@ def test_a_keyframe_from_pictures_to_fused_depth(device: str, reads: list[int]) 
     seen = np.ones(left.shape, np.bool_)
     pair = StereoPair(
         left=left, right=np.roll(left, -5, 1), baseline_m=4.0, K=K, labels=16,
-        plane=np.array([0.0, 0.0, 8.0]), slope=1.0, T_world_left=np.eye(4),
+        plane=np.array([0.0, 0.0, 8.0]), slope=1.0,
         R_left_keyframe=np.eye(3), guide=np.repeat(left[:, :, None], 3, 2), left_seen=seen,
         right_seen=seen,
     )  # fmt: skip

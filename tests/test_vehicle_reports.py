@@ -41,7 +41,7 @@ def wxyz(R: Rotation) -> F64:
 def step_at(enu: tuple[float, float, float], head: Rotation = HEAD, segment: int = 0) -> Step:
     R = R_ENU_NED @ head.as_matrix() @ R_GIMBAL_CAMERA
     T = se3.compose(R, np.array(enu))
-    tracked = Tracked("tracked", segment, T, np.eye(6), tracks=150)
+    tracked = Tracked("tracked", segment, T, tracks=150)
     anchor = Anchorage(0, object.__new__(OdometryKeyframe), np.eye(4))
     return Step(tracked, Placed(0, T, 1.0, COVARIANCE, ("vision",)), False, anchor)
 

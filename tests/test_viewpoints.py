@@ -30,7 +30,7 @@ def offer(
     views: Viewpoints, seq: int, x_m: float, state: str, segment: int = 0, blurred: bool = False
 ) -> Viewpoint | None:
     taken = frame(seq, x_m, segment, blurred)
-    tracked = Tracked(state, segment, taken.T_odom_camera, np.eye(6))
+    tracked = Tracked(state, segment, taken.T_odom_camera)
     return taken if views.offer(taken, tracked) else None
 
 

@@ -144,7 +144,6 @@ def rectify(
         labels=labels,
         plane=plane,
         slope=1.0 - float(plane[0]),
-        T_world_left=left.T_odom_camera @ se3.compose(R_rect_left.T, np.zeros(3)),
         R_left_keyframe=R_rect_left,
         guide=guide,
         left_seen=left_seen,

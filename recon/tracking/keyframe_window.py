@@ -83,7 +83,6 @@ class OdometryKeyframe:
     uv: F64  # (N, 2) corners
     landmark: I64  # (N,) number in ``map``, -1 none yet
     map: Landmarks  # of its segment, in the odometry's frame
-    sigma_scale: float = 0.0  # relative, of the step to it; what the landmarks do not show
 
     @property
     def T_odom_camera(self) -> F64:
@@ -91,7 +90,7 @@ class OdometryKeyframe:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Incoming:
+class TrackingFrame:
     """A new frame on its way in."""
 
     grey: U8  # (H, W) undistorted

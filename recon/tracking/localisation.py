@@ -15,7 +15,7 @@ import numpy as np
 from recon import se3
 from recon.tracking import matching, pnp, prediction, robust_geometry, two_view
 from recon.tracking.common_view import CommonView, FeatureCache, common_view
-from recon.tracking.keyframe_window import Incoming, OdometryKeyframe
+from recon.tracking.keyframe_window import OdometryKeyframe, TrackingFrame
 from recon.tracking.matching import Matcher
 from recon.tracking.prediction import Motion
 from recon.types import F64, Bool, Camera, PosePrior
@@ -56,9 +56,6 @@ FEATURE_SHARE = 0.03
 CLEAR_SHARE = 0.6
 """Of the corners searched: so many found leave no need for another start."""
 
-RELIEF_SHARE = 0.02
-"""Sigma of a depth that is only that of the plane through other landmarks."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Start:
@@ -90,8 +87,6 @@ class Bridge:
     T_camera_odom: F64  # (4, 4)
     uv: F64  # (N, 2) of the keyframe's corners
     ok: Bool  # (N,)
-    sigma_scale: float  # relative, of the step between the two
-    parallax_rad: float
 
 
 class Localiser:
@@ -105,7 +100,7 @@ class Localiser:
         self._features = features
 
     def locate(
-        self, new: Incoming, keyframes: Sequence[OdometryKeyframe], motion: Motion,
+        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], motion: Motion,
         still: bool, lost: bool,
     ) -> Located | str:  # fmt: skip
         """The frame against a recent keyframe, averaged with the one before; or why not.
@@ -134,7 +129,7 @@ class Localiser:
         return reason if best is None else self._with_left(new, keyframes, best)
 
     def others(
-        self, new: Incoming, keyframes: Sequence[OdometryKeyframe], found: Located
+        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], found: Located
     ) -> list[Located]:
         """The frame against the other recent keyframes that see the same ground."""
         share, least = 0.5 * self.config.search_share, self.config.min_tracks // 3
@@ -143,7 +138,7 @@ class Localiser:
         located = [self.pose_from(key, new.pyramid, T, share, least) for key in rest]
         return [other for other in located if not isinstance(other, str)]
 
-    def bridge(self, new: Incoming, keyframes: Sequence[OdometryKeyframe]) -> Bridge | None:
+    def bridge(self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe]) -> Bridge | None:
         """The frame by two views alone: little of what it shares with a keyframe has landmarks.
 
         The scale is that of the keyframe's landmarks, or where none is shared of the ground
@@ -160,7 +155,9 @@ class Localiser:
                 return bridge
         return None
 
-    def _two_views(self, new: Incoming, key: OdometryKeyframe, uv: F64, ok: Bool) -> Bridge | None:
+    def _two_views(
+        self, new: TrackingFrame, key: OdometryKeyframe, uv: F64, ok: Bool
+    ) -> Bridge | None:
         """The pose by the keyframe's corners found at ``uv`` (N, 2) where ``ok`` (N,)."""
         if ok.sum() < 2 * self.config.min_tracks:
             return None
@@ -176,18 +173,16 @@ class Localiser:
         depth = prediction.landmark_depths(key, self.camera.K, rows)
         if depth is None:
             return None
-        ratio = np.log(depth.z / seen.points[seen.inliers, 2])
+        ratio = np.log(depth / seen.points[seen.inliers, 2])
         ratio = ratio[np.isfinite(ratio)]
         scale = float(np.exp(np.median(ratio)))
-        spread = 1.48 * float(np.median(np.abs(ratio - np.median(ratio))))
-        sigma = spread / np.sqrt(len(ratio)) if depth.is_measured else max(spread, RELIEF_SHARE)
         step = se3.compose(seen.T_b_a[:3, :3], scale * seen.T_b_a[:3, 3])
         good = np.zeros(len(ok), np.bool_)
         good[rows] = True
-        return Bridge(key, step @ key.T_camera_odom, uv, good, float(sigma), seen.parallax_rad)
+        return Bridge(key, step @ key.T_camera_odom, uv, good)
 
     def _with_left(
-        self, new: Incoming, keyframes: Sequence[OdometryKeyframe], found: Located
+        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], found: Located
     ) -> Located:
         """The pose averaged with the one that the keyframe before gives, as the paper does."""
         if len(keyframes) < 2 or found.key is not keyframes[-1]:
@@ -200,7 +195,7 @@ class Localiser:
         return replace(found, pose=pnp.average_left_right(left.pose, found.pose))
 
     def _starts(
-        self, new: Incoming, keyframes: Sequence[OdometryKeyframe], motion: Motion, lost: bool
+        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], motion: Motion, lost: bool
     ) -> Iterator[Start]:
         """Where the camera may be, most trusted first."""
         key = keyframes[-1]
@@ -215,7 +210,9 @@ class Localiser:
         if not still or turn is None:
             yield Start(key, by_motion, self.config.wide_search_share)
 
-    def _by_features(self, new: Incoming, keyframes: Sequence[OdometryKeyframe]) -> Iterator[Start]:
+    def _by_features(
+        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe]
+    ) -> Iterator[Start]:
         """Poses by features that the frame shares with recent keyframes, the most first."""
         for key, view in self._views(new, keyframes):
             T_camera_odom = self._pose_by(key, view)
@@ -223,7 +220,7 @@ class Localiser:
                 yield Start(key, T_camera_odom, FEATURE_SHARE, by_features=True)
 
     def _views(
-        self, new: Incoming, keyframes: Sequence[OdometryKeyframe]
+        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe]
     ) -> list[tuple[OdometryKeyframe, CommonView]]:
         """Recent keyframes that share features with the frame, the most first."""
         here = self._features.of(new.seq, new.grey)
@@ -349,7 +346,7 @@ class FirstViews:
         self._drift = np.eye(3)
 
     def match(
-        self, new: Incoming, first: OdometryKeyframe, R_b_a: F64 | None, still: bool
+        self, new: TrackingFrame, first: OdometryKeyframe, R_b_a: F64 | None, still: bool
     ) -> tuple[F64, Bool]:
         """(N, 2) pixels and (N,) success of the first frame's corners in a new frame.
 
@@ -376,7 +373,7 @@ class FirstViews:
         return best
 
     def _guesses(
-        self, new: Incoming, first: OdometryKeyframe, R_b_a: F64 | None, still: bool
+        self, new: TrackingFrame, first: OdometryKeyframe, R_b_a: F64 | None, still: bool
     ) -> Iterator[prediction.Prediction]:
         """Where the corners went, best first."""
         if not still:
@@ -389,7 +386,7 @@ class FirstViews:
         if view is not None:
             yield view.predict(first.uv, self._radius_px)
 
-    def _by_telemetry(self, new: Incoming, first: OdometryKeyframe, R_b_a: F64) -> F64:
+    def _by_telemetry(self, new: TrackingFrame, first: OdometryKeyframe, R_b_a: F64) -> F64:
         """(3, 3) homography of level ground by attitude, and by position and height if known."""
         a, b = first.prior, new.prior
         height, t = b.agl_m or 0.0, np.zeros(3)

@@ -20,9 +20,9 @@ from recon.tracking import matching, prediction, two_view
 from recon.tracking.common_view import FeatureCache
 from recon.tracking.keyframe_window import (
     I64,
-    Incoming,
     Landmarks,
     OdometryKeyframe,
+    TrackingFrame,
     adjust_window,
     landmarks,
     triangulate,
@@ -43,9 +43,7 @@ class Tracked:
     state: str  # "started", "waiting", "tracked", "keyframe" or "lost"
     segment: int
     T_odom_camera: F64 | None = None  # (4, 4)
-    covariance: F64 | None = None  # (6, 6) left perturbation of the camera-from-odom pose
     tracks: int = 0
-    base_to_height: float = 0.0  # against the last keyframe
     reason: str = ""
 
 
@@ -70,7 +68,7 @@ class Odometry:
         self.segment = -1
         self._metric = False  # the current segment has landmarks
         self._lost = 0
-        self._missed_still: Incoming | None = None  # the last frame, when it has no pose
+        self._missed_still: TrackingFrame | None = None  # the last frame, when it has no pose
         self._motion: Motion | None = None
         features = FeatureCache()
         self._localiser = Localiser(camera, self.config, self._matcher, features)
@@ -103,7 +101,7 @@ class Odometry:
             blurred: a later frame makes a better keyframe, if it comes soon.
         """
         pyramid = self._matcher.pyramid(grey, self.config.matching.search_levels)
-        new = Incoming(grey, pyramid, seq, time_ns, prior, mask, blurred)
+        new = TrackingFrame(grey, pyramid, seq, time_ns, prior, mask, blurred)
         self._gap_ns, self._frame_ns = time_ns - self._frame_ns, time_ns
         if not self.keyframes:
             return self._start(new)
@@ -128,11 +126,7 @@ class Odometry:
         assert self._motion is not None
         return self._motion
 
-    def _missed(
-        self,
-        new: Incoming,
-        reason: str,
-    ) -> Tracked:
+    def _missed(self, new: TrackingFrame, reason: str) -> Tracked:
         """Count a frame without a pose; after too many, or two stills, begin a new segment."""
         self._lost += 1
         if self._still and self._missed_still is not None and self._lost >= 2:
@@ -144,10 +138,7 @@ class Odometry:
         self._missed_still = new if self._still else None
         return Tracked("lost", self.segment, reason=reason)
 
-    def _start(
-        self,
-        new: Incoming,
-    ) -> Tracked:
+    def _start(self, new: TrackingFrame) -> Tracked:
         """Begin a segment at this frame."""
         uv = self._corners(new)
         if len(uv) < 2 * self.config.min_tracks:
@@ -177,19 +168,16 @@ class Odometry:
             )
         ]
         self._motion = Motion(new.time_ns, T_odom_camera, new.prior)
-        return Tracked("started", self.segment, T_odom_camera, np.zeros((6, 6)))
+        return Tracked("started", self.segment, T_odom_camera)
 
-    def _corners(self, new: Incoming) -> F64:
+    def _corners(self, new: TrackingFrame) -> F64:
         """(N, 2) Harris corners of the frame, Eq. 4-5."""
         found = self._matcher.corners(new.pyramid, self.config.matching, new.mask)
         return found.uv_px.astype(np.float64)
 
     # ---- the second view --------------------------------------------------------------
 
-    def _second_view(
-        self,
-        new: Incoming,
-    ) -> Tracked:
+    def _second_view(self, new: TrackingFrame) -> Tracked:
         """Wait until the camera has moved enough, then make the first landmarks."""
         first = self.keyframes[0]
         R_b_a = prediction.relative_rotation(first.prior, new.prior)
@@ -219,14 +207,8 @@ class Odometry:
         self._metric = True
         self._add_keyframe(new, T_camera_odom, [(first, uv, ok)])
         self._moving.update(new.time_ns, self.keyframes[-1].T_odom_camera, new.prior)
-        return Tracked(
-            "keyframe",
-            self.segment,
-            self.keyframes[-1].T_odom_camera,
-            self.keyframes[-1].covariance,
-            int(ok.sum()),
-            view.parallax_rad,
-        )
+        T_odom_camera = self.keyframes[-1].T_odom_camera
+        return Tracked("keyframe", self.segment, T_odom_camera, int(ok.sum()))
 
     def _first_landmarks(self, view: two_view.TwoView, rows: I64, prior: PosePrior) -> float:
         """Enter the two-view points into the table; return metres per unit of the baseline."""
@@ -239,14 +221,10 @@ class Odometry:
 
     # ---- keyframes ---------------------------------------------------------------------
 
-    def _accept(
-        self,
-        new: Incoming,
-        found: Located,
-    ) -> Tracked:
+    def _accept(self, new: TrackingFrame, found: Located) -> Tracked:
         """Keep the pose; make the frame a keyframe when it has moved enough."""
         key = found.key
-        T_camera_odom, covariance = found.pose.T_camera_points, found.pose.covariance
+        T_camera_odom = found.pose.T_camera_points
         moved = T_camera_odom @ key.T_odom_camera
         depth = self.median_depth(key)
         base = float(np.linalg.norm(moved[:3, 3])) / max(depth, 1e-6)
@@ -257,7 +235,7 @@ class Odometry:
         self._lost = 0
         due = self.config.base_to_height * (OVERDUE if new.blurred else 1.0)
         if base < due and found.share > 0.45 and turned < 0.25:
-            return Tracked("tracked", self.segment, T_odom_camera, covariance, tracks, base)
+            return Tracked("tracked", self.segment, T_odom_camera, tracks)
         share = 0.5 * self.config.search_share
         whole = self._localiser.pose_from(
             key, new.pyramid, T_camera_odom, share, self.config.min_tracks
@@ -271,23 +249,19 @@ class Odometry:
         )
         last, tracks = self.keyframes[-1], int(found.ok.sum())
         self._moving.correct(last.T_odom_camera)
-        return Tracked("keyframe", self.segment, last.T_odom_camera, last.covariance, tracks, base)
+        return Tracked("keyframe", self.segment, last.T_odom_camera, tracks)
 
-    def _cross(self, new: Incoming, bridge: Bridge) -> Tracked:
+    def _cross(self, new: TrackingFrame, bridge: Bridge) -> Tracked:
         """Make a keyframe of a frame that two views alone place."""
         self._lost = 0
         self._add_keyframe(new, bridge.T_camera_odom, [(bridge.key, bridge.uv, bridge.ok)])
         last = self.keyframes[-1]
-        last.sigma_scale = bridge.sigma_scale
         self._moving.update(new.time_ns, last.T_odom_camera, new.prior)
         tracks = int(bridge.ok.sum())
-        return Tracked(
-            "keyframe", self.segment, last.T_odom_camera, last.covariance, tracks,
-            bridge.parallax_rad,
-        )  # fmt: skip
+        return Tracked("keyframe", self.segment, last.T_odom_camera, tracks)
 
     def _add_keyframe(
-        self, new: Incoming, T_camera_odom: F64, seen: list[tuple[OdometryKeyframe, F64, Bool]]
+        self, new: TrackingFrame, T_camera_odom: F64, seen: list[tuple[OdometryKeyframe, F64, Bool]]
     ) -> None:
         """Append a keyframe: tracked corners, new landmarks, fresh corners; adjust the window.
 

@@ -57,14 +57,8 @@ def on_landmarks(
     return Prediction(uv, warp, radius_px), visible
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Depths:
-    z: F64  # (N,) in the keyframe's camera, odometry units
-    is_measured: bool  # by landmarks; else on the plane through landmarks elsewhere
-
-
-def landmark_depths(key: OdometryKeyframe, K: F64, rows: I64) -> Depths | None:
-    """Depths of the keyframe's corners ``rows`` (N,), NaN without a landmark.
+def landmark_depths(key: OdometryKeyframe, K: F64, rows: I64) -> F64 | None:
+    """(N,) depths in its camera of the keyframe's corners ``rows`` (N,), NaN without a landmark.
 
     With too few landmarks among them all depths are those of the plane through the others;
     None where that does not reach.
@@ -74,11 +68,11 @@ def landmark_depths(key: OdometryKeyframe, K: F64, rows: I64) -> Depths | None:
     z = np.full(len(key.uv), np.nan)
     z[known] = P[:, 2]
     if np.isfinite(z[rows]).sum() >= MIN_MEASURED:
-        return Depths(z[rows], True)
+        return np.asarray(z[rows])
     if len(P) < MIN_MEASURED:
         return None
     inverse = rays(K, key.uv[rows]) @ _inverse_depth_plane(K, P)
-    return Depths(1.0 / inverse, False) if np.all(inverse > 0) else None
+    return np.asarray(1.0 / inverse) if np.all(inverse > 0) else None
 
 
 def relative_rotation(a: PosePrior, b: PosePrior) -> F64 | None:

@@ -128,7 +128,6 @@ def flown_pair(guide_px: tuple[int, int]) -> StereoPair:
         labels=LABELS,
         plane=np.array([0.0, 0.0, 8.0]),
         slope=1.0,
-        T_world_left=np.eye(4),
         R_left_keyframe=np.eye(3),
         guide=np.asarray(cv2.resize(colour, guide_px), np.uint8),
         left_seen=np.ones(left.shape, np.bool_),

@@ -28,7 +28,7 @@ FARTHEST_M = 1e6
 HEADING_KNOWN_RAD = 1.0
 
 
-class Motion(NamedTuple):
+class KeyframeStep(NamedTuple):
     """The step of the camera from the keyframe before, in units of the odometry."""
 
     T_before_camera: F64 | None  # (4, 4); None where the chain begins again
@@ -72,7 +72,9 @@ class Chain:
 
     # ---- keyframes ---------------------------------------------------------------------
 
-    def add(self, view: StereoCandidate, motion: Motion, depth: DepthMap | None) -> Placed | None:
+    def add(
+        self, view: StereoCandidate, motion: KeyframeStep, depth: DepthMap | None
+    ) -> Placed | None:
         """Append a view and look for loops; None without depth, or where no drone flies."""
         T_odom, step = view.view.T_odom_camera, motion.T_before_camera
         self._T_map = T_odom if step is None else self._T_map @ step

@@ -52,7 +52,7 @@ from service.compute.stopwatch import Stopwatch
 from service.compute.threading_layer import kernels_may_overlap, share_cores
 from service.config import ComputeConfig, Config
 from service.onboard.anchorage import VIEW, Carriers, Key
-from service.onboard.chain import Chain, Motion
+from service.onboard.chain import Chain, KeyframeStep
 from service.onboard.graph_aside import GraphAside
 from service.onboard.loops import LoopSearch
 from service.onboard.surface_map import SurfaceMap
@@ -250,24 +250,24 @@ class Register:
         self._before: tuple[int, DepthMap | None] | None = None  # number and depth
         self.verdicts: Counter[str] = Counter()
 
-    def __call__(self, view: StereoCandidate, depth: DepthMap | None) -> Motion:
+    def __call__(self, view: StereoCandidate, depth: DepthMap | None) -> KeyframeStep:
         """The step from the keyframe before: vision's and ICP's, weighted by covariance."""
         covariance = view.covariance + np.diag([1e-4**2] * 3 + [0.005**2] * 3)
         before, self._before = self._before, (view.seq, depth)
         T_before = view.earlier.get(before[0]) if before is not None else None
         if before is None or T_before is None:
-            return Motion(None, covariance)
+            return KeyframeStep(None, covariance)
         step = se3.inverse(T_before) @ view.view.T_odom_camera
         A = se3.adjoint(step)
         covariance = A @ covariance @ A.T
         if depth is None or before[1] is None:
-            return Motion(step, covariance)
+            return KeyframeStep(step, covariance)
         with self._stopwatch("icp"):
             found = self._backend.register(depth, before[1], step, self._config)
         self.verdicts[found.verdict] += 1
         if not found.converged:
-            return Motion(step, covariance)
-        return Motion(*se3.average(step, covariance, found.T_target_source, found.covariance))
+            return KeyframeStep(step, covariance)
+        return KeyframeStep(*se3.average(step, covariance, found.T_target_source, found.covariance))
 
 
 class MakeKeyframe:
