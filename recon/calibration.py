@@ -77,13 +77,13 @@ class Calibration:
 
 
 def find_board(gray: U8, board: Board) -> F32 | None:
-    """(N, 2) corners of the board in a grey picture, sub-pixel, or None when it is not there.
+    """(N, 2) corners of the board in a gray picture, sub-pixel, or None when it is not there.
 
     The classic detector finds more real boards; the sector-based one (Duda and Frese 2018)
     is asked where it finds none. Both are refined to the saddle points.
     """
     if gray.ndim != 2:
-        raise ValueError(f"the picture must be grey (H, W), got {gray.shape}")
+        raise ValueError(f"the picture must be gray (H, W), got {gray.shape}")
     pattern = (board.columns, board.rows)
     classic = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     found, corners = cv2.findChessboardCorners(gray, pattern, flags=classic)

@@ -90,8 +90,8 @@ class StereoPair:
     and the depth along the rectified left camera's z is ``K[0, 0] * baseline_m / d``.
     """
 
-    left: U8  # (h, w) grey, rectified
-    right: U8  # (h, w) grey, rectified, shifted by the disparity plane
+    left: U8  # (h, w) gray, rectified
+    right: U8  # (h, w) gray, rectified, shifted by the disparity plane
     baseline_m: float
     K: F64  # (3, 3) px of the rectified left view at (w, h)
     labels: int

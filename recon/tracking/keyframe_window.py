@@ -93,7 +93,7 @@ class OdometryKeyframe:
 class TrackingFrame:
     """A new frame on its way in."""
 
-    grey: U8  # (H, W) undistorted
+    gray: U8  # (H, W) undistorted
     pyramid: matching.Pyramid
     seq: int
     time_ns: int

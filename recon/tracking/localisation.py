@@ -26,7 +26,7 @@ class OdometryConfig:
     """Parameters of the odometry; angles are in rad, shares are of the image width."""
 
     base_to_height: float = 0.1  # motion between keyframes over the distance to the ground
-    least_base_to_height: float = 0.03  # under it two frames are not triangulated
+    min_base_to_height: float = 0.03  # under it two frames are not triangulated
     window: int = 8  # keyframes adjusted together
     search_share: float = 0.03  # ZSSD search radius around a good prediction
     wide_search_share: float = 0.09  # and around a poor one
@@ -41,8 +41,8 @@ class OdometryConfig:
     pnp: pnp.PnpConfig = field(default_factory=pnp.PnpConfig)
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.least_base_to_height <= self.base_to_height < 1.0:
-            raise ValueError("0 < least_base_to_height <= base_to_height < 1 must hold")
+        if not 0.0 < self.min_base_to_height <= self.base_to_height < 1.0:
+            raise ValueError("0 < min_base_to_height <= base_to_height < 1 must hold")
         if self.window < 3:
             raise ValueError(f"window must hold 3 keyframes or more, got {self.window}")
 
@@ -167,7 +167,7 @@ class Localiser:
         seen = two_view.solve(key.uv[ok], uv[ok], self.camera.K, turn, largest, up)
         if seen is None and turn is not None:  # tags are often wrong
             seen = two_view.solve(key.uv[ok], uv[ok], self.camera.K, None, np.pi, up)
-        if seen is None or seen.parallax_rad < self.config.least_base_to_height:
+        if seen is None or seen.parallax_rad < self.config.min_base_to_height:
             return None
         rows = np.flatnonzero(ok)[seen.inliers]
         depth = prediction.landmark_depths(key, self.camera.K, rows)
@@ -223,7 +223,7 @@ class Localiser:
         self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe]
     ) -> list[tuple[OdometryKeyframe, CommonView]]:
         """Recent keyframes that share features with the frame, the most first."""
-        here = self._features.of(new.seq, new.grey)
+        here = self._features.of(new.seq, new.gray)
         views = []
         for key in keyframes[-RECALLED:]:
             view = common_view(self._features.of(key.seq, key.pyramid.levels[0]), here)
@@ -381,7 +381,7 @@ class FirstViews:
         if R_b_a is not None:
             H = self._by_telemetry(new, first, R_b_a)
             yield prediction.by_homography(H, first.uv, self._radius_px)
-        here = self._features.of(new.seq, new.grey)
+        here = self._features.of(new.seq, new.gray)
         view = common_view(self._features.of(first.seq, first.pyramid.levels[0]), here)
         if view is not None:
             yield view.predict(first.uv, self._radius_px)

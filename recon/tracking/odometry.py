@@ -85,7 +85,7 @@ class Odometry:
 
     def track(
         self,
-        grey: U8,
+        gray: U8,
         seq: int,
         time_ns: int,
         prior: PosePrior,
@@ -95,13 +95,13 @@ class Odometry:
         """Pose of a new frame, or why there is none.
 
         Args:
-            grey: (H, W) undistorted picture.
+            gray: (H, W) undistorted picture.
             prior: telemetry's word on this frame; parts may be missing.
             mask: (H, W) non-zero where the picture is valid.
             blurred: a later frame makes a better keyframe, if it comes soon.
         """
-        pyramid = self._matcher.pyramid(grey, self.config.matching.search_levels)
-        new = TrackingFrame(grey, pyramid, seq, time_ns, prior, mask, blurred)
+        pyramid = self._matcher.pyramid(gray, self.config.matching.search_levels)
+        new = TrackingFrame(gray, pyramid, seq, time_ns, prior, mask, blurred)
         self._gap_ns, self._frame_ns = time_ns - self._frame_ns, time_ns
         if not self.keyframes:
             return self._start(new)
@@ -197,7 +197,7 @@ class Odometry:
         view = two_view.solve(first.uv[ok], uv[ok], self.K, R_b_a, turn, up_a)
         if view is None and R_b_a is not None and self._still:  # tags are often wrong
             view = two_view.solve(first.uv[ok], uv[ok], self.K, None, np.pi, up_a)
-        if view is None or view.parallax_rad < self.config.least_base_to_height:
+        if view is None or view.parallax_rad < self.config.min_base_to_height:
             return self._missed(new, "no certain motion between two frames")
         matched = np.flatnonzero(ok)
         ok[matched[~view.inliers]] = False
@@ -268,7 +268,7 @@ class Odometry:
         ``seen`` are keyframes with where (N, 2) their corners were found and which (N,) were,
         the one that gave the pose first. Of the others only corners with landmarks count.
         """
-        least = 0.5 * self.config.least_base_to_height
+        least = 0.5 * self.config.min_base_to_height
         kept, landmark = np.zeros((0, 2)), np.zeros(0, np.int64)
         for key, uv, ok in seen:
             triangulate(key, T_camera_odom, uv, ok, self.K, least, self.config.loose_px)

@@ -19,7 +19,7 @@ from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F32, U8, Bool, DisparityMap
 from service.bench import BenchOptions, BenchResult, compare
 from service.compute.backend_choice import choose_backend
-from service.compute.rectified_pair import matching_config, read_grey
+from service.compute.rectified_pair import matching_config, read_gray
 from service.errors import InputError
 
 SIZES = ((320, 180, 16), (640, 360, 32))
@@ -136,12 +136,12 @@ def true_pairs(folder: Path) -> list[TruePair]:
         place = folder / name
         if place.is_dir():
             truths = [
-                read_grey(place / f"{f}.png").astype(np.float32) / np.float32(scale)
+                read_gray(place / f"{f}.png").astype(np.float32) / np.float32(scale)
                 for f in (truth, other)
             ]
             for px in truths:
                 px[px == 0] = np.nan
-            images = [read_grey(place / f"{f}.png") for f in (left, right)]
+            images = [read_gray(place / f"{f}.png") for f in (left, right)]
             visible = seen_by_both(truths[0], truths[1])
             found.append(TruePair(name, images[0], images[1], truths[0], visible, labels))
     place = folder / "motorcycle"
@@ -149,7 +149,7 @@ def true_pairs(folder: Path) -> list[TruePair]:
         with np.load(place / "motorcycle_disp.npz") as archive:
             px = archive["arr_0"].astype(np.float32)
         px[~np.isfinite(px)] = np.nan
-        images = [read_grey(place / f"motorcycle_{side}.png") for side in ("left", "right")]
+        images = [read_gray(place / f"motorcycle_{side}.png") for side in ("left", "right")]
         found.append(TruePair("motorcycle", images[0], images[1], px, not_hidden(px), 64))
     if not found:
         raise InputError(f"{folder}: holds none of cones, teddy, cloth3, motorcycle")

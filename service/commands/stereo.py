@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.compute.rectified_pair import matching_config, read_grey
+from service.compute.rectified_pair import matching_config, read_gray
 from service.errors import InputError, OutsideError
 
 if TYPE_CHECKING:
@@ -40,10 +40,10 @@ def stereo(
     surface behind; unknown stay blank areas and what lies outside the right image. With
     --checked, as in flight, only what the pair proves is kept.
     """
-    grey_left, grey_right = read_grey(left), read_grey(right)
-    if grey_left.shape != grey_right.shape:
+    gray_left, gray_right = read_gray(left), read_gray(right)
+    if gray_left.shape != gray_right.shape:
         raise InputError(
-            f"{left} is {_size(grey_left)} but {right} is {_size(grey_right)}: "
+            f"{left} is {_size(gray_left)} but {right} is {_size(gray_right)}: "
             "a rectified pair has one size"
         )
     if not 2 <= labels <= 1024:
@@ -55,7 +55,7 @@ def stereo(
     chosen = open_matcher(backend, model)
     start = time.perf_counter()
     try:
-        found = chosen.belief_propagation(grey_left, grey_right, labels, config)
+        found = chosen.belief_propagation(gray_left, gray_right, labels, config)
     except ValueError as error:
         raise InputError(f"stereo: {error}") from error
     seconds = time.perf_counter() - start
@@ -63,9 +63,9 @@ def stereo(
     known = float((found.px == found.px).mean())
     if as_json:
         report = {"out": str(out), "known_share": known, "backend": chosen.name}
-        print(json.dumps(report | {"seconds": seconds, "size_px": grey_left.shape[::-1]}))
+        print(json.dumps(report | {"seconds": seconds, "size_px": gray_left.shape[::-1]}))
     else:
-        print(f"{out}: {_size(grey_left)}, {100 * known:.1f} % known, {chosen.name}")
+        print(f"{out}: {_size(gray_left)}, {100 * known:.1f} % known, {chosen.name}")
 
 
 def open_matcher(backend: str, model: Path | None) -> Backend:

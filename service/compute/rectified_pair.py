@@ -30,8 +30,8 @@ def matching_config(iterations: int, min_disparity: int, checked: bool) -> Belie
         raise InputError(f"stereo: {error}") from error
 
 
-def read_grey(path: Path) -> U8:
-    """A grey 8-bit image (h, w); InputError when there is none."""
+def read_gray(path: Path) -> U8:
+    """A gray 8-bit image (h, w); InputError when there is none."""
     import cv2
     import numpy as np
 
