@@ -118,7 +118,7 @@ class AutopilotLink:
             return
         round_trip_ns = self.timesync.round_trip_of(message.ts1, now_ns)
         if round_trip_ns is not None:
-            self._presence.answered(packet.system, packet.component, round_trip_ns)
+            self._presence.autopilots.answered(packet.system, packet.component, round_trip_ns)
         if is_autopilot and self.timesync.answer(message.tc1, message.ts1, now_ns):
             clock = self._clocks.setdefault(packet.component, BootClock())
             clock.set_timesync(self.timesync.offset_ns)
@@ -129,7 +129,7 @@ class AutopilotLink:
         """Ask for the time and for messages that come too slowly; report a loss."""
         autopilot, seen = self._presence.autopilot, self._presence.autopilot_seen_ns
         if autopilot is None or seen is None:
-            if self._presence.others(now_ns):
+            if self._presence.autopilots.others(now_ns):
                 self._ask_time(now_ns)
             return
         is_lost = now_ns - seen > LOST_NS
@@ -149,7 +149,7 @@ class AutopilotLink:
         """Ask our autopilot; or every one, where the answers say which vehicle is ours."""
         target, link = EVERYONE, None
         autopilot = self._presence.autopilot
-        if autopilot is not None and not self._presence.others(now_ns):
+        if autopilot is not None and not self._presence.autopilots.others(now_ns):
             target, link = Address(*autopilot), self.link
         request = self.timesync.request(now_ns, target)
         if request is not None:
@@ -159,7 +159,7 @@ class AutopilotLink:
         """When :meth:`tick` has something to do, in ns."""
         if self._presence.autopilot is not None:
             return [self.timesync.next_timer(), self._rates.next_timer()]
-        return [self.timesync.next_timer()] if self._presence.others(now_ns) else []
+        return [self.timesync.next_timer()] if self._presence.autopilots.others(now_ns) else []
 
     def boot_clock(self) -> BootClock | None:
         """The autopilot's clock; None before it was heard."""

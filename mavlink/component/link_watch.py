@@ -125,7 +125,7 @@ class LinkWatch:
         since_ns = self._start_ns if seen_ns is None else seen_ns
         if not self._is_stale(since_ns, self._config.wait_s, now_ns):
             return None
-        others = self._presence.others(now_ns)
+        others = self._presence.autopilots.others(now_ns)
         if not others:
             return Trouble("autopilot", SILENT)
         names = ", ".join(map(str, others))
@@ -154,7 +154,9 @@ class LinkWatch:
             text = UNANSWERED if is_asked and not self._is_ground_heard else NO_GROUND
             return Trouble("ground", text)
         is_late = self._is_stale(self._start_ns, ASK_WAIT_S, now_ns)
-        if asked_ns is None and is_late and self._presence.firmware == PX4:
+        autopilot = self._presence.autopilots.followed
+        is_px4 = autopilot is not None and autopilot.firmware == PX4
+        if asked_ns is None and is_late and is_px4:
             return Trouble("ground", NEVER_ASKED, is_grave=False)
         return None
 
@@ -223,7 +225,7 @@ class LinkProbe:
         for index, packet, heard_ns in self._inbox.take(0.0)[0]:
             self._hear(index, packet, heard_ns)
         self._presence.confirm(Health.STANDBY, now_ns)
-        self._presence.look(now_ns)
+        self._presence.autopilots.look(now_ns)
         self._autopilot.follow()
         self._autopilot.tick(now_ns)
         messages = (*self._presence.due(now_ns), *self._outbox.take())
@@ -232,6 +234,6 @@ class LinkProbe:
     def _hear(self, index: int, packet: Packet, now_ns: int) -> None:
         message = self._decoder.message(packet)
         if message is not None:
-            self._presence.count(packet.system, packet.component)
+            self._presence.autopilots.count(packet.system, packet.component)
             self._autopilot.hear(message, packet, index, now_ns)
             self._watch.hear(packet, message, now_ns)

@@ -51,7 +51,10 @@ class PresenceConfig:
 
 
 class Presence:
-    """What we say of ourselves every second, and what others say. Safe between threads."""
+    """What we say of ourselves every second, and what others say.
+
+    The heartbeats may be asked for in another thread than the rest.
+    """
 
     def __init__(
         self,
@@ -68,7 +71,7 @@ class Presence:
         self._health = Health.BOOT
         self._confirmed_ns = now_ns
         self._next_ns = now_ns if first_ns is None else first_ns
-        self._autopilots = Autopilots(config.system, remembered, config.latch_s)
+        self.autopilots = Autopilots(config.system, remembered, config.latch_s)
         self._intruder = False
         self.is_ready = True  # the links have what a flight needs
         self._news: list[str] = []
@@ -76,54 +79,43 @@ class Presence:
     @property
     def system(self) -> int:
         """The system id that we use."""
-        return self._autopilots.system
+        return self.autopilots.system
 
     @property
     def proven_system(self) -> int | None:
         """The system id to remember; None until the evidence speaks for one."""
-        autopilots = self._autopilots
+        autopilots = self.autopilots
         return autopilots.system if autopilots.is_proven else None
 
     @property
     def autopilot(self) -> tuple[int, int] | None:
         """(system, component) of our autopilot; None before it was heard."""
-        followed = self._autopilots.followed
+        followed = self.autopilots.followed
         return None if followed is None else (followed.system, followed.component)
-
-    @property
-    def firmware(self) -> int | None:
-        """MAV_AUTOPILOT of our autopilot; None before it was heard."""
-        followed = self._autopilots.followed
-        return None if followed is None else followed.firmware
 
     @property
     def autopilot_seen_ns(self) -> int | None:
         """When the autopilot's heartbeat was heard last."""
-        followed = self._autopilots.followed
+        followed = self.autopilots.followed
         return None if followed is None else followed.seen_ns
 
     @property
     def is_certain(self) -> bool:
         """False while our autopilot was only the first that was heard: it may be another's."""
-        return self._autopilots.is_certain
+        return self.autopilots.is_certain
 
     @property
     def is_armed(self) -> bool:
         """True while the autopilot says so."""
-        followed = self._autopilots.followed
+        followed = self.autopilots.followed
         return followed is not None and followed.is_armed
 
     def is_disarmed(self, now_ns: int) -> bool:
         """True only where what is certainly our autopilot said so a moment ago."""
-        followed = self._autopilots.followed
+        followed = self.autopilots.followed
         if followed is None or followed.is_armed or not self.is_certain:
             return False
         return now_ns - followed.seen_ns <= RECENT_NS
-
-    def others(self, now_ns: int) -> list[int]:
-        """The systems of autopilots that are heard but not followed."""
-        with self._lock:
-            return self._autopilots.others(now_ns)
 
     def confirm(self, health: Health, now_ns: int) -> None:
         """The service is alive and this is its state; to be said again every few seconds."""
@@ -168,27 +160,11 @@ class Presence:
     def hear(self, message: Any, now_ns: int) -> None:
         """Take in anyone's heartbeat."""
         system, component = message.get_srcSystem(), message.get_srcComponent()
-        with self._lock:
-            if is_autopilot(component, message):
-                armed = bool(message.base_mode & ARMED)
-                self._autopilots.hear(system, component, armed, now_ns, message.autopilot)
-            elif system == self.system and component in TYPES:
-                self._hear_namesake(component, message.custom_mode)
-
-    def count(self, system: int, component: int) -> None:
-        """Count a message of someone."""
-        with self._lock:
-            self._autopilots.count(system, component)
-
-    def answered(self, system: int, component: int, round_trip_ns: int) -> None:
-        """Take in someone's answer to one of our TIMESYNC questions."""
-        with self._lock:
-            self._autopilots.answered(system, component, round_trip_ns)
-
-    def look(self, now_ns: int) -> None:
-        """Compare the autopilots that are heard, when it is time."""
-        with self._lock:
-            self._autopilots.look(now_ns)
+        if is_autopilot(component, message):
+            armed = bool(message.base_mode & ARMED)
+            self.autopilots.hear(system, component, armed, now_ns, message.autopilot)
+        elif system == self.system and component in TYPES:
+            self._hear_namesake(component, message.custom_mode)
 
     def _hear_namesake(self, component: int, token: int) -> None:
         if token == self._token or self._intruder:
@@ -198,9 +174,8 @@ class Presence:
 
     def take_news(self) -> list[str]:
         """What the operator must know, each once."""
-        with self._lock:
-            news, self._news = self._news, []
-            return self._autopilots.take_news() + news
+        news, self._news = self._news, []
+        return self.autopilots.take_news() + news
 
 
 MS = 1_000_000
@@ -232,7 +207,10 @@ class Autopilot:
 
 
 class Autopilots:
-    """Every autopilot heard, at most one per system id, and the one that is followed."""
+    """Every autopilot heard, at most one per system id, and the one that is followed.
+
+    Fed by one thread; others may read it.
+    """
 
     def __init__(self, given: int | None, remembered: int | None, wait_s: float) -> None:
         """``given`` is never left; ``remembered`` is waited for ``wait_s`` before others."""
@@ -357,7 +335,7 @@ class Autopilots:
 
     def others(self, now_ns: int) -> list[int]:
         """The systems of present autopilots that are not followed, ascending."""
-        present = (a for a in self._heard.values() if now_ns - a.seen_ns < PRESENT_NS)
+        present = [a for a in list(self._heard.values()) if now_ns - a.seen_ns < PRESENT_NS]
         return sorted(a.system for a in present if a is not self.followed)
 
 
