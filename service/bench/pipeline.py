@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from threading import Event
+from typing import Any
 
 import cv2
 import numpy as np
@@ -93,29 +95,39 @@ def _photograph(ground: U8, T_world_camera: F64) -> U8:
 
 def _path(video: Path, folder: Path, upsample: bool, sgbm: bool) -> dict[str, float]:
     """Clouds and frames a second of one run, and the process's memory at its end."""
-    from service.cameras import open_camera
-    from service.config import load_config
-    from service.onboard.scan import Scan, ScanInputs, create_store
-
     flags = [f"compute.upsample={str(upsample).lower()}", "compute.pairs=30"]
-    config = load_config(None, [*flags, "scan.assumed_agl_m=60"])
-    backend = SgbmBackend() if sgbm else CpuBackend()
-    source = open_camera(str(video))
-    camera = Camera(K, np.zeros(5), SIZE)
-    inputs = ScanInputs(source, camera, config, backend, folder, "bench", 0)
-    store = create_store(inputs)
-    start = time.perf_counter()
-    scan = Scan(inputs, store)
-    scan.run(Event())
-    summary = scan.close()
-    elapsed = time.perf_counter() - start
-    source.close()
-    store.close()
+    summary, elapsed = _fly(video, folder, flags, SgbmBackend() if sgbm else CpuBackend())
     return {
         "clouds": summary["clouds"] / elapsed,
         "fps": summary["frames"] / elapsed,
         "rss_mib": resident_mib(),
     }
+
+
+def _fly(
+    video: Path,
+    folder: Path,
+    flags: list[str],
+    backend: CpuBackend,
+    watch: Callable[[Scan], None] | None = None,
+) -> tuple[dict[str, Any], float]:
+    """The summary of one scan, and its seconds."""
+    from service.cameras import open_camera
+    from service.config import load_config
+    from service.onboard.scan import ScanInputs, create_store
+
+    config = load_config(None, [*flags, "scan.assumed_agl_m=60"])
+    source = open_camera(str(video))
+    inputs = ScanInputs(source, Camera(K, np.zeros(5), SIZE), config, backend, folder, "bench", 0)
+    store = create_store(inputs)
+    start = time.perf_counter()
+    scan = Scan(inputs, store)
+    scan.run(Event(), watch)
+    summary = scan.close()
+    elapsed = time.perf_counter() - start
+    source.close()
+    store.close()
+    return summary, elapsed
 
 
 def resident_mib() -> float:
@@ -148,10 +160,11 @@ def run_memory(options: BenchOptions) -> list[BenchResult]:
     with tempfile.TemporaryDirectory() as folder:
         short, video = Path(folder) / "short.mp4", Path(folder) / "flight.mp4"
         make_video(short, 120)
-        _fly(short, Path(folder) / "warm", _Watch())  # what compilers need is not the flight's
+        backend = CpuBackend()
+        _fly(short, Path(folder) / "warm", [], backend)  # what compilers need is not the flight's
         make_video(video, frames)
         watch = _Watch()
-        summary = _fly(video, Path(folder) / "scan", watch)
+        summary, _ = _fly(video, Path(folder) / "scan", [], backend, watch)
     note = f"{summary['frames']} frames, {summary['keyframes']} keyframes"
     early, late = watch.tenth(0), watch.tenth(9)
     return [
@@ -180,21 +193,3 @@ class _Watch:
         first, last = (int(n * len(self._seen) / 10) for n in (index, index + 1))
         part = self._seen[first:last]
         return part[-1][1], 1e3 * (part[-1][0] - part[0][0]) / (len(part) - 1)
-
-
-def _fly(video: Path, folder: Path, watch: _Watch) -> dict[str, int]:
-    from service.cameras import open_camera
-    from service.config import load_config
-    from service.onboard.scan import ScanInputs, create_store
-
-    config = load_config(None, ["scan.assumed_agl_m=60"])
-    source = open_camera(str(video))
-    camera = Camera(K, np.zeros(5), SIZE)
-    inputs = ScanInputs(source, camera, config, CpuBackend(), folder, "bench", 0)
-    store = create_store(inputs)
-    scan = Scan(inputs, store)
-    scan.run(Event(), watch)
-    summary = scan.close()
-    source.close()
-    store.close()
-    return summary
