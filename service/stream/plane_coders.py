@@ -226,29 +226,6 @@ def _normal_equations(c: F64, k: F64, size: tuple[int, int], step: int) -> tuple
 
 
 @numba.njit(cache=True, nogil=True)
-def _solve(A: F64, b: F64) -> F64:
-    """x of ``A x = b`` for a positive definite A of which the lower triangle is given."""
-    n = b.size
-    L = np.zeros((n, n))  # A = L L^T
-    x: F64 = b.copy()
-    for j in range(n):
-        for m in range(j + 1):
-            rest = A[j, m]
-            for q in range(m):
-                rest -= L[j, q] * L[m, q]
-            L[j, m] = np.sqrt(rest) if m == j else rest / L[m, m]
-    for j in range(n):
-        for q in range(j):
-            x[j] -= L[j, q] * x[q]
-        x[j] /= L[j, j]
-    for j in range(n - 1, -1, -1):
-        for q in range(j + 1, n):
-            x[j] -= L[q, j] * x[q]
-        x[j] /= L[j, j]
-    return x
-
-
-@numba.njit(cache=True, nogil=True)
 def _residuals(c: F64, k: F64, size: tuple[int, int], weights: I64) -> U16:
     """Zigzag residuals of the known pixels in scan order.
 
@@ -332,7 +309,8 @@ def fit(c: F64, k: F64, size: tuple[int, int]) -> I64:
     plane."""
     step = max(1, round(k.sum() / FIT_PIXELS))
     A, b = _normal_equations(c, k, size, step)
-    weights = _solve(A + _PRIOR * np.eye(WEIGHTS), b + _PRIOR * _PLANE)
+    A += np.tril(A, -1).T + _PRIOR * np.eye(WEIGHTS)  # of which the sums are the lower triangle
+    weights = np.linalg.solve(A, b + _PRIOR * _PLANE)
     return np.asarray(np.rint(np.clip(weights, -7.9, 7.9) * (1 << SHIFT)), np.int64)
 
 
