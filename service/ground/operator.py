@@ -164,9 +164,9 @@ class Operator:
         others: list[Ack] = []
 
         def overhear(message: Any, _: Any = None) -> None:
-            told = parse_fields(message.fields_json)
-            if message.component_id != component and told.get("command") == number:
-                result = told.get("result", 4)
+            answer = parse_fields(message.fields_json)
+            if message.component_id != component and answer.get("command") == number:
+                result = answer.get("result", 4)
                 others.append(Ack(message.system_id, message.component_id, int(result)))
 
         module = self._direct_module

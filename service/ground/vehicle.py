@@ -1,4 +1,4 @@
-"""The vehicle beside the portal: its figures, and the operator's orders with their answers."""
+"""The vehicle that the portal shows: its figures, and the operator's orders with their answers."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ class RateEstimate:
     CLIMB, CREEP = 0.05, 0.005  # of the configured rate, per report
     FLOOR = 0.03  # of the configured rate
     MIN_REPORT_S = 0.8  # reports closer together are joined
-    MAX_GAP_S = 10.0  # after a gap, begin anew
+    MAX_GAP_S = 10.0  # after a longer gap the estimate restarts
     REST = 2  # reports after a fall that are not judged
     PATIENCE = 2  # bad reports in a row before the rate falls
     SAME = 0.6  # a share lost that shrank by less than this did not depend on the rate

@@ -1,4 +1,4 @@
-"""What a store holds, by kind and number, kept in memory; and who is told of news."""
+"""What a store holds, by kind and number, kept in memory; and who hears of news."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ MAX_WAITING_ASKS = 64
 RETRY_S = 1.0
 """From one attempt to open a session to the next, at least; a tenth of it after a timeout."""
 SILENCE_S = 5.0
-"""When stations that were heard fall silent for so long, the session is opened anew: TCP
+"""When stations that were heard fall silent for so long, a new session is opened: TCP
 waits longer and longer before it tries a dead connection again."""
 FIRST_PATIENCE_S, MIN_PATIENCE_S = 10.0, 1.5
 PATIENCE = 3.0

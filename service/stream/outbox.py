@@ -286,14 +286,14 @@ class Outbox:
     def held(self, scan_id: str, peer: str, report: Held, now: float) -> bool:
         """A ground station reports what it holds; False when it is not served."""
         feed = self._feeds.get(scan_id)
-        anew = not self.listened(now)
+        is_first = not self.listened(now)
         if feed is None or not self._hear(peer, now):
             return False
         feed.held.pop(peer, None)
         feed.held[peer] = report.numbers
         for former in list(feed.held)[:-MAX_STATIONS]:
             del feed.held[former]
-        if anew:
+        if is_first:
             self._catch_up(feed, report.numbers)
         estimate = self._estimates.setdefault((scan_id, peer), RateEstimate(self._configured))
         estimate.report(feed.sent_bytes, report.received_bytes, now)
