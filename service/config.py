@@ -226,7 +226,7 @@ class FusionConfig:
         400, "keyframes remembered for that, 0.1 MB each; of more, every second old one goes"
     )
     graph_keyframes: int = key(
-        1500, "keyframes in the pose graph, 0.04 MB each; of more, older ones ride on neighbours"
+        400, "keyframes in the pose graph, 0.04 MB each; of more, older ones ride on neighbours"
     )
 
     def __post_init__(self) -> None:

@@ -59,7 +59,6 @@ ROWS: tuple[Row, ...] = (
     Row("gst", "process: a GStreamer pipeline, and what it complains of", 1),
     Row("scan", "one scan: tracking, map and store", 2, deadline_s=_HANG_S),
     Row("dense", "reconstruction; a replay waits instead of dropping", 2, 3, DROP, _HANG_S),
-    Row("graph", "the pose graph's process and its pipes", 2, starts_itself="owns its process"),
     Row("coverage", "coverage.png beside the growing scan", 2),
     Row("files", "the files of a scan that has ended", 3),
     # The daemon.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from functools import cache
 from itertools import pairwise
 
@@ -19,7 +17,6 @@ from recon.graph.thinning import moved_loops, over_gaps, surplus, thinned
 from recon.graph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 from service.bench.graph import HEIGHT_M, legs
-from service.onboard.graph_aside import GraphAside
 
 COUNT, MOST, EACH = 250, 50, 5
 STEP_M, SCALE = 5.0, 1.3
@@ -68,7 +65,7 @@ def test_many_short_segments_keep_to_the_bound_and_near_the_truth() -> None:
     assert np.median(np.abs(np.array(scales) / SCALE - 1.0)) < 0.05
     assert trajectory.moved(final=True) == []
     for i in range(0, COUNT, 7):
-        assert trajectory.telling(i)[0] >= 1
+        assert trajectory.tell(trajectory.place(i))[0] >= 1
 
 
 def test_without_fixes_nothing_jumps_when_segments_go() -> None:
@@ -104,21 +101,6 @@ def test_what_was_let_go_stays_as_it_was_told() -> None:
     found = trajectory.place(before + 1)
     np.testing.assert_array_equal(found.T_world_camera, told.T_world_camera)
     assert found.scale == told.scale
-
-
-def test_aside_it_is_the_same_also_after_its_process_died() -> None:
-    here = Trajectory(graph=bounded())
-    fly(here)
-    graph = GraphAside(wait_s=5.0, again_s=0.0, most_nodes=MOST)
-    there = Trajectory(graph=graph)
-    fly(there, 0, 150)
-    graph.residuals()
-    os.kill(graph.pid, signal.SIGKILL)
-    fly(there, 150)
-    poses = landed(there, COUNT)
-    assert graph.seqs == here.graph.seqs
-    graph.close()
-    np.testing.assert_allclose(poses, landed(here, COUNT), atol=2e-2)
 
 
 def nodes_of(sizes: list[int]) -> list[Node]:

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -22,7 +18,6 @@ from recon.graph.thinning import moved_loop, surplus, thinned
 from recon.graph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 from service.bench.graph import HEIGHT_M, legs
-from service.onboard.graph_aside import GraphAside
 from service.scans.file_ledger import FileLedger
 
 COUNT, MOST, LEG = 200, 60, 50
@@ -125,8 +120,8 @@ def test_everything_told_is_corrected_at_the_end_and_counted() -> None:
     poses = landed(trajectory, COUNT)
     assert trajectory.moved(final=True) == []
     for i, before in told.items():
-        times, first_scale = trajectory.telling(i)
-        assert times >= 1 and first_scale > 0
+        times, growth = trajectory.tell(trajectory.place(i))
+        assert times >= 1 and growth > 0
         if np.linalg.norm(before.T_world_camera[:3, 3] - poses[i, :3, 3]) > 0.01:
             assert times >= 2
 
@@ -175,28 +170,3 @@ def test_ends_of_segments_stay() -> None:
         for segment in {n.segment for n in nodes}:
             seqs = [n.seq for n in nodes if n.segment == segment]
             assert (seqs[0], seqs[-1]) == (7 * segment, 7 * segment + 6)
-
-
-@contextmanager
-def beside(most: int = MOST) -> Iterator[GraphAside]:
-    graph = GraphAside(wait_s=5.0, again_s=0.0, most_nodes=most)
-    yield graph
-    graph.close()
-
-
-def test_aside_it_is_the_same_also_after_its_process_died() -> None:
-    """What is kept to make the graph anew is bounded, and makes the same graph."""
-    here = Trajectory(graph=bounded())
-    fly(here, 150)
-    with beside() as graph:
-        there = Trajectory(graph=graph)
-        fly(there, 150)
-        graph.residuals()
-        assert graph.generation == here.graph.generation and graph.seqs == here.graph.seqs
-        assert len(graph._orders) < MOST and len(graph._nodes) == len(graph._spread) <= MOST
-        os.kill(graph.pid, signal.SIGKILL)
-        fly(there, COUNT, 150)
-        fly(here, COUNT, 150)
-        poses = landed(there, COUNT)
-    assert graph.seqs == here.graph.seqs
-    np.testing.assert_allclose(poses, landed(here, COUNT), atol=2e-3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -30,10 +29,10 @@ def prior(T: F64, agl_m: float = 60.0) -> PosePrior:
 
 def told(priors: list[PosePrior]) -> tuple[list[str], GraphWatch]:
     graph, heard = PoseGraph(), list[str]()
-    watch = GraphWatch(graph, threading.Lock(), heard.append)
+    watch = GraphWatch(graph)
     for i, (T, p) in enumerate(zip(track(len(priors)), priors, strict=True)):
         graph.add_keyframe(i, i * 10**9, 0, T, COVARIANCE, p, (60.0, 0.0))
-        watch.look()
+        heard += watch.look()
     return heard, watch
 
 

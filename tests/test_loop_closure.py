@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import threading
 from functools import lru_cache
 
 import cv2
@@ -224,8 +223,8 @@ def test_two_verified_loops_close_the_map() -> None:
 
 def search_along(poses: list[F64], chain: list[F64], segment: list[int]) -> LoopSearch:
     """The search fed as the reconstruction feeds it, without telemetry."""
-    trajectory, lock = Trajectory(), threading.Lock()
-    search = LoopSearch(trajectory, lock, LoopConfig(least_gap=5))
+    trajectory = Trajectory()
+    search = LoopSearch(trajectory, LoopConfig(least_gap=5))
     covariance = np.diag([4e-3**2] * 3 + [0.1**2] * 3)
     for i, (T, odom) in enumerate(zip(poses, chain, strict=True)):
         trajectory.add(i, segment[i], odom, PosePrior(), None, i * 10**9, covariance)
@@ -282,7 +281,7 @@ def test_a_lost_stretch_is_found_by_its_look_among_many() -> None:
 def test_the_search_keeps_a_bounded_number_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = view(A, 1)
     trajectory = Trajectory()
-    search = LoopSearch(trajectory, threading.Lock(), most_views=6)
+    search = LoopSearch(trajectory, most_views=6)
     rng = np.random.default_rng(4)
     for i in range(20):
         T = camera(300.0 * i, 0.0, 40.0, 0.0)

@@ -14,8 +14,8 @@ from painted_ground import CAMERA, FOOTPRINT_M, HEIGHT_M, pose, still
 from typer.testing import CliRunner
 
 from recon.graph.alignment import Similarity
-from recon.graph.keyframe_graph import KeyframeGraph
 from recon.graph.loop_book import Edge
+from recon.graph.pose_graph import PoseGraph
 from recon.types import F64, PosePrior
 from service.cameras.camera_file import save_camera
 from service.cli import app
@@ -49,7 +49,7 @@ def apart(
     for segment, count in enumerate(points):
         for i in range(3):
             pieces.add(10 * segment + i, segment, count, prior)
-    return pieces.apart(cast(KeyframeGraph, ties))
+    return pieces.apart(cast(PoseGraph, ties))
 
 
 def test_without_ties_the_largest_stays() -> None:

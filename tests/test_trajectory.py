@@ -154,8 +154,8 @@ def test_a_frame_rides_on_its_keyframe() -> None:
     halved = [se3.compose(T[:3, :3], 0.5 * T[:3, 3]) for T in truth]
     trajectory = flown(truth, halved, 0.5 * HEIGHT_M)
     step = se3.compose(np.eye(3), np.array([0.5, 0.0, 0.0]))
-    ridden = trajectory.ride(50, step)
     key = trajectory.place(50)
+    ridden = key.carry(step)
     assert key.scale == pytest.approx(2.0, rel=0.03)
     here = se3.inverse(key.T_world_camera) @ ridden.T_world_camera
     assert here[0, 3] == pytest.approx(0.5 * key.scale)

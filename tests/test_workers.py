@@ -144,8 +144,6 @@ OUTSIDE = {
     "service/workers.py": "it is the executor",
     "service/bench/": "benchmarks make their own load, peers and links",
     "service/commands/demo.py": "it starts the other commands, as a person would",
-    "service/onboard/graph_process.py": "the graph's process and its two pipes",
-    "service/onboard/graph_server.py": "the other end of that pipe",
     "mavlink/component/vehicle.py": "mavlink knows nothing of service; rows by name",
     "mavlink/wire/link.py": "the same",
     "mavlink/component/rehearsal.py": "the same",

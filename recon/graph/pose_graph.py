@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +19,6 @@ from recon import se3
 from recon.graph import factors as graph_factors
 from recon.graph.alignment import Scale, Similarity
 from recon.graph.factors import pose3
-from recon.graph.graph_memory import GraphMemory
 from recon.graph.loop_book import Edge, LoopBook
 from recon.graph.motions import Motions
 from recon.graph.readings import Readings, is_frozen
@@ -60,21 +58,6 @@ class PoseGraph:
         self._book = LoopBook(self.config, self)
         self._built = 0
         self._start()
-
-    @classmethod
-    def batch(
-        cls,
-        nodes: Sequence[Node],
-        loops: Sequence[Loop] = (),
-        config: PoseGraphConfig | None = None,
-    ) -> PoseGraph:
-        """The graph of all keyframes and accepted loops at once, solved."""
-        graph = cls(config)
-        for node in nodes:
-            graph._keep(replace(node, key=len(graph)))
-        graph._book.taken = list(loops)
-        graph.solve()
-        return graph
 
     # ---- what goes in --------------------------------------------------------------------------
 
@@ -198,33 +181,6 @@ class PoseGraph:
     def seqs(self) -> list[int]:
         """Numbers of the nodes, in order."""
         return list(self._nodes)
-
-    def memory(self) -> GraphMemory:
-        """All from which :meth:`restored` makes the same graph."""
-        return GraphMemory(
-            self.config, list(self._nodes.values()), dict(self._ridden), set(self._let_go),
-            self._segments, list(self._book.taken), list(self._book.pending),
-            Counter(self._book.counts), Counter(self._kept_counts), self.entered,
-            self.generation, self._thin_at,
-        )  # fmt: skip
-
-    @classmethod
-    def restored(cls, memory: GraphMemory) -> PoseGraph:
-        """The graph that :meth:`memory` was taken of, built anew."""
-        graph = cls(memory.config)
-        graph._nodes = {node.seq: node for node in memory.nodes}
-        graph._ridden, graph._segments = dict(memory.ridden), memory.segments
-        graph._let_go = set(memory.let_go)
-        book, graph._kept_counts = graph._book, Counter(memory.kept_counts)
-        book.taken, book.pending = list(memory.taken), list(memory.pending)
-        book.counts, graph._thin_at = Counter(memory.book_counts), memory.thin_at
-        graph.entered, graph.generation = memory.entered, memory.generation
-        graph.rebuild()
-        return graph
-
-    def records(self) -> tuple[list[Node], list[Loop]]:
-        """Keyframes and accepted loops, from which :meth:`batch` makes the same graph."""
-        return list(self._nodes.values()), list(self._book.taken)
 
     def metric_loops(self) -> list[Loop]:
         """Accepted loops with lengths in metres, by the scale known now."""

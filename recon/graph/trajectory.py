@@ -10,14 +10,13 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from recon import se3
 from recon.graph.alignment import Similarity
-from recon.graph.keyframe_graph import KeyframeGraph
 from recon.graph.ledger import Ledger, MemoryLedger, Rows
 from recon.graph.pose_graph import PoseGraph
 from recon.graph.riders import KEYFRAME, Carrier, change, left, moved_m, ridden, whole
@@ -49,6 +48,12 @@ class Placed:
     def sigma_m(self) -> float:
         """Of the place, in all three directions together."""
         return float(np.sqrt(np.trace(self.covariance[3:, 3:])))
+
+    def carry(self, T_key_camera: F64) -> Placed:
+        """A frame in the world by its pose relative to this keyframe (odometry units)."""
+        moved = T_key_camera.copy()
+        moved[:3, 3] *= self.scale
+        return replace(self, T_world_camera=self.T_world_camera @ moved)
 
 
 class _Told:
@@ -113,13 +118,13 @@ class Trajectory:
     def __init__(
         self,
         config: TrajectoryConfig | None = None,
-        graph: KeyframeGraph | None = None,
+        graph: PoseGraph | None = None,
         ledger: Ledger | None = None,
     ) -> None:
         """``graph`` places the keyframes; a :class:`PoseGraph` when left out. ``ledger`` takes
         rows of :data:`recon.graph.riders.KEYFRAME`; memory when left out."""
         self.config = config or TrajectoryConfig()
-        self.graph: KeyframeGraph = PoseGraph() if graph is None else graph
+        self.graph = PoseGraph() if graph is None else graph
         self._ledger: Ledger = MemoryLedger(KEYFRAME) if ledger is None else ledger
         self._told = _Told()
         self._row: dict[int, int] = {}  # of the nodes, in the ledger
@@ -190,13 +195,6 @@ class Trajectory:
         """Metres per unit of the odometry at a keyframe."""
         return self.graph.scale(seq) if seq in self.graph else self.place(seq).scale
 
-    def ride(self, seq: int, T_key_camera: F64) -> Placed:
-        """A frame's world pose from its pose relative to keyframe ``seq`` (odometry units)."""
-        key = self.place(seq)
-        moved = T_key_camera.copy()
-        moved[:3, 3] *= key.scale
-        return Placed(seq, key.T_world_camera @ moved, key.scale, key.covariance, key.sources)
-
     def step_between(self, a: int, b: int) -> F64:
         """(4, 4) T_a_b in metres by what the graph holds now."""
         return np.asarray(se3.inverse(self.place(a).T_world_camera) @ self.place(b).T_world_camera)
@@ -241,7 +239,6 @@ class Trajectory:
         told = self._told
         if not len(told) or (told.checked == self.graph.version and not final):
             return []
-        self._follow()  # asking for the version may have brought another state
         told.checked = self.graph.version
         keys = told.keys
         T, scales = self.graph.pose_array()[keys], self.graph.scales()[keys]
@@ -288,8 +285,11 @@ class Trajectory:
             out += [placed[i] for i in told[far]]
         return out
 
-    def tell(self, placed: Placed) -> None:
-        """Remember that this pose of the keyframe was published."""
+    def tell(self, placed: Placed) -> tuple[int, float]:
+        """Remember that this pose of the keyframe was published.
+
+        Returns how often it had been published before, and its scale over the first published.
+        """
         self._follow()
         if placed.seq in self.graph:
             node = self.graph.node(placed.seq)
@@ -300,11 +300,7 @@ class Trajectory:
         if rows["told"][0] == 1:
             rows["first_scale"] = placed.scale
         self._ledger.amend(row, rows)
-
-    def telling(self, seq: int) -> tuple[int, float]:
-        """How often a keyframe's pose was published, and the scale that was published first."""
-        row = self._rows_of(seq)[1][0]
-        return int(row["told"]), float(row["first_scale"])
+        return int(rows["told"][0]) - 1, placed.scale / float(rows["first_scale"][0])
 
     # ---- keyframes that are no nodes -----------------------------------------------------------
 

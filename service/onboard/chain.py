@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable
@@ -13,14 +12,16 @@ import numpy as np
 from recon import se3
 from recon.graph.alignment import height_above, height_below
 from recon.graph.dead_reckoning import carried
-from recon.graph.keyframe_graph import KeyframeGraph
+from recon.graph.pose_graph import PoseGraph
 from recon.graph.trajectory import Placed, Trajectory
 from recon.tracking.odometry import Tracked
 from recon.types import F64, DepthMap, Keyframe, PosePrior
 from service.compute.stopwatch import Stopwatch
 from service.onboard.anchorage import Anchorage, Carriers, Key
+from service.onboard.graph_watch import GraphWatch
 from service.onboard.loops import LoopSearch
 from service.onboard.viewpoints import StereoCandidate, UndistortedFrame
+from service.stream.records import Repose
 
 FARTHEST_M = 1e6
 """From the scan's origin."""
@@ -35,11 +36,21 @@ class KeyframeStep(NamedTuple):
     covariance: F64  # (6, 6) left perturbation; of the pose itself where the chain begins
 
 
+class News(NamedTuple):
+    """What the graph says once a view is in it."""
+
+    placed: Placed  # the view in the world
+    is_aligned: bool  # its segment has a frame in the world
+    reposes: tuple[Repose, ...]  # keyframes published before whose pose is better now
+    doubts: list[str]  # what the operator must know of the telemetry
+
+
 class Chain:
     """Where keyframes are in the world, and by them every frame.
 
-    :meth:`add` and :meth:`map_pose` belong to the thread that reconstructs, the rest to the one
-    that tracks; the trajectory is read and written under :attr:`lock`.
+    :meth:`add` and :meth:`map_pose` belong to the thread that reconstructs, which alone knows the
+    trajectory until all is done; the rest belongs to the thread that tracks, which goes by the
+    :class:`News` of the newest view and so never waits for the graph.
     """
 
     def __init__(
@@ -51,17 +62,22 @@ class Chain:
         stopwatch: Stopwatch,
     ) -> None:
         """``is_settled`` says which keyframes the odometry adjusts no longer."""
-        self.trajectory, self.lock = trajectory, threading.Lock()
+        self.trajectory, self.watch = trajectory, GraphWatch(trajectory.graph)
         self.loops: LoopSearch | None = None
         self._carriers, self._is_settled = carriers, is_settled
         self._rejected, self._stopwatch = rejected, stopwatch
         self._pieces = Pieces()
         self._T_map = np.eye(4)  # of the last keyframe
         self._seen: tuple[PosePrior, Placed, int] | None = None  # what vision placed last
+        self._news: dict[int, News] = {}  # by view, from thread to thread
+        self._newest: Placed | None = None  # view of the chain; None again once all is done
+        self._aligned = -1  # the newest segment that has a frame in the world
+        self._reposes: list[Repose] = []
+        self._doubts: list[str] = []
 
     @property
-    def graph(self) -> KeyframeGraph:
-        """Read it under :attr:`lock`."""
+    def graph(self) -> PoseGraph:
+        """That places the keyframes."""
         return self.trajectory.graph
 
     @property
@@ -81,23 +97,32 @@ class Chain:
         up = T_odom[2, :3]
         below = height_below(depth, up) if depth is not None else None
         height = (below, 0.0) if below is not None else height_above(view.points, up)
-        with self.lock:
-            self.trajectory.add(
-                view.seq, view.segment, self._T_map, view.prior, height, view.time_ns,
-                motion.covariance,
-            )  # fmt: skip
-        if depth is None:
-            return None
-        if self.loops is not None:
+        self.trajectory.add(
+            view.seq, view.segment, self._T_map, view.prior, height, view.time_ns,
+            motion.covariance,
+        )  # fmt: skip
+        if depth is not None and self.loops is not None:
             with self._stopwatch("loops"):
                 self.loops.look(view.seq, view.segment, view.view.gray, view.view.K, depth)
-        with self.lock:
-            placed = self.trajectory.place(view.seq)
-            if not np.abs(placed.T_world_camera[:3, 3]).max() < FARTHEST_M:
-                self._rejected["placed beyond all reach"] += 1
-                return None
+        placed = self.trajectory.place(view.seq)
+        is_near = bool(np.abs(placed.T_world_camera[:3, 3]).max() < FARTHEST_M)
+        if depth is not None and is_near:
             self.trajectory.tell(placed)
-        return placed
+        elif depth is not None:
+            self._rejected["placed beyond all reach"] += 1
+        self._news[view.seq] = News(
+            placed, self.trajectory.similarity(view.segment) is not None,
+            self._moved() if depth is not None else (), self.watch.look(),
+        )  # fmt: skip
+        return placed if depth is not None and is_near else None
+
+    def _moved(self, final: bool = False) -> tuple[Repose, ...]:
+        """Corrections of keyframes published before, which count as published from now on."""
+        moved = [(placed, *self.trajectory.tell(placed)) for placed in self.trajectory.moved(final)]
+        return tuple(
+            Repose(placed.seq, revision, placed.T_world_camera, growth, placed.covariance)
+            for placed, revision, growth in moved
+        )
 
     def map_pose(self, seq: int) -> F64:
         """(4, 4) T_map_camera of a keyframe in its segment's chain."""
@@ -106,6 +131,11 @@ class Chain:
     def reconstructed(self, view: StereoCandidate, keyframe: Keyframe | None) -> None:
         """Let a view of the chain carry frames from now on."""
         self._carriers.add(view.anchor)
+        news = self._news.pop(view.seq)
+        self._newest = news.placed
+        self._aligned = view.segment if news.is_aligned else self._aligned
+        self._reposes += news.reposes
+        self._doubts += news.doubts
         if keyframe is not None:
             points = int(np.count_nonzero(keyframe.fresh & np.isfinite(keyframe.depth.depth_m)))
             self._pieces.add(keyframe.seq, view.segment, points, view.prior)
@@ -114,18 +144,23 @@ class Chain:
         """Drop what is kept of keyframes that the odometry adjusts no longer."""
         self._carriers.settle(self._is_settled)
 
-    def corrections(self, final: bool = False) -> tuple[Placed, ...]:
-        """Keyframes published before whose pose is better now; they count as published."""
-        with self.lock:
-            moved = self.trajectory.moved(final)
-            for placed in moved:
-                self.trajectory.tell(placed)
-        return tuple(moved)
+    def corrections(self, final: bool = False) -> tuple[Repose, ...]:
+        """Keyframes published before whose pose is better now; call with ``final`` once all is
+        reconstructed, to solve the graph once more."""
+        out, self._reposes = tuple(self._reposes), []
+        if final:
+            self._newest = None
+            out += self._moved(final)
+        return out
+
+    def new_doubts(self) -> list[str]:
+        """What the operator must know of the telemetry, each once."""
+        out, self._doubts = self._doubts, []
+        return out
 
     def apart(self) -> list[tuple[int, int]]:
         """First and last keyframe of each stretch that nothing ties to the rest of the scan."""
-        with self.lock:
-            return self._pieces.apart(self.graph)
+        return self._pieces.apart(self.graph)
 
     # ---- frames ------------------------------------------------------------------------
 
@@ -141,9 +176,9 @@ class Chain:
         carrier = self._carriers.of(anchor)
         if carrier is None:
             return Placed(anchor.key.seq, T_odom_camera, 1.0, np.eye(6), ("vision",))
-        moved = se3.inverse(carrier.T_odom_camera) @ T_odom_camera
-        with self.lock:
-            return self.trajectory.ride(carrier.seq, moved)
+        # In flight no other view than the newest carries a new frame.
+        known = self._newest or self.trajectory.place(carrier.seq)
+        return known.carry(se3.inverse(carrier.T_odom_camera) @ T_odom_camera)
 
     def by_telemetry(self, image: UndistortedFrame, tracked: Tracked) -> Placed | None:
         """A lost frame where telemetry alone says the camera is; None without attitude, heading
@@ -160,9 +195,7 @@ class Chain:
         T = se3.compose(R, position)
         if self._seen is not None:
             before, seen, segment = self._seen
-            with self.lock:
-                is_aligned = self.trajectory.similarity(segment) is not None
-            if is_aligned:
+            if segment == self._aligned:
                 T = carried(before, prior, seen.T_world_camera, None, 0.0)
         tilt, yaw = prior.sigma_tilt_rad, prior.sigma_yaw_rad
         covariance = np.diag(np.square([tilt, tilt, yaw, *sigma]))
@@ -190,7 +223,7 @@ class Pieces:
         if prior.sigma_position_m is not None and prior.sigma_yaw_rad < HEADING_KNOWN_RAD:
             self._placed.add(segment)
 
-    def apart(self, graph: KeyframeGraph) -> list[tuple[int, int]]:
+    def apart(self, graph: PoseGraph) -> list[tuple[int, int]]:
         """First and last keyframe of the segments that nothing ties to the scan's main piece.
 
         The main piece is the one that fixes place; without fixes, that with most points.
@@ -225,7 +258,7 @@ class Pieces:
         return self._segments[at] if at >= 0 else None
 
 
-def _rests_on_fixes(graph: KeyframeGraph, segment: int) -> bool:
+def _rests_on_fixes(graph: PoseGraph, segment: int) -> bool:
     found = graph.similarity(segment)
     return found is not None and "gnss" in found.sources
 

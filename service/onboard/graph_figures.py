@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.graph.keyframe_graph import KeyframeGraph
+from recon.graph.pose_graph import PoseGraph
 from recon.graph.sensor_offsets import Constants
 from service.stream.records import pack_covariance, pack_motion
 
@@ -14,7 +14,7 @@ MOST_LOOPS = 300
 """Loops that a summary carries with their motions; of more, an even sample."""
 
 
-def graph_figures(graph: KeyframeGraph) -> dict[str, Any] | None:
+def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:
     """Residuals by kind of factor, loops and readings left out, fit for JSON; None when empty.
 
     ``nodes`` of the ``keyframes`` are in the graph; the others ride on them.

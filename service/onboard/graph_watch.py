@@ -1,12 +1,10 @@
-"""Tells the operator, once each, what the pose graph finds wrong with the telemetry."""
+"""What the pose graph finds wrong with the telemetry, in words for the operator."""
 
 from __future__ import annotations
 
 import math
-import threading
-from collections.abc import Callable
 
-from recon.graph.keyframe_graph import KeyframeGraph
+from recon.graph.pose_graph import PoseGraph
 
 LEAST = 5
 """Readings of one kind left out before it is said."""
@@ -27,25 +25,21 @@ LEFT_OUT = {
 
 
 class GraphWatch:
-    """Looks at a pose graph now and then; what it finds goes to ``tell`` when it is new."""
+    """Looks at a pose graph now and then, on the thread that builds it."""
 
-    def __init__(
-        self, graph: KeyframeGraph, lock: threading.Lock, tell: Callable[[str], None]
-    ) -> None:
-        """``lock`` guards the graph."""
-        self._graph, self._lock, self._tell = graph, lock, tell
+    def __init__(self, graph: PoseGraph) -> None:
+        self._graph = graph
         self._seen = 0
         self._told: set[str] = set()
 
-    def look(self) -> None:
-        """Look again when enough keyframes have come since the last time."""
+    def look(self) -> list[str]:
+        """What is newly found, once for each kind; looks when the keyframes have grown enough."""
         if self._graph.entered < max(LEAST, LOOK_GROWTH * self._seen):
-            return
+            return []
         self._seen = self._graph.entered
-        for kind, sentence in self._findings().items():
-            if kind not in self._told:
-                self._told.add(kind)
-                self._tell(sentence)
+        fresh = {k: text for k, text in self._findings().items() if k not in self._told}
+        self._told |= fresh.keys()
+        return list(fresh.values())
 
     def sentences(self) -> list[str]:
         """Everything that is wrong, as known now."""
@@ -53,9 +47,7 @@ class GraphWatch:
 
     def _findings(self) -> dict[str, str]:
         """Sentences by kind."""
-        with self._lock:
-            counts = self._graph.counts
-            scales = self._graph.newest_scales()
+        counts, scales = self._graph.counts, self._graph.newest_scales()
         out = {
             kind: f"{counts[kind]} {text}" for kind, text in LEFT_OUT.items()
             if counts[kind] >= LEAST

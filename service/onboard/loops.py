@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections import Counter
 from dataclasses import dataclass
 
@@ -96,18 +95,15 @@ class LoopSearch:
     def __init__(
         self,
         trajectory: Trajectory,
-        lock: threading.Lock,
         config: LoopConfig | None = None,
         most_views: int = 400,
     ) -> None:
-        """``lock`` guards the trajectory.
-
-        Of more than ``most_views`` keyframes, about 0.1 MB each, every second of the older half
+        """Of more than ``most_views`` keyframes, about 0.1 MB each, every second of the older half
         is forgotten.
         """
         self._most_views = most_views
         self.counts: Counter[str] = Counter()  # "tried", "verified", "taken"
-        self.trajectory, self._lock = trajectory, lock
+        self.trajectory = trajectory
         self._config = config or LoopConfig()
         self._kept: dict[int, _Kept] = {}
         self._rest = 0
@@ -134,15 +130,12 @@ class LoopSearch:
             self._thin()
 
     def _search(self, new: _Kept) -> None:
-        with self._lock:
-            view = new.unpacked(self.trajectory.scale(new.seq))
-            likely = self._likely(new, view)
-        for seq in likely:
+        view = new.unpacked(self.trajectory.scale(new.seq))
+        for seq in self._likely(new, view):
             self.counts["tried"] += 1
-            with self._lock:
-                guess = self.trajectory.step_between(seq, new.seq)
-                scale = self.trajectory.scale(seq)
-            found = verify(self._kept[seq].unpacked(scale), view, guess, self._config)
+            guess = self.trajectory.step_between(seq, new.seq)
+            known = self._kept[seq].unpacked(self.trajectory.scale(seq))
+            found = verify(known, view, guess, self._config)
             if found is not None and self._tell(seq, new, found):
                 self._rest = PAUSE
                 return
@@ -150,10 +143,7 @@ class LoopSearch:
     def _tell(self, seq: int, new: _Kept, found: LoopClosure) -> bool:
         """True when the graph believes the loop."""
         self.counts["verified"] += 1
-        with self._lock:
-            taken = self.trajectory.add_loop(
-                seq, new.seq, found.T_a_b, found.covariance, found.growth
-            )
+        taken = self.trajectory.add_loop(seq, new.seq, found.T_a_b, found.covariance, found.growth)
         self.counts["taken"] += taken
         return taken
 

@@ -18,6 +18,7 @@ from service.config import ComputeConfig, ScanConfig
 from service.onboard.anchorage import Anchorage
 from service.onboard.stages import Stages
 from service.onboard.viewpoints import StereoCandidate
+from service.stream.records import Repose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,7 +30,7 @@ class Step:
     is_view: bool = False  # the frame takes part in stereo and may become a keyframe
     anchor: Anchorage | None = None  # gives the frame's place again, as it is known later
     keyframes: tuple[Keyframe, ...] = ()  # finished depth images, oldest first
-    moved: tuple[Placed, ...] = ()  # keyframes published before whose pose is better now
+    moved: tuple[Repose, ...] = ()  # keyframes published before whose pose is better now
 
 
 class Pipeline:

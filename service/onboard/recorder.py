@@ -17,7 +17,7 @@ from service.onboard.pipeline import Pipeline, Step
 from service.onboard.rig import Rig, attitude_of
 from service.scans.drawing import save_debug
 from service.stream.codec import CodecConfig, encode
-from service.stream.records import PoseRecord, Repose
+from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
 TOLD_M = 0.05
@@ -150,17 +150,8 @@ class Recorder:
                 self._on_keyframe(keyframe)
         if self.pipeline.stages.debug and step.keyframes:
             save_debug(self.store.path.parent, step.keyframes[-1].seq, self.pipeline.stages.debug)
-        with self._chain.lock:
-            moved = [self._repose(placed) for placed in step.moved]
-        if moved:
-            self.store.add_reposes(moved)
-
-    def _repose(self, placed: Placed) -> Repose:
-        """The correction of a keyframe, whose depth was made with the scale first told."""
-        told, scale = self._chain.trajectory.telling(placed.seq)
-        return Repose(
-            placed.seq, told - 1, placed.T_world_camera, placed.scale / scale, placed.covariance
-        )
+        if step.moved:
+            self.store.add_reposes(step.moved)
 
     def _record(self, told: Told, placed: Placed) -> PoseRecord:
         """The pose record of a frame, with speed and turn from the one before it."""

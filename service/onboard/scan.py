@@ -22,7 +22,6 @@ from service.config import Config
 from service.errors import InputError
 from service.onboard.frame_tags import FILE as TAGS
 from service.onboard.frame_tags import FrameTags
-from service.onboard.graph_watch import GraphWatch
 from service.onboard.pipeline import Pipeline, Step
 from service.onboard.recorder import Recorder
 from service.onboard.rig import ASSUMED_AGL_M, Rig
@@ -123,8 +122,6 @@ class Scan:
         self.check = TelemetryCheck(
             inputs.config.camera, inputs.history, inputs.tell, inputs.latency_ms
         )
-        chain = self.pipeline.stages.chain
-        self.watch = GraphWatch(chain.graph, chain.lock, inputs.tell)
         self.tracking = TrackingWatch(inputs.tell)
         self.tags = FrameTags(inputs.folder / TAGS) if inputs.history is not None else None
         self.tagged = self.odd_sized = self.heights = self.attitudes = 0
@@ -151,8 +148,8 @@ class Scan:
         step = self.pipeline.step(Frame(frame.image, exposed_ns, frame.seq, prior))
         self.check.add(time_ns, step.tracked)
         self.tracking.look(step.tracked, time_ns)
-        if step.keyframes:
-            self.watch.look()
+        for doubt in self.pipeline.stages.chain.new_doubts():
+            inputs.tell(doubt)
         self.recorder.write(step, exposed_ns, state.alt_agl_m if state is not None else None)
         if inputs.on_step is not None:
             inputs.on_step(step, state, exposed_ns)
@@ -213,7 +210,7 @@ class Scan:
 
     def _doubts(self) -> list[str]:
         """What the reader of this scan must know."""
-        out = [*self.check.told.values(), *self.watch.sentences()]
+        out = [*self.check.told.values(), *self.pipeline.stages.chain.watch.sentences()]
         if self.odd_sized:
             W, H = self.inputs.camera.size_px
             out.append(f"{self.odd_sized} frames were not {W}x{H} like the camera model: left out")

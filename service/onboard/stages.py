@@ -16,7 +16,6 @@ from recon import se3
 from recon.backends import Backend, DenseStages, MatchingBackend, PathBackend
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.clouds.registration import IcpConfig
-from recon.graph.keyframe_graph import KeyframeGraph
 from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.graph.riders import KEYFRAME
 from recon.graph.trajectory import Placed, Trajectory
@@ -53,7 +52,6 @@ from service.compute.threading_layer import kernels_may_overlap, share_cores
 from service.config import ComputeConfig, Config
 from service.onboard.anchorage import VIEW, Carriers, Key
 from service.onboard.chain import Chain, KeyframeStep
-from service.onboard.graph_aside import GraphAside
 from service.onboard.loops import LoopSearch
 from service.onboard.surface_map import SurfaceMap
 from service.onboard.viewpoints import StereoCandidate, StereoViews, UndistortedFrame, Viewpoints
@@ -329,10 +327,10 @@ def build_stages(
 ) -> Stages:
     """The stages that the configuration asks for. Raises ValueError for an unusable camera model.
 
-    ``live`` lets old work give way when reconstruction cannot keep up, and gives the pose graph
-    a process of its own; otherwise nothing is dropped. ``pages`` is a folder that the parts of
-    the map flown long ago may go to; beside it what is remembered of every view lies in files
-    without a name. None: keep all that in memory, and forget the map's oldest.
+    ``live`` lets old work give way when reconstruction cannot keep up; otherwise nothing is
+    dropped. ``pages`` is a folder that the parts of the map flown long ago may go to; beside it
+    what is remembered of every view lies in files without a name. None: keep all that in memory,
+    and forget the map's oldest.
     """
     compute, stopwatch, resources = config.compute, Stopwatch(), ExitStack()
     refused: Counter[str] = Counter()
@@ -377,7 +375,7 @@ def build_stages(
         reproject=pair.reproject,
         fuse=pair.fuse,
         register=Register(backend, stopwatch),
-        chain=_chain(config, live, pages, track.is_settled, rejected, stopwatch, resources),
+        chain=_chain(config, pages, track.is_settled, rejected, stopwatch, resources),
         map=SurfaceMap(pages, compute.map_voxels, config.scan.resolution_m, stopwatch),
         keyframe=MakeKeyframe(debug),
         beside=beside,
@@ -391,7 +389,6 @@ def build_stages(
 
 def _chain(
     config: Config,
-    live: bool,
     pages: Path | None,
     is_settled: Callable[[Key], bool],
     rejected: Counter[str],
@@ -399,12 +396,7 @@ def _chain(
     resources: ExitStack,
 ) -> Chain:
     """The pose graph and all that hangs on it."""
-    graph: KeyframeGraph
-    if live:
-        graph = GraphAside(most_nodes=config.fusion.graph_keyframes)
-        resources.callback(graph.close)
-    else:
-        graph = PoseGraph(PoseGraphConfig(most_nodes=config.fusion.graph_keyframes))
+    graph = PoseGraph(PoseGraphConfig(most_nodes=config.fusion.graph_keyframes))
     trajectory, carriers = Trajectory(graph=graph), Carriers()
     if pages is not None:
         ledger = FileLedger(KEYFRAME, pages.parent)
@@ -413,7 +405,7 @@ def _chain(
         carriers = Carriers(FileLedger(VIEW, pages.parent))
     chain = Chain(trajectory, carriers, is_settled, rejected, stopwatch)
     if config.fusion.loops:
-        chain.loops = LoopSearch(trajectory, chain.lock, most_views=config.fusion.loop_views)
+        chain.loops = LoopSearch(trajectory, most_views=config.fusion.loop_views)
     return chain
 
 

@@ -91,20 +91,17 @@ class Sample:
     frames: int
     keyframes: int  # in flight clouds, of which a keyframe has some
     budgets: tuple[int, ...]  # voxels in memory, tiles on disk, views for loops, nodes
-    graph_mib: float = 0.0  # of that memory, the pose graph's process
     own_mib: float = 0.0  # of that memory, what is in no file
     still: bool = False  # nothing came from the camera
 
 
 class Held(NamedTuple):
-    """What a process and its children hold. Of the resident memory, ``below_mib`` is that of the
-    children; ``own_mib`` leaves out pages of files (libraries), which the kernel takes away and
-    reads again as it likes.
+    """What a process and its children hold. ``own_mib`` leaves out pages of files (libraries),
+    which the kernel takes away and reads again as it likes.
     """
 
     mib: float
     own_mib: float
-    below_mib: float
     files: int
 
 
@@ -116,11 +113,9 @@ def held(pid: int) -> Held:
     for thread in Path(f"/proc/{pid}/task").iterdir():
         with contextlib.suppress(OSError, KeyError):  # the thread or the child has ended
             children += [held(int(child)) for child in (thread / "children").read_text().split()]
-    below = sum(child.mib for child in children)
     return Held(
-        kib["VmRSS"] / 1024.0 + below,
+        kib["VmRSS"] / 1024.0 + sum(child.mib for child in children),
         (kib["RssAnon"] + kib["RssShmem"]) / 1024.0 + sum(child.own_mib for child in children),
-        below,
         len(os.listdir(f"/proc/{pid}/fd")) + sum(child.files for child in children),
     )
 
@@ -149,8 +144,7 @@ def flown(
         hours = (time.monotonic() - begin_s) / 3600.0
         frames, clouds, *budgets = (int(status.get(name, 0)) for name in COUNTS)
         counts = (now.files, frames, clouds, tuple(budgets))
-        memory = (now.below_mib, now.own_mib)
-        out.append(Sample(number, aloft_s, hours, now.mib, *counts, *memory, is_still))
+        out.append(Sample(number, aloft_s, hours, now.mib, *counts, now.own_mib, is_still))
         if camera is not None and is_still:
             camera.send_signal(signal.SIGCONT)
         assert service.process.poll() is None
@@ -315,17 +309,14 @@ def tell_scan(samples: list[Sample], record: Row, lost: str) -> bool:
     """Write the row of the long scan; True when memory grows within it beyond doubt."""
     aloft = [s for s in samples if s.aloft_s != LANDED]
     end = [s for s in aloft if s.still][-1]
-    service = slope_within(aloft, lambda s: s.memory_mib - s.graph_mib)
-    graph = slope_within(aloft, lambda s: s.graph_mib)
-    both = slope_within(aloft, lambda s: s.memory_mib)
+    slope = slope_within(aloft, lambda s: s.memory_mib)
     record(
         f"soak of {MINUTES:g} minutes: one scan",
         1,
         f"of {LONG_S / 60.0:.0f} minutes, {end.frames} frames, {samples[-1].keyframes} keyframes, "
         f"{end.budgets[3]} of them in the pose graph; after the first {100 * WARM_SHARE:.0f} %, "
-        f"whenever the camera held still: the service at {end.memory_mib - end.graph_mib:.0f} MiB, "
-        f"slope {in_words(service)}; the pose graph's process at {end.graph_mib:.0f} MiB, slope "
-        f"{in_words(graph)}; both {in_words(both)}",
+        f"whenever the camera held still: the service at {end.memory_mib:.0f} MiB, "
+        f"slope {in_words(slope)}",
         lost,
     )
-    return both[1] >= FLAT_MIB_PER_H
+    return slope[1] >= FLAT_MIB_PER_H
