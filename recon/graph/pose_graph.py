@@ -26,7 +26,7 @@ from recon.graph.records import Loop, Node, PoseGraphConfig
 from recon.graph.segment_frames import SegmentFrames
 from recon.graph.sensor_offsets import Constants
 from recon.graph.smoother import ROUNDS, Smoother, moved_covariance
-from recon.graph.thinning import GONE_SHARE, Ridden, moved_loop, thin
+from recon.graph.thinning import GONE_SHARE, thin
 from recon.types import F64, Pose, PosePrior
 
 __all__ = ["Edge", "PoseGraph", "PoseGraphConfig"]
@@ -47,8 +47,6 @@ class PoseGraph:
         self.config = config or PoseGraphConfig()
         self._kept_counts: Counter[str] = Counter()  # of what happens once, whatever is rebuilt
         self._nodes: dict[int, Node] = {}  # by keyframe number, in order of time
-        self._ridden: dict[int, Ridden] = {}  # that were nodes until the last thinning
-        self._let_go: set[int] = set()  # with their segments, by that thinning
         self._thin_at = self.config.most_nodes
         self.entered = 0  # keyframes, whether they are nodes or not
         self.generation = 0  # how often nodes were thinned out
@@ -117,18 +115,15 @@ class PoseGraph:
         must be multiplied by to fit a's. One loop alone is not believed: a repeated texture
         gives perfect matches at the wrong place. A second one nearby must close the same circle.
         """
-        if self.is_let_go(a) or self.is_let_go(b):
-            return False
-        if not all(end in self._nodes or end in self._ridden for end in (a, b)) or a == b:
+        if a not in self._nodes or b not in self._nodes or a == b:
             raise ValueError(f"keyframes {a} and {b} are not two of the graph")
         if a > b:
             a, b, growth = b, a, 1.0 / growth
             T_a_b, covariance = graph_factors.reversed_motion(T_a_b, covariance)
-        scale = self.scale(self.carrier(a))
-        ratio = growth * self.scale(self.carrier(b)) / scale
+        scale = self.scale(a)
+        ratio = growth * self.scale(b) / scale
         loop = Loop(a, b, T_a_b, covariance, ratio).scaled(1.0 / scale)
-        loop = moved_loop(loop, self._ridden)
-        fresh = self._book.offer(loop) if loop.a < loop.b else []
+        fresh = self._book.offer(loop)
         if not fresh:
             return False
         if self._tie(loop):
@@ -168,14 +163,6 @@ class PoseGraph:
     def loops(self) -> list[Edge]:
         """All loops that were offered."""
         return self._book.edges()
-
-    def carrier(self, seq: int) -> int:
-        """The node that keyframe ``seq`` is, or hangs on since the last thinning."""
-        return self._ridden[seq].node if seq in self._ridden else seq
-
-    def is_let_go(self, seq: int) -> bool:
-        """True of a keyframe that the last thinning let go with its whole segment."""
-        return seq in self._let_go
 
     @property
     def seqs(self) -> list[int]:
@@ -319,11 +306,11 @@ class PoseGraph:
         """Let some of the older keyframes ride on their neighbours, and build anew."""
         poses = dict(zip(self._nodes, self._smoother.poses(), strict=False))  # but the newest
         done = thin(list(self._nodes.values()), self._refused(), poses)
-        nodes, self._ridden, self._let_go = done.nodes, done.ridden, done.let_go
-        self._kept_counts["keyframe let go"] += len(self._let_go)
+        nodes = done.nodes
+        self._kept_counts["keyframe let go"] += len(done.let_go)
         self._nodes = {node.seq: node for node in nodes}
         self._segments.thin(nodes)
-        self._book.thin(self._ridden, self._let_go, len(nodes))
+        self._book.thin(done.ridden, done.let_go, len(nodes))
         self._thin_at = max(self.config.most_nodes, int(len(nodes) * (1.0 + GONE_SHARE)))
         self.generation += 1
         self.rebuild()

@@ -172,7 +172,6 @@ class Trajectory:
 
     def place(self, seq: int) -> Placed:
         """The keyframe in the world, as known now. Raises KeyError for an unknown keyframe."""
-        self._follow()
         if seq not in self.graph:
             row, rows = self._rows_of(seq)
             return self._carried(row, rows, *self._beside(seq))[0]
@@ -183,7 +182,6 @@ class Trajectory:
 
     def places(self, seqs: Sequence[int]) -> F64:
         """(N, 4, 4) T_world_camera of keyframes."""
-        self._follow()
         nodes, graph = self.graph.pose_array(), self.graph
         found = [
             nodes[graph.node(seq).key] if seq in graph else self.place(seq).T_world_camera
@@ -203,7 +201,6 @@ class Trajectory:
         """As :meth:`recon.graph.pose_graph.PoseGraph.add_loop`; ``a`` need not be a node, and
         then the loop is moved to the node before it; False where that is of another
         segment."""
-        self._follow()
         if a not in self.graph:
             before, after = self._beside(a)
             if not self._same_segment(before, after):
@@ -229,7 +226,6 @@ class Trajectory:
         """
         if final:
             self.graph.solve()
-        self._follow()
         nodes = self._moved_nodes(final)
         if final:
             self._owed = deque(self._nodes[:-1])
@@ -290,7 +286,6 @@ class Trajectory:
 
         Returns how often it had been published before, and its scale over the first published.
         """
-        self._follow()
         if placed.seq in self.graph:
             node = self.graph.node(placed.seq)
             self._told.put(placed, node.key, node.height or 1.0)
