@@ -58,7 +58,7 @@ ROWS: tuple[Row, ...] = (
     Row("decoder", "images of a recording, decoded ahead", 1, 4, WAIT),
     Row("gst", "process: a GStreamer pipeline, and what it complains of", 1),
     Row("scan", "one scan: tracking, map and store", 2, deadline_s=_HANG_S),
-    Row("dense", "reconstruction; a replay waits instead of dropping", 2, 3, DROP, _HANG_S),
+    Row("dense", "reconstruction, pose graph; a replay waits, drops nothing", 2, 3, DROP, _HANG_S),
     Row("coverage", "coverage.png beside the growing scan", 2),
     Row("files", "the files of a scan that has ended", 3),
     # The daemon.

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import resource
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from recon import se3
-from recon.types import F64
+from recon.graph.trajectory import Trajectory
+from recon.types import F64, PosePrior
+from service.compute.stopwatch import Stopwatch
 from service.errors import OutsideError
 from service.onboard.anchorage import Anchorage, Carriers, Key, Told, ToldFrames
+from service.onboard.chain import Chain, KeyframeStep
 
 RNG = np.random.default_rng(4)
 
@@ -105,3 +110,27 @@ def test_carriers_keep_their_places_when_they_settle() -> None:
         assert np.array_equal(new.T_odom_camera, old.T_odom_camera)
         assert isinstance(new.key, Refined) == (new.seq >= 70)
     assert carriers.of(Anchorage(0, Refined(0, 7, np.eye(4)), np.eye(4))) is None
+
+
+def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None:
+    """The graph is at work then on another thread: nobody asks it, nobody waits for it."""
+    chain: Any = Chain(Trajectory(), Carriers(), before(0), Counter(), Stopwatch())
+    key = Refined(3, 0, some_pose())
+    frame, anchor = Anchorage(7, key, some_pose()), Anchorage(5, key, some_pose())
+    assert chain.place(frame).sources == ("vision",)  # nothing is reconstructed yet
+    view = SimpleNamespace(
+        seq=5, segment=0, time_ns=0, prior=PosePrior(), points=np.zeros((0, 3)), anchor=anchor,
+        view=SimpleNamespace(T_odom_camera=anchor.T_odom_camera),
+    )  # fmt: skip
+    assert chain.add(view, KeyframeStep(None, np.eye(6)), None) is None
+    trajectory, known = chain.trajectory, chain.trajectory.place(5)
+    chain.trajectory = None
+    assert chain.place(frame).seq == 3  # the view is not done
+    chain.reconstructed(view, None)
+    step = se3.inverse(anchor.T_odom_camera) @ frame.T_odom_camera
+    step[:3, 3] *= known.scale
+    found = chain.place(frame)
+    np.testing.assert_allclose(found.T_world_camera, known.T_world_camera @ step, atol=1e-12)
+    chain.trajectory = trajectory
+    assert chain.corrections(final=True) == ()
+    np.testing.assert_allclose(chain.place(frame).T_world_camera, found.T_world_camera, atol=1e-9)
