@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.stereo.reprojection import LABEL_SIGMA_PX, points_from_depth, reproject
-from recon.types import F64, DepthMap, DisparityMap, StereoPair
+from recon.stereo.reprojection import LABEL_SIGMA_PX, reproject
+from recon.types import F64, DisparityMap, StereoPair
 
 K = np.array([[190.0, 0, 159.5], [0, 190.0, 89.5], [0, 0, 1]])
 BASELINE_M = 4.0
@@ -94,19 +94,3 @@ def test_unknown_doubtful_and_infinite_are_nan() -> None:
     assert np.isfinite(found.depth_m[2:]).all()
     with pytest.raises(ValueError, match="bad disparity"):
         reproject(DisparityMap(px, confidence[1:]), pair, K, SIZE)
-
-
-def test_points_project_back_onto_their_pixels() -> None:
-    depth = np.random.default_rng(0).uniform(30, 80, (36, 64)).astype(np.float32)
-    depth[3, 4] = np.nan
-    small = np.array([[38.0, 0, 31.5], [0, 38.0, 17.5], [0, 0, 1]])
-    ones = np.ones((36, 64), np.uint8)
-    points = points_from_depth(DepthMap(depth, depth * 0.01, ones, small, np.eye(4)))
-    assert points.shape == (36, 64, 3)
-    assert points.dtype == np.float32
-    assert np.isnan(points[3, 4]).all()
-    uvw = points.reshape(-1, 3).astype(np.float64) @ small.T
-    v, u = np.mgrid[0:36, 0:64]
-    keep = np.arange(36 * 64) != 3 * 64 + 4
-    np.testing.assert_allclose((uvw[:, 0] / uvw[:, 2])[keep], u.ravel()[keep], atol=1e-3)
-    np.testing.assert_allclose((uvw[:, 1] / uvw[:, 2])[keep], v.ravel()[keep], atol=1e-3)

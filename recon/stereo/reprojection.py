@@ -118,16 +118,6 @@ def _reproject(
             sigma_m[v, u] = depth / d * abs(slope) * LABEL_SIGMA_PX / np.sqrt(trust)
 
 
-def points_from_depth(depth: DepthMap) -> F32:
-    """(h, w, 3) float32 points in the camera's frame, metres; NaN where depth is (Eq. 3)."""
-    height, width = depth.depth_m.shape
-    K = depth.K
-    y = (np.arange(height)[:, None] - K[1, 2]) / K[1, 1]
-    x = (np.arange(width)[None, :] - K[0, 2] - K[0, 1] * y) / K[0, 0]
-    z = depth.depth_m
-    return np.stack([x * z, y * z, z], axis=-1).astype(np.float32)
-
-
 @dataclass(frozen=True, slots=True)
 class FusionConfig:
     """Parameters of the fusion of stereo pairs."""
