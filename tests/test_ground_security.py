@@ -113,7 +113,7 @@ def test_a_viewer_reads_and_cannot_write(
         assert link.drain(15.0)
 
         def published() -> bool:
-            link._post(link._outbox.tell)
+            link._post(link._outbox.publish_heads)
             return "skyrelief/red/scan-1/head" in seen
 
         until(published)
@@ -279,7 +279,7 @@ def test_a_revoked_viewer_sees_nothing_and_its_successor_does(
         assert link.drain(15.0)
 
         def published() -> bool:
-            link._post(link._outbox.tell)
+            link._post(link._outbox.publish_heads)
             return "new" in seen
 
         until(published)
