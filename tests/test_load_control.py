@@ -19,7 +19,7 @@ from service.cameras import CameraFrame, open_camera
 from service.cameras.source import CameraSource
 from service.compute.backend_choice import FallbackBackend
 from service.config import load_config
-from service.daemon.frame_gate import FrameGate, picture_name
+from service.daemon.frame_gate import FrameGate, image_name
 from service.daemon.load_shedding import Level
 from service.daemon.machine import Machine
 from service.daemon.runtime import Daemon
@@ -117,7 +117,7 @@ def test_nothing_is_kept_while_paused_or_without_room(
 
 
 def test_names_of_pictures_are_times() -> None:
-    assert picture_name(1_533_459_888_480_000_000) == "20180805090448480000Z.jpg"
+    assert image_name(1_533_459_888_480_000_000) == "20180805090448480000Z.jpg"
 
 
 class Operator:

@@ -1,7 +1,7 @@
 """Cameras behind one table: each line is a word before the colon and who opens what follows it.
 
 A source is written ``word:rest``, as in ``file:flight.mp4``, ``images:DIR`` or ``pipe:-``. A
-bare path is a file or a folder of pictures, a bare ``-`` is standard input. Options follow a
+bare path is a file or a folder of images, a bare ``-`` is standard input. Options follow a
 question mark: ``pipe:-?format=rawvideo&video_size=1280x720``.
 """
 
@@ -32,9 +32,9 @@ CAMERAS: dict[str, str] = {
 
 
 def open_camera(source: str) -> CameraSource:
-    """The camera that ``source`` names, open and with its first picture seen.
+    """The camera that ``source`` names, open and with its first image seen.
 
-    Raises InputError when there is no such source or it holds no pictures, OutsideError when
+    Raises InputError when there is no such source or it holds no images, OutsideError when
     a device or a link does not answer.
     """
     word, rest, options = parse_source(source)

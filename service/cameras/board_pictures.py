@@ -1,4 +1,4 @@
-"""Chessboard pictures from files, folders or a video, and the coverage picture of a calibration."""
+"""Chessboard images from files, folders or a video, and the coverage image of a calibration."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ MOST_VIEWS = 80
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardSet:
-    """The board in a set of pictures of one size."""
+    """The board in a set of images of one size."""
 
     views: tuple[BoardView, ...]
-    missed: tuple[tuple[str, str], ...]  # (name, why the picture is not used)
+    missed: tuple[tuple[str, str], ...]  # (name, why the image is not used)
     size_px: tuple[int, int]  # (W, H)
 
 
 def find_boards(sources: Sequence[Path], board: Board) -> BoardSet:
-    """The board in pictures, folders of pictures, or videos; InputError when nothing is usable."""
+    """The board in images, folders of images, or videos; InputError when nothing is usable."""
     views: list[BoardView] = []
     missed: list[tuple[str, str]] = []
     size: tuple[int, int] | None = None
-    for name, gray in _pictures(sources):
+    for name, gray in _images(sources):
         if gray is None:
             missed.append((name, "cannot be read as a picture"))
             continue
@@ -62,8 +62,8 @@ def _is_repeat(corners: F32, views: Sequence[BoardView], size: tuple[int, int]) 
     return any(float(np.abs(v.corners_px - corners).max()) < limit for v in views)
 
 
-def _pictures(sources: Sequence[Path]) -> Iterator[tuple[str, U8 | None]]:
-    """(name, grey picture) of every source in turn; None when a file cannot be read."""
+def _images(sources: Sequence[Path]) -> Iterator[tuple[str, U8 | None]]:
+    """(name, gray image) of every source in turn; None when a file cannot be read."""
     for source in sources:
         if source.is_dir():
             inside = sorted(p for p in source.iterdir() if p.suffix.lower() in STILLS)
@@ -86,7 +86,7 @@ def _still(path: Path) -> U8 | None:
 
 
 def _video(path: Path) -> Iterator[tuple[str, U8]]:
-    """Pictures of a video, a few a second."""
+    """Images of a video, a few a second."""
     from service.cameras import open_camera
 
     camera = open_camera(f"file:{path}")
@@ -102,7 +102,7 @@ def _video(path: Path) -> Iterator[tuple[str, U8]]:
 
 
 def draw_coverage(calibration: Calibration, views: Sequence[BoardView]) -> U8:
-    """(h, w, 3) BGR picture: every corner used, coloured by its view's rms, over the lens' bend.
+    """(h, w, 3) BGR image: every corner used, coloured by its view's rms, over the lens' bend.
 
     The lines are a straight grid as the lens bends it, so that the distortion can be seen.
     """
@@ -155,9 +155,9 @@ def _fold(distortion: F64) -> float:
     return float(r[turn[0]] ** 2) if len(turn) else 16.0
 
 
-def write_picture(path: Path, picture: U8) -> None:
+def write_image(path: Path, image: U8) -> None:
     """Write a PNG; OutsideError when it cannot be written."""
-    ok, data = cv2.imencode(".png", picture)
+    ok, data = cv2.imencode(".png", image)
     try:
         if not ok:
             raise OSError("OpenCV cannot write PNG")

@@ -58,7 +58,7 @@ def load_camera(path: str | Path) -> Camera:
 
 
 def check_size(camera: Camera, size_px: tuple[int, int], source: str) -> None:
-    """InputError when the pictures (W, H) of ``source`` are not those of the camera model."""
+    """InputError when the images (W, H) of ``source`` are not those of the camera model."""
     if camera.size_px != size_px:
         raise InputError(
             f"the camera model is for {camera.size_px[0]}x{camera.size_px[1]} pictures, "

@@ -50,11 +50,11 @@ BROKEN = (
     ValueError,
     struct.error,
 )
-"""What Pillow raises, besides OSError, for files that are no pictures or hold broken tags."""
+"""What Pillow raises, besides OSError, for files that are no images or hold broken tags."""
 
 
 def read_tags(path: Path) -> Tags:
-    """The tags of the picture at ``path``; raises OSError when it is not a picture, or one that
+    """The tags of the image at ``path``; raises OSError when it is not an image, or one that
     claims more pixels than any camera has."""
     from PIL import Image
 

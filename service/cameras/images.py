@@ -1,4 +1,4 @@
-"""A folder of stills, as mapping drones leave it: times and positions from the pictures' tags."""
+"""A folder of stills, as mapping drones leave it: times and positions from the images' tags."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""A camera that never ends: arrival times smoothed, stalls and frozen pictures found out.
+"""A camera that never ends: arrival times smoothed, stalls and frozen images found out.
 
 The stream is opened again, with growing pauses, when it ends, fails, stalls or repeats one
-picture. Pictures keep one time axis through all of that: ns since the source was opened, on the
+image. Images keep one time axis through all of that: ns since the source was opened, on the
 machine's monotonic clock.
 
 ``rtsp://…``; ``stream:URL`` for whatever else FFmpeg opens (udp, tcp, srt, http);
@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 from recon.types import U8
 from service.cameras import reject_options
 from service.cameras.source import CameraFrame, CameraSource, Paced
-from service.cameras.video import decoded_pictures, picture_bgr, video_stream
+from service.cameras.video import decoded_frames, frame_bgr, video_stream
 from service.errors import InputError, OutsideError
 from service.redaction import without_credentials
 
@@ -39,15 +39,15 @@ V4L2_OPTIONS = ("video_size", "framerate", "input_format")
 OPEN_S = 10.0
 
 LIVE_OPTIONS = {"fflags": "nobuffer", "flags": "low_delay", "fpsprobesize": "0"}
-"""The last: the stream is opened at once, not when its rate is known some twenty pictures later."""
+"""The last: the stream is opened at once, not when its rate is known some twenty images later."""
 
 
 @dataclass(frozen=True, slots=True)
 class LiveConfig:
     """When a live camera counts as gone, and how it is called back."""
 
-    stall_s: float = 3.0  # no picture for so long: open again
-    frozen_s: float = 8.0  # one and the same picture for so long: open again
+    stall_s: float = 3.0  # no image for so long: open again
+    frozen_s: float = 8.0  # one and the same image for so long: open again
     first_retry_s: float = 0.25
     longest_retry_s: float = 5.0
 
@@ -62,10 +62,10 @@ class LiveConfig:
 class StampFilter:
     """Arrival times without their jitter: presentation time plus the least delay seen of late.
 
-    Queues and decoders only ever delay a picture, so the lower envelope of arrival minus
+    Queues and decoders only ever delay an image, so the lower envelope of arrival minus
     presentation time is the best estimate of the clocks' offset. It may rise by 200 ppm, which
     is more than two crystals drift apart. A new connection first hands over what it had
-    gathered, faster than it was taken: those pictures are older than their arrival tells.
+    gathered, faster than it was taken: those images are older than their arrival tells.
     """
 
     RISE = 200e-6
@@ -78,16 +78,16 @@ class StampFilter:
 
     @property
     def is_set(self) -> bool:
-        """True once a picture had a presentation time."""
+        """True once an image had a presentation time."""
         return self._offset_ns is not None
 
     def time_ns(self, pts_ns: int, arrival_ns: int) -> int | None:
-        """The picture's time, on the clock of its arrival; None while catching up."""
+        """The image's time, on the clock of its arrival; None while catching up."""
         step_ns = pts_ns - self._last_pts_ns
         self._last_pts_ns = pts_ns
         delay_ns = float(arrival_ns - pts_ns)
         if self._offset_ns is None or not 0 <= step_ns < 10_000_000_000:
-            self._offset_ns = delay_ns  # first picture, or a new time line
+            self._offset_ns = delay_ns  # first image, or a new time line
             return None
         fall_ns = self._offset_ns - delay_ns
         self._offset_ns = min(self._offset_ns + self.RISE * step_ns, delay_ns)
@@ -95,7 +95,7 @@ class StampFilter:
 
 
 class LiveSource:
-    """Pictures of a stream that is opened again whenever it is lost."""
+    """Images of a stream that is opened again whenever it is lost."""
 
     def __init__(
         self,
@@ -103,7 +103,7 @@ class LiveSource:
         description: str,
         config: LiveConfig | None = None,
     ) -> None:
-        """Open the stream by ``open_container(stall_s)`` and see its first picture.
+        """Open the stream by ``open_container(stall_s)`` and see its first image.
 
         Raises OutsideError when the camera gives none now; nothing is retried here.
         """
@@ -113,16 +113,16 @@ class LiveSource:
         self.fps: float | None = None
         self.warnings: list[str] = []
         self.losses = 0
-        self.misfits = 0  # pictures of another size, dropped
-        self._fits = True  # the last picture did
+        self.misfits = 0  # images of another size, dropped
+        self._fits = True  # the last image did
         self.epoch_unix_ns: int | None = time.time_ns()
         self._start_ns = time.monotonic_ns()
         self.start_monotonic_ns: int | None = self._start_ns
         self._open_container = open_container
         self._closed = Event()
         self._iterated = False
-        self._pictures = self._connect()
-        first = next(self._pictures, None)
+        self._images = self._connect()
+        first = next(self._images, None)
         if first is None:
             why = f" ({self.warnings[-1]})" if self.warnings else ""
             raise OutsideError(
@@ -132,18 +132,18 @@ class LiveSource:
         self._first = first
 
     def __iter__(self) -> Iterator[CameraFrame]:
-        """Yield pictures until :meth:`close`; then, or when dropped, let go of the stream."""
+        """Yield images until :meth:`close`; then, or when dropped, let go of the stream."""
         self._iterated = True
         try:
             yield from self._frames()
         finally:
-            self._pictures.close()
+            self._images.close()
 
     def close(self) -> None:
-        """End the iteration at the next picture, and the waiting for a lost camera at once."""
+        """End the iteration at the next image, and the waiting for a lost camera at once."""
         self._closed.set()
         if not self._iterated:
-            self._pictures.close()
+            self._images.close()
 
     def _frames(self) -> Iterator[CameraFrame]:
         seq = 0
@@ -159,10 +159,10 @@ class LiveSource:
                 last_ns = time_ns
 
     def _endless(self) -> Iterator[tuple[U8, int]]:
-        """Every (picture, time) of every connection, with pauses that grow between failures."""
+        """Every (image, time) of every connection, with pauses that grow between failures."""
         retry_s = self.config.first_retry_s
         while not self._closed.is_set():
-            for found in self._pictures:
+            for found in self._images:
                 retry_s = self.config.first_retry_s
                 yield found
                 if self._closed.is_set():
@@ -172,10 +172,10 @@ class LiveSource:
             self.losses += 1
             self._closed.wait(retry_s)
             retry_s = min(2.0 * retry_s, self.config.longest_retry_s)
-            self._pictures = self._connect()
+            self._images = self._connect()
 
     def _connect(self) -> Generator[tuple[U8, int], None, None]:
-        """The (picture, time) of one connection; ends, with a log line, when it is lost."""
+        """The (image, time) of one connection; ends, with a log line, when it is lost."""
         import av.error
 
         try:
@@ -191,19 +191,19 @@ class LiveSource:
             rate = stream.average_rate  # as the camera says; it is not measured
             self.fps = float(rate) if rate else None
             log.info("%s: connected", self.description)
-            yield from self._watch(decoded_pictures(container, stream, self._tell, self._damage))
+            yield from self._watch(decoded_frames(container, stream, self._tell, self._damage))
         finally:
             container.close()
 
-    def _watch(self, pictures: Iterator[av.VideoFrame]) -> Iterator[tuple[U8, int]]:
-        """Stamp the pictures; end when one picture is repeated for too long."""
+    def _watch(self, frames: Iterator[av.VideoFrame]) -> Iterator[tuple[U8, int]]:
+        """Stamp the images; end when one image is repeated for too long."""
         stamps = StampFilter()
         print_of_last, changed_ns = 0, time.monotonic_ns()
-        for picture in pictures:
+        for frame in frames:
             if self._closed.is_set():
                 return
             arrival_ns = time.monotonic_ns()
-            image = picture_bgr(picture)
+            image = frame_bgr(frame)
             fingerprint = zlib.crc32(image[::16, ::16].tobytes())
             if fingerprint != print_of_last:
                 print_of_last, changed_ns = fingerprint, arrival_ns
@@ -211,8 +211,8 @@ class LiveSource:
                 self._tell(f"the picture is frozen since {self.config.frozen_s:g} s")
                 return
             time_ns: int | None = arrival_ns
-            if picture.pts is not None and picture.time_base is not None:
-                pts_ns = round(picture.pts * picture.time_base * 1_000_000_000)
+            if frame.pts is not None and frame.time_base is not None:
+                pts_ns = round(frame.pts * frame.time_base * 1_000_000_000)
                 time_ns = stamps.time_ns(pts_ns, arrival_ns)
             elif stamps.is_set:  # left in the decoder when the stream broke off, seconds ago
                 time_ns = None

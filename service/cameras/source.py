@@ -16,7 +16,7 @@ from service.workers import PROCESS, Worker
 
 @dataclass(frozen=True, slots=True)
 class GeoTag:
-    """Where a picture was taken, as the camera itself wrote it (EXIF, XMP)."""
+    """Where an image was taken, as the camera itself wrote it (EXIF, XMP)."""
 
     lat_deg: float
     lon_deg: float
@@ -29,29 +29,29 @@ class GeoTag:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraFrame:
-    """One picture as the source gave it."""
+    """One image as the source gave it."""
 
     image: U8  # (H, W, 3) BGR
     time_ns: int  # presentation time, ns since the start of the stream
-    seq: int  # 0, 1, 2 … of the pictures that came out
+    seq: int  # 0, 1, 2 … of the images that came out
     geotag: GeoTag | None
     name: str  # file name of a still, else "frame <seq>"
 
 
 @runtime_checkable
 class CameraSource(Protocol):
-    """An open camera: iterate once for its pictures, in order of time, then close it."""
+    """An open camera: iterate once for its images, in order of time, then close it."""
 
     description: str  # for a log line and scan.json
     size_px: tuple[int, int]  # (W, H)
     epoch_unix_ns: int | None  # UTC of time_ns = 0, when the source tells
     start_monotonic_ns: int | None  # this machine's monotonic clock at time_ns = 0, if live
-    fps: float | None  # mean pictures per second, when the source tells
-    is_live: bool  # True: pictures that are not fetched in time are lost
-    warnings: list[str]  # one line each; grows while pictures are fetched
+    fps: float | None  # mean images per second, when the source tells
+    is_live: bool  # True: images that are not fetched in time are lost
+    warnings: list[str]  # one line each; grows while images are fetched
 
     def __iter__(self) -> Iterator[CameraFrame]:
-        """Yield the pictures, oldest first; ends with the recording."""
+        """Yield the images, oldest first; ends with the recording."""
         ...
 
     def close(self) -> None:

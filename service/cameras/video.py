@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_PIXELS = 1 << 27
-"""Of a picture; the decoder refuses larger ones before it makes room for them."""
+"""Of an image; the decoder refuses larger ones before it makes room for them."""
 
 EARLIEST_UNIX_S = 946_684_800  # 2000-01-01: cameras without a clock write 1904 or 1970
 
@@ -41,7 +41,7 @@ HEAD_BYTES = 4096
 
 
 class VideoSource:
-    """The pictures of one open PyAV container; its first picture is decoded on construction."""
+    """The images of one open PyAV container; its first image is decoded on construction."""
 
     def __init__(
         self,
@@ -71,7 +71,7 @@ class VideoSource:
             raise InputError(f"{description}: its video has a format that cannot be decoded")
         self._stream = stream
         self._expected = self._stream.frames
-        self._decoded = decoded_pictures(container, self._stream, self._warn, self._damage)
+        self._decoded = decoded_frames(container, self._stream, self._warn, self._damage)
         self._first = next(self._decoded, None)
         if self._first is None:
             self.close()
@@ -87,27 +87,27 @@ class VideoSource:
         self.fps = float(rate) if rate else None
 
     def __iter__(self) -> Iterator[CameraFrame]:
-        """Yield the pictures whose time goes forward; says at the end what was left out."""
+        """Yield the images whose time goes forward; says at the end what was left out."""
         first, self._first = self._first, None
         if first is None:
             return
         last_ns = -1
         seq = 0
         decoded = 0
-        for picture in itertools.chain((first,), self._decoded):
+        for frame in itertools.chain((first,), self._decoded):
             decoded += 1
-            time_ns = self._time_ns(picture, last_ns)
+            time_ns = self._time_ns(frame, last_ns)
             if time_ns <= last_ns:
                 self._unordered += 1
                 continue
-            size_px = (int(picture.width), int(picture.height))
+            size_px = (int(frame.width), int(frame.height))
             if size_px != self._stored_px:
                 self._warn(
                     f"picture size changed from {_by(self._stored_px)} to {_by(size_px)} at "
                     f"{time_ns / 1e9:.2f} s; what follows is left out"
                 )
                 break
-            image = np.rot90(picture_bgr(picture), -(self.turned_deg // 90))
+            image = np.rot90(frame_bgr(frame), -(self.turned_deg // 90))
             yield CameraFrame(np.ascontiguousarray(image), time_ns, seq, None, f"frame {seq}")
             last_ns = time_ns
             seq += 1
@@ -125,13 +125,13 @@ class VideoSource:
         self._damaged += 1
         log.debug("%s: picture dropped: %s", self.description, error)
 
-    def _time_ns(self, picture: av.VideoFrame, last_ns: int) -> int:
-        """Presentation time; a picture without one follows the last by the mean interval."""
-        if picture.pts is None or picture.time_base is None:
+    def _time_ns(self, frame: av.VideoFrame, last_ns: int) -> int:
+        """Presentation time; an image without one follows the last by the mean interval."""
+        if frame.pts is None or frame.time_base is None:
             step = 1e9 / self.fps if self.fps else 1e9 / 30.0
             return last_ns + int(step) if last_ns >= 0 else 0
         # Whole ticks first: floats of seconds lose nanoseconds after minutes.
-        return round((picture.pts * picture.time_base - self._start_s) * 1_000_000_000)
+        return round((frame.pts * frame.time_base - self._start_s) * 1_000_000_000)
 
     def _tell_losses(self, decoded: int) -> None:
         if self._damaged:
@@ -159,15 +159,15 @@ def video_stream(container: av.container.InputContainer) -> av.VideoStream | Non
     return stream
 
 
-def decoded_pictures(
+def decoded_frames(
     container: av.container.InputContainer,
     stream: av.VideoStream,
     broke_off: Callable[[str], None],
     damaged: Callable[[Exception], None],
 ) -> Iterator[av.VideoFrame]:
-    """Every whole picture of ``stream``, packet by packet: a damaged one costs itself only.
+    """Every whole image of ``stream``, packet by packet: a damaged one costs itself only.
 
-    ``broke_off`` is told when the container ends with an error, ``damaged`` of each picture
+    ``broke_off`` is told when the container ends with an error, ``damaged`` of each image
     that does not decode or that the decoder pieced together from others.
     """
     import av.error
@@ -180,17 +180,17 @@ def decoded_pictures(
             broke_off(f"the recording breaks off: {error}")
             packet = None
         try:
-            pictures = stream.codec_context.decode(None) if packet is None else packet.decode()
+            frames = stream.codec_context.decode(None) if packet is None else packet.decode()
         except av.error.EOFError:
-            pictures = []  # the decoder was emptied before
+            frames = []  # the decoder was emptied before
         except av.error.FFmpegError as error:
             damaged(error)
-            pictures = []
-        for picture in pictures:
-            if picture.is_corrupt:
+            frames = []
+        for frame in frames:
+            if frame.is_corrupt:
                 damaged(ValueError("concealed by the decoder"))
             else:
-                yield picture
+                yield frame
         if packet is None:
             return
 
@@ -221,7 +221,7 @@ def parse_time_unix_ns(text: str) -> int | None:
 def _start_s(stream: av.VideoStream, first: av.VideoFrame) -> Fraction:
     """Presentation time of the stream's start as an exact fraction of seconds.
 
-    The first picture that decodes may come later than the start (a stream joined midway).
+    The first image that decodes may come later than the start (a stream joined midway).
     """
     if stream.start_time is not None and stream.time_base is not None:
         start = stream.start_time * stream.time_base
@@ -232,9 +232,9 @@ def _start_s(stream: av.VideoStream, first: av.VideoFrame) -> Fraction:
     return Fraction(0)
 
 
-def picture_bgr(picture: av.VideoFrame) -> U8:
-    """(H, W, 3) BGR of a decoded picture."""
-    return np.ascontiguousarray(picture.to_ndarray(format="bgr24"), dtype=np.uint8)
+def frame_bgr(frame: av.VideoFrame) -> U8:
+    """(H, W, 3) BGR of a decoded image."""
+    return np.ascontiguousarray(frame.to_ndarray(format="bgr24"), dtype=np.uint8)
 
 
 def _by(size_px: tuple[int, int]) -> str:
@@ -340,7 +340,7 @@ def open_pipe(rest: str, options: Mapping[str, str]) -> VideoSource:
 
 
 def index_at_end(head: bytes) -> bool:
-    """True when ``head`` starts an mp4 whose pictures come before their index."""
+    """True when ``head`` starts an mp4 whose images come before their index."""
     if head[4:8] != b"ftyp":
         return False
     at = 0

@@ -31,7 +31,7 @@ def calibrate(
     """
     from recon.calibration import FEWEST_VIEWS, CalibrationConfig
     from recon.calibration import calibrate as fit
-    from service.cameras.board_pictures import draw_coverage, find_boards, write_picture
+    from service.cameras.board_pictures import draw_coverage, find_boards, write_image
     from service.cameras.camera_file import save_camera
 
     board = _board(pattern, square_m)
@@ -50,7 +50,7 @@ def calibrate(
     except ValueError as error:
         raise InputError(f"the views give no usable camera ({error}); take more views") from error
     picture = out.with_name(f"{out.stem}_coverage.png")
-    write_picture(picture, draw_coverage(result, boards.views))
+    write_image(picture, draw_coverage(result, boards.views))
     report = _record(result, boards, board) | {
         "out": str(out),
         "coverage_picture": str(picture),

@@ -1,6 +1,6 @@
 """Between camera and scan: which frames pass, and which are only kept on the disk.
 
-Kept pictures are JPEG files named by their time, a folder that ``skyrelief replay`` takes as it
+Kept images are JPEG files named by their time, a folder that ``skyrelief replay`` takes as it
 is: what was not reconstructed in flight is reconstructed later from it and the scan's .tlog.
 """
 
@@ -20,7 +20,7 @@ from service.daemon.load_shedding import STRIDE, Level
 log = logging.getLogger(__name__)
 
 KEEP_EVERY_NS = 200_000_000
-"""Between two kept pictures; 2 m of flight at 10 m/s."""
+"""Between two kept images; 2 m of flight at 10 m/s."""
 
 QUALITY = 90
 LEAST_FREE_MIB = 500.0
@@ -37,7 +37,7 @@ class FrameGate:
         alive: Callable[[], None],
         paused: Event,
     ) -> None:
-        """Kept pictures go to ``folder``; ``zero_unix_ns`` is the unix time of time 0.
+        """Kept images go to ``folder``; ``zero_unix_ns`` is the unix time of time 0.
 
         ``alive`` is called for every frame that ends here, so that nobody takes the scan for
         hung. While ``paused`` is set nothing is kept.
@@ -101,7 +101,7 @@ class FrameGate:
             self.age_s = max(0.0, 1e-9 * (time.monotonic_ns() - shown_ns))
 
     def _keep(self, frame: CameraFrame) -> None:
-        """Write the picture, when one is due and there is room."""
+        """Write the image, when one is due and there is room."""
         if self._paused.is_set() or frame.time_ns - self._kept_ns < KEEP_EVERY_NS:
             return
         self._kept_ns = frame.time_ns
@@ -123,13 +123,13 @@ class FrameGate:
         if shutil.disk_usage(self._folder).free < LEAST_FREE_MIB * 2**20:
             raise OSError(28, "the disk is nearly full")
         _, data = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-        path = self._folder / picture_name(self._zero_unix_ns + frame.time_ns)
+        path = self._folder / image_name(self._zero_unix_ns + frame.time_ns)
         part = path.with_suffix(".part")
         part.write_bytes(data.tobytes())
         os.replace(part, path)
 
 
-def picture_name(unix_ns: int) -> str:
+def image_name(unix_ns: int) -> str:
     """A file name that tells the time in UTC to the microsecond: 20261121130501123456Z.jpg."""
     seconds, rest_ns = divmod(unix_ns, 1_000_000_000)
     moment = time.strftime("%Y%m%d%H%M%S", time.gmtime(seconds))

@@ -35,13 +35,13 @@ GRACE_S = 10.0
 
 
 class Level(IntEnum):
-    """How much is done with the pictures; each step keeps what the one before gave up."""
+    """How much is done with the images; each step keeps what the one before gave up."""
 
     FULL = 0
     LOWER_RATE = 1  # every second frame, half the stereo pairs
     LOWER_RESOLUTION = 2  # the stereo pair at 0.7 of its width
     NO_UPSAMPLING = 3
-    RECORD_ONLY = 4  # pictures go to the disk, to be reconstructed later
+    RECORD_ONLY = 4  # images go to the disk, to be reconstructed later
 
     @property
     def label(self) -> str:

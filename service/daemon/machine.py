@@ -240,7 +240,7 @@ def fill_small_caches() -> None:
 
     It keeps up to :data:`KEPT_EACH` freed blocks of every size below :data:`SMALL_BYTES`
     (numpy/_core/src/multiarray/alloc.c): 3.5 MiB. Taken one by one they would lie between
-    pictures, and each hold a page of memory; taken together they lie together.
+    images, and each hold a page of memory; taken together they lie together.
     """
     import numpy as np
 

@@ -71,7 +71,7 @@ class Daemon:
         self._fault = fault
         self._landing = LandingWatch()
         self._cores = CoreLoad()
-        self._is_silent = False  # no picture comes, and that was said
+        self._is_silent = False  # no image comes, and that was said
         self.scanning = Scanning(config)
         self.load_control = LoadControl(self.scanning)
         self.actions = ControlActions(self.scanning, self.quit)
