@@ -8,7 +8,7 @@ import pytest
 from recon import se3
 from recon.graph.alignment import Anchor, fit
 from recon.graph.altitude_datum import altitude_datum
-from recon.graph.fix_average import FixAverage
+from recon.graph.between_keyframes import FixAverage
 from recon.types import PosePrior
 
 SIGMA = np.array([1.0, 1.0, 1.5])

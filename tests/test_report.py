@@ -16,7 +16,7 @@ from recon.graph.boresight import Boresight
 from recon.graph.pose_graph import PoseGraph
 from recon.graph.sensor_offsets import Constants
 from recon.types import PosePrior
-from service.onboard.graph_figures import graph_figures
+from service.onboard.graph_report import graph_figures
 from service.scans.coverage import coverage_of
 from service.scans.folder import write_deliverables
 from service.scans.report import consistency, sensor_constants

@@ -10,8 +10,7 @@ from recon import se3
 from recon.camera_model import rays
 from recon.graph.ground_control import Closure, Track, adjust, supported
 from recon.loops.loop_closure import LoopView
-from recon.loops.submap import filled
-from recon.loops.submap_loops import SubmapLoopConfig, verify_surfaces
+from recon.loops.submap_loops import SubmapLoopConfig, filled, verify_surfaces
 from recon.types import F64, DepthMap, Keyframe, Pose
 from service.refine.stored_loops import StoredLoops, steps_m
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from recon import se3
 from recon.graph import factors as graph_factors
-from recon.graph.dead_reckoning import carried
+from recon.graph.between_keyframes import carried
 from recon.graph.factors import pose3
 from recon.graph.readings import BLOCK
 from recon.graph.records import Node, PoseGraphConfig

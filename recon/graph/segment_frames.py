@@ -11,7 +11,7 @@ import numpy as np
 from recon import se3
 from recon.graph import alignment
 from recon.graph.alignment import Anchor, ReadingNoise, Scale, Similarity
-from recon.graph.fix_average import at_camera
+from recon.graph.between_keyframes import at_camera
 from recon.graph.records import Node
 from recon.graph.sensor_offsets import Constants, Offsets, constants, offsets
 from recon.types import F64, PosePrior

@@ -11,14 +11,14 @@ import numpy as np
 
 from recon import se3
 from recon.graph.alignment import height_above, height_below
-from recon.graph.dead_reckoning import carried
+from recon.graph.between_keyframes import carried
 from recon.graph.pose_graph import PoseGraph
 from recon.graph.trajectory import Placed, Trajectory
 from recon.tracking.odometry import Tracked
 from recon.types import F64, DepthMap, Keyframe, PosePrior
 from service.compute.stopwatch import Stopwatch
 from service.onboard.anchorage import Anchorage, Carriers, Key
-from service.onboard.graph_watch import GraphWatch
+from service.onboard.graph_report import GraphWatch
 from service.onboard.loops import LoopSearch
 from service.onboard.viewpoints import StereoCandidate, UndistortedFrame
 from service.stream.records import Repose

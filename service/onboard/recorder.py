@@ -12,7 +12,7 @@ import numpy as np
 from recon.graph.trajectory import Placed
 from recon.types import F64, Keyframe
 from service.onboard.anchorage import Told, ToldFrames
-from service.onboard.graph_figures import graph_figures
+from service.onboard.graph_report import graph_figures
 from service.onboard.pipeline import Pipeline, Step
 from service.onboard.rig import Rig, attitude_of
 from service.scans.drawing import save_debug

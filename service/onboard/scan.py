@@ -15,7 +15,7 @@ from typing import Any, Protocol
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import VehicleState
 from recon.backends import Backend
-from recon.graph.travel import Odometer
+from recon.graph.between_keyframes import Odometer
 from recon.types import Camera, Frame, Keyframe
 from service.cameras.source import CameraFrame, CameraSource, ahead
 from service.config import Config

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from recon import se3
-from recon.graph.fix_average import FixAverage
+from recon.graph.between_keyframes import FixAverage
 from recon.stereo.virtual_stereo import View
 from recon.tracking.keyframe_window import OdometryKeyframe, landmarks
 from recon.tracking.odometry import Odometry, Tracked

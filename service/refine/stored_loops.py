@@ -17,8 +17,7 @@ from scipy.spatial import cKDTree
 from recon import se3
 from recon.graph.ground_control import Closure, Track
 from recon.loops.loop_closure import LoopConfig, LoopView, candidates, ground_seen
-from recon.loops.submap import filled
-from recon.loops.submap_loops import SubmapLoopConfig, verify_surfaces
+from recon.loops.submap_loops import SubmapLoopConfig, filled, verify_surfaces
 from recon.types import F64, Keyframe
 
 NEIGHBOURS = 8
