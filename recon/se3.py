@@ -68,7 +68,7 @@ def inverse(T: F64) -> F64:
     return out
 
 
-def tidied(T: F64) -> F64:
+def project_to_so3(T: F64) -> F64:
     """(4, 4) motion with the rotation nearest to what stands in ``T``, whose rounding errors are
     gone (polar decomposition; Higham 1986, doi:10.1137/0907079).
 

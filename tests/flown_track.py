@@ -34,13 +34,13 @@ def sensed(
 
 def tell(trajectory: Trajectory, seq: int) -> None:
     """Publish a new keyframe, and those that have moved since they were."""
-    trajectory.tell(trajectory.place(seq))
+    trajectory.publish(trajectory.place(seq))
     for placed in trajectory.moved():
-        trajectory.tell(placed)
+        trajectory.publish(placed)
 
 
 def landed(trajectory: Trajectory, count: int) -> F64:
     """(count, 4, 4) where all keyframes are after the last correction, which is published."""
     for placed in trajectory.moved(final=True):
-        trajectory.tell(placed)
+        trajectory.publish(placed)
     return np.array([trajectory.place(i).T_world_camera for i in range(count)])

@@ -65,7 +65,7 @@ def test_many_short_segments_keep_to_the_bound_and_near_the_truth() -> None:
     assert np.median(np.abs(np.array(scales) / SCALE - 1.0)) < 0.05
     assert trajectory.moved(final=True) == []
     for i in range(0, COUNT, 7):
-        assert trajectory.tell(trajectory.place(i))[0] >= 1
+        assert trajectory.publish(trajectory.place(i))[0] >= 1
 
 
 def test_without_fixes_nothing_jumps_when_segments_go() -> None:

@@ -120,7 +120,7 @@ def test_everything_told_is_corrected_at_the_end_and_counted() -> None:
     poses = landed(trajectory, COUNT)
     assert trajectory.moved(final=True) == []
     for i, before in told.items():
-        times, growth = trajectory.tell(trajectory.place(i))
+        times, growth = trajectory.publish(trajectory.place(i))
         assert times >= 1 and growth > 0
         if np.linalg.norm(before.T_world_camera[:3, 3] - poses[i, :3, 3]) > 0.01:
             assert times >= 2

@@ -89,7 +89,7 @@ def test_a_loop_closure_reaches_store_and_ground_alike(tmp_path: Path) -> None:
         for i, (T, odom) in enumerate(zip(truth, chain, strict=True)):
             trajectory.add(10 * i, 0, odom, prior(T), (HEIGHT_M, 0.0), i * 10**9, COVARIANCE)
             placed = trajectory.place(10 * i)
-            trajectory.tell(placed)
+            trajectory.publish(placed)
             scales[10 * i] = placed.scale
             keyframe = flat(10 * i, placed.T_world_camera)
             layers = codec.encode(keyframe, keyframe.time_ns, codec.CodecConfig())
@@ -99,7 +99,7 @@ def test_a_loop_closure_reaches_store_and_ground_alike(tmp_path: Path) -> None:
         moved = trajectory.moved()
         assert moved
         for placed in moved:
-            trajectory.tell(placed)
+            trajectory.publish(placed)
         drone.add_reposes(
             [
                 Repose(p.seq, 1, p.T_world_camera, p.scale / scales[p.seq], p.covariance)
@@ -131,7 +131,7 @@ def test_a_correction_is_told_once_and_small_ones_only_at_the_end() -> None:
     truth = legs()
     trajectory = flown(truth, drifted(truth, 0.0))
     for i in range(len(truth)):
-        trajectory.tell(trajectory.place(10 * i))
+        trajectory.publish(trajectory.place(10 * i))
     assert trajectory.moved() == []
     wrong = legs()
     for T in wrong[LEG:]:
@@ -141,11 +141,11 @@ def test_a_correction_is_told_once_and_small_ones_only_at_the_end() -> None:
     assert moved and all(p.scale == pytest.approx(1.0, abs=0.02) for p in moved)
     assert all("loop" not in p.sources or p.seq >= 10 * LEG for p in moved)
     for p in moved:
-        trajectory.tell(p)
+        trajectory.publish(p)
     assert trajectory.moved() == []
     rest = trajectory.moved(final=True)
     for p in rest:
-        trajectory.tell(p)
+        trajectory.publish(p)
     assert trajectory.moved(final=True) == []
 
 

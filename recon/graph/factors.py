@@ -37,7 +37,7 @@ def pose3(T: F64) -> Any:
     """The gtsam.Pose3 of ``T`` (4, 4), its rotation made exact."""
     import gtsam
 
-    T = se3.tidied(T)
+    T = se3.project_to_so3(T)
     return gtsam.Pose3(gtsam.Rot3(T[:3, :3]), T[:3, 3])
 
 

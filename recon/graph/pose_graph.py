@@ -340,7 +340,7 @@ class PoseGraph:
         else:
             T_last, spread_last = self._smoother.state(last.key)
             motion, covariance = self._motions.add(node, last, T_last)
-            T = se3.tidied(T_last @ motion)
+            T = se3.project_to_so3(T_last @ motion)
             self._path[-1] += float(np.linalg.norm(motion[:3, 3]))
             spread = moved_covariance(spread_last, T_last, covariance)
         self._smoother.add_pose(node.key, T, spread)

@@ -213,7 +213,7 @@ class Trajectory:
             a, T_a_b, covariance = before, T @ T_a_b, step + A @ covariance @ A.T
         return self.graph.add_loop(a, b, T_a_b, covariance, growth)
 
-    # ---- telling -------------------------------------------------------------------------------
+    # ---- publishing ----------------------------------------------------------------------------
 
     def moved(self, final: bool = False) -> list[Placed]:
         """Keyframes whose world pose changed since it was told by more than is worth it.
@@ -281,7 +281,7 @@ class Trajectory:
             out += [placed[i] for i in told[far]]
         return out
 
-    def tell(self, placed: Placed) -> tuple[int, float]:
+    def publish(self, placed: Placed) -> tuple[int, float]:
         """Remember that this pose of the keyframe was published.
 
         Returns how often it had been published before, and its scale over the first published.

@@ -88,7 +88,7 @@ class _Flown:
         moved = self.trajectory.moved(final)
         self.most = max(self.most, len(moved))
         for placed in moved:
-            self.trajectory.tell(placed)
+            self.trajectory.publish(placed)
 
 
 class _Tracking:
@@ -122,7 +122,7 @@ def _keyframe(flight: _Flight, i: int, flown: _Flown) -> None:
     T, prior, trajectory = flight.odometry[i], flight.priors[i], flown.trajectory
     begun = time.perf_counter()
     trajectory.add(i, 0, T, prior, (HEIGHT_M / 1.3, 0.0), i * 1_000_000_000, flight.covariance)
-    trajectory.tell(trajectory.place(i))
+    trajectory.publish(trajectory.place(i))
     partner, is_taken, before = _opposite(i), False, time.perf_counter()
     if i % LOOP_EVERY == 0 and partner is not None:
         T_a_b = se3.inverse(flight.truth[partner]) @ flight.truth[i]

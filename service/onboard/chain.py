@@ -107,7 +107,7 @@ class Chain:
         placed = self.trajectory.place(view.seq)
         is_near = bool(np.abs(placed.T_world_camera[:3, 3]).max() < FARTHEST_M)
         if depth is not None and is_near:
-            self.trajectory.tell(placed)
+            self.trajectory.publish(placed)
         elif depth is not None:
             self._rejected["placed beyond all reach"] += 1
         self._news[view.seq] = News(
@@ -118,7 +118,9 @@ class Chain:
 
     def _moved(self, final: bool = False) -> tuple[Repose, ...]:
         """Corrections of keyframes published before, which count as published from now on."""
-        moved = [(placed, *self.trajectory.tell(placed)) for placed in self.trajectory.moved(final)]
+        moved = [
+            (placed, *self.trajectory.publish(placed)) for placed in self.trajectory.moved(final)
+        ]
         return tuple(
             Repose(placed.seq, revision, placed.T_world_camera, growth, placed.covariance)
             for placed, revision, growth in moved
