@@ -10,9 +10,9 @@ import pytest
 from flown_track import SPREAD, landed, sensed, tell
 
 from recon import se3
+from recon.graph.interpolated import KEYFRAME, Carrier, left
 from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.graph.records import Loop, Node
-from recon.graph.riders import KEYFRAME, Carrier, left
 from recon.graph.thinning import moved_loops, over_gaps, surplus, thinned
 from recon.graph.trajectory import Trajectory
 from recon.types import F64, PosePrior
@@ -117,12 +117,14 @@ def test_segments_go_whole_but_neither_the_first_nor_the_newest() -> None:
     nodes = nodes_of([2, 3, 2, 1, 2, 2, 2, 2, 2])
     gone = surplus(nodes)
     assert gone == {2, 3, 4, 7, 10, 11}  # inside the second; the one of one, and no two neighbours
-    kept, ridden = thinned(nodes, gone)
-    assert not ridden
+    kept, marginalised = thinned(nodes, gone)
+    assert not marginalised
     assert [n.key for n in kept] == list(range(len(kept)))
     poses = {n.seq: n.T_odom_camera for n in nodes}
     loops = [Loop(0, 7, np.eye(4), SPREAD, 1.0), Loop(0, 9, np.eye(4), SPREAD, 1.0)]
-    assert [one.ends for one in moved_loops(loops, ridden, gone - ridden.keys(), 9)] == [(0, 9)]
+    assert [
+        one.ends for one in moved_loops(loops, marginalised, gone - marginalised.keys(), 9)
+    ] == [(0, 9)]
     told = {n.seq: n.over for n in over_gaps(kept, poses) if n.over is not None}
     assert told.keys() == {5, 8, 12, 14, 16}
     np.testing.assert_allclose(told[8][:3, 3], [2.0, 0.0, 0.0])  # over the seventh
@@ -131,7 +133,7 @@ def test_segments_go_whole_but_neither_the_first_nor_the_newest() -> None:
 def test_of_what_was_never_told_the_node_before_tells() -> None:
     rng = np.random.default_rng(5)
     rows, poses = np.zeros(2, KEYFRAME), np.array([se3.exp(rng.normal(size=6)) for _ in range(2)])
-    rows["pose"], rows["scale"], rows["told"] = poses[:, :3], 3.0, [2, 0]
+    rows["pose"], rows["scale"], rows["published"] = poses[:, :3], 3.0, [2, 0]
     node = se3.exp(rng.normal(size=6))
     T, scales = left(rows, Carrier(0, np.eye(4), node, 2.0))
     np.testing.assert_array_equal(T, [poses[0], node])

@@ -11,9 +11,9 @@ import pytest
 from flown_track import SPREAD, landed, sensed, tell
 
 from recon import se3
+from recon.graph.interpolated import KEYFRAME
 from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.graph.records import Loop, Node
-from recon.graph.riders import KEYFRAME
 from recon.graph.thinning import moved_loop, surplus, thinned
 from recon.graph.trajectory import Trajectory
 from recon.types import F64, PosePrior
@@ -135,7 +135,7 @@ def test_composed_motions_and_moved_loops_have_the_spread_of_many_trials() -> No
     for step in steps:
         chain.append(chain[-1] @ step)
     nodes = [Node(i, i, i, 0, T, spreads[max(i - 1, 0)], PosePrior()) for i, T in enumerate(chain)]
-    kept, ridden = thinned(nodes, {1})
+    kept, marginalised = thinned(nodes, {1})
     assert [n.key for n in kept] == [0, 1, 2] and kept[1].weight == 2
     noise = [rng.multivariate_normal(np.zeros(6), S, 4000) for S in spreads]
     whole_step = se3.inverse(steps[0] @ steps[1])
@@ -147,7 +147,7 @@ def test_composed_motions_and_moved_loops_have_the_spread_of_many_trials() -> No
     scale = np.sqrt(np.outer(np.diag(found), np.diag(found)))
     np.testing.assert_allclose(kept[1].covariance / scale, found / scale, atol=0.08)
     loop = Loop(1, 3, steps[1] @ steps[2], spreads[2], 1.0)
-    moved = moved_loop(loop, ridden)
+    moved = moved_loop(loop, marginalised)
     assert moved.ends == (0, 3)
     np.testing.assert_allclose(moved.T_a_b, chain[3], atol=1e-12)
     errors = [
@@ -157,7 +157,7 @@ def test_composed_motions_and_moved_loops_have_the_spread_of_many_trials() -> No
     found = np.cov(np.array(errors).T)
     scale = np.sqrt(np.outer(np.diag(found), np.diag(found)))
     np.testing.assert_allclose(moved.covariance / scale, found / scale, atol=0.08)
-    back = moved_loop(Loop(0, 1, steps[0], spreads[0], 1.0), ridden)
+    back = moved_loop(Loop(0, 1, steps[0], spreads[0], 1.0), marginalised)
     assert back.ends == (0, 0)
 
 

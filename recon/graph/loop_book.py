@@ -11,7 +11,7 @@ import numpy as np
 
 from recon import se3
 from recon.graph.records import Loop, Node, PoseGraphConfig, loops_agree
-from recon.graph.thinning import Ridden, moved_loops
+from recon.graph.thinning import Marginalised, moved_loops
 from recon.types import F64
 
 CHI2_LIMIT = 22.5
@@ -74,11 +74,13 @@ class LoopBook:
         self.taken += fresh
         return fresh
 
-    def thin(self, ridden: Mapping[int, Ridden], let_go: Collection[int], most: int) -> None:
+    def thin(
+        self, marginalised: Mapping[int, Marginalised], let_go: Collection[int], most: int
+    ) -> None:
         """Move the ends that are nodes no more; loops of those let go end, and at most ``most``
         stay."""
-        self.taken = moved_loops(self.taken, ridden, let_go, most)
-        self.pending = moved_loops(self.pending, ridden, let_go, most)
+        self.taken = moved_loops(self.taken, marginalised, let_go, most)
+        self.pending = moved_loops(self.pending, marginalised, let_go, most)
 
     def edges(self) -> list[Edge]:
         """All loops that were offered and not refused."""

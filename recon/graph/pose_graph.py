@@ -310,7 +310,7 @@ class PoseGraph:
         self._kept_counts["keyframe let go"] += len(done.let_go)
         self._nodes = {node.seq: node for node in nodes}
         self._segments.thin(nodes)
-        self._book.thin(done.ridden, done.let_go, len(nodes))
+        self._book.thin(done.marginalised, done.let_go, len(nodes))
         self._thin_at = max(self.config.most_nodes, int(len(nodes) * (1.0 + GONE_SHARE)))
         self.generation += 1
         self.rebuild()

@@ -36,7 +36,7 @@ MOST_WORSE = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ridden:
+class Marginalised:
     """A keyframe that hangs on the node before it."""
 
     node: int  # number of that node
@@ -49,7 +49,7 @@ class Thinned:
     """A graph's nodes after it was thinned out."""
 
     nodes: list[Node]  # that stay, with keys that follow each other
-    ridden: dict[int, Ridden]  # by number, those that hang on the node before them
+    marginalised: dict[int, Marginalised]  # by number, those that hang on the node before them
     let_go: set[int]  # numbers of those that went with their whole segment
 
 
@@ -58,8 +58,8 @@ def thin(nodes: Sequence[Node], refused: Collection[int], poses: Mapping[int, F6
     perhaps none yet, and which leaves the fixes of the ``refused`` out."""
     nodes = without(nodes, refused)
     gone = surplus(nodes)
-    kept, ridden = thinned(nodes, gone)
-    return Thinned(over_gaps(kept, poses), ridden, gone - ridden.keys())
+    kept, marginalised = thinned(nodes, gone)
+    return Thinned(over_gaps(kept, poses), marginalised, gone - marginalised.keys())
 
 
 def surplus(nodes: Sequence[Node]) -> set[int]:
@@ -88,13 +88,13 @@ def surplus(nodes: Sequence[Node]) -> set[int]:
     return {nodes[i].seq for i in gone}
 
 
-def thinned(nodes: Sequence[Node], gone: set[int]) -> tuple[list[Node], dict[int, Ridden]]:
+def thinned(nodes: Sequence[Node], gone: set[int]) -> tuple[list[Node], dict[int, Marginalised]]:
     """The nodes that stay, with keys that follow each other, and where the others hang.
 
     Those of segments of which nothing stays hang nowhere.
     """
     kept: list[Node] = []
-    ridden: dict[int, Ridden] = {}
+    marginalised: dict[int, Marginalised] = {}
     left: Node | None = None
     for node in nodes:
         if node.seq in gone:
@@ -102,14 +102,14 @@ def thinned(nodes: Sequence[Node], gone: set[int]) -> tuple[list[Node], dict[int
             if node.segment != last.segment:
                 continue
             T = se3.inverse(last.T_odom_camera) @ node.T_odom_camera
-            ridden[node.seq] = Ridden(last.seq, T, node.covariance)
+            marginalised[node.seq] = Marginalised(last.seq, T, node.covariance)
             left = node
             continue
         if left is not None:
-            node = _joined(ridden[left.seq], left, node)
+            node = _joined(marginalised[left.seq], left, node)
         kept.append(replace(node, key=len(kept)))
         left = None
-    return kept, ridden
+    return kept, marginalised
 
 
 def over_gaps(nodes: Sequence[Node], poses: Mapping[int, F64]) -> list[Node]:
@@ -124,7 +124,10 @@ def over_gaps(nodes: Sequence[Node], poses: Mapping[int, F64]) -> list[Node]:
 
 
 def moved_loops(
-    loops: Sequence[Loop], ridden: Mapping[int, Ridden], let_go: Collection[int], most: int
+    loops: Sequence[Loop],
+    marginalised: Mapping[int, Marginalised],
+    let_go: Collection[int],
+    most: int,
 ) -> list[Loop]:
     """The loops between nodes that stay, or that others hang on: the surest of several between
     the same two, and of more than ``most`` every second of the older half."""
@@ -132,7 +135,7 @@ def moved_loops(
     for loop in loops:
         if loop.a in let_go or loop.b in let_go:
             continue
-        moved = moved_loop(loop, ridden)
+        moved = moved_loop(loop, marginalised)
         if moved.a >= moved.b:
             continue
         known = best.get(moved.ends)
@@ -145,15 +148,15 @@ def moved_loops(
     return out
 
 
-def moved_loop(loop: Loop, ridden: Mapping[int, Ridden]) -> Loop:
+def moved_loop(loop: Loop, marginalised: Mapping[int, Marginalised]) -> Loop:
     """The loop with its ends at the nodes that they hang on."""
-    if (one := ridden.get(loop.a)) is not None:
+    if (one := marginalised.get(loop.a)) is not None:
         A = se3.adjoint(one.T_node_camera)
         covariance = one.covariance + A @ loop.covariance @ A.T
         loop = replace(
             loop, a=one.node, T_a_b=one.T_node_camera @ loop.T_a_b, covariance=covariance
         )
-    if (other := ridden.get(loop.b)) is not None:
+    if (other := marginalised.get(loop.b)) is not None:
         units = np.array([1.0] * 3 + [loop.ratio] * 3)
         T, covariance = reversed_motion(other.T_node_camera, other.covariance)
         T[:3, 3] *= loop.ratio
@@ -185,9 +188,9 @@ def without(nodes: Sequence[Node], refused: Collection[int]) -> list[Node]:
     ]
 
 
-def _joined(ridden: Ridden, left: Node, node: Node) -> Node:
+def _joined(marginalised: Marginalised, left: Node, node: Node) -> Node:
     """The node with the motion over ``left``, which goes, and with the mean of both's fixes."""
-    A = se3.adjoint(ridden.T_node_camera)
+    A = se3.adjoint(marginalised.T_node_camera)
     return replace(
         node,
         covariance=left.covariance + A @ node.covariance @ A.T,

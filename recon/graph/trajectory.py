@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from recon import se3
 from recon.graph.alignment import Similarity
+from recon.graph.interpolated import KEYFRAME, Carrier, change, interpolated, left, moved_m, whole
 from recon.graph.ledger import Ledger, MemoryLedger, Rows
 from recon.graph.pose_graph import PoseGraph
-from recon.graph.riders import KEYFRAME, Carrier, change, left, moved_m, ridden, whole
 from recon.types import F64, PosePrior
 
 AT_ONCE = 200
@@ -56,7 +56,7 @@ class Placed:
         return replace(self, T_world_camera=self.T_world_camera @ moved)
 
 
-class _Told:
+class _Published:
     """Nodes as they were last published, as columns that grow."""
 
     def __init__(self) -> None:
@@ -112,7 +112,7 @@ class Trajectory:
     """Keyframe poses of one scan, segment by segment.
 
     The graph may let keyframes go that it has no room for; they are carried by the nodes beside
-    them (:mod:`recon.graph.riders`), and little of each is kept, in a ledger.
+    them (:mod:`recon.graph.interpolated`), and little of each is kept, in a ledger.
     """
 
     def __init__(
@@ -122,15 +122,15 @@ class Trajectory:
         ledger: Ledger | None = None,
     ) -> None:
         """``graph`` places the keyframes; a :class:`PoseGraph` when left out. ``ledger`` takes
-        rows of :data:`recon.graph.riders.KEYFRAME`; memory when left out."""
+        rows of :data:`recon.graph.interpolated.KEYFRAME`; memory when left out."""
         self.config = config or TrajectoryConfig()
         self.graph = PoseGraph() if graph is None else graph
         self._ledger: Ledger = MemoryLedger(KEYFRAME) if ledger is None else ledger
-        self._told = _Told()
+        self._published = _Published()
         self._row: dict[int, int] = {}  # of the nodes, in the ledger
         self._nodes: list[int] = []  # their numbers, in order
         self._generation = 0  # of the graph
-        self._owed: deque[int] = deque()  # nodes after which riders may have moved
+        self._owed: deque[int] = deque()  # nodes after which others may have moved
 
     def add(
         self,
@@ -229,10 +229,10 @@ class Trajectory:
         nodes = self._moved_nodes(final)
         if final:
             self._owed = deque(self._nodes[:-1])
-        return nodes + self._moved_riders(final)
+        return nodes + self._moved_interpolated(final)
 
     def _moved_nodes(self, final: bool) -> list[Placed]:
-        told = self._told
+        told = self._published
         if not len(told) or (told.checked == self.graph.version and not final):
             return []
         told.checked = self.graph.version
@@ -251,7 +251,7 @@ class Trajectory:
         ]
 
     def _owe(self, seqs: Sequence[int]) -> None:
-        """Look at the riders on both sides of these nodes soon."""
+        """Look at the keyframes on both sides of these nodes soon."""
         owed = set(self._owed)
         for seq in seqs:
             i = bisect_left(self._nodes, seq)
@@ -260,7 +260,7 @@ class Trajectory:
                     owed.add(self._nodes[k])
                     self._owed.append(self._nodes[k])
 
-    def _moved_riders(self, final: bool) -> list[Placed]:
+    def _moved_interpolated(self, final: bool) -> list[Placed]:
         out: list[Placed] = []
         while self._owed and (final or len(out) < AT_ONCE):
             before = self._owed.popleft()
@@ -269,14 +269,14 @@ class Trajectory:
             if first == end:
                 continue
             rows = self._ledger.read(first, end)
-            known = self._told.of(before)
+            known = self._published.of(before)
             least = self.config.repose_m
             if known is not None:
                 least = max(least, self.config.repose_sigmas * known.sigma_m)
             placed = self._carried(first, rows, before, after)
             T = np.array([p.T_world_camera for p in placed])
             scales = np.array([p.scale for p in placed])
-            told = np.flatnonzero(rows["told"] > 0)
+            told = np.flatnonzero(rows["published"] > 0)
             far = moved_m(rows[told], T[told], scales[told]) > (1e-6 if final else least)
             out += [placed[i] for i in told[far]]
         return out
@@ -288,14 +288,14 @@ class Trajectory:
         """
         if placed.seq in self.graph:
             node = self.graph.node(placed.seq)
-            self._told.put(placed, node.key, node.height or 1.0)
+            self._published.put(placed, node.key, node.height or 1.0)
         row, rows = self._rows_of(placed.seq)
-        rows["told"] += 1
+        rows["published"] += 1
         rows["pose"], rows["scale"] = placed.T_world_camera[:3], placed.scale
-        if rows["told"][0] == 1:
+        if rows["published"][0] == 1:
             rows["first_scale"] = placed.scale
         self._ledger.amend(row, rows)
-        return int(rows["told"][0]) - 1, placed.scale / float(rows["first_scale"][0])
+        return int(rows["published"][0]) - 1, placed.scale / float(rows["first_scale"][0])
 
     # ---- keyframes that are no nodes -----------------------------------------------------------
 
@@ -306,7 +306,7 @@ class Trajectory:
         self._generation = self.graph.generation
         self._nodes = list(self.graph.seqs)
         self._row = {seq: self._row[seq] for seq in self._nodes}
-        self._told.thin({seq: key for key, seq in enumerate(self._nodes)})
+        self._published.thin({seq: key for key, seq in enumerate(self._nodes)})
         self._owed = deque(seq for seq in self._owed if seq in self._row)
 
     def _same_segment(self, a: int, b: int) -> bool:
@@ -347,7 +347,7 @@ class Trajectory:
             for p in (held, self.place(after))
         ]  # fmt: skip
         if self._same_segment(before, after):
-            T, scales = ridden(rows, first, *ends)
+            T, scales = interpolated(rows, first, *ends)
         else:
             T, scales = left(rows, ends[0])
         return [

@@ -16,8 +16,8 @@ from recon import se3
 from recon.backends import Backend, DenseStages, MatchingBackend, PathBackend
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.clouds.registration import IcpConfig
+from recon.graph.interpolated import KEYFRAME
 from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
-from recon.graph.riders import KEYFRAME
 from recon.graph.trajectory import Placed, Trajectory
 from recon.image_quality import BlurWatch, stretch
 from recon.stereo.belief_propagation import BeliefPropagationConfig

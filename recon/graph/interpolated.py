@@ -20,7 +20,7 @@ KEYFRAME = np.dtype(
     [
         ("seq", np.int64),
         ("segment", np.int32),
-        ("told", np.int32),  # how often its pose was published
+        ("published", np.int32),  # how often its pose was published
         ("odom", np.float64, (3, 4)),  # T_odom_camera in the segment's chain
         ("height", np.float64),  # above the ground that it sees, in odometry units
         ("pose", np.float64, (3, 4)),  # T_world_camera as last published
@@ -41,7 +41,7 @@ class Carrier:
     scale: float  # metres per unit of the odometry
 
 
-def ridden(rows: Rows, first: int, before: Carrier, after: Carrier) -> tuple[F64, F64]:
+def interpolated(rows: Rows, first: int, before: Carrier, after: Carrier) -> tuple[F64, F64]:
     """(N, 4, 4) poses and (N,) scales of the ledger's rows from ``first`` on, between two nodes."""
     inverse = se3.inverse(before.T_odom_camera)
     motions = inverse @ whole(rows["odom"])
@@ -58,7 +58,7 @@ def ridden(rows: Rows, first: int, before: Carrier, after: Carrier) -> tuple[F64
 def left(rows: Rows, before: Carrier) -> tuple[F64, F64]:
     """(N, 4, 4) poses and (N,) scales of the ledger's rows that no node carries: as published,
     and in the place of the node ``before`` them if they never were."""
-    told = rows["told"] > 0
+    told = rows["published"] > 0
     poses = np.where(told[:, None, None], whole(rows["pose"]), before.T_world_camera)
     return poses, np.where(told, rows["scale"], before.scale)
 
