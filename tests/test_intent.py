@@ -366,13 +366,10 @@ def test_only_a_flight_that_ended_closes_a_scan() -> None:
 # ---- any order of events -------------------------------------------------------------------------
 
 
-class NoThread:
-    """A thread that the test runs itself."""
+class NoWorkers:
+    """A table whose workers the test runs itself."""
 
-    def __init__(self, target: Any, args: tuple[Any, ...], **_: Any) -> None:
-        self.target, self.args = target, args
-
-    def start(self) -> None:
+    def start(self, *_: object, **__: object) -> None:
         pass
 
 
@@ -464,9 +461,7 @@ class AnyOrder(RuleBasedStateMachine):
 
 
 def test_any_order_of_commands_and_faults(monkeypatch: pytest.MonkeyPatch) -> None:
-    fake = SimpleNamespace(**{n: getattr(threading, n) for n in ("RLock", "Event")})
-    fake.Thread = NoThread
-    monkeypatch.setattr(scanning_module, "threading", fake)
+    monkeypatch.setattr(scanning_module, "PROCESS", NoWorkers())
     monkeypatch.setattr(scanning_module, "give_back", lambda **_: None)
     monkeypatch.setattr(scanning_module.log, "exception", lambda *_: None)
     chosen = settings(max_examples=40, stateful_step_count=30, deadline=None)
