@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from recon.graph.factors import matrix, pose3
+from recon.posegraph.factors import matrix, pose3
 from recon.types import F64, Bool, Camera
 
 I64 = npt.NDArray[np.int64]

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from recon import se3
-from recon.graph.trajectory import Trajectory
+from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 
 SPREAD = np.diag([3e-4**2] * 3 + [0.02**2] * 3)

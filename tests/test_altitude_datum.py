@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.graph.alignment import Anchor, fit
-from recon.graph.altitude_datum import altitude_datum
-from recon.graph.between_keyframes import FixAverage
+from recon.posegraph.alignment import Anchor, fit
+from recon.posegraph.altitude_datum import altitude_datum
+from recon.posegraph.between_keyframes import FixAverage
 from recon.types import PosePrior
 
 SIGMA = np.array([1.0, 1.0, 1.5])

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.graph.trajectory import Trajectory
+from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 from service.compute.stopwatch import Stopwatch
 from service.errors import OutsideError
-from service.onboard.anchorage import Anchorage, Carriers, Key, Told, ToldFrames
-from service.onboard.chain import Chain, KeyframeStep
+from service.flight.anchorage import Anchorage, Carriers, Key, Told, ToldFrames
+from service.flight.chain import Chain, KeyframeStep
 
 RNG = np.random.default_rng(4)
 

@@ -17,7 +17,7 @@ import pytest
 
 from recon import se3
 from recon.backends import BACKENDS, Backend, load_backend
-from recon.clouds.registration import IcpConfig
+from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.matching_cost import MatchingCostConfig, matching_cost
 from recon.stereo.upsampling import UpsamplingConfig

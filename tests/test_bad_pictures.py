@@ -17,10 +17,10 @@ from mavlink.telemetry.samples import VehicleState
 from recon import se3
 from recon.backends import load_backend
 from recon.types import F64, U8, Camera, Frame, Keyframe
+from service.cameras.rig import Rig
 from service.config import load_config
-from service.onboard.pipeline import Pipeline
-from service.onboard.rig import Rig
-from service.onboard.stages import build_stages
+from service.flight.pipeline import Pipeline
+from service.flight.stages import build_stages
 
 K: F64 = np.array([[400.0, 0, 239.5], [0, 400.0, 134.5], [0, 0, 1]])
 CAMERA = Camera(K, np.zeros(5), (480, 270))

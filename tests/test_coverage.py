@@ -18,9 +18,9 @@ from recon.surface import coverage
 from recon.surface.coverage import CoverageMap
 from recon.types import F64, DepthMap
 from service.errors import InputError
-from service.exports.view import ExportOptions, ScanView, export
 from service.georeference import LocalFrame
 from service.ground.portal import Portal, PortalConfig
+from service.offline.exports.view import ExportOptions, ScanView, export
 from service.scans.coverage import (
     FIGURES,
     PICTURE,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.clouds import disagreement
-from recon.clouds.disagreement import Disagreement
+from recon.mapping import disagreement
+from recon.mapping.disagreement import Disagreement
 from recon.types import F64, DepthMap
 
 SIZE = (160, 120)

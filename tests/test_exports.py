@@ -16,10 +16,10 @@ from typer.testing import CliRunner
 from recon.types import F64
 from service.cli import app
 from service.errors import InputError
-from service.exports import EXPORTERS
-from service.exports.clouds import octree
-from service.exports.view import ExportOptions, ScanView, export
 from service.georeference import LocalFrame
+from service.offline.exports import EXPORTERS
+from service.offline.exports.clouds import octree
+from service.offline.exports.view import ExportOptions, ScanView, export
 
 if TYPE_CHECKING:
     from conftest import HouseFlight

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mavlink.telemetry.samples import VehicleState
-from service.onboard.frame_tags import COLUMNS, FILE, FrameTags
+from service.flight.frame_tags import COLUMNS, FILE, FrameTags
 
 STATE = VehicleState(
     0,

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from recon.clouds.cloud_fusion import cloud_of
-from recon.clouds.free_space import MOST_VIEWS, Tiles, open_above, seen_through, spread
+from recon.mapping.cloud_fusion import cloud_of
+from recon.mapping.free_space import MOST_VIEWS, Tiles, open_above, seen_through, spread
 from recon.types import F64, DepthMap, PointCloud
 
 if TYPE_CHECKING:

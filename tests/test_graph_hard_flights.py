@@ -14,8 +14,8 @@ import pytest
 from flown_track import SPREAD, landed, sensed, tell
 
 from recon import se3
-from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
-from recon.graph.trajectory import Trajectory
+from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 from service.bench.graph import HEIGHT_M, legs
 

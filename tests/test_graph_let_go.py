@@ -10,11 +10,11 @@ import pytest
 from flown_track import SPREAD, landed, sensed, tell
 
 from recon import se3
-from recon.graph.interpolated import KEYFRAME, Carrier, left
-from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
-from recon.graph.records import Loop, Node
-from recon.graph.thinning import moved_loops, over_gaps, surplus, thinned
-from recon.graph.trajectory import Trajectory
+from recon.posegraph.interpolated import KEYFRAME, Carrier, left
+from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.posegraph.records import Loop, Node
+from recon.posegraph.thinning import moved_loops, over_gaps, surplus, thinned
+from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 from service.bench.graph import HEIGHT_M, legs
 

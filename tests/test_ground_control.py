@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.graph import ground_control
-from recon.graph.ground_control import Closure, Mark, Point, Track, adjust, map_position
+from recon.posegraph import ground_control
+from recon.posegraph.ground_control import Closure, Mark, Point, Track, adjust, map_position
 from recon.types import F64, PosePrior
 
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])

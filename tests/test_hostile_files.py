@@ -22,7 +22,7 @@ from service.cameras import open_camera, video
 from service.cameras.camera_file import load_camera
 from service.config import load_config
 from service.errors import InputError
-from service.refine.survey_file import read_survey
+from service.offline.refine.survey_file import read_survey
 
 
 @pytest.fixture(scope="module")

@@ -20,9 +20,9 @@ from google.protobuf import descriptor_pb2  # noqa: E402
 from mcap.reader import make_reader  # noqa: E402
 
 from service.errors import InputError  # noqa: E402
-from service.exports.recording import export_mcap  # noqa: E402
 from service.ground import mcap_records  # noqa: E402
 from service.ground.mcap_import import header_in, store_from_mcap  # noqa: E402
+from service.offline.exports.recording import export_mcap  # noqa: E402
 
 MAGIC = b"\x89MCAP0\r\n"
 

@@ -15,8 +15,8 @@ from conftest import HouseFlight
 
 from recon.types import DepthMap, Keyframe, Pose
 from service.errors import InputError
-from service.exports.view import ExportOptions, ScanView, export
-from service.refine.refinement import RefineOptions, refine
+from service.offline.exports.view import ExportOptions, ScanView, export
+from service.offline.refine.refinement import RefineOptions, refine
 from service.scans.folder import CLOUD, CSV, PREVIEW, TUM, write_deliverables
 from service.stream.codec import encode
 from service.stream.records import Repose, pack_pose, pack_repose

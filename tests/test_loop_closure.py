@@ -12,11 +12,11 @@ import scipy.ndimage as ndi
 
 from recon import se3
 from recon.camera_model import rays, scaled_K
-from recon.graph.pose_graph import PoseGraph
-from recon.graph.trajectory import Trajectory
-from recon.loops.loop_closure import LoopConfig, LoopView, candidates, ground_seen, verify
+from recon.posegraph.loop_closure import LoopConfig, LoopView, candidates, ground_seen, verify
+from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, DepthMap, PosePrior
-from service.onboard.loops import LoopSearch
+from service.flight.loops import LoopSearch
 
 SIZE = (640, 360)
 K = np.array([[450.0, 0, 319.5], [0, 450.0, 179.5], [0, 0, 1.0]])

@@ -20,8 +20,8 @@ from recon.surface import triangle_grid
 from service.cameras import CameraFrame
 from service.cli import app
 from service.errors import InputError, OutsideError
-from service.exports import mesh_tiles, pictures
-from service.exports.mesh_tiles import (
+from service.offline.exports import mesh_tiles, pictures
+from service.offline.exports.mesh_tiles import (
     Footprint,
     TileJob,
     TilePart,

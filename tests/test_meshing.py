@@ -16,7 +16,7 @@ from recon.surface.raster import Grid, Raster, smoothed
 from recon.types import F32, PointCloud
 from service.cli import app
 from service.errors import InputError
-from service.exports.model import glb
+from service.offline.exports.model import glb
 
 if TYPE_CHECKING:
     from conftest import HouseFlight

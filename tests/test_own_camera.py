@@ -16,7 +16,7 @@ from recon.camera_model import rays
 from recon.types import F64, U8, Camera
 from service.cli import app
 from service.errors import InputError
-from service.refine.own_camera import FILE, found_camera, pictures_at, sightings, write
+from service.offline.refine.own_camera import FILE, found_camera, pictures_at, sightings, write
 
 SIZE = (480, 270)
 TRUE = Camera(

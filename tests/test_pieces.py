@@ -13,13 +13,13 @@ import numpy as np
 from painted_ground import CAMERA, FOOTPRINT_M, HEIGHT_M, pose, still
 from typer.testing import CliRunner
 
-from recon.graph.alignment import Similarity
-from recon.graph.loop_book import Edge
-from recon.graph.pose_graph import PoseGraph
+from recon.posegraph.alignment import Similarity
+from recon.posegraph.loop_book import Edge
+from recon.posegraph.pose_graph import PoseGraph
 from recon.types import F64, PosePrior
 from service.cameras.camera_file import save_camera
 from service.cli import app
-from service.onboard.chain import Pieces
+from service.flight.chain import Pieces
 
 NOWHERE = PosePrior()
 PLACED = PosePrior(np.eye(3), 0.02, 0.1, np.zeros(3), np.ones(3))

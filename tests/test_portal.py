@@ -233,7 +233,7 @@ def test_an_mcap_from_the_aircraft_becomes_a_scan(
 ) -> None:
     pytest.importorskip("foxglove")
     pytest.importorskip("mcap")
-    from service.exports.recording import export_mcap
+    from service.offline.exports.recording import export_mcap
 
     recording = tmp_path / "flight.mcap"
     with ScanStore.open(store / "drone-1/test-1/scan.db") as scan:

@@ -14,9 +14,9 @@ from portal_client import NEEDS, TOKEN, browser, flown_store
 
 from mavlink.component.rehearsal import RehearsalVehicle
 from service.bench.portal import Browser
-from service.exports.view import ExportOptions, ScanView, export
 from service.ground.portal import Portal, PortalConfig
 from service.ground.vehicle import Vehicle
+from service.offline.exports.view import ExportOptions, ScanView, export
 from service.stream.codec import encode
 from service.stream.records import Repose
 from service.stream.store import ScanStore

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from recon import se3
-from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
-from recon.graph.smoother import Smoother
-from recon.graph.track_alignment import mean_rotation, umeyama
+from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.posegraph.smoother import Smoother
+from recon.posegraph.track_alignment import mean_rotation, umeyama
 from recon.types import F64, Pose, PosePrior
 
 STEP_M = 6.0

@@ -8,8 +8,8 @@ from pymavlink.dialects.v20 import common as dialect  # type: ignore[import-unty
 from mavlink.telemetry.decode import decode
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import AccuracySample, PositionSample
+from service.cameras.rig import Rig
 from service.config import CameraConfig, FusionConfig, ScanConfig
-from service.onboard.rig import Rig
 
 S = 1_000_000_000
 

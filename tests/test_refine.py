@@ -19,9 +19,9 @@ from recon.types import F64, DepthMap, Keyframe, Pose
 from service.cli import app
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.refine.refinement import RefineOptions, refine, undo
-from service.refine.revisions import REFINED, Revisions
-from service.refine.survey_file import read_survey
+from service.offline.refine.refinement import RefineOptions, refine, undo
+from service.offline.refine.revisions import REFINED, Revisions
+from service.offline.refine.survey_file import read_survey
 from service.stream.codec import encode
 from service.stream.records import (
     PoseRecord,

@@ -19,8 +19,8 @@ from recon.types import F64, DepthMap
 from service.cli import app
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.refine import refly
-from service.refine.refly import Refly, plan_json, suggest, waypoints_text
+from service.offline.refine import refly
+from service.offline.refine.refly import Refly, plan_json, suggest, waypoints_text
 from service.scans.coverage import Coverage, Limits
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from recon import se3
 from recon.camera_model import rays
-from recon.clouds.registration import IcpConfig, register_projective
+from recon.mapping.registration import IcpConfig, register_projective
 from recon.types import F64, DepthMap, Registration
 
 RGBD = Path(__file__).resolve().parents[2] / "shared" / "data" / "rgbd_five_poses"

@@ -12,9 +12,9 @@ from mavlink.telemetry.samples import VehicleState
 from recon.frames import rotation_from_rpy, rpy_from_rotation
 from recon.se3 import quaternion_from_rotation
 from recon.types import F64
+from service.cameras.rig import ASSUMED_AGL_M, Rig, attitude_of
 from service.cameras.source import GeoTag
 from service.config import CameraConfig, FusionConfig, ScanConfig
-from service.onboard.rig import ASSUMED_AGL_M, Rig, attitude_of
 
 
 def rig(camera: CameraConfig | None = None, fusion: FusionConfig | None = None) -> Rig:

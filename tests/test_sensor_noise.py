@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.graph.alignment import Anchor, fit, scales
-from recon.graph.between_keyframes import Odometer
-from recon.graph.sensor_noise import Noise, drift_noise, wander_noise
+from recon.posegraph.alignment import Anchor, fit, scales
+from recon.posegraph.between_keyframes import Odometer
+from recon.posegraph.sensor_noise import Noise, drift_noise, wander_noise
 from recon.types import F64, PosePrior, Travel
 
 NADIR = np.diag([1.0, -1.0, -1.0])

@@ -17,8 +17,8 @@ from recon.surface.meshing import Mesh
 from recon.types import F64, PointCloud
 from service.cli import app
 from service.errors import InputError
-from service.exports.model import glb
 from service.georeference import LocalFrame
+from service.offline.exports.model import glb
 from service.scans.fused_cloud import write_laz
 from service.sim.deliverable_scoring import options_of, view_from_above
 from service.sim.recording import Faults, SimulationOptions

@@ -13,9 +13,9 @@ from loopback import until
 from mavlink.component.rehearsal import RehearsalControl
 from mavlink.component.vehicle import VehicleConfig, VehicleLink
 from service.config import Config
+from service.flight.datalink import DaemonLink, open_backlog
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
-from service.onboard.datalink import DaemonLink, open_backlog
 from service.stream.link import DatalinkSender
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.reports import delivered, open_undelivered

@@ -62,7 +62,7 @@ def decoder(schema: Any) -> Any:
 
 
 def test_indexed_reader_finds_everything_in_order(tmp_path: Path) -> None:
-    from service.exports.recording import export_mcap
+    from service.offline.exports.recording import export_mcap
 
     out = tmp_path / "flight.mcap"
     with new_store(tmp_path / "scan.db") as store:
@@ -99,7 +99,7 @@ def test_indexed_reader_finds_everything_in_order(tmp_path: Path) -> None:
 
 
 def test_a_place_that_cannot_be_written_is_said_in_one_line(tmp_path: Path) -> None:
-    from service.exports.recording import export_mcap
+    from service.offline.exports.recording import export_mcap
 
     with (
         new_store(tmp_path / "scan.db") as store,

@@ -24,9 +24,9 @@ from mavlink.wire.framing import Framer
 from recon import se3
 from recon.types import DepthMap, Keyframe, Pose
 from service.config import Config, DatalinkConfig
+from service.flight.datalink import OWN_LINKS, DaemonLink
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
-from service.onboard.datalink import OWN_LINKS, DaemonLink
 from service.radio import GROUND, TUNNEL, EndpointCarrier, RadioLink
 from service.stream import codec
 from service.stream.link import DatalinkSender

@@ -8,11 +8,11 @@ import scipy.ndimage as ndi
 
 from recon import se3
 from recon.camera_model import rays
-from recon.graph.ground_control import Closure, Track, adjust, supported
-from recon.loops.loop_closure import LoopView
-from recon.loops.submap_loops import SubmapLoopConfig, filled, verify_surfaces
+from recon.posegraph.ground_control import Closure, Track, adjust, supported
+from recon.posegraph.loop_closure import LoopView
+from recon.posegraph.submap_loops import SubmapLoopConfig, filled, verify_surfaces
 from recon.types import F64, DepthMap, Keyframe, Pose
-from service.refine.stored_loops import StoredLoops, steps_m
+from service.offline.refine.stored_loops import StoredLoops, steps_m
 
 SIZE = (320, 180)
 K = np.array([[240.0, 0.0, 159.5], [0.0, 240.0, 89.5], [0.0, 0.0, 1.0]])

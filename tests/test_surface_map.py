@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.clouds.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
+from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
 from recon.types import F64, DepthMap
-from service.onboard.surface_map import MOST_OVER, PagedMap
+from service.flight.surface_map import MOST_OVER, PagedMap
 
 K: F64 = np.array([[60.0, 0.0, 39.5], [0.0, 60.0, 29.5], [0.0, 0.0, 1.0]])
 NADIR: F64 = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])

@@ -16,7 +16,7 @@ from mavlink.telemetry.samples import AttitudeSample, GimbalFrame, GimbalSample
 from recon.frames import R_GIMBAL_CAMERA
 from recon.tracking.odometry import Tracked
 from service.config import CameraConfig
-from service.onboard.telemetry_check import TelemetryCheck
+from service.flight.telemetry_check import TelemetryCheck
 
 S = 1_000_000_000
 LATE_S = 0.07

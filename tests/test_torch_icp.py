@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.clouds import icp_kernels
-from recon.clouds.registration import IcpConfig, Surface
-from recon.clouds.registration import register_projective as compiled
+from recon.mapping import icp_kernels
+from recon.mapping.registration import IcpConfig, Surface
+from recon.mapping.registration import register_projective as compiled
 from recon.types import F64, DepthMap, Registration
 
 torch = pytest.importorskip("torch")

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.clouds.registration import IcpConfig, register_projective
+from recon.mapping.registration import IcpConfig, register_projective
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.matching_cost import matching_cost
 from recon.stereo.upsampling import UpsamplingConfig, guide_at_taps

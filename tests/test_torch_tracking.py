@@ -20,7 +20,7 @@ from recon.tracking.odometry import Odometry, Tracked
 from recon.types import F64, U8, Camera, PosePrior
 from service.compute.backend_choice import FallbackBackend
 from service.config import Config
-from service.onboard.stages import build_stages
+from service.flight.stages import build_stages
 
 torch = pytest.importorskip("torch")
 

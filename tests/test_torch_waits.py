@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.clouds.registration import IcpConfig
+from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.reprojection import FusionConfig
 from recon.stereo.upsampling import UpsamplingConfig

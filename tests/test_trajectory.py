@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.graph.trajectory import Trajectory
+from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, DepthMap, Keyframe, Pose, PosePrior
 from service.scans.fused_cloud import fused_cloud
 from service.stream import codec

@@ -22,7 +22,7 @@ from service.daemon.runtime import Daemon
 from service.daemon.scan_run import ScanRun
 from service.daemon.vehicle_config import TUNABLES, parameters_of, with_parameter
 from service.errors import InputError
-from service.onboard.scan import Scan, ScanInputs, create_store
+from service.flight.scan import Scan, ScanInputs, create_store
 
 
 class Operator:

@@ -19,14 +19,14 @@ from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
-from recon.graph.trajectory import Placed
+from recon.posegraph.trajectory import Placed
 from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.tracking.odometry import Tracked
 from recon.types import F64
 from service.config import CameraConfig
-from service.onboard.anchorage import Anchorage
-from service.onboard.pipeline import Step
-from service.onboard.vehicle_reports import OdometryReport
+from service.flight.anchorage import Anchorage
+from service.flight.pipeline import Step
+from service.flight.vehicle_reports import OdometryReport
 
 S = 1_000_000_000
 BODY = Rotation.from_euler("ZYX", [0.7, 0.05, -0.1])  # q_ned_body

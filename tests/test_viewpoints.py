@@ -11,8 +11,8 @@ from recon.tracking.matching import Pyramid
 from recon.tracking.odometry import Tracked
 from recon.types import PosePrior
 from service.config import ScanConfig
-from service.onboard.anchorage import Anchorage
-from service.onboard.viewpoints import Viewpoint, Viewpoints, frames_apart
+from service.flight.anchorage import Anchorage
+from service.flight.viewpoints import Viewpoint, Viewpoints, frames_apart
 
 
 def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> Viewpoint:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.clouds.cloud_fusion import CORRELATED_SHARE, fuse, fuse_strips
-from recon.clouds.voxel_map import VoxelMap, VoxelMapConfig, ground_sample_m
+from recon.mapping.cloud_fusion import CORRELATED_SHARE, fuse, fuse_strips
+from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, ground_sample_m
 from recon.types import F64, Bool, DepthMap, PointCloud
 
 K = np.array([[100.0, 0.0, 79.5], [0.0, 100.0, 44.5], [0.0, 0.0, 1.0]])

@@ -19,7 +19,7 @@ from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPai
 
 if TYPE_CHECKING:
     from recon.backends.torch_kernels import Kernels
-    from recon.clouds.registration import IcpConfig
+    from recon.mapping.registration import IcpConfig
     from recon.tracking.matching import Matcher
 
 

@@ -11,7 +11,7 @@ from recon.stereo.upsampling import UpsamplingConfig, upsample
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration
 
 if TYPE_CHECKING:
-    from recon.clouds.registration import IcpConfig
+    from recon.mapping.registration import IcpConfig
 
 
 class CpuBackend:
@@ -34,14 +34,14 @@ class CpuBackend:
         self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
     ) -> Registration:
         """Projective point-to-plane ICP from the given start."""
-        from recon.clouds.registration import register_projective
+        from recon.mapping.registration import register_projective
 
         return register_projective(source, target, T_target_source, config)
 
 
 def warm_up() -> None:
     """Compile every kernel, or load it from numba's cache on disk; seconds once, then less."""
-    from recon.clouds.registration import IcpConfig
+    from recon.mapping.registration import IcpConfig
 
     rng = np.random.default_rng(0)
     guide = rng.integers(0, 256, (180, 320, 3), np.uint8)  # rows enough for several threads

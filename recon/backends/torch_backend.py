@@ -22,7 +22,7 @@ from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration, St
 
 if TYPE_CHECKING:
     from recon.backends.torch_icp import DeviceIcp
-    from recon.clouds.registration import IcpConfig
+    from recon.mapping.registration import IcpConfig
     from recon.tracking.matching import Matcher
 
 KEPT_PLANS = 8

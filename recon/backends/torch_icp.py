@@ -2,7 +2,7 @@
 
 Surfaces, partners, weights and steps stay on the device, for a fixed number of iterations; one
 that has settled stands still. Nothing is read in between, so on CUDA all of it is one captured
-graph. The verdict and the covariance are those of :mod:`recon.clouds.registration`, from the
+graph. The verdict and the covariance are those of :mod:`recon.mapping.registration`, from the
 sums of one more iteration.
 """
 
@@ -30,7 +30,7 @@ from recon.backends.torch_surface import (
     scale_of,
     solve,
 )
-from recon.clouds.registration import (
+from recon.mapping.registration import (
     AREA_LAGS,
     AREA_SIGMAS,
     MIN_PARTNERS,
@@ -54,7 +54,7 @@ class DeviceIcp:
     def register(
         self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
     ) -> Registration:
-        """As :func:`recon.clouds.registration.register_projective`."""
+        """As :func:`recon.mapping.registration.register_projective`."""
         start = np.array(T_target_source, np.float64)
         if start.shape != (4, 4) or not np.isfinite(start).all():
             raise ValueError("T_target_source must be (4, 4) finite numbers")
@@ -143,7 +143,7 @@ def _concluded(told: F64, start: F64, config: IcpConfig) -> Registration:
 
 
 def _area(lags: F64) -> float:
-    """How many neighbours err together, as :func:`recon.clouds.icp_kernels.correlated_area`."""
+    """How many neighbours err together, as :func:`recon.mapping.icp_kernels.correlated_area`."""
     area = 1.0
     for products, powers, counts in lags:
         length = 1.0
@@ -164,7 +164,7 @@ SIGN_ROUNDS = 26
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weighed:
-    """The weighted normal equations, as :class:`recon.clouds.registration.Equations`."""
+    """The weighted normal equations, as :class:`recon.mapping.registration.Equations`."""
 
     H: Tensor  # (6, 6)
     common: Tensor  # (6, 6)

@@ -19,7 +19,7 @@ from recon.stereo.upsampling import UpsamplingConfig
 if TYPE_CHECKING:
     from recon.backends.torch_icp import Weighed
     from recon.backends.torch_surface import DeviceSurface, SourcePoints
-    from recon.clouds.registration import IcpConfig
+    from recon.mapping.registration import IcpConfig
     from recon.stereo.belief_propagation import BeliefPropagationConfig
 
 
@@ -152,7 +152,7 @@ def _registered(device: str, size_px: tuple[int, int]) -> Callable[[Kernels], tu
     """ICP of rolling ground seen from two places: kernels to the motion (4, 4)."""
     from recon.backends.torch_icp import descend
     from recon.backends.torch_surface import DOUBLE, build
-    from recon.clouds.registration import IcpConfig
+    from recon.mapping.registration import IcpConfig
 
     (w, h), config = size_px, IcpConfig()
     intrinsics = torch.tensor([0.6 * w, 0.6 * w, w / 2, h / 2], dtype=DOUBLE, device=device)

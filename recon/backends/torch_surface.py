@@ -1,6 +1,6 @@
 """Surface elements of depth maps in torch, their partners, and the linear algebra of ICP.
 
-The elements are those of :func:`recon.clouds.icp_kernels.surface_elements`. No library call here
+The elements are those of :func:`recon.mapping.icp_kernels.surface_elements`. No library call here
 waits for the device, so all of it can be captured as a graph.
 """
 
@@ -12,15 +12,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from recon.clouds.icp_kernels import MIN_PIXELS, REACH
-from recon.clouds.registration import IcpConfig
+from recon.mapping.icp_kernels import MIN_PIXELS, REACH
+from recon.mapping.registration import IcpConfig
 
 DOUBLE = torch.float64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeviceSurface:
-    """As :class:`recon.clouds.registration.Surface`, on a device."""
+    """As :class:`recon.mapping.registration.Surface`, on a device."""
 
     elements: Tensor  # (h, w, 6) float32
     intrinsics: Tensor  # (4,) float64 fx fy cx cy
@@ -149,7 +149,7 @@ def points(source: DeviceSurface, stride: int) -> SourcePoints:
 def match(source: SourcePoints, target: DeviceSurface, T: Tensor, config: IcpConfig) -> Partners:
     """Each element with the target element of the pixel that it projects to.
 
-    As :func:`recon.clouds.icp_kernels.residuals`.
+    As :func:`recon.mapping.icp_kernels.residuals`.
     """
     h, w = target.elements.shape[:2]
     fx, fy, cx, cy = target.intrinsics

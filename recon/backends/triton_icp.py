@@ -21,7 +21,7 @@ from torch import Tensor
 
 from recon.backends.torch_icp import SHARED, SIGN_ROUNDS, Weighed
 from recon.backends.torch_surface import DeviceSurface, SourcePoints, scale_of
-from recon.clouds.registration import MIN_PARTNERS, IcpConfig
+from recon.mapping.registration import MIN_PARTNERS, IcpConfig
 
 POINTS = 128
 """Points of one program."""

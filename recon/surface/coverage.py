@@ -21,7 +21,7 @@ from numba import njit
 
 from recon import se3
 from recon.camera_model import rays
-from recon.graph.ledger import Ledger, MemoryLedger, Rows
+from recon.posegraph.ledger import Ledger, MemoryLedger, Rows
 from recon.surface.raster import Grid
 from recon.types import F32, F64, Array, Bool, DepthMap
 

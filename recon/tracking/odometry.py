@@ -6,7 +6,7 @@ virtual stereo camera) are found again in the new frame, each view gives a pose 
 triangulated and the last keyframes are adjusted together (:mod:`recon.tracking.keyframe_window`).
 
 The odometry works in a frame of its own that starts at the first telemetry pose; scale,
-heading and position are corrected afterwards by :mod:`recon.graph.alignment`.
+heading and position are corrected afterwards by :mod:`recon.posegraph.alignment`.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from recon.backends import Backend, load_backend
-from recon.clouds.registration import IcpConfig
+from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import DepthMap, StereoPair

@@ -20,7 +20,7 @@ from recon.backends.torch_matching import harris_cells, refine, search
 from recon.backends.torch_plan import Plan, part
 from recon.backends.torch_stereo import DenseStereo, believe, drop_unseen
 from recon.backends.torch_tracking import TorchMatcher
-from recon.clouds.registration import IcpConfig
+from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.reprojection import FusionConfig
 from recon.stereo.upsampling import UpsamplingConfig

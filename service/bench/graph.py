@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon import se3
-from recon.graph.pose_graph import PoseGraph, PoseGraphConfig
-from recon.graph.trajectory import Placed, Trajectory
+from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.posegraph.trajectory import Placed, Trajectory
 from recon.types import F64, PosePrior
 from service.bench import BenchOptions, BenchResult
 from service.config import FusionConfig

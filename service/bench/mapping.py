@@ -17,10 +17,10 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import rays
-from recon.clouds.cloud_fusion import cloud_of, fuse
-from recon.clouds.free_space import seen_through
-from recon.clouds.registration import IcpConfig, register_projective
-from recon.clouds.voxel_map import VoxelMap, VoxelMapConfig
+from recon.mapping.cloud_fusion import cloud_of, fuse
+from recon.mapping.free_space import seen_through
+from recon.mapping.registration import IcpConfig, register_projective
+from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig
 from recon.types import F64, Array, DepthMap, PointCloud
 from service.bench import BenchOptions, BenchResult, compare
 

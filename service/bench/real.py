@@ -21,14 +21,14 @@ import numpy as np
 from pyproj import Transformer
 
 from recon import se3
-from recon.graph.track_alignment import umeyama
+from recon.posegraph.track_alignment import umeyama
 from recon.types import F64, DepthMap
 from service.bench import BenchOptions, BenchResult
 from service.cameras import open_camera
 from service.errors import InputError, OutsideError
-from service.refine.control_points import Pictures, candidates_of
-from service.refine.revisions import Revisions
-from service.refine.survey_file import Sighting, SurveyPoint
+from service.offline.refine.control_points import Pictures, candidates_of
+from service.offline.refine.revisions import Revisions
+from service.offline.refine.survey_file import Sighting, SurveyPoint
 from service.scans.track import latest, local_frame
 from service.scans.trust import Trust
 from service.stream.store import ScanStore

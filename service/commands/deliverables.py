@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from service.errors import InputError
-from service.exports import EXPORTERS
+from service.offline.exports import EXPORTERS
 
 KINDS = "|".join(EXPORTERS)
 
@@ -32,8 +32,8 @@ def export(
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
 ) -> None:
     """Write deliverables of a scan: clouds, surface model, orthophoto, tiles, mesh, flight."""
-    from service.exports.view import ExportOptions, ScanView
-    from service.exports.view import export as write
+    from service.offline.exports.view import ExportOptions, ScanView
+    from service.offline.exports.view import export as write
 
     for kind in to:
         if kind not in EXPORTERS:
@@ -84,8 +84,8 @@ def mesh(
 ) -> None:
     """Mesh and texture a scan into one binary glTF file."""
     from service.errors import InputError
-    from service.exports.model import MeshOptions, write_mesh
-    from service.exports.view import ExportOptions, ScanView
+    from service.offline.exports.model import MeshOptions, write_mesh
+    from service.offline.exports.view import ExportOptions, ScanView
 
     try:
         options = ExportOptions(
@@ -130,7 +130,7 @@ def inspect(
     import cv2
     import numpy as np
 
-    from service.exports.view import ScanView
+    from service.offline.exports.view import ScanView
     from service.scans.drawing import middle_keyframe, stages
     from service.scans.writing import writing
 

@@ -39,10 +39,10 @@ def refine(
     written again.
     """
     from service.errors import InputError
-    from service.refine.refinement import RefineOptions
-    from service.refine.refinement import intrinsics as run_intrinsics
-    from service.refine.refinement import refine as run
-    from service.refine.refinement import undo as run_undo
+    from service.offline.refine.refinement import RefineOptions
+    from service.offline.refine.refinement import intrinsics as run_intrinsics
+    from service.offline.refine.refinement import refine as run
+    from service.offline.refine.refinement import undo as run_undo
 
     if intrinsics != (video is not None):
         raise InputError("--intrinsics and --video FILE go together")
@@ -139,8 +139,8 @@ def refly(
     import numpy as np
 
     from service.errors import InputError
-    from service.exports.view import ScanView
-    from service.refine.refly import plan_json, suggest, waypoints_text
+    from service.offline.exports.view import ScanView
+    from service.offline.refine.refly import plan_json, suggest, waypoints_text
     from service.scans.coverage import coverage_of
     from service.scans.writing import writing
 

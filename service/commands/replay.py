@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from recon.types import Camera
     from service.cameras.source import CameraSource
     from service.config import Config
-    from service.onboard.scan import Scan
+    from service.flight.scan import Scan
 
 
 def replay(
@@ -94,8 +94,8 @@ def _replay(
 ) -> dict[str, Any]:
     from service.cameras.source import Paced
     from service.compute.opening import open_backend
-    from service.onboard.datalink import open_datalink
-    from service.onboard.scan import Scan, ScanInputs, create_store
+    from service.flight.datalink import open_datalink
+    from service.flight.scan import Scan, ScanInputs, create_store
     from service.scans.folder import write_deliverables
 
     notes: list[str] = []

@@ -30,7 +30,7 @@ from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPai
 from service.errors import InputError, OutsideError
 
 if TYPE_CHECKING:
-    from recon.clouds.registration import IcpConfig
+    from recon.mapping.registration import IcpConfig
 
 Result = TypeVar("Result")
 

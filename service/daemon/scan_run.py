@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from service.cameras.source import CameraSource
     from service.daemon.frame_gate import FrameGate
     from service.daemon.scanning import Scanning
-    from service.onboard.pipeline import Step
-    from service.onboard.scan import Scan, ScanInputs
+    from service.flight.pipeline import Step
+    from service.flight.scan import Scan, ScanInputs
     from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
@@ -124,7 +124,7 @@ class ScanRun:
         return None
 
     def _scan(self, source: CameraSource) -> None:
-        from service.onboard.scan import Scan, create_store
+        from service.flight.scan import Scan, create_store
 
         host = self._host
         inputs, gate = self._inputs(source)
@@ -154,7 +154,7 @@ class ScanRun:
         """What the scan is made from, with its camera behind a gate."""
         from service.cameras.camera_file import check_size
         from service.daemon.frame_gate import FrameGate
-        from service.onboard.scan import ScanInputs
+        from service.flight.scan import ScanInputs
 
         host, vehicle = self._host, self._host.vehicle
         camera, backend = host.equipment()
@@ -232,14 +232,14 @@ def odometry_reporter(
     """What tells the autopilot how it moves, where that is wanted."""
     if not config.mavlink.odometry:
         return None
-    from service.onboard.vehicle_reports import OdometryReport
+    from service.flight.vehicle_reports import OdometryReport
 
     return OdometryReport(config.camera, vehicle.report_odometry).tell
 
 
 def tell_keyframe(vehicle: VehicleLink, scan: Scan, keyframe: Keyframe) -> None:
     """Tell ground stations of a keyframe, at the pose that it has now."""
-    from service.onboard.vehicle_reports import keyframe_report
+    from service.flight.vehicle_reports import keyframe_report
 
     inputs = scan.inputs
     state = vehicle.history.state_at(keyframe.time_ns)

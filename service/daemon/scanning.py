@@ -23,7 +23,7 @@ from service.daemon.scan_run import ScanRun
 from service.daemon.warm_up import is_warm
 from service.daemon.writing import ClosingWatch, Writings
 from service.errors import InputError, SkyreliefError
-from service.onboard.datalink import DaemonLink
+from service.flight.datalink import DaemonLink
 from service.scans.retention import Claim
 from service.workers import PROCESS, Worker
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from recon.backends import Backend
     from recon.types import Camera
     from service.daemon.frame_gate import FrameGate
-    from service.onboard.scan import Scan
+    from service.flight.scan import Scan
     from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)

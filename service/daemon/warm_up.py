@@ -73,7 +73,7 @@ def warm_up(config: Config) -> tuple[float, int]:
     from recon.backends.cpu import warm_up as warm_up_backend
     from recon.types import Camera
     from service.compute.opening import open_backend
-    from service.onboard.scan import Scan, ScanInputs, create_store
+    from service.flight.scan import Scan, ScanInputs, create_store
     from service.scans.folder import write_deliverables
 
     start = time.monotonic()

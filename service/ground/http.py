@@ -30,13 +30,13 @@ from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
 from service.errors import InputError, OutsideError
-from service.exports import EXPORTERS
 from service.ground.guard import CHANGING, WHO, AuditLog, Guard, Pace, Tokens, note
 from service.ground.library import ConflictError, Library
 from service.ground.live import serve_live
 from service.ground.scan_files import file_routes
 from service.ground.state import Jobs, PortalState, names_of, state_of
 from service.ground.vehicle import BUTTONS, Vehicle
+from service.offline.exports import EXPORTERS
 from service.workers import Workers
 
 T = TypeVar("T")

@@ -35,7 +35,7 @@ import numpy as np
 from starlette.concurrency import run_in_threadpool
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from recon.clouds.cloud_fusion import cloud_of
+from recon.mapping.cloud_fusion import cloud_of
 from recon.types import F64, DepthMap, Keyframe
 from service.errors import SkyreliefError
 from service.scans.track import latest

@@ -1,6 +1,6 @@
 """A scan's store from the MCAP that an aircraft recorded or exported.
 
-Reads what :mod:`service.exports.recording` writes: points in the camera's frame become the
+Reads what :mod:`service.offline.exports.recording` writes: points in the camera's frame become the
 depth image again that they came from. What an MCAP does not hold (covariances of rotation,
 re-poses, the scan's settings) is left at defaults and said in a note.
 """
@@ -20,8 +20,8 @@ import numpy as np
 from recon import se3
 from recon.types import F64, U8, DepthMap, Keyframe, Pose
 from service.errors import InputError
-from service.exports.recording import POINT
 from service.ground.mcap_records import messages
+from service.offline.exports.recording import POINT
 from service.stream import codec
 from service.stream.codec import MAX_PIXELS, MAX_SIDE_PX
 from service.stream.naming import split_scan_name

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO, Any, cast
 
 from service.errors import InputError
-from service.exports.recording import POINT
+from service.offline.exports.recording import POINT
 from service.packages import needing
 from service.stream.codec import MAX_PIXELS
 from service.stream.validity import MAX_TIME_NS

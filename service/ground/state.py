@@ -14,10 +14,10 @@ from typing import Any
 from starlette.requests import HTTPConnection
 
 from service.errors import InputError, SkyreliefError
-from service.exports import EXPORTERS
-from service.exports.view import ExportOptions, ScanView, export
 from service.ground.library import Library
 from service.ground.vehicle import Vehicle
+from service.offline.exports import EXPORTERS
+from service.offline.exports.view import ExportOptions, ScanView, export
 from service.scans.coverage import LiveCoverages
 from service.workers import Worker, Workers
 

@@ -21,7 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.graph.ledger import Ledger, Rows
+from recon.posegraph.ledger import Ledger, Rows
 from recon.surface.coverage import (
     PLACE,
     CoverageGrid,

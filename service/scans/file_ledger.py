@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from recon.graph.ledger import Rows
+from recon.posegraph.ledger import Rows
 from service.errors import OutsideError
 
 
 class FileLedger:
-    """See :class:`recon.graph.ledger.Ledger`. Raises OutsideError when the disk takes no more."""
+    """A :class:`recon.posegraph.ledger.Ledger` on disk; OutsideError when the disk is full."""
 
     def __init__(self, kind: np.dtype[Any], folder: Path) -> None:
         self._kind, self._count = kind, 0

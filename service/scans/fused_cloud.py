@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from recon.clouds.cloud_fusion import cloud_of, fuse_strips, without
-from recon.clouds.free_space import seen_through, spread
-from recon.clouds.voxel_map import ground_sample_m
+from recon.mapping.cloud_fusion import cloud_of, fuse_strips, without
+from recon.mapping.free_space import seen_through, spread
+from recon.mapping.voxel_map import ground_sample_m
 from recon.types import F64, PointCloud
 from service.georeference import LocalFrame
 from service.stream.store import ScanStore

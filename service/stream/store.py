@@ -149,7 +149,7 @@ class ScanStore:
 
     @property
     def refinement(self) -> dict[str, Any] | None:
-        """The figures of the refinement in force (:mod:`service.refine.revisions`), or None."""
+        """The figures of the refinement in force, or None."""
         note = json_object(self._db.get("refinement"))
         figures = note.get("figures")
         return figures if isinstance(figures, dict) and not figures.get("undone") else None

@@ -18,7 +18,7 @@ from trial_decoders import DECODERS, seeds
 from service.cameras import open_camera
 from service.errors import SkyreliefError
 from service.ground.mcap_import import header_in, store_from_mcap
-from service.refine.survey_file import read_survey
+from service.offline.refine.survey_file import read_survey
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 FRAMES = DATA.parents[1] / "demo" / "caliterra" / "frames"

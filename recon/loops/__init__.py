@@ -1,1 +1,0 @@
-"""Places seen again: candidates, and the proof that they are the same."""

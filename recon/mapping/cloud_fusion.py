@@ -1,0 +1,248 @@
+"""Many clouds fused into one: inverse-variance means per voxel, lone contradicted points left out.
+
+The voxel keys are those of :mod:`recon.mapping.voxel_map`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+from numba import njit
+
+from recon.mapping.voxel_map import I32, I64, find_slot, rehash, voxel_key
+from recon.types import F32, F64, U8, Bool, DepthMap, PointCloud
+
+CORRELATED_SHARE = 0.5
+"""Sigma of a mean over keyframes never falls below this share of its best member's: their
+errors share frames, poses and texture, so they do not average out any further."""
+
+LONE_NEIGHBOURS = 3
+"""A point with fewer occupied voxels than this among the 26 around it stands alone."""
+
+
+def fuse(clouds: Iterable[PointCloud], voxel_m: float) -> PointCloud:
+    """One point per voxel of ``voxel_m``: mean position, colour and sigma, views summed.
+
+    Points count by the inverse of their variance. Points of one cloud in one voxel are
+    neighbours in one depth image, so together they count as the best of them for sigma and
+    views; clouds count as independent down to CORRELATED_SHARE. A single-view point that
+    stands alone is left out when surface seen more often, above or below it, contradicts it.
+    Order is that of the voxel keys (x first), whatever the order of points in a cloud.
+    Raises ValueError for a voxel size that is not positive.
+    """
+    return fuse_strips([lambda: clouds], [-np.inf, np.inf], voxel_m)
+
+
+def fuse_strips(
+    strips: Sequence[Callable[[], Iterable[PointCloud]]], edges_m: Sequence[float], voxel_m: float
+) -> PointCloud:
+    """As :func:`fuse`, one strip of x after the other, so that the sums of one are held.
+
+    ``strips[n]`` gives the clouds that reach into ``edges_m[n] <= x < edges_m[n + 1]``; their
+    points outside are passed over. Finite edges are moved to the voxel border below them, so
+    the result is that of the whole.
+    """
+    if not (np.isfinite(voxel_m) and voxel_m > 0.0):
+        raise ValueError(f"voxel_m is {voxel_m}, must be positive")
+    borders = np.floor(np.asarray(edges_m, np.float64) / voxel_m)
+    keys, clouds = [], []
+    for strip, low, high in zip(strips, borders[:-1], borders[1:], strict=True):
+        sums = _Sums()
+        for number, cloud in enumerate(strip()):
+            sums.add(_between(cloud, low, high, voxel_m), number, 1.0 / voxel_m)
+        key, mean = sums.means()
+        keys.append(key)
+        clouds.append(mean)
+    whole = PointCloud(
+        *(
+            np.concatenate([getattr(cloud, name) for cloud in clouds])
+            for name in ("xyz_m", "rgb", "sigma_m", "views")
+        )
+    )
+    lone = _lone_contradicted(np.concatenate(keys), whole.xyz_m, whole.sigma_m, whole.views)
+    return whole if not lone.any() else without(whole, lone)
+
+
+def without(cloud: PointCloud, mask: Bool) -> PointCloud:
+    """The points of ``cloud`` that ``mask`` (N,) does not mark."""
+    keep = ~mask
+    return PointCloud(
+        cloud.xyz_m[keep], cloud.rgb[keep], cloud.sigma_m[keep], cloud.views[keep], cloud.frame
+    )
+
+
+def _between(cloud: PointCloud, low: float, high: float, voxel_m: float) -> PointCloud:
+    """The points whose voxel's x index lies in [low, high)."""
+    if low == -np.inf and high == np.inf:
+        return cloud
+    index = np.floor(cloud.xyz_m[:, 0].astype(np.float64) * (1.0 / voxel_m))
+    return without(cloud, ~((index >= low) & (index < high)))
+
+
+class _Sums:
+    """The running sums of ``fuse``, in dense arrays found through a hash of voxel keys."""
+
+    def __init__(self) -> None:
+        self.keys: I64 = np.full(1 << 16, -1, np.int64)
+        self.ids: I32 = np.zeros(1 << 16, np.int32)
+        self.count = 0
+        self._grow(1 << 15)
+
+    def _grow(self, rows: int) -> None:
+        old = self.count
+        names = (("xyzw", 4, np.float64), ("rgb", 3, np.float32), ("info", 3, np.float64))
+        for name, width, dtype in names:
+            new = np.zeros((rows, width), dtype)
+            if old:
+                new[:old] = getattr(self, name)[:old]
+            setattr(self, name, new)
+        tags = np.zeros((rows, 3), np.int32)
+        if old:
+            tags[:old] = self.tags[:old]
+        self.tags = tags
+
+    xyzw: F64  # sum of w x, w y, w z, w over points
+    rgb: F32  # sum of w colour
+    info: F64  # sum over clouds of the best w; best w of the last cloud; best w of all
+    tags: I32  # last cloud; sum over clouds of the most views; most views in the last cloud
+
+    def add(self, cloud: PointCloud, number: int, inverse: float) -> None:
+        """Add one cloud's points."""
+        while len(self.tags) < self.count + len(cloud):
+            self._grow(2 * len(self.tags))
+        slots = len(self.keys)
+        while slots < 2 * (self.count + len(cloud)):
+            slots *= 2
+        if slots > len(self.keys):
+            self.keys, self.ids = rehash(self.keys, self.ids, slots)
+        self.count = _accumulate(
+            self.keys,
+            self.ids,
+            self.count,
+            number + 1,
+            np.ascontiguousarray(cloud.xyz_m, np.float32),
+            np.ascontiguousarray(cloud.rgb, np.uint8),
+            np.ascontiguousarray(cloud.sigma_m, np.float32),
+            np.ascontiguousarray(cloud.views, np.uint8),
+            inverse,
+            self.xyzw,
+            self.rgb,
+            self.info,
+            self.tags,
+        )
+
+    def means(self) -> tuple[I64, PointCloud]:
+        """The voxel keys, sorted, and the mean point of each."""
+        at = np.flatnonzero(self.keys != -1)
+        at = at[np.argsort(self.keys[at])]
+        keys, rows = self.keys[at], self.ids[at]
+        weight = self.xyzw[rows, 3]
+        xyz = (self.xyzw[rows, :3] / weight[:, None]).astype(np.float32)
+        rgb = np.clip(np.rint(self.rgb[rows] / weight[:, None]), 0, 255).astype(np.uint8)
+        best = 1.0 / np.sqrt(self.info[rows, 2])
+        sigma = np.maximum(1.0 / np.sqrt(self.info[rows, 0]), CORRELATED_SHARE * best)
+        views = np.minimum(self.tags[rows, 1], 255).astype(np.uint8)
+        return keys, PointCloud(xyz, rgb, sigma.astype(np.float32), views)
+
+
+@njit(cache=True, nogil=True)
+def _accumulate(
+    keys: I64,
+    ids: I32,
+    count: int,
+    number: int,
+    xyz: F32,
+    rgb: U8,
+    sigma: F32,
+    views: U8,
+    inverse: float,
+    xyzw: F64,
+    colour: F32,
+    info: F64,
+    tags: I32,
+) -> int:
+    """Add points to the sums; the new number of voxels. Points without a sigma are left out."""
+    for n in range(xyz.shape[0]):
+        s = sigma[n]
+        if not (s > 0.0 and s < 1e6):
+            continue
+        x, y, z = float(xyz[n, 0]), float(xyz[n, 1]), float(xyz[n, 2])
+        key = voxel_key(x, y, z, inverse)
+        if key == -1:
+            continue
+        t = find_slot(keys, key)
+        if keys[t] == -1:
+            keys[t] = key
+            ids[t] = count
+            count += 1
+        r = ids[t]
+        w = 1.0 / (float(s) * float(s))
+        xyzw[r, 0] += w * x
+        xyzw[r, 1] += w * y
+        xyzw[r, 2] += w * z
+        xyzw[r, 3] += w
+        for c in range(3):
+            colour[r, c] += w * rgb[n, c]
+        if tags[r, 0] != number:
+            tags[r, 0] = number
+            tags[r, 2] = 0
+            info[r, 1] = 0.0
+        if w > info[r, 1]:
+            info[r, 0] += w - info[r, 1]
+            info[r, 1] = w
+        if w > info[r, 2]:
+            info[r, 2] = w
+        if views[n] > tags[r, 2]:
+            tags[r, 1] += views[n] - tags[r, 2]
+            tags[r, 2] = views[n]
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _lone_contradicted(keys: I64, xyz: F32, sigma: F32, views: U8) -> Bool:
+    """(N,) lone single-view points with better, more often seen surface above or below.
+
+    ``keys`` are sorted, so a column of voxels is one run of rows.
+    """
+    n = keys.shape[0]
+    out = np.zeros(n, np.bool_)
+    low = (1 << 21) - 1
+    for p in range(n):
+        if views[p] > 1:
+            continue
+        neighbours = -1  # the point itself
+        contradicted = False
+        height = keys[p] & low
+        for di in range(-1, 2):
+            for dj in range(-1, 2):
+                column = (keys[p] & ~low) + (np.int64(di) << 42) + (np.int64(dj) << 21)
+                q = np.searchsorted(keys, column)
+                while q < n and (keys[q] & ~low) == column:
+                    if abs((keys[q] & low) - height) <= 1:
+                        neighbours += 1
+                    if views[q] > 1 and sigma[q] < sigma[p]:
+                        apart = abs(xyz[q, 2] - xyz[p, 2])
+                        contradicted |= apart > 3.0 * (sigma[p] + sigma[q])
+                    q += 1
+        out[p] = contradicted and neighbours < LONE_NEIGHBOURS
+    return out
+
+
+def cloud_of(depth: DepthMap, bgr: U8, mask: Bool | None = None) -> PointCloud:
+    """World points of the pixels with depth, in row order, where ``mask`` if given.
+
+    ``bgr`` is (h, w, 3) on the grid of the depth. Raises ValueError when sizes differ.
+    """
+    if bgr.shape[:2] != depth.depth_m.shape:
+        raise ValueError(f"colour is {bgr.shape}, depth is {depth.depth_m.shape}")
+    known = np.isfinite(depth.depth_m) & (depth.depth_m > 0.0) & np.isfinite(depth.sigma_m)
+    if mask is not None:
+        known &= mask
+    v, u = np.nonzero(known)
+    z = depth.depth_m[known].astype(np.float64)
+    K, T = depth.K, depth.T_world_camera
+    camera = np.column_stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z])
+    xyz = (camera @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+    rgb = np.ascontiguousarray(bgr[known][:, ::-1])
+    return PointCloud(xyz, rgb, depth.sigma_m[known], depth.views[known])

@@ -1,0 +1,305 @@
+"""Alignment of depth images (the paper's ICP, section 2.3).
+
+Depth images are aligned by projective point-to-plane ICP (Blais and Levine 1995,
+doi:10.1109/34.400574; Chen and Medioni 1992): a source point's partner is the surface element
+of the pixel it projects to, so no tree is searched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon import se3
+from recon.camera_model import rays
+from recon.mapping import icp_kernels
+from recon.types import F32, F64, Bool, DepthMap, Registration
+
+__all__ = [
+    "Equations",
+    "IcpConfig",
+    "Surface",
+    "conclude",
+    "register_projective",
+    "register_surfaces",
+]
+
+
+# Variance that the residuals do not show: edges half seen, errors of the normals; measured.
+_UNSEEN_VARIANCE = 1.5
+
+AREA_SIGMAS, AREA_LAGS = 4.685, 12
+"""Residuals beyond so many sigmas say nothing of how neighbours err; the longest distance asked."""
+
+
+MIN_PARTNERS = 50
+"""Fewer are no overlap."""
+
+
+@dataclass(frozen=True, slots=True)
+class IcpConfig:
+    """Parameters of the alignment."""
+
+    strides: tuple[int, ...] = (6, 3)  # pixels between the source points, level by level
+    iterations: tuple[int, ...] = (8, 6)  # of each level, at most
+    gate_share: float = 0.05  # residuals above this share of the depth are no partners
+    edge_share: float = 0.004  # a 5x5 window that bends more than this holds a depth edge
+    huber_sigmas: float = 1.345
+    tukey_sigmas: float = 4.685
+    min_inlier_share: float = 0.3  # of the source's surface, else rejected
+    max_rms_share: float = 0.01  # point to plane over the median depth, else rejected
+    max_step_share: float = 0.05  # correction over the median depth, else rejected
+    max_turn_rad: float = 0.1
+    weak_slope: float = 0.02  # rms slope of the ground that a direction needs to be observed
+    unknown_sigma_m: float = 10.0  # given to directions that are not observed
+
+    def __post_init__(self) -> None:
+        """Raise ValueError when a parameter makes no sense."""
+        if not self.strides or len(self.strides) != len(self.iterations):
+            raise ValueError("strides and iterations must be of one length, at least 1")
+        if min(self.strides) < 1 or min(self.iterations) < 1:
+            raise ValueError("strides and iterations must be at least 1")
+        shares = (self.gate_share, self.edge_share, self.max_rms_share, self.max_step_share)
+        if min(shares) <= 0 or not 0 < self.min_inlier_share <= 1:
+            raise ValueError("shares must be positive, min_inlier_share at most 1")
+        if self.weak_slope <= 0 or self.unknown_sigma_m <= 0:
+            raise ValueError("weak_slope and unknown_sigma_m must be positive")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """A depth map with its surface elements, ready to be aligned many times."""
+
+    elements: F32  # (h, w, 6), see recon.mapping.icp_kernels
+    intrinsics: F64  # (4,) fx fy cx cy
+    centre: F64  # (3,) m, mean of the surface in the camera frame
+    lever_m: float  # rms distance of the surface from its centre
+
+    @staticmethod
+    def build(depth: DepthMap, config: IcpConfig) -> Surface:
+        """The surface of ``depth``; raises ValueError when its shapes disagree."""
+        h, w = depth.depth_m.shape
+        if depth.sigma_m.shape != (h, w) or min(h, w) < 8:
+            raise ValueError(f"depth {h, w} and sigma {depth.sigma_m.shape} do not fit")
+        K = depth.K
+        z = np.ascontiguousarray(depth.depth_m, np.float32)
+        sigma = np.ascontiguousarray(depth.sigma_m, np.float32)
+        intrinsics = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+        elements = np.zeros((h, w, 6), np.float32)
+        icp_kernels.surface_elements(z, sigma, *intrinsics, config.edge_share, elements)
+        v, u = np.nonzero(elements[::4, ::4, 4])
+        some = z[4 * v, 4 * u].astype(np.float64)
+        points = some[:, None] * rays(K, np.column_stack([4.0 * u, 4.0 * v]))
+        centre = points.mean(axis=0) if len(points) else np.zeros(3)
+        lever = np.sqrt(np.mean(np.sum((points - centre) ** 2, axis=1))) if len(points) else 1.0
+        return Surface(elements, intrinsics, centre, max(float(lever), 1e-6))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Equations:
+    """What an iteration sums up over all partners (:mod:`recon.mapping.icp_kernels`)."""
+
+    H: F64  # (6, 6)
+    common: F64  # (6, 6)
+    g: F64  # (6,)
+    sums: F64  # (4,)
+    scale: float  # robust standard deviation of the residuals in sigmas
+    centre: F64  # (3,) m, target frame
+    lever_m: float
+    area: float | None = None  # neighbours whose residuals err together, when known
+    partners: int = MIN_PARTNERS
+
+
+@dataclass(slots=True, eq=False)
+class _Problem:
+    """The weighted normal equations of one iteration, rotating about the points' centre."""
+
+    size: F32  # (hs, ws) residuals in sigmas, see recon.mapping.icp_kernels.residuals
+    scale: float  # robust standard deviation of the residuals in sigmas
+    centre: F64  # (3,) m, target frame
+    unit: F64  # (6,) turns a twist in metres at the rms lever into rad and m
+    sums: F64  # (4,), see recon.mapping.icp_kernels.normal_equations
+    values: F64  # (6,) information along the principal directions
+    vectors: F64  # (6, 6) columns, scaled by ``unit``
+    shared: F64  # (6,) the part of the information that both surfaces agree on
+    gradient: F64  # (6,) along the principal directions
+    strong: Bool  # (6,) directions that the surface determines
+    area: float | None = None  # neighbours that err together; None: asked of ``size``
+
+    def step(self) -> F64:
+        """(4, 4) left correction in the target frame; weak directions stay put."""
+        part = np.where(self.strong, self.gradient / np.maximum(self.values, 1e-30), 0.0)
+        return self._about_centre(-self.vectors @ part)
+
+    def _about_centre(self, scaled_twist: F64) -> F64:
+        twist = self.unit * scaled_twist
+        R = se3.so3_exp(twist[:3])
+        return se3.compose(R, self.centre - R @ self.centre + twist[3:])
+
+    def settled(self, step: F64, share: float) -> bool:
+        """True when ``step`` moves the points by less than ``share`` of its own sigma."""
+        move = float(np.linalg.norm(step[:3, :3] @ self.centre + step[:3, 3] - self.centre))
+        turn = float(np.linalg.norm(se3.so3_log(step[:3, :3]))) / float(self.unit[0])
+        variance = float(self.sums[1]) / max(float(self.sums[0]), 1.0)
+        sigma = np.sqrt(variance / max(float(self.values[self.strong].min(initial=1e30)), 1e-30))
+        return max(move, turn) < max(share * float(sigma), 1e-7)
+
+
+def _problem(
+    source: Surface, target: Surface, T: F64, stride: int, tukey: bool, config: IcpConfig
+) -> _Problem | None:
+    """The problem at ``T``, or None when fewer than 50 points find a partner."""
+    h, w = source.elements.shape[:2]
+    shape = (h - stride // 2 - 1) // stride + 1, (w - stride // 2 - 1) // stride + 1
+    size, rows = np.empty(shape, np.float32), np.empty((*shape, 10), np.float32)
+    icp_kernels.residuals(
+        source.elements, source.intrinsics, target.elements, target.intrinsics,
+        T, stride, config.gate_share, size, rows,
+    )  # fmt: skip
+    return _weighed(size, rows, T[:3, :3] @ source.centre + T[:3, 3], source.lever_m, tukey, config)
+
+
+def _weighed(
+    size: F32, rows: F32, centre: F64, lever_m: float, tukey: bool, config: IcpConfig
+) -> _Problem | None:
+    """The problem of partners that were found, or None when they are fewer than 50."""
+    matched = size[size < icp_kernels.UNMATCHED]
+    if len(matched) < MIN_PARTNERS:
+        return None
+    every = max(len(matched) // 2000, 1)
+    scale = max(float(np.median(np.abs(matched[::every]))) / 0.6745, 1e-3)
+    H, common, g, sums = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(4)
+    limit = scale * (config.tukey_sigmas if tukey else config.huber_sigmas)
+    icp_kernels.normal_equations(size, rows, centre, limit, tukey, H, common, g, sums)
+    equations = Equations(H, common, g, sums, scale, centre, lever_m)
+    return _along_directions(equations, size, config)
+
+
+def _along_directions(equations: Equations, size: F32, config: IcpConfig) -> _Problem:
+    """The problem in its principal directions."""
+    H, common, g, lever_m = equations.H, equations.common, equations.g, equations.lever_m
+    unit = np.array([1 / lever_m] * 3 + [1.0] * 3)
+    values, vectors = np.linalg.eigh(H * np.outer(unit, unit))
+    shared = np.einsum("ik,ij,jk->k", vectors, common * np.outer(unit, unit), vectors)
+    # The eigenvalues are mean squares of the slope against each motion, 1 for a motion along
+    # all normals. Noise tilts the normals too, but not those of both surfaces alike.
+    enough = config.weak_slope**2 * max(float(values[-1]), 1e-30)
+    strong = (shared > enough) & (shared > 0.35 * values)
+    return _Problem(
+        size, equations.scale, equations.centre, unit, equations.sums, values, vectors, shared,
+        vectors.T @ (unit * g), strong, equations.area,
+    )  # fmt: skip
+
+
+def conclude(
+    equations: Equations, T: F64, T_start: F64, available: int, iterations: int, config: IcpConfig
+) -> Registration:
+    """The registration after a last step from ``T`` (4, 4), for a search made elsewhere.
+
+    ``available`` counts the source's surface elements. Fewer than 50 partners: rejected.
+    """
+    if equations.partners < MIN_PARTNERS:
+        return _no_overlap(T_start, iterations)
+    problem = _along_directions(equations, np.zeros((0, 0), np.float32), config)
+    depth = float(problem.centre[2])
+    limits = config.max_rms_share * depth, config.max_step_share * depth
+    moved = problem.step() @ T
+    return _judged(problem, moved, T_start, available, limits, iterations + 1, config)
+
+
+def register_projective(
+    source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig | None = None
+) -> Registration:
+    """The motion that lays ``source`` onto ``target``, starting from ``T_target_source`` (4, 4).
+
+    The maps' own poses are not used. Directions that the surface does not determine (on flat
+    ground: both horizontal shifts and the turn about the vertical) keep the start, get
+    ``unknown_sigma_m`` in the covariance and make the verdict "degenerate". "rejected": too
+    little overlap, residuals too large, or a correction too large to be believed.
+    """
+    config = config or IcpConfig()
+    return register_surfaces(
+        Surface.build(source, config), Surface.build(target, config), T_target_source, config
+    )
+
+
+def register_surfaces(
+    source: Surface, target: Surface, T_target_source: F64, config: IcpConfig
+) -> Registration:
+    """As :func:`register_projective`, for surfaces that were built before."""
+    T = np.array(T_target_source, dtype=np.float64)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise ValueError("T_target_source must be (4, 4) finite numbers")
+    problem: _Problem | None = None
+    done = 0
+    last = len(config.strides) - 1
+    for level, (stride, limit) in enumerate(zip(config.strides, config.iterations, strict=True)):
+        for _ in range(limit):
+            problem = _problem(source, target, T, stride, level == last, config)
+            if problem is None:
+                return _no_overlap(T_target_source, done)
+            step = problem.step()
+            T = step @ T
+            done += 1
+            if problem.settled(step, 0.3 if level == last else 1.0):
+                break
+    assert problem is not None
+    grid = source.elements[stride // 2 :: stride, stride // 2 :: stride, 4]
+    available = int(np.count_nonzero(grid))
+    depth = float(problem.centre[2])
+    limits = config.max_rms_share * depth, config.max_step_share * depth
+    return _judged(problem, T, T_target_source, available, limits, done, config)
+
+
+def _no_overlap(T: F64, iterations: int) -> Registration:
+    return Registration(
+        np.array(T, np.float64), np.eye(6) * 1e6, "rejected", float("nan"), 0.0, iterations
+    )
+
+
+def _judged(
+    problem: _Problem, T: F64, T_start: F64, available: int, limits_m: tuple[float, float],
+    iterations: int, config: IcpConfig,
+) -> Registration:  # fmt: skip
+    """The registration with its verdict; ``limits_m`` are of the rms and of the correction."""
+    covariance, weak = _covariance(problem, config)
+    rms = float(np.sqrt(problem.sums[3] / max(problem.sums[0], 1e-9)))
+    share = float(problem.sums[2]) / max(available, 1)
+    change = T @ se3.inverse(T_start)
+    step = float(np.linalg.norm(change[:3, :3] @ problem.centre + change[:3, 3] - problem.centre))
+    turn = float(np.linalg.norm(se3.so3_log(change[:3, :3])))
+    implausible = (
+        share < config.min_inlier_share
+        or rms > limits_m[0]
+        or step > limits_m[1]
+        or turn > config.max_turn_rad
+        or not problem.strong.any()
+    )
+    good = "converged" if problem.strong.all() else "degenerate"
+    verdict = "rejected" if implausible else good
+    return Registration(T, covariance, verdict, rms, share, iterations, weak)
+
+
+def _covariance(problem: _Problem, config: IcpConfig) -> tuple[F64, F64]:
+    """(6, 6) covariance of a left perturbation and the (k, 6) weak directions, unit rows."""
+    weights, squares = float(problem.sums[0]), float(problem.sums[1])
+    # Residuals of neighbours err together, so they count as fewer than they are.
+    area = problem.area
+    if area is None:
+        area = float(
+            icp_kernels.correlated_area(problem.size, AREA_SIGMAS * problem.scale, AREA_LAGS)
+        )
+    variance = max(squares / max(weights - 6.0, 1.0), 1e-6) * area * _UNSEEN_VARIANCE
+    # Information from noise in the normals is none: only the shared part moves the estimate.
+    information = np.maximum(problem.shared, 1e-30) ** 2 / np.maximum(problem.values, 1e-30)
+    spread = np.where(problem.strong, variance / information, config.unknown_sigma_m**2)
+    # The rotation was about the centre; a left perturbation turns about the origin.
+    move = se3.adjoint(se3.compose(np.eye(3), problem.centre))
+    directions = move @ (problem.unit[:, None] * problem.vectors)
+    covariance = (directions * spread) @ directions.T
+    return np.asarray(covariance), _unit_rows(directions[:, ~problem.strong].T)
+
+
+def _unit_rows(rows: F64) -> F64:
+    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-30))

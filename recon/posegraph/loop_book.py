@@ -1,0 +1,126 @@
+"""Which loops are believed: two that agree, and that vision can have drifted to."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from recon import se3
+from recon.posegraph.records import Loop, Node, PoseGraphConfig, loops_agree
+from recon.posegraph.thinning import Marginalised, moved_loops
+from recon.types import F64
+
+CHI2_LIMIT = 22.5
+"""99.9 % of chi-square with six degrees of freedom."""
+
+MOST_PENDING = 50
+"""Loops that wait for one that agrees; older ones are forgotten."""
+
+
+class Track(Protocol):
+    """The track that loops are held against."""
+
+    def node(self, seq: int) -> Node:
+        """What is known of a keyframe."""
+        ...
+
+    def place(self, seq: int) -> F64:
+        """(4, 4) T_world_camera of a keyframe."""
+        ...
+
+    def scale(self, seq: int) -> float:
+        """Metres per unit of the odometry at a keyframe."""
+        ...
+
+    def path_m(self, a: int, b: int) -> float:
+        """Metres flown from one keyframe to a later one."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """A loop as reports show it."""
+
+    a: int  # number of the earlier keyframe
+    b: int
+    accepted: bool  # False: none that agrees was found
+
+
+class LoopBook:
+    """Loops that were offered, and which of them the map rests on."""
+
+    def __init__(self, config: PoseGraphConfig, track: Track) -> None:
+        self.taken: list[Loop] = []
+        self.pending: list[Loop] = []  # none that agrees was found yet
+        self.counts: Counter[str] = Counter()
+        self._config, self._track = config, track
+
+    def offer(self, loop: Loop) -> list[Loop]:
+        """The loops that are believed from now on; empty while this one waits or is refused."""
+        if not self._is_possible(loop):
+            self.counts["loop impossible"] += 1
+            return []
+        support = [other for other in self.pending + self.taken if self._agree(loop, other)]
+        if not support:
+            self.pending = [*self.pending, loop][-MOST_PENDING:]
+            self.counts["loop waits"] += 1
+            return []
+        fresh = [loop, *(other for other in support if other in self.pending)]
+        self.pending = [other for other in self.pending if other not in support]
+        self.taken += fresh
+        return fresh
+
+    def thin(
+        self, marginalised: Mapping[int, Marginalised], let_go: Collection[int], most: int
+    ) -> None:
+        """Move the ends that are nodes no more; loops of those let go end, and at most ``most``
+        stay."""
+        self.taken = moved_loops(self.taken, marginalised, let_go, most)
+        self.pending = moved_loops(self.pending, marginalised, let_go, most)
+
+    def edges(self) -> list[Edge]:
+        """All loops that were offered and not refused."""
+        found = [Edge(loop.a, loop.b, True) for loop in self.taken]
+        return found + [Edge(loop.a, loop.b, False) for loop in self.pending]
+
+    def into(self, segment: int) -> list[Loop]:
+        """Believed loops from an earlier segment into this one."""
+        return [loop for loop in self.taken if self.enters(loop, segment)]
+
+    def enters(self, loop: Loop, segment: int) -> bool:
+        """True when the loop leads from an earlier segment into this one."""
+        ends = [self._track.node(seq).segment for seq in loop.ends]
+        return ends[1] == segment != ends[0]
+
+    def _is_possible(self, loop: Loop) -> bool:
+        """False when a loop within a segment is off by more than vision can drift."""
+        track, config = self._track, self._config
+        if track.node(loop.a).segment != track.node(loop.b).segment:
+            return True
+        T = se3.inverse(track.place(loop.a)) @ track.place(loop.b)
+        apart = se3.log(se3.inverse(loop.scaled(track.scale(loop.a)).T_a_b) @ T)
+        allowed_m = config.loop_slack_m + config.loop_drift * track.path_m(loop.a, loop.b)
+        turned, moved = float(np.linalg.norm(apart[:3])), float(np.linalg.norm(apart[3:]))
+        return moved < allowed_m and turned < config.loop_turn_rad
+
+    def _agree(self, one: Loop, other: Loop) -> bool:
+        """True when two loops, joined by the track between their ends, close on themselves."""
+        window, track = self._config.loop_window, self._track
+        near = all(self._apart(*pair) <= window for pair in zip(one.ends, other.ends, strict=True))
+        if not near or one.ends == other.ends:
+            return False
+        ends = (one.a, other.a, other.b, one.b)
+        a, a_other, b_other, b = (track.place(seq) for seq in ends)
+        T_a_a, T_b_b = se3.inverse(a) @ a_other, se3.inverse(b_other) @ b
+        T_b_b[:3, 3] *= one.ratio * track.scale(one.a) / track.scale(one.b)
+        one, other = one.scaled(track.scale(one.a)), other.scaled(track.scale(other.a))
+        return loops_agree(one, other, T_a_a, T_b_b, CHI2_LIMIT)
+
+    def _apart(self, seq: int, other: int) -> int:
+        """Keyframes from one to the other; many between segments."""
+        one, two = self._track.node(seq), self._track.node(other)
+        return abs(one.key - two.key) if one.segment == two.segment else 1_000_000

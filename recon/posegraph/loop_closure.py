@@ -1,0 +1,294 @@
+"""Places seen before: candidates by overlap of the views, each verified before it is believed.
+
+Verification is independent of the pose graph: corners of one keyframe with their depths are
+matched in the other's picture (ZSSD), give a pose by EPnP, and the two depth maps must then
+agree by ICP. Whether a loop that passes may bend the map is for
+:meth:`recon.posegraph.pose_graph.PoseGraph.add_loop` to say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from recon import se3
+from recon.camera_model import project, rays
+from recon.mapping.registration import IcpConfig, register_projective
+from recon.tracking import matching, pnp
+from recon.tracking.common_view import common_view, features
+from recon.types import F32, F64, U8, Bool, DepthMap
+
+FEATURE_SHARE = 0.03
+"""Search radius around places that features predict, as a share of the width."""
+
+LEAST_RAD, LEAST_SHARE = 2e-4, 0.1
+"""A loop's sigmas are no less than this, and than this share of its depths' sigma: what the
+points of one depth map have in common does not average out."""
+
+__all__ = [
+    "LoopClosure",
+    "LoopConfig",
+    "LoopView",
+    "candidates",
+    "ground_seen",
+    "landmarks",
+    "verify",
+    "warps",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class LoopConfig:
+    """Parameters of the search for loops."""
+
+    least_gap: int = 10  # keyframes between the two ends of a loop
+    least_overlap: float = 0.35  # of the later view in the earlier one
+    search_share: float = 0.12  # of the picture's width, about the predicted places
+    min_matches: int = 40
+    max_disagreement: float = 4.0  # chi-square per degree of freedom between EPnP and ICP
+    matching: matching.MatchingConfig = field(default_factory=matching.MatchingConfig)
+    pnp: pnp.PnpConfig = field(default_factory=lambda: pnp.PnpConfig(min_inliers=30))
+    icp: IcpConfig = field(default_factory=IcpConfig)
+
+    def without_gap(self) -> LoopConfig:
+        """The same for keyframes that are known not to be neighbours."""
+        return replace(self, least_gap=1)
+
+    def __post_init__(self) -> None:
+        """Raise ValueError when a parameter makes no sense."""
+        if self.least_gap < 1 or self.min_matches < 6:
+            raise ValueError("least_gap must be at least 1, min_matches at least 6")
+        if not (0 < self.least_overlap <= 1 and 0 < self.search_share <= 0.5):
+            raise ValueError("least_overlap must be in (0, 1], search_share in (0, 0.5]")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopView:
+    """A keyframe as the search for loops needs it."""
+
+    gray: U8  # (H, W) without distortion
+    K: F64  # (3, 3) px of the picture
+    depth: DepthMap  # metres; of the same camera at any size
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopClosure:
+    """A verified motion between two keyframes."""
+
+    T_a_b: F64  # (4, 4) m
+    covariance: F64  # (6, 6) left perturbation in a's camera frame
+    matches: int
+    sources: tuple[str, ...]  # of "epnp", "icp"
+    growth: float = 1.0  # of b's depths, to fit a's
+
+
+def ground_seen(depth: DepthMap) -> F64:
+    """(N, 3) what a camera sees, in its frame: a grid over the whole picture.
+
+    Where nothing was measured lies the plane through what was.
+    """
+    h, w = depth.depth_m.shape
+    u, v = np.meshgrid(np.linspace(0, w - 1, 17), np.linspace(0, h - 1, 11))
+    uv = np.column_stack([u.ravel(), v.ravel()])
+    at = np.rint(uv).astype(np.int64)
+    grid = rays(depth.K, uv)
+    z = depth.depth_m[at[:, 1], at[:, 0]].astype(np.float64)
+    known = np.isfinite(z)
+    if not known.any():
+        return np.zeros((0, 3))
+    normal = plane_normal(grid[known] * z[known, None])
+    level = float(np.median(np.sum(grid[known] * normal, axis=1) * z[known]))
+    slope = grid @ normal
+    ahead = slope * np.sign(level) > 1e-3  # the others look above the horizon
+    z[~known & ahead] = level / slope[~known & ahead]
+    usable = (z > 0) & (z < 5.0 * float(np.median(z[known])))
+    return np.asarray(grid[usable] * z[usable, None])
+
+
+def plane_normal(points: F64) -> F64:
+    """(3,) unit normal of the plane that most of the points (N, 3) lie near, away from the camera.
+
+    Of fewer than three points, or points in a line, the camera's axis.
+    """
+    weight, normal = np.ones(len(points)), np.array([0.0, 0.0, 1.0])
+    if len(points) < 3:
+        return normal
+    for _ in range(8):
+        about = points - weight @ points / weight.sum()
+        _, size, rows = np.linalg.svd(about * np.sqrt(weight)[:, None], full_matrices=False)
+        if size[1] < 0.02 * size[0]:
+            return np.array([0.0, 0.0, 1.0])
+        normal = rows[2] * np.sign(rows[2, 2] if rows[2, 2] else 1.0)
+        off = np.abs(about @ normal)
+        weight = 1.0 / np.maximum(off, max(float(np.median(off)), 1e-6))
+    return np.asarray(normal)
+
+
+def candidates(
+    poses: Mapping[int, F64], newest: int, K: F64, size_px: tuple[int, int], ground: F64,
+    config: LoopConfig | None = None,
+) -> list[tuple[int, float]]:  # fmt: skip
+    """Earlier keyframes that see what ``newest`` sees, with the share of its view, best first.
+
+    ``poses`` are T_world_camera (4, 4) by keyframe number; ``ground`` (N, 3) is what the newest
+    sees, in its camera's frame (:func:`ground_seen`).
+    """
+    config = config or LoopConfig()
+    W, H = size_px
+    if not len(ground):
+        return []
+    ground = se3.transform(poses[newest], ground)
+    order = list(poses)
+    position = order.index(newest)
+    found = []
+    for seq in order[: max(position - config.least_gap + 1, 0)]:
+        there = se3.transform(se3.inverse(poses[seq]), ground)
+        seen = project(K, there)
+        inside = (seen >= 0).all(axis=1) & (seen <= [W - 1, H - 1]).all(axis=1)
+        inside &= there[:, 2] > 0
+        share = float(np.mean(inside))
+        if share >= config.least_overlap:
+            found.append((seq, share))
+    here = poses[newest][:3, 3]
+    return sorted(
+        found, key=lambda item: (-item[1], float(np.linalg.norm(poses[item[0]][:3, 3] - here)))
+    )
+
+
+def verify(
+    a: LoopView, b: LoopView, T_a_b_guess: F64, config: LoopConfig | None = None
+) -> LoopClosure | None:
+    """The motion between two keyframes that may see the same place, or None when they do not.
+
+    ``T_a_b_guess`` (4, 4) is the pose graph's word. Where it is too far off, the features that
+    both images share predict instead.
+    """
+    config = config or LoopConfig()
+    uv, points = landmarks(a, config.matching)
+    if len(uv) < config.min_matches:
+        return None
+    pyramids = tuple(matching.Pyramid.build(v.gray, config.matching.search_levels) for v in (a, b))
+    T_b_a = se3.inverse(T_a_b_guess)
+    predicted = project(b.K, se3.transform(T_b_a, points))
+    warp = warps(a.K, b.K, T_b_a, uv, points)
+    solved = _pose(pyramids, uv, points, predicted, warp, b, T_b_a, config)
+    if solved is None:
+        view = common_view(features(a.gray), features(b.gray))
+        if view is not None:
+            near = replace(config, search_share=FEATURE_SHARE)
+            there = view.predict(uv, FEATURE_SHARE * b.gray.shape[1])
+            solved = _pose(pyramids, uv, points, there.uv, there.warp, b, None, near)
+    if solved is None:
+        return None
+    T_a_b = se3.inverse(solved.T_camera_points)
+    A = se3.adjoint(T_a_b)
+    return _with_icp(a, b, T_a_b, A @ solved.covariance @ A.T, solved, config)
+
+
+def landmarks(view: LoopView, config: matching.MatchingConfig) -> tuple[F64, F64]:
+    """(N, 2) corners with a known depth and their (N, 3) points in the camera frame."""
+    corners = matching.harris_grid(view.gray, config).uv_px.astype(np.float64)
+    h, w = view.depth.depth_m.shape
+    H, W = view.gray.shape
+    place = np.rint((corners + 0.5) * [w / W, h / H] - 0.5).astype(np.int64)
+    place = np.clip(place, 0, [w - 1, h - 1])
+    depth = view.depth.depth_m[place[:, 1], place[:, 0]].astype(np.float64)
+    known = np.isfinite(depth) & ~_at_edge(view.depth.depth_m, place)
+    return corners[known], rays(view.K, corners[known]) * depth[known, None]
+
+
+def _at_edge(depth: F32, place: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Bool:
+    """(N,) True next to a depth edge or a hole, where a corner's depth is anyone's guess."""
+    h, w = depth.shape
+    here = depth[place[:, 1], place[:, 0]]
+    spread = np.zeros(len(place))
+    for dv, du in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        v, u = np.clip(place[:, 1] + dv, 0, h - 1), np.clip(place[:, 0] + du, 0, w - 1)
+        spread = np.maximum(spread, np.abs(depth[v, u] - here))
+    return np.asarray(~(spread < 0.03 * here))
+
+
+def warps(K_a: F64, K_b: F64, T_b_a: F64, uv: F64, points: F64) -> F64:
+    """(N, 2, 2) maps of offsets about landmarks in a to offsets in b, all of one slope.
+
+    Each landmark's surface is taken to be parallel to the plane that most of them lie on, so
+    that two oblique views of the ground from opposite sides still compare like with like.
+    """
+    normal = plane_normal(points)
+    level = np.sum(points * normal, axis=1)
+    out = np.empty((len(uv), 2, 2))
+    here = project(K_b, se3.transform(T_b_a, points))
+    for axis in range(2):
+        ways = rays(K_a, uv + 8.0 * np.eye(2)[axis])
+        slope = ways @ normal
+        beside = ways * (level / np.where(np.abs(slope) > 1e-6, slope, np.nan))[:, None]
+        out[:, :, axis] = (project(K_b, se3.transform(T_b_a, beside)) - here) / 8.0
+    return out
+
+
+def _pose(
+    pyramids: tuple[matching.Pyramid, ...], uv: F64, points: F64, predicted: F64, warp: F64,
+    b: LoopView, prior: F64 | None, config: LoopConfig,
+) -> pnp.PnpResult | None:  # fmt: skip
+    """EPnP pose of b from a's landmarks found in it."""
+    radius = config.search_share * b.gray.shape[1]
+    found = matching.match(
+        pyramids[0], uv, pyramids[1], predicted, radius, warp, config.matching
+    )  # fmt: skip
+    if np.count_nonzero(found.ok) < config.min_matches:
+        return None
+    seen = found.uv_px[found.ok].astype(np.float64)
+    solved = pnp.solve(points[found.ok], seen, b.K, config.pnp, prior)
+    if solved is None or solved.inlier_share < 0.5:
+        return None
+    return solved
+
+
+def _with_icp(
+    a: LoopView, b: LoopView, T_a_b: F64, covariance: F64, solved: pnp.PnpResult,
+    config: LoopConfig,
+) -> LoopClosure | None:  # fmt: skip
+    """The loop after the depth maps had their say; None when they contradict."""
+    growth = _growth(a, b, T_a_b)
+    if growth is None:
+        return None
+    b = replace(b, depth=_grown(b.depth, growth))
+    count = int(np.count_nonzero(solved.inliers))
+    # Depths of one keyframe err together, which the pixels do not show.
+    depth = float(np.nanmedian(a.depth.depth_m))
+    sigma = float(np.nanmedian(a.depth.sigma_m))
+    covariance = covariance + np.diag([(sigma / depth) ** 2 * 0.01] * 3 + [(0.3 * sigma) ** 2] * 3)
+    aligned = register_projective(b.depth, a.depth, T_a_b, config.icp)
+    if not aligned.converged:
+        return None
+    difference = se3.log(aligned.T_target_source @ se3.inverse(T_a_b))
+    spread = covariance + aligned.covariance
+    if float(difference @ np.linalg.solve(spread, difference)) / 6.0 > config.max_disagreement:
+        return None
+    T, covariance = se3.average(T_a_b, covariance, aligned.T_target_source, aligned.covariance)
+    covariance = covariance + np.diag([LEAST_RAD**2] * 3 + [(LEAST_SHARE * sigma) ** 2] * 3)
+    return LoopClosure(T, covariance, count, ("epnp", "icp"), growth)
+
+
+def _growth(a: LoopView, b: LoopView, T_a_b: F64) -> float | None:
+    """Median ratio of a's depths to b's where both see the same; None with too few."""
+    h, w = a.depth.depth_m.shape
+    v, u = np.mgrid[0:h:4, 0:w:4].reshape(2, -1)
+    depth = a.depth.depth_m[v, u].astype(np.float64)
+    known = np.isfinite(depth)
+    points = rays(a.depth.K, np.column_stack([u, v])[known].astype(np.float64))
+    there = se3.transform(se3.inverse(T_a_b), points * depth[known, None])
+    pixel = project(b.depth.K, there)
+    h, w = b.depth.depth_m.shape
+    inside = (pixel >= 0).all(axis=1) & (pixel <= [w - 1, h - 1]).all(axis=1) & (there[:, 2] > 0)
+    at = np.rint(pixel[inside]).astype(np.int64)
+    ratio = there[inside, 2] / b.depth.depth_m[at[:, 1], at[:, 0]]
+    ratio = ratio[np.isfinite(ratio)]
+    return float(np.median(ratio)) if len(ratio) >= 50 else None
+
+
+def _grown(depth: DepthMap, growth: float) -> DepthMap:
+    factor = np.float32(growth)
+    return replace(depth, depth_m=depth.depth_m * factor, sigma_m=depth.sigma_m * factor)

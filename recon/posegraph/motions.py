@@ -1,0 +1,152 @@
+"""Motions between keyframes as factors of the pose graph: vision's, or telemetry's without it.
+
+A segment that has a frame in the world leaves its scale open, block by block of keyframes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from recon import se3
+from recon.posegraph import factors as graph_factors
+from recon.posegraph.between_keyframes import carried
+from recon.posegraph.factors import pose3
+from recon.posegraph.readings import BLOCK
+from recon.posegraph.records import Node, PoseGraphConfig
+from recon.posegraph.segment_frames import SegmentFrames
+from recon.posegraph.smoother import SCALAR, Smoother
+from recon.types import F64
+
+VELOCITY_S = 1.0
+FASTEST_M_S = 100.0
+
+
+class Motions:
+    """Adds the motions of one graph to its smoother, and knows which scale each keyframe has."""
+
+    def __init__(
+        self,
+        config: PoseGraphConfig,
+        smoother: Smoother,
+        segments: SegmentFrames,
+        counts: Counter[str],
+    ) -> None:
+        """``counts`` takes in the stretches without vision."""
+        import gtsam
+
+        self._gtsam = gtsam
+        self._config, self._smoother = config, smoother
+        self._segments, self._counts = segments, counts
+        self.scale_of: list[int] = []  # key of each keyframe's scale; 0 while it has none
+        self._blocks: dict[int, tuple[list[int], int, int]] = {}
+        # keys of scales, keyframe of the last, and how many keyframes that block stands for
+
+    def first(self, node: Node) -> tuple[F64, F64]:
+        """Pose and covariance of the first keyframe: loose where readings will tell.
+
+        The gauge that no reading ever fixes is held at the start.
+        """
+        frame = self._segments.frame(node.segment)
+        T = frame.pose(node.T_odom_camera)
+        sigma_t, sigma_r = 0.01, 1.0 if node.prior.R_world_camera is not None else 0.01
+        if "gnss" in frame.sources:  # places along a line do not tell the roll about it
+            known = float(np.sqrt(np.linalg.eigvalsh(frame.covariance[:3, :3])[-1]))
+            sigma_t, sigma_r = 50.0, max(sigma_r, min(known, 1.0))
+        sigma = np.array([sigma_r] * 3 + [sigma_t] * 3)
+        noise = self._gtsam.noiseModel.Diagonal.Sigmas(sigma)
+        self._smoother.add(self._gtsam.PriorFactorPose3(node.key, pose3(T), noise), "prior")
+        return T, graph_factors.left_covariance(T, np.diag(sigma**2))
+
+    def add(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
+        """T_last_node in metres and its (6, 6) covariance, left, in last's frame; now a factor."""
+        if node.segment == last.segment:
+            motion, covariance = self._seen(node, last)
+        else:
+            motion, covariance = self._link(node, last, T_last)
+        self._connect(node, last, motion, covariance)
+        return motion, covariance
+
+    def scale_key(self, node: Node) -> int:
+        """Key of the node's scale, a new one every twenty keyframes; made when missing.
+
+        Blocks keep the smoother incremental: one variable for the whole flight would tie every
+        keyframe to the newest reading.
+        """
+        gtsam = self._gtsam
+        keys, since, held = self._blocks.get(node.segment, ([], 0, 0))
+        if keys and node.key - since < BLOCK:
+            if self.scale_of[node.key] != keys[-1]:
+                self._blocks[node.segment] = (keys, since, held + node.weight)
+            self.scale_of[node.key] = keys[-1]
+            return keys[-1]
+        key = int(gtsam.symbol(SCALAR, len(keys) + 1_000_000 * node.segment))
+        one = gtsam.noiseModel.Isotropic
+        if keys:
+            value = self._smoother.scalar(keys[-1])
+            walk = self._config.sigma_scale_walk * float(np.sqrt(max(1.0, held / BLOCK)))
+            hold = gtsam.BetweenFactorVector(keys[-1], key, np.zeros(1), one.Sigma(1, walk))
+        else:
+            value, sigma = 0.0, self._config.sigma_scale
+            hold = gtsam.PriorFactorVector(key, np.zeros(1), one.Sigma(1, sigma))
+        self._smoother.add(hold, "scale")
+        self._smoother.add_scalar(key, value)
+        self._blocks[node.segment] = ([*keys, key], node.key, node.weight)
+        self.scale_of[node.key] = key
+        return key
+
+    def _connect(self, node: Node, last: Node, motion: F64, covariance: F64) -> None:
+        """The motion between two keyframes; of an aligned segment, with its scale left open."""
+        gtsam = self._gtsam
+        noise = gtsam.noiseModel.Gaussian.Covariance(
+            graph_factors.right_covariance(motion, covariance)
+        )
+        if node.segment != last.segment or self._segments.known(node.segment) is None:
+            kind = "vision" if node.segment == last.segment else "link"
+            factor = gtsam.BetweenFactorPose3(last.key, node.key, pose3(motion), noise)
+            self._smoother.add(factor, kind)
+            return
+        keys = [last.key, node.key, self.scale_key(node)]
+        error = graph_factors.scaled_motion_error(motion)
+        self._smoother.add(gtsam.CustomFactor(noise, keys, error), "vision")
+
+    def _seen(self, node: Node, last: Node) -> tuple[F64, F64]:
+        """Vision's motion."""
+        frame = self._segments.frame(node.segment)
+        motion = se3.inverse(frame.pose(last.T_odom_camera)) @ frame.pose(node.T_odom_camera)
+        units = np.array([1.0] * 3 + [frame.scale] * 3)
+        covariance = node.covariance * np.outer(units, units) + np.diag([1e-10] * 3 + [1e-6] * 3)
+        covariance[3:, 3:] += self._config.sigma_step**2 * np.outer(motion[:3, 3], motion[:3, 3])
+        return motion, covariance
+
+    def _link(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
+        """Dead reckoning where vision was lost: telemetry's motion, else the last one's, wide."""
+        self._counts["stretch without vision"] += 1
+        passed_s = (node.time_ns - last.time_ns) * 1e-9
+        frame = self._segments.known(node.segment)
+        if frame is not None and self._segments.is_tied(node.segment):
+            T = frame.pose(node.T_odom_camera)
+        elif node.over is not None:
+            T = T_last @ node.over
+        else:
+            priors = self._segments.at_camera(last), self._segments.at_camera(node)
+            T = carried(*priors, T_last, self._velocity(last, T_last), passed_s)
+        prior = node.prior
+        is_turn_known = prior.R_world_camera is not None and prior.sigma_yaw_rad < 1.0
+        sigma_r = self._config.sigma_link_rad if is_turn_known else 1.5
+        sigma_m = self._config.sigma_link_m * max(passed_s, 1.0) + 5.0
+        motion = se3.inverse(T_last) @ T
+        # Where it went and how it turned are told apart: the one does not swing by the other.
+        apart = np.diag(np.square([sigma_r] * 3 + [sigma_m] * 3))
+        return motion, graph_factors.left_covariance(motion, apart)
+
+    def _velocity(self, last: Node, T_last: F64) -> F64 | None:
+        """(3,) m/s at a segment's keyframe, over a second or more; None at its start, and where
+        no aircraft is so fast: a camera about to fail stamps pictures anyhow."""
+        for node in reversed(self._segments.nodes[last.segment]):
+            passed_s = (last.time_ns - node.time_ns) * 1e-9
+            if node.key < last.key and passed_s >= VELOCITY_S:
+                velocity = (T_last[:3, 3] - self._smoother.pose(node.key)[:3, 3]) / passed_s
+                return velocity if np.linalg.norm(velocity) < FASTEST_M_S else None
+        return None

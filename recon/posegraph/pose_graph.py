@@ -1,0 +1,391 @@
+"""One consistent trajectory: vision, attitude, altitude, GNSS and loops in one pose graph.
+
+A pose per keyframe, in the world and in metres. Vision gives the motion between keyframes; a
+segment's frame is brought to the world by one similarity from all its telemetry
+(:mod:`recon.posegraph.alignment`), because a frame with a wrong heading or scale would be sheared
+by single readings. About that similarity the graph bends the track as far as the readings, each
+with its own wander, and the loops outweigh vision.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from recon import se3
+from recon.posegraph import factors as graph_factors
+from recon.posegraph.alignment import Scale, Similarity
+from recon.posegraph.factors import pose3
+from recon.posegraph.loop_book import Edge, LoopBook
+from recon.posegraph.motions import Motions
+from recon.posegraph.readings import Readings, is_frozen
+from recon.posegraph.records import Loop, Node, PoseGraphConfig
+from recon.posegraph.segment_frames import SegmentFrames
+from recon.posegraph.sensor_offsets import Constants
+from recon.posegraph.smoother import ROUNDS, Smoother, moved_covariance
+from recon.posegraph.thinning import GONE_SHARE, thin
+from recon.types import F64, Pose, PosePrior
+
+__all__ = ["Edge", "PoseGraph", "PoseGraphConfig"]
+
+log = logging.getLogger(__name__)
+
+SOURCES = ("vision", "attitude", "altitude", "gnss", "loop", "dead reckoning")
+
+
+class PoseGraph:
+    """Keyframe poses in the world, corrected as evidence comes in.
+
+    Poses, motions and covariances use this package's conventions (left perturbations).
+    """
+
+    def __init__(self, config: PoseGraphConfig | None = None) -> None:
+        """An empty graph."""
+        self.config = config or PoseGraphConfig()
+        self._kept_counts: Counter[str] = Counter()  # of what happens once, whatever is rebuilt
+        self._nodes: dict[int, Node] = {}  # by keyframe number, in order of time
+        self._thin_at = self.config.most_nodes
+        self.entered = 0  # keyframes, whether they are nodes or not
+        self.generation = 0  # how often nodes were thinned out
+        self._segments = SegmentFrames(
+            self.config.least_anchors, self.config.fix_s, self.config.attitude_s
+        )
+        self._book = LoopBook(self.config, self)
+        self._built = 0
+        self._start()
+
+    # ---- what goes in --------------------------------------------------------------------------
+
+    def add_keyframe(
+        self,
+        seq: int,
+        time_ns: int,
+        segment: int,
+        T_odom_camera: F64,
+        covariance: F64,
+        prior: PosePrior,
+        height: tuple[float, float] | None = None,
+    ) -> Pose:
+        """The new keyframe's pose after all that is known.
+
+        Of more than ``most_nodes`` some older ones stop being nodes: their motions are those of
+        the nodes beside them (:mod:`recon.posegraph.thinning`), and all is built anew.
+
+        Args:
+            seq: number of the keyframe; greater than those before.
+            segment: stretch of unbroken vision; each has an odometry frame of its own.
+            T_odom_camera: (4, 4) in the segment's frame.
+            covariance: (6, 6) of the motion since the last keyframe, a left perturbation in
+                the last camera's frame, in units of the odometry.
+            prior: telemetry's word on this moment; parts may be missing.
+            height: above ground as :func:`recon.posegraph.alignment.height_above` gives it.
+        """
+        if self._nodes and seq <= next(reversed(self._nodes)):
+            raise ValueError(f"keyframe {seq} does not come after {next(reversed(self._nodes))}")
+        if T_odom_camera.shape != (4, 4) or covariance.shape != (6, 6):
+            raise ValueError("T_odom_camera must be (4, 4) and covariance (6, 6)")
+        above, lean = height if height is not None else (None, 0.0)
+        node = Node(
+            seq, len(self._nodes), time_ns, segment, np.array(T_odom_camera, np.float64),
+            np.array(covariance, np.float64), self._fresh(prior), above, lean,
+        )  # fmt: skip
+        last = self._newest() if self._nodes else None
+        self._keep(node)
+        is_refitted = self._segments.refit(segment, self._smoother.pose)
+        if len(self) >= self._thin_at:
+            self._thin()
+        elif is_refitted:
+            self.rebuild()
+        else:
+            try:
+                self._insert(node, last)
+                self._smoother.update()
+            except RuntimeError:
+                self.rebuild()
+        return self.pose(seq)
+
+    def add_loop(self, a: int, b: int, T_a_b: F64, covariance: F64, growth: float = 1.0) -> bool:
+        """True when the loop bent the graph; False while it waits for another that agrees.
+
+        ``T_a_b`` (4, 4) in metres between the cameras of keyframes ``a`` and ``b``, with a
+        ``covariance`` (6, 6) as a left perturbation in a's frame; ``growth`` is what b's depths
+        must be multiplied by to fit a's. One loop alone is not believed: a repeated texture
+        gives perfect matches at the wrong place. A second one nearby must close the same circle.
+        """
+        if a not in self._nodes or b not in self._nodes or a == b:
+            raise ValueError(f"keyframes {a} and {b} are not two of the graph")
+        if a > b:
+            a, b, growth = b, a, 1.0 / growth
+            T_a_b, covariance = graph_factors.reversed_motion(T_a_b, covariance)
+        scale = self.scale(a)
+        ratio = growth * self.scale(b) / scale
+        loop = Loop(a, b, T_a_b, covariance, ratio).scaled(1.0 / scale)
+        fresh = self._book.offer(loop)
+        if not fresh:
+            return False
+        if self._tie(loop):
+            self.rebuild()
+            return True
+        try:
+            for item in fresh:
+                self._add_loop_factor(item)
+            self._smoother.update(now=True, rounds=ROUNDS)
+        except RuntimeError:
+            self.rebuild()
+        return True
+
+    def solve(self) -> None:
+        """Fit every segment's frame once more to all its telemetry, and build all anew."""
+        for segment, nodes in self._segments.nodes.items():
+            if self._segments.forget(segment) and nodes[0].key > 0:
+                self.rebuild()  # so that the segment's start is known
+                if any(self._tie(loop) for loop in self._book.into(segment)):
+                    continue
+            self._segments.refit(segment, self._smoother.pose)
+        self.rebuild()
+
+    # ---- what comes out ------------------------------------------------------------------------
+
+    @property
+    def aligned(self) -> bool:
+        """True when the newest segment's frame is the world's, by fixes."""
+        return bool(self._nodes) and self._segments.rests_on_fixes(self._newest().segment)
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Readings and loops left out, by reason."""
+        return self._kept_counts + self._book.counts + self._left_out
+
+    @property
+    def loops(self) -> list[Edge]:
+        """All loops that were offered."""
+        return self._book.edges()
+
+    @property
+    def seqs(self) -> list[int]:
+        """Numbers of the nodes, in order."""
+        return list(self._nodes)
+
+    def metric_loops(self) -> list[Loop]:
+        """Accepted loops with lengths in metres, by the scale known now."""
+        return [loop.scaled(self.scale(loop.a)) for loop in self._book.taken]
+
+    def similarity(self, segment: int) -> Similarity | None:
+        """What brings a segment's odometry to the world; None before telemetry or a loop does."""
+        return self._segments.known(segment)
+
+    def constants(self) -> Constants:
+        """What the sensors are constantly off by, as known for the newest segment."""
+        return self._segments.constants(self._newest().segment) if self._nodes else Constants()
+
+    def is_tied(self, segment: int) -> bool:
+        """True when fixes or a loop tell where the segment lies."""
+        return self._segments.is_tied(segment)
+
+    def node(self, seq: int) -> Node:
+        """What is known of keyframe ``seq``. Raises KeyError for an unknown one."""
+        return self._nodes[seq]
+
+    def __contains__(self, seq: int) -> bool:
+        return seq in self._nodes
+
+    def __len__(self) -> int:
+        return len(self._nodes)
+
+    def place(self, seq: int) -> F64:
+        """(4, 4) T_world_camera of keyframe ``seq``."""
+        return self._smoother.pose(self._nodes[seq].key)
+
+    def path_m(self, a: int, b: int) -> float:
+        """Metres flown from keyframe ``a`` to the later ``b``."""
+        return self._path[self._nodes[b].key] - self._path[self._nodes[a].key]
+
+    def pose(self, seq: int) -> Pose:
+        """The pose of keyframe ``seq`` with its covariance and sources."""
+        node = self._nodes[seq]
+        T, covariance = self._smoother.state(node.key)
+        return Pose(T, covariance, self.sources(seq))
+
+    def scale(self, seq: int) -> float:
+        """Metres per unit of the odometry at keyframe ``seq``."""
+        node = self._nodes[seq]
+        key = self._motions.scale_of[node.key]
+        return self._segments.frame(node.segment).scale * float(
+            np.exp(self._smoother.scalar(key) if key else 0.0)
+        )
+
+    def poses(self) -> dict[int, F64]:
+        """(4, 4) T_world_camera of every node."""
+        return dict(zip(self._nodes, self._smoother.poses(), strict=True))
+
+    @property
+    def version(self) -> int:
+        """Changes whenever poses told before may be others now."""
+        return self._built * 1_000_000 + self._smoother.updates
+
+    def pose_array(self) -> F64:
+        """(N, 4, 4) T_world_camera in the order of the keyframes."""
+        return self._smoother.poses()
+
+    def sources(self, seq: int) -> tuple[str, ...]:
+        """What keyframe ``seq`` rests on."""
+        used = self._sources[self._nodes[seq].key]
+        return tuple(name for name in SOURCES if name in used)
+
+    def scales(self) -> F64:
+        """(N,) metres per unit of the odometry, in the order of the keyframes."""
+        blocks, block = np.unique(np.array(self._motions.scale_of, np.int64), return_inverse=True)
+        drift = np.array([self._smoother.scalar(int(key)) if key else 0.0 for key in blocks])
+        frames = [
+            np.full(len(nodes), self._segments.frame(segment).scale)
+            for segment, nodes in self._segments.nodes.items()
+        ]
+        return np.asarray(np.concatenate(frames) * np.exp(drift[block]))
+
+    def residuals(self) -> dict[str, F64]:
+        """Whitened residuals by kind of factor: "vision", "attitude", "position", "altitude",
+        "height", "loop", "link" and "prior"; (n, dimension) each."""
+        self._smoother.update(now=True)
+        return self._smoother.residuals()
+
+    def newest_scales(self) -> tuple[Scale | None, Scale | None]:
+        """The newest segment's scale by fixes alone and by heights alone."""
+        return self._segments.scales(self._newest().segment) if self._nodes else (None, None)
+
+    # ---- building ------------------------------------------------------------------------------
+
+    def _start(self, careful: bool = False) -> None:
+        import gtsam
+
+        self._gtsam = gtsam
+        self._built += 1
+        self._smoother = Smoother(careful)
+        self._left_out: Counter[str] = Counter()
+        times = [n.time_ns for n in self._nodes.values()]
+        span_s = (times[-1] - times[0]) * 1e-9 if times else 0.0
+        self._readings = Readings(
+            self.config, self._smoother, self._left_out, len(times), span_s,
+            self._segments.altitude_offset(),
+        )  # fmt: skip
+        self._motions = Motions(self.config, self._smoother, self._segments, self._left_out)
+        self._sources: list[set[str]] = []
+        self._path: list[float] = []  # m flown up to each keyframe
+
+    def rebuild(self) -> None:
+        """Make the whole graph anew from all readings and the segments' present frames.
+
+        Where full steps lead nowhere it is made once more with careful ones.
+        """
+        try:
+            self._make()
+            if self._smoother.is_sound():
+                return
+            why = "its scales went astray"
+        except RuntimeError as error:  # GTSAM: an indeterminate system, by steps gone wild
+            why = " ".join(str(error).split()[:9])
+        log.warning("the pose graph is solved again, carefully: %s", why)
+        self._kept_counts["solved again"] += 1
+        self._make(careful=True)
+        if not self._smoother.is_sound():
+            self._kept_counts["solved badly"] += 1
+
+    def _make(self, careful: bool = False) -> None:
+        self._start(careful)
+        last: Node | None = None
+        for node in self._nodes.values():
+            self._insert(node, last)
+            last = node
+        for loop in self._book.taken:
+            self._add_loop_factor(loop)
+        self._smoother.update(now=True, rounds=ROUNDS)
+
+    def _thin(self) -> None:
+        """Let some of the older keyframes ride on their neighbours, and build anew."""
+        poses = dict(zip(self._nodes, self._smoother.poses(), strict=False))  # but the newest
+        done = thin(list(self._nodes.values()), self._refused(), poses)
+        nodes = done.nodes
+        self._kept_counts["keyframe let go"] += len(done.let_go)
+        self._nodes = {node.seq: node for node in nodes}
+        self._segments.thin(nodes)
+        self._book.thin(done.marginalised, done.let_go, len(nodes))
+        self._thin_at = max(self.config.most_nodes, int(len(nodes) * (1.0 + GONE_SHARE)))
+        self.generation += 1
+        self.rebuild()
+
+    def _refused(self) -> set[int]:
+        """Nodes whose fix was left out when the graph was built last."""
+        return {
+            node.seq
+            for node, used in zip(self._nodes.values(), self._sources, strict=False)
+            if node.prior.sigma_position_m is not None
+            and "gnss" not in used
+            and self._segments.rests_on_fixes(node.segment)
+        }
+
+    def _keep(self, node: Node) -> None:
+        self.entered += 1
+        self._nodes[node.seq] = node
+        self._segments.keep(node)
+
+    def _insert(self, node: Node, last: Node | None) -> None:
+        is_seen = last is None or last.segment == node.segment
+        self._sources.append({"vision" if is_seen else "dead reckoning"})
+        self._motions.scale_of.append(0)
+        self._path.append(self._path[-1] if self._path else 0.0)
+        if last is None:
+            T, spread = self._motions.first(node)
+        else:
+            T_last, spread_last = self._smoother.state(last.key)
+            motion, covariance = self._motions.add(node, last, T_last)
+            T = se3.project_to_so3(T_last @ motion)
+            self._path[-1] += float(np.linalg.norm(motion[:3, 3]))
+            spread = moved_covariance(spread_last, T_last, covariance)
+        self._smoother.add_pose(node.key, T, spread)
+        frame = self._segments.known(node.segment)
+        drift_m = None if frame is None else self.config.frame_drift * self._path[node.key]
+        node = self._segments.freed(node)
+        noise = self._segments.noise(node.segment)
+        used = self._readings.add(node, T, spread, drift_m, noise)
+        if frame is not None and self._readings.height(
+            node, self._motions.scale_key(node), frame.scale
+        ):
+            used.add("altitude")
+        self._sources[node.key] |= used
+
+    def _fresh(self, prior: PosePrior) -> PosePrior:
+        """The prior without its position when the receiver repeats its last one."""
+        if not self._nodes or not is_frozen(prior, self._newest().prior):
+            return prior
+        self._kept_counts["position at rest" if prior.is_at_rest else "position frozen"] += 1
+        return replace(prior, sigma_position_m=None)
+
+    # ---- loops ---------------------------------------------------------------------------------
+
+    def _tie(self, loop: Loop) -> bool:
+        """True when a loop between segments now places the later one, which no fix does."""
+        a, b = self._nodes[loop.a], self._nodes[loop.b]
+        if not self._book.enters(loop, b.segment) or self._segments.is_tied(b.segment):
+            return False
+        scale = self.scale(loop.a)
+        T = self._smoother.pose(a.key) @ loop.scaled(scale).T_a_b
+        R = T[:3, :3] @ b.T_odom_camera[:3, :3].T
+        scale *= loop.ratio
+        self._segments.tie(b.segment, scale, R, T[:3, 3] - scale * R @ b.T_odom_camera[:3, 3])
+        return True
+
+    def _add_loop_factor(self, loop: Loop) -> None:
+        a, b = self._nodes[loop.a].key, self._nodes[loop.b].key
+        loop = loop.scaled(self.scale(loop.a))
+        noise = self._gtsam.noiseModel.Gaussian.Covariance(
+            graph_factors.right_covariance(loop.T_a_b, loop.covariance)
+        )
+        self._sources[b].add("loop")
+        # Not robust: two loops agreed, and what closes late would lose its weight by its size.
+        factor = self._gtsam.BetweenFactorPose3(a, b, pose3(loop.T_a_b), noise)
+        self._smoother.add(factor, "loop")
+
+    def _newest(self) -> Node:
+        return next(reversed(self._nodes.values()))

@@ -1,0 +1,126 @@
+"""What the pose graph keeps of keyframes and loops, and its parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from recon import se3
+from recon.posegraph.sensor_noise import PRECISE_TAU_S
+from recon.types import F64, PosePrior
+
+LEAST_NODES = 50
+"""Of a pose graph's keyframes, what its bound may not go below."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseGraphConfig:
+    """Parameters of the pose graph."""
+
+    sigma_scale: float = 0.1  # of a segment's scale after its alignment, before the readings
+    sigma_scale_walk: float = 0.003  # change of the scale per twenty keyframes
+    sigma_step: float = 0.002  # of one vision motion, as a share of its length
+    least_anchors: int = 3  # keyframes of a segment before telemetry places it
+    fix_s: float = 60.0  # a receiver's error wanders with this time constant
+    precise_fix_s: float = PRECISE_TAU_S  # and that of an RTK fix, under 0.3 m, with this one
+    attitude_s: float = 40.0  # an attitude's
+    altitude_s: float = 120.0  # a barometer's
+    altitude_slack_m: float = 3.0  # beyond its gate, until a barometer is said to have stepped
+    blocks_per_height: float = 2.0  # heights over ground of so many blocks count as one
+    gate_sigmas: float = 5.0  # readings further from the prediction are left out
+    huber_sigmas: float = 1.5
+    sigma_link_m: float = 3.0  # per second without vision
+    sigma_link_rad: float = 0.3
+    frame_drift: float = 0.003  # of the path flown, what a track may leave its frame by
+    loop_drift: float = 0.05  # of the path between its ends; a loop off by more is impossible
+    loop_slack_m: float = 2.0  # and this
+    loop_turn_rad: float = 0.5
+    loop_window: int = 15  # keyframes within which two loops support each other
+    most_nodes: int = 100_000  # keyframes in the graph; of more, some ride on their neighbours
+
+    def __post_init__(self) -> None:
+        """Raise ValueError when a parameter makes no sense."""
+        for name in ("sigma_scale", "sigma_scale_walk", "sigma_step", "gate_sigmas",
+                     "huber_sigmas", "sigma_link_m", "sigma_link_rad"):  # fmt: skip
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if min(self.fix_s, self.precise_fix_s, self.attitude_s, self.altitude_s) < 0:
+            raise ValueError("time constants must not be negative")
+        if self.most_nodes < LEAST_NODES:
+            raise ValueError(f"most_nodes must be at least {LEAST_NODES}, got {self.most_nodes}")
+        if self.loop_window < 1 or self.least_anchors < 2:
+            raise ValueError("loop_window must be at least 1, least_anchors at least 2")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Node:
+    """One keyframe and what is known of it."""
+
+    seq: int
+    key: int  # in the graph
+    time_ns: int
+    segment: int
+    T_odom_camera: F64  # (4, 4) in the segment's chain
+    covariance: F64  # (6, 6) of the motion since the node before, left, in that camera's frame
+    prior: PosePrior
+    height: float | None = None  # above the ground that it sees, in odometry units
+    lean: float = 0.0  # 1 - cosine of how far off the vertical that ground is seen
+    weight: int = 1  # keyframes since the node before, this one among them
+    over: F64 | None = None  # (4, 4) m, motion since the node of another segment before it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Loop:
+    """A motion seen between two keyframes that are far apart in time.
+
+    Lengths are in units of the odometry at ``a``, so that a better scale moves them too.
+    """
+
+    a: int  # number of the earlier keyframe
+    b: int
+    T_a_b: F64  # (4, 4)
+    covariance: F64  # (6, 6) left perturbation in a's frame
+    ratio: float  # units of a's odometry in one of b's
+
+    @property
+    def ends(self) -> tuple[int, int]:
+        """Both keyframes, the earlier first."""
+        return self.a, self.b
+
+    def scaled(self, factor: float) -> Loop:
+        """The same with lengths multiplied by ``factor``."""
+        units = np.array([1.0] * 3 + [factor] * 3)
+        T = self.T_a_b.copy()
+        T[:3, 3] *= factor
+        return replace(self, T_a_b=T, covariance=self.covariance * np.outer(units, units))
+
+
+class SeenMotion(Protocol):
+    """A motion between two keyframes, whoever found it."""
+
+    @property
+    def T_a_b(self) -> F64:
+        """(4, 4)"""
+        ...
+
+    @property
+    def covariance(self) -> F64:
+        """(6, 6) left perturbation in a's frame."""
+        ...
+
+
+def loops_agree(one: SeenMotion, other: SeenMotion, T_a_a: F64, T_b_b: F64, limit: float) -> bool:
+    """True when two loops, joined by the track between their ends, close on themselves.
+
+    ``T_a_a`` takes the other's first camera to the one's, ``T_b_b`` the one's second to the
+    other's. The track is trusted to 3 % of its length; ``limit`` is of chi-square.
+    """
+    circle = T_a_a @ other.T_a_b @ T_b_b @ se3.inverse(one.T_a_b)
+    length = float(np.linalg.norm(T_a_a[:3, 3]) + np.linalg.norm(T_b_b[:3, 3]))
+    A = se3.adjoint(T_a_a)
+    slack = np.diag([0.01**2] * 3 + [(0.03 * length + 0.02) ** 2] * 3)
+    covariance = one.covariance + A @ other.covariance @ A.T + slack
+    error = se3.log(circle)
+    return bool(error @ np.linalg.solve(covariance, error) < limit)

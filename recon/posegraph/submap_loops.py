@@ -1,0 +1,212 @@
+"""Loops between keyframes of a finished flight, whose surfaces are known on both sides.
+
+Corners of one are found in the other's picture (ZSSD), and their places on both surfaces give
+the motion by a robust fit of points to points. That needs fewer matches than a pose from
+pixels, so it holds where little of two pictures is alike: oblique views from opposite sides.
+A kept keyframe holds only what was new when it was flown, so its view is first filled with the
+surface that its neighbours measured, brought over by the track between them.
+Arun et al. 1987, doi:10.1109/TPAMI.1987.4767965, with weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from recon import se3
+from recon.camera_model import project, rays
+from recon.posegraph.loop_closure import LoopClosure, LoopView, landmarks, warps
+from recon.tracking import matching
+from recon.types import F32, F64, Bool, DepthMap, Keyframe
+
+LEAST_RAD, LEAST_SHARE = 2e-4, 0.1
+"""A loop's sigmas are no less than this, and than this share of its depths' sigma."""
+
+
+@dataclass(frozen=True, slots=True)
+class SubmapLoopConfig:
+    """Parameters of the search; the track is near the truth already."""
+
+    least_gap: int = 10  # keyframes between the two ends
+    least_overlap: float = 0.2  # of the later view in the earlier one
+    search_shares: tuple[float, ...] = (0.03, 0.1)  # of the picture's width, tried in turn
+    min_matches: int = 14
+    min_inlier_share: float = 0.6
+    gate_sigmas: float = 3.0
+    pixel_sigma: float = 0.4  # of a match
+    least_spread: float = 0.02  # of the matches across their narrow side, of their distance
+    matching: matching.MatchingConfig = field(
+        default_factory=lambda: matching.MatchingConfig(
+            grid=50, ambiguity=0.9, max_zssd=0.6, max_return_px=0.7
+        )
+    )
+
+    def __post_init__(self) -> None:
+        """Raise ValueError when a parameter makes no sense."""
+        if self.least_gap < 1 or self.min_matches < 6:
+            raise ValueError("least_gap must be at least 1, min_matches at least 6")
+        if not 0 < self.least_overlap <= 1 or not all(0 < s <= 0.5 for s in self.search_shares):
+            raise ValueError("least_overlap must be in (0, 1], search_shares in (0, 0.5]")
+
+
+def verify_surfaces(
+    a: LoopView, b: LoopView, T_a_b_guess: F64, config: SubmapLoopConfig | None = None
+) -> LoopClosure | None:
+    """The motion between two keyframes that may see the same place, or None when they do not.
+
+    ``T_a_b_guess`` (4, 4) is the track's word. The covariance is of a left perturbation in a's
+    camera frame.
+    """
+    config = config or SubmapLoopConfig()
+    uv, points = landmarks(a, config.matching)
+    if len(uv) < config.min_matches:
+        return None
+    pyramids = [matching.Pyramid.build(v.gray, config.matching.search_levels) for v in (a, b)]
+    T_b_a = se3.inverse(T_a_b_guess)
+    predicted = project(b.K, se3.transform(T_b_a, points))
+    bent = warps(a.K, b.K, T_b_a, uv, points)
+    for share in config.search_shares:
+        radius = share * b.gray.shape[1]
+        found = matching.match(
+            pyramids[0], uv, pyramids[1], predicted, radius, bent, config.matching
+        )  # fmt: skip
+        closure = _fitted(a, b, points, found, T_a_b_guess, config)
+        if closure is not None:
+            return closure
+    return None
+
+
+def _fitted(
+    a: LoopView, b: LoopView, points: F64, found: matching.Matches, guess: F64,
+    config: SubmapLoopConfig,
+) -> LoopClosure | None:  # fmt: skip
+    there, known = _on_surface(b, found.uv_px.astype(np.float64))
+    ok = found.ok & known
+    if np.count_nonzero(ok) < config.min_matches:
+        return None
+    here, there = points[ok], there[ok]
+    sigma = _sigma(a, here, config) + _sigma(b, there, config)
+    T, inside = _rigid(here, there, sigma, guess, config.gate_sigmas)
+    count = int(np.count_nonzero(inside))
+    if count < config.min_matches or count < config.min_inlier_share * len(here):
+        return None
+    spread = np.linalg.svd(here[inside] - here[inside].mean(axis=0), compute_uv=False)
+    if spread[1] < config.least_spread * float(np.median(here[:, 2])) * np.sqrt(count):
+        return None
+    return LoopClosure(T, _covariance(T, here, there, sigma, inside), count, ("points",))
+
+
+def _on_surface(view: LoopView, uv: F64) -> tuple[F64, Bool]:
+    """(N, 3) surface points at pixels (N, 2) of the picture, and where there is one."""
+    h, w = view.depth.depth_m.shape
+    H, W = view.gray.shape
+    at = np.rint((uv + 0.5) * [w / W, h / H] - 0.5)
+    inside = ((at >= 0) & (at <= [w - 1, h - 1])).all(axis=1)
+    at = np.clip(np.nan_to_num(at), 0, [w - 1, h - 1]).astype(np.int64)
+    z = view.depth.depth_m[at[:, 1], at[:, 0]].astype(np.float64)
+    return rays(view.K, uv) * z[:, None], np.asarray(inside & np.isfinite(z))
+
+
+def _sigma(view: LoopView, points: F64, config: SubmapLoopConfig) -> F64:
+    """(N,) m of a point, by its depth's median sigma and a pixel's width there."""
+    own = float(np.nanmedian(view.depth.sigma_m))
+    return np.asarray(np.hypot(own, config.pixel_sigma * points[:, 2] / view.K[0, 0]))
+
+
+def _rigid(here: F64, there: F64, sigma: F64, guess: F64, gate: float) -> tuple[F64, Bool]:
+    """(4, 4) motion that takes ``there`` to ``here``, and which pairs (N,) it holds for."""
+    T = guess.copy()
+    T[:3, 3] += np.median(here - se3.transform(T, there), axis=0)
+    inside = np.ones(len(here), bool)
+    for _ in range(15):
+        off = np.linalg.norm(here - se3.transform(T, there), axis=1) / sigma
+        limit = max(gate, 2.0 * float(np.median(off)))  # opens while the start is still off
+        weight = np.where(off < limit, (1.0 - (off / limit) ** 2) ** 2, 0.0) / sigma**2
+        if np.count_nonzero(weight) < 6:
+            return T, np.zeros(len(here), bool)
+        weight /= weight.sum()
+        centre_a, centre_b = weight @ here, weight @ there
+        H = (there - centre_b).T @ ((here - centre_a) * weight[:, None])
+        U, _, Vt = np.linalg.svd(H)
+        R = Vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
+        T = se3.compose(R, centre_a - R @ centre_b)
+    inside = np.linalg.norm(here - se3.transform(T, there), axis=1) < gate * sigma
+    return T, np.asarray(inside)
+
+
+def _covariance(T: F64, here: F64, there: F64, sigma: F64, inside: Bool) -> F64:
+    """(6, 6) of a left perturbation in a's frame, by the scatter that was left."""
+    moved = se3.transform(T, there[inside])
+    H = np.zeros((6, 6))
+    for p, s in zip(moved, sigma[inside], strict=True):
+        J = np.hstack([-se3.hat(p), np.eye(3)]) / s
+        H += J.T @ J
+    off = (here[inside] - moved) / sigma[inside, None]
+    variance = max(float(np.sum(off**2)) / max(3 * len(moved) - 6, 1), 0.3)
+    least = LEAST_SHARE * float(np.median(sigma))
+    floor = np.diag([LEAST_RAD**2] * 3 + [least**2] * 3)
+    return np.asarray(variance * np.linalg.inv(H) + floor)
+
+
+LEAST_NEIGHBOURS = 5
+"""Of a pixel's eight, that must be known for it to be filled."""
+
+
+def filled(own: Keyframe, others: Sequence[Keyframe]) -> Keyframe:
+    """``own`` with the nearest surface of ``others`` as its camera sees it, in depth and colour.
+
+    Every depth's ``T_world_camera`` counts. What ``own`` measured itself stays; holes of single
+    pixels are closed, and what nobody measured is black.
+    """
+    at = own.depth
+    h, w = at.depth_m.shape
+    T_own_world = se3.inverse(at.T_world_camera)
+    layers = np.full((h, w, 5), np.nan, np.float32)  # depth, sigma, colour
+    rows = [_rows(one, T_own_world @ one.depth.T_world_camera) for one in others]
+    if rows:
+        points, values = (np.concatenate(part) for part in zip(*rows, strict=True))
+        uv = np.rint(project(at.K, points))
+        inside = (uv >= 0).all(axis=1) & (uv <= [w - 1, h - 1]).all(axis=1)
+        points, values, uv = points[inside], values[inside], uv[inside].astype(np.int64)
+        order = np.argsort(-points[:, 2])  # the nearest is written last
+        layers[uv[order, 1], uv[order, 0]] = values[order]
+        layers[..., 0][uv[order, 1], uv[order, 0]] = points[order, 2]
+        layers = _closed(layers)
+    known = np.isfinite(at.depth_m)
+    layers[known, 0], layers[known, 1] = at.depth_m[known], at.sigma_m[known]
+    layers[known, 2:] = own.bgr[known]
+    views = np.where(np.isfinite(layers[..., 0]), np.maximum(at.views, 2), 0).astype(np.uint8)
+    depth = DepthMap(layers[..., 0].copy(), layers[..., 1].copy(), views, at.K, at.T_world_camera)
+    bgr = np.nan_to_num(layers[..., 2:], nan=0.0).astype(np.uint8)
+    return replace(own, depth=depth, bgr=np.ascontiguousarray(bgr))
+
+
+def _rows(one: Keyframe, T: F64) -> tuple[F64, F32]:
+    """(N, 3) points after ``T`` (4, 4) and (N, 5) their depth, sigma and colour."""
+    v, u = np.nonzero(np.isfinite(one.depth.depth_m))
+    points, sigma = points_of(one.depth, T)
+    return points, np.column_stack([points[:, 2], sigma, one.bgr[v, u]]).astype(np.float32)
+
+
+def points_of(depth: DepthMap, T: F64) -> tuple[F64, F64]:
+    """(N, 3) points of a depth map, taken on by ``T`` (4, 4) from its camera, and (N,) sigmas."""
+    v, u = np.nonzero(np.isfinite(depth.depth_m))
+    z = depth.depth_m[v, u].astype(np.float64)
+    points = rays(depth.K, np.column_stack([u, v]).astype(np.float64)) * z[:, None]
+    return se3.transform(T, points), depth.sigma_m[v, u].astype(np.float64)
+
+
+def _closed(layers: F32) -> F32:
+    """The layers (h, w, C) with single unknown pixels set to the median of their neighbours."""
+    padded = np.pad(layers, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
+    v, u = np.nonzero(np.isnan(layers[..., 0]))
+    around = np.array(
+        [padded[v + dv, u + du] for dv in range(3) for du in range(3) if (dv, du) != (1, 1)]
+    )
+    enough = np.count_nonzero(np.isfinite(around[..., 0]), axis=0) >= LEAST_NEIGHBOURS
+    out: F32 = layers.copy()
+    if enough.any():
+        out[v[enough], u[enough]] = np.nanmedian(around[:, enough], axis=0)
+    return out

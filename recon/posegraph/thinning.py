@@ -1,0 +1,241 @@
+"""A pose graph's keyframes thinned out: fewer nodes over the same track.
+
+A keyframe that stops being a node hands its motion to the next one: motions are composed, and
+so are their covariances (Barfoot, State Estimation for Robotics, 2017, section 7.3). Loops that
+ended at it end at the node before it, moved there by vision. Its fix goes into the mean of the
+next node's; other readings of it go. Readings are weighed by how many of them there are in the
+time flown (:mod:`recon.posegraph.readings`), so those that stay then weigh more.
+
+Where segments are so many and short that this finds too few, whole segments are let go, those
+first that leave the smallest holes. Their keyframes stay where they were told to be; their
+readings and loops are gone.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby, pairwise
+
+import numpy as np
+
+from recon import se3
+from recon.posegraph.factors import reversed_motion
+from recon.posegraph.records import Loop, Node
+from recon.types import F64, PosePrior
+
+NEWEST_SHARE = 0.25
+"""Of the nodes, the newest, which always stay: vision's next motions and loops hang on them."""
+
+GONE_SHARE = 0.25
+"""Of the nodes, how many go at once, so that building anew is seldom due."""
+
+MOST_WORSE = 2.0
+"""A fix whose sigma is so many times that of another spoils their mean."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Marginalised:
+    """A keyframe that hangs on the node before it."""
+
+    node: int  # number of that node
+    T_node_camera: F64  # (4, 4) in units of the odometry
+    covariance: F64  # (6, 6) of that motion, left, in the node's frame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Thinned:
+    """A graph's nodes after it was thinned out."""
+
+    nodes: list[Node]  # that stay, with keys that follow each other
+    marginalised: dict[int, Marginalised]  # by number, those that hang on the node before them
+    let_go: set[int]  # numbers of those that went with their whole segment
+
+
+def thin(nodes: Sequence[Node], refused: Collection[int], poses: Mapping[int, F64]) -> Thinned:
+    """Thin out a graph in which nodes have these ``poses`` (4, 4) T_world_camera, the newest
+    perhaps none yet, and which leaves the fixes of the ``refused`` out."""
+    nodes = without(nodes, refused)
+    gone = surplus(nodes)
+    kept, marginalised = thinned(nodes, gone)
+    return Thinned(over_gaps(kept, poses), marginalised, gone - marginalised.keys())
+
+
+def surplus(nodes: Sequence[Node]) -> set[int]:
+    """Numbers of those that can go: from where nodes stand closest, never two neighbours.
+
+    The first and the last of each segment stay, and so do the newest. When those are too many,
+    whole segments go.
+    """
+    found, wanted = [], GONE_SHARE * len(nodes)
+    old = len(nodes) - max(2, int(NEWEST_SHARE * len(nodes)))
+    for i in range(1, old):
+        before, node, after = nodes[i - 1 : i + 2]
+        if before.segment == node.segment == after.segment:
+            found.append((node.weight + after.weight, i))
+    gone: set[int] = set()
+    for _, i in sorted(found):
+        if len(gone) >= wanted:
+            break
+        if i - 1 not in gone and i + 1 not in gone:
+            gone.add(i)
+    for segment in _smallest_holes_first(nodes, old):
+        if len(gone) >= wanted:
+            break
+        if segment[0] - 1 not in gone and segment[-1] + 1 not in gone:
+            gone.update(segment)
+    return {nodes[i].seq for i in gone}
+
+
+def thinned(nodes: Sequence[Node], gone: set[int]) -> tuple[list[Node], dict[int, Marginalised]]:
+    """The nodes that stay, with keys that follow each other, and where the others hang.
+
+    Those of segments of which nothing stays hang nowhere.
+    """
+    kept: list[Node] = []
+    marginalised: dict[int, Marginalised] = {}
+    left: Node | None = None
+    for node in nodes:
+        if node.seq in gone:
+            last = kept[-1]
+            if node.segment != last.segment:
+                continue
+            T = se3.inverse(last.T_odom_camera) @ node.T_odom_camera
+            marginalised[node.seq] = Marginalised(last.seq, T, node.covariance)
+            left = node
+            continue
+        if left is not None:
+            node = _joined(marginalised[left.seq], left, node)
+        kept.append(replace(node, key=len(kept)))
+        left = None
+    return kept, marginalised
+
+
+def over_gaps(nodes: Sequence[Node], poses: Mapping[int, F64]) -> list[Node]:
+    """The nodes, those that begin a segment with the motion since the node before as the
+    ``poses`` (4, 4) have it: from now on it rests on nothing that may be thinned out."""
+    out = list(nodes[:1])
+    for last, node in pairwise(nodes):
+        if node.segment != last.segment and node.seq in poses:
+            node = replace(node, over=se3.inverse(poses[last.seq]) @ poses[node.seq])
+        out.append(node)
+    return out
+
+
+def moved_loops(
+    loops: Sequence[Loop],
+    marginalised: Mapping[int, Marginalised],
+    let_go: Collection[int],
+    most: int,
+) -> list[Loop]:
+    """The loops between nodes that stay, or that others hang on: the surest of several between
+    the same two, and of more than ``most`` every second of the older half."""
+    best: dict[tuple[int, int], Loop] = {}
+    for loop in loops:
+        if loop.a in let_go or loop.b in let_go:
+            continue
+        moved = moved_loop(loop, marginalised)
+        if moved.a >= moved.b:
+            continue
+        known = best.get(moved.ends)
+        if known is None or _spread(moved) < _spread(known):
+            best[moved.ends] = moved
+    out = list(best.values())
+    while len(out) > most:
+        half = len(out) // 2
+        out = out[:half:2] + out[half:]
+    return out
+
+
+def moved_loop(loop: Loop, marginalised: Mapping[int, Marginalised]) -> Loop:
+    """The loop with its ends at the nodes that they hang on."""
+    if (one := marginalised.get(loop.a)) is not None:
+        A = se3.adjoint(one.T_node_camera)
+        covariance = one.covariance + A @ loop.covariance @ A.T
+        loop = replace(
+            loop, a=one.node, T_a_b=one.T_node_camera @ loop.T_a_b, covariance=covariance
+        )
+    if (other := marginalised.get(loop.b)) is not None:
+        units = np.array([1.0] * 3 + [loop.ratio] * 3)
+        T, covariance = reversed_motion(other.T_node_camera, other.covariance)
+        T[:3, 3] *= loop.ratio
+        A = se3.adjoint(loop.T_a_b)
+        covariance = loop.covariance + A @ (covariance * np.outer(units, units)) @ A.T
+        loop = replace(loop, b=other.node, T_a_b=loop.T_a_b @ T, covariance=covariance)
+    return loop
+
+
+def _smallest_holes_first(nodes: Sequence[Node], old: int) -> list[list[int]]:
+    """Indices of the segments among the first ``old`` nodes that may go whole; the first segment,
+    from which all is carried on, may not."""
+    groups = [list(group) for _, group in groupby(range(old), lambda i: nodes[i].segment)]
+    if groups and nodes[old].segment == nodes[old - 1].segment:
+        groups.pop()
+    return sorted(groups[1:], key=lambda group: nodes[group[-1] + 1].seq - nodes[group[0] - 1].seq)
+
+
+def without(nodes: Sequence[Node], refused: Collection[int]) -> list[Node]:
+    """The nodes without the fixes that the graph refused, unless most of a segment's were: among
+    fewer nodes one that is far off would weigh too much."""
+    seen = Counter(n.segment for n in nodes)
+    off = Counter(n.segment for n in nodes if n.seq in refused)
+    return [
+        replace(n, prior=replace(n.prior, sigma_position_m=None))
+        if n.seq in refused and 2 * off[n.segment] <= seen[n.segment]
+        else n
+        for n in nodes
+    ]
+
+
+def _joined(marginalised: Marginalised, left: Node, node: Node) -> Node:
+    """The node with the motion over ``left``, which goes, and with the mean of both's fixes."""
+    A = se3.adjoint(marginalised.T_node_camera)
+    return replace(
+        node,
+        covariance=left.covariance + A @ node.covariance @ A.T,
+        prior=_with_altitudes(_with_fix(node, left), left.prior),
+        weight=left.weight + node.weight,
+    )
+
+
+def _with_fix(node: Node, left: Node) -> PosePrior:
+    """The node's prior with the mean of both fixes, which is the fix of the mean place; with
+    that of ``left`` where it has none."""
+    one, other = node.prior, left.prior
+    if other.position_m is None or other.sigma_position_m is None:
+        return one
+    share, position_m = left.weight / (left.weight + node.weight), one.position_m
+    if position_m is None or one.sigma_position_m is None:
+        one = replace(one, sigma_position_m=other.sigma_position_m, above_m=None, above_fixes=0)
+        share, position_m = 1.0, other.position_m
+    elif np.any(other.sigma_position_m > MOST_WORSE * one.sigma_position_m):
+        return one
+    places = [_place_of_fix(n) for n in (node, left)]
+    place = places[0] + share * (places[1] - places[0])
+    return replace(
+        one,
+        position_m=position_m + share * (other.position_m - position_m),
+        fix_offset=se3.transform(se3.inverse(node.T_odom_camera), place[None])[0],
+    )
+
+
+def _place_of_fix(node: Node) -> F64:
+    """(3,) in the segment's odometry."""
+    offset = np.zeros(3) if node.prior.fix_offset is None else node.prior.fix_offset
+    return np.asarray(se3.transform(node.T_odom_camera, offset[None])[0])
+
+
+def _with_altitudes(prior: PosePrior, left: PosePrior) -> PosePrior:
+    """The prior with both means of the receiver's own altitude, weighed by their fixes."""
+    if left.above_m is None or left.above_fixes == 0 or left.sigma_position_m is None:
+        return prior
+    if prior.above_m is None or prior.sigma_position_m is None:
+        return prior
+    fixes = prior.above_fixes + left.above_fixes
+    mean = (prior.above_m * prior.above_fixes + left.above_m * left.above_fixes) / fixes
+    return replace(prior, above_m=mean, above_fixes=fixes)
+
+
+def _spread(loop: Loop) -> float:
+    return float(np.trace(loop.covariance))

@@ -1,0 +1,364 @@
+"""The keyframes' poses: chained from vision and ICP, placed in the world by the pose graph.
+
+A scan may break into segments (the camera lost its way and found it again elsewhere). Each
+segment has a chain of its own; the graph (:mod:`recon.posegraph.pose_graph`) holds them all in one
+frame.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from recon import se3
+from recon.posegraph.alignment import Similarity
+from recon.posegraph.interpolated import (
+    KEYFRAME,
+    Carrier,
+    change,
+    interpolated,
+    left,
+    moved_m,
+    whole,
+)
+from recon.posegraph.ledger import Ledger, MemoryLedger, Rows
+from recon.posegraph.pose_graph import PoseGraph
+from recon.types import F64, PosePrior
+
+AT_ONCE = 200
+"""Carried keyframes told in flight with one correction, about; the rest comes with the next."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryConfig:
+    """When corrected poses are worth telling."""
+
+    repose_m: float = 0.05  # a keyframe that moved or would move its ground by more
+    repose_sigmas: float = 0.1  # and by more than this share of the sigma, in flight
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A keyframe in the world."""
+
+    seq: int
+    T_world_camera: F64  # (4, 4)
+    scale: float  # metres per odometry unit: multiplies depths of the chain
+    covariance: F64  # (6, 6) left perturbation in the world
+    sources: tuple[str, ...]
+
+    @property
+    def sigma_m(self) -> float:
+        """Of the place, in all three directions together."""
+        return float(np.sqrt(np.trace(self.covariance[3:, 3:])))
+
+    def carry(self, T_key_camera: F64) -> Placed:
+        """A frame in the world by its pose relative to this keyframe (odometry units)."""
+        moved = T_key_camera.copy()
+        moved[:3, 3] *= self.scale
+        return replace(self, T_world_camera=self.T_world_camera @ moved)
+
+
+class _Published:
+    """Nodes as they were last published, as columns that grow."""
+
+    def __init__(self) -> None:
+        self.placed: list[Placed] = []
+        self.checked = -1  # version of the graph that they were compared with
+        self._row: dict[int, int] = {}
+        self._columns = np.zeros((64, 20))  # pose, scale, sigma, height, key
+
+    def __len__(self) -> int:
+        return len(self.placed)
+
+    def put(self, placed: Placed, key: int, height: float) -> None:
+        """Take a node's newest published pose; ``height`` in odometry units."""
+        row = self._row.setdefault(placed.seq, len(self.placed))
+        if row == len(self.placed):
+            self.placed.append(placed)
+        if row == len(self._columns):
+            self._columns = np.concatenate([self._columns, np.zeros_like(self._columns)])
+        self.placed[row] = placed
+        self._columns[row, :16] = placed.T_world_camera.ravel()
+        self._columns[row, 16:] = placed.scale, placed.sigma_m, height, key
+
+    def of(self, seq: int) -> Placed | None:
+        """A node as it was published; None before it was."""
+        row = self._row.get(seq)
+        return None if row is None else self.placed[row]
+
+    def thin(self, keys: dict[int, int]) -> None:
+        """Keep those that have a key in the graph."""
+        before, heights = self.placed, self._columns[: len(self), 18].copy()
+        self.placed, self._row = [], {}
+        for placed, height in zip(before, heights, strict=True):
+            if placed.seq in keys:
+                self.put(placed, keys[placed.seq], float(height))
+
+    @property
+    def keys(self) -> npt.NDArray[np.int64]:
+        """(N,) keys in the graph."""
+        return self._columns[: len(self), 19].astype(np.int64)
+
+    @property
+    def sigma(self) -> F64:
+        """(N,) m of the place."""
+        return self._columns[: len(self), 17]
+
+    def change(self, T: F64, scales: F64) -> F64:
+        """(N,) metres by which the keyframes or their ground are off, given where they are now."""
+        rows = self._columns[: len(self)]
+        return change(rows[:, :16].reshape(-1, 4, 4), rows[:, 16], rows[:, 18], T, scales)
+
+
+class Trajectory:
+    """Keyframe poses of one scan, segment by segment.
+
+    The graph may let keyframes go that it has no room for; they are carried by the nodes beside
+    them (:mod:`recon.posegraph.interpolated`), and little of each is kept, in a ledger.
+    """
+
+    def __init__(
+        self,
+        config: TrajectoryConfig | None = None,
+        graph: PoseGraph | None = None,
+        ledger: Ledger | None = None,
+    ) -> None:
+        """``graph`` places the keyframes; a :class:`PoseGraph` when left out. ``ledger`` takes
+        rows of :data:`recon.posegraph.interpolated.KEYFRAME`; memory when left out."""
+        self.config = config or TrajectoryConfig()
+        self.graph = PoseGraph() if graph is None else graph
+        self._ledger: Ledger = MemoryLedger(KEYFRAME) if ledger is None else ledger
+        self._published = _Published()
+        self._row: dict[int, int] = {}  # of the nodes, in the ledger
+        self._nodes: list[int] = []  # their numbers, in order
+        self._generation = 0  # of the graph
+        self._owed: deque[int] = deque()  # nodes after which others may have moved
+
+    def add(
+        self,
+        seq: int,
+        segment: int,
+        T_map_camera: F64,
+        prior: PosePrior,
+        height: tuple[float, float] | None,
+        time_ns: int,
+        covariance: F64,
+    ) -> None:
+        """Append a keyframe to its segment.
+
+        ``height`` comes from :func:`recon.posegraph.alignment.height_above`, in odometry units, and
+        ``covariance`` is of the step from the keyframe before, as in
+        :meth:`recon.posegraph.pose_graph.PoseGraph.add_keyframe`.
+        """
+        self.graph.add_keyframe(seq, time_ns, segment, T_map_camera, covariance, prior, height)
+        row = np.zeros(1, KEYFRAME)
+        row["seq"], row["segment"], row["odom"] = seq, segment, T_map_camera[:3]
+        row["height"] = height[0] if height is not None and height[0] else 1.0
+        self._row[seq] = len(self._ledger)
+        self._nodes.append(seq)
+        self._ledger.append(row)
+        self._follow()
+
+    def __contains__(self, seq: int) -> bool:
+        return seq in self.graph or self._find(seq) is not None
+
+    def similarity(self, segment: int) -> Similarity | None:
+        """The segment's way to the world; None while it stands where telemetry first put it."""
+        return self.graph.similarity(segment)
+
+    def map_pose(self, seq: int) -> F64:
+        """(4, 4) T_map_camera of a keyframe in its segment's chain."""
+        if seq in self.graph:
+            return self.graph.node(seq).T_odom_camera
+        return np.asarray(whole(self._rows_of(seq)[1]["odom"])[0])
+
+    def place(self, seq: int) -> Placed:
+        """The keyframe in the world, as known now. Raises KeyError for an unknown keyframe."""
+        if seq not in self.graph:
+            row, rows = self._rows_of(seq)
+            return self._carried(row, rows, *self._beside(seq))[0]
+        pose = self.graph.pose(seq)
+        known = self.graph.similarity(self.graph.node(seq).segment) is not None
+        covariance = pose.covariance if known else np.eye(6)
+        return Placed(seq, pose.T_world_camera, self.graph.scale(seq), covariance, pose.sources)
+
+    def places(self, seqs: Sequence[int]) -> F64:
+        """(N, 4, 4) T_world_camera of keyframes."""
+        nodes, graph = self.graph.pose_array(), self.graph
+        found = [
+            nodes[graph.node(seq).key] if seq in graph else self.place(seq).T_world_camera
+            for seq in seqs
+        ]
+        return np.array(found).reshape(-1, 4, 4)
+
+    def scale(self, seq: int) -> float:
+        """Metres per unit of the odometry at a keyframe."""
+        return self.graph.scale(seq) if seq in self.graph else self.place(seq).scale
+
+    def step_between(self, a: int, b: int) -> F64:
+        """(4, 4) T_a_b in metres by what the graph holds now."""
+        return np.asarray(se3.inverse(self.place(a).T_world_camera) @ self.place(b).T_world_camera)
+
+    def add_loop(self, a: int, b: int, T_a_b: F64, covariance: F64, growth: float = 1.0) -> bool:
+        """As :meth:`recon.posegraph.pose_graph.PoseGraph.add_loop`; ``a`` need not be a node, and
+        then the loop is moved to the node before it; False where that is of another
+        segment."""
+        if a not in self.graph:
+            before, after = self._beside(a)
+            if not self._same_segment(before, after):
+                return False  # no node carries it
+            T = self.step_between(before, a)
+            node, rows = self.graph.node(after), self._row[after] - self._row[before]
+            units = np.array([1.0] * 3 + [self.graph.scale(before)] * 3)
+            step = node.covariance * np.outer(units, units) * (rows / node.weight)
+            A = se3.adjoint(T)
+            a, T_a_b, covariance = before, T @ T_a_b, step + A @ covariance @ A.T
+        return self.graph.add_loop(a, b, T_a_b, covariance, growth)
+
+    # ---- publishing ----------------------------------------------------------------------------
+
+    def moved(self, final: bool = False) -> list[Placed]:
+        """Keyframes whose world pose changed since it was told by more than is worth it.
+
+        In flight a change must exceed ``repose_m`` and a tenth of the pose's own sigma, or
+        each fix of a poor receiver would move the whole scan; those carried by nodes that moved
+        follow by and by, :data:`AT_ONCE` at a time. At the end (``final``) the graph is solved
+        once more and every change is told, so that the result does not hang on when corrections
+        were asked for.
+        """
+        if final:
+            self.graph.solve()
+        nodes = self._moved_nodes(final)
+        if final:
+            self._owed = deque(self._nodes[:-1])
+        return nodes + self._moved_interpolated(final)
+
+    def _moved_nodes(self, final: bool) -> list[Placed]:
+        told = self._published
+        if not len(told) or (told.checked == self.graph.version and not final):
+            return []
+        told.checked = self.graph.version
+        keys = told.keys
+        T, scales = self.graph.pose_array()[keys], self.graph.scales()[keys]
+        least = np.maximum(self.config.repose_m, self.config.repose_sigmas * told.sigma)
+        rows = np.flatnonzero(told.change(T, scales) > (1e-6 if final else least))
+        if final:
+            return [self.place(told.placed[i].seq) for i in rows]
+        # In flight with the sigmas told before: newer readings have only made them smaller.
+        before = [told.placed[i] for i in rows]
+        self._owe([p.seq for p in before])
+        return [
+            Placed(p.seq, T[i], float(scales[i]), p.covariance, self.graph.sources(p.seq))
+            for i, p in zip(rows, before, strict=True)
+        ]
+
+    def _owe(self, seqs: Sequence[int]) -> None:
+        """Look at the keyframes on both sides of these nodes soon."""
+        owed = set(self._owed)
+        for seq in seqs:
+            i = bisect_left(self._nodes, seq)
+            for k in (i - 1, i):
+                if 0 <= k < len(self._nodes) - 1 and self._nodes[k] not in owed:
+                    owed.add(self._nodes[k])
+                    self._owed.append(self._nodes[k])
+
+    def _moved_interpolated(self, final: bool) -> list[Placed]:
+        out: list[Placed] = []
+        while self._owed and (final or len(out) < AT_ONCE):
+            before = self._owed.popleft()
+            after = self._nodes[bisect_left(self._nodes, before) + 1]
+            first, end = self._row[before] + 1, self._row[after]
+            if first == end:
+                continue
+            rows = self._ledger.read(first, end)
+            known = self._published.of(before)
+            least = self.config.repose_m
+            if known is not None:
+                least = max(least, self.config.repose_sigmas * known.sigma_m)
+            placed = self._carried(first, rows, before, after)
+            T = np.array([p.T_world_camera for p in placed])
+            scales = np.array([p.scale for p in placed])
+            told = np.flatnonzero(rows["published"] > 0)
+            far = moved_m(rows[told], T[told], scales[told]) > (1e-6 if final else least)
+            out += [placed[i] for i in told[far]]
+        return out
+
+    def publish(self, placed: Placed) -> tuple[int, float]:
+        """Remember that this pose of the keyframe was published.
+
+        Returns how often it had been published before, and its scale over the first published.
+        """
+        if placed.seq in self.graph:
+            node = self.graph.node(placed.seq)
+            self._published.put(placed, node.key, node.height or 1.0)
+        row, rows = self._rows_of(placed.seq)
+        rows["published"] += 1
+        rows["pose"], rows["scale"] = placed.T_world_camera[:3], placed.scale
+        if rows["published"][0] == 1:
+            rows["first_scale"] = placed.scale
+        self._ledger.amend(row, rows)
+        return int(rows["published"][0]) - 1, placed.scale / float(rows["first_scale"][0])
+
+    # ---- keyframes that are no nodes -----------------------------------------------------------
+
+    def _follow(self) -> None:
+        """Let go of what was kept of keyframes that are nodes no more."""
+        if self.graph.generation == self._generation:
+            return
+        self._generation = self.graph.generation
+        self._nodes = list(self.graph.seqs)
+        self._row = {seq: self._row[seq] for seq in self._nodes}
+        self._published.thin({seq: key for key, seq in enumerate(self._nodes)})
+        self._owed = deque(seq for seq in self._owed if seq in self._row)
+
+    def _same_segment(self, a: int, b: int) -> bool:
+        return self.graph.node(a).segment == self.graph.node(b).segment
+
+    def _beside(self, seq: int) -> tuple[int, int]:
+        """The nodes before and after a keyframe that is none."""
+        i = bisect_left(self._nodes, seq)
+        if not 0 < i < len(self._nodes):
+            raise KeyError(seq)
+        return self._nodes[i - 1], self._nodes[i]
+
+    def _find(self, seq: int) -> tuple[int, Rows] | None:
+        """Place and row of a keyframe in the ledger."""
+        row = self._row.get(seq)
+        if row is not None:
+            return row, self._ledger.read(row, row + 1)
+        i = bisect_left(self._nodes, seq)
+        if not 0 < i < len(self._nodes):
+            return None
+        first = self._row[self._nodes[i - 1]] + 1
+        rows = self._ledger.read(first, self._row[self._nodes[i]])
+        k = int(np.searchsorted(rows["seq"], seq))
+        return (first + k, rows[k : k + 1]) if k < len(rows) and rows["seq"][k] == seq else None
+
+    def _rows_of(self, seq: int) -> tuple[int, Rows]:
+        found = self._find(seq)
+        if found is None:
+            raise KeyError(seq)
+        return found
+
+    def _carried(self, first: int, rows: Rows, before: int, after: int) -> list[Placed]:
+        """Keyframes between two nodes, the ledger's rows from ``first`` on."""
+        held = self.place(before)
+        ends = [
+            Carrier(self._row[p.seq], self.graph.node(p.seq).T_odom_camera, p.T_world_camera,
+                    p.scale)
+            for p in (held, self.place(after))
+        ]  # fmt: skip
+        if self._same_segment(before, after):
+            T, scales = interpolated(rows, first, *ends)
+        else:
+            T, scales = left(rows, ends[0])
+        return [
+            Placed(int(row["seq"]), T[i], float(scales[i]), held.covariance, held.sources)
+            for i, row in enumerate(rows)
+        ]

@@ -1,0 +1,273 @@
+"""The chain of keyframes: the pose graph, loops, and the frames that keyframes carry."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from recon import se3
+from recon.posegraph.alignment import height_above, height_below
+from recon.posegraph.between_keyframes import carried
+from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.trajectory import Placed, Trajectory
+from recon.tracking.odometry import Tracked
+from recon.types import F64, DepthMap, Keyframe, PosePrior
+from service.compute.stopwatch import Stopwatch
+from service.flight.anchorage import Anchorage, Carriers, Key
+from service.flight.graph_report import GraphWatch
+from service.flight.loops import LoopSearch
+from service.flight.viewpoints import StereoCandidate, UndistortedFrame
+from service.stream.records import Repose
+
+FARTHEST_M = 1e6
+"""From the scan's origin."""
+
+HEADING_KNOWN_RAD = 1.0
+
+
+class KeyframeStep(NamedTuple):
+    """The step of the camera from the keyframe before, in units of the odometry."""
+
+    T_before_camera: F64 | None  # (4, 4); None where the chain begins again
+    covariance: F64  # (6, 6) left perturbation; of the pose itself where the chain begins
+
+
+class News(NamedTuple):
+    """What the graph says once a view is in it."""
+
+    placed: Placed  # the view in the world
+    is_aligned: bool  # its segment has a frame in the world
+    reposes: tuple[Repose, ...]  # keyframes published before whose pose is better now
+    doubts: list[str]  # what the operator must know of the telemetry
+
+
+class Chain:
+    """Where keyframes are in the world, and by them every frame.
+
+    :meth:`add` and :meth:`map_pose` belong to the thread that reconstructs, which alone knows the
+    trajectory until all is done; the rest belongs to the thread that tracks, which goes by the
+    :class:`News` of the newest view and so never waits for the graph.
+    """
+
+    def __init__(
+        self,
+        trajectory: Trajectory,
+        carriers: Carriers,
+        is_settled: Callable[[Key], bool],
+        rejected: Counter[str],
+        stopwatch: Stopwatch,
+    ) -> None:
+        """``is_settled`` says which keyframes the odometry adjusts no longer."""
+        self.trajectory, self.watch = trajectory, GraphWatch(trajectory.graph)
+        self.loops: LoopSearch | None = None
+        self._carriers, self._is_settled = carriers, is_settled
+        self._rejected, self._stopwatch = rejected, stopwatch
+        self._pieces = Pieces()
+        self._T_map = np.eye(4)  # of the last keyframe
+        self._seen: tuple[PosePrior, Placed, int] | None = None  # what vision placed last
+        self._news: dict[int, News] = {}  # by view, from thread to thread
+        self._newest: Placed | None = None  # view of the chain; None again once all is done
+        self._aligned = -1  # the newest segment that has a frame in the world
+        self._reposes: list[Repose] = []
+        self._doubts: list[str] = []
+
+    @property
+    def graph(self) -> PoseGraph:
+        """That places the keyframes."""
+        return self.trajectory.graph
+
+    @property
+    def held(self) -> dict[str, int]:
+        """Views that are remembered for loops, and keyframes in the graph."""
+        views = 0 if self.loops is None else len(self.loops)
+        return {"loop_views": views, "graph_keyframes": len(self.graph)}
+
+    # ---- keyframes ---------------------------------------------------------------------
+
+    def add(
+        self, view: StereoCandidate, motion: KeyframeStep, depth: DepthMap | None
+    ) -> Placed | None:
+        """Append a view and look for loops; None without depth, or where no drone flies."""
+        T_odom, step = view.view.T_odom_camera, motion.T_before_camera
+        self._T_map = T_odom if step is None else self._T_map @ step
+        up = T_odom[2, :3]
+        below = height_below(depth, up) if depth is not None else None
+        height = (below, 0.0) if below is not None else height_above(view.points, up)
+        self.trajectory.add(
+            view.seq, view.segment, self._T_map, view.prior, height, view.time_ns,
+            motion.covariance,
+        )  # fmt: skip
+        if depth is not None and self.loops is not None:
+            with self._stopwatch("loops"):
+                self.loops.look(view.seq, view.segment, view.view.gray, view.view.K, depth)
+        placed = self.trajectory.place(view.seq)
+        is_near = bool(np.abs(placed.T_world_camera[:3, 3]).max() < FARTHEST_M)
+        if depth is not None and is_near:
+            self.trajectory.publish(placed)
+        elif depth is not None:
+            self._rejected["placed beyond all reach"] += 1
+        self._news[view.seq] = News(
+            placed, self.trajectory.similarity(view.segment) is not None,
+            self._moved() if depth is not None else (), self.watch.look(),
+        )  # fmt: skip
+        return placed if depth is not None and is_near else None
+
+    def _moved(self, final: bool = False) -> tuple[Repose, ...]:
+        """Corrections of keyframes published before, which count as published from now on."""
+        moved = [
+            (placed, *self.trajectory.publish(placed)) for placed in self.trajectory.moved(final)
+        ]
+        return tuple(
+            Repose(placed.seq, revision, placed.T_world_camera, growth, placed.covariance)
+            for placed, revision, growth in moved
+        )
+
+    def map_pose(self, seq: int) -> F64:
+        """(4, 4) T_map_camera of a keyframe in its segment's chain."""
+        return self.trajectory.map_pose(seq)
+
+    def reconstructed(self, view: StereoCandidate, keyframe: Keyframe | None) -> None:
+        """Let a view of the chain carry frames from now on."""
+        self._carriers.add(view.anchor)
+        news = self._news.pop(view.seq)
+        self._newest = news.placed
+        self._aligned = view.segment if news.is_aligned else self._aligned
+        self._reposes += news.reposes
+        self._doubts += news.doubts
+        if keyframe is not None:
+            points = int(np.count_nonzero(keyframe.fresh & np.isfinite(keyframe.depth.depth_m)))
+            self._pieces.add(keyframe.seq, view.segment, points, view.prior)
+
+    def settle(self) -> None:
+        """Drop what is kept of keyframes that the odometry adjusts no longer."""
+        self._carriers.settle(self._is_settled)
+
+    def corrections(self, final: bool = False) -> tuple[Repose, ...]:
+        """Keyframes published before whose pose is better now; call with ``final`` once all is
+        reconstructed, to solve the graph once more."""
+        out, self._reposes = tuple(self._reposes), []
+        if final:
+            self._newest = None
+            out += self._moved(final)
+        return out
+
+    def new_doubts(self) -> list[str]:
+        """What the operator must know of the telemetry, each once."""
+        out, self._doubts = self._doubts, []
+        return out
+
+    def apart(self) -> list[tuple[int, int]]:
+        """First and last keyframe of each stretch that nothing ties to the rest of the scan."""
+        return self._pieces.apart(self.graph)
+
+    # ---- frames ------------------------------------------------------------------------
+
+    def follow(self, image: UndistortedFrame, anchor: Anchorage) -> Placed:
+        """A tracked frame in the world."""
+        placed = self.place(anchor)
+        self._seen = image.prior, placed, anchor.key.segment
+        return placed
+
+    def place(self, anchor: Anchorage) -> Placed:
+        """A frame in the world, carried by the chain's keyframe at or before it."""
+        T_odom_camera = anchor.T_odom_camera
+        carrier = self._carriers.of(anchor)
+        if carrier is None:
+            return Placed(anchor.key.seq, T_odom_camera, 1.0, np.eye(6), ("vision",))
+        # In flight no other view than the newest carries a new frame.
+        known = self._newest or self.trajectory.place(carrier.seq)
+        return known.carry(se3.inverse(carrier.T_odom_camera) @ T_odom_camera)
+
+    def by_telemetry(self, image: UndistortedFrame, tracked: Tracked) -> Placed | None:
+        """A lost frame where telemetry alone says the camera is; None without attitude, heading
+        or position.
+
+        Telemetry is off by as much as it was when vision was lost, so that the track goes on.
+        """
+        prior = image.prior
+        R, position, sigma = prior.R_world_camera, prior.position_m, prior.sigma_position_m
+        if tracked.state != "lost" or R is None or position is None or sigma is None:
+            return None
+        if prior.sigma_yaw_rad > 1.0:
+            return None
+        T = se3.compose(R, position)
+        if self._seen is not None:
+            before, seen, segment = self._seen
+            if segment == self._aligned:
+                T = carried(before, prior, seen.T_world_camera, None, 0.0)
+        tilt, yaw = prior.sigma_tilt_rad, prior.sigma_yaw_rad
+        covariance = np.diag(np.square([tilt, tilt, yaw, *sigma]))
+        return Placed(image.seq, T, 1.0, covariance, ("attitude", "gnss", "dead reckoning"))
+
+
+class Pieces:
+    """The segments of one scan with their keyframes, and which telemetry places in the world."""
+
+    def __init__(self) -> None:
+        self._starts: list[int] = []  # numbers of the segments' first keyframes
+        self._segments: list[int] = []
+        self._last: list[int] = []
+        self._points: Counter[int] = Counter()  # by segment
+        self._placed: set[int] = set()  # by a fix and a heading of their own
+
+    def add(self, seq: int, segment: int, points: int, prior: PosePrior) -> None:
+        """Take the next keyframe with surface."""
+        if not self._segments or self._segments[-1] != segment:
+            self._starts.append(seq)
+            self._segments.append(segment)
+            self._last.append(seq)
+        self._last[-1] = seq
+        self._points[segment] += points
+        if prior.sigma_position_m is not None and prior.sigma_yaw_rad < HEADING_KNOWN_RAD:
+            self._placed.add(segment)
+
+    def apart(self, graph: PoseGraph) -> list[tuple[int, int]]:
+        """First and last keyframe of the segments that nothing ties to the scan's main piece.
+
+        The main piece is the one that fixes place; without fixes, that with most points.
+        """
+        piece = {segment: segment for segment in self._segments}
+        looped: set[int | None] = set()
+        for edge in graph.loops:
+            a, b = (self._segment_of(seq) for seq in (edge.a, edge.b))
+            if edge.accepted and a is not None and b is not None:
+                _join(piece, a, b)
+                looped |= {a, b}
+        fixed = [s for s in self._segments if s in self._placed or _rests_on_fixes(graph, s)]
+        for segment in fixed[1:]:
+            _join(piece, fixed[0], segment)
+        if fixed:
+            main = piece[fixed[0]]
+        else:
+            sizes: Counter[int] = Counter()
+            for segment, points in self._points.items():
+                sizes[piece[segment]] += points
+            main = sizes.most_common(1)[0][0] if sizes else -1
+        ends = zip(self._segments, self._starts, self._last, strict=True)
+        return [
+            (first, last)
+            for segment, first, last in ends
+            # A long flight forgets loops, and not which segments they tied.
+            if piece[segment] != main and (segment in looped or not graph.is_tied(segment))
+        ]
+
+    def _segment_of(self, seq: int) -> int | None:
+        at = bisect_right(self._starts, seq) - 1
+        return self._segments[at] if at >= 0 else None
+
+
+def _rests_on_fixes(graph: PoseGraph, segment: int) -> bool:
+    found = graph.similarity(segment)
+    return found is not None and "gnss" in found.sources
+
+
+def _join(piece: dict[int, int], a: int, b: int) -> None:
+    """Make one piece of those that segments ``a`` and ``b`` are in."""
+    old, new = piece[b], piece[a]
+    for segment, name in piece.items():
+        if name == old:
+            piece[segment] = new

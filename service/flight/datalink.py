@@ -1,0 +1,143 @@
+"""The sending end of the datalink: one sender per scan, and one for earlier scans between."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from service.config import Config
+from service.errors import SkyreliefError
+from service.workers import PROCESS
+
+if TYPE_CHECKING:
+    from mavlink.component.vehicle import VehicleLink
+    from service.flight.scan import Datalink
+    from service.radio import VehicleRadio
+    from service.stream.store import ScanStore
+    from service.stream.tunnel import Carrier
+
+log = logging.getLogger(__name__)
+
+OWN_LINKS = "mavlink"
+"""The value of ``datalink.radio`` that means the links of the [mavlink] section."""
+
+
+def open_datalink(
+    store: ScanStore, config: Config, own_links: Carrier | None = None
+) -> Datalink | None:
+    """A sender of what the store gets, or None when no ground station is configured.
+
+    ``own_links`` are the vehicle's links; without a vehicle, as in a replay, there are none.
+    """
+    datalink, radio = config.datalink, own_links
+    if datalink.radio != OWN_LINKS:
+        radio = _endpoint(datalink.radio) if datalink.radio else None
+    if not (datalink.connect or datalink.listen or radio):
+        return None
+    from service.stream.link import DatalinkSender
+
+    return DatalinkSender(store, datalink, radio=radio)
+
+
+def _endpoint(endpoint: str) -> Carrier:
+    from service.radio import EndpointCarrier
+
+    return EndpointCarrier(endpoint)
+
+
+def open_backlog(config: Config) -> Datalink | None:
+    """A sender of earlier scans that the ground lacks, for the time between flights.
+
+    None when no ground station is configured or it has everything. Close it before a scan.
+    """
+    from service.stream.reports import open_undelivered
+
+    if not (config.datalink.connect or config.datalink.listen):
+        return None
+    stores = open_undelivered(Path(config.scan.folder))
+    if not stores:
+        return None
+    from service.stream.link import DatalinkSender
+
+    sender = DatalinkSender(None, config.datalink, config.scan.drone_name)
+    for store in stores:
+        sender.add(store, owned=True)
+    return sender
+
+
+class DaemonLink:
+    """The datalink over a daemon's life: a scan's sender while one is flown, else the backlog.
+
+    Safe between threads; nothing here waits for the link.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self.flying: Datalink | None = None  # the sender of the scan that is flown
+        self._backlog: Datalink | None = None
+        self._is_wanted = False  # the backlog
+        self._serial = 0  # of the last wish for the backlog
+        self._radio: VehicleRadio | None = None
+
+    def take_off(self, store: ScanStore, config: Config, vehicle: VehicleLink) -> None:
+        """Send a scan, in place of the backlog, to the ground stations that are configured."""
+        self.rest()
+        if config.datalink.radio == OWN_LINKS and self._radio is None:
+            from service.radio import VehicleRadio
+
+            self._radio = VehicleRadio(vehicle)
+        self.flying = open_datalink(store, config, self._radio)
+
+    def land(self, config: Config, in_haste: bool = False) -> None:
+        """End the scan's sender. What it could not send the backlog will; by radio alone there
+        is none, and the rest is waited for unless the next scan is ``in_haste``."""
+        sender, self.flying = self.flying, None
+        if sender is None:
+            return
+        if not (in_haste or config.datalink.connect or config.datalink.listen):
+            sender.drain(config.datalink.drain_s)
+        sender.close()
+
+    def offer_backlog(self, config: Config, is_idle: Callable[[], bool] = lambda: True) -> None:
+        """Send earlier scans that the ground lacks until :meth:`take_off` or :meth:`rest`.
+
+        Nothing happens unless ``is_idle`` says so.
+        """
+        with self._lock:
+            if self._is_wanted or not is_idle():
+                return
+            self._is_wanted = True
+            self._serial += 1
+            serial = self._serial
+        PROCESS.start("backlog", lambda _: self._open_backlog(config, serial))
+
+    def _open_backlog(self, config: Config, serial: int) -> None:
+        """Open it, which may read much of the disk, unless it is no longer wanted by then."""
+        try:
+            sender = open_backlog(config)
+        except SkyreliefError as error:
+            log.error("earlier scans are not offered: %s", error)
+            return
+        with self._lock:
+            if self._is_wanted and self._serial == serial:
+                self._backlog, sender = sender, None
+        if sender is not None:
+            sender.close()
+
+    def rest(self) -> None:
+        """End the backlog; what still has to be closed is closed on a thread of its own."""
+        with self._lock:
+            self._is_wanted = False
+            sender, self._backlog = self._backlog, None
+        if sender is not None:
+            # The process does not end before it has: Zenoh would abort it.
+            PROCESS.start("backlog closing", lambda _: sender.close())
+
+    def follow(self, config: Config) -> None:
+        """Keep to another budget, also in flight."""
+        for sender in (self.flying, self._backlog):
+            if sender is not None:
+                sender.set_budget(config.datalink.budget_kbit_s, config.datalink.share)

@@ -1,0 +1,134 @@
+"""What the pose graph of a flight says: doubts for the operator, figures for the summary."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.sensor_offsets import Constants
+from service.stream.records import pack_covariance, pack_motion
+
+LEAST = 5
+"""Readings of one kind left out before it is said."""
+
+SIGMAS, LEAST_SHARE = 3.0, 0.03
+"""Two scales disagree when they are further apart than both of these."""
+
+LOOK_GROWTH = 1.2
+"""The track is looked at again when its keyframes have grown by so much."""
+
+LEFT_OUT = {
+    "position off": "positions far from the track were left out: does GNSS jump?",
+    "position frozen": "positions only repeated the one before: is GNSS frozen?",
+    "heading off": "headings contradict the track and were left out: check the compass",
+    "tilt off": "attitudes contradict the pictures and were left out: check the gimbal's frame",
+    "altitude off": "altitudes stepped and were left out: check the barometer",
+}
+
+
+class GraphWatch:
+    """Looks at a pose graph now and then, on the thread that builds it."""
+
+    def __init__(self, graph: PoseGraph) -> None:
+        self._graph = graph
+        self._seen = 0
+        self._told: set[str] = set()
+
+    def look(self) -> list[str]:
+        """What is newly found, once for each kind; looks when the keyframes have grown enough."""
+        if self._graph.entered < max(LEAST, LOOK_GROWTH * self._seen):
+            return []
+        self._seen = self._graph.entered
+        fresh = {k: text for k, text in self._findings().items() if k not in self._told}
+        self._told |= fresh.keys()
+        return list(fresh.values())
+
+    def sentences(self) -> list[str]:
+        """Everything that is wrong, as known now."""
+        return list(self._findings().values())
+
+    def _findings(self) -> dict[str, str]:
+        """Sentences by kind."""
+        counts, scales = self._graph.counts, self._graph.newest_scales()
+        out = {
+            kind: f"{counts[kind]} {text}" for kind, text in LEFT_OUT.items()
+            if counts[kind] >= LEAST
+        }  # fmt: skip
+        by_fixes, by_heights = scales
+        if by_fixes is not None and by_heights is not None:
+            apart = math.log(by_fixes.metres / by_heights.metres)
+            limit = max(SIGMAS * math.hypot(by_fixes.sigma, by_heights.sigma), LEAST_SHARE)
+            if abs(apart) > limit:
+                percent = 100.0 * (math.exp(abs(apart)) - 1.0)
+                which = "larger" if apart > 0 else "smaller"
+                out["scale"] = (
+                    f"scale: GNSS makes the map {percent:.0f} % {which} than the height above "
+                    "ground does; check both"
+                )
+        return out
+
+
+MOST_LOOPS = 300
+"""Loops that a summary carries with their motions; of more, an even sample."""
+
+
+def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:
+    """Residuals by kind of factor, loops and readings left out, fit for JSON; None when empty.
+
+    ``nodes`` of the ``keyframes`` are in the graph; the others ride on them.
+    ``loops.motions`` are the accepted loops as refinement takes them: two keyframes, seven
+    numbers of the motion and 21 of its covariance.
+    """
+    if len(graph) < 2:
+        return None
+    accepted = graph.metric_loops()
+    step = max(1, -(-len(accepted) // MOST_LOOPS))
+    edges = graph.loops
+    return {
+        "keyframes": graph.entered,
+        "nodes": len(graph),
+        "residuals": {
+            kind: {
+                "count": len(rows),
+                "rms": round(float(np.sqrt(np.mean(np.square(rows)))), 4),
+            }
+            for kind, rows in graph.residuals().items()
+            if rows.size
+        },
+        "loops": {
+            "used": sum(edge.accepted for edge in edges),
+            "waiting": sum(not edge.accepted for edge in edges),
+            "pairs": [[edge.a, edge.b, edge.accepted] for edge in edges][-2 * MOST_LOOPS :],
+            "motions": [
+                [
+                    loop.a,
+                    loop.b,
+                    [float(f"{v:.9g}") for v in pack_motion(loop.T_a_b)],
+                    [float(f"{v:.6g}") for v in pack_covariance(loop.covariance)],
+                ]
+                for loop in accepted[::step]
+            ],
+        },
+        **_constants(graph.constants()),
+        "left_out": {str(k): int(v) for k, v in graph.counts.items()},
+    }
+
+
+def _constants(found: Constants) -> dict[str, Any]:
+    """Boresight and altitude's zero. ``boresight.deg`` turns the reported camera about its x, y
+    and z axes (right, down, ahead); it is used when it is sure."""
+    one, datum = found.boresight, found.datum
+    return {
+        "boresight": {
+            "deg": [round(float(v), 3) for v in np.degrees(one.turn)],
+            "sigma_deg": [round(float(v), 3) for v in np.degrees(one.sigma)],
+            "sure": one.is_sure,
+        },
+        "altitude_datum": {
+            "shift_m": round(datum.shift_m, 3),
+            "sigma_m": round(datum.sigma_m, 3) if np.isfinite(datum.sigma_m) else None,
+        },
+    }

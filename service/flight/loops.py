@@ -1,0 +1,197 @@
+"""Places seen before, looked for after each keyframe, on the thread that reconstructs."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from recon.camera_model import scaled_K
+from recon.posegraph.loop_closure import (
+    LoopClosure,
+    LoopConfig,
+    LoopView,
+    candidates,
+    ground_seen,
+    verify,
+)
+from recon.posegraph.trajectory import Trajectory
+from recon.tracking.common_view import Signatures, alike
+from recon.types import F64, U8, DepthMap
+
+WIDTH_PX = 640
+"""Of the pictures kept; loops need no finer ones."""
+
+LEAST_DEPTH_PX = 120
+"""A depth image at least twice as wide is kept at half its size."""
+
+TRIES = 2
+"""Verifications per keyframe, at most. Each is bounded work: some 30 to 120 ms on one core."""
+
+COMPARED = 20
+"""Keyframes whose look is compared with a new one's, at most: some 4 ms each."""
+
+MIN_ALIKE = 8
+"""Features that two images of one place have in common, of their strongest."""
+
+PAUSE = 3
+"""Keyframes without a search after a loop was taken; neighbours would only repeat it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Kept:
+    """A keyframe packed for later."""
+
+    seq: int
+    ordinal: int  # among all keyframes
+    segment: int
+    picture: U8  # JPEG, grey
+    K: F64  # (3, 3) px of that picture
+    depth: npt.NDArray[np.uint16]  # (h, w) share of ``far``, 0 unknown
+    far: float  # odometry units
+    sigma: npt.NDArray[np.float16]  # (h, w) odometry units
+    depth_K: F64
+    size_px: tuple[int, int]
+
+    def gray(self) -> U8:
+        """(H, W) image."""
+        return np.asarray(cv2.imdecode(self.picture, cv2.IMREAD_GRAYSCALE), np.uint8)
+
+    def unpacked(self, scale: float) -> LoopView:
+        """The view with its depth in metres."""
+        depth = self.depth.astype(np.float32) * np.float32(scale * self.far / 65535.0)
+        depth[self.depth == 0] = np.nan
+        sigma = self.sigma.astype(np.float32) * np.float32(scale)
+        views = np.where(self.depth > 0, 2, 0).astype(np.uint8)
+        return LoopView(
+            self.gray(), self.K,
+            DepthMap(depth, sigma, views, self.depth_K, np.eye(4)),
+        )  # fmt: skip
+
+
+def _packed(seq: int, ordinal: int, segment: int, grey: U8, K: F64, depth: DepthMap) -> _Kept:
+    H, W = grey.shape
+    size = (min(WIDTH_PX, W), round(min(WIDTH_PX, W) * H / W))
+    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    _, picture = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 92])
+    step = 2 if depth.depth_m.shape[1] >= 2 * LEAST_DEPTH_PX else 1
+    z, sigma = depth.depth_m[::step, ::step], depth.sigma_m[::step, ::step]
+    depth_K = depth.K / np.array([[step], [step], [1.0]])  # every second pixel keeps its place
+    known = np.isfinite(z)
+    far = float(z[known].max()) if known.any() else 1.0
+    share = np.where(known, np.maximum(np.rint(z * (65535.0 / far)), 1), 0)
+    return _Kept(
+        seq, ordinal, segment, np.asarray(picture, np.uint8), scaled_K(K, size[0] / W, size[1] / H),
+        share.astype(np.uint16), far, sigma.astype(np.float16), depth_K, size,
+    )  # fmt: skip
+
+
+class LoopSearch:
+    """Remembers keyframes, finds earlier ones that see the same, and tells the trajectory."""
+
+    def __init__(
+        self,
+        trajectory: Trajectory,
+        config: LoopConfig | None = None,
+        most_views: int = 400,
+    ) -> None:
+        """Of more than ``most_views`` keyframes, about 0.1 MB each, every second of the older half
+        is forgotten.
+        """
+        self._most_views = most_views
+        self.counts: Counter[str] = Counter()  # "tried", "verified", "taken"
+        self.trajectory = trajectory
+        self._config = config or LoopConfig()
+        self._kept: dict[int, _Kept] = {}
+        self._rest = 0
+        self._turn = 0
+        self._signatures = Signatures()
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def look(self, seq: int, segment: int, grey: U8, K: F64, depth: DepthMap) -> None:
+        """Search for loops that end in this keyframe, and remember it.
+
+        Args:
+            grey: (H, W) picture without distortion, ``K`` (3, 3) px of it.
+            depth: of the same camera, in units of its segment's odometry.
+        """
+        new = _packed(seq, self.trajectory.graph.entered - 1, segment, grey, K, depth)
+        self._kept[seq] = new
+        if self._rest > 0:
+            self._rest -= 1
+        else:
+            self._search(new)
+        if len(self._kept) > self._most_views:
+            self._thin()
+
+    def _search(self, new: _Kept) -> None:
+        view = new.unpacked(self.trajectory.scale(new.seq))
+        for seq in self._likely(new, view):
+            self.counts["tried"] += 1
+            guess = self.trajectory.step_between(seq, new.seq)
+            known = self._kept[seq].unpacked(self.trajectory.scale(seq))
+            found = verify(known, view, guess, self._config)
+            if found is not None and self._tell(seq, new, found):
+                self._rest = PAUSE
+                return
+
+    def _tell(self, seq: int, new: _Kept, found: LoopClosure) -> bool:
+        """True when the graph believes the loop."""
+        self.counts["verified"] += 1
+        taken = self.trajectory.add_loop(seq, new.seq, found.T_a_b, found.covariance, found.growth)
+        self.counts["taken"] += taken
+        return taken
+
+    def _likely(self, new: _Kept, view: LoopView) -> list[int]:
+        """Earlier keyframes worth a verification, the best first."""
+        depth_m = float(np.nanmedian(view.depth.depth_m))
+        if not depth_m > 0:
+            return []
+        seqs = [seq for seq, kept in self._kept.items() if self._is_apart(kept, new)]
+        if not seqs:
+            return []
+        W, H = new.size_px
+        reach = depth_m * float(np.hypot(W, H)) / new.K[0, 0]
+        *there, here = self.trajectory.places([*seqs, new.seq])
+        centres, ways = (np.array(there)[:, :3, k] for k in (3, 2))
+        ahead = centres + depth_m * ways
+        apart = np.linalg.norm(ahead - (here[:3, 3] + depth_m * here[:3, 2]), axis=1)
+        some = {seqs[i]: there[i] for i in np.argsort(apart)[:8] if apart[i] < reach}
+        some[new.seq] = here
+        config = self._config.without_gap()
+        ground = ground_seen(view.depth)
+        found = [s for s, _ in candidates(some, new.seq, new.K, new.size_px, ground, config)]
+        return list(dict.fromkeys(self._by_look(new, seqs) + found))[:TRIES]
+
+    def _by_look(self, new: _Kept, seqs: list[int]) -> list[int]:
+        """Earlier keyframes that look like this one, the most alike first; some of them a time.
+
+        Where fixes or a loop tell where the segment lies, the place says more.
+        """
+        if self.trajectory.graph.is_tied(new.segment):
+            return []
+        here = self._signatures.of(new.seq, new.gray)
+        self._turn += 1
+        every = -(-len(seqs) // COMPARED)
+        found = []
+        for seq in seqs[self._turn % every :: every]:
+            count = alike(self._signatures.of(seq, self._kept[seq].gray), here)
+            if count >= MIN_ALIKE:
+                found.append((count, seq))
+        return [seq for _, seq in sorted(found, reverse=True)]
+
+    def _is_apart(self, one: _Kept, two: _Kept) -> bool:
+        """True when two keyframes are not neighbours on one chain."""
+        gap = two.ordinal - one.ordinal
+        return gap >= self._config.least_gap or one.segment != two.segment
+
+    def _thin(self) -> None:
+        """Forget every second keyframe of the older half."""
+        for seq in list(self._kept)[: len(self._kept) // 2 : 2]:
+            del self._kept[seq]
+            self._signatures.forget(seq)

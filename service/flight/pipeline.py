@@ -1,0 +1,159 @@
+"""Figure 1 of the paper: images and telemetry in, posed depth images out.
+
+:meth:`Pipeline.step` is the upper row of the figure, up to the virtual stereo camera;
+:meth:`Pipeline.reconstruct` is the lower row, from a stereo view to a keyframe. Every box is one
+line with its equation. The stages are built from the configuration by
+:func:`service.flight.stages.build_stages`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+from recon.posegraph.trajectory import Placed
+from recon.tracking.odometry import Tracked
+from recon.types import Frame, Keyframe
+from service.config import ComputeConfig, ScanConfig
+from service.flight.anchorage import Anchorage
+from service.flight.stages import Stages
+from service.flight.viewpoints import StereoCandidate
+from service.stream.records import Repose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """What one frame brought."""
+
+    tracked: Tracked
+    placed: Placed | None = None  # the frame in the world; by telemetry alone when vision fails
+    is_view: bool = False  # the frame takes part in stereo and may become a keyframe
+    anchor: Anchorage | None = None  # gives the frame's place again, as it is known later
+    keyframes: tuple[Keyframe, ...] = ()  # finished depth images, oldest first
+    moved: tuple[Repose, ...] = ()  # keyframes published before whose pose is better now
+
+
+class Pipeline:
+    """One scan: feed :meth:`step` every frame in order, then call :meth:`finish`."""
+
+    def __init__(self, stages: Stages) -> None:
+        self.stages = stages
+        self._beside = stages.beside(self.reconstruct)
+
+    # ---- the figure --------------------------------------------------------------------
+
+    def step(self, frame: Frame) -> Step:
+        """One frame: where the camera is, and which views have their partners by now.
+
+        Raises ValueError when the image is not of the camera model's size.
+        """
+        s = self.stages
+        image = s.undistort(frame)  # section 2.1
+        tracked = s.track(image)  # Harris and ZSSD (Eq. 4-5), EPnP (Eq. 6-7)
+        anchor, is_view = s.views.take(image, tracked)  # virtual stereo camera, section 2.3
+        if anchor is None:
+            return Step(tracked, s.chain.by_telemetry(image, tracked))
+        for view in s.views.ready():
+            self._beside.offer(view)  # to be reconstructed
+        keyframes = self._finished()
+        moved = s.chain.corrections() if keyframes else ()
+        placed = s.chain.follow(image, anchor)
+        return Step(tracked, placed, is_view, anchor, keyframes, moved)
+
+    def reconstruct(self, view: StereoCandidate) -> Keyframe | None:
+        """One view: its depth by all its partners, its pose, and what of its surface is new."""
+        s, depth = self.stages, None
+        pairs, grid = s.rectify(view)  # virtual stereo pairs, section 2.1
+        if pairs:
+            depth = s.whole_path(pairs, grid)  # Eq. 1-3 at once, where a device does that
+        if pairs and depth is None:
+            depths = []
+            for pair in pairs:
+                disparity = s.match(pair)  # belief propagation, Eq. 1
+                disparity = s.upsample(disparity, pair)  # joint bilateral upsampling, Eq. 2
+                depths.append(s.reproject(disparity, pair, grid))  # Eq. 3
+            depth = s.fuse(depths, grid)
+        s.rectify.learn(depth)  # how far the relief of the next pairs may reach
+        motion = s.register(view, depth)  # ICP onto the keyframe before
+        placed = s.chain.add(view, motion, depth)  # pose graph
+        if depth is None or placed is None:
+            return None
+        sigma_m, fresh = s.map(view, depth, s.chain.map_pose(view.seq))  # map: what is new
+        return s.keyframe(view, depth, sigma_m, fresh, placed)
+
+    def finish(self) -> Step:
+        """The views still waiting for partners, and the last corrections."""
+        s = self.stages
+        s.views.end_stretch()
+        for view in s.views.ready(everything=True):
+            self._beside.offer(view)
+        keyframes = self._finished(everything=True)
+        self._beside.close()
+        s.map.clear()
+        tracked = Tracked("lost", s.track.segment, reason="end of the recording")
+        return Step(tracked, keyframes=keyframes, moved=s.chain.corrections(final=True))
+
+    def _finished(self, everything: bool = False) -> tuple[Keyframe, ...]:
+        """Keyframes that are done, in order."""
+        done = self._beside.finished(everything)
+        for view, keyframe in done:
+            self.stages.chain.reconstructed(view, keyframe)
+        self.stages.chain.settle()
+        return tuple(keyframe for _, keyframe in done if keyframe is not None)
+
+    # ---- in flight ---------------------------------------------------------------------
+
+    def set_baseline(self, config: ScanConfig) -> None:
+        """Follow another ``scan.baseline`` from the next frame on."""
+        views = self.stages.views.selection
+        views.set_baseline(config)
+        self.stages.rectify.set_min_base_to_height(views.min_base_to_height)
+
+    def set_effort(self, compute: ComputeConfig) -> None:
+        """Follow another ``pairs``, ``stereo_width`` and ``upsample`` from the next view on."""
+        self.stages.views.selection.set_partners(compute.pairs)
+        self.stages.rectify.set_effort(compute)
+
+    def take_next(self) -> None:
+        """Make the next frame with a pose a view, whatever the baseline asks for."""
+        self.stages.views.selection.take_next()
+
+    def reset_map(self) -> None:
+        """Reset the map: all surface counts as unseen."""
+        self.stages.map.clear()
+
+    def close(self) -> None:
+        """End what runs beside; call it last. The graph stays readable."""
+        self.stages.resources.close()
+
+    # ---- figures -----------------------------------------------------------------------
+
+    @property
+    def segments(self) -> int:
+        """Stretches of unbroken vision so far."""
+        return self.stages.track.segment + 1
+
+    @property
+    def pairs(self) -> int:
+        """Stereo pairs so far."""
+        return self.stages.rectify.pairs
+
+    @property
+    def dropped(self) -> int:
+        """Views that were not reconstructed because newer ones came faster."""
+        return self._beside.dropped
+
+    @property
+    def busy_s(self) -> float:
+        """Seconds for which one view has been under reconstruction; 0 when none is."""
+        return self._beside.busy_s
+
+    @property
+    def held(self) -> dict[str, int]:
+        """What memory holds of this scan: the map's voxels, its tiles on disk, views for loops,
+        and keyframes in the pose graph."""
+        return self.stages.map.held | self.stages.chain.held
+
+    def refusals(self) -> Counter[str]:
+        """Frames, views and pairs not used, by reason."""
+        return self.stages.refused + self.stages.rejected

@@ -1,0 +1,195 @@
+"""What the pipeline finds, written into the scan's store and summed up."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from recon.posegraph.trajectory import Placed
+from recon.types import F64, Keyframe
+from service.cameras.rig import Rig, attitude_of
+from service.flight.anchorage import Told, ToldFrames
+from service.flight.graph_report import graph_figures
+from service.flight.pipeline import Pipeline, Step
+from service.scans.drawing import save_debug
+from service.stream.codec import CodecConfig, encode
+from service.stream.records import PoseRecord
+from service.stream.store import ScanStore
+
+TOLD_M = 0.05
+"""A frame's pose that moved by more than this until the end is written again."""
+
+
+class Recorder:
+    """Writes one scan: poses as they come, keyframes as chunks, corrections as re-poses."""
+
+    def __init__(
+        self,
+        store: ScanStore,
+        pipeline: Pipeline,
+        rig: Rig,
+        clock_offset_ns: int = 0,
+        on_keyframe: Callable[[Keyframe], None] | None = None,
+    ) -> None:
+        """``clock_offset_ns`` takes the frames' clock to unix time."""
+        self._on_keyframe = on_keyframe
+        self.store, self.pipeline, self._rig = store, pipeline, rig
+        self._chain, self._is_settled = pipeline.stages.chain, pipeline.stages.track.is_settled
+        self.points = self.keyframes = self.frames = self.chunk_bytes = 0
+        self.states: Counter[str] = Counter()
+        self.distance_m = self.speed_m_s = self.turn_rate_rad_s = 0.0
+        self.last: PoseRecord | None = None
+        self._offset_ns = clock_offset_ns
+        self._codec = CodecConfig()
+        self._told = ToldFrames(store.path.parent)
+        self._last: tuple[int, F64] | None = None  # unix ns and T_world_camera of the last pose
+        self._origin_written = False
+
+    def write(self, step: Step, time_ns: int, agl_m: float | None) -> None:
+        """One step of the pipeline; raises OutsideError when the disk is full."""
+        self.frames += 1
+        self.states[step.tracked.state] += 1
+        self._write_origin()
+        self._write_keyframes(step)
+        if step.placed is None:
+            return
+        position = step.placed.T_world_camera[:3, 3]
+        told = Told(time_ns + self._offset_ns, step.anchor, position, agl_m, step.is_view)
+        self._told.add(told, self._is_settled)
+        self.last = self._record(told, step.placed)
+        self.store.add_pose(self.last)
+
+    def flush(self) -> None:
+        """Write what the pipeline still holds and correct the trajectory; call it once."""
+        self._write_keyframes(self.pipeline.finish())
+        self._correct_trajectory()
+        self._told.close()
+
+    def close(self, extra: dict[str, Any]) -> dict[str, Any]:
+        """Close the scan, which is flushed; return its summary."""
+        summary = self.summary() | {"graph": graph_figures(self._chain.graph)}
+        summary["apart"] = [list(ends) for ends in self._chain.apart()]
+        summary |= extra
+        self.store.finish(summary)
+        return summary
+
+    def _correct_trajectory(self) -> None:
+        """Write those poses again that corrections have moved; the newest of a time holds."""
+        self._last, self.distance_m = None, 0.0
+        for told in self._told.corrigible():
+            assert told.anchor is not None
+            record = self._record(told, self._chain.place(told.anchor))
+            if np.linalg.norm(record.T_world_camera[:3, 3] - told.position_m) > TOLD_M:
+                self.store.add_pose(record)
+
+    def summary(self) -> dict[str, Any]:
+        """Figures of the scan so far, fit for JSON."""
+        pipeline = self.pipeline
+        return {
+            "frames": self.frames,
+            "frames_tracked": self.states["tracked"] + self.states["keyframe"],
+            "frames_lost": self.states["lost"],
+            "segments": pipeline.segments,
+            "pairs": pipeline.pairs,
+            "clouds": pipeline.pairs,  # one per stereo pair, Eq. 3
+            "keyframes": self.keyframes,
+            "points": self.points,
+            "chunk_bytes": self.chunk_bytes,
+            "distance_m": round(self.distance_m, 2),
+            "georeference": self._rig.georeference,
+            "scale": self._scale(),
+            "stage_ms": {k: round(v, 2) for k, v in pipeline.stages.stopwatch.mean_ms().items()},
+            "refusals": dict(pipeline.refusals()),
+            "drops": self._drops(),
+            "registrations": dict(pipeline.stages.register.verdicts),
+        }
+
+    def _drops(self) -> dict[str, int]:
+        """What was not used, by reason."""
+        late = {"newer views came faster": self.pipeline.dropped} if self.pipeline.dropped else {}
+        return dict(self.pipeline.refusals()) | late
+
+    def _scale(self) -> dict[str, Any]:
+        """What the metric scale rests on, and its relative sigma."""
+        found = self._chain.trajectory.similarity(max(self.pipeline.segments - 1, 0))
+        if found is None:
+            return {"from": "first telemetry", "sigma": None}
+        return {
+            "from": ", ".join(found.sources) or "an assumed height",
+            "sigma": round(found.sigma_scale, 4),
+        }
+
+    def _write_origin(self) -> None:
+        """The origin goes into the header once the first position is known."""
+        frame = self._rig.frame
+        if frame is None or self._origin_written:
+            return
+        self.store.update_header(
+            origin_lat_deg=frame.lat_deg,
+            origin_lon_deg=frame.lon_deg,
+            origin_alt_amsl_m=frame.alt_amsl_m,
+            epsg=frame.epsg,
+            georeference=self._rig.georeference,
+        )
+        self._origin_written = True
+
+    def _write_keyframes(self, step: Step) -> None:
+        for keyframe in step.keyframes:
+            with self.pipeline.stages.stopwatch("encode"):
+                layers = encode(keyframe, keyframe.time_ns + self._offset_ns, self._codec)
+            with self.pipeline.stages.stopwatch("store"):
+                self.store.add_keyframe(keyframe.seq, layers)
+            self.keyframes += 1
+            self.points += int((keyframe.fresh & np.isfinite(keyframe.depth.depth_m)).sum())
+            self.chunk_bytes += sum(map(len, layers))
+            if self._on_keyframe is not None:
+                self._on_keyframe(keyframe)
+        if self.pipeline.stages.debug and step.keyframes:
+            save_debug(self.store.path.parent, step.keyframes[-1].seq, self.pipeline.stages.debug)
+        if step.moved:
+            self.store.add_reposes(step.moved)
+
+    def _record(self, told: Told, placed: Placed) -> PoseRecord:
+        """The pose record of a frame, with speed and turn from the one before it."""
+        T = placed.T_world_camera
+        roll, pitch, yaw = attitude_of(T)
+        speed = turn = 0.0
+        if self._last is not None and told.time_ns > self._last[0]:
+            dt = (told.time_ns - self._last[0]) * 1e-9
+            step = float(np.linalg.norm(T[:3, 3] - self._last[1][:3, 3]))
+            self.distance_m += step
+            speed, turn = step / dt, _heading_change(self._last[1], T) / dt
+        self._last = (told.time_ns, T)
+        self.speed_m_s, self.turn_rate_rad_s = speed, turn
+        lat = lon = alt = None
+        frame = self._rig.frame
+        if frame is not None:
+            lat, lon, alt = (float(x) for x in frame.to_geodetic(T[None, :3, 3])[0])
+        return PoseRecord(
+            time_unix_ns=told.time_ns,
+            T_world_camera=T,
+            covariance=placed.covariance,
+            lat_deg=lat,
+            lon_deg=lon,
+            alt_amsl_m=alt,
+            agl_m=told.agl_m,
+            roll_rad=roll,
+            pitch_rad=pitch,
+            yaw_rad=yaw,
+            speed_m_s=speed,
+            distance_m=self.distance_m,
+            turn_rate_rad_s=turn,
+            sources=placed.sources,
+            sigma_m=float(np.sqrt(np.trace(placed.covariance[3:, 3:]))),
+            keyframe_seq=told.anchor.seq if told.is_view and told.anchor else None,
+        )
+
+
+def _heading_change(T_a: F64, T_b: F64) -> float:
+    """Turn about the vertical from pose a to b, rad, positive to the right (clockwise)."""
+    R = T_b[:3, :3] @ T_a[:3, :3].T
+    return -math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])

@@ -1,0 +1,236 @@
+"""One scan from first frame to closed folder: a camera, the pipeline, the store, the link."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import time
+from collections.abc import Callable
+from contextlib import closing, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Event
+from typing import Any, Protocol
+
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.telemetry.samples import VehicleState
+from recon.backends import Backend
+from recon.posegraph.between_keyframes import Odometer
+from recon.types import Camera, Frame, Keyframe
+from service.cameras.rig import ASSUMED_AGL_M, Rig
+from service.cameras.source import CameraFrame, CameraSource, ahead
+from service.config import Config
+from service.errors import InputError
+from service.flight.frame_tags import FILE as TAGS
+from service.flight.frame_tags import FrameTags
+from service.flight.pipeline import Pipeline, Step
+from service.flight.recorder import Recorder
+from service.flight.stages import build_stages
+from service.flight.telemetry_check import TelemetryCheck
+from service.flight.tracking_watch import TrackingWatch
+from service.redaction import public_configuration, redacted
+from service.scans.coverage import CoverageWriter
+from service.scans.retention import PAGES
+from service.stream.records import ScanHeader
+from service.stream.store import ScanStore
+from service.version import software
+
+log = logging.getLogger(__name__)
+
+TIME_STEP_NS = 100_000
+"""Frame times are rounded to this; no camera's clock is finer."""
+
+
+class Datalink(Protocol):
+    """The sending end, as a scan needs it."""
+
+    def drain(self, timeout_s: float) -> bool:
+        """Wait until the ground holds everything; False when the time is up."""
+        ...
+
+    def set_budget(self, budget_kbit_s: float, share: float | None = None) -> None:
+        """Change the link's rate, in flight."""
+        ...
+
+    def close(self) -> None:
+        """Stop sending."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanInputs:
+    """What a scan is made from."""
+
+    source: CameraSource
+    camera: Camera
+    config: Config
+    backend: Backend
+    folder: Path
+    scan_id: str
+    epoch_ns: int  # of the frames' time 0, on the history's clock
+    unix_offset_ns: int = 0  # history's clock to unix time
+    history: VehicleHistory | None = None
+    notes: tuple[str, ...] = ()
+    assumed: tuple[str, ...] = ()  # of "lens"
+    extra: dict[str, Any] = field(default_factory=dict)  # goes into scan.json
+    latency_ms: float | None = None  # the camera's as an earlier scan found it
+    tell: Callable[[str], None] = log.warning  # the operator
+    on_step: Callable[[Step, VehicleState | None, int], None] | None = None  # and its exposure
+    on_keyframe: Callable[[Keyframe], None] | None = None
+
+
+def create_store(inputs: ScanInputs) -> ScanStore:
+    """The scan's folder and database; InputError when it holds a scan already."""
+    path = inputs.folder / "scan.db"
+    if path.exists():
+        raise InputError(
+            f"{inputs.folder} already holds a scan; give another --out, nothing was changed"
+        )
+    W, H = inputs.camera.size_px
+    header = ScanHeader(
+        scan_id=inputs.scan_id,
+        drone=inputs.config.scan.drone_name,
+        started_unix_ns=inputs.epoch_ns + inputs.unix_offset_ns,
+        camera={
+            "width": W,
+            "height": H,
+            "K": inputs.camera.K.ravel().tolist(),
+            "distortion": inputs.camera.distortion.tolist(),
+        },
+        configuration=public_configuration(inputs.config.to_dict()),
+        software=software(),
+        notes=redacted(inputs.notes),
+        run_id=secrets.token_hex(16),
+    )
+    return ScanStore.create(path, header)
+
+
+class Scan:
+    """Runs frames through the pipeline into the store until the source ends or a stop."""
+
+    def __init__(self, inputs: ScanInputs, store: ScanStore) -> None:
+        self.inputs, self.store, self.source = inputs, store, inputs.source
+        self.epoch_ns = inputs.epoch_ns
+        config, live, pages = inputs.config, inputs.source.is_live, inputs.folder / PAGES
+        self.pipeline = Pipeline(
+            build_stages(inputs.camera, config, inputs.backend, live=live, pages=pages)
+        )
+        self.rig, self._odometer = Rig(config.camera, config.scan, config.fusion), Odometer()
+        self.recorder = Recorder(
+            store, self.pipeline, self.rig, inputs.unix_offset_ns, inputs.on_keyframe
+        )
+        self.check = TelemetryCheck(
+            inputs.config.camera, inputs.history, inputs.tell, inputs.latency_ms
+        )
+        self.tracking = TrackingWatch(inputs.tell)
+        self.tags = FrameTags(inputs.folder / TAGS) if inputs.history is not None else None
+        self.tagged = self.odd_sized = self.heights = self.attitudes = 0
+        self._started = time.monotonic()
+
+    def feed(self, frame: CameraFrame) -> Step | None:
+        """One frame through the pipeline; None when its size is not the camera's."""
+        inputs = self.inputs
+        H, W = frame.image.shape[:2]
+        if inputs.camera.size_px != (W, H):
+            self.odd_sized += 1
+            return None
+        time_ns = self.epoch_ns + frame.time_ns
+        exposed_ns = self.check.exposed_ns(time_ns)
+        # Containers round times by up to 11 us; rounded alike, a pipe and a file agree.
+        exposed_ns = round(exposed_ns / TIME_STEP_NS) * TIME_STEP_NS
+        state = inputs.history.state_at(exposed_ns) if inputs.history is not None else None
+        self.tagged += state is not None
+        if self.tags is not None:
+            self.tags.write(exposed_ns + inputs.unix_offset_ns, state)
+        self.heights += self.rig.height_known(state, frame.geotag)
+        self.attitudes += self.rig.attitude_known(state, frame.geotag)
+        prior = self._odometer.take(exposed_ns, self.rig.prior(state, frame.geotag))
+        step = self.pipeline.step(Frame(frame.image, exposed_ns, frame.seq, prior))
+        self.check.add(time_ns, step.tracked)
+        self.tracking.look(step.tracked, time_ns)
+        for doubt in self.pipeline.stages.chain.new_doubts():
+            inputs.tell(doubt)
+        self.recorder.write(step, exposed_ns, state.alt_agl_m if state is not None else None)
+        if inputs.on_step is not None:
+            inputs.on_step(step, state, exposed_ns)
+        return step
+
+    def run(
+        self,
+        stop: Event,
+        progress: Callable[[Scan], None] | None = None,
+        paused: Event | None = None,
+    ) -> None:
+        """Feed every frame of the source until it ends or ``stop`` is set.
+
+        Frames that come while ``paused`` is set are passed over. A recording is decoded ahead.
+        """
+        live = self.source.is_live
+        coverage = CoverageWriter(self.store) if live else nullcontext()
+        source = nullcontext(self.source) if live else closing(ahead(self.source))
+        with coverage, source as frames:
+            for frame in frames:
+                if stop.is_set():
+                    log.info("stopped; closing the scan")
+                    break
+                if paused is not None and paused.is_set():
+                    continue
+                self.feed(frame)
+                if progress is not None:
+                    progress(self)
+
+    def close(self) -> dict[str, Any]:
+        """Write what is left and close the scan in the store; return its figures."""
+        elapsed = max(time.monotonic() - self._started, 1e-9)
+        self.check.finish()
+        if self.tags is not None:
+            self.tags.close()
+        self.recorder.flush()
+        extra = self.check.summary() | {
+            "frames_tagged": self.tagged,
+            "frames_of_another_size": self.odd_sized,
+            "seconds": round(elapsed, 2),
+            "warnings": [*self.inputs.notes, *self.inputs.source.warnings, *self._doubts()],
+        }
+        extra["assumed"] = self._assumed()
+        summary = self.recorder.close(redacted(extra | self.inputs.extra))
+        self.pipeline.close()
+        summary["clouds_per_second"] = round(summary["clouds"] / elapsed, 2)
+        self.store.finish(summary)
+        return summary
+
+    def _assumed(self) -> list[str]:
+        """What nothing measured in this scan, of "lens", "view" and "height"."""
+        out = list(self.inputs.assumed)
+        if self.attitudes == 0:
+            out.append("view")
+        if self.heights == 0 and self.rig.georeference == "none":
+            out.append("height")
+        return out
+
+    def _doubts(self) -> list[str]:
+        """What the reader of this scan must know."""
+        out = [*self.check.told.values(), *self.pipeline.stages.chain.watch.sentences()]
+        if self.odd_sized:
+            W, H = self.inputs.camera.size_px
+            out.append(f"{self.odd_sized} frames were not {W}x{H} like the camera model: left out")
+        if self.inputs.history is not None and self.tagged == 0 and self.recorder.frames:
+            out.append("no frame lies inside the telemetry: poses rest on vision alone")
+        frames = self.recorder.frames
+        if frames and "height" in self._assumed():
+            out.append(
+                f"no telemetry: the scale assumes {ASSUMED_AGL_M:g} m above ground; "
+                "set scan.assumed_agl_m to the true height"
+            )
+        apart = self.pipeline.stages.chain.apart()
+        if apart:
+            out.append(
+                f"left out of the cloud: {len(apart)} of {self.pipeline.segments} "
+                "stretches of the flight, which neither fixes nor a place seen twice tie to the "
+                "rest; fly with GNSS or more overlap"
+            )
+        if frames and self.recorder.keyframes == 0:
+            top = self.pipeline.refusals().most_common(2)
+            why = "; ".join(f"{reason} ({n})" for reason, n in top) or "too few frames"
+            out.append(f"nothing was reconstructed: {why}")
+        return out

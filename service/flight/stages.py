@@ -1,0 +1,425 @@
+"""The boxes of Figure 1 as small objects, and the one place that builds them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from recon import se3
+from recon.backends import Backend, DenseStages, MatchingBackend, PathBackend
+from recon.camera_model import Undistorter, scaled, scaled_K
+from recon.image_quality import BlurWatch, stretch
+from recon.mapping.registration import IcpConfig
+from recon.posegraph.interpolated import KEYFRAME
+from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.posegraph.trajectory import Placed, Trajectory
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.reprojection import FusionConfig, PairDepth, fuse, reproject
+from recon.stereo.upsampling import UpsamplingConfig
+from recon.stereo.virtual_stereo import (
+    PairRejection,
+    VirtualStereoConfig,
+    drop_unseen,
+    plane_relief,
+    rectify,
+)
+from recon.tracking.localisation import OdometryConfig
+from recon.tracking.odometry import Odometry, Tracked
+from recon.types import (
+    F32,
+    F64,
+    U8,
+    Array,
+    Bool,
+    Camera,
+    DepthMap,
+    DisparityMap,
+    Frame,
+    Keyframe,
+    Pose,
+    StereoPair,
+)
+from service.background import BackgroundWorker
+from service.compute.stopwatch import Stopwatch
+from service.compute.threading_layer import kernels_may_overlap, share_cores
+from service.config import ComputeConfig, Config
+from service.flight.anchorage import VIEW, Carriers, Key
+from service.flight.chain import Chain, KeyframeStep
+from service.flight.loops import LoopSearch
+from service.flight.surface_map import SurfaceMap
+from service.flight.viewpoints import StereoCandidate, StereoViews, UndistortedFrame, Viewpoints
+from service.scans.file_ledger import FileLedger
+
+MAX_TRACKING_WIDTH_PX = 1280
+MAX_WAITING = 3
+"""Views that wait for reconstruction."""
+
+
+class Grid(NamedTuple):
+    """Where a view's depth is: its pixels and its pose."""
+
+    K: F64  # (3, 3) px
+    size_px: tuple[int, int]  # (w, h)
+    T_odom_camera: F64  # (4, 4)
+
+
+class Undistort:
+    """Images without distortion, in colour, in gray, and as the odometry takes them."""
+
+    def __init__(self, camera: Camera, guide_width_px: int, stopwatch: Stopwatch) -> None:
+        """Raises ValueError for an unusable camera model."""
+        self._undistorter = Undistorter(_within_width(camera, int(1.3 * guide_width_px)))
+        self._stopwatch, self._blur = stopwatch, BlurWatch()
+        self.camera, self.valid = self._undistorter.camera, self._undistorter.valid
+        self.tracking_camera = _within_width(self.camera, MAX_TRACKING_WIDTH_PX)
+
+    def __call__(self, frame: Frame) -> UndistortedFrame:
+        """Raises ValueError when the image is not of the camera model's size."""
+        with self._stopwatch("undistort"):
+            bgr = self._undistorter.image(_resized(frame.image, self.camera.size_px))
+            gray = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
+            small, mask = gray, self.valid
+            size = self.tracking_camera.size_px
+            if size != self.camera.size_px:
+                small = np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
+                mask = np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+            small = stretch(small, mask > 0)
+            is_blurred = self._blur.blurred(small)
+            return UndistortedFrame(
+                frame.seq, frame.time_ns, frame.prior, bgr, gray, small,
+                None if mask.all() else mask, is_blurred,
+            )  # fmt: skip
+
+
+class Track:
+    """The odometry: Harris corners, ZSSD (Eq. 4-5) and EPnP (Eq. 6-7)."""
+
+    def __init__(self, odometry: Odometry, refused: Counter[str], stopwatch: Stopwatch) -> None:
+        self.odometry, self._refused, self._stopwatch = odometry, refused, stopwatch
+
+    def __call__(self, image: UndistortedFrame) -> Tracked:
+        """The frame's pose, or why there is none."""
+        with self._stopwatch("track"):
+            tracked = self.odometry.track(
+                image.small, image.seq, image.time_ns, image.prior, image.mask, image.is_blurred
+            )
+        if tracked.T_odom_camera is None:
+            self._refused[tracked.reason] += 1
+        return tracked
+
+    @property
+    def segment(self) -> int:
+        """Stretch of unbroken vision."""
+        return self.odometry.segment
+
+    def is_settled(self, key: Key) -> bool:
+        """True when the odometry adjusts a keyframe of its no longer."""
+        window = self.odometry.keyframes
+        return key.segment != self.segment or not window or key.seq < window[0].seq
+
+
+class Rectify:
+    """A view and its partners as rectified pairs of a virtual stereo camera."""
+
+    def __init__(
+        self,
+        config: VirtualStereoConfig,
+        rejected: Counter[str],
+        debug: dict[str, Array] | None,
+        stopwatch: Stopwatch,
+    ) -> None:
+        self._config, self._rejected, self._debug = config, rejected, debug
+        self._stopwatch = stopwatch
+        self._relief_m = (0.0, 0.0)
+        self.pairs = 0
+
+    def __call__(self, candidate: StereoCandidate) -> tuple[list[StereoPair], Grid]:
+        """The pairs that stereo can use, and the grid of the view's depth."""
+        config = self._config  # another thread may set it meanwhile
+        view = candidate.view
+        H, W = view.gray.shape
+        w, h = config.width_px, round(config.width_px * H / W)
+        grid = Grid(scaled_K(view.K, w / W, h / H), (w, h), view.T_odom_camera)
+        pairs = []
+        for partner in candidate.partners:
+            with self._stopwatch("rectify"):
+                pair = rectify(view, partner, candidate.points, config, self._relief_m)
+            if isinstance(pair, PairRejection):
+                self._rejected[pair.reason] += 1
+                continue
+            pairs.append(pair)
+            if self._debug is not None:
+                self._debug.clear()
+                self._debug |= {"raw_left": candidate.bgr, "raw_right": partner.gray}
+        self.pairs += len(pairs)
+        return pairs, grid
+
+    def learn(self, depth: DepthMap | None) -> None:
+        """Make room for as much relief as the last view showed."""
+        if depth is not None:
+            self._relief_m = plane_relief(depth, self._relief_m)
+
+    def set_min_base_to_height(self, minimum: float) -> None:
+        """Accept baselines as short as ``minimum`` of the distance."""
+        self._config = replace(self._config, min_base_to_height=minimum)
+
+    def set_effort(self, compute: ComputeConfig) -> None:
+        """Reconstruct at another width, with or without upsampling, from the next view on."""
+        self._config = replace(self._config, width_px=compute.stereo_width, guided=compute.upsample)
+
+
+class PairStages:
+    """Eq. 1 to 3 and the fusion, each by the backend or on the host."""
+
+    def __init__(
+        self,
+        backend: Backend,
+        config: DenseStages,
+        debug: dict[str, Array] | None,
+        stopwatch: Stopwatch,
+    ) -> None:
+        self._backend, self._config = backend, config
+        self._debug, self._stopwatch = debug, stopwatch
+
+    def match(self, pair: StereoPair) -> DisparityMap:
+        """Labels of the left view by belief propagation, Eq. 1."""
+        with self._stopwatch("belief propagation"):
+            coarse = self._backend.belief_propagation(
+                pair.left, pair.right, pair.labels, self._config.matching
+            )
+            coarse = drop_unseen(coarse, pair)
+        self._keep(rect_left=pair.left, rect_right=pair.right, disparity=coarse.px)
+        return coarse
+
+    def upsample(self, coarse: DisparityMap, pair: StereoPair) -> DisparityMap:
+        """The labels at the size of the pair's guide, Eq. 2; as they are without one."""
+        fine = coarse
+        if pair.guide is not None:
+            with self._stopwatch("upsample"):
+                fine = self._backend.upsample(coarse, pair.guide, self._config.upsampling)
+        self._keep(upsampled=fine.px)
+        return fine
+
+    def reproject(self, disparity: DisparityMap, pair: StereoPair, grid: Grid) -> PairDepth:
+        """The pair's depth on the view's grid, Eq. 3."""
+        with self._stopwatch("reproject"):
+            return reproject(disparity, pair, grid.K, grid.size_px)
+
+    def fuse(self, depths: Sequence[PairDepth], grid: Grid) -> DepthMap:
+        """One depth map of all pairs, in units of the odometry."""
+        with self._stopwatch("fuse"):
+            return fuse(depths, grid.K, grid.T_odom_camera, self._config.fusion)
+
+    def _keep(self, **arrays: Array) -> None:
+        if self._debug is not None:
+            self._debug |= arrays
+
+
+WholePath = Callable[[Sequence[StereoPair], Grid], DepthMap | None]
+
+
+def whole_path(backend: Backend, config: DenseStages, stopwatch: Stopwatch) -> WholePath:
+    """Eq. 1 to 3 without leaving the device; gives None where the stages must do it."""
+
+    def on_device(pairs: Sequence[StereoPair], grid: Grid) -> DepthMap | None:
+        assert isinstance(backend, PathBackend)
+        with stopwatch("dense path"):
+            return backend.fused_depth(pairs, grid.K, grid.size_px, grid.T_odom_camera, config)
+
+    return on_device if isinstance(backend, PathBackend) else by_stages
+
+
+def by_stages(pairs: Sequence[StereoPair], grid: Grid) -> None:
+    """No device does the whole path."""
+
+
+class Register:
+    """ICP of each view's depth onto that of the keyframe before."""
+
+    def __init__(self, backend: Backend, stopwatch: Stopwatch) -> None:
+        self._backend, self._config, self._stopwatch = backend, IcpConfig(), stopwatch
+        self._before: tuple[int, DepthMap | None] | None = None  # number and depth
+        self.verdicts: Counter[str] = Counter()
+
+    def __call__(self, view: StereoCandidate, depth: DepthMap | None) -> KeyframeStep:
+        """The step from the keyframe before: vision's and ICP's, weighted by covariance."""
+        covariance = view.covariance + np.diag([1e-4**2] * 3 + [0.005**2] * 3)
+        before, self._before = self._before, (view.seq, depth)
+        T_before = view.earlier.get(before[0]) if before is not None else None
+        if before is None or T_before is None:
+            return KeyframeStep(None, covariance)
+        step = se3.inverse(T_before) @ view.view.T_odom_camera
+        A = se3.adjoint(step)
+        covariance = A @ covariance @ A.T
+        if depth is None or before[1] is None:
+            return KeyframeStep(step, covariance)
+        with self._stopwatch("icp"):
+            found = self._backend.register(depth, before[1], step, self._config)
+        self.verdicts[found.verdict] += 1
+        if not found.converged:
+            return KeyframeStep(step, covariance)
+        return KeyframeStep(*se3.average(step, covariance, found.T_target_source, found.covariance))
+
+
+class MakeKeyframe:
+    """What leaves the pipeline: metric depth in colour, its pose, and what of it is new."""
+
+    def __init__(self, debug: dict[str, Array] | None) -> None:
+        self._debug = debug
+
+    def __call__(
+        self, view: StereoCandidate, depth: DepthMap, sigma_m: F32, fresh: Bool, placed: Placed
+    ) -> Keyframe:
+        """``depth`` and ``sigma_m`` (h, w) are in units of the odometry."""
+        h, w = depth.depth_m.shape
+        scale = np.float32(placed.scale)
+        metric = DepthMap(
+            depth.depth_m * scale, sigma_m * scale, depth.views, depth.K, placed.T_world_camera
+        )
+        bgr = np.asarray(cv2.resize(view.bgr, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
+        if self._debug is not None:
+            self._debug |= {"depth_m": metric.depth_m, "sigma_m": metric.sigma_m, "bgr": bgr}
+        pose = Pose(placed.T_world_camera, placed.covariance, placed.sources)
+        return Keyframe(view.seq, view.time_ns, metric, bgr, pose, fresh)
+
+
+@dataclass(frozen=True, slots=True)
+class Stages:
+    """One object for each box of the figure, in its order."""
+
+    undistort: Undistort
+    track: Track
+    views: StereoViews
+    rectify: Rectify
+    whole_path: WholePath
+    match: Callable[[StereoPair], DisparityMap]
+    upsample: Callable[[DisparityMap, StereoPair], DisparityMap]
+    reproject: Callable[[DisparityMap, StereoPair, Grid], PairDepth]
+    fuse: Callable[[Sequence[PairDepth], Grid], DepthMap]
+    register: Register
+    chain: Chain
+    map: SurfaceMap
+    keyframe: MakeKeyframe
+    beside: Callable[
+        [Callable[[StereoCandidate], Keyframe | None]],
+        BackgroundWorker[StereoCandidate, Keyframe | None],
+    ]
+    stopwatch: Stopwatch
+    refused: Counter[str]  # frames and views, by reason; written while tracking
+    rejected: Counter[str]  # pairs and keyframes, by reason; written while reconstructing
+    debug: dict[str, Array] | None  # images of the last view's stages; None: not kept
+    resources: ExitStack  # what to close in the end
+
+
+def build_stages(
+    camera: Camera,
+    config: Config,
+    backend: Backend,
+    live: bool = False,
+    pages: Path | None = None,
+) -> Stages:
+    """The stages that the configuration asks for. Raises ValueError for an unusable camera model.
+
+    ``live`` lets old work give way when reconstruction cannot keep up; otherwise nothing is
+    dropped. ``pages`` is a folder that the parts of the map flown long ago may go to; beside it
+    what is remembered of every view lies in files without a name. None: keep all that in memory,
+    and forget the map's oldest.
+    """
+    compute, stopwatch, resources = config.compute, Stopwatch(), ExitStack()
+    refused: Counter[str] = Counter()
+    rejected: Counter[str] = Counter()
+    debug: dict[str, Array] | None = {} if config.scan.keep_debug else None
+    undistort = Undistort(camera, compute.guide_width, stopwatch)
+    odometry = Odometry(
+        undistort.tracking_camera,
+        OdometryConfig(base_to_height=config.scan.base_to_height),
+        backend.matcher() if isinstance(backend, MatchingBackend) else None,
+    )
+    track = Track(odometry, refused, stopwatch)
+    selection = Viewpoints(config.scan, compute.pairs)
+    stereo = VirtualStereoConfig(
+        min_base_to_height=selection.min_base_to_height,
+        width_px=compute.stereo_width,
+        guide_width_px=compute.guide_width,
+        guided=compute.upsample,
+        labels=compute.labels,
+    )
+    dense = DenseStages(
+        BeliefPropagationConfig(iterations=compute.iterations), UpsamplingConfig(), FusionConfig()
+    )
+    pair = PairStages(backend, dense, debug, stopwatch)
+    views = StereoViews(selection, odometry, undistort.camera, undistort.valid, refused)
+
+    def beside(
+        work: Callable[[StereoCandidate], Keyframe | None],
+    ) -> BackgroundWorker[StereoCandidate, Keyframe | None]:
+        if debug is not None or not kernels_may_overlap():
+            return BackgroundWorker(None, work, MAX_WAITING, live)
+        return BackgroundWorker("dense", work, MAX_WAITING, live, share_cores(compute.threads))
+
+    return Stages(
+        undistort=undistort,
+        track=track,
+        views=views,
+        rectify=Rectify(stereo, rejected, debug, stopwatch),
+        whole_path=whole_path(backend, dense, stopwatch) if debug is None else by_stages,
+        match=pair.match,
+        upsample=pair.upsample,
+        reproject=pair.reproject,
+        fuse=pair.fuse,
+        register=Register(backend, stopwatch),
+        chain=_chain(config, pages, track.is_settled, rejected, stopwatch, resources),
+        map=SurfaceMap(pages, compute.map_voxels, config.scan.resolution_m, stopwatch),
+        keyframe=MakeKeyframe(debug),
+        beside=beside,
+        stopwatch=stopwatch,
+        refused=refused,
+        rejected=rejected,
+        debug=debug,
+        resources=resources,
+    )
+
+
+def _chain(
+    config: Config,
+    pages: Path | None,
+    is_settled: Callable[[Key], bool],
+    rejected: Counter[str],
+    stopwatch: Stopwatch,
+    resources: ExitStack,
+) -> Chain:
+    """The pose graph and all that hangs on it."""
+    graph = PoseGraph(PoseGraphConfig(most_nodes=config.fusion.graph_keyframes))
+    trajectory, carriers = Trajectory(graph=graph), Carriers()
+    if pages is not None:
+        ledger = FileLedger(KEYFRAME, pages.parent)
+        resources.callback(ledger.close)
+        trajectory = Trajectory(graph=graph, ledger=ledger)
+        carriers = Carriers(FileLedger(VIEW, pages.parent))
+    chain = Chain(trajectory, carriers, is_settled, rejected, stopwatch)
+    if config.fusion.loops:
+        chain.loops = LoopSearch(trajectory, most_views=config.fusion.loop_views)
+    return chain
+
+
+def _resized(image: U8, size_px: tuple[int, int]) -> U8:
+    """A larger image at the undistorted camera's size; any other as it is."""
+    W, H = size_px
+    if image.shape[:2] == (H, W) or image.shape[1] <= W:
+        return image
+    return np.asarray(cv2.resize(image, (W, H), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _within_width(camera: Camera, width_px: int) -> Camera:
+    """The camera, or its image made smaller when it is wider than ``width_px``."""
+    W, H = camera.size_px
+    if width_px >= W:
+        return camera
+    return scaled(camera, (width_px, round(H * width_px / W)))

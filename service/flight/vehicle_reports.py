@@ -1,0 +1,111 @@
+"""What the autopilot and the ground station are told of frames: odometry and keyframes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from mavlink.component.camera import KeyframeReport
+from mavlink.component.status import Odometry
+from mavlink.telemetry.samples import VehicleState
+from recon import se3
+from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
+from recon.types import F64
+from service.config import CameraConfig
+from service.flight.pipeline import Step
+from service.georeference import LocalFrame
+
+LONGEST_STEP_S = 0.5  # between two poses that give a velocity
+JUMP_M = 0.5  # off the way that the velocity before would have led
+BEST_TRACKS = 200
+
+
+class OdometryReport:
+    """Turns steps of the pipeline into odometry and hands it on.
+
+    Position and attitude are those of the body; the way from body to camera is neglected. With
+    a gimbal, telemetry says how the head stands on the body. The reset counter grows when
+    tracking starts anew and when a correction moves the estimate.
+    """
+
+    def __init__(self, camera: CameraConfig, send: Callable[[Odometry, int], object]) -> None:
+        """``send(odometry, time_ns)`` takes what comes out, at the frame's exposure."""
+        self._send = send
+        rpy = np.radians([camera.mount_roll_deg, camera.mount_pitch_deg, camera.mount_yaw_deg])
+        self._R_body_head = rotation_from_rpy(*map(float, rpy))
+        self._fixed = camera.mount == "fixed"
+        self._last: tuple[int, int, F64] | None = None  # time, segment, position
+        self._velocity: F64 | None = None  # NED, m/s
+        self.resets = 0
+
+    def tell(self, step: Step, state: VehicleState | None, time_ns: int) -> None:
+        """Hand on the pose of one frame; nothing for a frame without one by vision."""
+        placed = step.placed
+        if placed is None or step.anchor is None:
+            return
+        position: F64 = np.asarray(R_ENU_NED.T @ placed.T_world_camera[:3, 3])
+        R_ned_head = R_ENU_NED.T @ placed.T_world_camera[:3, :3] @ R_GIMBAL_CAMERA.T
+        R_ned_body: F64 = np.asarray(R_ned_head @ self._body_of_head(state))
+        velocity = self._move(time_ns, step.tracked.segment, position)
+        w, x, y, z = (float(v) for v in se3.quaternion_from_rotation(R_ned_body))
+        a, b, c = (float(v) for v in R_ned_body.T @ velocity)
+        north, east, down = (float(v) for v in position)
+        quality = round(100.0 * min(1.0, step.tracked.tracks / BEST_TRACKS))
+        odometry = Odometry(
+            (north, east, down),
+            (w, x, y, z),
+            (a, b, c),
+            _covariance(placed.covariance),
+            self.resets,
+            max(1, quality),
+        )
+        self._send(odometry, time_ns)
+
+    def _body_of_head(self, state: VehicleState | None) -> F64:
+        """(3, 3) body's attitude in the head's axes, by telemetry or by the fixed mount."""
+        if state is not None and not self._fixed:
+            head, body = state.q_ned_gimbal_wxyz, state.q_ned_body_wxyz
+            if head is not None and body is not None:
+                R_ned_head, R_ned_body = map(se3.rotation_from_quaternion, (head, body))
+                return np.asarray(R_ned_head.T @ R_ned_body)
+        return np.asarray(self._R_body_head.T)
+
+    def _move(self, time_ns: int, segment: int, position: F64) -> F64:
+        """The velocity by the last step; one more reset where that was none of the vehicle's."""
+        last, self._last = self._last, (time_ns, segment, position)
+        unknown: F64 = np.full(3, np.nan)
+        if last is None:
+            return unknown
+        step_s = (time_ns - last[0]) * 1e-9
+        if segment != last[1] or not 0.0 < step_s < LONGEST_STEP_S:
+            self.resets += segment != last[1]
+            self._velocity = None
+            return unknown
+        velocity: F64 = np.asarray((position - last[2]) / step_s)
+        known = self._velocity
+        if known is not None and float(np.linalg.norm(velocity - known)) * step_s > JUMP_M:
+            self.resets += 1
+            return known
+        self._velocity = velocity
+        return velocity
+
+
+def _covariance(covariance: F64) -> list[list[float]]:
+    """(6, 6) x y z roll pitch yaw in NED of one with the rotation first in ENU."""
+    turn = np.zeros((6, 6))
+    turn[:3, 3:] = turn[3:, :3] = R_ENU_NED.T
+    rows: list[list[float]] = (turn @ covariance @ turn.T).tolist()
+    return rows
+
+
+def keyframe_report(
+    time_unix_ns: int, T_world_camera: F64, frame: LocalFrame | None, agl_m: float | None
+) -> KeyframeReport:
+    """Its place on the globe and the attitude of its head; no place without a georeference."""
+    R_ned_head = R_ENU_NED.T @ T_world_camera[:3, :3] @ R_GIMBAL_CAMERA.T
+    w, x, y, z = (float(v) for v in se3.quaternion_from_rotation(np.asarray(R_ned_head)))
+    lat = lon = alt = None
+    if frame is not None:
+        lat, lon, alt = (float(v) for v in frame.to_geodetic(T_world_camera[None, :3, 3])[0])
+    return KeyframeReport(time_unix_ns // 1000, lat, lon, alt, agl_m, (w, x, y, z))

@@ -1,0 +1,327 @@
+"""Which frames become views of the virtual stereo camera, and which of them pair up.
+
+Three ways, as the operator sets ``scan.baseline``: "auto" takes the odometry's keyframes,
+spaced by base-to-height; metres takes a frame every so far along the track; "k/m" takes k of
+every m frames, evenly, as the paper does (two of every ten).
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from recon import se3
+from recon.posegraph.between_keyframes import FixAverage
+from recon.stereo.virtual_stereo import View
+from recon.tracking.keyframe_window import OdometryKeyframe, landmarks
+from recon.tracking.odometry import Odometry, Tracked
+from recon.types import F64, U8, Camera, PosePrior
+from service.config import ScanConfig, parse_baseline
+from service.flight.anchorage import Anchorage
+
+KEPT = 6
+LAST_VIEW_SHARE = 0.1
+"""A stretch's last frame becomes a view when it is this share of a usual step further on."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UndistortedFrame:
+    """A frame without distortion."""
+
+    seq: int
+    time_ns: int
+    prior: PosePrior
+    bgr: U8  # (H, W, 3)
+    gray: U8  # (H, W)
+    small: U8  # (h, w) gray, as the odometry takes it
+    mask: U8 | None  # (h, w) non-zero where the image is valid; None: everywhere
+    is_blurred: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Viewpoint:
+    """A tracked frame that may take part in stereo; its pose follows its odometry keyframe's."""
+
+    seq: int
+    time_ns: int
+    prior: PosePrior
+    bgr: U8 | None  # (H, W, 3) undistorted; None for one that is only a partner
+    gray: U8  # (H, W) the same
+    key: OdometryKeyframe  # the last one when it was tracked
+    anchor: Anchorage
+    is_blurred: bool = False  # takes no part in stereo, only in the track
+
+    @property
+    def segment(self) -> int:
+        """Stretch of unbroken vision."""
+        return self.key.segment
+
+    @property
+    def T_odom_camera(self) -> F64:
+        """(4, 4) as refined by now."""
+        return self.anchor.T_odom_camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoCandidate:
+    """A view with everything that its reconstruction needs, poses as they are known now."""
+
+    seq: int
+    time_ns: int
+    segment: int
+    prior: PosePrior
+    bgr: U8  # (H, W, 3) of the view
+    view: View
+    partners: tuple[View, ...]
+    anchor: Anchorage
+    points: F64  # (N, 3) landmarks in the view's camera
+    covariance: F64  # (6, 6) of the view's pose, left perturbation of camera-from-odometry
+    earlier: Mapping[int, F64]  # number to pose (4, 4) of the segment's last few views
+
+
+class Viewpoints:
+    """Selects views from tracked frames and remembers the last few as partners."""
+
+    def __init__(self, config: ScanConfig, partners: int = 4) -> None:
+        """At most ``partners`` of the last :data:`KEPT` views pair up with one of them.
+
+        With more partners than the neighbouring views can be, tracked frames between them
+        become partners too.
+        """
+        self._kept: deque[Viewpoint] = deque(maxlen=KEPT)
+        self._between: deque[Viewpoint] = deque(maxlen=8 * partners if partners > KEPT - 2 else 0)
+        self._recent: deque[Viewpoint] = deque(maxlen=6)  # a quarter of a step apart
+        self._extra: tuple[Viewpoint, list[Viewpoint]] | None = None  # a last view's partner
+        self._most_partners = partners
+        self._views_of: Counter[int] = Counter()  # views by segment
+        self._take_next = False
+        self.set_baseline(config)
+
+    def set_baseline(self, config: ScanConfig) -> None:
+        """Follow another ``scan.baseline`` from the next frame on."""
+        self._mode, self._amount, every = parse_baseline(config.baseline)
+        self._stride = frames_apart(int(self._amount), every) if self._mode == "frames" else 0
+        self._partners = self._most_partners if self._mode == "auto" else 1
+
+    def set_partners(self, most: int) -> None:
+        """Pair each view with at most ``most`` others from now on, where the baseline is "auto"."""
+        self._most_partners = most
+        self._partners = most if self._mode == "auto" else 1
+
+    def take_next(self) -> None:
+        """Make the next frame with a pose a view, whatever the baseline asks for."""
+        self._take_next = True
+
+    @property
+    def min_base_to_height(self) -> float:
+        """The shortest baseline that stereo should accept: an operator's choice is kept."""
+        return 0.03 if self._mode == "auto" else 0.002
+
+    def offer(self, frame: Viewpoint, tracked: Tracked) -> bool:
+        """True when the frame is to be a view."""
+        if self._take_next or self._wants(frame.seq, tracked):
+            self._take_next = False
+            self._keep(frame)
+            return True
+        if self._between.maxlen:
+            self._between.append(replace(frame, bgr=None))
+        elif self._moved_on(frame):
+            self._recent.append(replace(frame, bgr=None))
+        return False
+
+    def end_stretch(self, frame: Viewpoint | None) -> bool:
+        """True when the last frame of a stretch is to be a view: it shows more than the last one.
+
+        ``frame`` is that frame unless it is a view already. The ground that came into view
+        last is not in the view before; a frame between the two becomes its partner.
+        """
+        step = self._step(self._kept[-1].segment) if self._kept else None
+        if step is None:
+            return False
+        least = LAST_VIEW_SHARE * step
+        is_view = (
+            frame is not None and not frame.is_blurred and _apart(frame, self._kept[-1]) >= least
+        )
+        if frame is not None and is_view:
+            self._keep(frame)
+        last = self._kept[-1]
+        near = [v for v in self._recent if v.segment == last.segment and not v.is_blurred]
+        near = [v for v in near if 0.5 * step <= _apart(v, last) < 0.9 * step]
+        near.sort(key=lambda v: abs(_apart(v, last) - 0.65 * step))
+        self._extra = (last, near[:1])
+        return is_view
+
+    def _step(self, segment: int) -> float | None:
+        """Distance between the last two views; None unless they are automatic and of it."""
+        same = [v for v in self._kept if v.segment == segment]
+        if self._mode != "auto" or len(same) < 2:
+            return None
+        return _apart(same[-1], same[-2])
+
+    def _moved_on(self, frame: Viewpoint) -> bool:
+        """True a quarter of a step after the last frame that was remembered."""
+        step = self._step(frame.segment)
+        if step is None:
+            return False
+        last = max([self._kept[-1], *self._recent], key=lambda v: v.seq)
+        return last.segment == frame.segment and _apart(frame, last) > 0.25 * step
+
+    def _keep(self, view: Viewpoint) -> None:
+        self._kept.append(view)
+        self._views_of[view.segment] += 1
+
+    def _wants(self, seq: int, tracked: Tracked) -> bool:
+        if tracked.state == "started" or not self._kept:
+            return tracked.state in ("started", "keyframe")
+        last = self._kept[-1]
+        if self._mode == "auto" or last.segment != tracked.segment:
+            return tracked.state == "keyframe"
+        if self._mode == "frames":
+            return seq - last.seq >= self._stride
+        assert tracked.T_odom_camera is not None
+        moved = tracked.T_odom_camera[:3, 3] - last.T_odom_camera[:3, 3]
+        return bool(np.linalg.norm(moved) >= self._amount)
+
+    def ready(self, view: Viewpoint) -> bool:
+        """True when the view has two neighbours to pair with, or its segment is over."""
+        if not self._kept or self._kept[-1] is view:
+            return False
+        if self._mode != "auto" or self._kept[-1].segment != view.segment:
+            return True
+        return sum(v.segment == view.segment for v in self._kept) >= 3
+
+    def confirmed(self, view: Viewpoint) -> bool:
+        """False for a stretch of two views: what one pair alone claims, nothing contradicts.
+
+        Clouds in the sky or a false first motion would otherwise become surface. A baseline
+        that the operator fixed pairs each view once and is taken at its word.
+        """
+        return self._mode != "auto" or self._views_of[view.segment] >= 3
+
+    def partners(self, view: Viewpoint) -> list[Viewpoint]:
+        """The views to pair it with, the best first.
+
+        Automatic: those nearest to the wanted base-to-height, from both sides; a fixed
+        baseline: the neighbour after it, or before it at the end of a segment.
+        """
+        candidates = [*self._kept, *self._between]
+        segment = view.segment
+        others = [v for v in candidates if v.segment == segment and not v.is_blurred]
+        others = [v for v in others if v is not view]
+        if self._mode != "auto":
+            others.sort(key=lambda v: (v.seq < view.seq, abs(v.seq - view.seq)))
+            return others[:1]
+        others.sort(key=lambda v: _apart(v, view))
+        if not self._between:
+            extra = self._extra[1] if self._extra and self._extra[0] is view else []
+            return [*extra, *others[: self._partners]]
+        return self._spread(view, others)
+
+    def _spread(self, view: Viewpoint, others: list[Viewpoint]) -> list[Viewpoint]:
+        """Partners between half and twice the keyframes' spacing, evenly spread."""
+        base = [_apart(v, view) for v in others]
+        steps = [b for v, b in zip(others, base, strict=True) if v.bgr is not None]
+        spacing = steps[0] if steps else 0.0
+        good = [v for v, b in zip(others, base, strict=True) if 0.6 * spacing <= b <= 2.2 * spacing]
+        picked = np.unique(np.linspace(0, len(good) - 1, self._partners).round().astype(int))
+        return [good[i] for i in picked] if good else []
+
+
+def _apart(a: Viewpoint, b: Viewpoint) -> float:
+    return float(np.linalg.norm(a.T_odom_camera[:3, 3] - b.T_odom_camera[:3, 3]))
+
+
+def frames_apart(chosen: int, every: int) -> int:
+    """Frames between two views when ``chosen`` of ``every`` frames take part, evenly spread.
+
+    Two of every ten are ten frames apart: at 60 frames a second and 3 m/s the paper's 0.5 m.
+    """
+    return max(1, round(every / max(chosen - 1, 1)))
+
+
+class StereoViews:
+    """The virtual stereo camera: takes every frame, gives each view once its partners have come."""
+
+    def __init__(
+        self,
+        selection: Viewpoints,
+        odometry: Odometry,
+        camera: Camera,
+        seen: U8,
+        refused: Counter[str],
+    ) -> None:
+        """``seen`` (H, W) is zero where the undistorted ``camera`` sees nothing."""
+        self.selection = selection
+        self._odometry, self._K, self._seen, self._refused = odometry, camera.K, seen, refused
+        self._segment = odometry.segment
+        self._fixes = FixAverage()
+        self._waiting: deque[tuple[Viewpoint, PosePrior]] = deque()
+        self._given: deque[Viewpoint] = deque(maxlen=8)
+        self._latest: Viewpoint | None = None  # the last tracked frame, unless it is a view
+
+    def take(self, image: UndistortedFrame, tracked: Tracked) -> tuple[Anchorage | None, bool]:
+        """What gives the frame's place again, None without a pose, and whether it is a view."""
+        if tracked.segment != self._segment:
+            self.end_stretch()
+            self._segment = tracked.segment
+        if tracked.T_odom_camera is None:
+            return None, False
+        key = self._odometry.keyframes[-1]
+        anchor = Anchorage(image.seq, key, se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera)
+        frame = Viewpoint(
+            image.seq, image.time_ns, image.prior, image.bgr, image.gray, key, anchor,
+            image.is_blurred,
+        )  # fmt: skip
+        is_view = self.selection.offer(frame, tracked)
+        self._fixes.take(tracked.T_odom_camera, image.prior)
+        if is_view:
+            self._wait(frame)
+        self._latest = None if is_view else frame
+        return anchor, is_view
+
+    def end_stretch(self) -> None:
+        """Make a view of a stretch's last frame: only it shows what the camera saw last."""
+        if self.selection.end_stretch(self._latest) and self._latest is not None:
+            self._wait(self._latest)
+        self._fixes.forget()
+        self._latest = None
+
+    def _wait(self, view: Viewpoint) -> None:
+        """Keep a view until its partners are there; all fixes since the last one are its own."""
+        self._waiting.append((view, self._fixes.given(view.T_odom_camera, view.prior)))
+
+    def ready(self, everything: bool = False) -> Iterator[StereoCandidate]:
+        """The views whose partners are there, in order."""
+        while self._waiting and (everything or self.selection.ready(self._waiting[0][0])):
+            view, prior = self._waiting.popleft()
+            if not self.selection.confirmed(view):
+                self._refused["seen by two views only"] += 1
+            elif view.is_blurred:
+                self._refused["blurred"] += 1
+            else:
+                candidate = self._candidate(view, prior)
+                self._given.append(view)
+                yield candidate
+
+    def _candidate(self, view: Viewpoint, prior: PosePrior) -> StereoCandidate:
+        points, _ = landmarks(view.key)
+        assert view.bgr is not None
+        return StereoCandidate(
+            view.seq,
+            view.time_ns,
+            view.segment,
+            prior,
+            view.bgr,
+            self._posed(view),
+            tuple(self._posed(partner) for partner in self.selection.partners(view)),
+            view.anchor,
+            se3.transform(se3.inverse(view.anchor.T_key_camera), points),
+            view.key.covariance,
+            {v.seq: v.T_odom_camera for v in self._given if v.segment == view.segment},
+        )
+
+    def _posed(self, view: Viewpoint) -> View:
+        return View(view.bgr, view.gray, self._K, view.T_odom_camera, self._seen)

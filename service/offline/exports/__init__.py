@@ -1,0 +1,36 @@
+"""Deliverables of a scan: one table, one function per kind of file.
+
+An exporter is ``function(scan: ScanView, out: Path, options: ExportOptions) -> None`` and
+writes ``out`` whole or not at all. The next kind is one file and one line in EXPORTERS.
+"""
+
+from __future__ import annotations
+
+EXPORTERS: dict[str, tuple[str, str, str]] = {
+    "ply": ("clouds:write_ply", "cloud.ply", "Fused cloud, binary PLY, UTM."),
+    "laz": ("clouds:write_laz_file", "cloud.laz", "Fused cloud, LAZ 1.4."),
+    "copc": ("clouds:write_copc", "cloud.copc.laz", "Cloud-optimised LAZ."),
+    "dsm": ("rasters:write_dsm", "dsm.tif", "Surface model, GeoTIFF (COG)."),
+    "ortho": ("rasters:write_ortho", "ortho.tif", "Orthophoto, GeoTIFF (COG)."),
+    "contours": (
+        "rasters:write_contours",
+        "contours.geojson",
+        "Height contours, GeoJSON.",
+    ),
+    "coverage": (
+        "rasters:write_coverage",
+        "coverage.tif",
+        "Views, sigma, height, COG.",
+    ),
+    "geojson": ("flight:write_geojson", "flight.geojson", "The flight, GeoJSON."),
+    "kml": ("flight:write_kml", "flight.kml", "The flight, KML."),
+    "colmap": (
+        "flight:write_colmap",
+        "colmap",
+        "Keyframes as a COLMAP text model with pictures.",
+    ),
+    "3dtiles": ("clouds:write_tiles", "3dtiles", "Point tiles for Cesium."),
+    "glb": ("model:write_glb", "mesh.glb", "Textured mesh, binary glTF."),
+    "mcap": ("recording:write_mcap", "flight.mcap", "Recording for Foxglove."),
+}
+"""Name to (``module:function`` of this package, usual name in the folder, one line of help)."""

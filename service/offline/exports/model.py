@@ -1,0 +1,196 @@
+"""The textured mesh of a scan as binary glTF."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from recon.surface.meshing import Mesh
+from recon.types import U8
+from service.errors import InputError
+from service.offline.exports.mesh_tiles import TileJob, footprints, run_tiles, tile_boxes
+from service.offline.exports.pictures import recording_of
+from service.offline.exports.view import ExportOptions, ScanView
+from service.packages import needing
+from service.scans.writing import writing
+
+METHODS = ("auto", "height", "poisson")
+TILE_POINTS = 20_000_000
+LARGEST_ATLAS_PX = 8192
+TILED_ATLAS_PX = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class MeshOptions:
+    """How a mesh is made; see ``skyrelief mesh --help``."""
+
+    method: str = "auto"
+    largest_faces: int = 400_000
+    tile_points: int = TILE_POINTS
+    scheduler: str | None = None
+    video: Path | None = None  # None: the scan's recording, when it is still there
+    recording: bool = True  # False: never look for the recording
+    video_epoch_ns: int | None = None
+
+
+def write_glb(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """The mesh that ``skyrelief mesh`` makes by default."""
+    write_mesh(scan, out, MeshOptions(), options)
+
+
+def write_mesh(
+    scan: ScanView, out: Path, how: MeshOptions, options: ExportOptions
+) -> dict[str, Any]:
+    """Mesh and texture the scan, and write it in local ENU metres; figures of the mesh.
+
+    ``height`` is one sheet over the ground; ``poisson`` a surface through all points; ``auto``
+    takes ``height`` unless many keyframes look sideways. Raises InputError when there is too
+    little surface, OutsideError when a cluster was named and does not answer.
+    """
+    if how.method not in METHODS:
+        raise InputError(f"mesh by {how.method!r}: there are {', '.join(METHODS)}")
+    method = how.method
+    if method == "auto":
+        method = "poisson" if scan.oblique else "height"
+    prints = footprints(scan.store)
+    if not prints:
+        raise InputError(f"{scan.folder} holds no points yet; nothing to mesh")
+    voxel_m = options.voxel_m or float(np.median([p.sample_m for p in prints]))
+    video = how.video
+    if video is None and how.recording:
+        recording = recording_of(scan.folder, scan.store.header)
+        options.progress(recording.words)
+        video = recording.path
+    boxes = tile_boxes(prints, how.tile_points)
+    jobs = [
+        TileJob(
+            str(scan.folder.resolve()),
+            box,
+            voxel_m,
+            method,
+            max(1000, how.largest_faces // len(boxes)),
+            LARGEST_ATLAS_PX if len(boxes) == 1 else TILED_ATLAS_PX,
+            None if video is None else str(video.resolve()),
+            how.video_epoch_ns,
+            how.video is not None,
+        )
+        for box in boxes
+    ]
+    parts = run_tiles(jobs, how.scheduler, options.progress)
+    if not parts:
+        raise InputError(f"{scan.folder}: cannot be meshed, there is too little surface")
+    figures = {
+        "method": method,
+        "tiles": len(parts),
+        "faces": sum(p.figures["faces"] for p in parts),
+        "vertices": sum(p.figures["vertices"] for p in parts),
+        "seen": float(
+            np.average(
+                [p.figures["seen"] for p in parts], weights=[p.figures["faces"] for p in parts]
+            )
+        ),
+        "pictures": "store" if video is None else str(video),
+        "texture_px": [p.figures["texture_px"] for p in parts],
+    }
+    options.progress(f"writing {figures['faces']} triangles")
+    with writing(out) as part:
+        part.write_bytes(glb([(p.mesh, p.picture) for p in parts], _extras(scan) | figures))
+    return figures
+
+
+def _extras(scan: ScanView) -> dict[str, Any]:
+    """Where the mesh stands: its x is east, y up, -z north of this origin."""
+    frame = scan.frame
+    if frame is None:
+        return {"scan": scan.store.header.scan_id, "origin": None}
+    origin = [frame.lat_deg, frame.lon_deg, frame.alt_amsl_m]
+    return {"scan": scan.store.header.scan_id, "origin_lat_lon_amsl": origin}
+
+
+LARGEST_TEXTURE_PX = 8192
+CLAMP_TO_EDGE, TRILINEAR = 33071, 9987
+
+
+def glb(parts: Sequence[tuple[Mesh, U8 | None]], extras: dict[str, Any]) -> bytes:
+    """The file's bytes: one mesh per part, each with its image.
+
+    An image is (h, w, 3) RGB for the mesh's uv; without one its rgb is used. glTF has y up:
+    x stays east, y is up, z is south. ``extras`` go into the asset.
+    """
+    with needing("a mesh file"):
+        import trimesh
+        from trimesh.exchange.gltf import export_glb
+    scene = trimesh.Scene()
+    textures: list[U8 | None] = []
+    for number, (mesh, image) in enumerate(parts):
+        textures.append(image if mesh.uv is not None else None)
+        scene.add_geometry(_geometry(mesh, textures[-1] is not None), f"surface {number}")
+
+    def add_textures(buffers: Any, tree: dict[str, Any]) -> None:
+        tree["materials"] = [_material() for _ in textures]
+        for number, image in enumerate(textures):
+            tree["meshes"][number]["primitives"][0]["material"] = number
+            if image is not None:
+                tree["images"].append({"bufferView": len(buffers), "mimeType": "image/jpeg"})
+                buffers[f"image {number}"] = _jpeg(image)
+                base = {"index": len(tree["textures"])}
+                tree["textures"].append({"source": len(tree["images"]) - 1, "sampler": 0})
+                tree["materials"][number]["pbrMetallicRoughness"]["baseColorTexture"] = base
+        if tree["textures"]:
+            wrap = {"wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}
+            tree["samplers"] = [wrap | {"minFilter": TRILINEAR}]
+        tree["extensionsUsed"] = ["KHR_materials_unlit"]
+        tree["asset"] |= {"generator": "skyrelief", "extras": extras}
+
+    return bytes(export_glb(scene, include_normals=False, buffer_postprocessor=add_textures))
+
+
+def _geometry(mesh: Mesh, textured: bool) -> Any:
+    """The mesh in glTF's axes with uv, or else colours, at its vertices."""
+    from trimesh import Trimesh
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    xyz = mesh.vertices_m[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
+    made: Any = Trimesh(xyz, mesh.faces, process=False)
+    if textured and mesh.uv is not None:
+        uv = mesh.uv.astype(np.float64)
+        uv[:, 1] = 1.0 - uv[:, 1]  # trimesh counts v upwards
+        made.visual = TextureVisuals(uv, material=PBRMaterial())
+    elif mesh.rgb is not None:
+        opaque = np.full(len(mesh.rgb), 255, np.uint8)
+        made.visual.vertex_colors = np.column_stack([_linear(mesh.rgb), opaque])
+    return made
+
+
+def _material() -> dict[str, Any]:
+    """Without light or back: what the image holds is shown from both sides."""
+    return {
+        "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+        "extensions": {"KHR_materials_unlit": {}},
+        "doubleSided": True,
+    }
+
+
+def _linear(rgb: U8) -> U8:
+    """Vertex colours are linear in glTF; images are sRGB (IEC 61966-2-1)."""
+    s = np.arange(256) / 255.0
+    table = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
+    return np.asarray(np.rint(255.0 * table).astype(np.uint8)[rgb])
+
+
+def _jpeg(rgb: U8) -> bytes:
+    """The texture as JPEG, at most LARGEST_TEXTURE_PX a side, padded to whole words."""
+    scale = LARGEST_TEXTURE_PX / max(rgb.shape[:2])
+    if scale < 1.0:
+        size = (round(rgb.shape[1] * scale), round(rgb.shape[0] * scale))
+        rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    ok, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+    if not ok:
+        raise ValueError("OpenCV cannot write JPEG on this machine")
+    return data.tobytes() + b"\0" * (-data.size % 4)

@@ -1,0 +1,246 @@
+"""Surface model, orthophoto and contours, as Cloud Optimized GeoTIFF and GeoJSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from recon.mapping.free_space import open_above
+from recon.surface.raster import (
+    Grid,
+    Raster,
+    fill_holes,
+    standing_height,
+    surface_model,
+    without_cells,
+)
+from recon.types import F64, Array
+from service.errors import InputError
+from service.georeference import LocalFrame
+from service.offline.exports.view import ExportOptions, ScanView
+from service.scans.coverage import coverage_of
+from service.scans.writing import writing
+
+NODATA_M = -9999.0
+SHORTEST_CONTOUR_CELLS = 12
+MAX_CONTOURS = 5000
+"""Heights at which contours are drawn: every metre up to the highest mountains."""
+OPEN_STEP_M = 2
+SIDEWAYS_DEG = 15.0
+MAX_OPEN_M, MAX_OPEN_SIDEWAYS_M = 4, 6
+"""Free air above a cell that is asked for at most: trees and eaves hang over higher up as well,
+but every metre costs ground at the border of the survey. Looking sideways one sees more of
+the ground below them."""
+
+
+def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """Heights in AMSL metres (float32, -9999 where unknown); band 2 holds their sigma.
+
+    Unknown is also what cannot be placed beside a step
+    (:func:`recon.surface.raster.surface_model`), and ground above which something may stand that
+    no picture shows.
+    """
+    cloud = scan.fused.cloud
+    raster = surface_model(scan.xyz_m, cloud.rgb, cloud.sigma_m, scan.grid(options.cell_m))
+    raster = _open_to_the_sky(scan, raster)
+    known = raster.known
+    bands = np.stack(
+        [np.where(known, raster.height_m, NODATA_M), np.where(known, raster.sigma_m, NODATA_M)]
+    ).astype(np.float32)
+    write_cog(scan, out, raster.grid, bands, ("height AMSL, m", "sigma, m"), nodata=NODATA_M)
+
+
+def _open_to_the_sky(scan: ScanView, raster: Raster) -> Raster:
+    """``raster`` where the air above was seen to be free, as high as things stand on this site."""
+    sideways = float(np.median(scan.off_nadir_deg)) > SIDEWAYS_DEG
+    highest = min(standing_height(raster), MAX_OPEN_SIDEWAYS_M if sideways else MAX_OPEN_M)
+    heights_m = [float(m) for m in range(OPEN_STEP_M, math.ceil(highest) + 1, OPEN_STEP_M)]
+    if not heights_m:
+        return raster
+    rows, cols = np.nonzero(raster.known)
+    grid = raster.grid
+    places = np.column_stack(
+        [
+            grid.west_m + (cols + 0.5) * grid.cell_m,
+            grid.north_m - (rows + 0.5) * grid.cell_m,
+            raster.height_m[rows, cols].astype(np.float64),
+        ]
+    )
+    if scan.frame is not None:
+        places = scan.frame.from_utm(places)
+    depths = (k.depth for k in scan.store.keyframes())
+    hidden = np.zeros(grid.shape, np.bool_)
+    hidden[rows, cols] = ~open_above(places, heights_m, depths)
+    return without_cells(raster, hidden)
+
+
+def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """Red, green, blue and opacity, one byte each; seen from straight above everywhere."""
+    raster = fill_holes(scan.raster(options.cell_m))
+    opacity = np.where(raster.known, 255, 0).astype(np.uint8)
+    bands = np.concatenate([raster.rgb.transpose(2, 0, 1), opacity[None]])
+    write_cog(scan, out, raster.grid, bands, ("red", "green", "blue", "opacity"))
+
+
+def write_cog(
+    scan: ScanView,
+    out: Path,
+    grid: Grid,
+    bands: Array,
+    names: tuple[str, ...],
+    nodata: float | None = None,
+) -> None:
+    """Write (bands, rows, cols) as Cloud Optimized GeoTIFF in the scan's UTM zone."""
+    import rasterio
+    from rasterio.enums import ColorInterp
+    from rasterio.io import MemoryFile
+    from rasterio.shutil import copy
+    from rasterio.transform import from_origin
+
+    profile: dict[str, Any] = {
+        "driver": "GTiff",
+        "height": grid.shape[0],
+        "width": grid.shape[1],
+        "count": len(bands),
+        "dtype": bands.dtype,
+        "transform": from_origin(grid.west_m, grid.north_m, grid.cell_m, grid.cell_m),
+        "nodata": nodata,
+    }
+    if scan.frame is not None:
+        profile["crs"] = rasterio.crs.CRS.from_epsg(scan.frame.epsg)
+    heights = "metres above mean sea level" if scan.frame else "metres above the scan's origin"
+    with writing(out) as part, MemoryFile() as memory:
+        with memory.open(**profile) as image:
+            image.write(bands)
+            image.descriptions = names
+            image.update_tags(SCAN=scan.store.header.scan_id, HEIGHTS=heights)
+            if len(bands) == 4:
+                kinds = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
+                image.colorinterp = kinds
+        with memory.open() as image:
+            predictor = "YES" if bands.dtype.kind == "f" else "STANDARD"
+            copy(image, str(part), driver="COG", compress="DEFLATE", predictor=predictor)
+
+
+def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """Height contours as GeoJSON lines (longitude, latitude), with their height AMSL.
+
+    Drawn on the surface smoothed over a few cells; lines shorter than a few cells are noise
+    and left out.
+    """
+    frame = scan.needs_place("a contour map")
+    raster = fill_holes(scan.raster(options.cell_m))
+    features = []
+    for height_m, line in contour_lines(raster, options.contour_m):
+        geodetic = frame.to_geodetic(
+            frame.from_utm(np.column_stack([line, np.full(len(line), height_m)]))
+        )
+        features.append(
+            {
+                "type": "Feature",
+                "properties": {"height_amsl_m": round(height_m, 3)},
+                "geometry": {
+                    "type": "LineString",
+                    "coordinates": [[round(p[1], 8), round(p[0], 8)] for p in geodetic],
+                },
+            }
+        )
+    with writing(out) as part:
+        part.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+
+
+def contour_lines(raster: Raster, step_m: float) -> Iterator[tuple[float, F64]]:
+    """(height, (N, 2) x y) of the closed or open contours at whole multiples of ``step_m``.
+
+    A contour is the border of the cells at or above its height, cut where it runs along
+    unknown ground.
+    """
+    known = raster.known
+    if not known.any():
+        return
+    filled = np.where(known, raster.height_m, np.float32(np.nanmedian(raster.height_m)))
+    smooth = cv2.GaussianBlur(filled.astype(np.float32), (0, 0), 1.5)
+    low, high = float(smooth[known].min()), float(smooth[known].max())
+    if (high - low) / step_m > MAX_CONTOURS:
+        raise InputError(
+            f"contours every {step_m:g} m over {high - low:.0f} m of height are too many; "
+            "give a larger --contour-m"
+        )
+    inner = cv2.erode(np.pad(known, 1).astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1]
+    for n in range(math.ceil(low / step_m), math.floor(high / step_m) + 1):
+        above = ((smooth >= n * step_m) & known).astype(np.uint8)
+        loops, _ = cv2.findContours(above, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        for loop in loops:
+            for run in _inside_runs(loop[:, 0], inner > 0):
+                if len(run) >= SHORTEST_CONTOUR_CELLS:
+                    x = raster.grid.west_m + (run[:, 0] + 0.5) * raster.grid.cell_m
+                    y = raster.grid.north_m - (run[:, 1] + 0.5) * raster.grid.cell_m
+                    yield n * step_m, np.column_stack([x, y])
+
+
+def _inside_runs(loop: Array, inside: Array) -> list[Array]:
+    """The stretches of a closed loop of (col, row) that lie inside the known ground."""
+    ok = inside[loop[:, 1], loop[:, 0]]
+    if ok.all():
+        return [np.concatenate([loop, loop[:1]])]
+    start = int(np.argmin(ok))
+    loop, ok = np.roll(loop, -start, axis=0), np.roll(ok, -start)
+    edges = np.flatnonzero(np.diff(np.r_[False, ok, False].astype(np.int8)))
+    return [loop[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def write_coverage(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """coverage.tif: views, sigma and height as float32, -9999 where unknown, in the scan's UTM.
+
+    Raises InputError when the scan holds no surface.
+    """
+    found = coverage_of(scan.store, options.cell_m)
+    if found is None:
+        raise InputError(f"{scan.folder} holds no points yet; nothing to export")
+    layer, grid = found.layer, found.layer.grid
+    height = layer.height_m + (0.0 if scan.frame is None else scan.frame.alt_amsl_m)
+    bands = np.stack([layer.views.astype(np.float32), layer.sigma_m, height]).astype(np.float32)
+    bands[:, ~(layer.known | (layer.views > 0))] = np.nan
+    if scan.frame is not None:
+        grid, bands = _in_utm(bands, grid, scan.frame)
+    bands = np.where(np.isfinite(bands), bands, np.float32(NODATA_M))
+    names = ("views", "sigma, m", "height, m")
+    write_cog(scan, out, grid, bands, names, nodata=NODATA_M)
+
+
+def _in_utm(bands: Array, grid: Grid, frame: LocalFrame) -> tuple[Grid, Array]:
+    """The bands on a north-up grid of the frame's UTM zone, nearest cell taken.
+
+    Over the extent of a scan UTM is an affine map of ENU to within a small part of a cell.
+    """
+    west, south, east, north = grid.bounds
+    corners = np.array([[west, north, 0.0], [east, north, 0.0], [east, south, 0.0],
+                        [west, south, 0.0]])  # fmt: skip
+    utm = frame.to_utm(corners)[:, :2]
+    cell = grid.cell_m
+    low = np.floor(utm.min(axis=0) / cell).astype(np.int64)
+    high = np.ceil(utm.max(axis=0) / cell).astype(np.int64)
+    shape = (int(high[1] - low[1]), int(high[0] - low[0]))
+    out = Grid(float(low[0] * cell), float(high[1] * cell), cell, shape)
+    # Pixel of the old grid as an affine function of the pixel of the new one.
+    A = cv2.getAffineTransform(
+        out.pixels(utm[:3]).astype(np.float32), grid.pixels(corners[:3, :2]).astype(np.float32)
+    )
+    layers = [
+        cv2.warpAffine(
+            np.ascontiguousarray(band),
+            A,
+            shape[::-1],
+            flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=float("nan"),
+        )
+        for band in bands
+    ]
+    return out, np.stack(layers)

@@ -1,0 +1,134 @@
+"""A scan folder opened for its deliverables: store, place, track and fused cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib import import_module
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+
+from recon.surface.raster import Grid, Raster, grid_over, rasterise_points
+from recon.types import F64
+from service.errors import InputError
+from service.georeference import LocalFrame
+from service.offline.exports import EXPORTERS
+from service.packages import needing
+from service.scans.fused_cloud import FusedCloud, fused_cloud, placed
+from service.scans.track import latest, local_frame
+from service.stream.records import PoseRecord
+from service.stream.store import ScanStore
+
+OBLIQUE_SHARE = 0.25
+"""Share of the keyframes looking sideways above which a scan counts as oblique."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExportOptions:
+    """What the operator may choose; None takes the scan's own ground sample distance."""
+
+    voxel_m: float | None = None
+    cell_m: float | None = None
+    contour_m: float = 1.0
+    progress: Callable[[str], None] = field(default=lambda _: None)
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for sizes that are not positive."""
+        for name in ("voxel_m", "cell_m", "contour_m"):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name} is {value}, must be positive")
+
+
+class ScanView:
+    """An open scan folder; close it, or use it in a ``with``."""
+
+    def __init__(self, folder: Path, voxel_m: float | None = None) -> None:
+        """Raises InputError when ``folder`` is no scan folder."""
+        if not folder.is_dir():
+            raise InputError(f"{folder} is not a folder; give a scan folder (it holds scan.db)")
+        if not (folder / "scan.db").is_file():
+            raise InputError(f"{folder} holds no scan.db; give a scan folder")
+        self.folder = folder
+        self.store = ScanStore.open(folder / "scan.db")
+        self._voxel_m = voxel_m
+
+    def __enter__(self) -> ScanView:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.store.close()
+
+    @cached_property
+    def frame(self) -> LocalFrame | None:
+        """The scan's place on the globe, or None."""
+        return local_frame(self.store.header)
+
+    @cached_property
+    def poses(self) -> list[PoseRecord]:
+        """The trajectory in order of time."""
+        return latest(self.store.poses())
+
+    @cached_property
+    def oblique(self) -> bool:
+        """True when many keyframes look more than 30 degrees off straight down."""
+        off = self.off_nadir_deg
+        return bool(len(off)) and float((off > 30.0).mean()) > OBLIQUE_SHARE
+
+    @cached_property
+    def off_nadir_deg(self) -> F64:
+        """(K,) how far each keyframe looks off straight down."""
+        down = [-k.depth.T_world_camera[2, 2] for k in self.store.keyframes()]
+        return np.asarray(np.degrees(np.arccos(np.clip(down, -1.0, 1.0))), np.float64)
+
+    @cached_property
+    def fused(self) -> FusedCloud:
+        """The fused cloud in ENU metres; InputError when there is not a single point."""
+        fused = fused_cloud(self.store, self._voxel_m)
+        if not len(fused.cloud):
+            raise InputError(f"{self.folder} holds no points yet; nothing to export")
+        return fused
+
+    @cached_property
+    def xyz_m(self) -> F64:
+        """(N, 3) of the fused cloud in UTM with AMSL heights; ENU without georeference."""
+        return placed(self.fused.cloud, self.frame)
+
+    def grid(self, cell_m: float | None) -> Grid:
+        """A grid over ``xyz_m``, by default of cells as large as the voxels."""
+        cell = cell_m or self.fused.voxel_m
+        try:
+            return grid_over(self.xyz_m[:, :2], cell, margin_cells=1)
+        except ValueError as error:
+            raise InputError(f"{self.folder}: {error} with --cell-m") from error
+
+    def raster(self, cell_m: float | None) -> Raster:
+        """The upper surface on :meth:`grid`, also where it is doubtful."""
+        cloud = self.fused.cloud
+        return rasterise_points(self.xyz_m, cloud.rgb, cloud.sigma_m, self.grid(cell_m))
+
+    def needs_place(self, what: str) -> LocalFrame:
+        """The frame; InputError when the scan has no georeference."""
+        if self.frame is None:
+            raise InputError(f"{self.folder} has no georeference; {what} needs one (fly with GNSS)")
+        return self.frame
+
+
+def export(view: ScanView, kind: str, out: Path | None, options: ExportOptions) -> Path:
+    """Write one deliverable; the path written. InputError for an unknown kind."""
+    if kind not in EXPORTERS:
+        raise InputError(f"cannot export to {kind!r}; there are {', '.join(EXPORTERS)}")
+    target, usual, _ = EXPORTERS[kind]
+    path = out or view.folder / usual
+    module, _, name = target.partition(":")
+    with needing(f"export to {kind}"):
+        getattr(import_module(f"service.offline.exports.{module}"), name)(view, path, options)
+    return path

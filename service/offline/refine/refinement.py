@@ -1,0 +1,398 @@
+"""A finished scan adjusted as a whole: telemetry, every loop, ground control, all at once.
+
+The unrefined state is the input, however often a scan was refined, so the same input gives
+the same result. What comes out are new poses of the same chunks, appended to the store, and
+the deliverables written again.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from recon import se3
+from recon.posegraph.ground_control import (
+    FIX_S,
+    Adjusted,
+    BatchConfig,
+    Closure,
+    Point,
+    Track,
+    adjust,
+    map_position,
+    supported,
+)
+from recon.posegraph.sensor_offsets import constants
+from recon.posegraph.submap_loops import SubmapLoopConfig
+from recon.self_calibration import SelfCalibrated
+from recon.types import F64, Camera, Keyframe, PosePrior
+from service.cameras.rig import Rig
+from service.config import CameraConfig, FusionConfig, ScanConfig
+from service.errors import InputError
+from service.georeference import LocalFrame
+from service.offline.refine import own_camera
+from service.offline.refine.control_points import (
+    Candidate,
+    Pictures,
+    candidates_of,
+    clustered,
+    place_by_survey,
+    screen,
+)
+from service.offline.refine.refinement_figures import in_words, told
+from service.offline.refine.revisions import Revisions, copy_store, grown, moved_frames
+from service.offline.refine.stored_loops import StoredLoops, loose
+from service.offline.refine.survey_file import read_survey
+from service.scans.folder import write_deliverables
+from service.scans.track import local_frame
+from service.stream.records import (
+    Repose,
+    ScanHeader,
+    unpack_covariance,
+    unpack_motion,
+)
+from service.stream.store import ScanStore
+
+log = logging.getLogger(__name__)
+
+LINK_LOG = "link.tlog"
+"""What the daemon keeps of the flight's telemetry beside a scan."""
+
+MIN_SIGMA_SCALE = 0.003
+BY_SURVEY = "control points"
+MAX_REFUSALS = 0.4
+"""Of the control points; when more contradict the rest, nobody knows which half is right."""
+
+
+@dataclass(frozen=True, slots=True)
+class RefineOptions:
+    """What the operator chose."""
+
+    gcp: Path | None = None
+    telemetry: Path | None = None
+    out: Path | None = None
+    loops: bool = True
+
+
+def refine(folder: Path, options: RefineOptions) -> dict[str, Any]:
+    """Adjust the scan in ``folder`` and write its deliverables again; the figures of it.
+
+    Raises InputError, in one line, for a scan that is not finished or holds fewer than two
+    keyframes, and for bad control points.
+    """
+    target = _open_target(folder, options.out)
+    with ScanStore.open(target / "scan.db") as store, Revisions(store) as revisions:
+        job = _Refinement(folder, store, revisions, options)
+        figures = job.run()
+    return _deliver(target, figures)
+
+
+def undo(folder: Path) -> dict[str, Any]:
+    """Bring back the unrefined state, as a further revision, and write the deliverables again."""
+    target = _open_target(folder, None)
+    with ScanStore.open(target / "scan.db") as store, Revisions(store) as revisions:
+        if not revisions.refined:
+            raise InputError(f"{folder} was never refined; there is nothing to undo")
+        states = [s for seq in store.seqs() if (s := revisions.keyframe_state(seq)) is not None]
+        back = [Repose(s.seq, 0, s.T_world_camera, s.scale, s.covariance) for s in states]
+        revisions.append(back, revisions.frames(), revisions.header, {"undone": True})
+    return _deliver(target, {"undone": True, "keyframes": len(states)})
+
+
+def intrinsics(
+    folder: Path, video: Path, telemetry: Path | None, out: Path | None
+) -> dict[str, Any]:
+    """Find the camera from the flight's video and write its file beside the scan, or in ``out``.
+
+    The scan itself stays as it is. Raises InputError, in one line, when the flight cannot tell.
+    """
+    _open_target(folder, None)
+    with ScanStore.open(folder / "scan.db") as store, Revisions(store) as revisions:
+        job = _Refinement(folder, store, revisions, RefineOptions(telemetry=telemetry))
+        found, given = job.own_camera(video)
+    return own_camera.write(found, given, out or folder) | {"notes": job.notes}
+
+
+def _deliver(target: Path, figures: dict[str, Any]) -> dict[str, Any]:
+    with ScanStore.open(target / "scan.db") as store:
+        write_deliverables(target, store, {})
+    return figures | {"scan_folder": str(target)}
+
+
+def _open_target(folder: Path, out: Path | None) -> Path:
+    """The folder to work in: the scan's own, or a copy of its store in ``out``."""
+    path = folder / "scan.db"
+    if not path.is_file():
+        raise InputError(f"{folder} holds no scan.db; give a scan folder")
+    with ScanStore.open(path) as store:
+        if not store.finished:
+            raise InputError(f"{folder} is not finished; refine it when the flight is over")
+        count = len(store.seqs())
+    if count < 2:
+        raise InputError(f"{folder} holds {count} keyframe(s); refining takes two or more")
+    if out is None or out.resolve() == folder.resolve():
+        return folder
+    copy_store(path, out / "scan.db")
+    return out
+
+
+def fixes_of(track: Track) -> tuple[F64, F64]:
+    """(N, 3) measured places, NaN where there is none, and their sigmas as of independent ones."""
+    places = np.full((len(track.poses), 3), np.nan)
+    sigma = np.ones((len(track.poses), 3))
+    gap_s = max(float(np.median(np.diff(track.times_s))), 1e-3)
+    for k, prior in enumerate(track.priors):
+        if prior.position_m is not None and prior.sigma_position_m is not None:
+            places[k] = prior.position_m
+            sigma[k] = prior.sigma_position_m * np.sqrt(max(1.0, 2.0 * FIX_S / gap_s))
+    return places, sigma
+
+
+class _Refinement:
+    """One adjustment of one scan."""
+
+    def __init__(
+        self, folder: Path, store: ScanStore, revisions: Revisions, options: RefineOptions
+    ) -> None:
+        self.folder, self.store, self.options = folder, store, options
+        self.revisions = revisions
+        self.header = revisions.header
+        self.frame = local_frame(self.header)
+        states = (revisions.keyframe_state(seq) for seq in store.seqs())
+        self.states = sorted((s for s in states if s is not None), key=lambda s: s.time_ns)
+        self.frames = revisions.frames()
+        self.keyframe = lru_cache(maxsize=64)(revisions.keyframe)
+        self.notes: list[str] = []
+        self.grown = 1.0  # metres of the survey per metre of the flight's own scale
+
+    def run(self) -> dict[str, Any]:
+        """Adjust and append; the figures."""
+        survey = read_survey(self.options.gcp) if self.options.gcp is not None else []
+        pictures = Pictures(self.states, self.frames, self.header.camera, self.keyframe, self.frame)
+        candidates = candidates_of(survey, pictures, str(self.options.gcp))
+        if self.frame is None and candidates:
+            self._place(candidates)
+        if self.frame is not None:
+            screen(candidates, self.frame)
+            self._enough(candidates)
+        elif self.options.telemetry is not None:
+            raise InputError(f"{self.folder} has no georeference; replay it with its telemetry")
+        track = self._track()
+        flown = self._flown_loops() if self.options.loops else []
+        closures = self._closures(track) if self.options.loops else []
+        kept = [c for c in supported([*flown, *closures], track.poses) if c not in flown]
+        track = replace(track, loops=[*flown, *kept])
+        found = self._adjusted(track, candidates)
+        told_clustered = clustered(candidates, track.poses[:, :3, 3])
+        self.notes += [told_clustered] if told_clustered else []
+        seqs = [s.seq for s in self.states]
+        verified = len(flown) + len(closures)
+        figures = told(seqs, track, found, candidates, verified, self._ahead_m())
+        figures["notes"] = self.notes
+        header = replace(self.header, notes=(*self.header.notes, in_words(figures)))
+        frames = moved_frames(self.frames, self.states, found, self.frame)
+        changed = self.revisions.append(self._reposes(found), frames, header, figures)
+        return figures | {"changed": changed}
+
+    def own_camera(self, video: Path) -> tuple[SelfCalibrated, Camera]:
+        """The camera by the flight's own pictures, and the one that it was flown with."""
+        track, given = self._track(), own_camera.camera_of(self.header)
+        times = [s.time_ns for s in self.states]
+        pictures = own_camera.pictures_at(video, self.header.started_unix_ns, times)
+        ahead = track.poses[:, :3, 2] * self._ahead_m()
+        ground_m = float(np.median(track.poses[:, 2, 3] + ahead[:, 2]))
+        fixes, sigma = fixes_of(track)
+        found = own_camera.found_camera(pictures, given, track.poses, ground_m, fixes, sigma)
+        return found, given
+
+    # ---- what goes in ------------------------------------------------------------------------
+
+    def _place(self, candidates: Sequence[Candidate]) -> None:
+        """Give a scan without a place, and without a sure scale, those of the survey."""
+        self.frame, scale, R, t = place_by_survey(candidates)
+        if not any(c.has_height for c in candidates if c.usable):
+            self.notes.append("no control point has a height: heights count from the scan's own 0")
+        self.grown = scale
+        moved = []
+        for s in self.states:
+            T = s.T_world_camera
+            placed = se3.compose(R @ T[:3, :3], scale * R @ T[:3, 3] + t)
+            spread = np.diag([0.03**2] * 3 + [1.0] * 3)
+            moved.append(
+                replace(s, T_world_camera=placed, covariance=spread, scale=s.scale * scale)
+            )
+        self.states = moved
+        for one in candidates:
+            if one.before_m is not None:
+                one.before_m = np.asarray(scale * R @ one.before_m + t)
+                one.sigma_before_m *= scale
+            one.marks = [
+                replace(
+                    m,
+                    depth_m=None if m.depth_m is None else scale * m.depth_m,
+                    sigma_depth_m=scale * m.sigma_depth_m,
+                    T_key_camera=grown(m.T_key_camera, scale),
+                )
+                for m in one.marks
+            ]
+        self.frames = [
+            replace(f, T_world_camera=se3.compose(
+                R @ f.T_world_camera[:3, :3], scale * R @ f.T_world_camera[:3, 3] + t))
+            for f in self.frames
+        ]  # fmt: skip
+        f = self.frame
+        self.header = replace(
+            self.header, origin_lat_deg=f.lat_deg, origin_lon_deg=f.lon_deg,
+            origin_alt_amsl_m=f.alt_amsl_m, epsg=f.epsg, georeference=BY_SURVEY,
+        )  # fmt: skip
+
+    def _enough(self, candidates: Sequence[Candidate]) -> None:
+        """Raise InputError when control points were given and none, or too few, hold."""
+        control = [c for c in candidates if not c.point.is_check]
+        refused = [c for c in control if not c.usable]
+        if control and len(refused) > MAX_REFUSALS * len(control):
+            told = "; ".join(f"{c.point.name}: {c.why_not}" for c in refused[:4])
+            raise InputError(
+                f"{self.options.gcp}: {len(refused)} of {len(control)} control points do not "
+                f"fit ({told}); nothing was changed"
+            )
+
+    def _track(self) -> Track:
+        times = np.array([s.time_ns * 1e-9 for s in self.states])
+        poses = np.array([s.T_world_camera for s in self.states])
+        spread = np.array([s.covariance for s in self.states])
+        return Track(poses, times - times[0], spread, self._priors())
+
+    def _priors(self) -> list[PosePrior]:
+        """What the flight's telemetry says of each keyframe; empty without a log."""
+        path = self.options.telemetry or self.folder / LINK_LOG
+        if self.frame is None or (self.options.telemetry is None and not path.is_file()):
+            return []
+        from mavlink.telemetry.logs import load_telemetry
+
+        try:
+            history = load_telemetry(path).history
+        except ValueError as error:
+            if self.options.telemetry is None:
+                self.notes.append(f"{LINK_LOG} beside the scan was not used: {error}")
+                return []
+            raise InputError(str(error)) from error
+        rig = _rig(self.header, self.frame)
+        states = [history.state_at(s.time_ns) for s in self.states]
+        if not any(s is not None and s.lat_deg is not None for s in states):
+            self.notes.append(f"{path.name} tells no position of any keyframe: not used")
+            return []
+        priors = [PosePrior() if s is None else rig.prior(s, None) for s in states]
+        span_s = (self.states[-1].time_ns - self.states[0].time_ns) * 1e-9
+        known = constants([([s.T_world_camera for s in self.states], priors)], span_s)
+        return [known.applied(prior) for prior in priors]
+
+    # ---- loops -------------------------------------------------------------------------------
+
+    def _flown_loops(self) -> list[Closure]:
+        """The loops that the flight accepted, with whole pictures at hand."""
+        graph = (self.store.summary or {}).get("graph") or {}
+        at = {s.seq: k for k, s in enumerate(self.states)}
+        out = []
+        for a, b, motion, upper in (graph.get("loops") or {}).get("motions", []):
+            T = unpack_motion(motion)
+            if a in at and b in at and T is not None and len(upper) == 21:
+                T = grown(T, self.grown)
+                units = np.array([1.0] * 3 + [self.grown] * 3)
+                spread = unpack_covariance(upper) * np.outer(units, units)
+                out.append(Closure(at[a], at[b], T, loose(T, spread)))
+        return out
+
+    def _closures(self, track: Track) -> list[Closure]:
+        """All pairs of keyframes far apart in time that see the same place, verified."""
+
+        def at(k: int) -> Keyframe | None:
+            found = self.keyframe(self.states[k])
+            if found is None:
+                return None
+            return replace(found, depth=replace(found.depth, T_world_camera=track.poses[k]))
+
+        return StoredLoops(track, at, SubmapLoopConfig()).find()
+
+    def _ahead_m(self) -> float:
+        """Usual distance of the ground; 0 without any surface."""
+        some = [self.keyframe(s) for s in self.states[:: max(1, len(self.states) // 16)]]
+        depths = [one.depth.depth_m for one in some if one is not None]
+        known = [float(np.nanmedian(z)) for z in depths if np.isfinite(z).any()]
+        return float(np.median(known)) if known else 0.0
+
+    def _config(self) -> BatchConfig:
+        """How sure the scan's scale is, by its own word."""
+        scale = (self.store.summary or {}).get("scale")
+        sigma = scale.get("sigma") if isinstance(scale, dict) else None
+        usual = BatchConfig()
+        if not sigma or self.header.georeference == BY_SURVEY:
+            return usual
+        return replace(usual, sigma_scale=max(float(sigma), MIN_SIGMA_SCALE))
+
+    # ---- adjustment --------------------------------------------------------------------------
+
+    def _adjusted(self, track: Track, candidates: Sequence[Candidate]) -> Adjusted:
+        """The adjustment; control points that stay off are left out one by one, and named."""
+        points = [
+            Point(np.zeros(3) if c.surveyed_m is None else c.surveyed_m, c.sigma_m)
+            for c in candidates
+        ]
+        most = int(MAX_REFUSALS * sum(not c.point.is_check for c in candidates))
+        while True:
+            used = [c for c in candidates if c.usable and not c.point.is_check]
+            marks = [m for c in used for m in c.marks]
+            try:
+                found = adjust(track, points, marks, self._config())
+            except RuntimeError as error:  # so the solver says that the system is ill-posed
+                raise InputError(
+                    "the poses of this scan contradict each other too far to be adjusted"
+                ) from error
+            worst, by = None, 1.0
+            for one in used:
+                after = map_position(found.poses, found.scales, one.marks)
+                if after is None or one.surveyed_m is None:
+                    continue
+                off = float(np.linalg.norm(one.off_m(after[0])))
+                ratio = off / (5.0 * one.tolerance_m(after[1]) + 0.3)
+                if ratio > by:
+                    worst, by, far = one, ratio, off
+            refused = sum(not c.usable and not c.point.is_check for c in candidates)
+            if worst is None or refused >= most:
+                return found
+            worst.why_not = f"stays {far:.2f} m off after the adjustment"
+
+    def _reposes(self, found: Adjusted) -> list[Repose]:
+        return [
+            Repose(s.seq, 0, T, s.scale * float(scale), spread)
+            for s, T, scale, spread in zip(
+                self.states, found.poses, found.scales, found.covariances, strict=True
+            )
+        ]
+
+
+Section = TypeVar("Section")
+
+
+def _section(kind: type[Section], kept: Any) -> Section:
+    """A part of the configuration as it was kept, with defaults for what was not."""
+    known = {f.name for f in fields(kind)} if is_dataclass(kind) else set()
+    return kind(**{k: v for k, v in dict(kept or {}).items() if k in known})
+
+
+def _rig(header: ScanHeader, frame: LocalFrame) -> Rig:
+    """The rig that the scan was flown with, about the scan's own origin."""
+    kept = header.configuration
+    rig = Rig(
+        _section(CameraConfig, kept.get("camera")),
+        _section(ScanConfig, kept.get("scan")),
+        _section(FusionConfig, kept.get("fusion")),
+    )
+    rig.frame = frame
+    return rig

@@ -1,0 +1,292 @@
+"""A scan before and after refinement, in one store: nothing is overwritten.
+
+Poses and re-poses are only ever appended. Re-poses of a refinement carry revisions from
+:data:`REFINED` on, so they hold against corrections of the flight, and the newest below it is
+the unrefined state. Which pose rows belong to refinements is noted in the store's meta table.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from recon import se3
+from recon.posegraph.ground_control import Adjusted
+from recon.types import F64, DepthMap, Keyframe
+from service.cameras.rig import attitude_of
+from service.errors import InputError
+from service.georeference import LocalFrame
+from service.stream import codec
+from service.stream.database import Database, Statement, blob, json_object
+from service.stream.records import (
+    PoseRecord,
+    Repose,
+    ScanHeader,
+    header_from_json,
+    pack_pose,
+    pack_repose,
+    unpack_pose,
+    unpack_repose,
+)
+from service.stream.store import ScanStore
+
+REFINED = 1_000_000
+"""Revisions of refinements begin here; a flight's own stay far below."""
+
+META = "refinement"
+META_HEADER = "unrefined_header"
+
+
+class _Note(msgspec.Struct):
+    """The fields of the refinement's note that are read."""
+
+    revision: int = 0
+    pose_rows: list[tuple[int, int]] = []
+    figures: dict[str, Any] = {}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeState:
+    """Where a keyframe was before any refinement."""
+
+    seq: int
+    time_ns: int
+    T_world_camera: F64  # (4, 4)
+    covariance: F64  # (6, 6)
+    scale: float  # that the flight gave its coded depth
+
+
+class Revisions:
+    """Reads the unrefined state of a store and appends refinements to it."""
+
+    def __init__(self, store: ScanStore) -> None:
+        self._store = store
+        self._db = Database(store.path)
+        self._note: dict[str, Any] = json_object(self._db.get(META))
+        try:
+            msgspec.convert(self._note, _Note)
+        except msgspec.ValidationError as error:
+            self._db.close()
+            raise InputError(
+                f"{store.path}: the note of its refinement is bad ({error})"
+            ) from error
+
+    def close(self) -> None:
+        """Give the connection back."""
+        self._db.close()
+
+    def __enter__(self) -> Revisions:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def refined(self) -> bool:
+        """True once a refinement was written, also when it was undone."""
+        return bool(self._note)
+
+    @property
+    def header(self) -> ScanHeader:
+        """The scan's header before any refinement."""
+        text = self._db.get(META_HEADER)
+        found = None if text is None else header_from_json(text.encode())
+        return found or self._store.header
+
+    def keyframe_state(self, seq: int) -> KeyframeState | None:
+        """The unrefined state of a keyframe; None when nothing of it can be read."""
+        data = self._store.chunk(seq, 0) or self._store.chunk(seq, 1)
+        keyframe = None if data is not None else self._store.keyframe(seq)
+        head = None if data is None else codec.unpack(data)
+        base = self._base(seq)
+        if head is not None:
+            time_ns, T, covariance = (
+                head[0].time_unix_ns,
+                head[0].T_world_camera,
+                head[0].covariance,
+            )
+        elif keyframe is not None:
+            time_ns, T = keyframe.time_ns, keyframe.depth.T_world_camera
+            covariance = keyframe.pose.covariance
+        else:
+            return None
+        if base is not None:
+            return KeyframeState(seq, time_ns, base.T_world_camera, base.covariance, base.scale)
+        return KeyframeState(seq, time_ns, T, covariance, 1.0)
+
+    def keyframe(self, state: KeyframeState) -> Keyframe | None:
+        """A keyframe with its depth as it was before any refinement."""
+        found = self._store.keyframe(state.seq)
+        if found is None:
+            return None
+        now = self._store.repose(state.seq)
+        grown = np.float32(state.scale / (1.0 if now is None else now.scale))
+        d = found.depth
+        depth = DepthMap(d.depth_m * grown, d.sigma_m * grown, d.views, d.K, state.T_world_camera)
+        return Keyframe(found.seq, found.time_ns, depth, found.bgr, found.pose, found.fresh)
+
+    def frames(self) -> list[PoseRecord]:
+        """All unrefined poses in order of time; of several for one time the newest."""
+        ranges = self._note.get("pose_rows", [])
+        newest: dict[int, PoseRecord] = {}
+        for number, data in self._db.all("SELECT id, data FROM poses ORDER BY id"):
+            if any(a <= number <= b for a, b in ranges):
+                continue
+            pose = unpack_pose(blob(data))
+            if pose is not None:
+                newest[pose.time_unix_ns] = pose
+        return [newest[t] for t in sorted(newest)]
+
+    def append(
+        self,
+        reposes: Sequence[Repose],
+        poses: Sequence[PoseRecord],
+        header: ScanHeader,
+        figures: dict[str, Any],
+    ) -> bool:
+        """Write a refinement in one transaction; False when only its figures were news.
+
+        The revisions of ``reposes`` are set here: one more than the newest refinement's. The
+        store must be opened again to see what was written.
+        """
+        changed = [r for r in reposes if not self._holds(r)]
+        statements: list[Statement] = []
+        note = dict(self._note)
+        if changed:
+            statements += self._rows(reposes, poses, note)
+        note["figures"] = figures | {"revision": note.get("revision", 0)}
+        meta = "INSERT OR REPLACE INTO meta VALUES (?, ?)"
+        statements.append((meta, (META, json.dumps(note, sort_keys=True))))
+        if self._db.get(META_HEADER) is None:
+            statements.append((meta, (META_HEADER, self._store.header.to_json().decode())))
+        if header.to_json() != self._store.header.to_json():
+            statements.append((meta, ("header", header.to_json().decode())))
+        self._db.write(statements)
+        self._note = note
+        return bool(changed)
+
+    def _rows(
+        self, reposes: Sequence[Repose], poses: Sequence[PoseRecord], note: dict[str, Any]
+    ) -> list[Statement]:
+        revision = REFINED + int(note.get("revision", 0))
+        note["revision"] = int(note.get("revision", 0)) + 1
+        out: list[Statement] = []
+        first = self._next("reposes")
+        for n, r in enumerate(reposes):
+            new = Repose(r.seq, revision, r.T_world_camera, r.scale, r.covariance)
+            sql = "INSERT INTO reposes VALUES (?, ?, ?, ?)"
+            out.append((sql, (first + n, r.seq, revision, pack_repose(new))))
+        first = self._next("poses")
+        for n, p in enumerate(poses):
+            sql = "INSERT INTO poses VALUES (?, ?, ?)"
+            out.append((sql, (first + n, p.time_unix_ns, pack_pose(p))))
+        rows = [list(pair) for pair in note.get("pose_rows", [])]
+        note["pose_rows"] = [*rows, [first, first + len(poses) - 1]] if poses else rows
+        return out
+
+    def _holds(self, wanted: Repose) -> bool:
+        """True when the store has a keyframe within a tenth of a millimetre already."""
+        now = self._store.repose(wanted.seq)
+        return (
+            now is not None
+            and now.revision >= REFINED
+            and bool(np.abs(now.T_world_camera - wanted.T_world_camera).max() < 1e-4)
+            and abs(now.scale / wanted.scale - 1.0) < 1e-6
+        )
+
+    def _base(self, seq: int) -> Repose | None:
+        sql = (
+            "SELECT data FROM reposes WHERE seq = ? AND revision < ? "
+            "ORDER BY revision DESC, id DESC LIMIT 1"
+        )
+        row = self._db.one(sql, (seq, REFINED))
+        return None if row is None else unpack_repose(blob(row[0]))
+
+    def _next(self, table: str) -> int:
+        row = self._db.one(f"SELECT MAX(id) FROM {table}")
+        return 1 if row is None or row[0] is None else int(row[0]) + 1
+
+
+def copy_store(source: Path, target: Path) -> None:
+    """A sound copy of a store that may be open elsewhere.
+
+    Raises InputError when ``target`` exists, OutsideError when it cannot be written.
+    """
+    import sqlite3
+
+    from service.errors import OutsideError
+
+    if target.exists():
+        raise InputError(f"{target} exists; choose another folder, nothing was changed")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with sqlite3.connect(source) as one, sqlite3.connect(target) as two:
+            one.backup(two)
+        one.close()
+        two.close()
+    except (OSError, sqlite3.Error) as error:
+        target.unlink(missing_ok=True)
+        raise OutsideError(f"cannot copy {source} to {target} ({error}); check the disk") from error
+
+
+def grown(T: F64, scale: float) -> F64:
+    """The motion ``T`` (4, 4) with its length times ``scale``."""
+    return se3.compose(T[:3, :3], scale * T[:3, 3])
+
+
+def moved_frames(
+    frames: Sequence[PoseRecord],
+    states: Sequence[KeyframeState],
+    found: Adjusted,
+    place: LocalFrame | None,
+) -> list[PoseRecord]:
+    """Every frame's pose, carried by the keyframes before and after it."""
+    keys = np.array([s.time_ns for s in states])
+    out: list[PoseRecord] = []
+    before: PoseRecord | None = None
+    distance = 0.0
+    for frame in frames:
+        b = int(np.clip(np.searchsorted(keys, frame.time_unix_ns), 1, len(keys) - 1))
+        one, two = (_carried(frame, states[k], found, k) for k in (b - 1, b))
+        share = (frame.time_unix_ns - keys[b - 1]) / max(int(keys[b] - keys[b - 1]), 1)
+        share = float(np.clip(share, 0.0, 1.0))
+        T = one @ se3.exp(share * se3.log(se3.inverse(one) @ two))
+        near = b - 1 if share < 0.5 else b
+        step = 0.0
+        if before is not None:
+            step = float(np.linalg.norm(T[:3, 3] - before.T_world_camera[:3, 3]))
+        distance += step
+        moved = _record(frame, T, found.covariances[near], place, distance)
+        if before is not None and frame.time_unix_ns > before.time_unix_ns:
+            seconds = (frame.time_unix_ns - before.time_unix_ns) * 1e-9
+            moved = replace(moved, speed_m_s=step / seconds)
+        out.append(moved)
+        before = moved
+    return out
+
+
+def _carried(frame: PoseRecord, state: KeyframeState, found: Adjusted, k: int) -> F64:
+    """A frame's pose as one keyframe carries it along."""
+    relative = se3.inverse(state.T_world_camera) @ frame.T_world_camera
+    return np.asarray(found.poses[k] @ grown(relative, float(found.scales[k])))
+
+
+def _record(
+    frame: PoseRecord, T: F64, spread: F64, place: LocalFrame | None, distance_m: float
+) -> PoseRecord:
+    roll, pitch, yaw = attitude_of(T)
+    lat = lon = alt = None
+    if place is not None:
+        lat, lon, alt = (float(v) for v in place.to_geodetic(T[None, :3, 3])[0])
+    lever = np.hstack([-se3.hat(T[:3, 3]), np.eye(3)])
+    sigma = float(np.sqrt(np.trace(lever @ spread @ lever.T)))
+    return replace(
+        frame, T_world_camera=T, covariance=spread, lat_deg=lat, lon_deg=lon, alt_amsl_m=alt,
+        roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw, distance_m=distance_m, sigma_m=sigma,
+    )  # fmt: skip
