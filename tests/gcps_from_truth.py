@@ -13,8 +13,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from recon import metrics, se3
+from recon import se3
 from recon.camera_model import rays
+from recon.surface import metrics
 from recon.types import F64
 from service.sim.truth import Truth, read_truth
 from service.stream.store import ScanStore

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from recon.calibration import Board, BoardView, CalibrationConfig, calibrate, find_board
+from recon.calibration.board import Board, BoardView, CalibrationConfig, calibrate, find_board
 from recon.types import F32, F64, U8
 from service.cameras.camera_file import load_camera
 from service.cli import app

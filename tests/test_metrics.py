@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from recon import metrics, se3
-from recon.metrics import Fit
-from recon.surface import triangle_grid
+from recon import se3
+from recon.surface import metrics, triangle_grid
+from recon.surface.metrics import Fit
 from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F64
 

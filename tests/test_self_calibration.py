@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.self_calibration import Sightings, self_calibrate, without_k3
+from recon.calibration.flight import Sightings, self_calibrate, without_k3
 from recon.types import F64, Camera
 
 SIZE = (1280, 720)

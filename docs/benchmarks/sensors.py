@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
 from mavlink.telemetry.logs import load_telemetry
-from recon import metrics
+from recon.surface import metrics
 from recon.types import F64
 from service.cli import app
 from service.sim.scoring import read_scan

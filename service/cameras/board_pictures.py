@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from recon.calibration import Board, BoardView, Calibration, find_board
+from recon.calibration.board import Board, BoardView, Calibration, find_board
 from recon.types import F32, F64, U8
 from service.errors import InputError, OutsideError
 

@@ -12,7 +12,7 @@ import typer
 from service.errors import InputError
 
 if TYPE_CHECKING:
-    from recon.calibration import Board, Calibration
+    from recon.calibration.board import Board, Calibration
     from service.cameras.board_pictures import BoardSet
 
 
@@ -29,8 +29,8 @@ def calibrate(
 
     Writes a picture of where the corners were beside the model.
     """
-    from recon.calibration import FEWEST_VIEWS, CalibrationConfig
-    from recon.calibration import calibrate as fit
+    from recon.calibration.board import FEWEST_VIEWS, CalibrationConfig
+    from recon.calibration.board import calibrate as fit
     from service.cameras.board_pictures import draw_coverage, find_boards, write_image
     from service.cameras.camera_file import save_camera
 
@@ -61,7 +61,7 @@ def calibrate(
 
 
 def _board(pattern: str, square_m: float) -> Board:
-    from recon.calibration import Board
+    from recon.calibration.board import Board
 
     found = re.match(r"^(\d{1,3})x(\d{1,3})$", pattern.strip())
     if found is None:

@@ -19,9 +19,8 @@ import cv2
 import msgspec
 import numpy as np
 
-from recon import metrics
-from recon.metrics import Fit, patch_shifts
-from recon.surface import triangle_grid
+from recon.surface import metrics, triangle_grid
+from recon.surface.metrics import Fit, patch_shifts
 from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F32, F64, U8, Array, Camera
 from service.errors import InputError

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from recon import metrics, se3
-from recon.metrics import Fit
+from recon import se3
+from recon.surface import metrics
+from recon.surface.metrics import Fit
 from recon.surface.raster import Grid, grid_over, rasterise_points, surface_model
 from recon.types import F32, F64
 from service.errors import InputError

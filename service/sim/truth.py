@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon import metrics, se3
-from recon.surface import triangle_grid
+from recon import se3
+from recon.surface import metrics, triangle_grid
 from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F64
 from service.errors import InputError

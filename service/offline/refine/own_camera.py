@@ -2,7 +2,7 @@
 
 Corners of each keyframe's picture are found again in its neighbours' and in those of other legs
 that show the same ground (undistorted by the model given, ZSSD), and
-:mod:`recon.self_calibration` adjusts poses, landmarks and the camera at once.
+:mod:`recon.calibration.flight` adjusts poses, landmarks and the camera at once.
 What comes out is a camera file to replay the flight with: depth images that were made with
 another focal length cannot be bent to this one. The scan and its own model stay as they are.
 """
@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 
 from recon import se3
+from recon.calibration.flight import SelfCalibrated, Sightings, self_calibrate
 from recon.camera_model import Undistorter, project, rays
-from recon.self_calibration import SelfCalibrated, Sightings, self_calibrate
 from recon.tracking import matching
 from recon.types import F64, U8, Camera
 from service.cameras.camera_file import save_camera

@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from recon import se3
+from recon.calibration.flight import SelfCalibrated
 from recon.posegraph.ground_control import (
     FIX_S,
     Adjusted,
@@ -30,7 +31,6 @@ from recon.posegraph.ground_control import (
 )
 from recon.posegraph.sensor_offsets import constants
 from recon.posegraph.submap_loops import SubmapLoopConfig
-from recon.self_calibration import SelfCalibrated
 from recon.types import F64, Camera, Keyframe, PosePrior
 from service.cameras.rig import Rig
 from service.config import CameraConfig, FusionConfig, ScanConfig

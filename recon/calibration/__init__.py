@@ -1,0 +1,1 @@
+"""The camera model, from chessboards or from the flight itself."""
