@@ -1,0 +1,37 @@
+"""docs/design.md says what the code says."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from service.workers import ROWS
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
+
+
+def test_the_table_of_workers_is_the_code_s() -> None:
+    shown = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in TEXT.splitlines()
+        if re.match(r"\| \d+ \| ", line)
+    ]
+    assert shown == [
+        [
+            str(row.stop),
+            row.name,
+            row.does,
+            str(row.bound or ""),
+            row.full,
+            "" if row.deadline_s is None else f"{row.deadline_s:g} s",
+            "yes" if row.restarts else "",
+        ]
+        for row in ROWS
+    ]
+
+
+def test_every_path_in_it_exists() -> None:
+    paths = re.findall(r"`((?:service|recon|mavlink|tests)/[\w./]+)`", TEXT)
+    assert len(paths) > 20
+    assert [path for path in paths if not (ROOT / path).exists()] == []
