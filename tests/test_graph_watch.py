@@ -73,3 +73,16 @@ def test_a_frozen_receiver_is_told() -> None:
     priors[20:] = [replace(p, position_m=priors[19].position_m) for p in priors[20:]]
     heard, _ = told(priors)
     assert any("is GNSS frozen" in text for text in heard)
+
+
+def test_a_track_that_the_fixes_contradict_is_reported() -> None:
+    """Vision that swings by metres, as a rolling shutter makes it, under a receiver of 5 cm."""
+    graph, watch_said = PoseGraph(), list[str]()
+    watch = GraphWatch(graph)
+    for i, T in enumerate(track(60)):
+        fix = replace(prior(T), sigma_position_m=np.full(3, 0.05))
+        swing = np.array([0.0, 3.0 * np.sin(0.5 * i), 1.5 * np.cos(0.5 * i)])
+        seen = se3.compose(T[:3, :3], T[:3, 3] + swing)
+        graph.add_keyframe(i, i * 10**9, 0, seen, COVARIANCE, fix, (60.0, 0.0))
+        watch_said += watch.look()
+    assert sum("track and GNSS differ" in text for text in watch_said) == 1

@@ -9,6 +9,7 @@ import numpy as np
 
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.sensor_offsets import Constants
+from recon.types import F64
 from service.stream.records import pack_covariance, pack_motion
 
 LEAST = 5
@@ -19,6 +20,9 @@ SIGMAS, LEAST_SHARE = 3.0, 0.03
 
 LOOK_GROWTH = 1.2
 """The track is looked at again when its keyframes have grown by so much."""
+
+MIN_FIXES = 10
+"""Fixes before the track is held against them."""
 
 LEFT_OUT = {
     "position off": "positions far from the track were left out: does GNSS jump?",
@@ -68,7 +72,20 @@ class GraphWatch:
                     f"scale: GNSS makes the map {percent:.0f} % {which} than the height above "
                     "ground does; check both"
                 )
+        off = _off_in_sigmas(self._graph.residuals().get("position"))
+        if off > SIGMAS:
+            out["track"] = (
+                f"track and GNSS differ by {off:.0f} sigma: check the camera's model, delay and "
+                "shutter"
+            )
         return out
+
+
+def _off_in_sigmas(rows: F64 | None) -> float:
+    """Robust rms of the positions' whitened residuals (n, 3); 0 with too few of them."""
+    if rows is None or len(rows) < MIN_FIXES:
+        return 0.0
+    return 1.4826 * float(np.median(np.abs(rows)))
 
 
 MOST_LOOPS = 300
