@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from service.ground.vehicle import Vehicle
 from service.offline.exports import EXPORTERS
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.scans.coverage import LiveCoverages
-from service.workers import Worker, Workers
+from service.workers import Worker, Workers, guarded
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +70,7 @@ class Jobs:
                     self._worker = None
                     return
                 folder, job = self._queue.popleft()
-            self._run(folder, job)
+            guarded("exports", partial(self._run, folder, job))
 
     def _run(self, folder: Path, job: dict[str, Any]) -> None:
         job["state"] = "running"
@@ -80,7 +81,7 @@ class Jobs:
         except SkyreliefError as error:
             job |= {"state": "failed", "error": str(error)}
         finally:
-            if job["state"] == "running":  # our own fault; the table of workers logs it
+            if job["state"] == "running":  # our own fault, which the caller logs
                 job |= {"state": "failed", "error": "failed; see the log"}
 
 
