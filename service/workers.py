@@ -184,7 +184,8 @@ class Workers:
         self._max_restarts, self._pause_s = max_restarts, pause_s
         self._lock = threading.Lock()
         self._workers: list[Worker] = []
-        _ALL.add(self)
+        with _ALL_LOCK:
+            _ALL.add(self)
 
     def start(
         self,
@@ -271,6 +272,8 @@ class Workers:
 
 
 _ALL: weakref.WeakSet[Workers] = weakref.WeakSet()
+_ALL_LOCK = threading.Lock()
+"""A set must not grow while it is listed."""
 _PROCESSES: list[tuple[str, subprocess.Popen[bytes]]] = []
 
 PROCESS = Workers()
@@ -301,7 +304,9 @@ def running() -> list[dict[str, Any]]:
 
     Threads that start themselves are found by their names.
     """
-    workers = [w for group in list(_ALL) for w in group.table() if w.has_failed or not w.is_done]
+    with _ALL_LOCK:
+        groups = list(_ALL)
+    workers = [w for group in groups for w in group.table() if w.has_failed or not w.is_done]
     ours = {worker.thread for worker in workers}
     found = [(worker.row, worker.to_dict()) for worker in workers]
     for name, process in list(_PROCESSES):

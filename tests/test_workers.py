@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import threading
 from pathlib import Path
 
@@ -132,6 +133,26 @@ def test_what_runs_is_shown_by_its_row() -> None:
     assert found["coverage"]["bound"] is None
     assert found["mavlink _beat"]["state"] == "running"
     assert list(found) == sorted(found, key=lambda name: ROWS.index(row_of(name)))
+
+
+def test_what_runs_is_shown_while_tables_come_and_go() -> None:
+    stop, before = threading.Event(), sys.getswitchinterval()
+
+    def make() -> None:
+        while not stop.is_set():
+            tables = [Workers() for _ in range(50)]
+            del tables
+
+    maker = threading.Thread(target=make)
+    sys.setswitchinterval(1e-6)
+    maker.start()
+    try:
+        for _ in range(3000):
+            running()
+    finally:
+        sys.setswitchinterval(before)
+        stop.set()
+        maker.join()
 
 
 def test_a_worker_outside_the_table_is_refused() -> None:
