@@ -20,7 +20,7 @@ from service.cameras import open_camera
 from service.config import load_config
 from service.daemon import simulated
 from service.daemon.simulated import SimulatedFlight
-from service.errors import InputError
+from service.errors import InputError, OutsideError
 
 SOURCE = "sim:?size=320x180&fps=5&duration_s=4"
 
@@ -120,6 +120,19 @@ def test_options_that_cannot_be_are_refused(
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
     with pytest.raises(InputError, match="sim"):
         SimulatedFlight(source)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_gets_its_room_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(simulation: object, folder: Path, *_: object) -> None:
+        (folder / "flight.mp4").write_bytes(bytes(100))
+        raise OutsideError("No space left on device")
+
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    monkeypatch.setattr("service.sim.recording.prepare", lambda options: None)
+    monkeypatch.setattr("service.sim.recording.write", full)
+    with pytest.raises(OutsideError, match="No space"):
+        SimulatedFlight(SOURCE)
     assert not list(tmp_path.iterdir())
 
 

@@ -152,6 +152,8 @@ def _render(folder: Path, given: dict[str, str]) -> None:
         part.rename(folder)
     except OSError as error:
         raise OutsideError(f"{folder} cannot be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)  # a full disk gets its room back
 
 
 def _can_write(folder: Path) -> bool:
