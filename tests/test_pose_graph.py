@@ -552,3 +552,17 @@ def test_wrong_calls_are_named() -> None:
         graph.add_loop(5, 5, np.eye(4), np.eye(6))
     with pytest.raises(ValueError, match="sigma_step"):
         PoseGraphConfig(sigma_step=0.0)
+
+
+def test_without_a_solution_keyframes_go_on_by_vision() -> None:
+    """One keyframe that makes the system indeterminate neither raises nor moves the others."""
+    f = flight(30)
+    graph = PoseGraph(WHITE)
+    for i, (T, prior) in enumerate(zip(f.odom, f.priors, strict=True)):
+        prior = replace(prior, altitude_m=np.nan) if i == 20 else prior
+        graph.add_keyframe(i, i * 10**9, 0, T, f.covariance, prior, None)
+        assert i < 3 or np.linalg.norm((graph.place(i) - f.truth[i])[:3, 3]) < 3.0
+    assert graph.counts["solved again"] and graph.counts["solved badly"]
+    graph.solve()
+    assert np.isfinite(graph.pose_array()).all() and np.isfinite(graph.scales()).all()
+    assert graph.residuals() == {}

@@ -277,7 +277,8 @@ class PoseGraph:
     def rebuild(self) -> None:
         """Make the whole graph anew from all readings and the segments' present frames.
 
-        Where full steps lead nowhere it is made once more with careful ones.
+        Where full steps lead nowhere it is made once more with careful ones. Where those find no
+        solution either, poses are as vision predicts them until it is made again.
         """
         try:
             self._make()
@@ -288,9 +289,13 @@ class PoseGraph:
             why = " ".join(str(error).split()[:9])
         log.warning("the pose graph is solved again, carefully: %s", why)
         self._kept_counts["solved again"] += 1
-        self._make(careful=True)
-        if not self._smoother.is_sound():
-            self._kept_counts["solved badly"] += 1
+        try:
+            self._make(careful=True)
+            is_sound = self._smoother.is_sound()
+        except RuntimeError as error:
+            log.error("the pose graph has no solution: %s", " ".join(str(error).split()[:9]))
+            is_sound = False
+        self._kept_counts["solved badly"] += not is_sound
 
     def _make(self, careful: bool = False) -> None:
         self._start(careful)

@@ -61,6 +61,7 @@ class Smoother:
         self._noises: list[Any] = []
         self._waiting: dict[int, tuple[F64, F64]] = {}  # pose and its left covariance
         self._held = 0
+        self.has_failed = False  # nothing can be solved any more: poses stay as predicted
         self.updates = 0
         self._states: dict[int, tuple[F64, F64]] = {}  # asked for since the last update
 
@@ -90,15 +91,18 @@ class Smoother:
         self._values.insert(key, np.array([value]))
 
     def update(self, now: bool = False, rounds: int = 0) -> bool:
-        """True when what waits went into the smoother: enough of it waits, or ``now``."""
-        if not now and len(self._waiting) <= LEAST_WAIT + self._held // POSES_PER_WAIT:
+        """True when what waits went into the smoother: enough of it waits, or ``now``.
+
+        Raises RuntimeError when there is no solution; after that nothing goes in any more.
+        """
+        is_due = now or len(self._waiting) > LEAST_WAIT + self._held // POSES_PER_WAIT
+        if self.has_failed or not is_due:
             return False
-        self._isam.update(self._graph, self._values)
-        g = self._gtsam
-        nothing: list[Any] = [g.NonlinearFactorGraph(), g.Values(), [], g.KeyGroupMap()]
-        nothing += [g.KeyList(), g.KeyList()]
-        for _ in range(rounds):
-            self._isam.update(*nothing, True)  # relinearise; no new factors, removals or groups
+        try:
+            self._solve(rounds)
+        except RuntimeError:
+            self.has_failed = True
+            raise
         self._graph.resize(0)
         self._values.clear()
         self._held += len(self._waiting)
@@ -106,6 +110,16 @@ class Smoother:
         self._states.clear()
         self.updates += 1
         return True
+
+    def _solve(self, rounds: int) -> None:
+        self._isam.update(self._graph, self._values)
+        g = self._gtsam
+        nothing: list[Any] = [g.NonlinearFactorGraph(), g.Values(), [], g.KeyGroupMap()]
+        nothing += [g.KeyList(), g.KeyList()]
+        for _ in range(rounds):
+            self._isam.update(*nothing, True)  # relinearise; no new factors, removals or groups
+        if len(self):
+            self._isam.calculateEstimatePose3(len(self) - 1)  # by QR, faults show only here
 
     # ---- what comes out ------------------------------------------------------------------------
 
@@ -138,11 +152,11 @@ class Smoother:
 
     def poses(self) -> F64:
         """(N, 4, 4) of all poses in the order of their keys."""
-        rows = np.asarray(
-            self._gtsam.utilities.extractPose3(self._isam.calculateEstimate()), np.float64
-        )
         out = np.tile(np.eye(4), (len(self), 1, 1))
         if self._held:
+            rows = np.asarray(
+                self._gtsam.utilities.extractPose3(self._isam.calculateEstimate()), np.float64
+            )
             out[: self._held, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
             out[: self._held, :3, 3] = rows[:, 9:]
         for key, (T, _) in self._waiting.items():
@@ -152,8 +166,11 @@ class Smoother:
     def residuals(self) -> dict[str, F64]:
         """Whitened residuals of all factors in the smoother by kind, one row per factor.
 
-        Robust losses are left out: a residual is the error over its sigma.
+        Robust losses are left out: a residual is the error over its sigma. Empty where there is
+        no solution.
         """
+        if self.has_failed:
+            return {}
         values, factors = self._isam.calculateEstimate(), self._isam.getFactorsUnsafe()
         out: dict[str, list[F64]] = {}
         for i, kind in enumerate(self._kinds[: factors.size()]):
