@@ -104,7 +104,7 @@ class BackgroundWorker(Generic[In, Out]):
     ) -> None:
         """``prepare`` is called once on the thread, before any work."""
         self._work, self._bound, self._live = work, bound, live
-        self._offered: deque[tuple[In, Future[Out]]] = deque()
+        self._offered: dict[Future[Out], In] = {}  # in order; what gives way is out at once
         self.dropped = 0
         self._began_s: list[float] = []  # when the work at hand began, if there is any
         self._todo: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
@@ -124,42 +124,46 @@ class BackgroundWorker(Generic[In, Out]):
     def offer(self, item: In) -> None:
         """Hand over one piece of work."""
         future: Future[Out] = Future()
-        self._offered.append((item, future))
+        self._offered[future] = item
         if self._worker is None:
-            self._do(item, future)
+            self._do(future)
             return
-        self._todo.put(partial(self._do, item, future))
-        waiting = [future for _, future in self._offered if not future.done()]
+        self._todo.put(partial(self._do, future))
+        waiting = [future for future in self._offered if not future.done()]
         if len(waiting) <= self._bound + 1:  # one is being worked on
             return
         if not self._live:
             waiting[0].exception()  # waits
-        elif any(future.cancel() for future in waiting[1:]):
+        elif (late := next((one for one in waiting[1:] if one.cancel()), None)) is not None:
+            del self._offered[late]
             self.dropped += 1
 
     def finished(self, everything: bool = False) -> list[tuple[In, Out]]:
         """What is done, in order; ``everything`` waits for the rest. Raises what work raised."""
         out = []
-        while self._offered and (everything or self._offered[0][1].done()):
-            item, future = self._offered.popleft()
-            if not future.cancelled():
-                out.append((item, future.result()))
+        while self._offered:
+            future = next(iter(self._offered))
+            if not everything and not future.done():
+                break
+            future.exception()  # waits
+            out.append((self._offered.pop(future), future.result()))
         return out
 
     def close(self) -> None:
         """End the thread; what has not begun is not done."""
-        for _, future in self._offered:
-            future.cancel()
+        for future in list(self._offered):
+            if future.cancel():
+                del self._offered[future]
         self._todo.put(None)
         if self._worker is not None:
             self._worker.join()
 
-    def _do(self, item: In, future: Future[Out]) -> None:
+    def _do(self, future: Future[Out]) -> None:
         if not future.set_running_or_notify_cancel():
             return
         self._began_s.append(time.monotonic())
         try:
-            result = self._work(item)
+            result = self._work(self._offered[future])
         except Exception as error:  # raised where the result is taken
             self._began_s.clear()
             future.set_exception(error)

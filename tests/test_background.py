@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import threading
 import time
+from types import SimpleNamespace
+from typing import Any
+from weakref import WeakSet
 
 import pytest
 from loopback import until
 
 from service.background import BackgroundWorker
+from service.flight.pipeline import Pipeline
 
 
 def test_results_come_in_order_and_nothing_is_dropped() -> None:
@@ -42,6 +46,26 @@ def test_live_the_oldest_that_has_not_begun_gives_way() -> None:
     assert kept[0] == 0 and kept[-1] == 9 and len(kept) == 3 and jobs.dropped == 7
 
 
+def test_live_what_gave_way_is_forgotten_while_the_work_at_hand_hangs() -> None:
+    class Item:
+        pass
+
+    gate, items = threading.Event(), WeakSet[Item]()
+    jobs: BackgroundWorker[Item, bool] = BackgroundWorker(
+        "dense", lambda _: gate.wait(5), 2, live=True
+    )
+    for _ in range(50):
+        item = Item()
+        items.add(item)
+        jobs.offer(item)
+        del item
+    assert len(items) == 3 and jobs.dropped == 47
+    gate.set()
+    assert len(jobs.finished(everything=True)) == 3
+    jobs.close()
+    assert len(items) == 0
+
+
 def test_a_fault_reaches_the_caller() -> None:
     def work(n: int) -> int:
         raise RuntimeError("no luck")
@@ -67,3 +91,21 @@ def test_a_worker_that_nobody_closes_ends_with_its_owner() -> None:
     assert any(t.name == "dense" for t in threading.enumerate())
     del jobs
     assert until(lambda: not any(t.name == "dense" for t in threading.enumerate()))
+
+
+def test_a_fault_at_the_end_of_a_scan_leaves_no_thread_behind() -> None:
+    def work(n: int) -> int:
+        raise RuntimeError("no luck")
+
+    jobs: list[BackgroundWorker[int, int]] = []
+
+    def beside(_: object) -> BackgroundWorker[int, int]:
+        jobs.append(BackgroundWorker("dense", work, 2))
+        return jobs[-1]
+
+    views = SimpleNamespace(end_stretch=lambda: None, ready=lambda everything: [1, 2, 3])
+    stages: Any = SimpleNamespace(beside=beside, views=views)
+    pipeline = Pipeline(stages)
+    with pytest.raises(RuntimeError, match="no luck"):
+        pipeline.finish()
+    assert not any(t.name == "dense" for t in threading.enumerate())

@@ -87,8 +87,10 @@ class Pipeline:
         s.views.end_stretch()
         for view in s.views.ready(everything=True):
             self._beside.offer(view)
-        keyframes = self._finished(everything=True)
-        self._beside.close()
+        try:
+            keyframes = self._finished(everything=True)
+        finally:
+            self._beside.close()
         s.map.clear()
         tracked = Tracked("lost", s.track.segment, reason="end of the recording")
         return Step(tracked, keyframes=keyframes, moved=s.chain.corrections(final=True))
