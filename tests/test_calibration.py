@@ -149,7 +149,7 @@ def test_wrong_input_is_refused() -> None:
         calibrate(views, BOARD, SIZE)
     with pytest.raises(ValueError, match="do not fit"):
         calibrate([BoardView("v", np.zeros((9, 2), np.float32))] * 4, BOARD, SIZE)
-    with pytest.raises(ValueError, match="grey"):
+    with pytest.raises(ValueError, match="gray"):
         find_board(np.zeros((48, 64, 3), np.uint8), BOARD)
     with pytest.raises(ValueError, match="squares"):
         Board(9, 6, -1.0)

@@ -244,7 +244,7 @@ def test_every_line_of_the_table_can_be_loaded() -> None:
 
     for target, _, text in EXPORTERS.values():
         module, _, name = target.partition(":")
-        assert callable(getattr(import_module(module), name))
+        assert callable(getattr(import_module(f"service.offline.exports.{module}"), name))
         assert len(text) < 60
 
 

@@ -404,8 +404,8 @@ def test_stopping_ends_the_retries(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(ScanRun, "carry_out", carry_out)
     monkeypatch.setattr("service.daemon.intent.FIRST_RETRY_S", 0.0)
     daemon.actions.start_scan()
-    assert daemon.scanning._thread is not None
-    daemon.scanning._thread.join()
+    assert daemon.scanning._worker is not None
+    assert daemon.scanning._worker.join(30.0)
     assert daemon.scanning.fault == "camera gone"
     assert daemon.scanning.intent.wants_scan  # waits to try again
     daemon.actions.stop_scan()
