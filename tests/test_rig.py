@@ -110,6 +110,14 @@ def test_a_picture_tag_serves_when_there_is_no_telemetry() -> None:
     np.testing.assert_allclose(top, [1, 0, 0], atol=1e-9)
 
 
+@pytest.mark.parametrize("altitude_m", [math.nan, math.inf, 1e30])
+def test_a_tag_that_cannot_be_true_gives_a_sound_prior(altitude_m: float) -> None:
+    """One such still would leave the pose graph without a solution."""
+    prior = rig().prior(None, GeoTag(30.0, -98.0, altitude_m, sigma_h_m=1e-12))
+    assert prior.position_m is not None and np.isfinite(prior.position_m).all()
+    assert prior.sigma_position_m is not None and prior.sigma_position_m.min() >= 0.005
+
+
 def test_without_anything_the_prior_says_how_little_it_knows() -> None:
     some = rig()
     prior = some.prior(None, None)

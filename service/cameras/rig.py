@@ -28,6 +28,9 @@ MOUNT_TILT_SIGMA_RAD = math.radians(6.0)
 AT_REST_M_S, ON_GROUND_M = 0.3, 2.0
 """A vehicle slower and lower than these stands on the ground."""
 
+MIN_SIGMA_M, MAX_ALTITUDE_M = 0.005, 1e5
+"""No receiver is better, and nothing with a camera flies higher; a tag may claim both."""
+
 NO_YAW_RAD = 3.0
 """Sigma of a heading that is not known."""
 
@@ -146,12 +149,15 @@ class Rig:
         if fix is None:
             return None, None
         altitude = fix.alt_amsl_m
+        if altitude is not None and not abs(altitude) < MAX_ALTITUDE_M:
+            altitude = None
         if self.frame is None:
             self.frame = LocalFrame(fix.lat_deg, fix.lon_deg, altitude or 0.0)
         if altitude is None:
             altitude = self.frame.alt_amsl_m
         enu = self.frame.to_enu(np.array([[fix.lat_deg, fix.lon_deg, altitude]]))[0]
-        return enu, np.array([fix.sigma_h_m, fix.sigma_h_m, fix.sigma_v_m])
+        sigma = np.array([fix.sigma_h_m, fix.sigma_h_m, fix.sigma_v_m])
+        return enu, np.maximum(sigma, MIN_SIGMA_M)
 
     def _agl(
         self, state: VehicleState | None, tag: GeoTag | None
