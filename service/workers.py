@@ -281,10 +281,13 @@ PROCESS = Workers()
 
 
 def open_process(name: str, command: Sequence[str], **streams: Any) -> subprocess.Popen[bytes]:
-    """Start a process of the table, with the ``streams`` of Popen; its owner ends it."""
+    """Start a process of the table, with the ``streams`` of Popen; its owner ends it.
+
+    Ctrl-C in a terminal does not reach it: it ends in its turn.
+    """
     row_of(name)
     _PROCESSES[:] = [(n, p) for n, p in _PROCESSES if p.poll() is None]
-    process = subprocess.Popen(command, **streams)
+    process = subprocess.Popen(command, start_new_session=True, **streams)
     _PROCESSES.append((name, process))
     return process
 
