@@ -68,11 +68,16 @@ class CommonView:
     def carry(self, uv_px: F64) -> F64:
         """(N, 2) pixels of image b for the pixels ``uv_px`` (N, 2) of image a.
 
-        The homography's word, corrected by the three nearest matches where there are any.
+        By the homography, corrected by the matches at the three nearest places if there are any.
+        SIFT may describe one place several times; it counts once.
         """
         there = cv2.perspectiveTransform(uv_px[:, None].astype(np.float64), self.H)[:, 0]
-        off = self.uv_b - cv2.perspectiveTransform(self.uv_a[:, None], self.H)[:, 0]
-        apart = np.linalg.norm(uv_px[:, None] - self.uv_a, axis=2)
+        _, once = np.unique(self.uv_a, axis=0, return_index=True)
+        if len(once) < 3:
+            return np.asarray(there, np.float64)
+        uv_a = self.uv_a[once]
+        off = self.uv_b[once] - cv2.perspectiveTransform(uv_a[:, None], self.H)[:, 0]
+        apart = np.linalg.norm(uv_px[:, None] - uv_a, axis=2)
         nearest = np.argpartition(apart, 2, axis=1)[:, :3]
         is_near = np.take_along_axis(apart, nearest, axis=1).max(axis=1) < (
             NEAR_SHARE * self.width_px
