@@ -11,16 +11,19 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from pyproj import Transformer
 
 from recon import se3
+from recon.camera_model import project, rays
+from recon.mapping.disagreement import NORMAL_MEDIAN
 from recon.posegraph.track_alignment import umeyama
 from recon.types import F64, DepthMap
 from service.bench import BenchOptions, BenchResult
@@ -64,8 +67,7 @@ class RealSet:
     source: str
     telemetry: str = ""
     boards: str = ""  # folder of chessboards by the same camera
-    settings: tuple[str, ...] = ()
-    checks: tuple[Check, ...] = field(default=())
+    checks: tuple[Check, ...] = ()
 
 
 def run(options: BenchOptions) -> list[BenchResult]:
@@ -95,22 +97,19 @@ def _replayed(one: RealSet, options: BenchOptions, folder: Path) -> Flight:
         model = folder / "camera.yaml"
         _skyrelief("calibrate", str(options.data / one.boards), *BOARD, "--out", str(model))
         words += ["--camera-model", str(model)]
-    for setting in one.settings:
-        words += ["--set", setting]
     _skyrelief(*words)
     data = options.data / one.source.split("/")[0]
     summary = json.loads((folder / "scan" / "scan.json").read_text(encoding="utf-8"))
     return Flight(data, str(source), folder / "scan", summary)
 
 
-def _skyrelief(*words: str) -> str:
-    """What a command prints. Raises OutsideError with its last line when it fails."""
+def _skyrelief(*words: str) -> None:
+    """Run a command. Raises OutsideError with its last line when it fails."""
     start = "from service.cli import main; main()"
     done = subprocess.run([sys.executable, "-c", start, *words], capture_output=True, text=True)
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["no output"])[-1]
         raise OutsideError(f"skyrelief {words[0]} of {words[1]} failed: {last}")
-    return done.stdout
 
 
 # ---- what needs no truth -------------------------------------------------------------------
@@ -145,7 +144,7 @@ def seams(flight: Flight) -> Iterator[tuple[str, float, str]]:
             break
     if apart:
         yield "seams, median", float(np.median(np.abs(np.concatenate(apart)))), "m"
-        sigmas = float(np.median(np.abs(np.concatenate(ratio)))) / 0.6745
+        sigmas = float(np.median(np.abs(np.concatenate(ratio)))) / NORMAL_MEDIAN
         yield "seams, robust rms over the claimed sigma", sigmas, ""
 
 
@@ -166,15 +165,11 @@ def _apart(a: DepthMap, b: DepthMap, rng: np.random.Generator) -> tuple[F64, F64
     if not len(known):
         return None
     some = rng.choice(known, min(SEAM_POINTS, len(known)), replace=False)
-    v, u = np.divmod(some, a.depth_m.shape[1])
-    z = a.depth_m.ravel()[some].astype(np.float64)
-    rays = np.stack([u, v, np.ones(len(u))], axis=1) @ np.linalg.inv(a.K).T
-    p = se3.transform(se3.inverse(b.T_world_camera) @ a.T_world_camera, rays * z[:, None])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        q = p @ b.K.T
-        at = np.rint(q[:, :2] / q[:, 2:])
+    T_b_a = se3.inverse(b.T_world_camera) @ a.T_world_camera
+    p = se3.transform(T_b_a, _points(a, some))
+    at = np.rint(project(b.K, p))
     h, w = b.depth_m.shape
-    inside = (p[:, 2] > 0) & np.all((at >= 0) & (at < (w, h)), axis=1)
+    inside = np.all((at >= 0) & (at < (w, h)), axis=1)  # NaN: behind b
     cols, rows = at[inside].astype(int).T
     there = b.depth_m[rows, cols]
     both = np.isfinite(there)
@@ -182,6 +177,13 @@ def _apart(a: DepthMap, b: DepthMap, rng: np.random.Generator) -> tuple[F64, F64
         return None
     sigma = np.hypot(a.sigma_m.ravel()[some][inside][both], b.sigma_m[rows, cols][both])
     return (p[inside, 2] - there)[both], sigma.astype(np.float64)
+
+
+def _points(depth: DepthMap, known: npt.NDArray[np.intp]) -> F64:
+    """(n, 3) points in the camera's frame, of flat indices whose depth is known."""
+    v, u = np.divmod(known, depth.depth_m.shape[1])
+    z = depth.depth_m.ravel()[known].astype(np.float64)
+    return np.asarray(rays(depth.K, np.stack([u, v], axis=1).astype(np.float64)) * z[:, None])
 
 
 # ---- what needs some -----------------------------------------------------------------------
@@ -194,38 +196,36 @@ def from_log(flight: Flight) -> Iterator[tuple[str, float, str]]:
     (path,) = flight.data.glob("*.tlog")
     history = load_telemetry(path).history
     with ScanStore.open(flight.scan / "scan.db") as store:
-        frame, poses = local_frame(store.header), latest(store.poses())
-    if frame is None:
-        return
-    off = []
-    for pose in poses:
-        state = history.state_at(pose.time_unix_ns)
-        if state is not None and state.lat_deg is not None and state.lon_deg is not None:
-            fix = np.array([[state.lat_deg, state.lon_deg, 0.0]])
-            off.append(frame.to_enu(fix)[0, :2] - pose.T_world_camera[:2, 3])
-    yield from _of_fixes(np.array(off).reshape(-1, 2))
+        times = [pose.time_unix_ns for pose in store.poses()]
+    states = ((time_ns, history.state_at(time_ns)) for time_ns in times)
+    yield from _off_fixes(flight, {t: (s.lat_deg, s.lon_deg) for t, s in states if s is not None})
 
 
 def from_tags(flight: Flight) -> Iterator[tuple[str, float, str]]:
     """Horizontal distance of the delivered track to the positions in the images' tags."""
     with ScanStore.open(flight.scan / "scan.db") as store:
+        start_ns = store.header.started_unix_ns
+    tags = ((image.time_ns, image.geotag) for image in open_camera(flight.source))
+    yield from _off_fixes(
+        flight, {start_ns + t: (tag.lat_deg, tag.lon_deg) for t, tag in tags if tag is not None}
+    )
+
+
+def _off_fixes(
+    flight: Flight, fixes: Mapping[int, tuple[float | None, float | None]]
+) -> Iterator[tuple[str, float, str]]:
+    """The track against latitudes and longitudes by unix time in ns; None: no fix then."""
+    with ScanStore.open(flight.scan / "scan.db") as store:
         frame, poses = local_frame(store.header), latest(store.poses())
-        start = store.header.started_unix_ns
-    if frame is None:
-        return
-    placed = {_tick(pose.time_unix_ns - start): pose for pose in poses}
-    off = []
-    for image in open_camera(flight.source):
-        pose = placed.get(_tick(image.time_ns))
-        if pose is not None and image.geotag is not None:
-            fix = np.array([[image.geotag.lat_deg, image.geotag.lon_deg, 0.0]])
-            off.append(frame.to_enu(fix)[0, :2] - pose.T_world_camera[:2, 3])
-    yield from _of_fixes(np.array(off).reshape(-1, 2))
-
-
-def _of_fixes(off: F64) -> Iterator[tuple[str, float, str]]:
-    if len(off):
-        yield "track to fixes, horizontal rms", float(np.sqrt((off**2).sum(axis=1).mean())), "m"
+    placed = {_tick(pose.time_unix_ns): pose.T_world_camera[:2, 3] for pose in poses}
+    off = [
+        frame.to_enu(np.array([[lat, lon, 0.0]]))[0, :2] - placed[_tick(time_ns)]
+        for time_ns, (lat, lon) in fixes.items()
+        if frame is not None and lat is not None and lon is not None and _tick(time_ns) in placed
+    ]
+    if off:
+        rms_m = float(np.sqrt(np.square(off).sum(axis=1).mean()))
+        yield "track to fixes, horizontal rms", rms_m, "m"
 
 
 def level_ground(flight: Flight) -> Iterator[tuple[str, float, str]]:
@@ -233,10 +233,7 @@ def level_ground(flight: Flight) -> Iterator[tuple[str, float, str]]:
     points = []
     for depth in _maps(flight):
         known = np.flatnonzero(np.isfinite(depth.depth_m))[::97]
-        v, u = np.divmod(known, depth.depth_m.shape[1])
-        rays = np.stack([u, v, np.ones(len(u))], axis=1) @ np.linalg.inv(depth.K).T
-        local = rays * depth.depth_m.ravel()[known][:, None]
-        points.append(se3.transform(depth.T_world_camera, local))
+        points.append(se3.transform(depth.T_world_camera, _points(depth, known)))
     if not points:
         return
     xyz = np.concatenate(points)
@@ -246,7 +243,11 @@ def level_ground(flight: Flight) -> Iterator[tuple[str, float, str]]:
         plane = np.linalg.lstsq(A * weight[:, None], xyz[:, 2] * weight, rcond=None)[0]
         r = xyz[:, 2] - A @ plane
         weight = 1.0 / (1.0 + (r / (2.0 * np.median(np.abs(r)) + 1e-9)) ** 2)
-    yield "flat ground, robust sigma about a plane", 1.4826 * float(np.median(np.abs(r))), "m"
+    yield (
+        "flat ground, robust sigma about a plane",
+        float(np.median(np.abs(r))) / NORMAL_MEDIAN,
+        "m",
+    )
     yield "flat ground, slope", float(np.degrees(np.arctan(np.hypot(*plane[:2])))), "deg"
 
 

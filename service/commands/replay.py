@@ -100,9 +100,9 @@ def _replay(
 
     notes: list[str] = []
     assumed: tuple[str, ...] = ()
-    if camera is None and getattr(source, "camera", None) is None:
-        assumed = ("lens",)
-    camera = _told_camera(source, notes) if camera is None else _fitted(camera, source, notes)
+    camera = _fitted(camera, source, notes) if camera else _tagged_camera(source, notes)
+    if camera is None:
+        camera, assumed = _assumed_camera(source, notes), ("lens",)
     epoch_ns = _epoch(source, log, video_epoch, notes)
     scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(epoch_ns / 1e9))
     folder = out or Path(f"scan-{scan_id}")
@@ -152,20 +152,26 @@ def _fitted(camera: Camera, source: CameraSource, notes: list[str]) -> Camera:
     return model
 
 
-def _told_camera(source: CameraSource, notes: list[str]) -> Camera:
-    """A pinhole by the images' own tags, else of 70 degrees, with a note that says so."""
+def _tagged_camera(source: CameraSource, notes: list[str]) -> Camera | None:
+    """A pinhole by the images' own tags, with a note that says so; None where they have none."""
+    from service.cameras.images import ImagesSource
+
+    if not isinstance(source, ImagesSource) or source.lens is None or source.camera is None:
+        return None
+    f, side = source.lens.focal, max(source.size_px)
+    notes.append(
+        f"no camera model given: taken from {source.lens.source} ({f * side:.0f} px); "
+        "make one with 'skyrelief calibrate' for shapes to be true"
+    )
+    return source.camera
+
+
+def _assumed_camera(source: CameraSource, notes: list[str]) -> Camera:
+    """A pinhole of 70 degrees, with a note that says so."""
     import numpy as np
 
     from recon.types import Camera
-    from service.cameras.images import ImagesSource
 
-    if isinstance(source, ImagesSource) and source.lens is not None and source.camera is not None:
-        f, side = source.lens.focal, max(source.size_px)
-        notes.append(
-            f"no camera model given: taken from {source.lens.source} ({f * side:.0f} px); "
-            "make one with 'skyrelief calibrate' for shapes to be true"
-        )
-        return source.camera
     W, H = source.size_px
     f = max(W, H) / 2 / np.tan(np.radians(35.0))
     notes.append(

@@ -10,9 +10,6 @@ import numpy as np
 
 from recon.types import Array
 
-LENS = "the lens is assumed: shapes bend; calibrate the camera"
-VIEW = "the view direction is assumed,"
-
 MAX_SCALE_SIGMA = 0.05
 """A scale less certain than this is not a measurement."""
 
@@ -36,17 +33,21 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     """The level as ``level`` and what limits it as ``reasons``, both for scan.json.
 
     Args:
-        run: what the scan's run noted: ``assumed``, ``scale``, ``frames``, ``frames_tracked``,
-            ``segments``. What it lacks, or holds in another form, limits nothing.
+        run: what the scan's run noted: ``assumed``, ``scale``, ``frames``,
+            ``frames_tracked``. What it lacks, or holds in another form, limits nothing.
         georeference: of the scan's header; "none" without.
         slope_deg: of the plane through the cloud.
     """
     assumed = run.get("assumed")
     assumed = assumed if isinstance(assumed, list) else []
     scale_sigma = _number(run.get("scale"), "sigma")
-    doubts = [LENS] if "lens" in assumed else []
+    doubts = []
+    if "lens" in assumed:
+        doubts.append("the lens is assumed: shapes bend; calibrate the camera")
     if "view" in assumed and slope_deg > MAX_SLOPE_DEG:
-        doubts.append(f"{VIEW} and the site leans by {slope_deg:.0f} degrees")
+        doubts.append(
+            f"the view direction is assumed, and the site leans by {slope_deg:.0f} degrees"
+        )
     frames, tracked = _number(run, "frames"), _number(run, "frames_tracked")
     if frames and tracked is not None and tracked < MIN_PLACED_SHARE * (frames - 1):
         doubts.append(f"vision placed only {tracked:.0f} of {frames:.0f} frames")
