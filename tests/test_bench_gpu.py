@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from typing import Any
 
-import numpy as np
 import pytest
 
 from recon.stereo.belief_propagation import BeliefPropagationConfig
@@ -18,8 +16,7 @@ from service.cli import main
 pytest.importorskip("torch")
 
 STAGES = (
-    "stereo", "what is believed", "upsampling", "reprojection", "fusion", "corners", "search",
-    "refinement", "tracks", "ICP", "cloud",
+    "stereo", "what is believed", "upsampling", "reprojection", "fusion", "ICP", "cloud",
 )  # fmt: skip
 
 
@@ -33,11 +30,6 @@ def test_every_stage_is_measured_beside_its_floor(
         monkeypatch.setattr(module, "SIZE", (96, 54))
     for guide in ("GUIDE", "GUIDE_ON_DEVICE"):
         monkeypatch.setattr(bench_gpu, guide, (192, 108))
-    full = gpu_stages.moved_pictures()
-    monkeypatch.setattr(
-        gpu_stages, "moved_pictures",
-        lambda: tuple(np.ascontiguousarray(p[:120, :160]) for p in full),
-    )  # fmt: skip
     device = str(request.config.getoption("--device"))
     for table in ("COPY_MB", "PRODUCT"):
         monkeypatch.setattr(gpu, table, {device: 16})
@@ -74,22 +66,3 @@ def test_an_unknown_device_is_refused(
         main()
     assert stop.value.code == 2
     assert "give cuda or cpu" in capsys.readouterr().err
-
-
-def test_a_fused_kernel_has_lines_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beside the plain ones, with the launches that it saves."""
-    from recon.backends.torch_kernels import Kernels
-    from service.bench import gpu_stages
-
-    for module in (bench_gpu, gpu_stages, gpu):
-        monkeypatch.setattr(module, "SIZE", (96, 54))
-
-    def bilateral(px: Any, sure: Any, taps: Any, guide: Any, true: Any, config: Any) -> Any:
-        return guide[:, :, 0].float(), guide[:, :, 1].float()
-
-    pair = bench_gpu.flown_pair((192, 108))
-    (fused,) = gpu_stages.fused_stages("cpu", pair, Kernels(None, bilateral))
-    assert fused.what == "upsampling to 192x108, exact, on the device, fused"
-    (plain,) = [s for s in gpu_stages.dense_stages("cpu", pair, Kernels()) if "exact" in s.what]
-    saved = [int(s.note.split()[0]) for s in (plain, fused)]
-    assert saved[1] < 0.1 * saved[0]

@@ -18,7 +18,6 @@ from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.reprojection import FusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
-from recon.tracking.matching import MatchingConfig
 from recon.types import U8, DepthMap, StereoPair
 
 torch = pytest.importorskip("torch")
@@ -148,25 +147,6 @@ def test_a_registration(device: str, reads: list[int]) -> None:
     assert len(reads) == 2 and max(reads) < 200
 
 
-def test_a_frame_of_the_odometry(device: str, reads: list[int]) -> None:
-    """Corners and tracks over several levels: one read each."""
-    from recon.backends.torch_backend import TorchBackend
-
-    config = MatchingConfig(grid=8)
-    matcher = TorchBackend(device).matcher()
-    reads.clear()
-    picture = texture(180, 240)
-
-    def frame() -> None:
-        key, new = (matcher.pyramid(p, 4) for p in (picture, np.roll(picture, 7, 1)))
-        uv = matcher.corners(key, config, None).uv_px
-        found = matcher.match(key, uv, new, uv, 30.0, None, config)
-        assert found.ok.sum() > 10
-
-    assert watched(device, frame) == []
-    assert reads[2:] == [8 * 8 * 3, 128 * 4]
-
-
 class OffTheDevice(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Notes tensors of the host in the work of a device without contents."""
 
@@ -188,9 +168,6 @@ def test_nothing_is_made_on_the_host_between_upload_and_result() -> None:
     """A graph cannot capture a copy from the host's memory; on a processor it would not show."""
     from recon.backends.torch_depth import DensePath, PairDepthStage
     from recon.backends.torch_icp import _descent
-    from recon.backends.torch_kernels import PLAIN
-    from recon.backends.torch_matching import harris_cells
-    from recon.backends.torch_tracking import match
 
     def empty(kind: Any, *shape: int) -> Any:
         return torch.empty(shape, dtype=kind, device="meta")
@@ -200,16 +177,11 @@ def test_nothing_is_made_on_the_host_between_upload_and_result() -> None:
     pair = [empty(torch.uint8, 64, 96) for _ in range(4)]
     pair += [empty(torch.uint8, 128, 192, 3), empty(torch.int64, 5), empty(torch.float64, 14)]
     depth = [empty(torch.float32, 48, 60)] * 2 + [empty(torch.float64, 4)]
-    levels = [empty(torch.uint8, 128 >> k, 160 >> k) for k in range(3)]
-    uv, warp, radius = empty(torch.float64, 9, 2), empty(torch.float64, 9, 4), empty(torch.float64)
     with OffTheDevice() as off:
         found = [
             *PairDepthStage(path, 4, 2, (96, 54))(*pair),
-            *_descent(IcpConfig(), PLAIN)(*depth, *depth, empty(torch.float64, 4, 4)),
-            harris_cells(levels[0], MatchingConfig(), levels[0]),
-            match(levels, levels, uv, uv, (warp, warp), empty(torch.bool, 9), radius, (2, 8),
-                  MatchingConfig()),
-        ]  # fmt: skip
+            *_descent(IcpConfig())(*depth, *depth, empty(torch.float64, 4, 4)),
+        ]
     assert off.seen == []
     assert all(t.device.type == "meta" for t in found)
     with OffTheDevice() as off:

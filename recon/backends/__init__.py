@@ -18,9 +18,7 @@ from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 
 if TYPE_CHECKING:
-    from recon.backends.torch_kernels import Kernels
     from recon.mapping.registration import IcpConfig
-    from recon.tracking.matching import Matcher
 
 
 class Backend(Protocol):
@@ -75,24 +73,6 @@ class PathBackend(Protocol):
         stages: DenseStages,
     ) -> DepthMap | None:
         """Depth of a keyframe on its grid ``size_px`` (w, h); None: do it stage by stage."""
-        ...
-
-
-@runtime_checkable
-class MatchingBackend(Protocol):
-    """A backend that finds corners and follows them on its device."""
-
-    def matcher(self) -> Matcher:
-        """One for a thread of its own, beside the one that reconstructs."""
-        ...
-
-
-@runtime_checkable
-class KernelBackend(Protocol):
-    """A backend that may compute some operations by fused kernels."""
-
-    def use(self, kernels: Kernels) -> None:
-        """Compute with these kernels from now on."""
         ...
 
 

@@ -12,7 +12,6 @@ from torch import Tensor
 from recon.backends import DenseStages
 from recon.backends.room import kept, pyramid_levels, room
 from recon.backends.torch_depth import DensePath, JointBilateral
-from recon.backends.torch_kernels import PLAIN, Kernels
 from recon.backends.torch_plan import Part, Plan, part, read
 from recon.backends.torch_stereo import DenseStereo
 from recon.stereo.belief_propagation import BeliefPropagationConfig, believe
@@ -23,7 +22,6 @@ from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration, St
 if TYPE_CHECKING:
     from recon.backends.torch_icp import DeviceIcp
     from recon.mapping.registration import IcpConfig
-    from recon.tracking.matching import Matcher
 
 KEPT_PLANS = 8
 """Shapes whose buffers (and CUDA graph) are kept."""
@@ -45,23 +43,10 @@ class TorchBackend:
             raise ValueError(f"messages are 'int16' or 'float32', not {messages!r}")
         self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         self.messages: torch.dtype = getattr(torch, messages)
-        self.kernels = PLAIN
         self._icp: DeviceIcp | None = None
         self._plans: dict[Any, Plan] = {}
         self._path: tuple[DenseStages, DensePath] | None = None
         torch.zeros(8, device=self.device).add_(1).cpu()  # fails here rather than in flight
-
-    def use(self, kernels: Kernels) -> None:
-        """Compute with these kernels from now on; what was captured before is forgotten."""
-        self.kernels = kernels
-        self._plans.clear()
-        self._path = self._icp = None
-
-    def matcher(self) -> Matcher:
-        """Corners and tracks on the same device, for another thread."""
-        from recon.backends.torch_tracking import TorchMatcher
-
-        return TorchMatcher(self.device)
 
     def belief_propagation(
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
@@ -74,7 +59,7 @@ class TorchBackend:
         true = np.array([h, w, labels])
         px, confidence = self._run(
             ("stereo", *space, label_room, levels, config),
-            lambda: DenseStereo(label_room, levels, config, self.messages, self.kernels),
+            lambda: DenseStereo(label_room, levels, config, self.messages),
             [part(left, (space[0], space[1])), part(right, (space[0], space[1])), part(true)],
             (left, right, true),
         )
@@ -92,7 +77,7 @@ class TorchBackend:
         )  # fmt: skip
         px, confidence = self._run(
             ("upsample", *small, *large, config),
-            lambda: JointBilateral(config, self.kernels),
+            lambda: JointBilateral(config),
             [
                 part(given[0], small), part(given[1], small), part(given[2], (*small, 3)),
                 part(guide, (*large, 3)), part(given[4]),
@@ -108,7 +93,7 @@ class TorchBackend:
         from recon.backends.torch_icp import DeviceIcp
 
         if self._icp is None:
-            self._icp = DeviceIcp(self.device, self.kernels)
+            self._icp = DeviceIcp(self.device)
         return self._icp.register(source, target, T_target_source, config)
 
     def fused_depth(
@@ -124,8 +109,7 @@ class TorchBackend:
             return None
         if self._path is None or self._path[0] != stages:
             path = DensePath(
-                self.device, stages.matching, stages.upsampling, stages.fusion, self.messages,
-                self.kernels,
+                self.device, stages.matching, stages.upsampling, stages.fusion, self.messages
             )  # fmt: skip
             self._path = stages, path
         return self._path[1].depth(pairs, K, size_px, T_world_camera)

@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from recon.backends.room import kept, pyramid_levels, room
-from recon.backends.torch_kernels import PLAIN, Kernels
 from recon.backends.torch_plan import Plan, part, read
 from recon.backends.torch_stereo import DenseStereo, believe, drop_unseen
 from recon.stereo.belief_propagation import BeliefPropagationConfig
@@ -41,7 +40,6 @@ class DensePath:
         upsampling: UpsamplingConfig,
         fusion: FusionConfig,
         messages: torch.dtype = torch.int16,
-        kernels: Kernels = PLAIN,
     ) -> None:
         if matching.fill_occluded:
             raise ValueError("the path on the device does not fill occlusions")
@@ -50,7 +48,6 @@ class DensePath:
         self.upsampling = upsampling
         self.fusion = fusion
         self.messages = messages
-        self.kernels = kernels
         self._plans: dict[Any, Plan] = {}
 
     def depth(
@@ -99,8 +96,8 @@ class PairDepthStage(torch.nn.Module):
 
     def __init__(self, path: DensePath, labels: int, levels: int, size_px: tuple[int, int]) -> None:
         super().__init__()
-        self.stereo = DenseStereo(labels, levels, path.matching, path.messages, path.kernels)
-        self.upsampling = JointBilateral(path.upsampling, path.kernels)
+        self.stereo = DenseStereo(labels, levels, path.matching, path.messages)
+        self.upsampling = JointBilateral(path.upsampling)
         self.matching = path.matching
         self.size_px = size_px
 
@@ -144,19 +141,16 @@ FAR_TAP = -1.0e4
 
 
 class JointBilateral(torch.nn.Module):
-    """From (h, w) to the size of the guide (H, W, 3); a kernel may do all of it."""
+    """From (h, w) to the size of the guide (H, W, 3); Eq. 2."""
 
-    def __init__(self, config: UpsamplingConfig, kernels: Kernels = PLAIN) -> None:
+    def __init__(self, config: UpsamplingConfig) -> None:
         super().__init__()
         self.config = config
-        self.kernel = kernels.bilateral
 
     def forward(
         self, px: Tensor, confidence: Tensor, taps: Tensor, guide: Tensor, true: Tensor
     ) -> tuple[Tensor, Tensor]:
         """``taps`` (h, w, 3) and ``guide`` (H, W, 3) in gray levels; ``true`` (4,) h, w, H, W."""
-        if self.kernel is not None:
-            return self.kernel(px, confidence, taps, guide, true, self.config)
         layers = tap_layers(px, confidence, taps)
         image = guide.float().permute(2, 0, 1)
         everything = torch.zeros_like(image[0])

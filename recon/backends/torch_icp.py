@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from recon.backends.room import kept
-from recon.backends.torch_kernels import PLAIN, Kernels
 from recon.backends.torch_plan import Plan, part
 from recon.backends.torch_surface import (
     DOUBLE,
@@ -46,9 +45,8 @@ KEPT_PLANS = 4
 class DeviceIcp:
     """Registers depth maps on ``device``; one thread at a time."""
 
-    def __init__(self, device: str, kernels: Kernels = PLAIN) -> None:
+    def __init__(self, device: str) -> None:
         self.device = device
-        self._kernels = kernels
         self._plans: dict[Any, Plan] = {}
 
     def register(
@@ -63,9 +61,7 @@ class DeviceIcp:
         with torch.inference_mode():
             plan = kept(
                 self._plans, key, KEPT_PLANS,
-                lambda: Plan(
-                    self.device, _descent(config, self._kernels), [part(a) for a in given]
-                ),
+                lambda: Plan(self.device, _descent(config), [part(a) for a in given]),
             )  # fmt: skip
             plan.upload(given)
             told = plan.run()[0].cpu().numpy()
@@ -87,7 +83,7 @@ def _inputs(depth: DepthMap) -> list[Array]:
     return [z, sigma, intrinsics]
 
 
-def _descent(config: IcpConfig, kernels: Kernels) -> Callable[..., tuple[Tensor, ...]]:
+def _descent(config: IcpConfig) -> Callable[..., tuple[Tensor, ...]]:
     """What a plan runs: from two depth maps and a start to the numbers of :func:`_concluded`."""
 
     def run(
@@ -96,8 +92,8 @@ def _descent(config: IcpConfig, kernels: Kernels) -> Callable[..., tuple[Tensor,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         a = build(z_a, sigma_a, K_a, config.edge_share)
         b = build(z_b, sigma_b, K_b, config.edge_share)
-        T, state, seen = descend(a, b, T, config, kernels)
-        last = (kernels.weigh or weigh)(seen, a, b, T, True, config)
+        T, state, seen = descend(a, b, T, config)
+        last = weigh(seen, a, b, T, True, config)
         size = last.residual.view(seen.shape)
         near = (last.found.view(seen.shape) > 0) & (size.abs() < AREA_SIGMAS * last.scale)
         numbers = [
@@ -111,10 +107,9 @@ def _descent(config: IcpConfig, kernels: Kernels) -> Callable[..., tuple[Tensor,
 
 
 def descend(
-    a: DeviceSurface, b: DeviceSurface, T: Tensor, config: IcpConfig, kernels: Kernels = PLAIN
+    a: DeviceSurface, b: DeviceSurface, T: Tensor, config: IcpConfig
 ) -> tuple[Tensor, Tensor, SourcePoints]:
     """The motion after the iterations of every level, their state, and the last level's points."""
-    look, move = kernels.weigh or weigh, kernels.advance or advance
     last = len(config.strides) - 1
     ones = torch.ones(2, dtype=DOUBLE, device=T.device)
     state = torch.cat([ones, torch.zeros_like(ones[:1])])
@@ -122,8 +117,8 @@ def descend(
         seen = points(a, stride)
         state = torch.stack([state[0], state[0], state[2]])
         for _ in range(limit):
-            found = look(seen, a, b, T, level == last, config)
-            T, state = move(found, a, T, state, 0.3 if level == last else 1.0, config)
+            found = weigh(seen, a, b, T, level == last, config)
+            T, state = advance(found, a, T, state, 0.3 if level == last else 1.0, config)
     return T, state, seen
 
 

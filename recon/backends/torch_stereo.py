@@ -16,7 +16,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from recon.backends.torch_kernels import PLAIN, Kernels, Sweep
 from recon.stereo.belief_propagation import (
     NOISE,
     RADIUS,
@@ -38,8 +37,7 @@ class DenseStereo(torch.nn.Module):
     """Gray images (h, w) in 0 to 255 to labels and their confidence, two (h, w).
 
     ``labels`` is the room for them, ``levels`` counts those of the pyramid; ``messages`` is the
-    type of costs and messages, torch.int16 (where they fit) or torch.float32. The kernel of
-    ``kernels`` renews messages of 16 bits.
+    type of costs and messages, torch.int16 (where they fit) or torch.float32.
     """
 
     def __init__(
@@ -48,7 +46,6 @@ class DenseStereo(torch.nn.Module):
         levels: int,
         config: BeliefPropagationConfig,
         messages: torch.dtype = torch.float32,
-        kernels: Kernels = PLAIN,
     ) -> None:
         super().__init__()
         self.labels = labels
@@ -56,8 +53,6 @@ class DenseStereo(torch.nn.Module):
         self.config = config
         short = messages == torch.int16 and config.truncation <= MAX_SHORT_TRUNCATION
         self.messages = torch.int16 if short else torch.float32
-        self.sweep = kernels.sweep if short else None
-        self.cost = kernels.cost or matching_cost
 
     def forward(self, left: Tensor, right: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
         """Labels, NaN where the partner is outside the right image; confidence, 0: not believed.
@@ -66,9 +61,9 @@ class DenseStereo(torch.nn.Module):
         their last row and column, and the results mean nothing.
         """
         left, right = left.float(), right.float()
-        cost = self.cost(left, right, self.labels, true, self.config)
+        cost = matching_cost(left, right, self.labels, true, self.config)
         edges = edge_weights(left, true, self.config)
-        belief = propagate(cost, edges, true, self.levels, self.config, self.messages, self.sweep)
+        belief = propagate(cost, edges, true, self.levels, self.config, self.messages)
         return select(belief, cost, true, self.config)
 
 
@@ -97,12 +92,8 @@ def propagate(
     levels: int,
     config: BeliefPropagationConfig,
     kind: torch.dtype,
-    sweep: Sweep | None = None,
 ) -> Tensor:
-    """(L, h, w) beliefs, as :func:`recon.stereo.message_passing.propagate` (Eq. 1).
-
-    ``sweep`` renews the messages of one colour in place; None: in plain torch.
-    """
+    """(L, h, w) beliefs, as :func:`recon.stereo.message_passing.propagate` (Eq. 1)."""
     labels = true[2]
     pyramid = [_cut(cost.to(kind), labels, config.truncation)]
     edges, sizes = [weights], [true[:2]]
@@ -119,17 +110,12 @@ def propagate(
         slope = torch.floor(weight * (COST_UNIT / FULL_WEIGHT)).to(kind)
         cut = torch.floor(weight * (config.truncation / FULL_WEIGHT)).to(kind)
         smooth = (_per_direction(slope), _per_direction(cut))
-        if sweep is not None:
-            messages = messages.contiguous()
         for t in range(config.iterations):
-            if sweep is not None:
-                sweep(data, messages, *smooth, t % 2)
-            else:
-                messages = sweep_plainly(data, messages, *smooth, t % 2, config.truncation)
+            messages = sweep(data, messages, *smooth, t % 2, config.truncation)
     return pyramid[0] + _total(_arriving(messages))
 
 
-def sweep_plainly(
+def sweep(
     data: Tensor, messages: Tensor, slope: Tensor, cut: Tensor, colour: int, truncation: int
 ) -> Tensor:
     """(4, L, h, w) messages of which those of the pixels of ``colour`` are new.

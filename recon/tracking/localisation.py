@@ -16,7 +16,6 @@ from recon import se3
 from recon.tracking import matching, pnp, prediction, robust_geometry, two_view
 from recon.tracking.common_view import CommonView, FeatureCache, common_view
 from recon.tracking.keyframe_window import OdometryKeyframe, TrackingFrame
-from recon.tracking.matching import Matcher
 from recon.tracking.prediction import Motion
 from recon.types import F64, Bool, Camera, PosePrior
 
@@ -92,11 +91,9 @@ class Bridge:
 class Localiser:
     """Poses of frames of one camera without distortion."""
 
-    def __init__(
-        self, camera: Camera, config: OdometryConfig, matcher: Matcher, features: FeatureCache
-    ) -> None:
-        """``matcher`` finds corners again; ``features`` finds views that no motion predicts."""
-        self.camera, self.config, self.matcher = camera, config, matcher
+    def __init__(self, camera: Camera, config: OdometryConfig, features: FeatureCache) -> None:
+        """``features`` finds views that no motion predicts."""
+        self.camera, self.config = camera, config
         self._features = features
 
     def locate(
@@ -146,7 +143,7 @@ class Localiser:
         """
         for key, view in self._views(new, keyframes):
             guess = view.predict(key.uv, FEATURE_SHARE * self.camera.size_px[0])
-            found = self.matcher.match(
+            found = matching.match(
                 key.pyramid, key.uv.astype(np.float32), new.pyramid, guess.uv.astype(np.float32),
                 guess.radius_px, guess.warp.astype(np.float32), self.config.matching,
             )  # fmt: skip
@@ -270,7 +267,7 @@ class Localiser:
         index = np.flatnonzero(visible)
         if index.size < least:
             return "the view left the map"
-        found = self.matcher.match(
+        found = matching.match(
             key.pyramid,
             key.uv[index].astype(np.float32),
             pyramid,
@@ -333,10 +330,8 @@ class FirstViews:
         camera: Camera,
         config: matching.MatchingConfig,
         radius_px: float,
-        matcher: Matcher,
         features: FeatureCache,
     ) -> None:
-        self._matcher = matcher
         self._K, self._config, self._radius_px = camera.K, config, radius_px
         self._features = features
         self._drift = np.eye(3)  # from the first frame's pixels to the last one's
@@ -354,7 +349,7 @@ class FirstViews:
         """
         best: tuple[F64, Bool] | None = None
         for guess in self._guesses(new, first, R_b_a, still):
-            found = self._matcher.match(
+            found = matching.match(
                 first.pyramid,
                 first.uv.astype(np.float32),
                 new.pyramid,

@@ -8,7 +8,7 @@ centres are at integers; level ``l`` of a pyramid holds the pixel (u, v) at (u, 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -190,7 +190,6 @@ class Pyramid:
     """A grey picture and its halvings, each (ceil(H / 2^l), ceil(W / 2^l)) uint8."""
 
     levels: tuple[U8, ...]
-    held: object = None  # the same where the matcher that made it keeps them
 
     @staticmethod
     def build(gray: U8, levels: int = 5) -> Pyramid:
@@ -426,43 +425,3 @@ def _repeats(search: _Search, uv: F64, ok: Bool, coarse: F64, fine: F64) -> Bool
     if not vague.any():
         return vague
     return np.asarray(vague & ~search.at(1, uv, vague, 8).distinct(search.config.ambiguity))
-
-
-class Matcher(Protocol):
-    """What the odometry asks of pictures."""
-
-    def pyramid(self, gray: U8, levels: int) -> Pyramid:
-        """The pyramid of ``gray`` (H, W), held where this matcher works."""
-        ...
-
-    def corners(self, pyramid: Pyramid, config: MatchingConfig, mask: U8 | None) -> Corners:
-        """As :func:`recon.tracking.harris_grid`, of the pyramid's first level."""
-        ...
-
-    def match(
-        self, pyramid_a: Pyramid, uv_a: npt.ArrayLike, pyramid_b: Pyramid,
-        uv_b_predicted: npt.ArrayLike, radius_px: float, warp: npt.ArrayLike | None,
-        config: MatchingConfig,
-    ) -> Matches:  # fmt: skip
-        """As :func:`match`."""
-        ...
-
-
-class HostMatcher:
-    """The compiled kernels of the processor."""
-
-    def pyramid(self, gray: U8, levels: int) -> Pyramid:
-        """See :class:`Matcher`."""
-        return Pyramid.build(gray, levels)
-
-    def corners(self, pyramid: Pyramid, config: MatchingConfig, mask: U8 | None) -> Corners:
-        """See :class:`Matcher`."""
-        return harris_grid(pyramid.levels[0], config, mask)
-
-    def match(
-        self, pyramid_a: Pyramid, uv_a: npt.ArrayLike, pyramid_b: Pyramid,
-        uv_b_predicted: npt.ArrayLike, radius_px: float, warp: npt.ArrayLike | None,
-        config: MatchingConfig,
-    ) -> Matches:  # fmt: skip
-        """See :class:`Matcher`."""
-        return match(pyramid_a, uv_a, pyramid_b, uv_b_predicted, radius_px, warp, config)

@@ -28,7 +28,7 @@ from recon.tracking.keyframe_window import (
     triangulate,
 )
 from recon.tracking.localisation import Bridge, FirstViews, Localiser, Located, OdometryConfig
-from recon.tracking.matching import HostMatcher, Matcher
+from recon.tracking.matching import Pyramid, harris_grid
 from recon.tracking.prediction import Motion
 from recon.types import F64, U8, Bool, Camera, PosePrior
 
@@ -54,13 +54,8 @@ class Odometry:
         self,
         camera: Camera,
         config: OdometryConfig | None = None,
-        matcher: Matcher | None = None,
     ) -> None:
-        """``camera`` has no distortion and the size of the frames to come.
-
-        ``matcher`` finds and follows corners; None: the processor does.
-        """
-        self._matcher = matcher or HostMatcher()
+        """``camera`` has no distortion and the size of the frames to come."""
         self.camera = camera
         self.K = camera.K
         self.config = config or OdometryConfig()
@@ -71,12 +66,11 @@ class Odometry:
         self._missed_still: TrackingFrame | None = None  # the last frame, when it has no pose
         self._motion: Motion | None = None
         features = FeatureCache()
-        self._localiser = Localiser(camera, self.config, self._matcher, features)
+        self._localiser = Localiser(camera, self.config, features)
         self._first_views = FirstViews(
             camera,
             self.config.matching,
             self.config.wide_search_share * camera.size_px[0],
-            self._matcher,
             features,
         )
         self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
@@ -100,7 +94,7 @@ class Odometry:
             mask: (H, W) non-zero where the picture is valid.
             blurred: a later frame makes a better keyframe, if it comes soon.
         """
-        pyramid = self._matcher.pyramid(gray, self.config.matching.search_levels)
+        pyramid = Pyramid.build(gray, self.config.matching.search_levels)
         new = TrackingFrame(gray, pyramid, seq, time_ns, prior, mask, blurred)
         self._gap_ns, self._frame_ns = time_ns - self._frame_ns, time_ns
         if not self.keyframes:
@@ -172,7 +166,7 @@ class Odometry:
 
     def _corners(self, new: TrackingFrame) -> F64:
         """(N, 2) Harris corners of the frame, Eq. 4-5."""
-        found = self._matcher.corners(new.pyramid, self.config.matching, new.mask)
+        found = harris_grid(new.gray, self.config.matching, new.mask)
         return found.uv_px.astype(np.float64)
 
     # ---- the second view --------------------------------------------------------------

@@ -48,21 +48,17 @@ def torch_results(compiled: Backend, options: BenchOptions) -> list[BenchResult]
     import torch
 
     from recon.backends.torch_backend import TorchBackend
-    from recon.backends.torch_kernels import PLAIN
     from service.bench.gpu_stages import stages, whole_path
-    from service.compute.fused_kernels import choose_kernels
 
     device = options.device or ("cuda" if torch.cuda.is_available() else "cpu")
     backend = TorchBackend(device)
     floor, results = measure_floor(device, options)
     guide = GUIDE_ON_DEVICE if device == "cuda" else GUIDE
     pair = flown_pair(guide)
-    kernels = choose_kernels(device) if device == "cuda" else PLAIN
-    for stage in stages(device, pair, kernels):
+    for stage in stages(device, pair):
         results.append(against_floor(stage, floor, options))
-    backend.use(kernels)
     results += calls(backend, compiled, guide, options)
-    whole = whole_path(device, pair, kernels)
+    whole = whole_path(device, pair)
     results += [against_floor(stage, floor, options) for stage in whole]
     return results
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -15,22 +13,16 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from recon.backends.room import pyramid_levels
 from recon.backends.torch_depth import DensePath, JointBilateral, averaged, fuse, reproject
 from recon.backends.torch_icp import DeviceIcp
-from recon.backends.torch_kernels import PLAIN, Kernels
-from recon.backends.torch_matching import harris_cells, refine, search
 from recon.backends.torch_plan import Plan, part
 from recon.backends.torch_stereo import DenseStereo, believe, drop_unseen
-from recon.backends.torch_tracking import TorchMatcher
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.reprojection import FusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
-from recon.tracking.matching import MatchingConfig, harris_grid
-from recon.types import U8, Array, StereoPair
+from recon.types import Array, StereoPair
 from service.bench.gpu import LABELS, SIZE, Stage, ground, propagation_work
 
 PAIRS = 4
-REACH = 8
-ITERATIONS = 6
 
 
 VIEWS = {
@@ -55,14 +47,9 @@ class Launches(TorchDispatchMode):  # type: ignore[no-untyped-call]
         return func(*args, **(kwargs or {}))
 
 
-def stages(device: str, pair: StereoPair, kernels: Kernels = PLAIN) -> list[Stage]:
-    """Cost and belief propagation, what is believed, upsampling, depth, fusion, ICP, matching."""
-    return [
-        *dense_stages(device, pair, PLAIN),
-        *(fused_stages(device, pair, kernels) if kernels != PLAIN else []),
-        icp_stage(device),
-        *matching_stages(device),
-    ]
+def stages(device: str, pair: StereoPair) -> list[Stage]:
+    """Cost and belief propagation, what is believed, upsampling, depth, fusion, ICP."""
+    return [*dense_stages(device, pair), icp_stage(device)]
 
 
 def staged(
@@ -89,20 +76,9 @@ def planned(device: str, stage: Callable[..., Any], *arrays: Array) -> Plan:
     return plan
 
 
-def fused_stages(device: str, pair: StereoPair, kernels: Kernels) -> list[Stage]:
-    """The stages that a fused kernel changes."""
-    found = dense_stages(device, pair, kernels)
-    chosen = [found[0]] if kernels.sweep is not None or kernels.cost is not None else []
-    if kernels.bilateral is not None:
-        chosen += [s for s in found if s.what.startswith("upsampling")]
-    if kernels.weigh is not None:
-        chosen.append(icp_stage(device, kernels))
-    return [replace(s, what=f"{s.what}, fused") for s in chosen]
-
-
-def icp_stage(device: str, kernels: Kernels = PLAIN) -> Stage:
+def icp_stage(device: str) -> Stage:
     """Six iterations on all points: surfaces, partners, sums and steps."""
-    icp = DeviceIcp(device, kernels)
+    icp = DeviceIcp(device)
     config = IcpConfig(strides=(1,), iterations=(6,))
     icp.register(ground(0.3), ground(0.0), np.eye(4), config)
     points, rounds = SIZE[0] * SIZE[1], config.iterations[0] + 1
@@ -112,7 +88,7 @@ def icp_stage(device: str, kernels: Kernels = PLAIN) -> Stage:
     )  # fmt: skip
 
 
-def dense_stages(device: str, pair: StereoPair, kernels: Kernels) -> list[Stage]:
+def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
     """From two rectified pictures to fused depth, one after the other."""
     w, h = SIZE
     matching, upsampling = BeliefPropagationConfig(), UpsamplingConfig()
@@ -124,7 +100,7 @@ def dense_stages(device: str, pair: StereoPair, kernels: Kernels) -> list[Stage]
     found = []
     for kind in (torch.int16, torch.float32):
         stereo = planned(
-            device, DenseStereo(LABELS, levels, matching, kind, kernels), pair.left, pair.right,
+            device, DenseStereo(LABELS, levels, matching, kind), pair.left, pair.right,
             own,
         )  # fmt: skip
         found.append(
@@ -141,7 +117,7 @@ def dense_stages(device: str, pair: StereoPair, kernels: Kernels) -> list[Stage]
         pair.left, px, sure, seen, seen, own,
     )  # fmt: skip
     px, sure = (t.cpu().numpy() for t in trusted.run())
-    bilateral = JointBilateral(upsampling, kernels)
+    bilateral = JointBilateral(upsampling)
     finer = planned(
         device,
         lambda p, s, guide, true: bilateral(p, s, averaged(guide, (h, w), true), guide, true),
@@ -171,66 +147,10 @@ def dense_stages(device: str, pair: StereoPair, kernels: Kernels) -> list[Stage]
     ]  # fmt: skip
 
 
-def matching_stages(device: str) -> list[Stage]:
-    """Corners of a picture, the search for them in another one, and its refinement."""
-    config = MatchingConfig()
-    a, b = moved_pictures()
-    uv = harris_grid(a, config).uv_px.astype(np.float64)
-    warp = np.tile([1.0, 0, 0, 1], (len(uv), 1))
-    active = np.ones(len(uv), np.uint8)
-    r = config.patch_radius_px
-    corners = planned(device, lambda image: harris_cells(image, config), a)
-
-    def searched(
-        a: Tensor, b: Tensor, uv: Tensor, near: Tensor, warp: Tensor, active: Tensor
-    ) -> tuple[Tensor, ...]:
-        found = search(a, b, uv, near, warp, active > 0, REACH, r, config.min_contrast)
-        return found.uv, found.score, found.second
-
-    def refined(
-        a: Tensor, b: Tensor, uv: Tensor, near: Tensor, warp: Tensor, active: Tensor
-    ) -> tuple[Tensor, ...]:
-        found = refine(a, b, uv, near, warp, active > 0, r, ITERATIONS)
-        return found.uv, found.score
-
-    given = (a, b, uv, uv + 2.0, warp, active)
-    look, place = planned(device, searched, *given), planned(device, refined, *given)
-    n, area = len(uv), (2 * r + 1) ** 2
-    places = (2 * REACH + 1) ** 2
-    size = f"{a.shape[1]}x{a.shape[0]}"
-    matcher = TorchMatcher(device)
-
-    def tracks() -> object:
-        key, new = (matcher.pyramid(p, config.search_levels) for p in (a, b))
-        return matcher.match(key, uv, new, uv, 4.0 * REACH, None, config)
-
-    return [
-        staged(f"corners of {size}, on the device", device, corners, 1.0 * a.size,
-              60.0 * a.size),
-        staged(f"search of {n} corners, on the device", device, look,
-              n * (2 * REACH + 2 * r + 1.0) ** 2, 2.0 * n * area * places, f"reach {REACH} px"),
-        staged(f"refinement of {n} places, on the device", device, place,
-              n * (2.0 * r + 4) ** 2, 20.0 * n * area * ITERATIONS, f"{ITERATIONS} iterations"),
-        Stage(f"tracks of {n} corners from picture to picture, with uploads", device, tracks,
-              2.7 * a.size, 2.0 * n * area * (places + 81 + 20 * ITERATIONS),
-              "pyramids up, search and refinement both ways, matches down"),
-    ]  # fmt: skip
-
-
-def moved_pictures() -> tuple[U8, U8]:
-    """A textured picture of 1280x720, and the same two pixels on."""
-    rng = np.random.default_rng(0)
-    rough = cv2.GaussianBlur(rng.normal(0, 90, (730, 1290)), (0, 0), 1.5)
-    canvas = np.clip(np.asarray(rough) * 2 + 128, 0, 255).astype(np.uint8)
-    return np.ascontiguousarray(canvas[2:722, 2:1282]), np.ascontiguousarray(canvas[:720, :1280])
-
-
-def whole_path(device: str, pair: StereoPair, kernels: Kernels = PLAIN) -> list[Stage]:
+def whole_path(device: str, pair: StereoPair) -> list[Stage]:
     """A cloud of one pair: inputs on the device, then pictures up and depth down, and four."""
     assert pair.guide is not None
-    path = DensePath(
-        device, BeliefPropagationConfig(), UpsamplingConfig(), FusionConfig(), kernels=kernels
-    )
+    path = DensePath(device, BeliefPropagationConfig(), UpsamplingConfig(), FusionConfig())
     path.depth([pair], pair.K, SIZE, np.eye(4))
     plan = next(iter(path._plans.values()))
     moved, operations = propagation_work(path.matching, 2)

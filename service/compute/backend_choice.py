@@ -12,20 +12,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.backends import (
     BACKENDS,
     Backend,
     DenseStages,
-    KernelBackend,
-    MatchingBackend,
     PathBackend,
     load_backend,
 )
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.upsampling import UpsamplingConfig
-from recon.tracking.matching import Corners, HostMatcher, Matcher, Matches, MatchingConfig, Pyramid
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 from service.errors import InputError, OutsideError
 
@@ -95,14 +91,6 @@ class FallbackBackend:
             )
         )
 
-    def matcher(self) -> Matcher:
-        """Of the backend's device while it works, else of the processor."""
-        return FallbackMatcher(self)
-
-    def device_matcher(self) -> Matcher | None:
-        """That of the backend at work; None where the processor follows corners."""
-        return self._backend.matcher() if isinstance(self._backend, MatchingBackend) else None
-
     def fail(self, error: Exception) -> None:
         """Compute on the processor from now on, because of this error."""
         self.failure = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -121,43 +109,6 @@ class FallbackBackend:
             if self._backend is backend:
                 self.fail(error)
             return operation(self._backend)
-
-
-class FallbackMatcher:
-    """Corners and tracks by a backend's device, and by the processor once either failed."""
-
-    def __init__(self, backend: FallbackBackend) -> None:
-        self._fallback = backend
-        self._host = HostMatcher()
-        self._own = backend.device_matcher()
-
-    def pyramid(self, gray: U8, levels: int) -> Pyramid:
-        """See :class:`recon.tracking.matching.Matcher`."""
-        return self._run(lambda m: m.pyramid(gray, levels))
-
-    def corners(self, pyramid: Pyramid, config: MatchingConfig, mask: U8 | None) -> Corners:
-        """See :class:`recon.tracking.matching.Matcher`."""
-        return self._run(lambda m: m.corners(pyramid, config, mask))
-
-    def match(
-        self, pyramid_a: Pyramid, uv_a: npt.ArrayLike, pyramid_b: Pyramid,
-        uv_b_predicted: npt.ArrayLike, radius_px: float, warp: npt.ArrayLike | None,
-        config: MatchingConfig,
-    ) -> Matches:  # fmt: skip
-        """See :class:`recon.tracking.matching.Matcher`."""
-        return self._run(
-            lambda m: m.match(pyramid_a, uv_a, pyramid_b, uv_b_predicted, radius_px, warp, config)
-        )
-
-    def _run(self, operation: Callable[[Matcher], Result]) -> Result:
-        if self._own is not None and self._fallback.failure is None:
-            try:
-                return operation(self._own)
-            except (RuntimeError, MemoryError) as error:
-                if self._fallback.failure is None:
-                    self._fallback.fail(error)
-        self._own = None
-        return operation(self._host)
 
 
 def choose_backend(name: str = "auto") -> Backend:
@@ -196,7 +147,7 @@ def fastest_backend() -> Backend:
             log.info("backend %s: not tried, %s", candidate, reason)
             continue
         try:
-            backend = with_kernels(load_backend(candidate, engine_folder()))
+            backend = load_backend(candidate, engine_folder())
         except (ImportError, RuntimeError, ValueError) as error:
             log.info("backend %s: cannot run here, %s", candidate, error)
             continue
@@ -232,25 +183,10 @@ def named_backend(name: str) -> Backend:
     if name not in BACKENDS:
         raise InputError(f"backend {name}: there are auto, {', '.join(BACKENDS)}")
     try:
-        backend = with_kernels(load_backend(name, engine_folder()))
+        backend = load_backend(name, engine_folder())
     except (ImportError, RuntimeError, ValueError) as error:
         raise OutsideError(f"backend {name} cannot run here: {error}") from error
     log.info("backend %s on %s, as named", backend.name, backend.device)
-    return backend
-
-
-def with_kernels(backend: Backend) -> Backend:
-    """The backend, on CUDA with the fused kernels that proved right and faster there.
-
-    What Triton compiles is kept beside the engines of other GPU providers.
-    """
-    if isinstance(backend, KernelBackend) and backend.device.startswith("cuda"):
-        folder = engine_folder()
-        if folder is not None:
-            os.environ.setdefault("TRITON_CACHE_DIR", str(Path(folder) / "triton"))
-        from service.compute.fused_kernels import choose_kernels
-
-        backend.use(choose_kernels(backend.device))
     return backend
 
 

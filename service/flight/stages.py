@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from recon import se3
-from recon.backends import Backend, DenseStages, MatchingBackend, PathBackend
+from recon.backends import Backend, DenseStages, PathBackend
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
 from recon.mapping.registration import IcpConfig
@@ -340,7 +340,6 @@ def build_stages(
     odometry = Odometry(
         undistort.tracking_camera,
         OdometryConfig(base_to_height=config.scan.base_to_height),
-        backend.matcher() if isinstance(backend, MatchingBackend) else None,
     )
     track = Track(odometry, refused, stopwatch)
     selection = Viewpoints(config.scan, compute.pairs)

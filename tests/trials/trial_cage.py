@@ -29,7 +29,7 @@ MAX_MIB, MAX_MESH_MIB = 1536, 4096
 """Resident memory that a case may take, imports included: rasters and meshes have their own
 bounds of cells and triangles, which scans of square kilometres reach."""
 PRELOADED = ("offline", "scans", "stream", "cameras", "commands", "flight", "ground")
-LATE = ("torch", "triton", "onnx", "mesh_cluster")
+LATE = ("torch", "onnx", "mesh_cluster")
 """What a case imports itself: large, or with threads that a fork does not copy."""
 FOREWARNED = {0: "done", 2: "refused in a line", 3: "outside world"}
 
