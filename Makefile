@@ -35,17 +35,17 @@ bench: $(STAMP)
 
 # Over an hour: fifty kills, the fuzzers, and beside them an hour of flights and a scan of an hour
 # (MINUTES=6 is shorter), which are their load. As root with systemd-container and debootstrap it
-# also installs into a bare Debian and boots that. Writes docs/trials.md and docs/boot-log.md.
+# also installs into a bare Debian and boots that. Writes trials.md and boot-log.md of docs/reports.
 MINUTES ?= 60
 SOAK := tests/trials/test_trial_soak.py
 trials: $(STAMP)
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[$(EXTRAS),trials]'
 	@export SKYRELIEF_TRIALS=whole SKYRELIEF_SOAK_MINUTES=$(MINUTES); \
-	  export SKYRELIEF_TRIALS_TABLE=docs/trials.md SKYRELIEF_BOOT_LOG=docs/boot-log.md; \
+	  export SKYRELIEF_TRIALS_TABLE=docs/reports/trials.md SKYRELIEF_BOOT_LOG=docs/reports/boot-log.md; \
 	  $(BIN)/python -m pytest -m trial $(SOAK) -k flights $(ARGS) & flights=$$!; \
 	  $(BIN)/python -m pytest -m trial $(SOAK) -k scan $(ARGS) & scan=$$!; \
 	  $(BIN)/python -m pytest -m trial tests/trials --ignore=$(SOAK) $(ARGS); rest=$$?; \
-	  wait $$flights; flights=$$?; wait $$scan; scan=$$?; cat docs/trials.md; \
+	  wait $$flights; flights=$$?; wait $$scan; scan=$$?; cat docs/reports/trials.md; \
 	  for rc in $$rest $$flights $$scan; do case $$rc in 0|5) ;; *) exit $$rc;; esac; done  # 5: none
 
 format: $(STAMP)
