@@ -110,6 +110,31 @@ class Page:
         self.run(f"setTimeout(() => {find}.click(), 0)")
         self.run("new Promise(r => setTimeout(r, 50))")
 
+    def mouse(self, x: float, y: float, *, to: tuple[float, float] | None = None) -> None:
+        """Click at a place of the page, or press there and release at ``to``; CSS pixels."""
+        one = {"button": "left", "clickCount": 1}
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+        self.call("Input.dispatchMouseEvent", type="mousePressed", x=x, y=y, **one)
+        if to is not None:
+            x, y = to
+            self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, **one)
+        self.call("Input.dispatchMouseEvent", type="mouseReleased", x=x, y=y, **one)
+
+    def key(self, name: str) -> None:
+        """Press and release a key that writes nothing, such as Escape."""
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=name, code=name)
+
+    def screen(self, width: int, height: int, mobile: bool = False) -> None:
+        """Show pages on a screen of this size, in CSS pixels."""
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=mobile,
+        )
+
     def picture(self, path: Path) -> None:
         """Write what the page shows as PNG."""
         data = self.call("Page.captureScreenshot", format="png")["data"]

@@ -32,3 +32,18 @@ export function size(bytes: number): string {
 
 export const date = (unix_s: number | null): string =>
   unix_s === null ? "no date" : new Date(unix_s * 1000).toLocaleString();
+
+/** An element of SVG with its attributes. */
+export function svg<K extends keyof SVGElementTagNameMap>(tag: K, attributes: Record<string, string>, text = ""): SVGElementTagNameMap[K] {
+  const node = document.createElementNS("http://www.w3.org/2000/svg", tag);
+  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
+  node.textContent = text;
+  return node;
+}
+
+/** Gives the browser a text as a file to download. */
+export function save(name: string, text: string): void {
+  const href = URL.createObjectURL(new Blob([text], { type: "application/geo+json" }));
+  el("a", { href, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(href), 10_000);
+}

@@ -1,72 +1,251 @@
-// Measuring in the view: click points, read distance, height difference and area.
+// The ruler: clicked places with labels over the scene, their figures, and the way out as GeoJSON.
 
 import * as THREE from "three";
+import type { Origin } from "./api";
+import { count, el, save, svg, tell } from "./dom";
+import { along, area, lastStep, profile, type Points, type Volume, volume } from "./figures";
+import { coordinates, placeOf } from "./globe";
+import { eachPoint, HOVER_POINTS, pick } from "./pick";
+
+const CLICK_PX = 5; // a pointer that moved farther turned the view
+const HOVER_MS = 120;
+
+export interface Scene {
+  camera: THREE.Camera;
+  canvas: HTMLCanvasElement;
+  /** What is looked at: the cloud, tiles or mesh. */
+  target: () => THREE.Object3D;
+  /** The cloud, for volumes and profiles. */
+  cloud: THREE.Object3D;
+}
 
 export class Ruler {
-  readonly group = new THREE.Group();
   active = false;
+  origin: Origin | null = null;
+  readonly panel = el("section", { className: "panel measure", hidden: true });
+  readonly overlay = svg("svg", { class: "overlay" });
+  readonly cursor = el("output", { className: "cursor" });
+  /** Called when the ruler is switched on or off. */
+  changed: () => void = () => undefined;
   private readonly places: THREE.Vector3[] = [];
-  private readonly line = new THREE.Line(
-    new THREE.BufferGeometry(),
-    new THREE.LineBasicMaterial({ color: 0xff3b30, depthTest: false }),
-  );
-  private readonly caster = new THREE.Raycaster();
+  private volume: Volume | null = null;
+  private heights: Float64Array | null = null;
+  private down: { x: number; y: number } | null = null;
+  private hovered = 0;
 
-  constructor() {
-    this.line.renderOrder = 10;
-    this.line.frustumCulled = false;
-    this.group.add(this.line);
+  constructor(private readonly scene: Scene) {
+    this.panel.setAttribute("aria-label", "measurement");
+    this.overlay.setAttribute("aria-hidden", "true");
+    const { canvas } = scene;
+    canvas.addEventListener("pointerdown", (e) => (this.down = { x: e.clientX, y: e.clientY }));
+    canvas.addEventListener("click", (e) => this.click(e));
+    canvas.addEventListener("pointermove", (e) => this.hover(e));
+    canvas.addEventListener("pointerleave", () => (this.cursor.value = ""));
+    addEventListener("keydown", this.press);
   }
 
-  /** Adds the point of the scene under the pointer; false when there is none. */
-  pick(pointer: THREE.Vector2, camera: THREE.Camera, target: THREE.Object3D): boolean {
-    this.caster.setFromCamera(pointer, camera);
-    const reach = camera.position.length();
-    this.caster.params.Points.threshold = Math.max(0.05, reach * 0.003);
-    const hits = this.caster.intersectObject(target, true);
-    const best = hits.reduce<THREE.Intersection | null>((found, hit) => {
-      const near = (h: THREE.Intersection): number => h.distanceToRay ?? 0;
-      return !found || near(hit) < near(found) ? hit : found;
-    }, null);
-    if (!best) return false;
-    this.places.push(best.point.clone());
-    this.redraw();
-    return true;
+  close(): void {
+    removeEventListener("keydown", this.press);
   }
 
-  clear(): void {
-    this.places.length = 0;
-    this.redraw();
+  toggle(): void {
+    this.active = !this.active;
+    this.clear();
+    this.panel.hidden = !this.active;
+    this.changed();
   }
 
-  /** What the points picked so far measure. */
-  text(): string {
-    const n = this.places.length;
-    if (n < 2) return n ? "click the next point" : "click a point";
-    const a = this.places[n - 2]!;
-    const b = this.places[n - 1]!;
-    let length = 0;
-    for (let i = 1; i < n; i++) length += this.places[i]!.distanceTo(this.places[i - 1]!);
-    const parts = [
-      `last ${a.distanceTo(b).toFixed(2)} m`,
-      `height ${(b.z - a.z).toFixed(2)} m`,
-      `along ${length.toFixed(2)} m`,
-    ];
-    if (n > 2) parts.push(`area ${this.area().toFixed(1)} m²`);
-    return parts.join(" · ");
-  }
-
-  /** Area of the polygon seen from above, m². */
-  private area(): number {
-    let sum = 0;
-    this.places.forEach((p, i) => {
-      const q = this.places[(i + 1) % this.places.length]!;
-      sum += p.x * q.y - q.x * p.y;
+  /** Draws lines and labels where the places are seen now. */
+  readonly draw = (): void => {
+    const { clientWidth: w, clientHeight: h } = this.scene.canvas;
+    const { camera } = this.scene;
+    camera.updateMatrixWorld();
+    const seen = this.places.map((p) => {
+      const q = p.clone().applyMatrix4(camera.matrixWorldInverse);
+      if (q.z > -1e-3) return null; // behind the camera
+      q.applyMatrix4(camera.projectionMatrix);
+      return { x: (w / 2) * (1 + q.x), y: (h / 2) * (1 - q.y) };
     });
-    return Math.abs(sum) / 2;
+    const inFront = seen.filter((p) => p !== null);
+    const parts: SVGElement[] = [];
+    const n = seen.length;
+    const text = (x: number, y: number, words: string): void =>
+      void parts.push(svg("text", { x: x.toFixed(1), y: (y - 7).toFixed(1) }, words));
+    seen.forEach((b, i) => {
+      const a = seen[(i || n) - 1];
+      if (!a || !b || n < 2 || (i === 0 && n < 3)) return;
+      const [x1, y1, x2, y2] = [a.x, a.y, b.x, b.y].map((v) => v.toFixed(1));
+      parts.push(svg("line", { x1: x1!, y1: y1!, x2: x2!, y2: y2!, class: i ? "" : "closing" }));
+      const step = this.places[i]!.distanceTo(this.places[(i || n) - 1]!);
+      if (i) text((a.x + b.x) / 2, (a.y + b.y) / 2, `${step.toFixed(2)} m`);
+    });
+    for (const p of inFront) parts.push(svg("circle", { cx: p.x.toFixed(1), cy: p.y.toFixed(1), r: "4" }));
+    const mean = (values: number[]): number => values.reduce((a, b) => a + b, 0) / n;
+    if (n > 2 && inFront.length === n)
+      text(mean(inFront.map((p) => p.x)), mean(inFront.map((p) => p.y)), `${area(this.places).toFixed(1)} m²`);
+    this.overlay.replaceChildren(...parts);
+  };
+
+  private clear(): void {
+    this.places.length = 0;
+    this.measure();
   }
 
-  private redraw(): void {
-    this.line.geometry.setFromPoints(this.places);
+  private at(event: MouseEvent, limit?: number): THREE.Vector3 | null {
+    const { canvas, camera, target } = this.scene;
+    const box = canvas.getBoundingClientRect();
+    const x = (2 * (event.clientX - box.left)) / box.width - 1;
+    const y = 1 - (2 * (event.clientY - box.top)) / box.height;
+    return pick(target(), camera, new THREE.Vector2(x, y), new THREE.Vector2(box.width, box.height), limit);
   }
+
+  private click(event: MouseEvent): void {
+    const { down } = this;
+    if (!down || Math.hypot(event.clientX - down.x, event.clientY - down.y) > CLICK_PX) return;
+    const place = this.at(event);
+    this.cursor.value = place ? coordinates(this.origin, place) : "";
+    if (!this.active) return;
+    if (!place) return tell("no point there");
+    this.places.push(place);
+    this.measure();
+  }
+
+  private hover(event: PointerEvent): void {
+    if (event.buttons || event.pointerType === "touch" || event.timeStamp - this.hovered < HOVER_MS) return;
+    this.hovered = event.timeStamp;
+    const place = this.at(event, HOVER_POINTS);
+    this.cursor.value = place ? coordinates(this.origin, place) : "";
+  }
+
+  private readonly press = (event: KeyboardEvent): void => {
+    if (!this.active || (event.target as HTMLElement).matches("input, select, textarea")) return;
+    if (event.key === "Backspace") this.back();
+    else if (event.key === "Escape" && this.places.length) this.clear();
+    else if (event.key === "Escape") this.toggle();
+    else return;
+    event.preventDefault();
+  };
+
+  private back(): void {
+    this.places.pop();
+    this.measure();
+  }
+
+  private measure(): void {
+    const { places } = this;
+    const points: Points = (use) => eachPoint(this.scene.cloud, use);
+    this.volume = places.length > 2 ? volume(places, points) : null;
+    this.heights = places.length > 1 ? profile(places, points) : null;
+    this.panel.replaceChildren(...this.rows());
+    this.draw();
+  }
+
+  private rows(): HTMLElement[] {
+    const n = this.places.length;
+    const button = (text: string, title: string, off: boolean, onclick: () => void): HTMLElement =>
+      el("button", { textContent: text, title, disabled: off, onclick });
+    const homeless = this.origin === null;
+    const out = homeless ? "this scan has no place on the globe" : "the places as GeoJSON";
+    const acts = el(
+      "p",
+      { className: "acts" },
+      button("Undo", "take back the last point (Backspace)", !n, () => this.back()),
+      button("Clear", "take back all points (Esc)", !n, () => this.clear()),
+      button("Copy", out, !n || homeless, () => void copy(this.geojson()).then(() => tell("copied"), tell)),
+      button("GeoJSON", out, !n || homeless, () => save("measurement.geojson", this.geojson())),
+    );
+    if (n < 2) {
+      const hint = n ? "Click the next point." : "Click a point. Backspace takes the last one back, Esc ends.";
+      return [el("p", { textContent: hint }), acts];
+    }
+    const facts = Object.entries(this.words()).flatMap(([k, v]) => [
+      el("dt", { textContent: k }),
+      el("dd", { textContent: v }),
+    ]);
+    return [el("dl", {}, ...facts), ...(this.heights ? [chart(this.heights, this.origin, along(this.places))] : []), acts];
+  }
+
+  /** What the places measure, as a list of names and texts. */
+  private words(): Record<string, string> {
+    const step = lastStep(this.places);
+    const words: Record<string, string> = {
+      Distance: `${step.distance_m.toFixed(2)} m`,
+      Level: `${step.level_m.toFixed(2)} m`,
+      Height: `${step.height_m >= 0 ? "+" : ""}${step.height_m.toFixed(2)} m`,
+      Slope: `${step.slope_deg.toFixed(1)}° (${((100 * step.height_m) / step.level_m).toFixed(0)} %)`,
+    };
+    if (this.places.length > 2) {
+      words["Along"] = `${along(this.places).toFixed(2)} m`;
+      words["Area"] = `${area(this.places).toFixed(1)} m²`;
+    }
+    if (this.volume) {
+      words["Volume above"] = `${count(this.volume.above_m3)} m³`;
+      words["Volume below"] = `${count(this.volume.below_m3)} m³`;
+      words["Base"] = "plane through the points";
+      words["Not seen"] = `${(100 * this.volume.unseen).toFixed(1)} % of the area`;
+    }
+    return words;
+  }
+
+  /** The places as GeoJSON: longitude, latitude and metres above mean sea level. */
+  private geojson(): string {
+    const origin = this.origin!;
+    const spots = this.places.map((p) => {
+      const { lon_deg, lat_deg, alt_m } = placeOf(origin, p);
+      return [Number(lon_deg.toFixed(9)), Number(lat_deg.toFixed(9)), Number(alt_m.toFixed(3))];
+    });
+    const properties: Record<string, number> = {};
+    const put = (name: string, value: number): number => (properties[name] = Number(value.toFixed(3)));
+    if (spots.length > 1) {
+      for (const [name, value] of Object.entries(lastStep(this.places))) put(`last_${name}`, value);
+      put("length_m", along(this.places));
+    }
+    if (spots.length > 2) put("area_m2", area(this.places));
+    if (this.volume) {
+      put("volume_above_m3", this.volume.above_m3);
+      put("volume_below_m3", this.volume.below_m3);
+      put("volume_unseen_share", this.volume.unseen);
+    }
+    const geometry =
+      spots.length === 1
+        ? { type: "Point", coordinates: spots[0] }
+        : spots.length === 2
+          ? { type: "LineString", coordinates: spots }
+          : { type: "Polygon", coordinates: [[...spots, spots[0]]] };
+    const feature = { type: "Feature", properties, geometry };
+    return JSON.stringify({ type: "FeatureCollection", features: [feature] }, null, 1);
+  }
+}
+
+/** The clipboard; over plain HTTP only the older way works. */
+async function copy(text: string): Promise<void> {
+  if (navigator.clipboard) return navigator.clipboard.writeText(text);
+  const area = el("textarea", { value: text });
+  document.body.append(area);
+  area.select();
+  const done = document.execCommand("copy");
+  area.remove();
+  if (!done) throw new Error("this browser does not let the page copy; use GeoJSON");
+}
+
+/** The heights along the way as a line, with the lowest and highest value at its side. */
+function chart(heights: Float64Array, origin: Origin | null, length_m: number): HTMLElement {
+  const known = heights.filter((z) => !Number.isNaN(z));
+  if (!known.length) return el("p", { textContent: "No points along the line." });
+  const [low, high] = [known.reduce((a, b) => Math.min(a, b)), known.reduce((a, b) => Math.max(a, b))];
+  const span = Math.max(high - low, 0.1);
+  let path = "";
+  let pen = "M";
+  heights.forEach((z, i) => {
+    if (Number.isNaN(z)) return void (pen = "M");
+    path += `${pen}${((i + 0.5) * 240) / heights.length} ${(4 + (62 * (high - z)) / span).toFixed(1)}`;
+    pen = "L";
+  });
+  const datum = origin?.alt_amsl_m ?? 0;
+  const words = `${(low + datum).toFixed(2)} to ${(high + datum).toFixed(2)} m over ${length_m.toFixed(1)} m`;
+  const drawing = svg("svg", { viewBox: "0 0 240 70", role: "img", "aria-label": `height profile: ${words}` });
+  drawing.append(svg("path", { d: path }));
+  const figure = el("figure", { className: "profile" }, el("figcaption", { textContent: `Profile ${words}` }));
+  figure.prepend(drawing);
+  return figure;
 }

@@ -3,25 +3,8 @@
 import * as THREE from "three";
 import { TilesRenderer } from "3d-tiles-renderer/three";
 import type { Origin } from "./api";
+import { eastNorthUp } from "./globe";
 import type { Stage } from "./stage";
-
-const A = 6378137.0; // WGS 84
-const E2 = 6.69437999014e-3;
-
-/** East, north, up at the origin to earth-centred metres. */
-export function eastNorthUp(origin: Origin): THREE.Matrix4 {
-  const lat = THREE.MathUtils.degToRad(origin.lat_deg);
-  const lon = THREE.MathUtils.degToRad(origin.lon_deg);
-  const [sa, ca, so, co] = [Math.sin(lat), Math.cos(lat), Math.sin(lon), Math.cos(lon)];
-  const n = A / Math.sqrt(1 - E2 * sa * sa);
-  const h = origin.alt_amsl_m;
-  return new THREE.Matrix4().set(
-    -so, -sa * co, ca * co, (n + h) * ca * co,
-    co, -sa * so, ca * so, (n + h) * ca * so,
-    0, ca, sa, (n * (1 - E2) + h) * sa,
-    0, 0, 0, 1,
-  );
-}
 
 /** Puts the tiles at `address` into the stage, on the scan's own axes; returns what removes them. */
 export function showTiles(stage: Stage, address: string, origin: Origin, pointSize: () => number): () => void {

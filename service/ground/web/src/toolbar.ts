@@ -20,7 +20,7 @@ export interface Parts {
 
 /** Everything right of the title. */
 export function toolbar(parts: Parts): HTMLElement {
-  const { stage, ruler } = parts;
+  const { stage } = parts;
   const bar = el("span", { className: "tools" });
   const follow = el("button", {
     textContent: "Follow",
@@ -35,7 +35,7 @@ export function toolbar(parts: Parts): HTMLElement {
   bar.append(
     group(colours(parts)),
     group(follow, whole),
-    group(measure(stage, ruler, parts.cloud), cameraButton(parts.cameras), coverageButton(parts)),
+    group(measure(parts.ruler), cameraButton(parts.cameras), coverageButton(parts)),
     showGroup(parts),
     settings(parts),
   );
@@ -66,29 +66,27 @@ function colours({ cloud, legend }: Parts): HTMLElement {
   return select;
 }
 
-function measure(stage: Stage, ruler: Ruler, cloud: Cloud): HTMLElement {
-  const button = el("button", { textContent: "Measure", title: "click points: distance, height, area" });
-  button.onclick = () => {
-    ruler.active = !ruler.active;
-    ruler.clear();
-    button.classList.toggle("on", ruler.active);
-  };
-  stage.renderer.domElement.addEventListener("click", (event) => {
-    if (!ruler.active) return;
-    const box = stage.renderer.domElement.getBoundingClientRect();
-    const x = (2 * (event.clientX - box.left)) / box.width - 1;
-    const y = 1 - (2 * (event.clientY - box.top)) / box.height;
-    const target = stage.model.children.length ? stage.model : cloud.group;
-    ruler.pick(new THREE.Vector2(x, y), stage.camera, target);
+function measure(ruler: Ruler): HTMLElement {
+  const button = el("button", {
+    textContent: "Measure",
+    title: "click points: distance, height, slope, area, volume, profile",
+    onclick: () => ruler.toggle(),
   });
+  ruler.changed = () => pressed(button, ruler.active);
   return button;
+}
+
+/** Marks a button that stays down, also for those who do not see it. */
+function pressed(button: HTMLElement, on: boolean): void {
+  button.classList.toggle("on", on);
+  button.setAttribute("aria-pressed", String(on));
 }
 
 function cameraButton(cameras: Cameras): HTMLElement {
   const button = el("button", { textContent: "Cameras", className: "on", title: "where pictures were taken" });
   button.onclick = () => {
     cameras.toggle();
-    button.classList.toggle("on", cameras.shown);
+    pressed(button, cameras.shown);
   };
   return button;
 }
@@ -119,7 +117,7 @@ function coverageButton({ coverage, id }: Parts): HTMLElement {
   };
   button.onclick = () => {
     coverage.hidden = !coverage.hidden;
-    button.classList.toggle("on", !coverage.hidden);
+    pressed(button, !coverage.hidden);
     refresh();
   };
   return button;
@@ -142,7 +140,7 @@ function showGroup(parts: Parts): HTMLElement {
       cloud.group.visible = chosen === points;
       parts.legend.hidden ||= chosen !== points;
       stage.touch();
-      buttons.forEach((b) => b.classList.toggle("on", b === chosen));
+      buttons.forEach((b) => pressed(b, b === chosen));
     } catch (error) {
       tell(error);
     }

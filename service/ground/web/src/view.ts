@@ -22,10 +22,12 @@ export function showView(root: HTMLElement, drone: string, name: string): () => 
   const legend = el("div", { className: "panel legend", hidden: true });
   const coverage = el("div", { className: "panel coverage", hidden: true });
   const latest = el("figure", { className: "panel latest", hidden: true });
-  root.replaceChildren(el("div", { className: "view" }, bar, host, figures, legend, coverage, latest));
+  const view = el("div", { className: "view" }, bar, host, figures, legend, coverage, latest);
+  root.replaceChildren(view);
   const id = { drone, scan: name };
   const cloud = new Cloud();
-  void api.scan(drone, name).then((s) => {
+  const facts = api.scan(drone, name);
+  void facts.then((s) => {
     title.textContent = s.title;
     cloud.datum_m = s.origin?.alt_amsl_m ?? 0;
     if (s.files.some((f) => f.name === "report.html"))
@@ -40,10 +42,19 @@ export function showView(root: HTMLElement, drone: string, name: string): () => 
   }
   const stage = new Stage(host);
   const cameras = new Cameras();
-  const ruler = new Ruler();
+  const ruler = new Ruler({
+    camera: stage.camera,
+    canvas: stage.renderer.domElement,
+    target: () => (stage.model.children.length ? stage.model : cloud.group),
+    cloud: cloud.group,
+  });
+  host.append(ruler.overlay, ruler.cursor);
+  view.append(ruler.panel);
+  stage.before.push(ruler.draw);
+  void facts.then((s) => (ruler.origin = s.origin), () => undefined);
   stage.drawGradually(cloud);
   stage.add(cameras.group);
-  for (const part of [cloud.group, ruler.group]) stage.addAgain(part);
+  stage.addAgain(cloud.group);
   bar.append(toolbar({ stage, cloud, cameras, ruler, legend, coverage, id }));
 
   let last: LastPose | undefined;
@@ -90,7 +101,7 @@ export function showView(root: HTMLElement, drone: string, name: string): () => 
     state.textContent = link;
     state.className = `state ${link}`;
     if (cameras.refresh()) stage.touch();
-    figures.replaceChildren(...rows(cloud, stage, last, ruler));
+    figures.replaceChildren(...rows(cloud, stage, last));
     document.body.dataset["points"] = String(cloud.total);
     document.body.dataset["drawn"] = String(cloud.drawn);
     document.body.dataset["fps"] = stage.painter.frames_per_s.toFixed(1);
@@ -99,6 +110,7 @@ export function showView(root: HTMLElement, drone: string, name: string): () => 
     clearInterval(clock);
     stopPictures();
     live.close();
+    ruler.close();
     stage.close();
   };
 }
@@ -130,7 +142,7 @@ function keepLatest(
   return () => clearInterval(timer);
 }
 
-function rows(cloud: Cloud, stage: Stage, last: LastPose | undefined, ruler: Ruler): HTMLElement[] {
+function rows(cloud: Cloud, stage: Stage, last: LastPose | undefined): HTMLElement[] {
   const facts: [string, string][] = [
     ["Points", count(cloud.total)],
     ["Drawn", count(cloud.drawn)],
@@ -148,6 +160,5 @@ function rows(cloud: Cloud, stage: Stage, last: LastPose | undefined, ruler: Rul
       facts.push(["At", `${last.lat_deg.toFixed(6)}, ${last.lon_deg.toFixed(6)}`]);
   }
   facts.push(["Pictures", `${stage.painter.frames_per_s.toFixed(stage.painter.frames_per_s < 3 ? 1 : 0)} /s`]);
-  if (ruler.active) facts.push(["Ruler", ruler.text()]);
   return facts.map(([k, v]) => el("div", {}, el("dt", { textContent: k }), el("dd", { textContent: v })));
 }

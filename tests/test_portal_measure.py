@@ -1,0 +1,197 @@
+"""The ruler of the portal, by clicks in a real browser, against the exact house of the flight."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import HouseFlight
+from portal_client import NEEDS, TOKEN, browser, flown_store
+
+from recon.types import F64, Keyframe
+from service.bench.portal import Browser
+from service.georeference import LocalFrame
+from service.ground.portal import Portal, PortalConfig
+
+pytestmark = NEEDS
+__all__ = ["browser"]  # the fixture
+
+GRID = [(x, y) for x in range(350, 951, 75) for y in (362, 384, 500, 530, 560)]
+"""Places on the screen that the cloud covers: no wall of the house, which has no points."""
+
+
+class WalledFlight(HouseFlight):
+    """The flight, without the rays that would reach the ground through the walls of the house."""
+
+    def keyframe(self, seq: int, east_m: float, sigma_m: float = 0.05) -> Keyframe:
+        one = super().keyframe(seq, east_m, sigma_m)
+        depth = one.depth.depth_m
+        v, u = np.indices(depth.shape)
+        x = east_m + (u - self.K[0, 2]) / self.K[0, 0] * depth
+        y = -(v - self.K[1, 2]) / self.K[1, 1] * depth
+        through = (depth > self.height_m - 1.0) & (self.roof_m(x, y) > 0.0)
+        return replace(one, fresh=~through)
+
+
+class Ruler:
+    """The page with the ruler switched on, over the cloud at rest."""
+
+    def __init__(self, page: Browser, frame: LocalFrame) -> None:
+        self.page, self.frame = page, frame
+
+    @property
+    def spots(self) -> F64:
+        """(N, 2) where the page draws the places picked, CSS pixels."""
+        script = (
+            "[...document.querySelectorAll('.overlay circle')].map(c => {"
+            " const r = c.getBoundingClientRect();"
+            " return [r.x + r.width / 2, r.y + r.height / 2]; })"
+        )
+        return np.asarray(self.page.run(script), np.float64).reshape(-1, 2)
+
+    def pick(self, x: float, y: float) -> F64:
+        """(3,) ENU metres of the place that a click picks, from the coordinates it shows."""
+        before = len(self.spots)
+        self.page.mouse(x, y)
+        self.page.wait(f"document.querySelectorAll('.overlay circle').length === {before + 1}", 10)
+        text = self.page.run("document.querySelector('.cursor').textContent")
+        found = re.fullmatch(r"(\S+), (\S+) · UTM 32N (\S+) (\S+) · (\S+) m AMSL", text)
+        assert found is not None, text
+        lat, lon, east, north, height = map(float, found.groups())
+        enu = self.frame.from_utm(np.array([[east, north, height]]))[0]
+        other = self.frame.to_enu(np.array([[lat, lon, height]]))[0]
+        assert np.abs(enu - other).max() < 0.03  # 7 decimals are about a centimetre
+        return np.asarray(enu)
+
+    @property
+    def figures(self) -> dict[str, str]:
+        """What the panel says."""
+        script = (
+            "Object.fromEntries([...document.querySelectorAll('.measure dt')]"
+            ".map(t => [t.textContent, t.nextSibling.textContent]))"
+        )
+        return dict(self.page.run(script))
+
+    def number(self, name: str) -> float:
+        """The number that begins a figure."""
+        found = re.match(r"[+-]?[\d.]+", self.figures[name].replace(",", ""))
+        assert found is not None
+        return float(found.group())
+
+
+@pytest.fixture
+def ruler(browser: Browser, tmp_path: Path, house: HouseFlight) -> Iterator[Ruler]:
+    portal = Portal(PortalConfig(flown_store(tmp_path, WalledFlight()), port=0, token=TOKEN))
+    portal.start()
+    browser.screen(1280, 800)
+    browser.open("about:blank")
+    browser.open(f"{portal.url.split('/?')[0]}/#/view/drone-1/test-1")
+    browser.wait("document.body.dataset.points > 71000")  # all five keyframes
+    browser.click("Whole site")
+    browser.wait("document.body.dataset.still === 'yes'")
+    browser.click("Measure")
+    yield Ruler(browser, LocalFrame(*house.origin))
+    portal.close()
+
+
+def at_level(house: HouseFlight, places: F64, level_m: float) -> np.ndarray:
+    """True for the places at this height of the truth, with nothing else half a metre around."""
+    near = [
+        house.roof_m(places[:, 0] + dx, places[:, 1] + dy)
+        for dx in (-0.5, 0.5)
+        for dy in (-0.5, 0.5)
+    ]
+    return np.asarray(np.all(np.abs(np.array(near) - level_m) < 1e-9, axis=0))
+
+
+def test_clicks_measure_the_house(ruler: Ruler, house: HouseFlight) -> None:
+    picked = np.array([ruler.pick(x, y) for x, y in GRID])  # each click finds a point
+    ground, roof = at_level(house, picked, 0.0), at_level(house, picked, 6.0)
+    assert roof.sum() >= 3 and ground.sum() >= 20
+    assert np.abs(picked[ground, 2]).max() < 0.05
+    assert np.abs(picked[roof, 2] - 6.0).max() < 0.05
+    # From where the page draws the picked places, where any place of the ground is seen.
+    to_page, _ = cv2.findHomography(picked[ground, :2], ruler.spots[ground])
+    assert to_page is not None
+
+    def seen(x: float, y: float) -> tuple[float, float]:
+        u, v, w = to_page @ np.array([x, y, 1.0])
+        return float(u / w), float(v / w)
+
+    ruler.page.key("Escape")
+    assert len(ruler.spots) == 0
+
+    first, last = ruler.pick(*seen(-5.0, -8.0)), ruler.pick(*seen(25.0, -8.0))
+    assert np.abs(first - (-5.0, -8.0, 0.0)).max() < 0.4  # a point every 0.29 m
+    assert abs(ruler.number("Distance") - float(np.linalg.norm(last - first))) < 0.02
+    label = ruler.page.run("document.querySelector('.overlay text').textContent")
+    assert label == ruler.figures["Distance"]  # written at the line
+    roof_place = picked[roof][0]
+    x, y = np.asarray(GRID)[roof][0]
+    up = ruler.pick(float(x), float(y))
+    assert np.abs(up - roof_place).max() < 0.01  # the same click, the same point
+    assert abs(ruler.number("Height") - 6.0) < 0.05
+    slope = np.degrees(np.arctan2(up[2] - last[2], np.hypot(*(up - last)[:2])))
+    assert abs(ruler.number("Slope") - slope) < 0.1
+    ruler.page.key("Backspace")
+    assert len(ruler.spots) == 2
+    ruler.page.mouse(600, 400, to=(640, 400))  # turns the view
+    assert len(ruler.spots) == 2
+    ruler.page.key("Escape")
+    ruler.page.key("Escape")
+    assert ruler.page.run("document.querySelector('.measure').hidden")
+
+
+def test_the_volume_of_the_house_its_profile_and_the_way_out(
+    ruler: Ruler, house: HouseFlight, tmp_path: Path
+) -> None:
+    picked = np.array([ruler.pick(x, y) for x, y in GRID])
+    ground = at_level(house, picked, 0.0) & (np.abs(picked[:, 2]) < 0.05)
+    to_page, _ = cv2.findHomography(picked[ground, :2], ruler.spots[ground])
+    ruler.page.key("Escape")
+    corners = np.array([(2.0, -4.0), (18.0, -4.0), (18.0, 12.0), (2.0, 12.0)])
+    spots = cv2.perspectiveTransform(corners[None], to_page)[0]
+    found = np.array([ruler.pick(float(x), float(y)) for x, y in spots])
+    assert np.abs(found[:, 2]).max() < 0.05
+    x, y = found[:, 0], found[:, 1]
+    plan_m2 = abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2.0
+    assert abs(ruler.number("Area") - plan_m2) < 0.2
+    assert abs(ruler.number("Volume above") / (12.0 * 8.0 * 6.0) - 1.0) < 0.01
+    assert ruler.number("Volume below") < 3.0
+
+    folder = tmp_path / "downloads"
+    ruler.page.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
+    ruler.page.click("GeoJSON")
+    target = folder / "measurement.geojson"
+    ruler.page.until(target.is_file, 20)
+    feature = json.loads(target.read_text())["features"][0]
+    ring = np.array(feature["geometry"]["coordinates"][0])
+    assert np.array_equal(ring[0], ring[-1])
+    back = ruler.frame.to_enu(ring[:-1][:, [1, 0, 2]])
+    assert np.abs(back - found).max() < 0.03
+    assert abs(feature["properties"]["volume_above_m3"] - ruler.number("Volume above")) < 0.6
+
+    ruler.page.call(
+        "Browser.grantPermissions", permissions=["clipboardReadWrite", "clipboardSanitizedWrite"]
+    )
+    ruler.page.call("Page.bringToFront")
+    ruler.page.click("Copy")
+    ruler.page.wait("[...document.querySelectorAll('.note')].some(n => n.textContent === 'copied')")
+    assert json.loads(ruler.page.run("navigator.clipboard.readText()"))["features"][0] == feature
+
+    ruler.page.key("Escape")
+    ends = cv2.perspectiveTransform(np.array([[(-2.0, 2.0), (22.0, 2.0)]]), to_page)[0]
+    for u, v in ends:
+        ruler.pick(float(u), float(v))
+    caption = ruler.page.run("document.querySelector('.profile figcaption').textContent")
+    low, high, length = map(float, re.findall(r"\d+\.\d+", caption))
+    datum = house.origin[2]
+    assert abs(low - datum) < 0.05 and abs(high - datum - 6.0) < 0.05
+    assert abs(length - 24.0) < 0.6
+    ruler.page.picture(tmp_path / "profile.png")  # to look at
