@@ -1,4 +1,4 @@
-"""The failures that the service reports, and the exit code of each (README, "Exit codes")."""
+"""The failures that the service reports, each with its exit code (see docs/commands.md)."""
 
 from __future__ import annotations
 
