@@ -21,11 +21,9 @@ KEPT = 120
 
 @dataclass(frozen=True, slots=True)
 class FrameVerdict:
-    """Which frame agrees with the pictures, and by how much."""
+    """The frame that agrees with the images."""
 
     frame: GimbalFrame
-    rms_rad: float  # disagreement of the frame chosen, per step
-    runner_up_rms_rad: float
     decided: bool  # the turns told the frames apart
     refuted: tuple[GimbalFrame, ...] = ()  # those that disagree clearly more
 
@@ -62,11 +60,10 @@ def judge_frame(
     best = min(rms, key=lambda frame: rms[frame])
     # A frame that means the same attitudes all along is no rival.
     rivals = [f for f in GimbalFrame if _largest_angle(heads[f], heads[best]) > SAME_RAD]
-    second = min((rms[f] for f in rivals), default=math.inf)
     refuted = tuple(
         f for f in rivals if rms[f] > 2.0 * rms[best] and rms[f] - rms[best] > CLEAR_RAD
     )
-    return FrameVerdict(best, rms[best], second, bool(rivals) and refuted == tuple(rivals), refuted)
+    return FrameVerdict(best, bool(rivals) and refuted == tuple(rivals), refuted)
 
 
 def _disagreement(heads: Sequence[Ends], steps: Sequence[Quaternion]) -> float:

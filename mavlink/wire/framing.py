@@ -15,7 +15,6 @@ MAGIC_V1 = 0xFE
 MAGIC_V2 = 0xFD
 SIGNATURE_LENGTH = 13
 SIGNED = 0x01
-MAX_PACKET = 280
 
 Message = Any
 """A message object of a pymavlink dialect."""

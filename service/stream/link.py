@@ -59,7 +59,6 @@ class LinkProgress:
     lacking: dict[str, int] = field(default_factory=dict)  # by kind, at the best ground station
     sent_bytes: int = 0
     rate_kbit_s: float = 0.0  # allowed now; below the budget when less comes through
-    left_for_later: int = 0  # live items that made way; a ground station asks for them
 
     @property
     def complete(self) -> bool:
