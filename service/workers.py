@@ -328,13 +328,13 @@ def _plain(name: str, row: Row) -> dict[str, Any]:
     return Worker(name, row, lambda _: None).to_dict()
 
 
-def guarded(name: str, work: Callable[[], None]) -> str:
+def guarded(name: str, work: Callable[[], object]) -> str:
     """Run ``work``; the exception that ended it in one line, empty when there was none."""
     try:
         work()
     except (SkyreliefError, OSError) as error:
         log.error("%s: %s", name, error)
-        return str(error)
+        return str(error) or type(error).__name__
     except Exception as error:  # a fault of ours; it must not end anything else
         log.exception("fault in %s", name)
         return f"{type(error).__name__}: {error}".splitlines()[0][:200]

@@ -11,6 +11,7 @@ import shlex
 import shutil
 import subprocess
 from collections.abc import Mapping
+from contextlib import ExitStack
 from typing import IO, Any
 
 from service.cameras import reject_options
@@ -81,13 +82,16 @@ def _open_command(command: list[str], stall_s: float) -> Any:
     assert process.stdout is not None
     assert process.stderr is not None
     complaints = _Complaints(process.stderr)
-    try:
-        container = av.open(f"pipe:{process.stdout.fileno()}", timeout=(OPEN_S, stall_s))
-    except Exception as error:
-        _end(process)
-        if complaint := complaints.wait():
-            raise OSError(complaint) from error
-        raise
+    with ExitStack() as on_fault:
+        on_fault.callback(_end, process)
+        try:
+            container = av.open(f"pipe:{process.stdout.fileno()}", timeout=(OPEN_S, stall_s))
+        except (av.error.FFmpegError, OSError) as error:
+            on_fault.close()
+            if complaint := complaints.wait():
+                raise OSError(complaint) from error
+            raise
+        on_fault.pop_all()
     return _CommandContainer(container, process)
 
 

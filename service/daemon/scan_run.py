@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -196,11 +197,10 @@ class ScanRun:
 
     def _close_scan(self, scan: Scan, store: ScanStore) -> None:
         """Finish the scan; when the pipeline cannot, what is stored is kept as interrupted."""
-        try:
+        with ExitStack() as on_fault:
+            on_fault.callback(store.finish, {"interrupted": True})
             summary = scan.close()
-        except Exception:
-            store.finish({"interrupted": True})
-            raise
+            on_fault.pop_all()
         if scan.check.latency is not None and scan.check.latency.is_settled:
             self._host.latency_ms = scan.check.latency.latency_ms
         self._host.vehicle.statustext(

@@ -257,7 +257,11 @@ class Scanning:
     @property
     def backend_failure(self) -> str:
         """Why the backend that was chosen gave way to the CPU; empty when it did not."""
-        return getattr(self._backend, "failure", None) or ""
+        if self._backend is None:
+            return ""
+        from service.compute.backend_choice import FallbackBackend
+
+        return (isinstance(self._backend, FallbackBackend) and self._backend.failure) or ""
 
     # ---- what may change meanwhile ------------------------------------------------------------
 

@@ -6,21 +6,20 @@ them. What is stored is safe by then, and the next start writes what this one co
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mavlink.component.control import ACCEPTED, Answer, Result, Work
 from service.compute.threading_layer import kernels_may_overlap
-from service.workers import PROCESS
+from service.errors import OutsideError
+from service.workers import PROCESS, guarded
 
 if TYPE_CHECKING:
     from service.stream.store import ScanStore
-
-log = logging.getLogger(__name__)
 
 OTHERS = ("scan.db", "link.tlog")
 
@@ -33,7 +32,7 @@ class Writing:
         :meth:`leave`, it is closed here and ``left`` is called.
         """
         self.name = folder.name
-        self.error: Exception | None = None
+        self.fault = ""  # why the files are not written; empty when they are
         self.work: Work | None = None  # that ends with the files
         self._folder, self._store = folder, store
         self._lock, self._done = threading.Lock(), threading.Event()
@@ -62,16 +61,13 @@ class Writing:
     def _write(self) -> None:
         from service.scans.folder import write_deliverables
 
-        try:
-            write_deliverables(self._folder, self._store, {})
-        except Exception as error:
-            self.error = error
-        finally:
-            with self._lock:
-                self._done.set()
-            if self._is_left:
-                self._store.close()
-                self._left(self)
+        write = partial(write_deliverables, self._folder, self._store, {})
+        self.fault = guarded(f"files of {self.name}", write)
+        with self._lock:
+            self._done.set()
+        if self._is_left:
+            self._store.close()
+            self._left(self)
 
 
 class Writings:
@@ -107,7 +103,7 @@ class Writings:
 
         While ``in_haste`` says that another scan is wanted, and kernels may run on two threads at
         once, no scan waits for the files: ``hand_over`` ends the sender, and the work that it
-        gives is finished with the files. Raises what writing them raised.
+        gives is finished with the files. Raises OutsideError when they cannot be written.
         """
         writing = Writing(folder, store, self._written)
         self._all.append(writing)
@@ -117,18 +113,16 @@ class Writings:
         self._all.remove(writing)
         land()
         store.close()
-        if writing.error is not None:
-            raise writing.error
+        if writing.fault:
+            raise OutsideError(writing.fault)
 
     def _written(self, writing: Writing) -> None:
         """The files are there that no scan waited for, or never will be in this life."""
         self._all.remove(writing)
         answer = ACCEPTED
-        if writing.error is not None:
-            text = f"Scan {writing.name} is kept, its files are not written: {writing.error}"
-            log.error("%s", text, exc_info=writing.error)
-            self._tell(text)
-            answer = Answer(Result.FAILED, str(writing.error))
+        if writing.fault:
+            self._tell(f"Scan {writing.name} is kept, its files are not written: {writing.fault}")
+            answer = Answer(Result.FAILED, writing.fault)
         if writing.work is not None:
             writing.work.finish(answer)
 
