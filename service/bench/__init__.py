@@ -60,6 +60,7 @@ class BenchResult:
     spread: float = 0.0  # 10th to 90th percentile of the rounds
     peer: str = ""
     peer_value: float | None = None
+    peer_spread: float = 0.0
     note: str = ""
 
     @property

@@ -177,7 +177,6 @@ class DatalinkSender:
                 lacking,
                 self._outbox.sent_bytes,
                 self._outbox.bucket.rate_bytes_s / 125,
-                self._outbox.skipped,
             )
 
     def drain(self, timeout_s: float) -> bool:
