@@ -316,7 +316,7 @@ def _page_loads(browser: Browser, base: str, rounds: int) -> list[float]:
 def _arrivals(browser: Browser, base: str, store: ScanStore) -> list[float]:
     """Milliseconds from a keyframe's commit to its points in the scene."""
     browser.open(f"{base}/#/view/bench/live")
-    browser.wait("document.querySelector('.state').textContent === 'receiving'")
+    browser.wait("document.querySelector('.state').classList.contains('receiving')")
     times = []
     for seq in range(ARRIVALS):
         layers = encode(make_keyframe(seq), seq)

@@ -14,7 +14,8 @@ N       uint8 sigma, in steps of 2 cm
 N       uint8 views
 ======  =======================================================================
 
-Points stay in the camera's frame, so a correction is a new matrix and scale.
+Points stay in the camera's frame, so a correction is a new matrix and scale. JSON texts have a
+``type``: ``repose``, ``track``, ``state``, and once a second ``link``.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ import logging
 import math
 import sqlite3
 import struct
-from collections.abc import Awaitable, Iterator
+import time
+from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -135,6 +137,7 @@ class LiveFeed:
     store: ScanStore
     index: StoreIndex
     max_points: int | None = None  # of one chunk
+    heard_unix_s: float = 0.0  # when the store grew, as far as this feed knows; else its last pose
     _sent: dict[int, int] = field(default_factory=dict)  # keyframe to the layer sent
     _scale: dict[int, float] = field(default_factory=dict)
     _revision: dict[int, int] = field(default_factory=dict)
@@ -144,8 +147,11 @@ class LiveFeed:
 
     def news(self, max_chunks: int = 20) -> Iterator[str | bytes]:
         """Messages for what has changed; at most ``max_chunks`` keyframes at a time."""
-        if not (self.index.changed() or self._more):
+        changed = self.index.changed()
+        if not (changed or self._more):
             return
+        if self._finished is not None and changed:
+            self.heard_unix_s = time.time()
         finest = self.index.layers()
         due = [seq for seq, layer in finest.items() if layer > self._sent.get(seq, -2)]
         self._more = len(due) > max_chunks
@@ -160,7 +166,10 @@ class LiveFeed:
         if reposes != before[1]:
             yield from self._corrections()
         if poses != before[0]:
-            yield track_message(latest(self.store.poses()))
+            track = latest(self.store.poses())
+            if not self.heard_unix_s and track:
+                self.heard_unix_s = track[-1].time_unix_ns / 1e9
+            yield track_message(track)
         state = self.store.finished
         if state != self._finished and not self._more:
             self._finished = state
@@ -216,10 +225,37 @@ def track_message(poses: list[PoseRecord]) -> str:
     return json.dumps(message)
 
 
+def link_message(entry: dict[str, Any], heard_unix_s: float) -> str:
+    """How a scan comes in: seconds of silence, bytes, lag and what is missing.
+
+    ``entry`` is the receiver's; it is empty for a scan that another process writes, which was
+    heard at ``heard_unix_s``.
+    """
+    return json.dumps(
+        {
+            "type": "link",
+            "silent_s": round(max(0.0, time.time() - entry.get("heard_unix_s", heard_unix_s)), 1),
+            "received_bytes": entry.get("received_bytes"),
+            "lag_s": entry.get("lag_s", {}).get("k0"),
+            "backlog": sum(entry.get("missing", {}).values()),
+            "trouble": entry.get("trouble"),
+        }
+    )
+
+
+def _entry(folder: Path, entries: list[dict[str, Any]]) -> dict[str, Any]:
+    """What the receiver says of the scan in ``folder``; empty when it does not receive it."""
+    names = (folder.parent.name, folder.name)
+    return next((e for e in entries if (e["drone"], e["scan"]) == names), {})
+
+
 POLL_S = 0.25
+LINK_S = 1.0
 
 
-async def serve_live(socket: WebSocket, folder: Path) -> None:
+async def serve_live(
+    socket: WebSocket, folder: Path, progress: Callable[[], list[dict[str, Any]]]
+) -> None:
     """Send what is new in the scan of ``folder`` over an accepted socket; close it at the end."""
     store = index = None
     try:
@@ -227,9 +263,14 @@ async def serve_live(socket: WebSocket, folder: Path) -> None:
         index = StoreIndex(store.path)
         feed = LiveFeed(store, index, _max_points(socket))
         gone = asyncio.create_task(_until_gone(socket))
+        said_at = -LINK_S
         while not gone.done():
             for message in await run_in_threadpool(lambda: list(feed.news())):
                 await _send(socket, message)
+            if time.monotonic() - said_at >= LINK_S:
+                said_at = time.monotonic()
+                entry = _entry(folder, progress())
+                await socket.send_text(link_message(entry, feed.heard_unix_s))
             await asyncio.wait({gone}, timeout=POLL_S)
     except (SkyreliefError, sqlite3.Error, WebSocketDisconnect, RuntimeError) as error:
         log.debug("live view of %s ended: %s", folder, error)

@@ -7,6 +7,7 @@ they are written and goes with them, so a kill at any time leaves one of the two
 from __future__ import annotations
 
 import logging
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -124,6 +125,7 @@ class ReceivedScan:
             "refused": intake.store.refused,
             "radio_messages": self.radio_messages,
             "lag_s": lags,
+            "heard_unix_s": round(time.time() - (time.monotonic() - self.used_at), 1),
             "trouble": self.trouble or None,
         }
 

@@ -32,7 +32,17 @@ export interface Scan {
   jobs?: Job[];
 }
 
-/** The JSON answer; throws an Error with the portal's own words when it refuses. */
+/** What the portal refused, in its own words. */
+export class Refused extends Error {
+  constructor(
+    message: string,
+    readonly status: number,
+  ) {
+    super(message);
+  }
+}
+
+/** The JSON answer; throws Refused when the portal refuses. */
 async function ask<T>(path: string, method = "GET", body?: unknown): Promise<T> {
   const init: RequestInit = { method };
   if (body !== undefined) {
@@ -41,7 +51,7 @@ async function ask<T>(path: string, method = "GET", body?: unknown): Promise<T> 
   }
   const answer = await fetch(path, init);
   const content = (await answer.json().catch(() => ({}))) as { error?: string };
-  if (!answer.ok) throw new Error(content.error ?? `the portal answered ${answer.status}`);
+  if (!answer.ok) throw new Refused(content.error ?? `the portal answered ${answer.status}`, answer.status);
   return content as T;
 }
 

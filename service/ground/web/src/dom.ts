@@ -26,6 +26,7 @@ export const count = (n: number | null | undefined): string =>
   n === null || n === undefined ? "?" : Math.round(n).toLocaleString("en");
 
 export function size(bytes: number): string {
+  if (bytes < 1e3) return `${bytes.toFixed(0)} B`;
   if (bytes < 1e6) return `${(bytes / 1e3).toFixed(0)} kB`;
   return bytes < 1e9 ? `${(bytes / 1e6).toFixed(1)} MB` : `${(bytes / 1e9).toFixed(2)} GB`;
 }

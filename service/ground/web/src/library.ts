@@ -8,7 +8,10 @@ const KINDS = [
   "laz", "copc", "ply", "dsm", "ortho", "contours", "glb", "3dtiles", "geojson", "kml", "mcap",
 ];
 
-export async function showLibrary(root: HTMLElement): Promise<void> {
+const REFRESH_MS = 3000;
+
+/** Shows the list and keeps it as the server has it; gives what ends that. */
+export async function showLibrary(root: HTMLElement): Promise<() => void> {
   const list = el("main", { className: "cards" });
   const search = el("input", { type: "search", placeholder: "find by name, tag or drone" });
   search.setAttribute("aria-label", "find");
@@ -20,22 +23,62 @@ export async function showLibrary(root: HTMLElement): Promise<void> {
     bin,
   );
   let scans: api.Scan[] = [];
+  let cards = new Map<string, Card>();
+  let seen = "";
   const draw = (): void => {
     const wanted = search.value.toLowerCase();
     const shown = scans.filter((s) =>
       [s.title, s.scan, s.drone, ...s.tags].join(" ").toLowerCase().includes(wanted),
     );
-    list.replaceChildren(...shown.map((s) => card(s, again)));
-    if (!shown.length) list.append(empty(scans.length > 0));
+    cards = new Map(shown.map((s) => [`${s.drone}/${s.scan}`, kept(cards.get(`${s.drone}/${s.scan}`), s, again)]));
+    arrange(list, [...cards.values()].map((c) => c.element));
+    if (!shown.length) list.replaceChildren(empty(scans.length > 0));
   };
   search.oninput = draw;
   async function load(): Promise<void> {
     const [found, deleted] = await Promise.all([api.scans(), api.bin()]);
+    const news = JSON.stringify([found, deleted]);
+    if (news === seen) return;
+    seen = news;
     scans = found;
     draw();
     bin.replaceChildren(...binRows(deleted, again));
   }
-  await load();
+  const refresh = setInterval(() => void (document.hidden || load().catch(() => undefined)), REFRESH_MS);
+  await load().catch(tell);
+  return () => clearInterval(refresh);
+}
+
+interface Card {
+  content: string;
+  element: HTMLElement;
+}
+
+/** The card of a scan: the one there is while nothing of the scan changed. */
+function kept(old: Card | undefined, s: api.Scan, again: () => void): Card {
+  const content = JSON.stringify(s);
+  if (old?.content === content) return old;
+  const element = card(s, again);
+  if (old) leaveAsFound(old.element, element);
+  return { content, element };
+}
+
+/** Opens, chooses and focuses in `now` what is open, chosen and focused in `old`. */
+function leaveAsFound(old: HTMLElement, now: HTMLElement): void {
+  now.querySelector("details")!.open = old.querySelector("details")!.open;
+  now.querySelector("select")!.value = old.querySelector("select")!.value;
+  const focused = document.activeElement;
+  if (!focused || !old.contains(focused)) return;
+  const same = [...now.querySelectorAll<HTMLElement>(focused.tagName)];
+  queueMicrotask(() => same.find((e) => e.textContent === focused.textContent)?.focus());
+}
+
+/** Makes `elements` the content of `place`; what is there already stays, with its focus. */
+function arrange(place: HTMLElement, elements: HTMLElement[]): void {
+  for (const old of [...place.children]) if (!elements.includes(old as HTMLElement)) old.remove();
+  elements.forEach((element, i) => {
+    if (place.children[i] !== element) place.insertBefore(element, place.children[i] ?? null);
+  });
 }
 
 /** What an empty list says: how scans get here. */
@@ -123,23 +166,19 @@ function downloads(s: api.Scan): HTMLElement {
   );
 }
 
+/** A kind to choose and a button that makes it. */
 function makeMenu(s: api.Scan, again: () => void): HTMLElement {
-  const menu = el("select", {}, el("option", { value: "", textContent: "Make …" }));
-  menu.setAttribute("aria-label", "make a file");
-  for (const kind of KINDS) menu.append(el("option", { value: kind, textContent: kind }));
-  menu.onchange = async () => {
-    const kind = menu.value;
-    menu.value = "";
-    try {
-      await api.make(s, kind);
-      tell(`making ${kind} of “${s.title}” …`);
-      await api.finished(s, kind);
-      again();
-    } catch (error) {
-      tell(error);
-    }
-  };
-  return menu;
+  const kinds = el("select", {}, ...KINDS.map((kind) => el("option", { value: kind, textContent: kind })));
+  kinds.setAttribute("aria-label", "deliverable");
+  const act = el("button", { textContent: "Make", onclick: () => void make(s, kinds.value).then(again, tell) });
+  act.setAttribute("aria-label", `Make a deliverable of ${s.title}`);
+  return el("span", { className: "group" }, kinds, act);
+}
+
+async function make(s: api.Scan, kind: string): Promise<void> {
+  await api.make(s, kind);
+  tell(`making ${kind} of “${s.title}” …`);
+  await api.finished(s, kind);
 }
 
 function rename(s: api.Scan, again: () => void): void {

@@ -31,7 +31,18 @@ export interface LastPose {
 export type News =
   | { type: "repose"; seq: number; scale: number; T: number[] }
   | { type: "track"; track: [number, number, number][]; last?: LastPose }
-  | { type: "state"; finished: boolean; keyframes: number };
+  | { type: "state"; finished: boolean; keyframes: number }
+  | Link;
+
+/** How the scan comes in, once a second. */
+export interface Link {
+  type: "link";
+  silent_s: number;
+  received_bytes: number | null;
+  lag_s: number | null;
+  backlog: number;
+  trouble: string | null;
+}
 
 /** The chunk in a binary message; throws when it is cut short. */
 export function decode(data: ArrayBuffer): Chunk {
@@ -72,14 +83,14 @@ export class LiveView {
     const socket = new WebSocket(this.address);
     this.socket = socket;
     socket.binaryType = "arraybuffer";
-    socket.onopen = () => this.onState("connected");
+    socket.onopen = () => this.onState("");
     socket.onmessage = ({ data }: MessageEvent<ArrayBuffer | string>) => {
       if (typeof data === "string") this.onNews(JSON.parse(data) as News);
       else this.onChunk(decode(data));
     };
     socket.onclose = ({ code, reason }) => {
       if (this.closed) return;
-      this.onState(code === 1008 ? reason || "refused" : "cut off, trying again");
+      this.onState(code === 1008 ? reason || "refused" : "the portal does not answer, trying again");
       if (code !== 1008) setTimeout(() => this.closed || this.open(), 1500);
     };
   }

@@ -6,17 +6,19 @@ import { showLibrary } from "./library";
 
 const root = document.getElementById("app")!;
 let close: () => void = () => undefined;
+let turn = 0;
 
 async function show(): Promise<void> {
+  const mine = ++turn;
   close();
   close = () => undefined;
   const [page, drone, scan] = location.hash.replace(/^#\//, "").split("/").map(decodeURIComponent);
-  if (page === "view" && drone && scan) {
-    const { showView } = await import("./view");
-    close = showView(root, drone, scan);
-  } else {
-    await showLibrary(root);
-  }
+  const isView = page === "view" && drone && scan;
+  const end = isView
+    ? await (await import("./view")).showView(root, drone, scan)
+    : await showLibrary(root);
+  if (mine === turn) close = end;
+  else end(); // another page was asked for meanwhile
 }
 
 addEventListener("hashchange", () => void show().catch(tell));

@@ -17,11 +17,11 @@ export interface Scene {
   target: () => THREE.Object3D;
   /** The cloud, for volumes and profiles. */
   cloud: THREE.Object3D;
+  origin: Origin | null;
 }
 
 export class Ruler {
   active = false;
-  origin: Origin | null = null;
   readonly panel = el("section", { className: "panel measure", hidden: true });
   readonly overlay = svg("svg", { class: "overlay" });
   readonly cursor = el("output", { className: "cursor" });
@@ -103,7 +103,7 @@ export class Ruler {
     const { down } = this;
     if (!down || Math.hypot(event.clientX - down.x, event.clientY - down.y) > CLICK_PX) return;
     const place = this.at(event);
-    this.cursor.value = place ? coordinates(this.origin, place) : "";
+    this.cursor.value = place ? coordinates(this.scene.origin, place) : "";
     if (!this.active) return;
     if (!place) return tell("no point there");
     this.places.push(place);
@@ -114,7 +114,7 @@ export class Ruler {
     if (event.buttons || event.pointerType === "touch" || event.timeStamp - this.hovered < HOVER_MS) return;
     this.hovered = event.timeStamp;
     const place = this.at(event, HOVER_POINTS);
-    this.cursor.value = place ? coordinates(this.origin, place) : "";
+    this.cursor.value = place ? coordinates(this.scene.origin, place) : "";
   }
 
   private readonly press = (event: KeyboardEvent): void => {
@@ -144,7 +144,7 @@ export class Ruler {
     const n = this.places.length;
     const button = (text: string, title: string, off: boolean, onclick: () => void): HTMLElement =>
       el("button", { textContent: text, title, disabled: off, onclick });
-    const homeless = this.origin === null;
+    const homeless = this.scene.origin === null;
     const out = homeless ? "this scan has no place on the globe" : "the places as GeoJSON";
     const acts = el(
       "p",
@@ -162,7 +162,7 @@ export class Ruler {
       el("dt", { textContent: k }),
       el("dd", { textContent: v }),
     ]);
-    return [el("dl", {}, ...facts), ...(this.heights ? [chart(this.heights, this.origin, along(this.places))] : []), acts];
+    return [el("dl", {}, ...facts), ...(this.heights ? [chart(this.heights, this.scene.origin, along(this.places))] : []), acts];
   }
 
   /** What the places measure, as a list of names and texts. */
@@ -189,7 +189,7 @@ export class Ruler {
 
   /** The places as GeoJSON: longitude, latitude and metres above mean sea level. */
   private geojson(): string {
-    const origin = this.origin!;
+    const origin = this.scene.origin!;
     const spots = this.places.map((p) => {
       const { lon_deg, lat_deg, alt_m } = placeOf(origin, p);
       return [Number(lon_deg.toFixed(9)), Number(lat_deg.toFixed(9)), Number(alt_m.toFixed(3))];

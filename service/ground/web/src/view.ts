@@ -2,7 +2,8 @@
 
 import * as api from "./api";
 import { Cameras } from "./cameras";
-import { count, el, tell } from "./dom";
+import { count, el } from "./dom";
+import { LinkState } from "./link";
 import { LiveView, type LastPose, type News } from "./live";
 import { Ruler } from "./measure";
 import { Cloud } from "./points";
@@ -11,28 +12,51 @@ import { toolbar } from "./toolbar";
 import { vehicleStrip } from "./vehicle";
 
 const PICTURE_EVERY_MS = 1500;
+const ASK_EVERY_MS = 2000;
 
-/** Shows a scan; returns what closes it. */
-export function showView(root: HTMLElement, drone: string, name: string): () => void {
-  const figures = el("div", { className: "panel figures" });
-  const state = el("span", { className: "state" });
-  const title = el("b", { textContent: name });
-  const bar = el("nav", {}, el("a", { href: "#/", textContent: "‹ Scans" }), title, state, vehicleStrip());
+/** Shows a scan, or why there is none; gives what closes it. */
+export async function showView(root: HTMLElement, drone: string, name: string): Promise<() => void> {
+  try {
+    return view(root, await api.scan(drone, name));
+  } catch (error) {
+    root.replaceChildren(nothing(error));
+    return () => undefined;
+  }
+}
+
+/** What stands in place of a scan that cannot be shown. */
+function nothing(error: unknown): HTMLElement {
+  const why = error instanceof Error ? error.message : String(error);
+  const unknown = error instanceof api.Refused && error.status === 404;
+  return el(
+    "main",
+    { className: "empty" },
+    el("h1", { textContent: unknown ? "There is no such scan" : "This scan cannot be shown" }),
+    el("p", { textContent: unknown ? `${why}. It may have been deleted or not arrived yet.` : why }),
+    el("p", {}, el("a", { href: "#/", textContent: "All scans" })),
+  );
+}
+
+function view(root: HTMLElement, scan: api.Scan): () => void {
+  const id = { drone: scan.drone, scan: scan.scan };
+  const figures = el("dl", { className: "panel figures" });
+  const link = new LinkState();
+  const title = el("h1", {});
+  const report = el("a", { href: api.file(id, "report.html"), textContent: "Report" });
+  const bar = el("nav", {}, el("a", { href: "#/", textContent: "‹ Scans" }), title, link.element, vehicleStrip(), report);
   const host = el("div", { className: "stage" });
   const legend = el("div", { className: "panel legend", hidden: true });
   const coverage = el("div", { className: "panel coverage", hidden: true });
   const latest = el("figure", { className: "panel latest", hidden: true });
-  const view = el("div", { className: "view" }, bar, host, figures, legend, coverage, latest);
-  root.replaceChildren(view);
-  const id = { drone, scan: name };
+  const page = el("main", { className: "view" }, bar, host, figures, legend, coverage, latest);
+  root.replaceChildren(page);
   const cloud = new Cloud();
-  const facts = api.scan(drone, name);
-  void facts.then((s) => {
-    title.textContent = s.title;
-    cloud.datum_m = s.origin?.alt_amsl_m ?? 0;
-    if (s.files.some((f) => f.name === "report.html"))
-      bar.append(el("a", { href: api.file(s, "report.html"), textContent: "Report" }));
-  }, tell);
+  cloud.datum_m = scan.origin?.alt_amsl_m ?? 0;
+  const learn = (now: api.Scan): void => {
+    title.textContent = now.title;
+    report.hidden = !now.files.some((f) => f.name === "report.html");
+  };
+  learn(scan);
   if (!canDraw()) {
     figures.hidden = true;
     host.append(
@@ -47,22 +71,22 @@ export function showView(root: HTMLElement, drone: string, name: string): () => 
     canvas: stage.renderer.domElement,
     target: () => (stage.model.children.length ? stage.model : cloud.group),
     cloud: cloud.group,
+    origin: scan.origin,
   });
   host.append(ruler.overlay, ruler.cursor);
-  view.append(ruler.panel);
+  page.append(ruler.panel);
   stage.before.push(ruler.draw);
-  void facts.then((s) => (ruler.origin = s.origin), () => undefined);
   stage.drawGradually(cloud);
   stage.add(cameras.group);
   stage.addAgain(cloud.group);
   bar.append(toolbar({ stage, cloud, cameras, ruler, legend, coverage, id }));
 
   let last: LastPose | undefined;
-  let link = "";
   let framed = false;
   let newest = -1;
   const reach = (): number => Math.max(last?.agl_m ?? 40, 5);
   const news = (item: News): void => {
+    if (item.type === "link") return link.news(item);
     stage.touch();
     if (item.type === "repose") {
       cloud.repose(item.seq, item.T, item.scale);
@@ -77,7 +101,7 @@ export function showView(root: HTMLElement, drone: string, name: string): () => 
       }
     }
     if (item.type === "state") {
-      link = item.finished ? "finished" : "receiving";
+      link.finished = item.finished;
       if (item.finished && !framed) stage.frame();
       framed ||= item.finished;
       stage.follow &&= !item.finished;
@@ -94,12 +118,14 @@ export function showView(root: HTMLElement, drone: string, name: string): () => 
       if (cloud.keyframes === 1) stage.frame();
     },
     news,
-    (text) => (link = text),
+    (text) => (link.cut = text),
   );
+  const asking = setInterval(() => {
+    if (link.finished && report.hidden) void api.scan(id.drone, id.scan).then(learn, () => undefined);
+  }, ASK_EVERY_MS);
   const stopPictures = keepLatest(id, latest, cameras, stage, () => newest);
   const clock = setInterval(() => {
-    state.textContent = link;
-    state.className = `state ${link}`;
+    link.draw();
     if (cameras.refresh()) stage.touch();
     figures.replaceChildren(...rows(cloud, stage, last));
     document.body.dataset["points"] = String(cloud.total);
@@ -108,6 +134,7 @@ export function showView(root: HTMLElement, drone: string, name: string): () => 
   }, 300);
   return () => {
     clearInterval(clock);
+    clearInterval(asking);
     stopPictures();
     live.close();
     ruler.close();

@@ -1,0 +1,122 @@
+"""The portal says how things stand: live state, unknown scans, the list; in a real browser."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from portal_client import NEEDS, TOKEN, browser, flown_store
+
+from service.bench.portal import Browser
+from service.ground.portal import Portal, PortalConfig
+from service.scans.folder import write_deliverables
+from service.stream.codec import encode
+from service.stream.store import ScanStore
+
+if TYPE_CHECKING:
+    from conftest import HouseFlight
+
+pytestmark = NEEDS
+__all__ = ["browser"]  # the fixture
+
+STATE = "document.querySelector('.state').textContent"
+
+
+@contextlib.contextmanager
+def page_of(browser: Browser, store: Path, entries: list[dict[str, Any]]) -> Iterator[str]:
+    """The address of a portal whose receiver says ``entries``."""
+    portal = Portal(PortalConfig(store, port=0, token=TOKEN), lambda: entries)
+    portal.start()
+    browser.open("about:blank")
+    try:
+        browser.open(portal.url)
+        browser.wait("document.querySelector('h1').textContent === 'skyrelief'")
+        yield portal.url.split("/?")[0]
+    finally:
+        browser.open("about:blank")
+        portal.close()
+
+
+@pytest.fixture
+def scans(tmp_path: Path, house: HouseFlight) -> Path:
+    return flown_store(tmp_path / "scans", house)
+
+
+def kind(browser: Browser, wanted: str) -> None:
+    browser.wait(f"document.querySelector('.state').classList.contains('{wanted}')", 30)
+
+
+def test_the_state_says_when_the_drone_was_heard(browser: Browser, scans: Path) -> None:
+    entry = {
+        "drone": "drone-1", "scan": "test-1", "heard_unix_s": time.time() - 25.0, "open": True,
+        "received_bytes": 1000, "lag_s": {"k0": 0.4}, "missing": {"k1": 2, "pose": 1},
+    }  # fmt: skip
+    with page_of(browser, scans, [entry]) as base:
+        browser.open(f"{base}/#/view/drone-1/test-1")
+        kind(browser, "silent")
+        said = browser.run(STATE)
+        assert said.startswith("silent · last heard 2") and said.endswith(" s ago · backlog 3")
+        entry["heard_unix_s"] = time.time() + 60.0  # it is back, for a while
+        browser.wait("document.querySelector('.state').textContent.includes('0 B/s')", 30)
+        entry["received_bytes"] = 500_000
+        kind(browser, "receiving")
+        browser.wait(
+            f"/receiving · last heard 0 s ago · [1-9][0-9]* kB.s · lag 0.4 s/.test({STATE})"
+        )
+
+
+def test_the_report_is_linked_when_the_scan_has_finished(
+    browser: Browser, scans: Path, house: HouseFlight
+) -> None:
+    folder = scans / "drone-1/test-1"
+    (folder / "report.html").rename(folder / "later.html")
+    with page_of(browser, scans, []) as base:
+        browser.open(f"{base}/#/view/drone-1/test-1")
+        browser.wait("document.body.dataset.points === '72000'")
+        kind(browser, "silent")
+        report = "[...document.querySelectorAll('nav a')].find(a => a.textContent === 'Report')"
+        assert browser.run(f"{report}.hidden") and " days ago" in browser.run(STATE)
+        with ScanStore.open(folder / "scan.db") as store:
+            one = house.keyframe(5, 30.0)
+            store.add_keyframe(5, encode(one, one.time_ns))
+        kind(browser, "receiving")
+        with ScanStore.open(folder / "scan.db") as store:
+            store.finish({})
+        kind(browser, "finished")
+        (folder / "later.html").rename(folder / "report.html")
+        browser.wait(f"!{report}.hidden", 30)
+
+
+def test_an_unknown_scan_is_said_to_be_unknown(browser: Browser, scans: Path) -> None:
+    with page_of(browser, scans, []) as base:
+        browser.open(f"{base}/#/view/drone-1/nothing")
+        browser.wait("document.querySelector('h1').textContent === 'There is no such scan'")
+        assert "no scan drone-1/nothing" in browser.run("document.body.textContent")
+
+
+def test_the_list_follows_the_server(browser: Browser, scans: Path, house: HouseFlight) -> None:
+    folder = scans / "drone-1/test-1"
+    with page_of(browser, scans, []):
+        browser.wait("document.querySelectorAll('article').length === 1")
+        browser.run("document.querySelector('article details').open = true")
+        browser.run("document.querySelector('article select').value = 'ply'")
+        browser.run("document.querySelector('article select').focus()")
+        shutil.copytree(folder, scans / "drone-2/test-1")
+        browser.wait("document.querySelectorAll('article').length === 2", 20)
+        with ScanStore.open(folder / "scan.db") as store:
+            one = house.keyframe(5, 30.0)
+            store.add_keyframe(5, encode(one, one.time_ns))
+            store.finish({})
+            write_deliverables(folder, store, {})
+        browser.wait("document.querySelectorAll('.badge').length === 1", 20)
+        first = (
+            "[...document.querySelectorAll('article')].find(a => a.textContent.includes('drone-1'))"
+        )
+        assert browser.run(f"{first}.querySelector('details').open")
+        assert browser.run(f"{first}.querySelector('select').value") == "ply"
+        assert browser.run(f"{first}.contains(document.activeElement)")
