@@ -22,7 +22,7 @@ PRIORITIES = (
     (logging.INFO, 6),
     (logging.DEBUG, 7),
 )
-MOST_BYTES = 100_000
+MAX_BYTES = 100_000
 
 
 class JournalHandler(logging.Handler):
@@ -50,7 +50,7 @@ class JournalHandler(logging.Handler):
 def packed(record: logging.LogRecord, text: str) -> bytes:
     """The record as a datagram of the journal."""
     fields = {
-        "MESSAGE": text[:MOST_BYTES],
+        "MESSAGE": text[:MAX_BYTES],
         "PRIORITY": str(next((p for level, p in PRIORITIES if record.levelno >= level), 7)),
         "SYSLOG_IDENTIFIER": "skyrelief",
         "LOGGER": record.name,

@@ -72,7 +72,7 @@ ROWS: tuple[Row, ...] = (
     Row("self-test", "camera and disk, on command", 5),
     Row("erase", "deletes finished scans, on command", 5),
     Row("recover", "closes what a crash left open", 5),
-    Row("tidy", "watches the machine, its memory and its disk", 5),
+    Row("housekeeping", "watches the machine, its memory and its disk", 5),
     Row("first beats", "heartbeats while the rest loads", 6, starts_itself=_BELOW),
     Row("mavlink", "vehicle, heartbeat, reader and writer of each link", 6, starts_itself=_BELOW),
     Row("rehearsal", "confirms a restart", 6, starts_itself=_BELOW),

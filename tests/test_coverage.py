@@ -23,7 +23,7 @@ from service.ground.portal import Portal, PortalConfig
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.scans.coverage import (
     FIGURES,
-    PICTURE,
+    IMAGE,
     CoverageWriter,
     LiveCoverage,
     LiveCoverages,
@@ -261,7 +261,7 @@ def test_picture_figures_and_geotiff(tmp_path: Path, house: HouseFlight) -> None
         write_deliverables(tmp_path, store, {})
         found = coverage_of(store)
     assert found is not None
-    picture = cv2.imread(str(tmp_path / PICTURE), cv2.IMREAD_UNCHANGED)
+    picture = cv2.imread(str(tmp_path / IMAGE), cv2.IMREAD_UNCHANGED)
     assert picture is not None and picture.shape == (*found.layer.grid.shape, 4)
     assert np.array_equal(picture[..., 3] > 0, found.layer.known | found.layer.inside)
     said = json.loads((tmp_path / FIGURES).read_text())
@@ -287,7 +287,7 @@ def test_without_a_surface_there_is_no_layer(tmp_path: Path, house: HouseFlight)
     with ScanStore.create(tmp_path / "two" / "scan.db", header) as empty:
         assert coverage_of(empty) is None
         summary = write_deliverables(tmp_path / "two", empty, {})
-    assert summary["coverage"] is None and not (tmp_path / "two" / PICTURE).exists()
+    assert summary["coverage"] is None and not (tmp_path / "two" / IMAGE).exists()
     with pytest.raises(InputError, match="nothing to export"), ScanView(tmp_path / "two") as scan:
         export(scan, "coverage", None, ExportOptions())
 
@@ -325,14 +325,14 @@ def test_a_growing_scan_has_its_layer_written_beside_it(tmp_path: Path, house: H
         one = house.keyframe(5, 30.0)
         store.add_keyframe(5, encode(one, one.time_ns))
         wait(6)
-    assert cv2.imread(str(tmp_path / PICTURE)) is not None
+    assert cv2.imread(str(tmp_path / IMAGE)) is not None
 
 
 def test_few_layers_are_kept_and_rarely_made_anew(tmp_path: Path, house: HouseFlight) -> None:
     folders = [tmp_path / str(n) for n in range(3)]
     for folder in folders:
         house.flown(folder).close()
-    kept = LiveCoverages(least_s=1000.0, most=2)
+    kept = LiveCoverages(min_age_s=1000.0, max_scans=2)
     first = kept.of(folders[0])
     assert kept.of(folders[0]) is first
     for folder in folders[1:]:

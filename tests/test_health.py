@@ -121,7 +121,7 @@ def test_http_survives_hostile_bytes(hostile: bytes) -> None:
 def test_why_it_cannot_start_is_told_before_it_is_started_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.daemon.runtime.TOLD_S", 60.0)
+    monkeypatch.setattr("service.daemon.runtime.REPORT_FAULT_S", 60.0)
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
     said: dict[str, Any] = {}
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:

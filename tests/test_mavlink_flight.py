@@ -31,20 +31,20 @@ from service.scans.folder import SUMMARY
 
 AGL_M, FOCAL_PX, SIZE = 50.0, 300.0, (320, 240)
 SPEED_M_S, INTERVAL_S = 5.0, 0.1
-PICTURES = 300  # more than are needed: a busy machine drops frames
+IMAGES = 300  # more than are needed: a busy machine drops frames
 LAT, LON = 47.3, 8.5
 
 
 def draw_flight(folder: Path) -> None:
     """Nadir pictures of flat ground, flown east with the picture's top to the north."""
     rng = np.random.default_rng(3)
-    ground = np.zeros((SIZE[1] + 8, SIZE[0] + 3 * PICTURES, 3), np.float32)
+    ground = np.zeros((SIZE[1] + 8, SIZE[0] + 3 * IMAGES, 3), np.float32)
     for size in (3, 9, 31):
         noise = rng.normal(size=ground.shape).astype(np.float32)
         ground += cv2.GaussianBlur(noise, (size, size), 0) * size
     ground = 128 + 50 * ground / ground.std()
     folder.mkdir()
-    for k in range(PICTURES):
+    for k in range(IMAGES):
         shift = SPEED_M_S * INTERVAL_S * k * FOCAL_PX / AGL_M
         move = np.array([[1.0, 0.0, -shift], [0.0, 1.0, 0.0]])
         picture = cv2.warpAffine(ground, move, SIZE, flags=cv2.INTER_CUBIC)

@@ -95,7 +95,7 @@ def test_work_is_repeated_also_after_faults() -> None:
         runs.append(1)
         raise OSError("the disk is full")
 
-    worker = table.every("tidy", 0.001, fails)
+    worker = table.every("housekeeping", 0.001, fails)
     assert until(lambda: len(runs) > 2)
     assert worker.fault == "the disk is full"
     assert worker.join(10.0)
@@ -108,10 +108,10 @@ def test_workers_stop_in_the_order_of_the_table() -> None:
         worker.stop.wait()
         ended.append(worker.name)
 
-    for name in ("health", "tidy", "scan", "files", "datalink"):
+    for name in ("health", "housekeeping", "scan", "files", "datalink"):
         table.start(name, work)
     table.stop()
-    assert ended == ["scan", "files", "datalink", "tidy", "health"]
+    assert ended == ["scan", "files", "datalink", "housekeeping", "health"]
 
 
 def test_what_runs_is_shown_by_its_row() -> None:

@@ -14,7 +14,7 @@ from mavlink.telemetry.samples import GimbalFrame
 
 SAME_RAD = math.radians(0.3)
 CLEAR_RAD = math.radians(0.05)
-LEAST_TURNS = 20
+MIN_TURNS = 20
 STEP_NS = 1_000_000_000  # turns are compared over so long: over less they are mostly noise
 KEPT = 120
 
@@ -119,4 +119,4 @@ class FrameWatch:
                 sent.append((first[0], second[0]))
                 bodies.append((first[1], second[1]))
                 turns.append(turn)
-        return judge_frame(sent, bodies, turns) if len(turns) >= LEAST_TURNS else None
+        return judge_frame(sent, bodies, turns) if len(turns) >= MIN_TURNS else None

@@ -19,12 +19,12 @@ from scipy.spatial.transform import Rotation
 
 from mavlink.telemetry.quaternion import Quaternion, multiply, normalised
 
-LEAST_WINDOWS = 50  # that do not overlap
-LEAST_CORRELATION = 0.7
+MIN_WINDOWS = 50  # that do not overlap
+MIN_CORRELATION = 0.7
 WINDOW_S = 0.2  # turns over less are mostly noise; over more, the latency drowns
 FLOOR_MS = 2.0  # neither exposures nor the stamps of telemetry are known better
 SETTLED_MS = 5.0  # sigma of an estimate that may be believed
-LARGEST_SIGMA_MS = 25.0  # one that is not worth telling
+MAX_SIGMA_MS = 25.0  # one that is not worth telling
 RIVAL = 1.3  # a second answer, further away than RIVAL_APART_S, must fit worse by so much
 RIVAL_APART_S = 0.15
 KEPT = 2000
@@ -94,21 +94,21 @@ class LatencyWatch:
 
         None while there are too few frames, too little rotation, or no clear answer.
         """
-        if len(attitudes) < LEAST_WINDOWS or len(self._frames) < LEAST_WINDOWS:
+        if len(attitudes) < MIN_WINDOWS or len(self._frames) < MIN_WINDOWS:
             return None
         track = Attitudes(attitudes)
         low, high = self._range_s
         seen = self._turns(track.base_ns, max(WINDOW_S, 2.0 * track.spacing_s))
         inside = (seen.start_s - high > track.first_s) & (seen.end_s - low < track.last_s)
         seen = seen.only(inside)
-        if len(seen) < LEAST_WINDOWS * seen.overlap:
+        if len(seen) < MIN_WINDOWS * seen.overlap:
             return None
         lags = np.arange(low, high + COARSE_S / 2, COARSE_S)
         fits = [_fit(seen, track, float(lag)) for lag in lags]
         misfits = np.array([np.inf if fit is None else fit.misfit for fit in fits])
         k = int(np.argmin(misfits))
         best = fits[k]
-        if best is None or not 0 < k < len(lags) - 1 or best.correlation < LEAST_CORRELATION:
+        if best is None or not 0 < k < len(lags) - 1 or best.correlation < MIN_CORRELATION:
             return None
         far = np.abs(lags - lags[k]) > RIVAL_APART_S
         if (misfits[far] < RIVAL * best.misfit).any():
@@ -153,7 +153,7 @@ class _Fit:
 def _fit(seen: _Turns, track: Attitudes, lag_s: float) -> _Fit | None:
     """None where telemetry says too little."""
     turns, known = track.turns(seen.start_s - lag_s, seen.end_s - lag_s)
-    if known.sum() < LEAST_WINDOWS:
+    if known.sum() < MIN_WINDOWS:
         return None
     ours = turns / (seen.end_s - seen.start_s)[:, None]
     ours = ours @ best_rotation(ours[known], seen.rate[known]).T
@@ -190,7 +190,7 @@ def _refine(seen: _Turns, track: Attitudes, lag_s: float) -> LatencyEstimate | N
     known = before.known & at.known & after.known
     sigma = _sigma(slope[known] @ weight, slope[known], at.rest[known], 2 * seen.overlap)
     sigma_ms = float(np.hypot(1e3 * sigma, FLOOR_MS))
-    if not sigma_ms <= LARGEST_SIGMA_MS:
+    if not sigma_ms <= MAX_SIGMA_MS:
         return None
     return LatencyEstimate(1e3 * latency, sigma_ms, at.correlation, int(known.sum()))
 

@@ -19,7 +19,7 @@ from recon.types import Camera
 
 DIAGONAL_35MM = 43.2666
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-LEAST_FOCAL, MOST_FOCAL = 0.2, 20.0
+MIN_FOCAL, MAX_FOCAL = 0.2, 20.0
 """Focal length over the longer side of the image; outside, a tag is wrong."""
 
 SAME_SHAPE = 0.005
@@ -91,7 +91,7 @@ def lens_of(
 
 
 def _is_sound(lens: Lens, size_px: tuple[int, int]) -> bool:
-    if not LEAST_FOCAL < lens.focal < MOST_FOCAL or max(map(abs, lens.principal)) > 0.2:
+    if not MIN_FOCAL < lens.focal < MAX_FOCAL or max(map(abs, lens.principal)) > 0.2:
         return False
     try:
         check_camera(lens.camera(size_px))

@@ -150,7 +150,7 @@ class LiveSource:
         last_ns = -1
         for image, time_ns in itertools.chain((self._first,), self._endless()):
             if (image.shape[1], image.shape[0]) != self.size_px:
-                self._tell_misfit(image)
+                self._warn_misfit(image)
                 continue
             self._fits = True
             if time_ns > last_ns:
@@ -181,17 +181,17 @@ class LiveSource:
         try:
             container = self._open_container(self.config.stall_s)
         except (av.error.FFmpegError, OSError, ValueError) as error:
-            self._tell(f"cannot be opened: {error}")
+            self._warn(f"cannot be opened: {error}")
             return
         try:
             stream = video_stream(container)
             if stream is None:
-                self._tell("holds no video stream that can be decoded")
+                self._warn("holds no video stream that can be decoded")
                 return
             rate = stream.average_rate  # as the camera says; it is not measured
             self.fps = float(rate) if rate else None
             log.info("%s: connected", self.description)
-            yield from self._watch(decoded_frames(container, stream, self._tell, self._damage))
+            yield from self._watch(decoded_frames(container, stream, self._warn, self._damage))
         finally:
             container.close()
 
@@ -208,7 +208,7 @@ class LiveSource:
             if fingerprint != print_of_last:
                 print_of_last, changed_ns = fingerprint, arrival_ns
             elif arrival_ns - changed_ns > self.config.frozen_s * 1e9:
-                self._tell(f"the picture is frozen since {self.config.frozen_s:g} s")
+                self._warn(f"the picture is frozen since {self.config.frozen_s:g} s")
                 return
             time_ns: int | None = arrival_ns
             if frame.pts is not None and frame.time_base is not None:
@@ -222,9 +222,9 @@ class LiveSource:
     def _damage(self, error: Exception) -> None:
         log.debug("%s: packet dropped: %s", self.description, error)
 
-    def _tell_misfit(self, image: U8) -> None:
+    def _warn_misfit(self, image: U8) -> None:
         if self._fits:
-            self._tell(
+            self._warn(
                 f"now gives {image.shape[1]}x{image.shape[0]} pictures instead of "
                 f"{self.size_px[0]}x{self.size_px[1]}; they are dropped: the camera model does "
                 "not fit them"
@@ -232,7 +232,7 @@ class LiveSource:
         self._fits = False
         self.misfits += 1
 
-    def _tell(self, text: str) -> None:
+    def _warn(self, text: str) -> None:
         text = without_credentials(text)  # FFmpeg's errors name the address
         if not self._closed.is_set():
             if text not in self.warnings:

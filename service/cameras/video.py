@@ -112,7 +112,7 @@ class VideoSource:
             last_ns = time_ns
             seq += 1
         else:
-            self._tell_losses(decoded)
+            self._warn_losses(decoded)
         self.close()
 
     def close(self) -> None:
@@ -133,7 +133,7 @@ class VideoSource:
         # Whole ticks first: floats of seconds lose nanoseconds after minutes.
         return round((frame.pts * frame.time_base - self._start_s) * 1_000_000_000)
 
-    def _tell_losses(self, decoded: int) -> None:
+    def _warn_losses(self, decoded: int) -> None:
         if self._damaged:
             self._warn(f"{self._damaged} damaged pictures were left out")
         if self._unordered:

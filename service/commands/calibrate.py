@@ -13,7 +13,7 @@ from service.errors import InputError
 
 if TYPE_CHECKING:
     from recon.calibration.board import Board, Calibration
-    from service.cameras.board_pictures import BoardSet
+    from service.cameras.board_images import BoardSet
 
 
 def calibrate(
@@ -31,7 +31,7 @@ def calibrate(
     """
     from recon.calibration.board import FEWEST_VIEWS, CalibrationConfig
     from recon.calibration.board import calibrate as fit
-    from service.cameras.board_pictures import draw_coverage, find_boards, write_image
+    from service.cameras.board_images import draw_coverage, find_boards, write_image
     from service.cameras.camera_file import save_camera
 
     board = _board(pattern, square_m)

@@ -155,9 +155,9 @@ def refly(
             raise InputError(f"{scan_dir} holds no surface; there is nothing to compare with")
         limits = found.limits
         if views is not None:
-            limits = replace(limits, least_views=views)
+            limits = replace(limits, min_views=views)
         if sigma_m is not None:
-            limits = replace(limits, most_sigma_m=sigma_m)
+            limits = replace(limits, max_sigma_m=sigma_m)
         found = replace(found, limits=limits)
         heights = [p.agl_m for p in scan.poses if p.agl_m is not None]
         height = float(np.median(heights)) if heights else None

@@ -216,10 +216,10 @@ def trial(backend: Backend) -> float:
     left = np.ascontiguousarray(guide[:height, :width, 0])
     right = np.roll(left, -5, axis=1)
     matching, upsampling = BeliefPropagationConfig(), UpsamplingConfig()
-    least = float("inf")
+    best = float("inf")
     for _ in range(TRIAL_ROUNDS + 1):
         start = time.perf_counter()
         coarse = backend.belief_propagation(left, right, TRIAL_LABELS, matching)
         backend.upsample(coarse, guide, upsampling)
-        least = min(least, time.perf_counter() - start)
-    return least
+        best = min(best, time.perf_counter() - start)
+    return best

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from recon.backends.learned_stereo import LearnedStereoBackend
 
 
-def open_backend(config: ComputeConfig, picture_px: tuple[int, int] | None = None) -> Backend:
+def open_backend(config: ComputeConfig, image_px: tuple[int, int] | None = None) -> Backend:
     """The backend named by ``compute.backend``, ready to run; "auto" is the fastest that works.
 
     With ``compute.model`` it is the learned model declared there, by ONNX Runtime; with the
@@ -40,7 +40,7 @@ def open_backend(config: ComputeConfig, picture_px: tuple[int, int] | None = Non
         )
     learned = load_learned_model(Path(config.model))
     width = config.stereo_width
-    height = 0 if picture_px is None else round(width * picture_px[1] / picture_px[0])
+    height = 0 if image_px is None else round(width * image_px[1] / image_px[0])
     if width > learned.config.width or height > learned.config.height:
         found = f"{width}x{height}" if height else f"{width} wide"
         raise InputError(

@@ -28,8 +28,8 @@ def share_cores(threads: int) -> Callable[[], None]:
     """
     import numba
 
-    most = numba.config.NUMBA_NUM_THREADS
-    half = max(1, min(threads or most, most) // 2)
+    available = numba.config.NUMBA_NUM_THREADS
+    half = max(1, min(threads or available, available) // 2)
     numba.set_num_threads(half)
     return functools.partial(numba.set_num_threads, half)
 

@@ -24,7 +24,7 @@ from service.daemon.vehicle_config import with_parameter
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.workers import PROCESS
 
-LEAST_FREE_MIB = 500.0
+MIN_FREE_MIB = 500.0
 """The self-test fails with less than that on the disk."""
 
 
@@ -154,7 +154,7 @@ class ControlActions:
                 check_size(self._scanning.camera, source.size_px, source.description)
             folder = existing(Path(config.scan.folder))
             free_mib = shutil.disk_usage(folder).free / 2**20
-            if free_mib < LEAST_FREE_MIB:
+            if free_mib < MIN_FREE_MIB:
                 raise OutsideError(f"{folder} has {free_mib:.0f} MiB left")
             work.finish(Answer(text="Self-test passed"))
         except SkyreliefError as error:

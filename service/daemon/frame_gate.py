@@ -23,7 +23,7 @@ KEEP_EVERY_NS = 200_000_000
 """Between two kept images; 2 m of flight at 10 m/s."""
 
 QUALITY = 90
-LEAST_FREE_MIB = 500.0
+MIN_FREE_MIB = 500.0
 
 
 class FrameGate:
@@ -120,7 +120,7 @@ class FrameGate:
         import cv2
 
         self._folder.mkdir(parents=True, exist_ok=True)
-        if shutil.disk_usage(self._folder).free < LEAST_FREE_MIB * 2**20:
+        if shutil.disk_usage(self._folder).free < MIN_FREE_MIB * 2**20:
             raise OSError(28, "the disk is nearly full")
         _, data = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
         path = self._folder / image_name(self._zero_unix_ns + frame.time_ns)

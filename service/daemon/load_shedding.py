@@ -69,7 +69,7 @@ class LadderConfig:
 
     hottest_c: float = 90.0
     cooler_c: float = 8.0  # below that before stepping up
-    least_memory_mib: float = 300.0  # half of it: straight to the last step
+    min_memory_mib: float = 300.0  # half of it: straight to the last step
     late_views: float = 0.25  # share of the views that may give way
     late_frames: float = 0.6  # share of the frames that may pass unseen
     oldest_s: float = 1.5  # age of a frame when it is taken up
@@ -169,9 +169,9 @@ class Ladder:
 def strain(readings: Readings, config: LadderConfig) -> Strain | None:
     """What is too much in ``readings``: memory before heat before lag; None when nothing is."""
     memory, heat = readings.memory_free_mib, readings.temperature_c
-    if memory is not None and memory < config.least_memory_mib:
+    if memory is not None and memory < config.min_memory_mib:
         text = f"{memory:.0f} MiB of memory left"
-        short = memory < 0.5 * config.least_memory_mib
+        short = memory < 0.5 * config.min_memory_mib
         return Strain(text, config.patience_s, Level.RECORD_ONLY, jump=short)
     if heat is not None and heat > config.hottest_c:
         return Strain(f"{heat:.0f} degrees", config.heat_patience_s, Level.RECORD_ONLY)
@@ -210,7 +210,7 @@ def is_calm(readings: Readings, config: LadderConfig) -> bool:
     return (
         not readings.throttled
         and (heat is None or heat < config.hottest_c - config.cooler_c)
-        and (memory is None or memory > 1.5 * config.least_memory_mib)
+        and (memory is None or memory > 1.5 * config.min_memory_mib)
         and views < 0.5 * config.late_views
         and frames < 0.75 * config.late_frames
         and readings.age_s < 0.5 * config.oldest_s
@@ -236,7 +236,7 @@ class LoadControl:
         self._scanning = scanning
         self._ladder = Ladder(_ladder_config(scanning.config.compute))
         self._counted: tuple[str, int, int, int, int] = ("", 0, 0, 0, 0)
-        self._told_failure = ""
+        self._reported_failure = ""
         self.readings = Readings()
 
     def look(self, machine: Machine, now_s: float | None = None) -> Move | None:
@@ -244,7 +244,7 @@ class LoadControl:
         now_s = time.monotonic() if now_s is None else now_s
         compute = self._scanning.config.compute
         self._ladder.config = _ladder_config(compute)
-        self._tell_failure()
+        self._report_failure()
         if not compute.relief:
             self._set(Level.FULL)
             return None
@@ -310,13 +310,13 @@ class LoadControl:
             machine.memory_left_mib,
         )
 
-    def _tell_failure(self) -> None:
+    def _report_failure(self) -> None:
         """Say once that the device has failed and the CPU goes on."""
         failure = self._scanning.backend_failure
-        if failure and failure != self._told_failure:
+        if failure and failure != self._reported_failure:
             self._scanning.vehicle.statustext(f"Compute device failed: {failure}", CRITICAL)
-        self._told_failure = failure
+        self._reported_failure = failure
 
 
 def _ladder_config(compute: ComputeConfig) -> LadderConfig:
-    return LadderConfig(hottest_c=compute.hottest_c, least_memory_mib=compute.least_memory_mib)
+    return LadderConfig(hottest_c=compute.hottest_c, min_memory_mib=compute.least_memory_mib)

@@ -135,13 +135,13 @@ def _limit_free_mib(root: Path) -> float | None:
     rooms = []
     for part in (group, *group.parents):
         folder = root / "sys/fs/cgroup" / part
-        most, used = _number(folder / "memory.max"), _number(folder / "memory.current")
-        if most is not None and used is not None:
+        limit, used = _number(folder / "memory.max"), _number(folder / "memory.current")
+        if limit is not None and used is not None:
             cache = 0.0
             for entry in _text(folder / "memory.stat").splitlines():
                 if entry.startswith("inactive_file "):
                     cache = float(entry.split()[1])
-            rooms.append((most - used + cache) / 2**20)
+            rooms.append((limit - used + cache) / 2**20)
     return min(rooms, default=None)
 
 

@@ -48,13 +48,13 @@ CLOSING_S = 120.0
 PROGRESS_S = 1.5
 """Closing made progress when its last step is not longer ago; looked at every second."""
 
-TIDY_S = 2.0
+HOUSEKEEPING_S = 2.0
 """From one look at the machine, its memory and its disk to the next."""
 
 COMPILING_S = 180.0
 """The same before anything was compiled, where nobody ran ``skyrelief warm-up``."""
 
-TOLD_S = 10.0
+REPORT_FAULT_S = 10.0
 """For so long the operator is told why the service cannot start, before it is started again."""
 
 
@@ -95,7 +95,7 @@ class Daemon:
             self._load(notifier)
             self.actions.is_ready = True
             notifier.ready()
-            PROCESS.every("tidy", TIDY_S, self._tidy)
+            PROCESS.every("housekeeping", HOUSEKEEPING_S, self._housekeeping)
             if kernels_may_overlap():
                 PROCESS.start("recover", lambda _: self._recover())
             else:
@@ -111,8 +111,8 @@ class Daemon:
             self.scanning.claim.give_up()
 
     def _load(self, notifier: Notifier) -> None:
-        """The heavy part of the start. Where the init system starts us again after a fault, the
-        operator is told of it for :data:`TOLD_S` first: nobody reads a journal on a field."""
+        """Load what is heavy. After a fault, report it to the operator for
+        :data:`REPORT_FAULT_S` before the init system restarts the service."""
         try:
             if self._fault is not None:
                 raise self._fault
@@ -123,8 +123,8 @@ class Daemon:
                 self.vehicle.set_health(Health.CRITICAL)
                 self.vehicle.statustext(f"Not ready: {error}", CRITICAL)
                 notifier.status(str(error))
-                log.error("%s; started again in %g s", error, TOLD_S)
-                self._quit.wait(TOLD_S)
+                log.error("%s; started again in %g s", error, REPORT_FAULT_S)
+                self._quit.wait(REPORT_FAULT_S)
             raise
 
     def _watch(self, notifier: Notifier) -> None:
@@ -134,7 +134,7 @@ class Daemon:
             self.vehicle.set_health(self._health())
             was_armed = self._follow_arming(was_armed)
             self._resume()
-            self._tell_of_camera()
+            self._report_camera()
             self._close_after_landing()
             scanning.follow_intent()
             if self.is_progressing:
@@ -156,9 +156,9 @@ class Daemon:
     @property
     def is_progressing(self) -> bool:
         """False for a hang that only a restart ends; a camera that gives nothing is none."""
-        most_s = HUNG_S if self.scanning.is_warm else COMPILING_S
+        max_s = HUNG_S if self.scanning.is_warm else COMPILING_S
         return (
-            self.scanning.busy_s < most_s
+            self.scanning.busy_s < max_s
             and self.scanning.idle_closing_s < self._max_closing_s
             and self.vehicle.is_serving
         )
@@ -241,7 +241,7 @@ class Daemon:
             log.warning("%s: another service scans to it; earlier scans are left alone", folder)
         self.scanning.offer_backlog()
 
-    def _tidy(self) -> None:
+    def _housekeeping(self) -> None:
         """Watch the machine, do less when it cannot keep up, keep room on the disk."""
         if self._quit.is_set():
             return
@@ -261,7 +261,7 @@ class Daemon:
             return Health.CRITICAL
         return Health.ACTIVE if self.scanning.phase is not Phase.IDLE else Health.STANDBY
 
-    def _tell_of_camera(self) -> None:
+    def _report_camera(self) -> None:
         """Say why the scan does not grow, and when it does again."""
         for text in self.scanning.camera_news():
             self.vehicle.statustext(f"Camera: {text}", WARNING)

@@ -48,7 +48,7 @@ class ScanRun:
         self._host, self._is_asked = host, is_asked
         self._store: ScanStore | None = None
         self._thread_id = 0
-        self._news_told = 0  # of the camera's warnings
+        self._news_reported = 0  # of the camera's warnings
 
     @property
     def is_ending(self) -> bool:
@@ -78,8 +78,8 @@ class ScanRun:
         gate = self.gate
         if gate is None or self.is_ending:
             return []
-        fresh = gate.warnings[self._news_told :]
-        self._news_told += len(fresh)
+        fresh = gate.warnings[self._news_reported :]
+        self._news_reported += len(fresh)
         return fresh
 
     def closing_marks(self) -> tuple[Any, ...]:
@@ -133,7 +133,7 @@ class ScanRun:
         for text in disagreement(inputs.unix_offset_ns):
             gate.warnings.append(text)
             host.vehicle.statustext(text, WARNING)
-        self._news_told = len(gate.warnings)
+        self._news_reported = len(gate.warnings)
         host.vehicle.record(inputs.folder / "link.tlog", inputs.unix_offset_ns)
         host.link.take_off(store, host.config, host.vehicle)
         self._store, self.gate, self.scan = store, gate, Scan(inputs, store)
@@ -217,7 +217,7 @@ class ScanRun:
     def _on_keyframe(self, keyframe: Keyframe) -> None:
         scan = self.scan
         if scan is not None:
-            tell_keyframe(self._host.vehicle, scan, keyframe)
+            report_keyframe(self._host.vehicle, scan, keyframe)
 
 
 def _zero_ns(source: CameraSource) -> int:
@@ -237,7 +237,7 @@ def odometry_reporter(
     return OdometryReport(config.camera, vehicle.report_odometry).tell
 
 
-def tell_keyframe(vehicle: VehicleLink, scan: Scan, keyframe: Keyframe) -> None:
+def report_keyframe(vehicle: VehicleLink, scan: Scan, keyframe: Keyframe) -> None:
     """Tell ground stations of a keyframe, at the pose that it has now."""
     from service.flight.vehicle_reports import keyframe_report
 

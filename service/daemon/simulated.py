@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 OPERATOR = "udpout:127.0.0.1:14550"
 """Where ``skyrelief ctl`` and ground stations listen by default."""
 LOOK_S = 0.5
-TELL_EVERY = 25  # frames between two lines of progress
+REPORT_EVERY = 25  # frames between two lines of progress
 
 
 class SimulatedFlight:
@@ -139,8 +139,8 @@ def _render(folder: Path, given: dict[str, str]) -> None:
         raise InputError(f"camera.source sim: {error}") from error
     notifier = Notifier()
 
-    def tell(done: int, total: int) -> None:
-        if done % TELL_EVERY == 0 or done == total:
+    def report(done: int, total: int) -> None:
+        if done % REPORT_EVERY == 0 or done == total:
             log.info("rendering the simulated flight: frame %d of %d", done, total)
             notifier.closing()  # systemd waits for it
 
@@ -148,7 +148,7 @@ def _render(folder: Path, given: dict[str, str]) -> None:
     try:
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
-        recording.write(simulation, part, tell)
+        recording.write(simulation, part, report)
         part.rename(folder)
     except OSError as error:
         raise OutsideError(f"{folder} cannot be written: {error.strerror or error}") from error

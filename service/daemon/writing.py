@@ -73,9 +73,9 @@ class Writing:
 class Writings:
     """All files that are being written, of the last scan and of those before it."""
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        """``tell`` gets what the operator should know of files that no scan waited for."""
-        self._tell = tell
+    def __init__(self, report: Callable[[str], None]) -> None:
+        """``report`` gets what the operator should know of files that no scan waited for."""
+        self._report = report
         self._all: list[Writing] = []
 
     def __len__(self) -> int:
@@ -121,7 +121,7 @@ class Writings:
         self._all.remove(writing)
         answer = ACCEPTED
         if writing.fault:
-            self._tell(f"Scan {writing.name} is kept, its files are not written: {writing.fault}")
+            self._report(f"Scan {writing.name} is kept, its files are not written: {writing.fault}")
             answer = Answer(Result.FAILED, writing.fault)
         if writing.work is not None:
             writing.work.finish(answer)

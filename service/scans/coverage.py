@@ -41,7 +41,7 @@ from service.workers import PROCESS, Worker
 
 log = logging.getLogger(__name__)
 
-PICTURE, FIGURES = "coverage.png", "coverage.json"
+IMAGE, FIGURES = "coverage.png", "coverage.json"
 MIN_VIEWS = 3
 """Pictures of a place below which it counts as weak: two alone can agree on what is wrong."""
 
@@ -65,8 +65,8 @@ WRITE_EVERY_S = 15.0
 class Limits:
     """What counts as weak."""
 
-    least_views: int
-    most_sigma_m: float
+    min_views: int
+    max_sigma_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class Coverage:
     @cached_property
     def weak(self) -> Array:
         """(rows, cols) bool: cells worth flying over again."""
-        return self.layer.weak(self.limits.least_views, self.limits.most_sigma_m)
+        return self.layer.weak(self.limits.min_views, self.limits.max_sigma_m)
 
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:
@@ -120,24 +120,24 @@ class Coverage:
             "views_median": float(np.median(views)) if len(views) else 0.0,
             "sigma_median_m": round(float(np.median(sigma)), 4) if some else None,
             "sigma_90_percent_m": round(float(np.percentile(sigma, 90)), 4) if some else None,
-            "least_views": self.limits.least_views,
-            "most_sigma_m": round(self.limits.most_sigma_m, 4),
+            "least_views": self.limits.min_views,
+            "most_sigma_m": round(self.limits.max_sigma_m, 4),
             "legend": LEGEND,
         }
 
-    def picture(self) -> U8:
+    def image(self) -> U8:
         """(rows, cols, 4) BGRA, north up: what is weak and why; clear where nobody flew."""
         layer, limits = self.layer, self.limits
         out = np.zeros((*layer.grid.shape, 4), np.uint8)
         known, inside = layer.known, layer.inside
         with np.errstate(invalid="ignore"):
-            share = np.clip(layer.sigma_m / max(limits.most_sigma_m, 1e-6), 0.0, 1.0)
+            share = np.clip(layer.sigma_m / max(limits.max_sigma_m, 1e-6), 0.0, 1.0)
         share = np.nan_to_num(share, nan=1.0)[..., None]
         shade = np.array(BEST) * (1 - share) + np.array(USUAL) * share
         out[..., :3] = np.where(known[..., None], shade, 0).astype(np.uint8)
         for cells, colour in (
-            (layer.unsure(limits.most_sigma_m), UNSURE),
-            (layer.seldom(limits.least_views), SELDOM),
+            (layer.unsure(limits.max_sigma_m), UNSURE),
+            (layer.seldom(limits.min_views), SELDOM),
             (layer.gaps, GAP),
         ):
             out[cells, :3] = colour
@@ -146,7 +146,7 @@ class Coverage:
 
     def png_bytes(self) -> bytes:
         """The picture as PNG with its alpha, a pixel per cell (fewer where it is very large)."""
-        image = self.picture()
+        image = self.image()
         step = -(-max(image.shape[:2]) // LARGEST_PX)
         return cv2.imencode(".png", np.ascontiguousarray(image[::step, ::step]))[1].tobytes()
 
@@ -238,7 +238,7 @@ def write_coverage_files(folder: Path, store: ScanStore) -> Coverage | None:
 
 
 def _write(folder: Path, found: Coverage) -> None:
-    with writing(folder / PICTURE) as part:
+    with writing(folder / IMAGE) as part:
         part.write_bytes(found.png_bytes())
     with writing(folder / FIGURES) as part:
         part.write_bytes(found.json_bytes())
@@ -273,13 +273,13 @@ class CoverageWriter:
 
 
 class LiveCoverages:
-    """The layers of scans that people look at, each refreshed at most every ``least_s``.
+    """Coverage of the scans viewed last; each is refreshed once it is older than ``min_age_s``.
 
-    For a server: safe between threads; keeps the ``most`` scans looked at last.
+    Thread-safe; keeps the ``max_scans`` scans viewed last.
     """
 
-    def __init__(self, least_s: float = 3.0, most: int = 4) -> None:
-        self._least_s, self._most = least_s, most
+    def __init__(self, min_age_s: float = 3.0, max_scans: int = 4) -> None:
+        self._min_age_s, self._max_scans = min_age_s, max_scans
         self._lock = threading.Lock()
         self._kept: OrderedDict[Path, tuple[LiveCoverage, ScanStore, float, Coverage | None]] = (
             OrderedDict()
@@ -296,10 +296,10 @@ class LiveCoverages:
                 store = ScanStore.open(folder / "scan.db")
                 held = (LiveCoverage(store), store, -np.inf, None)
             live, store, then, found = held
-            if time.monotonic() - then >= self._least_s:
+            if time.monotonic() - then >= self._min_age_s:
                 found, then = live.refresh(), time.monotonic()
             self._kept[folder] = (live, store, then, found)
-            while len(self._kept) > self._most:
+            while len(self._kept) > self._max_scans:
                 self._kept.popitem(last=False)[1][1].close()
             return found
 

@@ -108,9 +108,9 @@ def _fit(panel: U8, largest_px: int) -> U8:
     h, w = panel.shape[:2]
     scale = _scale((h, w), largest_px)
     if scale >= 1.0:
-        return _at_least(panel.repeat(int(scale), axis=0).repeat(int(scale), axis=1))
+        return _padded_to(panel.repeat(int(scale), axis=0).repeat(int(scale), axis=1))
     size = (max(1, round(w * scale)), max(1, round(h * scale)))
-    return _at_least(np.asarray(cv2.resize(panel, size, interpolation=cv2.INTER_AREA), np.uint8))
+    return _padded_to(np.asarray(cv2.resize(panel, size, interpolation=cv2.INTER_AREA), np.uint8))
 
 
 def _scale(shape: tuple[int, int], largest_px: int) -> float:
@@ -119,7 +119,7 @@ def _scale(shape: tuple[int, int], largest_px: int) -> float:
     return float(min(int(scale), 8)) if scale >= 1.0 else scale
 
 
-def _at_least(panel: U8, smallest_px: int = 160) -> U8:
+def _padded_to(panel: U8, smallest_px: int = 160) -> U8:
     """The panel with background to its right and below, so that the labels have room."""
     h, w = panel.shape[:2]
     if min(h, w) >= smallest_px:
@@ -178,13 +178,13 @@ def _text(image: U8, text: str, at: tuple[int, int], size: float) -> None:
     cv2.putText(image, text, at, FONT, size, INK, 1, cv2.LINE_AA)
 
 
-def _with_lines(picture: U8, lines: Sequence[str]) -> U8:
-    """The picture in a margin, wide enough for the lines of text below it."""
+def _with_lines(image: U8, lines: Sequence[str]) -> U8:
+    """The image in a margin, wide enough for the lines of text below it."""
     widest = max((cv2.getTextSize(t, FONT, 0.5, 1)[0][0] for t in lines), default=0)
-    h, w = picture.shape[:2]
+    h, w = image.shape[:2]
     size = (h + 2 * MARGIN + LINE_PX * len(lines) + 6, max(w, widest) + 2 * MARGIN, 3)
     out = np.full(size, BACKGROUND, np.uint8)
-    out[MARGIN : MARGIN + h, MARGIN : MARGIN + w] = picture
+    out[MARGIN : MARGIN + h, MARGIN : MARGIN + w] = image
     for n, text in enumerate(lines):
         at = (MARGIN, h + 2 * MARGIN + 10 + LINE_PX * n)
         cv2.putText(out, text, at, FONT, 0.5, INK, 1, cv2.LINE_AA)

@@ -23,7 +23,7 @@ from recon.types import PointCloud
 from service.errors import OutsideError, SkyreliefError
 from service.georeference import LocalFrame
 from service.redaction import public_configuration, redacted
-from service.scans.coverage import PICTURE as COVERAGE
+from service.scans.coverage import IMAGE as COVERAGE
 from service.scans.coverage import write_coverage_files
 from service.scans.drawing import blank_preview, draw_preview, middle_keyframe, stages
 from service.scans.fused_cloud import DEFAULT_VOXEL_M, FusedCloud, fused_cloud, write_laz
@@ -153,8 +153,8 @@ def _stages(folder: Path, store: ScanStore) -> bytes | None:
     keyframe = None if seq is None else store.keyframe(seq)
     if keyframe is None:
         return None
-    picture, _ = stages(folder, store.header.scan_id, keyframe)
-    return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
+    image, _ = stages(folder, store.header.scan_id, keyframe)
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
 
 
 def _resolution_m(header: ScanHeader) -> float | None:
@@ -166,17 +166,17 @@ def _resolution_m(header: ScanHeader) -> float | None:
     return float(value)
 
 
-def surface(fused: FusedCloud, most_cells: float = PREVIEW_CELLS) -> Raster | None:
+def surface(fused: FusedCloud, max_cells: float = PREVIEW_CELLS) -> Raster | None:
     """The upper surface in the scan's own ENU metres, or None without points.
 
-    Cells are the voxels, doubled until there are at most ``most_cells`` in the rectangle.
+    Cells are the voxels, doubled until there are at most ``max_cells`` in the rectangle.
     """
     if not len(fused.cloud):
         return None
     xy = fused.cloud.xyz_m[:, :2].astype(np.float64)
     cell = fused.voxel_m
     span = np.ptp(xy, axis=0)
-    while float(np.prod(span / cell + 2.0)) > most_cells:
+    while float(np.prod(span / cell + 2.0)) > max_cells:
         cell *= 2.0
     return rasterise(fused.cloud, grid_over(xy, cell, margin_cells=1))
 
@@ -260,12 +260,12 @@ def _preview(raster: Raster | None, poses: Sequence[PoseRecord], summary: dict[s
     """preview.jpg."""
     lines = _key_figures(summary)
     if raster is None:
-        picture = blank_preview(lines)
+        image = blank_preview(lines)
     else:
         track = np.array([p.T_world_camera[:3, 3] for p in poses]).reshape(-1, 3)
         zero = summary["origin"]["alt_amsl_m"] if summary["origin"] else 0.0
-        picture = draw_preview(raster, track, lines, height_of_zero_m=zero)
-    ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])
+        image = draw_preview(raster, track, lines, height_of_zero_m=zero)
+    ok, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])
     if not ok:
         raise OutsideError("preview.jpg: OpenCV cannot write JPEG on this machine")
     return data.tobytes()

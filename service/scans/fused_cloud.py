@@ -105,8 +105,8 @@ def _apart(summary: dict[str, Any]) -> list[tuple[int, int]]:
     return [(a, b) for a, b in pairs if isinstance(a, int) and isinstance(b, int)]
 
 
-def strip_edges(extents: Iterable[_Extent], most_points: int) -> list[float]:
-    """Edges in x, from -inf to inf, between which lie about ``most_points`` at most.
+def strip_edges(extents: Iterable[_Extent], max_points: int) -> list[float]:
+    """Edges in x, from -inf to inf, between which lie about ``max_points`` at most.
 
     A keyframe's points are taken as evenly spread over its width.
     """
@@ -117,7 +117,7 @@ def strip_edges(extents: Iterable[_Extent], most_points: int) -> list[float]:
     table: F64 = np.array(sorted(ends))
     x, density = table[:, 0], np.cumsum(table[:, 1])
     held = np.concatenate([[0.0], np.cumsum(density[:-1] * np.diff(x))])
-    count = max(1, int(np.ceil(held[-1] / most_points)))
+    count = max(1, int(np.ceil(held[-1] / max_points)))
     inner = np.interp(held[-1] * np.arange(1, count) / count, held, x)
     return [-np.inf, *(float(v) for v in inner), np.inf]
 

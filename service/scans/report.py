@@ -54,7 +54,7 @@ def report_html(
     parts = [
         f"<h1>{escape(summary['id'])}</h1>",
         _table(_flown(summary, poses)),
-        _picture(preview_jpg, "image/jpeg", "Colour and height from above, with the track."),
+        _figure(preview_jpg, "image/jpeg", "Colour and height from above, with the track."),
         "<h2>Coverage and accuracy</h2>",
         map_figure(summary, poses, coverage),
         _table([*_covered(coverage), *_accuracy(summary, raster)]),
@@ -76,11 +76,11 @@ def report_html(
     return f"{head}</title><style>{STYLE}</style><body>{''.join(parts)}</body></html>\n"
 
 
-def _stages(picture: bytes | None) -> list[str]:
-    if picture is None:
+def _stages(image: bytes | None) -> list[str]:
+    if image is None:
         return []
     words = "Stages of a keyframe in the middle; all of them with scan.keep_debug=true."
-    return ["<h2>A keyframe</h2>", _picture(picture, "image/jpeg", words)]
+    return ["<h2>A keyframe</h2>", _figure(image, "image/jpeg", words)]
 
 
 def _flown(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[tuple[str, str]]:
@@ -133,11 +133,11 @@ def sensor_constants(graph: dict[str, Any]) -> list[tuple[str, str]]:
     rows = []
     boresight, datum = graph.get("boresight"), graph.get("altitude_datum")
     if boresight is not None:
-        told = ("{:+.2f} +- {:.2f}".format(*pair) for pair in
+        offsets = ("{:+.2f} +- {:.2f}".format(*pair) for pair in
                 zip(boresight["deg"], boresight["sigma_deg"], strict=True))  # fmt: skip
         verdict = "taken out" if boresight["sure"] else "not sure, left alone"
         name = "boresight about right, down, ahead"
-        rows.append((name, f"{', '.join(told)} degrees: {verdict}"))
+        rows.append((name, f"{', '.join(offsets)} degrees: {verdict}"))
     if datum is not None and datum["shift_m"]:
         rows.append(("altitude raised to the receiver's", f"{datum['shift_m']:+.2f} m"))
     return rows
@@ -170,7 +170,7 @@ def _maps(cloud: PointCloud, raster: Raster | None) -> list[str]:
     ):
         panel = coloured(title, values, unit, colours)
         caption = panel.title.rpartition(",")[0] or panel.title
-        out.append(_picture(_png(panel.image), "image/png", caption + ", dark to light."))
+        out.append(_figure(_png(panel.image), "image/png", caption + ", dark to light."))
     return out
 
 
@@ -237,7 +237,7 @@ def _table(rows: Sequence[tuple[str, str]]) -> str:
     return rows_table((), rows)
 
 
-def _picture(data: bytes, kind: str, caption: str) -> str:
+def _figure(data: bytes, kind: str, caption: str) -> str:
     code = base64.b64encode(data).decode("ascii")
     image = f'<img alt="" src="data:{kind};base64,{code}">'
     return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"

@@ -150,9 +150,9 @@ class RateEstimate:
             self._knee = self.configured_bytes_s
         else:
             self._lost_at_fall = lost
-            least = self.FLOOR * self.configured_bytes_s
+            floor = self.FLOOR * self.configured_bytes_s
             through = max(self._through)
-            self._knee = max(least, 0.9 * through)
-            self.rate_bytes_s = max(least, min(self.rate_bytes_s, self.FALL * through))
+            self._knee = max(floor, 0.9 * through)
+            self.rate_bytes_s = max(floor, min(self.rate_bytes_s, self.FALL * through))
         self._totals.clear()
         self._rest, self._bad = self.REST, 0

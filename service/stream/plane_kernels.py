@@ -10,14 +10,14 @@ from recon.types import F32, U8, Bool
 
 @numba.njit(cache=True, nogil=True)
 def span(depth: F32, known: Bool) -> tuple[float, float]:
-    """The least and the greatest of the known depths."""
-    least, greatest = np.float32(np.inf), np.float32(0.0)
+    """The minimum and the maximum of the known depths."""
+    low, high = np.float32(np.inf), np.float32(0.0)
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             if known[v, u]:
-                least = min(least, depth[v, u])
-                greatest = max(greatest, depth[v, u])
-    return float(least), float(greatest)
+                low = min(low, depth[v, u])
+                high = max(high, depth[v, u])
+    return float(low), float(high)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -90,8 +90,8 @@ def block_means(sigma: F32, block: int) -> F32:
 
 
 @numba.njit(cache=True, nogil=True)
-def block_min(views: U8, known: Bool, block: int, most: int) -> U8:
-    """The least known value in each block, 1 to ``most``; 255 where there is none."""
+def block_min(views: U8, known: Bool, block: int, max_value: int) -> U8:
+    """The minimum known value in each block, 1 to ``max_value``; 255 where there is none."""
     h, w = views.shape
     rows, columns = -(-h // block), -(-w // block)
     out = np.full((rows, columns), 255, np.uint8)
@@ -103,10 +103,10 @@ def block_min(views: U8, known: Bool, block: int, most: int) -> U8:
                 value = views[v, u] if known[v, u] else np.uint8(255)
                 line[u] = min(line[u], value)
         for column in range(columns):
-            least = np.uint8(255)
+            low = np.uint8(255)
             for u in range(column * block, min(w, (column + 1) * block)):
-                least = min(least, line[u])
-            out[row, column] = least if least == 255 else min(max(least, 1), most)
+                low = min(low, line[u])
+            out[row, column] = low if low == 255 else min(max(low, 1), max_value)
     return out
 
 

@@ -123,12 +123,12 @@ def quantise(planes: Planes, step: float) -> tuple[U16, float, float]:
 
 
 def encode_depth(codes: U16, known: Bool, method: int) -> bytes:
-    """The codes by prediction, or as one JPEG-LS picture (8 bits deep when they fit)."""
+    """The codes by prediction, or as one JPEG-LS image (8 bits deep when they fit)."""
     if method == METHOD_PREDICTION:
         return plane_coders.encode_codes(codes, known)
     codes = _fill_back(codes, known)
-    picture = codes.astype(np.uint8) if codes.max() < 256 else codes
-    return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(picture)))
+    image = codes.astype(np.uint8) if codes.max() < 256 else codes
+    return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(image)))
 
 
 def decode_depth(data: bytes, known: Bool, method: int, low: float, step: float) -> F32 | None:
@@ -175,8 +175,8 @@ def decode_sigma(data: bytes, w: int, h: int) -> F32 | None:
 
 def encode_views(planes: Planes) -> bytes:
     """The section of views: one count per block of VIEWS_BLOCK_PX, at most MAX_VIEWS."""
-    least = plane_kernels.block_min(planes.views, planes.known, VIEWS_BLOCK_PX, MAX_VIEWS)
-    return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(_fill_back(least, least != 255))))
+    low = plane_kernels.block_min(planes.views, planes.known, VIEWS_BLOCK_PX, MAX_VIEWS)
+    return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(_fill_back(low, low != 255))))
 
 
 def decode_views(data: bytes, w: int, h: int) -> U8 | None:
@@ -195,14 +195,14 @@ def decode_views(data: bytes, w: int, h: int) -> U8 | None:
 def encode_colour(planes: Planes, quality: int) -> bytes:
     """The box as a JPEG; blocks without known pixels are flat, so they cost next to nothing."""
     whole = planes.known.all()
-    picture = planes.bgr if whole else plane_kernels.calm(planes.bgr, planes.known, MCU_PX)
+    image = planes.bgr if whole else plane_kernels.calm(planes.bgr, planes.known, MCU_PX)
     ok, data = cv2.imencode(
         ".jpg",
-        np.ascontiguousarray(picture),
+        np.ascontiguousarray(image),
         [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1],
     )
     if not ok:
-        raise ValueError(f"JPEG refused a picture of shape {picture.shape}")
+        raise ValueError(f"JPEG refused a image of shape {image.shape}")
     return data.tobytes()
 
 
@@ -211,12 +211,12 @@ def decode_colour(data: bytes, w: int, h: int) -> U8 | None:
     if image_size(data) != (w, h):
         return None
     try:
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error:
         return None
-    if picture is None or picture.shape != (h, w, 3):
+    if image is None or image.shape != (h, w, 3):
         return None
-    return np.asarray(picture, np.uint8)
+    return np.asarray(image, np.uint8)
 
 
 def _enlarge(blocks: Array, factor: int, w: int, h: int) -> Array:

@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 
 STILLS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm")
 VIDEO_STEP_S = 0.4
-MOST_VIEWS = 80
+MAX_VIEWS = 80
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +49,7 @@ def find_boards(sources: Sequence[Path], board: Board) -> BoardSet:
             missed.append((name, f"no board of {board.columns}x{board.rows} inner corners"))
         elif _is_repeat(corners, views, size):
             missed.append((name, "shows the board where another view has it"))
-        elif len(views) < MOST_VIEWS:
+        elif len(views) < MAX_VIEWS:
             views.append(BoardView(name, corners))
     if size is None:
         raise InputError(f"no readable picture in {', '.join(str(s) for s in sources)}")
