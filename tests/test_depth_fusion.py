@@ -49,7 +49,33 @@ def test_what_no_pair_knows_stays_unknown_and_single_views_are_marked() -> None:
     assert np.isnan(fused.depth_m[:20, :40]).all() and (fused.views[:20, :40] == 0).all()
     assert (fused.views[:20, 40:] == 1).all()
     single, double = fused.sigma_m[:20, 40:], fused.sigma_m[20:, 40:]
-    assert np.median(single) > 1.6 * np.median(double)
+    assert np.median(single) > 1.6 * np.nanmedian(double)  # few pixels: the two disagree
+
+
+def test_readings_that_contradict_each_other_are_dropped() -> None:
+    rng = np.random.default_rng(3)
+    truth = np.full(SHAPE, 60.0, np.float32)
+    a, b = reading(rng, truth, 0.3), reading(rng, truth, 0.3)
+    b.depth_m[:, :10] += 12.0
+    fused = fuse([a, b], K, np.eye(4), FusionConfig())
+    assert np.isnan(fused.depth_m[:, :10]).all() and np.isnan(fused.sigma_m[:, :10]).all()
+    assert (fused.views[:, :10] == 0).all()
+    assert np.isfinite(fused.depth_m[:, 10:]).mean() > 0.97
+
+
+def test_pairs_that_mostly_contradict_each_other_give_nothing() -> None:
+    """Water: each pair finds some depth, and no two the same. What one pair alone saw goes too."""
+    rng = np.random.default_rng(4)
+    truth = np.full(SHAPE, 60.0, np.float32)
+    pairs = [reading(rng, truth + 12.0 * n, 0.3) for n in range(3)]
+    for pair in pairs:
+        pair.depth_m[:, :20] = 60.0
+    pairs[0].depth_m[:5] = pairs[1].depth_m[:5] = np.nan
+    fused = fuse(pairs, K, np.eye(4), FusionConfig())
+    assert np.isnan(fused.depth_m).all() and np.isnan(fused.sigma_m).all()
+    assert (fused.views == 0).all()
+    few = fuse(pairs[2:], K, np.eye(4), FusionConfig())
+    assert np.isfinite(few.depth_m).all()  # one pair contradicts nobody
 
 
 def test_useless_readings_are_left_out() -> None:

@@ -274,7 +274,8 @@ def _label(
 def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Tensor, Tensor]:
     """Depth, sigma and number of views (h, w) float32 of pairs (P, h, w); no view: NaN.
 
-    As :func:`recon.stereo.reprojection.fuse`: inverse depth of the largest group that agrees.
+    As :func:`recon.stereo.reprojection.fuse`: inverse depth of the largest group that agrees,
+    nothing where several pairs read and no two agree.
     """
     z, e = depth.double(), sigma.double()
     usable = (z > 0) & (e < config.most_sigma_share * z)
@@ -285,7 +286,9 @@ def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Te
     member = usable & ((inverse - centre).abs() <= limit)
     weight = torch.where(member, 1 / s**2, 0.0)
     views = member.sum(0)
-    seen = views > 0
+    contradicted = (views == 1) & (usable.sum(0) > 1)
+    refuted = contradicted.sum() > (views >= 2).sum()
+    seen = (views > 0) & ~contradicted & ~refuted
     total = torch.where(seen, weight.sum(0), 1.0)
     mean = (weight * inverse).sum(0) / total
     scatter = (weight * (inverse - mean) ** 2).sum(0)
@@ -297,7 +300,7 @@ def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Te
     return (
         torch.where(seen, fused, nan).float(),
         torch.where(seen, error, nan).float(),
-        views.float(),
+        torch.where(seen, views, 0).float(),
     )
 
 

@@ -133,7 +133,9 @@ def fuse(pairs: Sequence[PairDepth], K: F64, T_world_camera: F64, config: Fusion
 
     The mean is over inverse depth (whose error is nearly Gaussian) with weights 1/sigma^2;
     the sigma is the larger of the propagated one and the spread inside the group. ``views``
-    counts the group. Raises ValueError without any pair.
+    counts the group. Where several pairs read and no two agree nothing is known; where that is
+    so at more pixels than those at which two agree, what they see is no rigid surface, or their
+    motion is false, and the whole map is unknown. Raises ValueError without any pair.
     """
     if not pairs:
         raise ValueError("no stereo pair to fuse")
@@ -148,6 +150,11 @@ def fuse(pairs: Sequence[PairDepth], K: F64, T_world_camera: F64, config: Fusion
         depth, sigma, config.agree_sigmas, config.single_view_sigma, config.most_sigma_share,
         config.least_sigma_share, out.depth_m, out.sigma_m, out.views,
     )  # fmt: skip
+    contradicted = np.isnan(out.depth_m) & (out.views > 0)
+    refuted = np.count_nonzero(contradicted) > np.count_nonzero(out.views >= 2)
+    out.views[contradicted | refuted] = 0
+    if refuted:
+        out.depth_m[:] = out.sigma_m[:] = np.nan
     return out
 
 
@@ -206,6 +213,9 @@ def _fuse(
                     total += weight
                     mean += weight * w[p]
                     views += 1
+            out_views[v, u] = views
+            if views == 1 and count > 1:
+                continue
             mean /= total
             spread = 0.0
             for p in range(count):
@@ -217,4 +227,3 @@ def _fuse(
             e = np.sqrt(variance) * z * z * (single_view if views == 1 else 1.0)
             out_depth[v, u] = z
             out_sigma[v, u] = max(e, least_share * z)
-            out_views[v, u] = views

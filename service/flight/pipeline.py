@@ -73,6 +73,7 @@ class Pipeline:
                 disparity = s.upsample(disparity, pair)  # joint bilateral upsampling, Eq. 2
                 depths.append(s.reproject(disparity, pair, grid))  # Eq. 3
             depth = s.fuse(depths, grid)
+        depth = s.plausible(view, depth)  # nothing that cannot be
         s.rectify.learn(depth)  # how far the relief of the next pairs may reach
         motion = s.register(view, depth)  # ICP onto the keyframe before
         placed = s.chain.add(view, motion, depth)  # pose graph

@@ -16,6 +16,7 @@ from recon import se3
 from recon.backends import Backend, DenseStages, PathBackend
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
+from recon.mapping.plausibility import plausible
 from recon.mapping.registration import IcpConfig
 from recon.posegraph.interpolated import KEYFRAME
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
@@ -240,6 +241,20 @@ def by_stages(pairs: Sequence[StereoPair], grid: Grid) -> None:
     """No device does the whole path."""
 
 
+class Plausible:
+    """Drops the depth that a view cannot have seen."""
+
+    def __init__(self, rejected: Counter[str]) -> None:
+        self._rejected = rejected
+
+    def __call__(self, view: StereoCandidate, depth: DepthMap | None) -> DepthMap | None:
+        """What is left of ``depth``; None where there is nothing."""
+        kept = None if depth is None else plausible(depth, view.prior)
+        if depth is not None and kept is None:
+            self._rejected["pairs contradict each other"] += 1
+        return kept
+
+
 class Register:
     """ICP of each view's depth onto that of the keyframe before."""
 
@@ -303,6 +318,7 @@ class Stages:
     upsample: Callable[[DisparityMap, StereoPair], DisparityMap]
     reproject: Callable[[DisparityMap, StereoPair, Grid], PairDepth]
     fuse: Callable[[Sequence[PairDepth], Grid], DepthMap]
+    plausible: Plausible
     register: Register
     chain: Chain
     map: SurfaceMap
@@ -373,6 +389,7 @@ def build_stages(
         upsample=pair.upsample,
         reproject=pair.reproject,
         fuse=pair.fuse,
+        plausible=Plausible(rejected),
         register=Register(backend, stopwatch),
         chain=_chain(config, pages, track.is_settled, rejected, stopwatch, resources),
         map=SurfaceMap(pages, compute.map_voxels, config.scan.resolution_m, stopwatch),

@@ -1,0 +1,50 @@
+"""What a camera cannot have seen."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
+from recon.mapping.plausibility import plausible
+from recon.types import F64, U8, DepthMap, PosePrior
+
+K = np.array([[100.0, 0, 59.5], [0, 100.0, 39.5], [0, 0, 1]])
+SHAPE = (80, 120)
+
+
+def surface(views: U8) -> DepthMap:
+    depth = np.where(views > 0, 50.0, np.nan).astype(np.float32)
+    return DepthMap(depth, 0.01 * depth, views, K, np.eye(4))
+
+
+def looking(pitch_deg: float) -> F64:
+    R = rotation_from_rpy(0.0, np.radians(pitch_deg), 0.7)
+    return np.asarray(R_ENU_NED @ R @ R_GIMBAL_CAMERA)
+
+
+def test_above_the_horizon_one_pair_alone_says_nothing() -> None:
+    """The camera looks 10 degrees down: the horizon lies 17.6 rows above the middle."""
+    views = np.full(SHAPE, 1, np.uint8)
+    views[:, :30] = 2
+    kept = plausible(surface(views), PosePrior(looking(-10.0), sigma_tilt_rad=0.0))
+    assert kept is not None
+    known = np.isfinite(kept.depth_m)
+    assert known[:, :30].all() and (kept.views[:, :30] == 2).all()
+    horizon = 39.5 - 100.0 * np.tan(np.radians(10.0))
+    np.testing.assert_array_equal(known[:, 30:].all(axis=1), np.arange(80) > horizon)
+    np.testing.assert_array_equal(known, kept.views > 0)
+    np.testing.assert_array_equal(known, np.isfinite(kept.sigma_m))
+
+
+def test_what_may_lie_below_the_horizon_is_kept() -> None:
+    alone = surface(np.ones(SHAPE, np.uint8))
+    unsure = PosePrior(looking(-10.0), sigma_tilt_rad=np.radians(6.1))  # 22 degrees in view, 2 sigma
+    assert plausible(alone, PosePrior(looking(-90.0))) is alone
+    assert plausible(alone, PosePrior()) is alone
+    kept = plausible(alone, unsure)
+    assert kept is not None and np.isfinite(kept.depth_m).mean() > 0.9
+
+
+def test_nothing_left_is_no_depth() -> None:
+    assert plausible(surface(np.zeros(SHAPE, np.uint8)), PosePrior()) is None
+    assert plausible(surface(np.ones(SHAPE, np.uint8)), PosePrior(looking(60.0), 0.0)) is None
