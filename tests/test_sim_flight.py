@@ -60,6 +60,15 @@ def test_motion_is_smooth_and_of_the_asked_speed(pattern: str) -> None:
     assert np.abs(np.gradient(flight.course(t), t)).max() < np.radians(120)
 
 
+def test_a_climb_ends_as_much_higher() -> None:
+    flight = fly(FlightPlan(duration_s=20.0, height_m=40.0, climb_m=-15.0, sway_m=0.0), 1)
+    height = flight.position(np.array([0.0, 10.0, 20.0]))[:, 2]
+    np.testing.assert_allclose(height, [40.0, 32.5, 25.0], atol=0.6)
+    assert flight.plan.lowest_m == 25.0 and flight.plan.highest_m == 40.0
+    with pytest.raises(ValueError, match="climb"):
+        FlightPlan(height_m=10.0, climb_m=-9.0)
+
+
 def test_legs_are_parallel_and_spaced() -> None:
     plan = still(pattern="legs", legs=3, spacing_m=20.0, duration_s=90.0, heading_deg=0.0)
     x = fly(plan, 1).position(seconds(90.0, 0.1))[:, 0]

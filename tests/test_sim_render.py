@@ -188,3 +188,19 @@ def test_noise_is_uniform_normal_and_does_not_repeat() -> None:
     spectrum = np.fft.rfft(line, 8000)
     correlation = np.fft.irfft(np.abs(spectrum) ** 2)[:3000]
     assert correlation[100:].max() < 0.35 * correlation[0]
+
+
+def test_water_covers_what_lies_below_it_and_never_holds_still() -> None:
+    """A level look: the horizon crosses the middle, with sky above and waves below."""
+    level = looking_down(0.0, 0.0, 30.0)
+    level[:3, :3] = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # to the north
+    wet = Look(noise=0.0, vignette=0.0, water_m=20.0)
+    early, later = (renderer().frame(level, 0, wet, t).astype(int) for t in (0.0, 1.0))
+    assert np.array_equal(early, renderer().frame(level, 7, wet, 0.0))
+    assert early[:80].min() > 150 and early[140:, :, 2].max() < 150  # bright sky, dark sea
+    assert np.abs(later - early)[140:].mean() > 3.0
+    shallow = looking_down(0.0, 0.0, 40.0)
+    covered = np.isnan(renderer().depth(shallow, 20.0))
+    ground = 40.0 - renderer().depth(shallow)  # the height of what is seen
+    np.testing.assert_array_equal(covered, ~(ground >= 20.0))
+    assert np.isfinite(renderer().depth(shallow, -20.0)).all()

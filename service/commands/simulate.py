@@ -37,7 +37,11 @@ def simulate(
     distortion: Annotated[bool, typer.Option(help="Barrel distortion of the lens.")] = True,
     wobble_deg: Annotated[float, typer.Option(help="Unsteadiness of the gimbal.")] = 1.0,
     sway_m: Annotated[float, typer.Option(help="Unsteadiness of the path.")] = 0.15,
+    climb_m: Annotated[float, typer.Option(help="Higher at the end than at the start.")] = 0.0,
     relief_m: Annotated[float, typer.Option(help="Height of the hills; 0 is flat.")] = 8.0,
+    water_m: Annotated[
+        float | None, typer.Option(help="Level of a sea with waves, above the origin's ground.")
+    ] = None,
     density: Annotated[float, typer.Option(help="Houses and trees; 0 is open country.")] = 1.0,
     photos: Annotated[Path | None, typer.Option(help="Aerial photos as the ground.")] = None,
     gps_noise_m: Annotated[float, typer.Option(help="Wander of the GPS.")] = 1.0,
@@ -90,7 +94,7 @@ def simulate(
         options = recording.SimulationOptions(
             FlightPlan(
                 pattern, duration_s, height_m, speed_m_s, heading_deg, camera_pitch_deg, legs,
-                spacing_m, wobble_deg, sway_m,
+                spacing_m, wobble_deg, sway_m, climb_m,
             ),
             SensorNoise.of(
                 gnss_noise,
@@ -104,7 +108,7 @@ def simulate(
                 _pair(telemetry_gap, "--telemetry-gap") if telemetry_gap else None, log_lead_s,
                 _pair(boresight_deg, "--boresight-deg"), gnss_accuracy, home_above_m,
             ),
-            Look(noise=image_noise),
+            Look(noise=image_noise, water_m=water_m),
             recording.Faults(
                 tuple((int(a), int(b)) for a, b in (_pair(v, "--blank") for v in blank or [])),
                 tuple(sorted(_pair(v, "--exposure") for v in exposure or [])),

@@ -33,6 +33,7 @@ class FlightPlan:
     spacing_m: float | None = None  # between legs; None: 0.45 of the height
     wobble_deg: float = 1.0  # of the stabilised camera, 1 sigma per axis
     sway_m: float = 0.15  # of the position about the path, 1 sigma per axis
+    climb_m: float = 0.0  # higher at the end than at the start, evenly
 
     def __post_init__(self) -> None:
         if self.pattern not in PATTERNS:
@@ -51,6 +52,18 @@ class FlightPlan:
             raise ValueError(f"camera pitch of {self.pitch_deg:g} deg is not within -90 to 0")
         if not (0 <= self.wobble_deg <= 20 and 0 <= self.sway_m <= 5):
             raise ValueError("wobble must be 0 to 20 deg and sway 0 to 5 m")
+        if not 2.0 <= self.lowest_m <= self.highest_m <= 1000:
+            raise ValueError(f"climb of {self.climb_m:g} m does not end within 2 to 1000 m")
+
+    @property
+    def lowest_m(self) -> float:
+        """The height at the lower end of the flight."""
+        return min(self.height_m, self.height_m + self.climb_m)
+
+    @property
+    def highest_m(self) -> float:
+        """The height at the higher end of the flight."""
+        return max(self.height_m, self.height_m + self.climb_m)
 
     @property
     def pitch_deg(self) -> float:
@@ -138,7 +151,9 @@ def fly(plan: FlightPlan, seed: int) -> Flight:
     else:
         xy, yaw = _follow(_waypoints(plan, heading), plan.speed_m_s, t, heading)
     sway = plan.sway_m * Waves.draw(rng, 3, 0.05, 0.25).at(t)
-    xyz = np.column_stack([xy, np.full(len(t), plan.height_m)]) + sway
+    z = plan.height_m + plan.climb_m * np.clip(t / plan.duration_s, 0.0, 1.0)
+    z = gaussian_filter1d(z, 0.9 / STEP_S, mode="nearest")
+    xyz = np.column_stack([xy, z]) + sway
     wobble, shake = Waves.draw(rng, 3, 0.08, 0.7), Waves.draw(rng, 3, 0.15, 1.2)
     return Flight(plan, CubicSpline(t, xyz), CubicSpline(t, yaw), wobble, shake)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 from fractions import Fraction
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 
 import av
 import numpy as np
+import numpy.typing as npt
 
 from recon.se3 import quaternion_from_rotation
 from recon.types import F64, U8, Camera
@@ -119,8 +120,8 @@ class Simulation:
         for start, factor in options.faults.exposure:
             if self.times_s[index] >= start:
                 gain = factor
-        look = Look(options.look.noise, options.look.vignette, gain)
-        return self.renderer.frame(self.poses[index], index, look)
+        look = replace(options.look, exposure=gain)
+        return self.renderer.frame(self.poses[index], index, look, float(self.times_s[index]))
 
     def surface_range(self, origins: F64, directions: F64) -> F64:
         """(N,) metres from (N, 3) places along (N, 3) unit directions to the first surface.
@@ -147,7 +148,7 @@ def prepare(options: SimulationOptions) -> Simulation:
     times = np.arange(options.frames) / options.fps
     poses = flight.T_world_camera(times)
     area = _area(flight, options)
-    texel = 0.75 * options.plan.height_m / options.camera.K[0, 0]
+    texel = 0.75 * options.plan.lowest_m / options.camera.K[0, 0]
     texel = max(texel, float(np.sqrt(area.size_m[0] * area.size_m[1] / LARGEST_TEXELS)))
     if area.size_m[0] * area.size_m[1] > 25e6:
         raise ValueError(
@@ -172,7 +173,7 @@ def _area(flight: Flight, options: SimulationOptions) -> Area:
     diagonal = np.arctan(0.55 * np.hypot(W, H) / (options.focal_share * W))
     tilt = np.radians(90.0 + plan.pitch_deg)
     steepest = min(tilt + diagonal + np.radians(3.0 * plan.wobble_deg), np.radians(74.0))
-    reach = (plan.height_m + options.relief_m) * np.tan(steepest) + 12.0
+    reach = (plan.highest_m + options.relief_m) * np.tan(steepest) + 12.0
     low, high = xy.min(axis=0) - reach, xy.max(axis=0) + reach
     return Area(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
 
@@ -212,7 +213,7 @@ def _write_truth(simulation: Simulation, truth: Path) -> None:
     """Origin, surface, trajectory and some depth maps."""
     origin = {"lat_deg": ORIGIN.lat_deg, "lon_deg": ORIGIN.lon_deg, "alt_amsl_m": ORIGIN.alt_amsl_m}
     (truth / "origin.json").write_text(json.dumps(origin) + "\n")
-    write_surface(truth / "surface.ply", simulation.scene.vertices, simulation.scene.triangles)
+    write_surface(truth / "surface.ply", simulation.scene.vertices, _dry(simulation))
     with (truth / "trajectory.tum").open("w") as out:
         for t, T in zip(simulation.times_s, simulation.poses, strict=True):
             q = quaternion_from_rotation(T[:3, :3])
@@ -222,11 +223,20 @@ def _write_truth(simulation: Simulation, truth: Path) -> None:
     for k in np.unique(np.linspace(0, len(simulation.times_s) - 1, count).astype(int)):
         np.savez_compressed(
             truth / f"depth_{k:06d}.npz",
-            depth_m=simulation.renderer.depth(simulation.poses[k]),
+            depth_m=simulation.renderer.depth(simulation.poses[k], simulation.options.look.water_m),
             K=simulation.options.camera.K,
             T_world_camera=simulation.poses[k],
             time_unix_ns=np.int64(round((EPOCH_UNIX_S + simulation.times_s[k]) * 1e9)),
         )
+
+
+def _dry(simulation: Simulation) -> npt.NDArray[np.int32]:
+    """(M, 3) triangles of the place that reach out of the water."""
+    vertices, triangles = simulation.scene.vertices, simulation.scene.triangles
+    level = simulation.options.look.water_m
+    if level is None:
+        return triangles
+    return np.asarray(triangles[vertices[triangles, 2].max(axis=1) > level])
 
 
 def _parameters(simulation: Simulation, packet_count: int) -> dict[str, Any]:

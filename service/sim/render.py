@@ -16,6 +16,7 @@ from service.sim.noise import normal
 from service.sim.picture import AMBIENT, SUN_STRENGTH, Picture, crown_shade, wall_colour
 from service.sim.scene import Scene
 from service.sim.shapes import CROWN, TREE_B, TREE_SEED, WALL
+from service.sim.water import flood
 
 SKY = (225.0, 205.0, 185.0)
 
@@ -55,6 +56,7 @@ class Look:
     noise: float = 1.5  # sensor noise, gray levels, 1 sigma
     vignette: float = 0.12  # share of light lost in the corners
     exposure: float = 1.0  # gain
+    water_m: float | None = None  # level of a sea with waves and clouds; None: no water
 
 
 class Renderer:
@@ -71,8 +73,8 @@ class Renderer:
         self._blocks = scene.blocks if len(scene.blocks) else np.zeros((1, shapes.COLUMNS))
         self._trees = scene.trees if len(scene.trees) else np.zeros((1, 8))
 
-    def frame(self, T_world_camera: F64, index: int, look: Look) -> U8:
-        """(H, W, 3) BGR picture as the distorted camera takes it."""
+    def frame(self, T_world_camera: F64, index: int, look: Look, time_s: float = 0.0) -> U8:
+        """(H, W, 3) BGR picture as the distorted camera takes it; water moves with the time."""
         H, W = self.rays.shape[:2]
         colour = np.empty((H, W, 3), np.float32)
         depth = np.empty((H, W))
@@ -84,15 +86,19 @@ class Renderer:
         _smooth_edges(
             *self.scene.grid.arrays(), *tables, self.rays, R, c, focal, colour, depth, body
         )
+        if look.water_m is not None:
+            flood(colour, depth, self.rays, R, c, focal, look.water_m, time_s)
         out = np.empty((H, W, 3), np.uint8)
         _develop(colour, self.rays, look.noise, look.vignette, look.exposure, index, out)
         return out
 
-    def depth(self, T_world_camera: F64) -> F32:
-        """(H, W) depth along z of the camera without distortion; NaN where nothing is hit."""
+    def depth(self, T_world_camera: F64, water_m: float | None = None) -> F32:
+        """(H, W) depth along z of the camera without distortion; NaN in the sky and on water."""
         H, W = self._straight.shape[:2]
         directions = self._straight.reshape(-1, 3) @ T_world_camera[:3, :3].T
         t, _ = self.scene.grid.cast(T_world_camera[:3, 3], directions)
+        if water_m is not None:
+            t[T_world_camera[2, 3] + t * directions[:, 2] < water_m] = np.nan
         return np.asarray(t.reshape(H, W), np.float32)
 
     def _tables(self) -> tuple[object, ...]:
