@@ -55,7 +55,7 @@ def stereo_pair(height: int, width: int, labels: int, seed: int, guide: int = 4)
     return StereoPair(
         left=left,
         right=np.ascontiguousarray(canvas[:, 40 : 40 + width]),
-        baseline_m=4.0 + 0.2 * seed,
+        baseline_m=4.0,
         K=own,
         labels=labels,
         plane=np.array([0.01, -0.02, 8.0]),
