@@ -143,7 +143,11 @@ class ComputeConfig:
         "declares it",
     )
     threads: int = key(0, "threads of the CPU backend; 0: one per core")
-    stereo_width: int = key(320, "width of the stereo pair in pixels; the paper's is 320")
+    stereo_width: int = key(
+        320,
+        "width of the stereo pair in pixels; the paper's is 320. Where it is not set, a replay "
+        "that need not keep pace takes 640 of a recording that has as many",
+    )
     labels: int = key(16, "least number of disparity labels; the paper's is 16")
     iterations: int = key(5, "belief propagation's iterations per level; the paper's is 5")
     guide_width: int = key(1280, "width of the picture that guides the upsampling")
@@ -282,6 +286,14 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = (), only: s
     for override in overrides:
         config = _override(config, override)
     return config
+
+
+def is_given(name: str, path: Path | None, overrides: Sequence[str] = ()) -> bool:
+    """True where the file or an override sets ``section.key``, be it to its default."""
+    section, _, field = name.partition(".")
+    data = _read(path).get(section) if path is not None else None
+    in_file = isinstance(data, dict) and field in data
+    return in_file or any(text.partition("=")[0].strip() == name for text in overrides)
 
 
 def reload(

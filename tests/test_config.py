@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import cast
 
 import pytest
 
+from service.cameras.source import CameraSource
+from service.commands.replay import denser
 from service.commands.setup import to_toml
-from service.config import Config, keys, load_config, parse_baseline
+from service.config import Config, is_given, keys, load_config, parse_baseline
 from service.errors import InputError
 
 AGREED = """
@@ -154,3 +157,23 @@ def test_baseline_notation() -> None:
     for wrong in ("0/10", "2/0", "-2", "nan", "inf", "", "2/10/3"):
         with pytest.raises(ValueError, match=r"scan\.baseline"):
             parse_baseline(wrong)
+
+
+def test_what_is_given_is_known_even_where_it_is_the_default(tmp_path: Path) -> None:
+    path = written(tmp_path, "[compute]\nstereo_width = 320\n")
+    assert is_given("compute.stereo_width", path)
+    assert not is_given("compute.guide_width", path) and not is_given("scan.folder", path)
+    assert is_given("compute.guide_width", None, ["compute.guide_width=640"])
+    assert not is_given("compute.guide", None, ["compute.guide_width=640"])
+
+
+@pytest.mark.parametrize(("image_px", "guide_px", "width_px"), [
+    (1920, 1280, 640), (480, 1280, 480), (240, 1280, 320), (1920, 500, 500),
+])  # fmt: skip
+def test_a_replay_is_as_dense_as_its_images(image_px: int, guide_px: int, width_px: int) -> None:
+    class Images:
+        size_px = (image_px, image_px // 2)
+
+    config = load_config(None, [f"compute.guide_width={guide_px}"])
+    dense = denser(config, cast(CameraSource, Images()))
+    assert dense.compute.stereo_width == width_px

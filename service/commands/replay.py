@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from service.flight.scan import Scan
 
 
+WIDTH, STEREO_WIDTH_PX = "compute.stereo_width", 640
+"""Of a replay that has the time for it."""
+
+
 def replay(
     video: Annotated[str, typer.Argument(help="a video, a folder of pictures, or - for a pipe")],
     telemetry: Annotated[
@@ -44,7 +48,7 @@ def replay(
 ) -> None:
     """Recorded video, a folder of pictures or a pipe through the onboard path into a scan."""
     from service.cameras import open_camera
-    from service.config import load_config
+    from service.config import is_given, load_config
 
     overrides = list(set_ or [])
     if backend is not None:
@@ -54,10 +58,21 @@ def replay(
     log = _load_telemetry(telemetry, chosen)
     source = open_camera(video)
     try:
+        if not (realtime or chosen.compute.model or is_given(WIDTH, config, overrides)):
+            chosen = denser(chosen, source)
         summary = _replay(source, camera, log, video_epoch, out, chosen, realtime, as_json)
     finally:
         source.close()
     _report(summary, as_json)
+
+
+def denser(config: Config, source: CameraSource) -> Config:
+    """The stereo width that the recording and the guide carry, up to 640."""
+    from service.config import change
+
+    compute = config.compute
+    width = min(STEREO_WIDTH_PX, source.size_px[0], compute.guide_width)
+    return change(config, WIDTH, max(width, compute.stereo_width))
 
 
 def _load_model(path: Path | None, config: Config) -> Camera | None:
