@@ -38,7 +38,7 @@ def test_above_the_horizon_one_pair_alone_says_nothing() -> None:
 
 def test_what_may_lie_below_the_horizon_is_kept() -> None:
     alone = surface(np.ones(SHAPE, np.uint8))
-    unsure = PosePrior(looking(-10.0), sigma_tilt_rad=np.radians(6.1))  # 22 degrees in view, 2 sigma
+    unsure = PosePrior(looking(-10.0), sigma_tilt_rad=np.radians(6.1))
     assert plausible(alone, PosePrior(looking(-90.0))) is alone
     assert plausible(alone, PosePrior()) is alone
     kept = plausible(alone, unsure)
