@@ -9,16 +9,20 @@ PIP_FLAGS ?=
 ARGS ?=
 
 BIN := $(VENV)/bin
+CORE := $(VENV)/core
 STAMP := $(VENV)/installed
 PEERS := $(VENV)/peers/installed
 
 .PHONY: demo test lint types check bench trials format bundle lock notices clean
 
-demo: $(STAMP)
-	$(BIN)/skyrelief demo --out demo-output $(ARGS)
+# Needs the core and the portal alone, without torch and Open3D.
+demo: $(CORE)
+	@$(BIN)/skyrelief demo --out demo-output $(ARGS)
 
+# A worker a core; JOBS=0: one after the other, in one process.
+JOBS ?= auto
 test: $(STAMP) $(PEERS)
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -71,10 +75,15 @@ clean:
 	rm -rf demo-output build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
 
 # Installed again only when what is installed changes.
-$(STAMP): pyproject.toml constraints.txt
+$(CORE): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' || \
 	  { echo "skyrelief needs Python 3.10 to 3.13; say which with: make $(MAKECMDGOALS) PYTHON=python3.12" >&2; exit 2; }
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@echo "installing skyrelief into $(VENV): once, a minute or two"
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[portal]'
+	@touch $(CORE)
+
+$(STAMP): $(CORE)
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt $(PIP_FLAGS) -e '.[$(EXTRAS)]'
 	@touch $(STAMP)
 

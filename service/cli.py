@@ -47,6 +47,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
 """Name to (``module:function``, one line of help). The next command is a function and a line."""
 
 
+SERVICES = ("run", "ground")
+"""These log what they do; the other commands log warnings only, unless --verbose."""
+
+
 class LazyCommands(typer.core.TyperGroup):
     """A command group that imports a subcommand's module only when it is called.
 
@@ -87,10 +91,12 @@ app = typer.Typer(
 
 @app.callback()
 def _root(
+    context: typer.Context,
     verbose: bool = typer.Option(False, "--verbose", "-v", help="Log what every stage does."),
 ) -> None:
     """Terrain and buildings in 3D, in real time, from the camera of a drone."""
-    logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, handlers=[log_handler()])
+    quiet = logging.INFO if context.invoked_subcommand in SERVICES else logging.WARNING
+    logging.basicConfig(level=logging.DEBUG if verbose else quiet, handlers=[log_handler()])
 
 
 def main() -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,10 +39,19 @@ def demo(
     _prepare(out)
     began = time.monotonic()
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
-    ground = _start_ground(out, endpoint)
+    _say(1, "ground station")
+    portal = f"127.0.0.1:{_free_port()}" if _has_portal() else ""
+    ground = _start_ground(out, endpoint, portal)
     try:
         _wait_until_listening(ground, endpoint, out)
+        if portal:
+            _say(1, f"open this page and see the map grow: {_live_page(ground, out)}")
+        images = sum(1 for _ in (source / "frames").iterdir())
+        _say(2, f"flight: {images} images of {source}")
+        if not _are_kernels_compiled():
+            _say(2, "the first flight after an installation compiles its kernels: a minute or two")
         _replay(source, out, endpoint, set_ or [])
+        _say(3, "ground station: takes what is left, writes its files")
         received = _wait_for_ground(ground, out)
     finally:
         _stop(ground)
@@ -51,6 +62,24 @@ def demo(
             f"the ground holds {report['ground_points']} of {report['points']} points; "
             f"see {out / 'ground.log'}"
         )
+
+
+def _say(step: int, what: str) -> None:
+    """One line of progress, where it does not disturb the report."""
+    print(f"[{step}/3] {what}", file=sys.stderr, flush=True)
+
+
+def _has_portal() -> bool:
+    """True when the packages of the extra ``portal`` are installed."""
+    return all(find_spec(package) for package in ("starlette", "uvicorn", "websockets"))
+
+
+def _are_kernels_compiled() -> bool:
+    """True when numba has kept kernels of this installation."""
+    import recon
+
+    folder = os.environ.get("NUMBA_CACHE_DIR") or Path(recon.__file__).parent
+    return any(Path(folder).rglob("*.nbi"))
 
 
 def _flight(flight: Path | None) -> Path:
@@ -89,11 +118,13 @@ def _skyrelief(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "service.cli", *arguments]
 
 
-def _start_ground(out: Path, endpoint: str) -> subprocess.Popen[str]:
+def _start_ground(out: Path, endpoint: str, portal: str) -> subprocess.Popen[str]:
     """A receiver that ends by itself when it holds a whole scan, with its report as JSON."""
     command = _skyrelief(
         "ground", "--store", str(out / "ground"), "--listen", endpoint, "--once", "--json"
     )
+    if portal:
+        command += ["--portal", portal]
     with (out / "ground.log").open("wb") as log:
         return subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True
@@ -111,6 +142,17 @@ def _wait_until_listening(ground: subprocess.Popen[str], endpoint: str, out: Pat
         else:
             return
     raise OutsideError(f"the ground receiver did not start; see {out / 'ground.log'}")
+
+
+def _live_page(ground: subprocess.Popen[str], out: Path) -> str:
+    """The portal's address with its token, once the receiver's log names it."""
+    deadline = time.monotonic() + READY_S
+    while time.monotonic() < deadline and ground.poll() is None:
+        for line in (out / "ground.log").read_text(encoding="utf-8").splitlines():
+            if line.startswith("portal: "):
+                return line.partition(" ")[2]
+        time.sleep(0.1)
+    raise OutsideError(f"the portal did not start; see {out / 'ground.log'}")
 
 
 def _replay(flight: Path, out: Path, endpoint: str, overrides: list[str]) -> None:
@@ -192,7 +234,8 @@ Look at it:
   {onboard}/cloud.laz     coloured points, EPSG:{report["epsg"]}, metres above sea level;
                           CloudCompare, QGIS, Potree
   {onboard}/trajectory.csv and scan.json: where the camera was, what was used, how good it is
-  skyrelief ground --store {report["ground_store"]} --portal 127.0.0.1:8080   in a browser"""
+  skyrelief ground --store {report["ground_store"]} --portal 127.0.0.1:8080   in a browser
+                          (pip install -e '.[ground]' adds exports and meshes)"""
 
 
 def _read(path: Path) -> dict[str, Any]:
