@@ -1,1 +1,1 @@
-"""MAVLink: bytes into vehicle state, commands into calls; knows nothing of recon."""
+"""MAVLink: bytes into vehicle state, commands into calls; independent of recon."""

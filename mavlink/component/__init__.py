@@ -1,1 +1,1 @@
-"""What we are on the network: the onboard computer and the camera."""
+"""The onboard computer and the camera that this service is on the MAVLink network."""

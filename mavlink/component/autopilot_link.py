@@ -1,8 +1,8 @@
-"""What passes between us and the autopilot: telemetry into the history, clocks, rates, TIMESYNC.
+"""Exchange with the autopilot: telemetry into the history, clocks, message rates, TIMESYNC.
 
-It follows the autopilot that ``Presence`` has chosen; what another vehicle said before is dropped.
-A new link carries little until asked, and a ground station may slow
-streams down for all, so messages that come too slowly are asked for again.
+It follows the autopilot that ``Presence`` has chosen and drops what other vehicles sent before.
+A new link carries few messages until they are requested, and a ground station may lower the rates
+for everyone, so messages that arrive too slowly are requested again.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ class AutopilotLink:
         outbox: Outbox,
         say: Callable[[int, str], None],
     ) -> None:
-        self.link: int | None = None  # on which the autopilot was heard last
+        self.link: int | None = None  # where the autopilot was heard last
         self.timesync, self.wall_time = TimesyncFilter(), WallTime()
         self._presence, self._history, self._outbox, self._say = presence, history, outbox, say
         self._rates = RateKeeper()
-        self._clocks: dict[int, BootClock] = {}  # component of our system to its boot clock
+        self._clocks: dict[int, BootClock] = {}  # by component of our system
         self._followed = (presence.system, presence.autopilot)
         self._is_lost = False
 
-    # In.
+    # Input.
 
     def hear(self, message: Any, packet: Packet, link: int, now_ns: int) -> None:
-        """Take in anyone's message that may say something of the autopilot or its clocks."""
+        """Process a message of any sender that may carry data of the autopilot or its clocks."""
         name = message.get_type()
         if name in READERS:
             self._hear_telemetry(name, message, packet, now_ns)
@@ -83,7 +83,7 @@ class AutopilotLink:
         self._history.add(sample, time_ns)
 
     def follow(self) -> None:
-        """Drop what another vehicle, or another component, said."""
+        """Drop the data of another vehicle or component."""
         (system, autopilot), before = self._followed, self._followed
         self._followed = (self._presence.system, self._presence.autopilot)
         if self._followed == before or (self._followed[0] == system and autopilot is None):
@@ -109,9 +109,9 @@ class AutopilotLink:
             self.wall_time.hear(message.time_unix_usec, now_ns)
 
     def _hear_timesync(self, message: Any, packet: Packet, link: int, now_ns: int) -> None:
-        """A question of the autopilot, or anyone's answer to ours."""
+        """Answer the autopilot's request, or process an answer to ours."""
         is_autopilot = (packet.system, packet.component) == self._presence.autopilot
-        if message.tc1 == 0:  # a question; we answer with our own time since boot
+        if message.tc1 == 0:  # a request: answer with our own time since boot
             reply = dialect.MAVLink_timesync_message(now_ns, message.ts1)
             if is_autopilot:
                 self._outbox.put(ONBOARD, reply, link)
@@ -123,10 +123,10 @@ class AutopilotLink:
             clock = self._clocks.setdefault(packet.component, BootClock())
             clock.set_timesync(self.timesync.offset_ns)
 
-    # Out.
+    # Output.
 
     def tick(self, now_ns: int) -> None:
-        """Ask for the time and for messages that come too slowly; report a loss."""
+        """Request the time and slow messages; report loss of telemetry."""
         autopilot, seen = self._presence.autopilot, self._presence.autopilot_seen_ns
         if autopilot is None or seen is None:
             if self._presence.autopilots.others(now_ns):
@@ -134,10 +134,10 @@ class AutopilotLink:
             return
         is_lost = now_ns - seen > LOST_NS
         if is_lost and not self._is_lost:
-            self._say(texts.WARNING, "Telemetry of the autopilot is lost")
+            self._say(texts.WARNING, "Telemetry lost")
         elif self._is_lost and not is_lost:
             self._rates.restart()
-            self._say(texts.NOTICE, "Telemetry of the autopilot is back")
+            self._say(texts.NOTICE, "Telemetry recovered")
         self._is_lost = is_lost
         if is_lost:
             return
@@ -146,7 +146,7 @@ class AutopilotLink:
         self._ask_time(now_ns)
 
     def _ask_time(self, now_ns: int) -> None:
-        """Ask our autopilot; or every one, where the answers say which vehicle is ours."""
+        """Send TIMESYNC to our autopilot, or to all while it is not clear which one is ours."""
         target, link = EVERYONE, None
         autopilot = self._presence.autopilot
         if autopilot is not None and not self._presence.autopilots.others(now_ns):
@@ -156,7 +156,7 @@ class AutopilotLink:
             self._outbox.put(ONBOARD, request, link)
 
     def next_timers(self, now_ns: int) -> list[int]:
-        """When :meth:`tick` has something to do, in ns."""
+        """Times in ns at which :meth:`tick` is due."""
         if self._presence.autopilot is not None:
             return [self.timesync.next_timer(), self._rates.next_timer()]
         return [self.timesync.next_timer()] if self._presence.autopilots.others(now_ns) else []
@@ -179,8 +179,8 @@ WANTED_HZ: Mapping[str, float] = {
 NUMBERS = {kind.msgname: number for number, kind in dialect.mavlink_map.items()}
 LOOK_NS = 10 * S
 ENOUGH = 0.6  # of the rate wanted
-PATIENCE = 5  # requests without a single message before we ask only rarely
-RARELY = 12  # looks between two such requests
+PATIENCE = 5  # requests without an answer before the rate of requests drops
+RARELY = 12  # checks between two such requests
 
 
 @dataclass(slots=True)
@@ -193,7 +193,7 @@ class _Want:
 
 
 class RateKeeper:
-    """Counts what comes and says which SET_MESSAGE_INTERVAL to send."""
+    """Counts received messages and returns the SET_MESSAGE_INTERVAL requests to send."""
 
     def __init__(self, wanted_hz: Mapping[str, float] = WANTED_HZ) -> None:
         self._wants = {n: _Want(NUMBERS[n], hz) for n, hz in wanted_hz.items()}
@@ -206,13 +206,13 @@ class RateKeeper:
             want.heard += 1
 
     def restart(self) -> None:
-        """Ask for everything again at the next look, as after a reboot."""
+        """Request everything again at the next check, as after a reboot."""
         self._looked_ns = None
         for want in self._wants.values():
             want.heard = want.futile = want.wait = 0
 
     def tick(self, system: int, component: int, now_ns: int) -> list[Any]:
-        """COMMAND_LONGs to the autopilot for what comes too slowly; none between looks."""
+        """COMMAND_LONGs that request slow messages; empty between checks."""
         if self._looked_ns is not None and now_ns - self._looked_ns < LOOK_NS:
             return []
         passed_s = math.inf if self._looked_ns is None else (now_ns - self._looked_ns) / S
@@ -237,5 +237,5 @@ class RateKeeper:
         return want.wait == 0
 
     def next_timer(self) -> int:
-        """When :meth:`tick` looks again, in ns."""
+        """Time in ns of the next check."""
         return 0 if self._looked_ns is None else self._looked_ns + LOOK_NS

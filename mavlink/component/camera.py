@@ -1,7 +1,7 @@
 """The scan as a MAVLink camera (component 100, camera protocol v2).
 
-Recording is scanning; a photo is one keyframe. The camera's status is sent before and after
-every keyframe that was asked for, or a ground station's button would stay busy.
+Recording means scanning; a photo is one keyframe. The camera's status is sent before and after
+every requested keyframe, because a ground station's button stays busy otherwise.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from mavlink.wire.first_beat import CAMERA
 from mavlink.wire.messages import Address, Outbox, Streams
 
 S = 1_000_000_000
-CAPABILITIES = 1 | 2 | 8 | 16  # videos, images, each while the other is taken
+CAPABILITIES = 1 | 2 | 8 | 16  # video, image, and each during the other
 CAPTURE_STATUS = 262
 SHOT_TIMEOUT_NS = 10 * S
-MIN_INTERVAL_S = 0.2  # of a series
-KEPT = 500  # keyframes that can be asked for again
+MIN_INTERVAL_S = 0.2  # of a series of shots
+KEPT = 500  # keyframes that can be requested again
 UNKNOWN_I32 = 0
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeReport:
-    """A keyframe as the operator's ground station shows it; unknown parts are None."""
+    """A keyframe as reported to ground stations; unknown parts are None."""
 
     unix_us: int = 0
     lat_deg: float | None = None
@@ -61,27 +61,27 @@ class CameraComponent:
         self._count = 0
         self._kept: deque[tuple[int, int, KeyframeReport]] = deque(maxlen=KEPT)  # index, boot ms
         self._shots: deque[tuple[Address, float]] = deque(maxlen=64)
-        self._waiting: deque[int] = deque()  # times at which shots are given up
-        self._series: tuple[float, int] | None = None  # interval in s, how many are left (0: any)
+        self._waiting: deque[int] = deque()  # times at which pending shots expire
+        self._series: tuple[float, int] | None = None  # interval in s, shots left (0: unlimited)
         self._next_shot_ns = 0
         streams.add(CAMERA, CAPTURE_STATUS, -1, self.send_capture_status)
 
-    # What commands ask for.
+    # Called by commands.
 
     def stream_status(self, hz: float) -> None:
-        """Send CAMERA_CAPTURE_STATUS at a rate; 0 ends it."""
+        """Send CAMERA_CAPTURE_STATUS at a rate; 0 stops it."""
         interval = -1 if hz <= 0.0 else max(20_000, round(1e6 / max(hz, 1e-3)))
         self._streams.set_interval(CAMERA, CAPTURE_STATUS, interval)
 
     def is_new_shot(self, source: Address, sequence: float) -> bool:
-        """True the first time a numbered shot of a sender comes."""
+        """True the first time a numbered shot of a sender arrives."""
         if (source, sequence) in self._shots:
             return False
         self._shots.append((source, sequence))
         return True
 
     def shoot(self) -> Handled:
-        """Ask for one keyframe; the keyframe is reported when it is there."""
+        """Request one keyframe; it is reported once it exists."""
         handled = self._control.capture_keyframe()
         if isinstance(handled, Work) or handled.result is Result.ACCEPTED:
             self._waiting.append(self._now() + SHOT_TIMEOUT_NS)
@@ -89,7 +89,7 @@ class CameraComponent:
         return handled
 
     def shoot_every(self, interval_s: float, count: int) -> Handled:
-        """Start a series; the first shot is taken now. A count of 0 goes on until stopped."""
+        """Start a series; the first shot is taken now. A count of 0 means until stopped."""
         first = self.shoot()
         if isinstance(first, Answer) and first.result is not Result.ACCEPTED:
             return first
@@ -98,19 +98,19 @@ class CameraComponent:
         return ACCEPTED
 
     def stop_shooting(self) -> None:
-        """End the series."""
+        """Stop the series."""
         self._series = None
         self.send_capture_status()
 
     def reset_image_log(self) -> None:
-        """Start counting keyframes at zero again."""
+        """Restart the keyframe count at zero."""
         self._count = 0
         self._kept.clear()
 
-    # What the service reports.
+    # Called by the service.
 
     def report(self, keyframe: KeyframeReport) -> int:
-        """Publish a keyframe; its index comes back."""
+        """Publish a keyframe; returns its index."""
         index = self._count
         self._count += 1
         boot_ms = self._boot_ms()
@@ -122,7 +122,7 @@ class CameraComponent:
         return index
 
     def tick(self, now_ns: int) -> None:
-        """Take the next shot of a series; give up shots that never came."""
+        """Take the next shot of a series; drop expired shots."""
         while self._waiting and now_ns >= self._waiting[0]:
             self._waiting.popleft()
             failed = KeyframeReport(ok=False)
@@ -138,7 +138,7 @@ class CameraComponent:
             self._series = None
 
     def next_timer(self) -> int | None:
-        """When :meth:`tick` has something to do, in ns."""
+        """Time in ns at which :meth:`tick` is due."""
         times = [self._waiting[0]] if self._waiting else []
         if self._series is not None:
             times.append(self._next_shot_ns)
@@ -147,7 +147,7 @@ class CameraComponent:
     # Messages.
 
     def message(self, number: int, index: int) -> object | None:
-        """The message asked for by its number; None when we have no such message."""
+        """The message with this number; None when the camera has no such message."""
         if number == 263:
             kept = next((kept for kept in self._kept if kept[0] == index), None)
             return None if kept is None else self._image_captured(*kept)
@@ -189,7 +189,7 @@ class CameraComponent:
             free,
             math.nan,
             math.nan,
-            254 if known else 0,  # a kind of storage without a name of its own
+            254 if known else 0,  # MAV_STORAGE_TYPE_OTHER
             b"scans",
         )
 

@@ -1,11 +1,10 @@
-"""The command protocol: each call is checked, carried out once and answered.
+"""The command protocol: each call is checked, executed once and acknowledged.
 
-The rules are those of the MAVLink command service: an answer at once, IN_PROGRESS while
-bounded work runs and a final answer after it, TEMPORARILY_REJECTED for the same command while
-one runs, UNSUPPORTED for what is not known. Clients do not count their retransmissions
-reliably, so a repetition is known by its content: the last command carried out
-is answered again, not carried out again, when it comes again within its window. A stop is
-carried out every time, also while other work of the same command runs.
+Rules of the MAVLink command service: immediate acknowledgement, IN_PROGRESS while work runs and a
+final result after it, TEMPORARILY_REJECTED for the same command while it runs, UNSUPPORTED for
+unknown commands. Clients do not number their retransmissions reliably, so a repetition is
+recognised by its content: within a time window the last executed command is acknowledged again,
+not executed again. A stop is executed every time, also while the same command runs.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ BUSY = Answer(Result.TEMPORARILY_REJECTED, "busy")
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A command as it came; parameters that were not set are NaN."""
+    """A received command; unset parameters are NaN."""
 
     number: int
     params: tuple[float, float, float, float, float, float, float]
@@ -38,23 +37,23 @@ class Call:
     link: int
 
     def param(self, k: int, default: float) -> float:
-        """Parameter k (1 to 7), or the default when it was not set."""
+        """Parameter k (1 to 7), or the default when it is not set."""
         value = self.params[k - 1]
         return value if math.isfinite(value) else default
 
     @property
     def is_broadcast(self) -> bool:
-        """True when the asker did not say which component."""
+        """True when the sender named no component."""
         return self.target.component == 0
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What carries out a command."""
+    """A command's handler and its rules."""
 
-    components: frozenset[int]  # of ours that take it
-    window_s: float  # how long a repetition is a retransmission; 0 for questions
-    handle: Callable[[Call, Any], Handled | None]  # None: it is not meant for this component
+    components: frozenset[int]  # our components that accept it
+    window_s: float  # within it a repetition is a retransmission; 0 for queries
+    handle: Callable[[Call, Any], Handled | None]  # None: not for this component
 
 
 def decode_call(message: Any, link: int) -> Call | None:
@@ -78,7 +77,7 @@ def decode_call(message: Any, link: int) -> Call | None:
 
 
 def _key(call: Call) -> tuple[object, ...]:
-    """Equal for a call and its repetition; NaN, which equals nothing, goes by its name."""
+    """Equal for a call and its repetition; NaN is replaced because it never equals itself."""
     return (call.source, call.number, *map(str, call.params))
 
 
@@ -100,7 +99,7 @@ class _Done:
 
 
 class CommandDesk:
-    """Takes calls for our components and answers them through an outbox."""
+    """Receives calls for our components and answers them through an outbox."""
 
     def __init__(
         self,
@@ -116,15 +115,15 @@ class CommandDesk:
         self._host = host
         self._say = say
         self._running: dict[tuple[int, int], _Running] = {}  # (component, number)
-        self._last: _Done | None = None  # of either component: they act on one scan
+        self._last: _Done | None = None  # shared: both components act on one scan
 
     def receive(self, call: Call, components: tuple[int, ...], now_ns: int) -> None:
-        """Carry out a call for one of our components (which the caller has checked)."""
+        """Execute a call for one of our components (the caller has checked that)."""
         command = self._commands.get(call.number)
         if call.is_broadcast:
             mine = [c for c in components if command is not None and c in command.components]
             if not mine:
-                return  # somebody else's; two refusals from us would only mislead the asker
+                return  # not for us; refusals from both components would mislead the sender
             component = mine[0]
         else:
             component = call.target.component
@@ -162,7 +161,7 @@ class CommandDesk:
     def _answer_while(
         self, running: _Running, component: int, call: Call, key: tuple[object, ...]
     ) -> None:
-        """Answer by how the work of this command goes; the end of only one can be reported."""
+        """Acknowledge while this command runs; only one final result can be reported."""
         if running.key == key:
             self._progress(component, call, running.work)
         else:
@@ -171,7 +170,7 @@ class CommandDesk:
     def _remember(
         self, key: tuple[object, ...], answer: Answer, now_ns: int, window_ns: int
     ) -> None:
-        """A question leaves no trace, so that it does not hide what was done before it."""
+        """Remember an executed command; queries are not remembered, so that they hide none."""
         if window_ns:
             self._last = _Done(key, answer, now_ns + window_ns)
 
@@ -184,7 +183,7 @@ class CommandDesk:
         self.tick(now_ns)
 
     def cancel(self, number: int, source: Address, now_ns: int) -> bool:
-        """Ask running work of this number to end; True when there was some."""
+        """Cancel running work of this number; True when there was some."""
         found = [r for (_, n), r in self._running.items() if n == number]
         for running in found:
             running.work.cancel()
@@ -192,12 +191,12 @@ class CommandDesk:
         return bool(found)
 
     def tick(self, now_ns: int) -> None:
-        """Tell askers how their work goes on, and how it ended."""
+        """Report progress and final results of running work."""
         for (component, number), running in list(self._running.items()):
             answer = running.work.answer
             if answer is None and now_ns >= running.until_ns:
                 running.work.cancel()
-                answer = Answer(Result.FAILED, "took too long")
+                answer = Answer(Result.FAILED, "timed out")
             if answer is not None:
                 del self._running[(component, number)]
                 if running.work.cancelled and answer.result is Result.ACCEPTED:
@@ -209,7 +208,7 @@ class CommandDesk:
                 self._progress(component, running.call, running.work)
 
     def next_timer(self) -> int | None:
-        """When :meth:`tick` has something to do, in ns; None when nothing runs."""
+        """Time in ns at which :meth:`tick` is due; None when nothing runs."""
         return min((r.next_report_ns for r in self._running.values()), default=None)
 
     def _progress(self, component: int, call: Call, work: Work) -> None:

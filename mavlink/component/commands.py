@@ -1,7 +1,7 @@
-"""The commands that our components carry out: a function each, a line in :data:`COMMANDS`.
+"""The commands of our components: one function each, one line in :data:`COMMANDS`.
 
-Windows: for so long the same call again is a retransmission. Questions have none; they may be
-asked again at will.
+Within its window an identical call is a retransmission. Queries have no window and may be
+repeated at will.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MAX_SHOTS = 100_000
 MIN_MESSAGE_US, MAX_MESSAGE_US = 20_000, 3.6e9
 GET_MESSAGE_INTERVAL = 510
 PAUSE, RESUME, CLEAR_MAP, BASELINE, FINALISE, SELF_TEST, START, STOP = range(1, 9)
-"""Actions of USER_1, its param 1."""
+"""Actions of USER_1, by param 1."""
 
 STOPS: dict[int, tuple[int, tuple[float, ...]]] = {
     2501: (0, ()),
@@ -31,11 +31,11 @@ STOPS: dict[int, tuple[int, tuple[float, ...]]] = {
     200: (4, (0.0,)),
     31010: (1, (FINALISE, STOP)),
 }
-"""Commands that stop: number to the parameter that says so and its values (0: always)."""
+"""Stop commands: number to (parameter, values) that make it a stop (0: always)."""
 
 
 def is_stop(call: Call) -> bool:
-    """True for a call that stops something: it is carried out however often it comes."""
+    """True for a call that stops something: it is executed however often it arrives."""
     k, values = STOPS.get(call.number, (1, ()))
     return k == 0 or call.param(k, math.nan) in values
 
@@ -44,20 +44,20 @@ def is_stop(call: Call) -> bool:
 
 
 def start_scan(call: Call, host: Companion) -> Handled:
-    """VIDEO_START_CAPTURE: start a scan, or end its pause; starting twice is one start.
+    """VIDEO_START_CAPTURE: start or resume a scan; a second start changes nothing.
 
-    Param 2 asks for CAMERA_CAPTURE_STATUS at that rate in Hz (0: none).
+    Param 2 requests CAMERA_CAPTURE_STATUS at that rate in Hz (0: none).
     """
     return _start(host, call.param(2, 0.0))
 
 
 def stop_scan(call: Call, host: Companion) -> Handled:
-    """VIDEO_STOP_CAPTURE: close the scan; accepted also when nothing runs: it is stopped."""
+    """VIDEO_STOP_CAPTURE: close the scan; also accepted when none runs."""
     return _stop(host, host.control.stop_scan)
 
 
 def control_video(call: Call, host: Companion) -> Handled:
-    """DO_CONTROL_VIDEO, the old way to start (param 4 = 1 or 2) and stop (0) recording."""
+    """DO_CONTROL_VIDEO, the old command to start (param 4 = 1 or 2) and stop (0) recording."""
     recording = call.param(4, -1.0)
     if recording in (1.0, 2.0):
         return _start(host)
@@ -67,7 +67,7 @@ def control_video(call: Call, host: Companion) -> Handled:
 
 
 def _start(host: Companion, status_hz: float = 0.0) -> Handled:
-    """Start a scan unless one takes frames, and send the camera's status at a rate."""
+    """Start a scan unless one takes frames, and stream the camera's status at a rate."""
     phase = host.control.status().phase
     host.camera.stream_status(status_hz)
     handled = ACCEPTED if phase is Phase.SCANNING else host.control.start_scan()
@@ -76,10 +76,10 @@ def _start(host: Companion, status_hz: float = 0.0) -> Handled:
 
 
 def _stop(host: Companion, how: Callable[[], Handled]) -> Handled:
-    """End the scan, its retries, the series of keyframes and the stream of the camera's status.
+    """End the scan, its retries, the keyframe series and the camera status stream.
 
-    ``how`` is the control's way to stop. It is called whatever its state is: a scan may be
-    wanted although none runs.
+    ``how`` is the control's method of stopping. It is called in every state, because a scan may
+    be pending although none runs.
     """
     host.camera.stream_status(0.0)
     handled = how()
@@ -88,7 +88,7 @@ def _stop(host: Companion, how: Callable[[], Handled]) -> Handled:
 
 
 def set_baseline(call: Call, host: Companion) -> Handled:
-    """DO_SET_CAM_TRIGG_DIST: its distance is the virtual stereo baseline.
+    """DO_SET_CAM_TRIGG_DIST: set the virtual stereo baseline.
 
     Param 1: metres, 0 lets it follow the altitude; param 3 = 1 takes a keyframe now.
     """
@@ -99,7 +99,7 @@ def set_baseline(call: Call, host: Companion) -> Handled:
 
 
 def user(call: Call, host: Companion) -> Handled:
-    """USER_1 to the onboard computer: what no standard command says, by param 1.
+    """USER_1 to the onboard computer: actions without a standard command, by param 1.
 
     1 pause, 2 resume, 3 clear the map, 4 baseline of param 2 metres (0: automatic),
     5 finalise, 6 self-test, 7 start a scan, 8 stop it.
@@ -121,7 +121,7 @@ def user(call: Call, host: Companion) -> Handled:
         return _start(host)
     if action in (FINALISE, STOP):
         return _stop(host, control.finalise if action == FINALISE else control.stop_scan)
-    return Answer(Result.DENIED, "unknown action of USER_1; 1 to 8 are known")
+    return Answer(Result.DENIED, "USER_1: unknown action, use 1 to 8")
 
 
 # Keyframes.
@@ -130,25 +130,25 @@ def user(call: Call, host: Companion) -> Handled:
 def start_capture(call: Call, host: Companion) -> Handled:
     """IMAGE_START_CAPTURE: one keyframe now, or several at an interval.
 
-    Param 2: interval in s, param 3: count (0: until stopped), param 4: sequence. A single shot
-    with a sequence number is taken once however often it comes. Without a number a repetition
-    within a moment is the same call heard on two links.
+    Param 2: interval in s, param 3: count (0: until stopped), param 4: sequence. A numbered single
+    shot is taken once, however often it arrives. Without a number, a repetition within a moment is
+    the same call received on two links.
     """
     interval_s, count = call.param(2, 0.0), call.param(3, 1.0)
     if not 0.0 <= interval_s <= MAX_SERIES_INTERVAL_S or not 0.0 <= count <= MAX_SHOTS:
-        return Answer(Result.DENIED, "photo refused: interval or count is out of range")
+        return Answer(Result.DENIED, "photo refused: interval or count out of range")
     if count == 1.0:
         sequence = call.param(4, 0.0)
         if sequence > 0.0 and not host.camera.is_new_shot(call.source, sequence):
             return ACCEPTED
         return host.camera.shoot()
     if interval_s < MIN_INTERVAL_S:
-        return Answer(Result.DENIED, "photo refused: the interval is too short")
+        return Answer(Result.DENIED, "photo refused: interval too short")
     return host.camera.shoot_every(interval_s, int(count))
 
 
 def stop_capture(call: Call, host: Companion) -> Handled:
-    """IMAGE_STOP_CAPTURE: end a series of keyframes; accepted when there is none."""
+    """IMAGE_STOP_CAPTURE: end a series of keyframes; also accepted when there is none."""
     host.camera.stop_shooting()
     return ACCEPTED
 
@@ -156,7 +156,7 @@ def stop_capture(call: Call, host: Companion) -> Handled:
 def digicam(call: Call, host: Companion) -> Handled:
     """DO_DIGICAM_CONTROL: one keyframe when param 5 = 1 (ArduPilot's CAM1_TYPE=5 sends it).
 
-    Zoom, focus and session are not ours.
+    Zoom, focus and session are ignored.
     """
     return host.camera.shoot() if call.param(5, 0.0) == 1.0 else Answer(Result.UNSUPPORTED)
 
@@ -178,7 +178,7 @@ def reboot(call: Call, host: Companion) -> Handled | None:
 
 
 def erase(call: Call, host: Companion) -> Handled:
-    """STORAGE_FORMAT: erase the finished scans; refused while one runs or unless disarmed.
+    """STORAGE_FORMAT: erase the finished scans; refused while scanning or unless disarmed.
 
     Param 1: storage (1, or 0 for all), param 2 = 1 erases, param 3 = 1 resets the count.
     """
@@ -195,17 +195,17 @@ def erase(call: Call, host: Companion) -> Handled:
 
 
 def _unless_disarmed(host: Companion, what: str) -> Answer | None:
-    """The refusal; None where the autopilot said a moment ago that it is disarmed."""
+    """The refusal; None where the autopilot has just reported that it is disarmed."""
     if host.presence.is_armed:
         return Answer(Result.TEMPORARILY_REJECTED, f"{what} refused while armed")
     if not host.is_disarmed:
-        text = f"{what} refused: no autopilot says that it is disarmed"
+        text = f"{what} refused: armed state unknown"
         return Answer(Result.TEMPORARILY_REJECTED, text)
     return None
 
 
 def reset_settings(call: Call, host: Companion) -> Handled:
-    """RESET_CAMERA_SETTINGS: every parameter to its default (param 1 = 1); not while scanning."""
+    """RESET_CAMERA_SETTINGS: reset every parameter (param 1 = 1); refused while scanning."""
     if call.param(1, 0.0) != 1.0:
         return Answer(Result.DENIED, "reset refused: param 1 must be 1")
     if host.control.status().phase is not Phase.IDLE:
@@ -214,14 +214,14 @@ def reset_settings(call: Call, host: Companion) -> Handled:
     return ACCEPTED
 
 
-# Questions.
+# Queries.
 
 
 def request_message(call: Call, host: Companion) -> Handled | None:
-    """REQUEST_MESSAGE: send the message of a number (param 1) from the component asked.
+    """REQUEST_MESSAGE: send the message of a number (param 1) from the addressed component.
 
-    UNSUPPORTED when that one has no such message. Where all are asked it comes from the first
-    that has it.
+    UNSUPPORTED when the component has no such message. A broadcast is answered by the first
+    component that has it.
     """
     asked = (CAMERA, ONBOARD) if call.is_broadcast else (call.target.component,)
     number = int(call.param(1, -1.0))
@@ -232,20 +232,20 @@ def request_message(call: Call, host: Companion) -> Handled | None:
 
 
 CAMERA_MESSAGES = {521: 259, 522: 260, 525: 261, 527: 262, 2504: 269, 2505: 270}
-"""Older questions about the camera, of older ground stations: command to message."""
+"""Older camera queries of older ground stations: command to message."""
 
 
 def request_camera(call: Call, host: Companion) -> Handled:
-    """Send the message that the command stands for; 525 puts the answer flag in param 2."""
+    """Send the message that the command requests; 525 has its flag in param 2."""
     flag = 2 if call.number == 525 else 1
     if call.number not in (2504, 2505) and call.param(flag, 1.0) != 1.0:
-        return ACCEPTED  # asked for nothing
+        return ACCEPTED  # nothing requested
     sent = host.send_requested(CAMERA, CAMERA_MESSAGES[call.number], 0, call.link)
     return ACCEPTED if sent else Answer(Result.UNSUPPORTED)
 
 
 def message_interval(call: Call, host: Companion) -> Handled | None:
-    """SET_MESSAGE_INTERVAL and GET_MESSAGE_INTERVAL for the messages that we can repeat.
+    """SET_MESSAGE_INTERVAL and GET_MESSAGE_INTERVAL for the messages that can be streamed.
 
     Param 1: message, param 2: interval in us, 0 for the default, -1 for never.
     """
@@ -283,4 +283,4 @@ COMMANDS: dict[int, Command] = {
     511: Command(_CAMERA | _ONBOARD, 0.0, message_interval),
     GET_MESSAGE_INTERVAL: Command(_CAMERA | _ONBOARD, 0.0, message_interval),
 }
-"""MAV_CMD to what carries it out. The next command is one function and one line."""
+"""MAV_CMD to its handler. A new command is one function and one line."""

@@ -1,7 +1,7 @@
 """The companion computer on the vehicle's network: packets in, messages out.
 
 No sockets and no clocks: ``receive(link, packet, now_ns)``, ``tick(now_ns)``, ``take()`` and
-``next_timer()``. :mod:`mavlink.component.vehicle` puts it on real links.
+``next_timer()``. :mod:`mavlink.component.vehicle` connects it to real links.
 """
 
 from __future__ import annotations
@@ -57,21 +57,21 @@ SERVED = (
     "PARAM_EXT_SET",
 )
 HEARD = numbers_of((*READERS, *SERVED)) | {COMMAND_CANCEL}
-"""Numbers of the messages with which :meth:`Companion.receive` does something."""
+"""Numbers of the messages that :meth:`Companion.receive` handles."""
 
 
 @dataclass(frozen=True, slots=True)
 class CompanionConfig:
-    """What the companion asks for and offers."""
+    """Settings of the companion."""
 
-    parameters: Mapping[str, float] = field(default_factory=dict)  # defaults of this aircraft
+    parameters: Mapping[str, float] = field(default_factory=dict)  # this aircraft's defaults
     watch: WatchConfig = field(default_factory=WatchConfig)
     load_every_s: float = 2.0
     motion_every_s: float = 1.0
 
 
 class Companion:
-    """Everything that our two components say and do, apart from their heartbeats."""
+    """The protocol of our two components, apart from their heartbeats."""
 
     def __init__(
         self,
@@ -120,10 +120,10 @@ class Companion:
         self.watch = LinkWatch(config.watch, presence, now_ns)
         self._is_recording, self._watch_ns = False, now_ns
 
-    # In.
+    # Input.
 
     def receive(self, link: int, packet: Packet, now_ns: int) -> None:
-        """Take in one packet that arrived on a link at ``now_ns`` (monotonic)."""
+        """Process one packet that arrived on a link at ``now_ns`` (monotonic)."""
         self._now_ns = max(self._now_ns, now_ns)
         self.presence.autopilots.count(packet.system, packet.component)
         if packet.message_id == COMMAND_CANCEL:
@@ -142,7 +142,7 @@ class Companion:
             self._hear_parameter(message, name)
         elif name == "FILE_TRANSFER_PROTOCOL":
             self._hear_file_request(message, link)
-        self.watch.hear(packet, message, now_ns)  # by now it is known whose heartbeat it was
+        self.watch.hear(packet, message, now_ns)  # after the sender of a heartbeat is known
 
     def _hear_command(self, message: Any, link: int, now_ns: int) -> None:
         call = decode_call(message, link)
@@ -152,7 +152,7 @@ class Companion:
 
     @property
     def is_disarmed(self) -> bool:
-        """True only where the autopilot said so a moment ago."""
+        """True only where the autopilot has just reported it."""
         return self.presence.is_disarmed(self._now_ns)
 
     def _is_for_us(self, target: Address) -> bool:
@@ -160,7 +160,7 @@ class Companion:
         return ours and (target.component == 0 or target.component in COMPONENTS)
 
     def _cancel(self, packet: Packet, now_ns: int) -> None:
-        # uint16 command, uint8 target system, uint8 target component; zeros at the end are cut.
+        # uint16 command, uint8 target system, uint8 target component; trailing zeros are cut.
         payload = packet.data[10 : 10 + packet.data[1]] if packet.data[0] == 0xFD else b""
         payload = payload.ljust(4, b"\0")
         number = payload[0] | payload[1] << 8
@@ -191,7 +191,7 @@ class Companion:
         return answer
 
     def announce_kept(self) -> None:
-        """Tell the service the parameters that were kept from an earlier run."""
+        """Pass the parameters kept from an earlier run to the service."""
         for name, value in self.parameters.kept().items():
             answer = self._parameter_changed(name, value)
             if answer.result is not Result.ACCEPTED:
@@ -201,14 +201,14 @@ class Companion:
         gimbal = replace(self.history.config.gimbal, yaw_frame=YAW_FRAMES[round(value)])
         self.history.set_gimbal(gimbal)
 
-    # Out.
+    # Output.
 
     def take(self) -> list[Outgoing]:
         """Messages to send now, in order."""
         return self._outbox.take()
 
     def tick(self, now_ns: int) -> None:
-        """Do what time asks for."""
+        """Do what is due."""
         self._now_ns = max(self._now_ns, now_ns)
         self.presence.autopilots.look(now_ns)
         self.autopilot.follow()
@@ -231,7 +231,7 @@ class Companion:
         self.presence.is_ready = not any(t.is_grave for t in self.watch.troubles(now_ns))
 
     def next_timer(self) -> int:
-        """When :meth:`tick` should be called next, in ns."""
+        """Time in ns at which :meth:`tick` is due."""
         times = [
             t
             for t in (self.camera.next_timer(), self.desk.next_timer(), self.streams.next_timer())
@@ -247,7 +247,7 @@ class Companion:
         self.say(severity, text, is_answer=True)
 
     def report(self, keyframe: KeyframeReport) -> int:
-        """Tell of a keyframe; its index comes back."""
+        """Publish a keyframe; returns its index."""
         return self.camera.report(keyframe)
 
     def send(self, message: Any) -> None:
@@ -255,11 +255,11 @@ class Companion:
         self._outbox.put(ONBOARD, message)
 
     def listen(self, name: str, listener: Callable[[Any], None]) -> None:
-        """Call back with every message of a name, whoever sends it."""
+        """Call ``listener`` with every message of a name, from any sender."""
         self._listeners.setdefault(name, []).append(listener)
 
     def send_requested(self, component: int, number: int, index: int, link: int) -> bool:
-        """Send a message that was asked for; False when the component has no such message."""
+        """Send a requested message; False when the component has no such message."""
         if component == CAMERA:
             message = self.camera.message(number, index)
         elif number == METADATA:
@@ -271,7 +271,7 @@ class Companion:
         if message is None:
             return False
         if number == CAPTURE_STATUS:
-            self.camera.send_capture_status()  # everyone's button follows it
+            self.camera.send_capture_status()  # ground stations' buttons depend on it
         else:
             self._outbox.put(component, message, link)
         return True

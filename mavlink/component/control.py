@@ -1,4 +1,4 @@
-"""What commands may ask of the scanning service, and how it answers."""
+"""The interface between commands and the scanning service."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ ACCEPTED = Answer()
 
 
 class Work:
-    """A command that takes a while: the service reports, the link tells the asker.
+    """A command that takes a while: the service reports, the link answers the sender.
 
-    Safe between threads. The service looks at ``cancelled``, set once the asker no longer wants
-    it, and finishes.
+    Thread-safe. The service checks ``cancelled``, which is set when the sender no longer wants the
+    result, and finishes.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self.fraction = 0.0  # how much is done, 0 to 1
-        self.answer: Answer | None = None  # how it ended; None while it runs
+        self.fraction = 0.0  # progress, 0 to 1
+        self.answer: Answer | None = None  # the result; None while it runs
         self.cancelled = False
 
     def report(self, fraction: float) -> None:
-        """Say how much is done, 0 to 1."""
+        """Report progress, 0 to 1."""
         self.fraction = min(1.0, max(0.0, fraction))
 
     def finish(self, answer: Answer = ACCEPTED) -> None:
-        """Say how it ended; the first word stands."""
+        """Report the result; the first one counts."""
         with self._lock:
             self.answer = self.answer or answer
 
     def cancel(self) -> None:
-        """Ask for an early end."""
+        """Request an early end."""
         self.cancelled = True
 
 
@@ -62,17 +62,17 @@ Handled = Answer | Work
 
 
 class Phase(Enum):
-    """What the scan is doing."""
+    """State of the scan."""
 
     IDLE = "idle"
-    WAITING = "waiting"  # a scan is wanted and not running: it is tried again soon
+    WAITING = "waiting"  # a scan is wanted, does not run, and is retried soon
     SCANNING = "scanning"
     PAUSED = "paused"
     FINALISING = "finalising"
 
 
 class Power(Enum):
-    """What a reboot command asks for."""
+    """Action of a reboot command."""
 
     RESTART_SERVICE = "restart service"
     REBOOT = "reboot"
@@ -81,7 +81,7 @@ class Power(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ScanStatus:
-    """A snapshot for the operator; figures that are not known are NaN or 0."""
+    """A snapshot for the operator; unknown figures are NaN or 0."""
 
     phase: Phase = Phase.IDLE
     scan_id: str = ""
@@ -91,7 +91,7 @@ class ScanStatus:
     speed_m_s: float = float("nan")
     distance_m: float = float("nan")
     turn_rate_rad_s: float = float("nan")
-    camera_latency_ms: float = float("nan")  # as the pictures say, whether applied or not
+    camera_latency_ms: float = float("nan")  # measured from the images, whether applied or not
     camera_latency_sigma_ms: float = float("nan")
 
     @property
@@ -107,37 +107,37 @@ class ScanControl(Protocol):
         """A snapshot."""
 
     def start_scan(self) -> Handled:
-        """Start a scan, end a pause, or try again at once; a second start changes nothing."""
+        """Start a scan, resume a paused one, or retry at once; a second start changes nothing."""
 
     def stop_scan(self) -> Handled:
-        """Want no scan: close the running one and drop every retry; always possible."""
+        """Close the running scan and drop every retry; always possible."""
 
     def capture_keyframe(self) -> Handled:
         """Make the next frame a keyframe and report it."""
 
     def pause(self) -> Handled:
-        """Stop adding to the scan without closing it."""
+        """Take no frames without closing the scan."""
 
     def resume(self) -> Handled:
-        """Go on after a pause."""
+        """Resume after a pause."""
 
     def clear_map(self) -> Handled:
         """Forget the map of the running scan."""
 
     def finalise(self) -> Handled:
-        """Stop as :meth:`stop_scan` does, and answer when everything is written out."""
+        """Stop as :meth:`stop_scan` does, and answer when all files are written."""
 
     def self_test(self) -> Handled:
         """Check camera, link, disk and compute."""
 
     def erase_scans(self) -> Handled:
-        """Delete the finished scans; asked only while none runs."""
+        """Delete the finished scans; called only while none runs."""
 
     def power(self, action: Power) -> Handled:
-        """Reboot or shut down; asked only while disarmed."""
+        """Reboot or shut down; called only while disarmed."""
 
     def parameter_changed(self, name: str, value: float) -> Answer:
-        """Take a new value of one of ``PARAMETERS``, or refuse it.
+        """Apply a new value of one of ``PARAMETERS``, or refuse it.
 
-        The baseline comes this way, whatever command set it: ``SR_BASELINE_M``, 0 automatic.
+        The baseline always arrives as ``SR_BASELINE_M`` (0: automatic), whatever command set it.
         """

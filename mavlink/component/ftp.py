@@ -1,4 +1,4 @@
-"""MAVLink FTP, reading only: a few small files (camera definition, metadata) out of memory.
+"""MAVLink FTP, read-only: a few small files (camera definition, metadata) from memory.
 
 Payload of FILE_TRANSFER_PROTOCOL, little endian: u16 sequence, u8 session, u8 opcode, u8 size,
 u8 opcode answered, u8 burst complete, u8 padding, u32 offset, 239 bytes of data.
@@ -28,19 +28,19 @@ MAX_SESSIONS = 8
 MAX_CLIENTS = 16
 BURST_PACKETS = 20
 SELECTOR = re.compile(r"^/?\[;comp=\d{1,3}\]")
-"""What an address has before the path; some clients send it along with the path."""
+"""Prefix of an address before the path; some clients send it along with the path."""
 
 
 def file_uri(component: int, name: str) -> str:
-    """The address of a file of one of our components, also for who heard of it from another.
+    """The address of a file of one of our components.
 
-    An autopilot may pass on what we say as its own, so the component is always named.
+    It names the component, because an autopilot may forward our messages as its own.
     """
     return f"mftp://[;comp={component}]{name}"
 
 
 def file_crc(data: bytes) -> int:
-    """MAVLink's CRC32, which starts at zero and is not inverted at the end."""
+    """MAVLink's CRC32: it starts at zero and is not inverted at the end."""
     return zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
@@ -57,7 +57,7 @@ class Request:
 
 
 def parse_request(payload: bytes) -> Request | None:
-    """The request in a payload; None when it is none."""
+    """The request in a payload; None for any other payload."""
     if len(payload) < HEAD.size:
         return None
     sequence, session, opcode, size, _, _, _, offset = HEAD.unpack_from(payload)
@@ -70,10 +70,10 @@ class FileServer:
     def __init__(self, files: Mapping[str, bytes]) -> None:
         self._files = dict(files)
         self._sessions: dict[int, tuple[Address, bytes]] = {}
-        self._last: dict[Address, tuple[int, list[bytes]]] = {}  # for answers that were lost
+        self._last: dict[Address, tuple[int, list[bytes]]] = {}  # to repeat lost answers
 
     def answer(self, payload: bytes, source: Address) -> list[bytes]:
-        """The answers to a request; none to what is no request."""
+        """The answers to a request; empty for any other payload."""
         request = parse_request(payload)
         if request is None or request.opcode in (0, ACK, NAK):
             return []

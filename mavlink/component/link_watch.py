@@ -1,8 +1,8 @@
-"""What is missing on the links although they are open, each with the setting to change.
+"""Detects what is missing on open links, and names the setting to change.
 
-ArduPilot does not forward a ground station's heartbeats to a port whose traffic stays private, so
-a ground station that is never heard is the sign that it does not hear us either. PX4 decides for
-each direction alone; there the sign is that no ground station ever asks our camera anything.
+ArduPilot does not forward a ground station's heartbeats to a port with private traffic, so a
+ground station that is never heard does not hear us either. PX4 forwards each direction
+independently; there the symptom is that no ground station ever queries our camera.
 """
 
 from __future__ import annotations
@@ -40,62 +40,55 @@ TO_ONE = numbers_of(
         "PARAM_EXT_SET",
     )
 )
-"""Messages that name the component they are for."""
+"""Messages that name their target component."""
 ASK_WAIT_S = 60.0
 PX4 = 12  # MAV_AUTOPILOT
 
-SILENT = (
-    "No autopilot heard: check mavlink.links, SERIALn_PROTOCOL and SERIALn_BAUD (PX4: MAV_n_CONFIG)"
-)
-MAVLINK_1 = "The autopilot sends MAVLink 1: set SERIALn_PROTOCOL = 2 (PX4: MAV_PROTO_VER = 2)"
+SILENT = "No autopilot: check mavlink.links, SERIALn_PROTOCOL and SERIALn_BAUD (PX4: MAV_n_CONFIG)"
+MAVLINK_1 = "Autopilot sends MAVLink 1: set SERIALn_PROTOCOL = 2 (PX4: MAV_PROTO_VER = 2)"
 NO_GIMBAL = (
     "No gimbal angles: set up the mount (MNT1_TYPE; PX4: MNT_MODE_OUT), or camera.mount = fixed"
 )
-NO_GROUND = (
-    "No ground station is heard: SERIALn_OPTIONS must not hold 1024 (PX4: set MAV_n_FORWARD = 1)"
-)
+NO_GROUND = "No ground station heard: remove 1024 from SERIALn_OPTIONS (PX4: MAV_n_FORWARD = 1)"
 UNANSWERED = (
-    "Commands come, but our answers stay here: remove 1024 from SERIALn_OPTIONS"
-    " (PX4: set MAV_n_FORWARD = 1)"
+    "Answers do not reach the ground: remove 1024 from SERIALn_OPTIONS (PX4: MAV_n_FORWARD = 1)"
 )
-NEVER_ASKED = (
-    "A ground station is heard but never asks our camera: set MAV_n_FORWARD = 1 for this port"
-)
+NEVER_ASKED = "Ground station does not query the camera: set MAV_n_FORWARD = 1 on this port"
 
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """Something that a flight misses."""
+    """Something that a flight needs and the links lack."""
 
     what: str  # autopilot, mavlink 1, gimbal or ground
     text: str
-    is_known: bool = False  # another text has named it already
-    is_grave: bool = True  # we are not ready to fly with it
+    is_known: bool = False  # another text has reported it already
+    is_grave: bool = True  # not ready to fly with it
 
 
 @dataclass(frozen=True)
 class WatchConfig:
-    """What is expected on the links, and for how long it is waited for."""
+    """What is expected on the links, and how long to wait for it."""
 
-    gimbal: bool | None = None  # True: a flight needs its angles; None: they are welcome
+    gimbal: bool | None = None  # True: its angles are required; None: optional
     wait_s: float = 10.0
-    ground_wait_s: float = 60.0  # ground stations come later, and go out of range
+    ground_wait_s: float = 60.0  # ground stations join later and leave radio range
 
 
 class LinkWatch:
-    """Fed with every packet that is heard; ``presence`` says whose vehicle we are on."""
+    """Gets every received packet; ``presence`` identifies our vehicle."""
 
     def __init__(self, config: WatchConfig, presence: Presence, now_ns: int) -> None:
         self._config, self._presence = config, presence
         self._first_autopilot_ns: int | None = None
         self._modern_ns = self._old_ns = self._gimbal_ns = -(1 << 62)  # never
         self._start_ns = self._ground_ns = now_ns
-        self._asked_ns: int | None = None  # a ground station named one of our components
+        self._asked_ns: int | None = None  # when a ground station addressed one of our components
         self._is_ground_heard = False
         self._announced: frozenset[str] = frozenset()
 
     def hear(self, packet: Packet, message: Any, now_ns: int) -> None:
-        """Take in one packet and the message in it."""
+        """Process one packet and its message."""
         system = self._presence.system
         if (packet.system, packet.component) == self._presence.autopilot:
             if self._first_autopilot_ns is None:
@@ -113,7 +106,7 @@ class LinkWatch:
             self._asked_ns = now_ns if is_ours else self._asked_ns
 
     def troubles(self, now_ns: int) -> tuple[Trouble, ...]:
-        """What is missing now, the gravest first."""
+        """What is missing now, the most severe first."""
         found = (self._autopilot(now_ns) or self._telemetry(now_ns), self._ground(now_ns))
         return tuple(trouble for trouble in found if trouble is not None)
 
@@ -137,7 +130,7 @@ class LinkWatch:
         return Trouble("autopilot", text)
 
     def _telemetry(self, now_ns: int) -> Trouble | None:
-        """What the autopilot that is heard does not send."""
+        """What the autopilot does not send."""
         first_ns, wait_s = self._first_autopilot_ns, self._config.wait_s
         if first_ns is None or not self._is_stale(first_ns, wait_s, now_ns):
             return None
@@ -161,7 +154,7 @@ class LinkWatch:
         return None
 
     def news(self, now_ns: int, is_start: bool) -> Sequence[str]:
-        """Texts for the operator: each trouble when it begins, and all when a scan starts."""
+        """Texts for the operator: each trouble when it begins, and all at the start of a scan."""
         troubles = self.troubles(now_ns)
         before = frozenset() if is_start else self._announced
         self._announced = frozenset(t.what for t in troubles)
@@ -174,7 +167,7 @@ BACKLOG = 10_000
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What a look found."""
+    """Result of a probe."""
 
     links: tuple[LinkReport, ...]
     autopilot: tuple[int, int] | None  # system and component
@@ -182,10 +175,10 @@ class Found:
 
 
 class LinkProbe:
-    """A short look at the links. ValueError for a link or key that cannot be.
+    """A short probe of the links. ValueError for an invalid link or key.
 
-    It says who we are and asks the autopilot for its telemetry, as the service does, because a
-    port may carry nothing before. It carries out no command.
+    It sends heartbeats and requests telemetry, as the service does, because a port may carry
+    nothing before. It executes no command.
     """
 
     def __init__(
@@ -210,7 +203,7 @@ class LinkProbe:
         self._links = Links(opened, lambda *heard: self._inbox.gather(heard), signing)
 
     def look(self, seconds: float) -> Found:
-        """Listen and ask for so long; what was found."""
+        """Listen and request for this long."""
         self._links.start()
         end_ns = time.monotonic_ns() + round(seconds * S)
         while time.monotonic_ns() < end_ns:

@@ -1,4 +1,4 @@
-"""What the vehicle link keeps over restarts, in one small file."""
+"""State of the vehicle link that survives restarts, in one small file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FILE = "mavlink.json"
 
 
 def remembered_system(folder: Path) -> int | None:
-    """The system id of the vehicle of the last run; None when it is not known."""
+    """The system id of the vehicle of the last run; None when unknown."""
     return Memory(folder).system
 
 
@@ -24,7 +24,7 @@ class Memory:
     def __init__(self, folder: Path | None) -> None:
         self._path = None if folder is None else folder / FILE
         self._revision = 0
-        self._written = _text({}, 0, None)  # as good as no file
+        self._written = _text({}, 0, None)  # equivalent to no file
         self.parameters: dict[str, float] = {}
         self.signing_timestamp = 0
         self.system: int | None = None
@@ -48,9 +48,9 @@ class Memory:
     def save(
         self, values: dict[str, float], revision: int, timestamp: int, system: int | None
     ) -> None:
-        """Keep them, where they are new; a full disk is logged, not raised.
+        """Save what has changed; a full disk is logged, not raised.
 
-        A ``system`` of None keeps the one that is known.
+        A ``system`` of None keeps the known one.
         """
         self._revision = revision
         self.system = system or self.system

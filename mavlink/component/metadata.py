@@ -1,9 +1,9 @@
 """Files that describe our parameters to ground stations, read over MAVLink FTP.
 
 COMPONENT_METADATA gives the address of ``general.json.xz``, which gives that of
-``parameters.json.xz`` (https://mavlink.io/en/services/component_metadata.html). They do not
-change while the service runs, as that protocol asks. The camera definition makes a ground
-station show the same parameters as camera settings.
+``parameters.json.xz`` (https://mavlink.io/en/services/component_metadata.html). The protocol
+requires that they stay constant while the service runs. The camera definition shows the same
+parameters as camera settings.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ NUMBER, CRC_EXTRA = 397, 182
 URI = 100  # bytes
 GENERAL, PARAMETERS = "general.json.xz", "parameters.json.xz"
 TYPE_PARAMETER = 1  # COMP_METADATA_TYPE
-FORMAT = 1  # of both formats; ground stations refuse the parameter schema's newer numbers
+FORMAT = 1  # version of both formats; ground stations refuse newer versions of the parameter schema
 XZ = [{"id": lzma.FILTER_LZMA2, "preset": 9, "dict_size": 1 << 16}]
 
 
@@ -74,7 +74,7 @@ class ComponentMetadata:
         self.files = {GENERAL: general, PARAMETERS: parameters}
 
     def message(self, boot_ms: int) -> ComponentMetadataMessage:
-        """Where the general file is, and its checksum."""
+        """The address of the general file, and its checksum."""
         crc = file_crc(self.files[GENERAL])
         return ComponentMetadataMessage(boot_ms, crc, file_uri(ONBOARD, GENERAL))
 
@@ -117,7 +117,7 @@ def camera_definition(vendor: str, model: str, table: Sequence[Parameter]) -> by
 
 
 def definition_version(table: Sequence[Parameter]) -> int:
-    """1 to 65535, another one whenever the parameters change: ground stations keep the file."""
+    """1 to 65535; changes with the parameters, because ground stations cache the file."""
     body = "".join(_described(parameter) for parameter in table)
     return zlib.crc32(body.encode()) & 0xFFFF or 1
 

@@ -1,8 +1,8 @@
-"""What an operator tunes in flight: PARAM_* on the onboard computer, PARAM_EXT_* on the camera.
+"""Values that an operator tunes in flight: PARAM_* (onboard computer), PARAM_EXT_* (camera).
 
-Both show the same values. All are REAL32: ArduPilot and PX4 encode other types differently.
-Ground stations use PARAM_EXT_* for the settings in a camera definition; there the 4 bytes of a
-REAL32 travel in a field of 128.
+Both give the same values. All are REAL32: ArduPilot and PX4 encode other types differently.
+Ground stations use PARAM_EXT_* for the settings in a camera definition; it carries the 4 bytes of
+a REAL32 in a field of 128.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Parameter:
     text: str
     options: tuple[str, ...] = ()  # names of the values 0, 1, 2 ...
     unit: str = ""
-    step: float = 1.0  # of a ground station's slider
+    step: float = 1.0  # step of a ground station's slider
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.name) <= 16 or not self.name.isascii():
@@ -45,7 +45,7 @@ class Parameter:
             raise ValueError(f"parameter {self.name}: default {self.default} is out of range")
 
     def accepts(self, value: float) -> bool:
-        """True for a value in range; whole numbers only where values have names."""
+        """True for a value in range; only whole numbers where values have names."""
         if not math.isfinite(value) or not self.low <= value <= self.high:
             return False
         return not self.options or value == round(value)
@@ -57,13 +57,13 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter("SR_LINK_KBIT_S", 1000.0, 1.0, 100_000.0, "Datalink budget", (), "kbit/s", 10.0),
     Parameter(YAW_FRAME, 0.0, 0.0, len(YAW_FRAMES) - 1.0, "Gimbal yaw frame", options=YAW_FRAMES),
     Parameter("SR_CAM_LATENCY", 0.0, -500.0, 2000.0, "Camera latency", (), "ms", 5.0),
-    Parameter("SR_CAM_LAT_AUTO", 0.0, 0.0, 1.0, "Apply the latency found", ("off", "on")),
+    Parameter("SR_CAM_LAT_AUTO", 0.0, 0.0, 1.0, "Apply measured latency", ("off", "on")),
 )
-"""The next parameter is one line here and one in the service's table."""
+"""A new parameter is one line here and one in the service's table."""
 
 
 def with_defaults(values: Mapping[str, float]) -> tuple[Parameter, ...]:
-    """The table with other defaults; those out of range are left as they are."""
+    """The table with other defaults; defaults out of range are ignored."""
     return tuple(
         replace(p, default=values[p.name]) if p.accepts(values.get(p.name, math.nan)) else p
         for p in PARAMETERS
@@ -84,14 +84,14 @@ class Parameters:
         self._on_change = on_change
         self._table = {p.name: p for p in table}
         self._values = {p.name: _real32(p.default) for p in table}
-        self.revision = 0  # grows with every change, so that a keeper knows when to save
+        self.revision = 0  # increases with every change, so that the owner knows when to save
         for name, value in (kept or {}).items():
             if name in self._table and self._table[name].accepts(value):
                 self._values[name] = _real32(value)
 
     @property
     def table(self) -> tuple[Parameter, ...]:
-        """Every parameter with the default that holds now."""
+        """Every parameter with its current default."""
         return tuple(self._table.values())
 
     def __getitem__(self, name: str) -> float:
@@ -107,11 +107,11 @@ class Parameters:
         return {name: v for name, v in self._values.items() if v != defaults[name]}
 
     def forget(self, name: str) -> None:
-        """Put a value that the service no longer takes back to its default."""
+        """Reset a value that the service no longer accepts to its default."""
         self._values[name] = _real32(self._table[name].default)
 
     def adopt(self, values: Mapping[str, float]) -> None:
-        """Take other defaults, which hold from now on, and show them."""
+        """Replace the defaults, and publish the new values."""
         for name, value in values.items():
             if self._table[name].accepts(value):
                 self._table[name] = replace(self._table[name], default=value)
@@ -136,14 +136,14 @@ class Parameters:
         self._send(name)
 
     def reset(self) -> None:
-        """Every value back to its default."""
+        """Reset every value to its default."""
         for parameter in self.table:
             self.change(parameter.name, parameter.default)
 
     def receive(self, message: Any) -> Answer | None:
-        """Serve a PARAM_* or PARAM_EXT_* message that is meant for our component.
+        """Handle a PARAM_* or PARAM_EXT_* message addressed to our component.
 
-        The answer of one that sets a value, for the operator; None for the rest.
+        Returns the operator's answer for a message that sets a value, None for the rest.
         """
         kind = message.get_type()
         send = self._send_extended if kind.startswith("PARAM_EXT_") else self._send
@@ -166,7 +166,7 @@ class Parameters:
         name, before = _text(message.param_id), self.revision
         answer = self.change(name, message.param_value)
         if self.revision == before and name in self._table:
-            self._send(name)  # shows the asker the value that holds
+            self._send(name)  # reports the value in force
         return answer
 
     def _set_extended(self, message: Any) -> Answer:
@@ -174,7 +174,7 @@ class Parameters:
         if name not in self._table or message.param_type != REAL32:
             self._acknowledge(name, 0.0, ACK_UNSUPPORTED)
             return Answer(Result.DENIED, f"no parameter {name}")
-        raw: bytes = message._param_value_raw  # pymavlink drops the zeros at its end
+        raw: bytes = message._param_value_raw  # pymavlink drops its trailing zeros
         answer = self.change(name, struct.unpack("<f", raw.ljust(4, b"\0")[:4])[0])
         accepted = answer.result is Result.ACCEPTED
         self._acknowledge(name, self[name], ACK_ACCEPTED if accepted else ACK_FAILED)
@@ -211,6 +211,6 @@ def _packed(value: float) -> bytes:
 
 
 def _text(raw: str | bytes) -> str:
-    """A parameter's name as it came, without what follows a zero."""
+    """A parameter's name as received, cut at the first zero."""
     text = raw.decode("ascii", "replace") if isinstance(raw, bytes) else raw
     return text.partition("\0")[0]

@@ -1,8 +1,8 @@
-"""Heartbeats of our two components, tied to the health of the service, and who else is there.
+"""Heartbeats of our two components, tied to the health of the service; and who else is there.
 
-Of several vehicles, the one that we are on answers our TIMESYNC questions sooner than others
-whose messages it forwards; where no autopilot answers, it is the one that says most. Where that
-does not decide either, nobody is followed and the operator is asked for ``mavlink.system_id``.
+Of several vehicles, ours answers our TIMESYNC requests sooner than vehicles whose messages it
+forwards. Without answers, the autopilot that sends the most messages is ours. If that is not
+decisive either, no vehicle is followed and the operator is asked to set ``mavlink.system_id``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mavlink.wire.messages import Outgoing
 S = 1_000_000_000
 PERIOD_NS = S
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
-RECENT_NS = 3 * S  # an armed state older than this is not known any more
+RECENT_NS = 3 * S  # an older armed state counts as unknown
 
 
 class Health(IntEnum):
@@ -35,13 +35,13 @@ class Health(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class PresenceConfig:
-    """Our place on the network."""
+    """Our settings on the network."""
 
-    system: int | None = None  # None: that of the vehicle that we are connected to
-    latch_s: float = 3.0  # how long the vehicle of the last flight is waited for before others
-    stale_s: float = 5.0  # health not confirmed for longer is CRITICAL
-    dead_s: float = 20.0  # not confirmed for longer: no heartbeat any more
-    boot_s: float = 120.0  # the same for a service that has not come up
+    system: int | None = None  # None: that of our vehicle
+    latch_s: float = 3.0  # how long to wait for the vehicle of the last flight
+    stale_s: float = 5.0  # health not confirmed for this long is CRITICAL
+    dead_s: float = 20.0  # not confirmed for this long: heartbeats stop
+    boot_s: float = 120.0  # the same during start-up
 
     def __post_init__(self) -> None:
         if self.system is not None and not 1 <= self.system <= 255:
@@ -51,9 +51,9 @@ class PresenceConfig:
 
 
 class Presence:
-    """What we say of ourselves every second, and what others say.
+    """Sends our heartbeats and reads those of others.
 
-    The heartbeats may be asked for in another thread than the rest.
+    The heartbeats may be requested from another thread than the rest.
     """
 
     def __init__(
@@ -66,24 +66,24 @@ class Presence:
     ) -> None:
         """The first heartbeat is due at ``first_ns``, or now; ``remembered``: the last system."""
         self.config = config
-        self._token = token  # in custom_mode: tells our echo from another companion
+        self._token = token  # in custom_mode: distinguishes our echo from another companion
         self._lock = threading.Lock()
         self._health = Health.BOOT
         self._confirmed_ns = now_ns
         self._next_ns = now_ns if first_ns is None else first_ns
         self.autopilots = Autopilots(config.system, remembered, config.latch_s)
         self._intruder = False
-        self.is_ready = True  # the links have what a flight needs
+        self.is_ready = True  # the links provide what a flight needs
         self._news: list[str] = []
 
     @property
     def system(self) -> int:
-        """The system id that we use."""
+        """The system id in use."""
         return self.autopilots.system
 
     @property
     def proven_system(self) -> int | None:
-        """The system id to remember; None until the evidence speaks for one."""
+        """The system id to remember; None until the evidence is sufficient."""
         autopilots = self.autopilots
         return autopilots.system if autopilots.is_proven else None
 
@@ -95,36 +95,36 @@ class Presence:
 
     @property
     def autopilot_seen_ns(self) -> int | None:
-        """When the autopilot's heartbeat was heard last."""
+        """Time of the autopilot's last heartbeat."""
         followed = self.autopilots.followed
         return None if followed is None else followed.seen_ns
 
     @property
     def is_certain(self) -> bool:
-        """False while our autopilot was only the first that was heard: it may be another's."""
+        """False while our autopilot was merely the first one heard: it may be another vehicle's."""
         return self.autopilots.is_certain
 
     @property
     def is_armed(self) -> bool:
-        """True while the autopilot says so."""
+        """True while the autopilot reports it."""
         followed = self.autopilots.followed
         return followed is not None and followed.is_armed
 
     def is_disarmed(self, now_ns: int) -> bool:
-        """True only where what is certainly our autopilot said so a moment ago."""
+        """True only where the autopilot, certainly ours, has just reported it."""
         followed = self.autopilots.followed
         if followed is None or followed.is_armed or not self.is_certain:
             return False
         return now_ns - followed.seen_ns <= RECENT_NS
 
     def confirm(self, health: Health, now_ns: int) -> None:
-        """The service is alive and this is its state; to be said again every few seconds."""
+        """Confirm that the service is alive and in this state; repeat every few seconds."""
         with self._lock:
             self._health = health
             self._confirmed_ns = now_ns
 
     def health(self, now_ns: int) -> Health | None:
-        """What the heartbeat says now; None once the service must be taken for dead."""
+        """State for the heartbeat; None once the service must be considered dead."""
         with self._lock:
             return self._state(now_ns)
 
@@ -138,7 +138,7 @@ class Presence:
         return Health.CRITICAL if silent < self.config.dead_s else None
 
     def due(self, now_ns: int) -> list[Outgoing]:
-        """The heartbeats to send now; the first call gives them at once."""
+        """The heartbeats to send now; the first call returns them at once."""
         with self._lock:
             if now_ns < self._next_ns:
                 return []
@@ -154,11 +154,11 @@ class Presence:
         return dialect.MAVLink_heartbeat_message(kind, NO_AUTOPILOT, 0, self._token, int(state), 3)
 
     def next_timer(self) -> int:
-        """When :meth:`due` has something again, in ns."""
+        """Time in ns of the next heartbeat."""
         return self._next_ns
 
     def hear(self, message: Any, now_ns: int) -> None:
-        """Take in anyone's heartbeat."""
+        """Process a heartbeat of any sender."""
         system, component = message.get_srcSystem(), message.get_srcComponent()
         if is_autopilot(component, message):
             armed = bool(message.base_mode & ARMED)
@@ -173,24 +173,24 @@ class Presence:
         self._news.append(f"Another companion uses component {component} of this vehicle")
 
     def take_news(self) -> list[str]:
-        """What the operator must know, each once."""
+        """New messages for the operator, each once."""
         news, self._news = self._news, []
         return self.autopilots.take_news() + news
 
 
 MS = 1_000_000
 AUTOPILOT1 = 1  # MAV_COMP_ID_AUTOPILOT1
-LOOK_NS = 3 * S  # how long evidence is gathered before it is compared
+LOOK_NS = 3 * S  # how long evidence is collected before it is compared
 PRESENT_NS = 5 * S  # an autopilot heard within this time takes part in a comparison
 ENOUGH_ANSWERS = 2  # of TIMESYNC within one look
 NEARER, NEARER_NS = 3, 5 * MS  # a round trip shorter by this factor and this much decides
-LOUDER, LOUD = 4, 8  # so many times as many messages decide, from this many on
-PROVEN_LOOKS = 10  # looks in a row that must speak against an autopilot that was proven ours
+LOUDER, LOUD = 4, 8  # this many times as many messages decide, from this count on
+PROVEN_LOOKS = 10  # consecutive evaluations against a proven autopilot before it is dropped
 
 
 @dataclass(slots=True)
 class Autopilot:
-    """One system's autopilot and what speaks for it in the current look."""
+    """One system's autopilot and its evidence in the current evaluation."""
 
     system: int
     component: int
@@ -199,30 +199,30 @@ class Autopilot:
     is_armed: bool = False
     messages: int = 0
     answers: int = 0
-    round_trip_ns: int = 0  # the shortest
+    round_trip_ns: int = 0  # the minimum
 
     def forget_evidence(self) -> None:
-        """Start a new look."""
+        """Start a new evaluation."""
         self.messages = self.answers = self.round_trip_ns = 0
 
 
 class Autopilots:
     """Every autopilot heard, at most one per system id, and the one that is followed.
 
-    Fed by one thread; others may read it.
+    One thread writes; others may read.
     """
 
     def __init__(self, given: int | None, remembered: int | None, wait_s: float) -> None:
-        """``given`` is never left; ``remembered`` is waited for ``wait_s`` before others."""
+        """``given`` is fixed; ``remembered`` is waited for ``wait_s`` before following others."""
         self.given = given
         self.remembered = remembered
         self.followed: Autopilot | None = None
-        self.is_proven = False  # nothing spoke for another vehicle
+        self.is_proven = False  # no evidence for another vehicle
         self._wait_ns = round(wait_s * S)
         self._heard: dict[int, Autopilot] = {}
         self._first_ns: int | None = None
         self._look_ns = 0
-        self._against = 0  # looks in a row that spoke for another vehicle
+        self._against = 0  # consecutive evaluations in favour of another vehicle
         self._is_unclear = False
         self._news: list[str] = []
 
@@ -235,7 +235,7 @@ class Autopilots:
 
     @property
     def is_certain(self) -> bool:
-        """False while the one followed was only the first that was heard."""
+        """False while the followed one was merely the first one heard."""
         followed = self.followed
         expected = followed is not None and followed.system in (self.given, self.remembered)
         return followed is None or self.is_proven or expected
@@ -243,7 +243,7 @@ class Autopilots:
     def hear(
         self, system: int, component: int, is_armed: bool, now_ns: int, firmware: int = 0
     ) -> None:
-        """Take in an autopilot's heartbeat; component 1 goes before others of its system."""
+        """Process an autopilot's heartbeat; component 1 is preferred within its system."""
         known = self._heard.get(system)
         if known is None or (known.component != component and component == AUTOPILOT1):
             fresh = self._heard[system] = Autopilot(system, component)
@@ -259,7 +259,7 @@ class Autopilots:
             self.followed = known
 
     def _may_follow(self, system: int, now_ns: int) -> bool:
-        """True where the first heartbeat is enough."""
+        """True where the first heartbeat suffices."""
         if self.given is not None:
             return system == self.given
         if self._is_unclear or self._first_ns is None:
@@ -268,13 +268,13 @@ class Autopilots:
         return expected or now_ns - self._first_ns >= self._wait_ns
 
     def count(self, system: int, component: int) -> None:
-        """Count a message; only those of autopilots speak for a vehicle."""
+        """Count a message; only those of autopilots are evidence."""
         known = self._heard.get(system)
         if known is not None and known.component == component:
             known.messages += 1
 
     def answered(self, system: int, component: int, round_trip_ns: int) -> None:
-        """Take in an answer to one of our TIMESYNC questions."""
+        """Process an answer to one of our TIMESYNC requests."""
         known = self._heard.get(system)
         if known is None or known.component != component:
             return
@@ -282,7 +282,7 @@ class Autopilots:
         known.answers, known.round_trip_ns = known.answers + 1, shortest
 
     def look(self, now_ns: int) -> None:
-        """Compare the evidence when it is time; follow another vehicle if it speaks for that."""
+        """Evaluate the evidence when due; follow another vehicle if it wins."""
         if self.given is not None or self._first_ns is None or now_ns < self._look_ns:
             return
         self._look_ns = now_ns + LOOK_NS
@@ -309,7 +309,7 @@ class Autopilots:
             self._follow(best)
 
     def _expected_among(self, present: Sequence[Autopilot]) -> Autopilot | None:
-        """The remembered vehicle, where it is there; it decides a draw."""
+        """The remembered vehicle, if present; it decides a tie."""
         expected = next((a for a in present if a.system == self.remembered), None)
         if expected is not None and self.followed is not expected and not self.is_proven:
             self._follow(expected)
@@ -329,7 +329,7 @@ class Autopilots:
         self._is_unclear = True
 
     def take_news(self) -> list[str]:
-        """What the operator must know, each once."""
+        """New messages for the operator, each once."""
         news, self._news = self._news, []
         return news
 
@@ -340,7 +340,7 @@ class Autopilots:
 
 
 def clear_winner(present: Sequence[Autopilot]) -> Autopilot | None:
-    """The autopilot that we are connected to by all evidence; None where it does not decide."""
+    """The autopilot that the evidence identifies as ours; None where it is not decisive."""
     if len(present) == 1:
         return present[0]
     answering = [a for a in present if a.answers >= ENOUGH_ANSWERS]

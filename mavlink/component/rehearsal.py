@@ -1,6 +1,6 @@
 """A vehicle link over a ScanControl that keeps the state of a scan but scans nothing.
 
-For benches and for trying a ground station on the table without camera or pipeline.
+For test benches, and to try a ground station without camera or pipeline.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from mavlink.component.vehicle import VehicleConfig, VehicleLink
 
 @dataclass
 class RehearsalControl:
-    """Answers every command from its own state and remembers what it was asked, in order."""
+    """Answers every command from its own state and records the requests in order."""
 
     state: ScanStatus = field(
         default_factory=lambda: ScanStatus(storage_total_mib=1000.0, storage_free_mib=750.0)
     )
     asked: list[str] = field(default_factory=list)
-    works: dict[str, Work] = field(default_factory=dict)  # answers that take a while, by name
+    works: dict[str, Work] = field(default_factory=dict)  # answers that take time, by name
     answers: dict[str, Answer] = field(default_factory=dict)  # answers other than ACCEPTED
 
     def _ask(self, name: str, phase: Phase | None = None) -> Handled:
@@ -73,17 +73,17 @@ class RehearsalControl:
         return self._ask("erase_scans")
 
     def power(self, action: Power) -> Handled:
-        """Take note of it; nothing is switched off."""
+        """Record the request; nothing is switched off."""
         return self._ask(f"power: {action.value}")
 
     def parameter_changed(self, name: str, value: float) -> Answer:
-        """Take it, unless ``answers`` holds a refusal by this name."""
+        """Accept it, unless ``answers`` holds a refusal by this name."""
         self.asked.append(f"{name}={value:g}")
         return self.answers.get(name, ACCEPTED)
 
 
 class RehearsalVehicle:
-    """A context: a VehicleLink whose health is confirmed, over a :class:`RehearsalControl`."""
+    """A context manager: a VehicleLink with confirmed health, over a :class:`RehearsalControl`."""
 
     def __init__(self, *links: str, **settings: Any) -> None:
         """``settings`` are fields of :class:`~mavlink.component.vehicle.VehicleConfig`."""
@@ -93,7 +93,7 @@ class RehearsalVehicle:
         self._thread = threading.Thread(target=self._confirm, name="rehearsal", daemon=True)
 
     def __enter__(self) -> RehearsalVehicle:
-        """Open the links; those that listen are open when this returns, if they can be."""
+        """Open the links; listening links are open when this returns, if possible."""
         self.link.start()
         self._thread.start()
         deadline = time.monotonic() + 5.0

@@ -1,4 +1,4 @@
-"""What we report: status texts, the companion's load, speed and distance, our odometry."""
+"""Messages about ourselves: status texts, computer load, speed and distance, odometry."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from mavlink.wire.messages import Outbox
 S = 1_000_000_000
 TEXT = 50  # bytes in one STATUSTEXT
 LONGEST = 200
-AGAIN_NS = 30 * S  # the same text is not said again within this time
-MAX_SAID = 100  # texts that are remembered; answers take at most half of the room
+AGAIN_NS = 30 * S  # a repeated text is suppressed within this time
+MAX_SAID = 100  # texts that are remembered; answers use at most half of it
 SPACING_NS = S
-BURST = 3  # texts that may go out at once after a quiet time
+BURST = 3  # texts that may be sent at once after a pause
 
 EMERGENCY, ALERT, CRITICAL, ERROR, WARNING, NOTICE, INFO, DEBUG = range(8)
 
 
 class StatusTexts:
-    """Texts to the operator: at most one a second, and no text again and again."""
+    """Texts to the operator: at most one a second, repetitions suppressed."""
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
@@ -49,7 +49,7 @@ class StatusTexts:
         self.tick(now_ns)
 
     def tick(self, now_ns: int) -> None:
-        """Send what may go out now."""
+        """Send the texts that are due."""
         passed = 0 if self._last_ns is None else max(0, now_ns - self._last_ns)
         self._last_ns = now_ns
         self._credit_ns = min(BURST * SPACING_NS, self._credit_ns + passed)
@@ -59,7 +59,7 @@ class StatusTexts:
 
     @property
     def is_waiting(self) -> bool:
-        """True while texts wait for their turn."""
+        """True while texts are queued."""
         return bool(self._waiting)
 
     def _send(self, severity: int, text: str) -> None:
@@ -71,14 +71,14 @@ class StatusTexts:
         for k, chunk in enumerate(chunks):
             message = dialect.MAVLink_statustext_message(severity, chunk, number, k)
             self._outbox.put(ONBOARD, message)
-        if number and len(raw) % TEXT == 0:  # a text ends with a zero byte somewhere
+        if number and len(raw) % TEXT == 0:  # a text must end with a zero byte
             last = dialect.MAVLink_statustext_message(severity, b"", number, len(chunks))
             self._outbox.put(ONBOARD, last)
 
 
 @dataclass(frozen=True, slots=True)
 class ComputerLoad:
-    """The companion's load as the service measures it; None where it does not know."""
+    """The companion's load as measured by the service; None where unknown."""
 
     cpu_percent: tuple[int, ...] = ()  # per core, the first eight are sent
     gpu_percent: int | None = None
@@ -145,7 +145,7 @@ def motion_values(status: ScanStatus, boot_ms: int) -> list[Any]:
     ]
 
 
-LOCAL_FRD = 20  # MAV_FRAME_LOCAL_FRD: an origin of our own; ArduPilot and PX4 both take it
+LOCAL_FRD = 20  # MAV_FRAME_LOCAL_FRD: an arbitrary origin; ArduPilot and PX4 both accept it
 BODY_FRD = 12  # MAV_FRAME_BODY_FRD
 VISION = 2  # MAV_ESTIMATOR_TYPE_VISION
 CELLS = 21  # upper triangle of 6 x 6
@@ -159,8 +159,8 @@ class Odometry:
     q_ned_body: Quaternion
     velocity_frd_m_s: tuple[float, float, float]
     pose_covariance: Sequence[Sequence[float]]  # (6, 6) x y z roll pitch yaw
-    reset_counter: int  # grows when the estimate jumps, as after a loop was closed
-    quality_percent: int  # 0 to 100; 0 and less is unusable
+    reset_counter: int  # increases when the estimate jumps, as after a loop closure
+    quality_percent: int  # 0 to 100; 0 is unusable
 
 
 def odometry_message(odometry: Odometry, boot_time_us: int) -> Any:

@@ -1,7 +1,7 @@
-"""The vehicle as the service uses it: links, two components, history, all in one object.
+"""The vehicle as the service uses it: links, two components and history in one object.
 
-Threads: two per link, one for the protocol, one for heartbeats. Everything that the service
-calls here returns at once; ``ScanControl`` is asked in the protocol's thread.
+Threads: two per link, one for the protocol, one for heartbeats. Every call of the service returns
+at once; ``ScanControl`` is called in the protocol's thread.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ log = logging.getLogger(__name__)
 S = 1_000_000_000
 SAVE_EVERY_NS = 30 * S
 TELEMETRY = numbers_of(READERS)
-BACKLOG = 10_000  # packets waiting for the protocol's thread
+BACKLOG = 10_000  # packets queued for the protocol's thread
 STUCK_NS = 10 * S
 TUNNEL_ROOM = 128
-BEAT_NICE = -10  # needs LimitNICE or root; without it the thread runs like the others
+BEAT_NICE = -10  # needs LimitNICE or root, otherwise the priority stays normal
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleConfig:
-    """Links and how we behave on them."""
+    """Links and our settings on them."""
 
     links: tuple[str, ...] = ()
     presence: PresenceConfig = field(default_factory=PresenceConfig)
@@ -68,27 +68,27 @@ class VehicleConfig:
 
 @dataclass(frozen=True, slots=True)
 class VehicleReport:
-    """How the connection to the vehicle does."""
+    """State of the connection to the vehicle."""
 
     links: tuple[LinkReport, ...]
     system: int
     autopilot: tuple[int, int] | None
-    is_certain: bool  # False while it was only the first that was heard: maybe another vehicle's
+    is_certain: bool  # False while it was merely the first one heard
     autopilot_age_s: float | None
     is_armed: bool
     timesync_round_trip_ms: float | None
     unverified: int  # packets refused for their signature
-    dropped: int  # packets that the protocol's thread could not take in time
+    dropped: int  # packets that overflowed the protocol's queue
     troubles: tuple[Trouble, ...]  # what is missing although the links are open
 
 
 class VehicleLink:
-    """Start it, feed it with health, and read ``history``."""
+    """Start it, confirm health regularly, and read ``history``."""
 
     def __init__(
         self, config: VehicleConfig, control: ScanControl, first: FirstBeats | None = None
     ) -> None:
-        """``first`` has opened the links of ``config`` already and speaks on them."""
+        """``first`` has opened the links of ``config`` already and sends heartbeats on them."""
         self.config = config
         links = None if first is None else first.hand_over()
         now_ns = time.monotonic_ns()
@@ -113,7 +113,7 @@ class VehicleLink:
             lambda: (time.monotonic_ns() + self.unix_offset_ns()) // 1000,
         )
         self._inbox: Inbox[tuple[int, Packet, int]] = Inbox(BACKLOG)
-        self._heard = set(HEARD)  # numbers of messages; nothing is done with others
+        self._heard = set(HEARD)  # numbers of handled messages; others are ignored
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self._alive_ns = now_ns
@@ -126,10 +126,10 @@ class VehicleLink:
             return None
         return Signing(read_key(self.config.signing_key), self._memory.signing_timestamp)
 
-    # The service's side.
+    # Called by the service.
 
     def start(self) -> None:
-        """Open the links; the first heartbeat goes out before anything else."""
+        """Open the links; the first heartbeat is sent before anything else."""
         self._inbox.put(self._companion.announce_kept)
         for target in (self._beat, self._run):
             thread = threading.Thread(target=target, name=f"mavlink {target.__name__}", daemon=True)
@@ -138,7 +138,7 @@ class VehicleLink:
         self._links.start()
 
     def stop(self) -> None:
-        """Say what is left to say, then close everything."""
+        """Send what is queued, then close everything."""
         self._stop.set()
         self._inbox.put(lambda: None)
         for thread in self._threads:
@@ -152,15 +152,15 @@ class VehicleLink:
         self.presence.confirm(health, time.monotonic_ns())
 
     def set_load(self, load: ComputerLoad) -> None:
-        """The companion's load, for the operator."""
+        """Set the companion's load, for the operator."""
         self._companion.load = load
 
     def statustext(self, text: str, severity: int = texts.INFO, is_answer: bool = False) -> None:
-        """Send a text to the operator; repetitions are held back, except of answers."""
+        """Send a text to the operator; repetitions are suppressed, except of answers."""
         self._inbox.put(lambda: self._companion.say(severity, text, is_answer))
 
     def report_keyframe(self, keyframe: KeyframeReport) -> None:
-        """Tell ground stations of a keyframe."""
+        """Report a keyframe to ground stations."""
         self._inbox.put(lambda: self._companion.report(keyframe))
 
     def send_tunnel(self, payload_type: int, payload: bytes) -> None:
@@ -172,14 +172,14 @@ class VehicleLink:
         self._inbox.put(lambda: self._companion.send(message))
 
     def listen(self, name: str, listener: Callable[[Any], None]) -> None:
-        """Call back, in the protocol's thread, with every message of a name such as TUNNEL."""
+        """Call ``listener`` in the protocol's thread with every message of a name, e.g. TUNNEL."""
         self._heard |= numbers_of([name])
         self._inbox.put(lambda: self._companion.listen(name, listener))
 
     def report_odometry(self, odometry: Odometry, time_ns: int) -> bool:
         """Send our estimate to the autopilot, stamped with its clock at our monotonic time.
 
-        False, and nothing sent, unless ``odometry`` is switched on and its clock is known.
+        Returns False and sends nothing unless ``odometry`` is enabled and its clock is known.
         """
         boot_us = self.boot_time_us(time_ns)
         if boot_us is None or not self.config.odometry:
@@ -196,11 +196,11 @@ class VehicleLink:
         return self._companion.parameters.values()
 
     def show_parameters(self, values: Mapping[str, float]) -> None:
-        """Let these hold, as the configuration says by now, and tell ground stations."""
+        """Make the configuration's values the defaults, and publish them to ground stations."""
         self._inbox.put(lambda: self._companion.parameters.adopt(values))
 
     def record(self, path: Path | None, unix_offset_ns: int | None = None) -> None:
-        """Keep a .tlog of all links in a file from now on, stamped with the monotonic clock plus
+        """Write a .tlog of all links to a file from now on, stamped with the monotonic clock plus
         ``unix_offset_ns`` (None: :meth:`unix_offset_ns`); a path of None ends it."""
         if path is None:
             self.recorder.close()
@@ -209,8 +209,8 @@ class VehicleLink:
             self.recorder.open(path, offset_ns)
 
     def unix_offset_ns(self) -> int:
-        """Unix time less our monotonic clock: this computer's, or the autopilot's where the two
-        clocks do not agree."""
+        """Unix time minus our monotonic clock: from this computer, or from the autopilot where the
+        two clocks disagree."""
         return self._companion.autopilot.wall_time.correct(computer_offset_ns())
 
     def boot_time_us(self, time_ns: int) -> int | None:
@@ -256,7 +256,7 @@ class VehicleLink:
         self._companion.receive(index, packet, now_ns)
 
     def _run(self) -> None:
-        """The protocol's thread, the only one that touches the companion."""
+        """The protocol's thread, the only one that uses the companion."""
         save_ns = time.monotonic_ns() + SAVE_EVERY_NS
         timer_ns = 0
         while not self._stop.is_set():
@@ -274,33 +274,33 @@ class VehicleLink:
         self._send(self._companion.take())
 
     def _serve(self, wait_s: float) -> bool:
-        """Do the jobs that wait and take in the telemetry; True when a job may have set a timer."""
+        """Run queued jobs and process telemetry; True when a job may have set a timer."""
         telemetry, jobs = self._inbox.take(wait_s)
-        for job in jobs:  # first: a heartbeat says whose telemetry follows
+        for job in jobs:  # first: a heartbeat identifies the telemetry that follows
             self._guard(job)
         for index, packet, now_ns in telemetry:
             try:
                 self._hear(index, packet, now_ns)
             except Exception:
-                log.exception("a fault while hearing telemetry")
+                log.exception("fault while processing telemetry")
         return bool(jobs)
 
     def _guard(self, job: Job) -> None:
-        """Do a job; a fault in what the service does on a command must not cost the link."""
+        """Run a job; a fault in the service's handler must not end the link."""
         try:
             job()
         except Exception:
-            log.exception("a fault while serving MAVLink")
+            log.exception("fault while serving MAVLink")
 
     def _beat(self) -> None:
-        """The heartbeats' thread, ahead of the others where the system lets us."""
+        """The heartbeats' thread, with raised priority where the system permits it."""
         if sys.platform == "linux":
             with contextlib.suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), BEAT_NICE)
         while not self._stop.is_set():
             now_ns = time.monotonic_ns()
             due = self.presence.due(now_ns)
-            if now_ns - self._alive_ns < STUCK_NS:  # else nobody would answer: say nothing
+            if now_ns - self._alive_ns < STUCK_NS:  # otherwise nothing would answer: stay silent
                 self._send(due)
             self._stop.wait(max(0.001, (self.presence.next_timer() - time.monotonic_ns()) / S))
 
@@ -323,5 +323,5 @@ class VehicleLink:
 
 
 def new_token() -> int:
-    """What tells our own heartbeats, heard back, from those of another companion."""
+    """A token that distinguishes our own echoed heartbeats from another companion's."""
     return secrets.randbits(32) or 1

@@ -1,1 +1,1 @@
-"""What the vehicle says: samples, clocks, its recent past, recorded logs."""
+"""Vehicle telemetry: samples, clocks, recent history, recorded logs."""

@@ -1,12 +1,12 @@
-"""The autopilot's clocks against ours: its boot clock, in a log and live, and unix time.
+"""The autopilot's clocks against ours: its boot clock, live and in a log, and unix time.
 
-A message is sampled at ``time_boot_ms`` of its sender and arrives later by an unknown delay,
-never earlier. So the difference of the two clocks is the lower edge of (arrival - boot time).
-Live, TIMESYNC gives it more precisely: we send ts1 = our ns with tc1 = 0; the autopilot echoes
-ts1 with tc1 = its boot time in ns, and a filter as PX4's follows the offset.
+A message is sampled at ``time_boot_ms`` of its sender and arrives after an unknown delay, so the
+offset of the two clocks is the lower edge of (arrival - boot time). Live, TIMESYNC measures it
+more precisely: we send ts1 = our ns with tc1 = 0; the autopilot echoes ts1 with tc1 = its boot
+time in ns, and a filter like PX4's follows the offset.
 
-What is fused goes by the boot clock; only names and labels rest on unix time, which a computer
-without a battery for its clock or a network gets from the autopilot's GNSS receiver.
+Fusion uses the boot clock; only names and labels use unix time, which a computer without clock
+battery and network takes from the autopilot's GNSS receiver.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MS = 1_000_000
 
 
 class BootCounter:
-    """Makes one sender's ``time_boot_ms`` count on over its 32-bit wrap; notices reboots."""
+    """Unwraps one sender's 32-bit ``time_boot_ms`` and detects reboots."""
 
     def __init__(self) -> None:
         self.session = 0
@@ -48,7 +48,7 @@ class BootCounter:
         if self._last_ms is not None and value < self._last_ms - REBOOT_BACK_MS:
             value = self._step_back(boot_ms, value)
         elif self._last_ms is not None and value > self._last_ms + WRAP_MS - WRAP_EDGE_MS:
-            return value - WRAP_MS  # a straggler from before the wrap
+            return value - WRAP_MS  # a late message from before the wrap
         self._last_ms = value if self._last_ms is None else max(self._last_ms, value)
         return value
 
@@ -70,7 +70,7 @@ class BootFit:
     boot_ns: F64  # (N,) knots, increasing
     offset_ns: F64  # (N,) relative to ``base_ns``
     base_ns: int
-    rate: float  # boot seconds per stamp second; 1 unless the log was made in faster time
+    rate: float  # boot seconds per stamp second; 1 unless a simulation ran faster than real time
     anchor_stamp_ns: int
     anchor_boot_ns: float
 
@@ -80,12 +80,12 @@ class BootFit:
         return self.rate == 1.0
 
     def from_boot(self, boot_ns: float) -> int:
-        """Time in ns of the stamps' clock at which the sender's clock read ``boot_ns``."""
+        """Time in ns on the stamps' clock when the sender's clock reads ``boot_ns``."""
         offset = float(np.interp(boot_ns, self.boot_ns, self.offset_ns))
         return self.base_ns + round(boot_ns + offset)
 
     def from_stamp(self, stamp_ns: int) -> int:
-        """The time to use for a message that carries no boot time."""
+        """The time to use for a message without a boot time."""
         if self.is_real_time:
             return stamp_ns
         passed = (stamp_ns - self.anchor_stamp_ns) * self.rate
@@ -96,9 +96,9 @@ def fit_boot(stamp_ns: Sequence[int], boot_ms: Sequence[float]) -> BootFit:
     """The fit of stamps (ns) and boot times (ms, unwrapped) of one session.
 
     The offset is the lower edge of stamp - boot in windows of 5 s: a straight line by
-    Theil-Sen when the windows agree with one (clocks drift), else it follows the windows (the
-    stamping computer's clock was set). When the two clocks run at different rates, as in a
-    simulation faster than real time, the boot clock is taken and anchored at the first stamp.
+    Theil-Sen when the windows fit one (clocks drift), otherwise the windows themselves (the
+    stamping computer's clock was set). When the clocks run at different rates, as in a
+    simulation faster than real time, the boot clock is used, anchored at the first stamp.
     """
     if len(stamp_ns) == 0 or len(stamp_ns) != len(boot_ms):
         raise ValueError(f"fit_boot needs pairs, got {len(stamp_ns)} and {len(boot_ms)}")
@@ -121,7 +121,7 @@ def _rate(stamps: F64, boots: F64) -> float:
     """Boot seconds per stamp second, exactly 1.0 when they agree within 3 percent."""
     if stamps[-1] - stamps[0] < WINDOW_NS:
         return 1.0
-    # The median slope over a twentieth of the log: a clock that is set once does not matter.
+    # The median slope over a twentieth of the log: a clock that is set once has no effect.
     lag = max(1, len(stamps) // 20)
     ds, db = stamps[lag:] - stamps[:-lag], boots[lag:] - boots[:-lag]
     use = ds > 0
@@ -132,7 +132,7 @@ def _rate(stamps: F64, boots: F64) -> float:
 
 
 def _lower_edge(stamps: F64, boots: F64) -> tuple[F64, F64]:
-    """Boot time and offset of the least delayed message of each window."""
+    """Boot time and offset of the message with minimum delay in each window."""
     order = np.argsort(boots, kind="stable")
     offsets, boots = (stamps - boots)[order], boots[order]
     window = ((boots - boots[0]) // WINDOW_NS).astype(np.int64)
@@ -143,7 +143,7 @@ def _lower_edge(stamps: F64, boots: F64) -> tuple[F64, F64]:
 
 
 def _line(x: F64, y: F64) -> F64:
-    """Theil-Sen line through the points, at x; a constant for less than four points."""
+    """Theil-Sen line through the points, at x; a constant for fewer than four points."""
     if len(x) < 4:
         return np.full_like(y, float(np.min(y)))
     pick = np.linspace(0, len(x) - 1, min(len(x), 200)).astype(np.int64)
@@ -155,10 +155,10 @@ def _line(x: F64, y: F64) -> F64:
 
 
 class BootClock:
-    """Live: one sender's boot clock to our monotonic clock by the least delayed message.
+    """Live: one sender's boot clock to our monotonic clock, by the messages with minimum delay.
 
-    Two windows of 5 s keep the lower edge fresh while clocks drift. A TIMESYNC offset, when
-    there is one, replaces it (:mod:`mavlink.telemetry.clock`).
+    Two windows of 5 s keep the lower edge current while clocks drift. A TIMESYNC offset
+    (:class:`TimesyncFilter`) replaces it.
     """
 
     def __init__(self) -> None:
@@ -170,11 +170,11 @@ class BootClock:
 
     @property
     def reboots(self) -> int:
-        """How many times the sender's clock started again."""
+        """How many times the sender has rebooted."""
         return self._counter.session
 
     def time_of(self, boot_ms: float, received_ns: int) -> int:
-        """Our time in ns at which the sender's clock read ``boot_ms``; never after arrival."""
+        """Our time in ns when the sender's clock read ``boot_ms``; never after arrival."""
         reboots = self.reboots
         boot_ns = self._counter.unwrap(boot_ms) * MS
         if self.reboots != reboots:
@@ -189,10 +189,10 @@ class BootClock:
         return min(received_ns, round(boot_ns) + best)
 
     def set_timesync(self, offset_ns: int | None) -> None:
-        """Take TIMESYNC's offset (ours - boot); None takes it away.
+        """Use TIMESYNC's offset (ours - boot); None removes it.
 
-        TIMESYNC's boot time has 64 bits and does not wrap, so the offset may be off by whole
-        turns of the 32-bit counter; the messages' own arrival tells by how many.
+        TIMESYNC's boot time has 64 bits and does not wrap, so the offset may differ by whole
+        periods of the 32-bit counter; the arrival times of messages resolve how many.
         """
         self._timesync_ns = None
         arrived = self.offset_ns
@@ -202,7 +202,7 @@ class BootClock:
 
     @property
     def offset_ns(self) -> int | None:
-        """Our clock minus the boot clock; None before anything was heard."""
+        """Our clock minus the boot clock; None before the first message."""
         if self._timesync_ns is not None:
             return self._timesync_ns
         if self._current_ns is None:
@@ -214,35 +214,35 @@ class BootClock:
 EARLIEST_UNIX_S = 1_735_689_600  # 2025-01-01: a clock before this was never set
 LATEST_UNIX_S = 4_102_444_800  # 2100-01-01
 DIFFER_NS = 5_000_000_000
-"""Two clocks that differ by less agree: SYSTEM_TIME waits in queues, and whoever sets it may be
-a second or two off."""
+"""Clocks that differ by less agree: SYSTEM_TIME waits in queues, and manual settings are a second
+or two off."""
 
 
 class WallTime:
-    """Unix time less our monotonic clock, as SYSTEM_TIME last told it."""
+    """Unix time minus our monotonic clock, from the last SYSTEM_TIME."""
 
     def __init__(self) -> None:
-        self.offset_ns: int | None = None  # None before it was told
+        self.offset_ns: int | None = None  # None before the first SYSTEM_TIME
 
     def hear(self, unix_us: int, now_ns: int) -> None:
-        """Take in ``time_unix_usec``, which is 0 or years ago before the first fix."""
+        """Process ``time_unix_usec``, which is 0 or years old before the first fix."""
         if EARLIEST_UNIX_S * 1_000_000 <= unix_us < LATEST_UNIX_S * 1_000_000:
             self.offset_ns = unix_us * 1000 - now_ns
 
     def correct(self, offset_ns: int) -> int:
-        """The offset to use instead of the computer's own ``offset_ns``: that, or the
-        autopilot's where the two do not agree."""
+        """The offset to use: the computer's own ``offset_ns``, or the autopilot's where the two
+        disagree."""
         told_ns = self.offset_ns
         return offset_ns if told_ns is None or agree(offset_ns, told_ns) else told_ns
 
 
 def computer_offset_ns() -> int:
-    """Unix time less the monotonic clock, by this computer's clock alone."""
+    """Unix time minus the monotonic clock, by this computer's clock alone."""
     return time.time_ns() - time.monotonic_ns()
 
 
 def agree(offset_ns: int, other_ns: int) -> bool:
-    """True for clocks with these offsets that differ by no more than is usual."""
+    """True when clocks with these offsets agree."""
     return abs(offset_ns - other_ns) <= DIFFER_NS
 
 
@@ -260,9 +260,9 @@ EVERYONE = Address(0, 0)
 
 
 class TimesyncRequest(dialect.MAVLink_timesync_message):  # type: ignore[misc]
-    """A question to one component, so that routers need not pass it on to others.
+    """A request to one component, so that routers need not forward it to others.
 
-    Its target stands in common.xml, but not in pymavlink's dialect.
+    common.xml has its target fields, pymavlink's dialect has not.
     """
 
     def __init__(self, ts1: int, target: Address) -> None:
@@ -281,15 +281,15 @@ class TimesyncRequest(dialect.MAVLink_timesync_message):  # type: ignore[misc]
 class TimesyncFilter:
     """Offset of our clock to a remote boot clock (ours = remote + offset), in ns.
 
-    Constants of PX4's Timesync.hpp: gains from 0.05 down to 0.003 over 500 samples, a deviation
-    of 100 ms is an outlier, five in a row start over. DEVIATION: the gate on the round trip is
-    10 ms there; here it is the larger of that and twice the shortest of the last minute, so
-    that a slow radio still synchronises.
+    Constants of PX4's Timesync.hpp: gains from 0.05 down to 0.003 over 500 samples; a deviation
+    of 100 ms is an outlier, five in a row restart the filter. DEVIATION: the gate on the round
+    trip is 10 ms there; here it is the larger of that and twice the minimum of the last minute,
+    so that a slow radio still synchronises.
     """
 
     def __init__(self) -> None:
         self._sent: deque[int] = deque(maxlen=REMEMBER)
-        self._asked: deque[int] = deque(maxlen=REMEMBER)  # also those that were answered
+        self._asked: deque[int] = deque(maxlen=REMEMBER)  # including answered ones
         self._rounds: deque[int] = deque(maxlen=60)
         self._base_ns = 0
         self._offset_ns = 0.0
@@ -302,18 +302,18 @@ class TimesyncFilter:
 
     @property
     def offset_ns(self) -> int | None:
-        """Our clock minus the remote one; None before enough answers came."""
+        """Our clock minus the remote one; None before enough answers arrived."""
         if self._count < USABLE_AT:
             return None
         return self._base_ns + round(self._offset_ns)
 
     @property
     def round_trip_ns(self) -> int | None:
-        """The shortest round trip of late."""
+        """The minimum round trip in the recent past."""
         return min(self._rounds, default=None)
 
     def reset(self) -> None:
-        """Start over, as after a reboot of the autopilot."""
+        """Restart, as after a reboot of the autopilot."""
         self._count = self._outliers = 0
         self._skew_ns = 0.0
         self._rounds.clear()
@@ -321,7 +321,7 @@ class TimesyncFilter:
         self.resets += 1
 
     def request(self, now_ns: int, target: Address = EVERYONE) -> object | None:
-        """The TIMESYNC to send now; None when it is not time."""
+        """The TIMESYNC to send now; None when none is due."""
         if now_ns < self._next_ns:
             return None
         quick = self._count < USABLE_AT
@@ -331,15 +331,15 @@ class TimesyncFilter:
         return TimesyncRequest(now_ns, target)
 
     def next_timer(self) -> int:
-        """When the next request is due, in ns."""
+        """Time in ns of the next request."""
         return self._next_ns
 
     def round_trip_of(self, ts1: int, received_ns: int) -> int | None:
-        """How long ago we asked this question, in ns; None when it is not one of our last."""
+        """Time in ns since we sent this request; None when it is not a recent one of ours."""
         return received_ns - ts1 if ts1 in self._asked and received_ns >= ts1 else None
 
     def answer(self, tc1: int, ts1: int, received_ns: int) -> bool:
-        """Take an answer in; True when it was used. Answers to others are not ours."""
+        """Process an answer; True when it was used. Answers to others are ignored."""
         if tc1 <= 0 or ts1 not in self._sent:
             return False
         self._sent.remove(ts1)

@@ -33,7 +33,7 @@ CLEARANCE_SIGMA_M = 1.0
 
 
 def decode(message: Message) -> Sample | None:
-    """The sample in a message; None when it carries none or its values make no sense."""
+    """The sample in a message; None when it has none or its values are implausible."""
     reader = READERS.get(message.get_type())
     return None if reader is None else reader(message)
 
@@ -111,7 +111,7 @@ def _mount_orientation(m: Any) -> GimbalSample | None:
     if not all(map(math.isfinite, (m.roll, m.pitch))):
         return None
     absolute = float(getattr(m, "yaw_absolute", math.nan))
-    # A sender of the short form leaves the extension zero although it points elsewhere.
+    # Senders of the short form leave the extension zero, whatever the heading.
     earth = math.isfinite(absolute) and absolute != 0.0
     yaw = absolute if earth else m.yaw
     if not math.isfinite(yaw):
@@ -133,7 +133,7 @@ def _finite(*values: float) -> bool:
 
 
 def plausible_place(lat_deg: float, lon_deg: float) -> bool:
-    """True for a place on Earth; 0, 0 is what autopilots send before they have one."""
+    """True for a place on Earth; autopilots send 0, 0 before they have a position."""
     if not _finite(lat_deg, lon_deg) or abs(lat_deg) > 90.0 or abs(lon_deg) > 180.0:
         return False
     return lat_deg != 0.0 or lon_deg != 0.0
@@ -152,4 +152,4 @@ READERS: dict[str, Callable[[Message], Sample | None]] = {
     "MOUNT_ORIENTATION": _mount_orientation,
     "MOUNT_STATUS": _mount_status,
 }
-"""Message name to reader. The next message is one function and one line."""
+"""Message name to reader. A new message is one function and one line."""

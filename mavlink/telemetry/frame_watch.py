@@ -1,4 +1,4 @@
-"""What a gimbal's quaternion refers to, by what its camera's images say of the rotation."""
+"""A gimbal quaternion's reference frame, from the rotation in its camera's images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mavlink.telemetry.samples import GimbalFrame
 SAME_RAD = math.radians(0.3)
 CLEAR_RAD = math.radians(0.05)
 MIN_TURNS = 20
-STEP_NS = 1_000_000_000  # turns are compared over so long: over less they are mostly noise
+STEP_NS = 1_000_000_000  # rotations over shorter times are mostly noise
 KEPT = 120
 
 
@@ -24,12 +24,12 @@ class FrameVerdict:
     """The frame that agrees with the images."""
 
     frame: GimbalFrame
-    decided: bool  # the turns told the frames apart
-    refuted: tuple[GimbalFrame, ...] = ()  # those that disagree clearly more
+    decided: bool  # the rotations distinguish the frames
+    refuted: tuple[GimbalFrame, ...] = ()  # frames that disagree clearly more
 
 
 Ends = tuple[Quaternion, Quaternion]
-"""A rotation at the first and at the second of two pictures."""
+"""A rotation at the first and at the second of two images."""
 
 
 def judge_frame(
@@ -37,10 +37,10 @@ def judge_frame(
 ) -> FrameVerdict | None:
     """The frame of a gimbal's quaternions that agrees with the rotation seen by the camera.
 
-    For N pairs of pictures: what the gimbal sent and the body's attitude at both, and the
-    rotation ``q_head(first)_head(second)`` measured between them, in the head's axes. None
-    when there is nothing to compare. ``decided`` needs the best frame to disagree less than
-    half as much as the next one that means something else.
+    For N pairs of images: the quaternions sent by the gimbal and the body's attitude at both, and
+    the rotation ``q_head(first)_head(second)`` measured between them, in the head's axes. None
+    without pairs. ``decided`` requires the best frame to disagree less than half as much as
+    every other frame with a different meaning.
     """
     if not len(q_sent) == len(q_ned_body) == len(q_seen_steps):
         raise ValueError(
@@ -58,7 +58,7 @@ def judge_frame(
     }
     rms = {frame: _disagreement(heads[frame], q_seen_steps) for frame in GimbalFrame}
     best = min(rms, key=lambda frame: rms[frame])
-    # A frame that means the same attitudes all along is no rival.
+    # A frame that always gives the same attitudes is no rival.
     rivals = [f for f in GimbalFrame if _largest_angle(heads[f], heads[best]) > SAME_RAD]
     refuted = tuple(
         f for f in rivals if rms[f] > 2.0 * rms[best] and rms[f] - rms[best] > CLEAR_RAD
@@ -82,17 +82,17 @@ def _largest_angle(a: Sequence[Ends], b: Sequence[Ends]) -> float:
 
 
 class FrameWatch:
-    """Collects turns between frames and says what the gimbal's quaternion refers to."""
+    """Collects rotations between frames and finds the reference frame of the gimbal."""
 
     def __init__(self, history: VehicleHistory) -> None:
         self._history = history
         self._turns: deque[tuple[int, int, Quaternion]] = deque(maxlen=KEPT)
-        self._open: tuple[int, int, Quaternion] | None = None  # a turn that is not whole yet
+        self._open: tuple[int, int, Quaternion] | None = None  # a rotation still growing
 
     def add(self, first_ns: int, second_ns: int, q_step: Quaternion) -> None:
         """Take in ``q_head(first)_head(second)``, seen between two frames, in the head's axes.
 
-        Steps that follow on each other are joined to turns of a second.
+        Consecutive steps are joined to rotations over a second.
         """
         step = normalised(q_step)
         if second_ns <= first_ns or step is None:
@@ -107,7 +107,7 @@ class FrameWatch:
             self._open = None
 
     def verdict(self, latency_ms: float = 0.0) -> FrameVerdict | None:
-        """The frame that agrees with the pictures; None with less than twenty turns to go by."""
+        """The frame that agrees with the images; None with fewer than twenty rotations."""
         shift = round(latency_ms * 1e6)
         sent: list[Ends] = []
         bodies: list[Ends] = []

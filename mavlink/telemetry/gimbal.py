@@ -1,10 +1,11 @@
 """Quaternions of gimbals into attitudes of the head in NED.
 
-GIMBAL_DEVICE_ATTITUDE_STATUS says by its flags what its quaternion refers to (MAVLink gimbal
+By its flags, GIMBAL_DEVICE_ATTITUDE_STATUS declares the reference of its quaternion (MAVLink gimbal
 protocol v2): bit 64 earth, bit 32 the vehicle's heading, neither: earth when yaw is locked
-(16), else the vehicle's heading. Some senders claim what is not so: ArduPilot's servo mounts
-send servo angles with flags 44, which claim the horizon. Hence the override by configuration,
-:func:`steadiest_frame` (by telemetry alone) and :mod:`.frame_watch` (by the images).
+(16), otherwise the vehicle's heading. Some senders declare it wrongly: ArduPilot's servo mounts
+send servo angles with flags 44, which declare the horizon. Therefore the configuration,
+:func:`steadiest_frame` (by telemetry alone) and :mod:`.frame_watch` (by the images) can override
+the flags.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ YAW_FRAMES = ("auto", "vehicle", "earth", "body", "servo")
 class GimbalConfig:
     """How gimbal messages are read."""
 
-    yaw_frame: str = "auto"  # auto: as the flags say, unless it cannot be
+    yaw_frame: str = "auto"  # auto: as the flags declare, unless telemetry refutes them
     mount_rpy_deg: tuple[float, float, float] | None = None  # fixed mount, used without messages
 
     def __post_init__(self) -> None:
@@ -59,7 +60,7 @@ class GimbalConfig:
 
 
 def frame_of_flags(flags: int) -> GimbalFrame:
-    """What the quaternion refers to, by the flags of GIMBAL_DEVICE_ATTITUDE_STATUS."""
+    """The quaternion's reference, by the flags of GIMBAL_DEVICE_ATTITUDE_STATUS."""
     if flags & YAW_IN_EARTH_FRAME:
         return GimbalFrame.EARTH
     if flags & YAW_IN_VEHICLE_FRAME:
@@ -68,7 +69,7 @@ def frame_of_flags(flags: int) -> GimbalFrame:
 
 
 def to_earth(q: Quaternion, frame: GimbalFrame, q_ned_body: Quaternion) -> Quaternion:
-    """``q_ned_gimbal`` of a quaternion in any frame and the body's attitude at its instant."""
+    """``q_ned_gimbal`` of a quaternion in any frame and the body's attitude at that time."""
     if frame is GimbalFrame.EARTH:
         return q
     if frame is GimbalFrame.BODY:
@@ -81,10 +82,10 @@ def to_earth(q: Quaternion, frame: GimbalFrame, q_ned_body: Quaternion) -> Quate
 def _of_servos(q: Quaternion) -> Quaternion:
     """``q_body_gimbal`` of servo angles that were sent as if they were yaw, pitch, roll.
 
-    The servos sit the other way round: pan on the body, roll on the pan, tilt on the roll. A
-    tilt beyond straight down comes back as one before it with the rest turned by half a circle;
-    straight down, where roll and yaw cannot be told apart, the turn is taken as roll, for few
-    servo mounts can pan.
+    The servo order differs: pan on the body, roll on the pan, tilt on the roll. A tilt beyond
+    straight down becomes one before it, with the other angles rotated by 180 degrees. Straight
+    down, roll and yaw are indistinguishable, and the rotation is taken as roll, because few servo
+    mounts can pan.
     """
     roll, pitch, yaw = to_rpy(q)
     if abs(pitch) > math.pi / 2 - STRAIGHT_RAD:
@@ -104,13 +105,12 @@ def _tilt(pitch_rad: float) -> Quaternion:
 def steadiest_frame(
     q_sent: Sequence[Quaternion], q_ned_body: Sequence[Quaternion], lag: int = TILT_LAG
 ) -> GimbalFrame | None:
-    """BODY or SERVO when a head that claims the horizon moves as only such a mount does.
+    """BODY or SERVO when a head that declares the horizon moves like such a mount.
 
-    A mount that keeps the horizon shows a steady tilt while the body's tilt changes. When the
-    tilt it sends changes against the body's instead, so that only the one composed with the
-    body's attitude is steady, its angles are relative to the body. Looks at pairs of samples,
-    ``lag`` apart, between which the body tilted by a degree; None when the claim stands, or
-    when there are too few pairs to tell.
+    A mount that holds the horizon has a steady tilt while the body's tilt changes. When instead the
+    sent tilt changes against the body's, so that only its composition with the body's attitude is
+    steady, its angles are relative to the body. Compares pairs of samples, ``lag`` apart, between
+    which the body tilted by a degree; None when the declaration holds, or with too few pairs.
     """
     pairs = [
         (i, i + lag)
@@ -128,12 +128,12 @@ def steadiest_frame(
 
 
 def _change(heads: Sequence[Quaternion], pairs: Sequence[tuple[int, int]]) -> float:
-    """Median change of tilt in rad over pairs: jumps of the target drop out."""
+    """Median change of tilt in rad over pairs; jumps of the target drop out."""
     steps = sorted(math.dist(_down(heads[i]), _down(heads[j])) for i, j in pairs)
     return steps[len(steps) // 2]
 
 
 def _down(q: Quaternion) -> tuple[float, float, float]:
-    """The horizon's down direction in the head's axes: blind to heading."""
+    """The down direction in the head's axes; independent of heading."""
     w, x, y, z = q
     return (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))

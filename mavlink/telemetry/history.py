@@ -1,4 +1,4 @@
-"""The vehicle's recent past: samples in, the state at any instant of it out."""
+"""The vehicle's recent past: adds samples, returns the state at any time in it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ M_PER_DEG = 111_319.49  # along a meridian, and along the equator
 ACCURACY_GAP_NS = 3_000_000_000
 FRAMES = tuple(GimbalFrame)
 GIMBAL_DEVICES = (154, 171, 172, 173, 174, 175)
-JUDGE_EVERY_NS = 10_000_000_000  # between two looks at what a gimbal's quaternion refers to
+JUDGE_EVERY_NS = 10_000_000_000  # between two checks of a gimbal's reference frame
 JUDGE_LAG_NS = 3_000_000_000
 JUDGED_SAMPLES = 600
 PATIENCE_S = 0.3  # live: a little more than the 3.5 Hz of a slow telemetry radio
@@ -49,8 +49,8 @@ class HistoryConfig:
     sigma_gimbal_rad: float = 0.01
     sigma_h_m: float = RECEIVER_SIGMA_H_M  # without an accuracy from the GNSS receiver
     sigma_v_m: float = RECEIVER_SIGMA_V_M
-    angular_acceleration_rad_s2: float = 1.5  # between samples the attitude may bend this much
-    acceleration_m_s2: float = 1.0  # the same for a position with velocity at both ends
+    angular_acceleration_rad_s2: float = 1.5  # angular acceleration assumed between samples
+    acceleration_m_s2: float = 1.0  # acceleration assumed between two positions with velocity
 
     def __post_init__(self) -> None:
         for name in ("keep_s", "sigma_tilt_rad", "sigma_yaw_rad", "sigma_gimbal_rad"):
@@ -61,9 +61,9 @@ class HistoryConfig:
 class VehicleHistory:
     """Samples of one vehicle by time; safe for one writer and several readers.
 
-    Live, on the monotonic clock, a frame is here before the attitude that was sampled after it,
-    and nothing is extrapolated by more than 20 ms. So :meth:`state_at` waits for up to
-    ``patience_s`` until the samples on the far side have come.
+    Live, a frame arrives before the attitude that was sampled after it, and nothing is
+    extrapolated by more than 20 ms. So :meth:`state_at` waits up to ``patience_s`` for the samples
+    after the frame.
     """
 
     def __init__(self, config: HistoryConfig | None = None, patience_s: float = 0.0) -> None:
@@ -71,7 +71,7 @@ class VehicleHistory:
         self._patience_s = patience_s
         self._lock = threading.Lock()
         self._news = threading.Condition()
-        self._waiting = 0  # readers
+        self._waiting = 0  # waiting readers
         self._attitude = Track()  # w x y z
         self._position = Track()  # lat lon alt relative vn ve vd, NaN where unknown
         self._accuracy = Track()  # has_fix sigma_h sigma_v alt, NaN where unknown
@@ -94,7 +94,7 @@ class VehicleHistory:
         return max(times, default=None)
 
     def covers(self, time_ns: int) -> bool:
-        """True when no stream that still flows may say more of ``time_ns``."""
+        """True when no active stream can still add data about ``time_ns``."""
         with self._lock:
             newest = [t.last_ns for t in (self._attitude, self._position, *self._gimbals.values())]
         flowing = [t for t in newest if t is not None and t > time_ns - MAX_GAP_NS]
@@ -106,7 +106,7 @@ class VehicleHistory:
             return [(AttitudeSample(None, _quaternion(r)), t) for t, r in self._attitude.items()]
 
     def claimed_at(self, time_ns: int) -> tuple[Quaternion, Quaternion] | None:
-        """(the gimbal's quaternion as it was sent, ``q_ned_body``) at an instant, if known."""
+        """(the gimbal's quaternion as sent, ``q_ned_body``) at a time, if known."""
         with self._lock:
             body = self._attitude.around(time_ns)
             if body is None:
@@ -120,7 +120,7 @@ class VehicleHistory:
         return None
 
     def _gimbal_order(self) -> list[tuple[int, int]]:
-        """The lowest rank says most; among equals the gimbal itself before its relay."""
+        """Streams by rank, most informative first; at equal rank the gimbal before its relay."""
         return sorted(self._gimbals, key=lambda k: (k[0], k[1] not in GIMBAL_DEVICES, k[1]))
 
     def heads(self, since_ns: int = 0) -> list[tuple[int, Quaternion]]:
@@ -141,7 +141,7 @@ class VehicleHistory:
         return len(self._attitude) + len(self._position)
 
     def add(self, sample: Sample, time_ns: int) -> None:
-        """Put a sample in at its time; order does not matter."""
+        """Insert a sample at its time; order does not matter."""
         with self._lock:
             track, row = self._place(sample)
             track.add(time_ns, row)
@@ -152,12 +152,12 @@ class VehicleHistory:
                 self._news.notify_all()
 
     def set_gimbal(self, gimbal: GimbalConfig) -> None:
-        """Read gimbal messages in another way from now on, those already kept as well."""
+        """Change how gimbal messages are read, including those already stored."""
         with self._lock:
             self.config = replace(self.config, gimbal=gimbal)
 
     def gimbal_frame(self) -> GimbalFrame | None:
-        """What the quaternion of the gimbal that counts is taken to refer to; None without one."""
+        """The reference frame in use for the gimbal; None without a gimbal."""
         with self._lock:
             for key in self._gimbal_order():
                 row = self._gimbals[key].last_row
@@ -166,12 +166,12 @@ class VehicleHistory:
         return None
 
     def trust_images(self, frame: GimbalFrame) -> None:
-        """Read the gimbal as the images say from now on, unless the configuration says how."""
+        """Read the gimbal as the images indicate, unless the configuration sets a frame."""
         with self._lock:
             self._seen = frame
 
     def clear(self) -> None:
-        """Forget everything, as after a reboot of the autopilot."""
+        """Discard everything, as after a reboot of the autopilot."""
         with self._lock:
             tracks = (self._attitude, self._position, self._accuracy, self._range, self._terrain)
             for track in tracks:
@@ -199,29 +199,29 @@ class VehicleHistory:
         if isinstance(sample, GimbalSample):
             track = self._gimbals.setdefault((sample.rank, sample.component), Track())
             return track, (*sample.q, float(FRAMES.index(sample.frame)))
-        raise ValueError(f"no place in the history for a {type(sample).__name__}")
+        raise ValueError(f"the history does not store a {type(sample).__name__}")
 
     def state_at(self, time_ns: int) -> VehicleState | None:
-        """The state interpolated at ``time_ns``, or None when no part of it is known then.
+        """The state interpolated at ``time_ns``, or None when no part of it is known.
 
-        Attitude by slerp, position by a cubic through both positions and velocities. Nothing
-        is carried further than 20 ms past the newest sample. Sigmas grow with the square of
-        the distance to the samples on both sides, and a part whose samples are more than one
-        second apart is left out. The height above ground comes from the first of rangefinder,
-        terrain, height above home.
+        Attitude by slerp, position by a cubic through positions and velocities at both ends.
+        Nothing is extrapolated by more than 20 ms past the last sample. Sigmas grow with the
+        square of the distance to the samples on both sides; a part whose samples are more than
+        one second apart is left out. The height above ground comes from the first available of
+        rangefinder, terrain, height above home.
         """
         if self._patience_s:
             self._await(time_ns)
         return self._state_at(time_ns)
 
     def _await(self, time_ns: int) -> None:
-        """Wait until every stream that flows has come past ``time_ns``, or patience is over."""
+        """Wait until every active stream has passed ``time_ns``, or until patience ends."""
         now_s = time.monotonic()
         end_s = now_s + self._patience_s
         if time_ns * 1e-9 >= end_s:
-            return  # what lies further ahead cannot come in time
+            return  # samples further ahead cannot arrive in time
         with self._news:
-            self._waiting += 1  # before looking, so that nothing new goes unnoticed
+            self._waiting += 1  # before checking, so that no new sample is missed
             while not self.covers(time_ns) and now_s < end_s:
                 self._news.wait(end_s - now_s)
                 now_s = time.monotonic()
@@ -270,7 +270,7 @@ class VehicleHistory:
     def _gimbal_at(
         self, key: tuple[int, int], at: Bracket, q_body: Quaternion | None
     ) -> Quaternion | None:
-        """``q_ned_gimbal`` between two samples, along the frame in which the head turned less."""
+        """``q_ned_gimbal`` between two samples, in the frame in which the head rotated less."""
         sent = _quaternion(at.before), _quaternion(at.after)
         frame = self._frame(key, FRAMES[int(at.before[4])])
         if frame is GimbalFrame.EARTH:
@@ -285,9 +285,9 @@ class VehicleHistory:
         return slerp(earth[0], earth[1], at.fraction)
 
     def _frame(self, key: tuple[int, int], claimed: GimbalFrame) -> GimbalFrame:
-        """What the quaternion refers to.
+        """The reference frame of the quaternion.
 
-        By configuration, else by the images, else as claimed unless it cannot be.
+        By configuration, else by the images, else as declared unless telemetry refutes it.
         """
         chosen = self.config.gimbal.yaw_frame
         if chosen != "auto":
@@ -305,7 +305,7 @@ class VehicleHistory:
         return better or claimed
 
     def _steadiest(self, track: Track) -> GimbalFrame | None:
-        """Judged on a thinned track: it is done now and then while flying."""
+        """Uses a thinned track, because it runs repeatedly in flight."""
         sent: list[Quaternion] = []
         bodies: list[Quaternion] = []
         samples = track.items()
@@ -327,7 +327,7 @@ class VehicleHistory:
         accuracy = self._accuracy.around(state.time_ns, ACCURACY_GAP_NS, ACCURACY_GAP_NS)
         nearest = None if accuracy is None else accuracy.nearer
         if nearest is not None and not nearest[0]:
-            return at  # no fix: the estimator's place is not worth a tag
+            return at  # no fix: the estimated position is too uncertain for a tag
         sigma_h, sigma_v = self.config.sigma_h_m, self.config.sigma_v_m
         if nearest is not None:
             sigma_h, sigma_v = nearest[1], nearest[2]
@@ -365,7 +365,7 @@ class VehicleHistory:
 
 
 class _Assembly:
-    """A VehicleState while its parts come together."""
+    """A VehicleState under construction."""
 
     def __init__(self, time_ns: int) -> None:
         self.time_ns = time_ns
@@ -377,7 +377,7 @@ class _Assembly:
         self.fields.update(fields)
 
     def set_agl(self, source: str, age_ms: float, agl_m: float, sigma_m: float) -> None:
-        # The ground and the climb between samples: a metre per second.
+        # Terrain and climb between samples: a metre per second.
         self.set(source, age_ms, alt_agl_m=agl_m, sigma_agl_m=math.hypot(sigma_m, age_ms * 1e-3))
 
     def finish(self) -> VehicleState | None:
@@ -396,7 +396,7 @@ def _slerp(at: Bracket) -> Quaternion:
 
 
 def _apart(a: Quaternion, b: Quaternion) -> float:
-    """Grows with the angle between two rotations; 0 when they are the same."""
+    """Grows with the angle between two rotations; 0 when they are equal."""
     return 1.0 - abs(sum(p * q for p, q in zip(a, b, strict=True)))
 
 
@@ -424,7 +424,7 @@ def _position_at(at: Bracket) -> tuple[float, float, float, object]:
 
 
 def _hermite(step: float, m0: float, m1: float, u: float) -> float:
-    """Way covered at fraction u; straight when the velocities contradict the step."""
+    """Distance covered at fraction u; linear when the velocities contradict the step."""
     straight = u * step
     if not (math.isfinite(m0) and math.isfinite(m1)) or not 0.0 <= u <= 1.0:
         return straight
@@ -435,7 +435,7 @@ def _hermite(step: float, m0: float, m1: float, u: float) -> float:
 
 
 def _receiver_above(accuracy: Bracket | None, positions: Track) -> ReceiverAltitude | None:
-    """The fix nearest in time against the autopilot's altitude then; None without either."""
+    """The fix nearest in time, compared with the autopilot's altitude then; None without either."""
     if accuracy is None:
         return None
     at = positions.around(accuracy.nearer_ns)

@@ -1,9 +1,9 @@
-"""The camera's latency, estimated from the rotation its images show.
+"""The camera's latency, estimated from the rotation in its images.
 
-A frame stamped ``t`` was exposed at ``t - latency``. The turns seen between frames, shifted by
-the latency, must be those of telemetry (VINS calls it ``td``, DOI 10.1109/IROS.2018.8593603):
+A frame stamped ``t`` was exposed at ``t - latency``. The rotations between frames, shifted by
+the latency, must match those of telemetry (VINS calls it ``td``, DOI 10.1109/IROS.2018.8593603):
 those of the head for a gimbal, of the body for a fixed mount. The mount need not be known; the
-rotation between the two sets of axes is solved for as well. Quaternions here are arrays (N, 4),
+rotation between the two sets of axes is estimated as well. Quaternions here are arrays (N, 4),
 w x y z, unit.
 """
 
@@ -19,13 +19,13 @@ from scipy.spatial.transform import Rotation
 
 from mavlink.telemetry.quaternion import Quaternion, multiply, normalised
 
-MIN_WINDOWS = 50  # that do not overlap
+MIN_WINDOWS = 50  # non-overlapping
 MIN_CORRELATION = 0.7
-WINDOW_S = 0.2  # turns over less are mostly noise; over more, the latency drowns
-FLOOR_MS = 2.0  # neither exposures nor the stamps of telemetry are known better
-SETTLED_MS = 5.0  # sigma of an estimate that may be believed
-MAX_SIGMA_MS = 25.0  # one that is not worth telling
-RIVAL = 1.3  # a second answer, further away than RIVAL_APART_S, must fit worse by so much
+WINDOW_S = 0.2  # shorter rotations are mostly noise; longer ones hide the latency
+FLOOR_MS = 2.0  # accuracy of exposure times and telemetry stamps
+SETTLED_MS = 5.0  # maximum sigma of an estimate that may be applied
+MAX_SIGMA_MS = 25.0  # maximum sigma of an estimate that is reported
+RIVAL = 1.3  # a second solution, further away than RIVAL_APART_S, must fit worse by this factor
 RIVAL_APART_S = 0.15
 KEPT = 2000
 COARSE_S, FINE_S, FINE_STEPS = 0.02, 0.004, 8
@@ -38,8 +38,8 @@ class LatencyEstimate:
 
     latency_ms: float
     sigma_ms: float
-    correlation: float  # of the turns seen and those of telemetry at that latency, 0 to 1
-    windows: int  # turns that took part
+    correlation: float  # of visual and telemetry rotation at that latency, 0 to 1
+    windows: int  # rotations used
 
     @property
     def is_settled(self) -> bool:
@@ -49,7 +49,7 @@ class LatencyEstimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Turns:
-    """What the pictures say: turns over windows of time."""
+    """Rotations from the images, over windows of time."""
 
     start_s: F64  # (N,)
     end_s: F64  # (N,)
@@ -60,12 +60,12 @@ class _Turns:
         return len(self.start_s)
 
     def only(self, mask: Bool) -> _Turns:
-        """Those of a mask."""
+        """The subset selected by a mask."""
         return _Turns(self.start_s[mask], self.end_s[mask], self.rate[mask], self.overlap)
 
 
 class LatencyWatch:
-    """Collects turns between frames and says what latency they speak for."""
+    """Collects rotations between frames and estimates the latency."""
 
     def __init__(self, range_ms: tuple[float, float] = (-200.0, 800.0)) -> None:
         if not range_ms[0] < range_ms[1]:
@@ -75,10 +75,9 @@ class LatencyWatch:
         self._run = 0
 
     def add(self, first_ns: int, second_ns: int, q_step: Quaternion) -> None:
-        """Take in ``q_camera(first)_camera(second)`` between two frames, at their stamps.
+        """Add ``q_camera(first)_camera(second)`` between two frames, at their stamps.
 
-        Steps that follow on each other are joined. What is no rotation, or goes back in time,
-        is left out.
+        Consecutive steps are joined. Invalid rotations and steps back in time are ignored.
         """
         step = normalised(q_step)
         if second_ns <= first_ns or step is None:
@@ -92,7 +91,7 @@ class LatencyWatch:
     def estimate(self, attitudes: Sequence[tuple[int, Quaternion]]) -> LatencyEstimate | None:
         """The latency by attitudes (time in ns, attitude) over the same time, oldest first.
 
-        None while there are too few frames, too little rotation, or no clear answer.
+        None with too few frames, too little rotation, or no unambiguous solution.
         """
         if len(attitudes) < MIN_WINDOWS or len(self._frames) < MIN_WINDOWS:
             return None
@@ -112,11 +111,11 @@ class LatencyWatch:
             return None
         far = np.abs(lags - lags[k]) > RIVAL_APART_S
         if (misfits[far] < RIVAL * best.misfit).any():
-            return None  # two latencies explain the pictures nearly as well
+            return None  # two latencies explain the images almost equally well
         return _refine(seen.only(best.good), track, float(lags[k]))
 
     def _turns(self, base_ns: int, window_s: float) -> _Turns:
-        """Turns over ``window_s`` or a little more, four to a window."""
+        """Rotations over ``window_s`` or a little more, four per window."""
         run = np.array([frame[0] for frame in self._frames])
         time_s: F64 = np.array([(frame[1] - base_ns) * 1e-9 for frame in self._frames])
         q: F64 = np.array([frame[2] for frame in self._frames], np.float64)
@@ -134,24 +133,24 @@ class LatencyWatch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
-    """Telemetry against the pictures at one latency."""
+    """Telemetry against the images at one latency."""
 
     ours: F64  # (N, 3) telemetry's rates in the camera's axes
-    rest: F64  # (N, 3) what the pictures saw beyond them
-    known: Bool  # (N,) telemetry is there
-    misfit: float  # mean square of the rest
+    rest: F64  # (N, 3) the images' rates minus these
+    known: Bool  # (N,) telemetry is available
+    misfit: float  # mean square of ``rest``
     correlation: float
 
     @property
     def good(self) -> Bool:
-        """(N,) all but what no noise explains, such as a frame placed wrongly."""
+        """(N,) all but outliers, such as a wrongly placed frame."""
         size = np.linalg.norm(self.rest, axis=1)
         good: Bool = self.known & (size <= OUTLIER * np.median(size[self.known]))
         return good
 
 
 def _fit(seen: _Turns, track: Attitudes, lag_s: float) -> _Fit | None:
-    """None where telemetry says too little."""
+    """None where telemetry is insufficient."""
     turns, known = track.turns(seen.start_s - lag_s, seen.end_s - lag_s)
     if known.sum() < MIN_WINDOWS:
         return None
@@ -165,10 +164,10 @@ def _fit(seen: _Turns, track: Attitudes, lag_s: float) -> _Fit | None:
 
 
 def _refine(seen: _Turns, track: Attitudes, lag_s: float) -> LatencyEstimate | None:
-    """The least weighted misfit near a latency; weights are those of the misfit itself.
+    """The minimum weighted misfit near a latency; weights come from the misfit itself.
 
-    The heading of an autopilot wanders more than its tilt, so each axis counts by how well it
-    fits. The sigma allows for misfits that last (Newey and West, DOI 10.2307/1913610).
+    The heading of an autopilot wanders more than its tilt, so each axis is weighted by its fit.
+    The sigma accounts for correlated misfits (Newey and West, DOI 10.2307/1913610).
     """
     start = _fit(seen, track, lag_s)
     if start is None:
@@ -196,7 +195,7 @@ def _refine(seen: _Turns, track: Attitudes, lag_s: float) -> LatencyEstimate | N
 
 
 def _cost(fit: _Fit | None, weight: F64) -> float:
-    """Mean weighted square of what telemetry leaves unexplained."""
+    """Mean weighted square of the rotation that telemetry does not explain."""
     if fit is None:
         return float("inf")
     rest = fit.rest[fit.known]
@@ -204,7 +203,7 @@ def _cost(fit: _Fit | None, weight: F64) -> float:
 
 
 def _sigma(weighted: F64, slope: F64, rest: F64, lasting: int) -> float:
-    """1 sigma in s of a time found by least squares, for misfits that last some windows."""
+    """1 sigma in s of a time found by least squares, for misfits correlated over some windows."""
     information = float((weighted * slope).sum())
     pulls = (weighted * rest).sum(axis=1)
     variance = float((pulls**2).sum())
@@ -218,26 +217,26 @@ F64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
 LONGEST_GAP_S = 0.25
-"""Attitudes further apart say nothing of what was between them."""
+"""Attitudes further apart are not interpolated."""
 
 FINER = 4
 """Steps from one attitude to the next."""
 
 
 class Attitudes:
-    """A flight's attitudes, to be asked for the turn between any two instants."""
+    """Attitudes of a flight; gives the rotation between any two times."""
 
     def __init__(self, samples: Sequence[tuple[int, Quaternion]]) -> None:
-        """``samples`` are (time in ns, ``q_ned_body``), oldest first; two at least.
+        """``samples`` are (time in ns, ``q_ned_body``), oldest first; at least two.
 
-        They are averaged over the time between two of them: noise would otherwise be least
-        half-way between two samples, and draw every comparison there.
+        Each pair of neighbours is averaged. Otherwise noise would be minimal half-way between two
+        samples, and would bias every comparison towards that point.
         """
         self.base_ns = samples[0][0]
         times_s: F64 = np.array([(t - self.base_ns) * 1e-9 for t, _ in samples])
         q: F64 = np.array([q for _, q in samples], np.float64)
         flips = np.where(np.einsum("ij,ij->i", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
-        q[1:] *= np.cumprod(flips)[:, None]  # neighbours on the same side, so they can be mixed
+        q[1:] *= np.cumprod(flips)[:, None]  # same hemisphere, so that neighbours average
         self.spacing_s = float(np.median(np.diff(times_s)))
         self._step_s = max(self.spacing_s / FINER, 1e-3)
         self._grid_s = np.arange(0.0, times_s[-1] + self._step_s, self._step_s)
@@ -248,16 +247,16 @@ class Attitudes:
 
     @property
     def first_s(self) -> float:
-        """Time of the oldest."""
+        """Time of the oldest sample."""
         return float(self._grid_s[0])
 
     @property
     def last_s(self) -> float:
-        """Time of the newest."""
+        """Time of the newest sample."""
         return float(self._grid_s[-1])
 
     def turns(self, start_s: F64, end_s: F64) -> tuple[F64, Bool]:
-        """((N, 3) rotation vectors in rad in the axes at the start, (N,) where they are known).
+        """((N, 3) rotation vectors in rad in the axes at the start, (N,) where known).
 
         Times are seconds since ``base_ns``.
         """
@@ -266,7 +265,7 @@ class Attitudes:
         return rotation_vectors(first, second), ok_first & ok_second
 
     def _at(self, time_s: F64) -> tuple[F64, Bool]:
-        """(N, 4) attitudes at instants, and where samples are near enough."""
+        """(N, 4) attitudes at times, and where samples are close enough."""
         i = np.searchsorted(self._grid_s, time_s, "right")
         inside = (i > 0) & (i < len(self._grid_s))
         i = np.clip(i, 1, len(self._grid_s) - 1)
@@ -277,9 +276,9 @@ class Attitudes:
 
 
 def _between(times_s: F64, q: F64, at_s: F64) -> tuple[F64, Bool]:
-    """(N, 4) attitudes on straight lines between samples, and where samples are near enough.
+    """(N, 4) attitudes interpolated linearly between samples, and where samples are close enough.
 
-    Between samples so near a straight line is a slerp to a thousandth of the turn.
+    For samples this close, linear interpolation equals slerp to a thousandth of the rotation.
     """
     i = np.clip(np.searchsorted(times_s, at_s, "right"), 1, len(times_s) - 1)
     gap = times_s[i] - times_s[i - 1]
@@ -289,7 +288,7 @@ def _between(times_s: F64, q: F64, at_s: F64) -> tuple[F64, Bool]:
 
 
 def rotation_vectors(first: F64, second: F64) -> F64:
-    """(N, 3) turns in rad from the first to the second (N, 4) attitudes, in the first's axes."""
+    """(N, 3) rotations in rad from the first to the second (N, 4) attitudes, in the first axes."""
     a, b = (Rotation.from_quat(q[:, [1, 2, 3, 0]]) for q in (first, second))
     return np.asarray((a.inv() * b).as_rotvec())
 

@@ -55,7 +55,7 @@ def from_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quaternion:
 
 
 def to_rpy(q: Quaternion) -> tuple[float, float, float]:
-    """(roll, pitch, yaw) in rad; at pitch +-90 degrees roll is zero and yaw carries the turn."""
+    """(roll, pitch, yaw) in rad; at pitch +-90 degrees roll is zero and yaw holds the rotation."""
     w, x, y, z = q
     sin_pitch = max(-1.0, min(1.0, 2.0 * (w * y - z * x)))
     pitch = math.asin(sin_pitch)
@@ -67,7 +67,7 @@ def to_rpy(q: Quaternion) -> tuple[float, float, float]:
 
 
 def yaw_of(q_ned_body: Quaternion) -> float:
-    """Heading in rad of the vehicle's x axis; steady through pitch +-90 degrees within a half."""
+    """Heading in rad of the vehicle's x axis; stable through pitch +-90 degrees."""
     return to_rpy(q_ned_body)[2]
 
 
@@ -86,7 +86,7 @@ def angle_between(a: Quaternion, b: Quaternion) -> float:
 def slerp(a: Quaternion, b: Quaternion, fraction: float) -> Quaternion:
     """The rotation ``fraction`` of the way from a (0) to b (1) on the shorter arc.
 
-    Fractions a little outside 0 to 1 carry the same turn on.
+    Fractions slightly outside 0 to 1 extrapolate the rotation.
     """
     dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
     if dot < 0.0:

@@ -1,4 +1,4 @@
-"""What one message says of the vehicle, and what all of them say of one instant."""
+"""Telemetry samples, one per message, and the vehicle state that they give at one time."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy.typing as npt
 from mavlink.telemetry.quaternion import Quaternion
 
 RECEIVER_SIGMA_H_M, RECEIVER_SIGMA_V_M = 2.1, 3.5
-"""1 sigma per axis of a receiver that states no accuracy: a circular error of 2.5 m, as the data
-sheets of u-blox M8 receivers give it, is 2.1 m per axis; heights are worse by about 1.7."""
+"""1 sigma per axis of a receiver that reports no accuracy: a circular error of 2.5 m, from the data
+sheets of u-blox M8 receivers, is 2.1 m per axis; heights are about 1.7 times worse."""
 
 
 class GimbalFrame(Enum):
-    """What a gimbal's quaternion refers to."""
+    """Reference frame of a gimbal's quaternion."""
 
     EARTH = "earth"  # NED
     VEHICLE = "vehicle"  # horizon in roll and pitch, the vehicle's heading in yaw
@@ -77,7 +77,7 @@ class TerrainSample(Sample):
 
 @dataclass(frozen=True, slots=True)
 class GimbalSample(Sample):
-    """Attitude of a gimbal's head as its sender claims it."""
+    """Attitude of a gimbal's head as declared by its sender."""
 
     q: Quaternion
     frame: GimbalFrame
@@ -86,7 +86,7 @@ class GimbalSample(Sample):
 
 
 OF_AUTOPILOT = (AttitudeSample, PositionSample, AccuracySample)
-"""What only the autopilot may say: a gimbal or camera that says it means itself."""
+"""Accepted from the autopilot only: a gimbal or camera that sends it describes itself."""
 
 
 F64 = npt.NDArray[np.float64]
@@ -94,10 +94,10 @@ F64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class ReceiverAltitude:
-    """One fix of the GNSS receiver beside the autopilot's altitude at the same instant."""
+    """One fix of the GNSS receiver and the autopilot's altitude at the same time."""
 
     time_ns: int
-    above_m: float  # the receiver's altitude less the autopilot's
+    above_m: float  # the receiver's altitude minus the autopilot's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +113,7 @@ class VehicleState:
     lat_deg: float | None = None
     lon_deg: float | None = None
     alt_amsl_m: float | None = None
-    alt_agl_m: float | None = None  # above the ground below; see ``sources`` for how it is known
+    alt_agl_m: float | None = None  # above the ground below; ``sources`` names its origin
     v_ned_m_s: F64 | None = None  # (3,)
     sigma_h_m: float | None = None  # of the horizontal position, per axis
     sigma_v_m: float | None = None  # of alt_amsl_m

@@ -1,4 +1,4 @@
-"""Samples of one quantity in order of time, and the two of them around an instant."""
+"""Samples of one quantity in order of time, and the two samples around a given time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MAX_GAP_NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Bracket:
-    """The samples before and after an instant; both are the same row at the end of a track."""
+    """The samples before and after a time; the same row twice at the end of a track."""
 
     before_ns: int
     after_ns: int
@@ -23,7 +23,7 @@ class Bracket:
 
     @property
     def fraction(self) -> float:
-        """Where the instant lies from before (0) to after (1); slightly outside past an end."""
+        """Position of the time from before (0) to after (1); slightly outside past an end."""
         span = self.after_ns - self.before_ns
         return (self.time_ns - self.before_ns) / span if span else 0.0
 
@@ -34,7 +34,7 @@ class Bracket:
 
     @property
     def nearer_ns(self) -> int:
-        """Its time."""
+        """Time of the nearer sample."""
         return self.before_ns if self.fraction < 0.5 else self.after_ns
 
     @property
@@ -44,13 +44,13 @@ class Bracket:
 
     @property
     def age_ms(self) -> float:
-        """Milliseconds from the instant to the nearer sample."""
+        """Milliseconds from the time to the nearer sample."""
         near = min(abs(self.time_ns - self.before_ns), abs(self.after_ns - self.time_ns))
         return near * 1e-6
 
     @property
     def curvature_s2(self) -> float:
-        """``dt_before * dt_after / 2``: times an acceleration, the error of a straight line."""
+        """``dt_before * dt_after / 2``: times an acceleration, the linear interpolation error."""
         before = (self.time_ns - self.before_ns) * 1e-9
         after = (self.after_ns - self.time_ns) * 1e-9
         return 0.5 * abs(before * after)
@@ -86,7 +86,7 @@ class Track:
         return list(zip(self._times, self._rows, strict=True))
 
     def add(self, time_ns: int, row: Row) -> None:
-        """Insert in order of time; a sample of the same instant is replaced."""
+        """Insert in order of time; replaces a sample of the same time."""
         if not self._times or time_ns > self._times[-1]:
             self._times.append(time_ns)
             self._rows.append(row)
@@ -99,12 +99,12 @@ class Track:
             self._rows.insert(i, row)
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Discard everything."""
         self._times.clear()
         self._rows.clear()
 
     def forget_before(self, time_ns: int) -> None:
-        """Drop older samples, in batches so that the cost per sample stays flat."""
+        """Drop older samples, in batches so that the cost per sample stays constant."""
         i = bisect_left(self._times, time_ns)
         if i > 64 and 2 * i > len(self._times):
             del self._times[:i]
@@ -116,10 +116,10 @@ class Track:
         max_gap_ns: int = MAX_GAP_NS,
         extrapolate_ns: int = EXTRAPOLATE_NS,
     ) -> Bracket | None:
-        """The samples around an instant, or None when there is nothing near enough.
+        """The samples around a time, or None without samples near enough.
 
         Inside the track the two neighbours must be at most ``max_gap_ns`` apart, unless one of
-        them is within ``extrapolate_ns``. Past an end the last two samples carry on for at
+        them is within ``extrapolate_ns``. Past an end the last two samples are extrapolated by at
         most ``extrapolate_ns``.
         """
         times = self._times
@@ -138,7 +138,7 @@ class Track:
             return None
         step = -1 if late else 1
         j = k + step
-        # Two samples closer together than the step ahead would magnify their noise.
+        # Samples closer together than the extrapolated step would amplify their noise.
         while 0 <= j < len(times) and abs(times[j] - times[k]) < beyond:
             j += step
         if beyond == 0 or not 0 <= j < len(times) or abs(times[j] - times[k]) > max_gap:

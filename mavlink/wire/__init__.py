@@ -1,1 +1,1 @@
-"""Bytes and links: packets, signing, ports, the messages that we send."""
+"""Bytes and links: packets, signing, ports, outgoing messages."""

@@ -1,6 +1,6 @@
-"""The dialect spoken: every message of ``common`` and ArduPilot's own, from pymavlink.
+"""The dialect: all messages of ``common`` and ArduPilot's own, from pymavlink.
 
-pymavlink carries no types, so this is the one place that says so.
+pymavlink has no type annotations; only this module imports it untyped.
 """
 
 from __future__ import annotations
@@ -25,6 +25,6 @@ CRC_EXTRA.setdefault(COMMAND_CANCEL, 14)  # of common.xml; pymavlink's dialect l
 
 
 def numbers_of(names: Iterable[str]) -> frozenset[int]:
-    """The numbers of messages by their names; names of other dialects are left out."""
+    """The numbers of messages by name; unknown names are ignored."""
     wanted = set(names)
     return frozenset(n for n, kind in dialect.mavlink_map.items() if kind.msgname in wanted)

@@ -1,8 +1,8 @@
 """Our two components, and their heartbeats before the heavy imports.
 
-An autopilot may not talk on a serial line until it hears MAVLink, and ArduPilot stops looking
-for a camera a minute after boot. Dialect and arrays take a while to import on a busy machine,
-so these first packets are made by hand. :class:`~mavlink.component.vehicle.VehicleLink` takes over.
+An autopilot may stay silent on a serial line until it receives MAVLink, and ArduPilot stops looking
+for a camera a minute after boot. Dialect and NumPy take a while to import on a busy machine,
+so these packets are packed by hand. :class:`~mavlink.component.vehicle.VehicleLink` takes over.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 BOOT = 1  # MAV_STATE
 HEARTBEAT, CRC_EXTRA, VERSION = 0, 50, 3
 PERIOD_S = 1.0
-LONGEST_S = 120.0  # who has not taken over by then is dead, and says so by silence
+LONGEST_S = 120.0  # a service that has not taken over by then is dead: stop
 
 
 FIRST_DEVICE = 100  # from here on component ids are of cameras, gimbals, computers, receivers ...
@@ -62,10 +62,10 @@ def _crc(data: bytes) -> int:
 
 
 class FirstBeats:
-    """Opens links and says once a second that we are booting, until someone takes over."""
+    """Opens links and sends a booting heartbeat once a second, until the service takes over."""
 
     def __init__(self, links: Sequence[str], system: int, token: int) -> None:
-        """Raises ValueError for a link that cannot be."""
+        """Raises ValueError for an invalid link."""
         self.system, self.token = system, token
         self.sequence = 0  # of the next packet of either component
         self.next_s = time.monotonic()
@@ -74,13 +74,13 @@ class FirstBeats:
         self._thread = threading.Thread(target=self._run, name="first beats", daemon=True)
 
     def start(self) -> None:
-        """Open the links and speak."""
+        """Open the links and start the heartbeats."""
         for link in self.links:
             link.start()
         self._thread.start()
 
     def hand_over(self) -> list[Link]:
-        """The open links; from now on it is the caller who speaks."""
+        """The open links; from now on the caller sends the heartbeats."""
         self._stop.set()
         self._thread.join()
         return self.links

@@ -1,7 +1,7 @@
 """Bytes into whole MAVLink packets, and packets into messages; damage is skipped and counted.
 
-Works on MAVLink 1 and 2. A packet whose checksum fails is not skipped as a whole: the search
-goes on one byte further, so that a packet inside the damage is found.
+Handles MAVLink 1 and 2. After a packet with a wrong checksum the search continues one byte further,
+so that a packet inside the damage is found.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Message = Any
 
 
 class Packet(NamedTuple):
-    """One packet with a right checksum, or of a kind whose checksum nobody here can know."""
+    """One packet with a correct checksum, or of a kind whose checksum cannot be verified here."""
 
     data: bytes
     message_id: int
@@ -38,7 +38,7 @@ class Packet(NamedTuple):
 def packet_length(data: bytes | bytearray, at: int) -> int | None:
     """Length in bytes of the packet that starts at ``at``; 0 when no packet can start there.
 
-    None when there are too few bytes to say.
+    None when there are too few bytes to decide.
     """
     if at >= len(data):
         return None
@@ -72,7 +72,7 @@ def check_packet(data: bytes) -> Packet | None:
 
 
 def _starts_whole(data: bytes) -> bool:
-    """True when a whole packet with a right checksum stands at the start."""
+    """True when a whole packet with a correct checksum is at the start."""
     length = packet_length(data, 0)
     if not length or length > len(data):
         return False
@@ -105,9 +105,9 @@ class NumbersMessage:
 class Decoder:
     """Packets into message objects; never raises.
 
-    Hundreds of telemetry messages come every second, and most of what pymavlink does with them
-    (the checksum, the header, the message's own bytes) is done already or is not asked for. So
-    messages of numbers alone are read here.
+    Hundreds of telemetry messages arrive every second, and most of pymavlink's work on them
+    (checksum, header, copy of the bytes) is done already or not needed. So messages with numeric
+    fields only are decoded here.
     """
 
     def __init__(self) -> None:
@@ -115,7 +115,7 @@ class Decoder:
         self._arrays: dict[int, list[tuple[int, int]]] = {}  # where in the fields, how long
 
     def message(self, packet: Packet) -> Message | None:
-        """The message object, or None when the payload cannot be one."""
+        """The message object, or None when the payload is malformed."""
         kind = dialect.mavlink_map.get(packet.message_id)
         if kind is None:
             return None
@@ -127,7 +127,7 @@ class Decoder:
             return None
 
     def _fields(self, kind: Any, data: bytes) -> dict[str, Any]:
-        """Zeros at a payload's end may have been cut; newer fields after it are left out."""
+        """Trailing zeros of a payload may be cut; extension fields beyond it are omitted."""
         start, size = 10 if data[0] == MAGIC_V2 else 6, kind.unpacker.size
         payload = data[start : start + min(data[1], size)]
         values = list(kind.unpacker.unpack(payload.ljust(size, b"\0")))
@@ -142,8 +142,8 @@ class Decoder:
 class Framer:
     """Splits a byte stream into packets; keeps at most one unfinished packet.
 
-    Noise may look like the start of a long packet. It is not waited for when what comes next
-    begins with a whole one, or an order sent once would wait for the next hundred bytes.
+    Noise may look like the start of a long packet. If the next data begins with a whole packet, that
+    start is discarded; otherwise a single command would wait for the next hundred bytes.
     """
 
     def __init__(self) -> None:
@@ -159,7 +159,7 @@ class Framer:
             if whole is not None:
                 self.packets[whole.system] += 1
                 return [whole]
-        if buffer and _starts_whole(data):  # then what waits is no packet, or lost its end
+        if buffer and _starts_whole(data):  # then the buffered bytes are noise or truncated
             self.skipped_bytes += len(buffer)
             buffer.clear()
         buffer += data

@@ -1,8 +1,8 @@
-"""Links to the outside: reopened forever, stamped at the read, never waited for.
+"""Links: reopened whenever they fail, stamped at the read; sending never blocks.
 
-:class:`Inbox` takes what comes to the protocol's thread. Waking a thread costs more than what a
-telemetry message wants done, so messages that nobody waits for are gathered for a moment. They
-carry their own stamps; nothing is lost by it.
+:class:`Inbox` passes received packets to the protocol's thread. Waking a thread costs more than
+processing a telemetry message, so messages that need no quick answer are batched briefly. They
+keep their own stamps.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ log = logging.getLogger(__name__)
 
 BACKOFF_S = (0.2, 5.0)
 QUEUE = 512
-KEPT_WHILE_DOWN = 8  # older messages for a link that is down are stale
+KEPT_WHILE_DOWN = 8  # messages kept for a link that is down; older ones are stale
 
 
 class Link:
-    """A port that is opened again whenever it fails, with a reading and a writing thread.
+    """A port that is reopened whenever it fails, with a reading and a writing thread.
 
-    ``on_data(data, monotonic_ns)`` is called in the reading thread for whatever comes.
+    ``on_data(data, monotonic_ns)`` is called in the reading thread for all received data.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class Link:
             thread.start()
 
     def stop(self) -> None:
-        """Send what waits, close the port and end both threads."""
+        """Send queued data, close the port and end both threads."""
         deadline = time.monotonic() + 0.5
         while self._waiting and self.is_up and time.monotonic() < deadline:
             time.sleep(0.01)
@@ -75,7 +75,7 @@ class Link:
             thread.join(timeout=5.0)
 
     def write(self, data: bytes) -> None:
-        """Send or queue data; never waits. The oldest give way on a link that takes nothing."""
+        """Send or queue data; never blocks. A full queue drops its oldest entries."""
         port = self._port
         if port is not None and port.is_quick:
             port.write(data)
@@ -146,7 +146,7 @@ class Link:
                 self._complain(error)
                 with self._wake:
                     if self._port is port:
-                        self._port = None  # the reading thread opens it again
+                        self._port = None  # the reading thread reopens it
 
 
 GATHER_S = 0.04
@@ -166,7 +166,7 @@ class Inbox(Generic[T]):
         self.dropped = 0
 
     def put(self, job: Job) -> None:
-        """Add a job and wake who takes it; dropped, and counted, when too many wait."""
+        """Add a job and wake the consumer; dropped and counted when the queue is full."""
         with self._wake:
             if len(self._jobs) >= self._limit:
                 self.dropped += 1
@@ -175,14 +175,14 @@ class Inbox(Generic[T]):
             self._wake.notify()
 
     def gather(self, telemetry: T) -> None:
-        """Add telemetry, to be taken within a moment; dropped when too much waits."""
+        """Add telemetry, which is taken within a moment; dropped when the queue is full."""
         if len(self._telemetry) >= self._limit:
             self.dropped += 1
             return
         self._telemetry.append(telemetry)
 
     def take(self, timeout_s: float) -> tuple[list[T], list[Job]]:
-        """The telemetry and the jobs that wait, after waiting for a job for a moment at most."""
+        """Queued telemetry and jobs, after waiting briefly for a job."""
         with self._wake:
             if not self._jobs:
                 self._wake.wait(min(GATHER_S, timeout_s))

@@ -1,4 +1,4 @@
-"""Outgoing messages: who says what to whom, at which interval; packed and sent on the links."""
+"""Outgoing messages: sender, addressee and interval; packed and sent on the links."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Outgoing:
 
 
 class Outbox:
-    """Messages waiting to be packed; the oldest give way when nobody takes them."""
+    """Messages waiting to be packed; a full queue drops the oldest."""
 
     def __init__(self, limit: int = 2000) -> None:
         self._waiting: deque[Outgoing] = deque(maxlen=limit)
@@ -56,7 +56,7 @@ log = logging.getLogger(__name__)
 
 
 class Packer:
-    """Packs for one link; safe between threads. Each component counts its own packets."""
+    """Packs for one link; thread-safe. Each component has its own sequence."""
 
     def __init__(self, link: int, signing: Signing | None = None, sequence: int = 0) -> None:
         self._link = link
@@ -86,7 +86,7 @@ class Packer:
 
 
 def _with_signed_flag(data: bytes, crc_extra: int) -> bytes:
-    """The packet saying that a signature follows, and its checksum for that."""
+    """The packet with the signed flag set and its checksum updated."""
     body = data[:2] + bytes((data[2] | SIGNED,)) + data[3:-2]
     crc: int = x25crc(body[1:] + bytes((crc_extra,))).crc
     return body + crc.to_bytes(2, "little")
@@ -94,14 +94,14 @@ def _with_signed_flag(data: bytes, crc_extra: int) -> bytes:
 
 @dataclass(slots=True)
 class _Stream:
-    default_us: int  # -1: not sent unless asked
+    default_us: int  # -1: only sent on request
     interval_us: int
     send: Callable[[], None]
     next_ns: int
 
 
 class Streams:
-    """A table of (component, message number) with an interval and a sender each."""
+    """A table of (component, message number), each with an interval and a sender."""
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
@@ -116,7 +116,7 @@ class Streams:
         return (component, number) in self._streams
 
     def set_interval(self, component: int, number: int, interval_us: int) -> None:
-        """0 is the default interval, -1 (any negative) switches the stream off."""
+        """0 is the default interval; -1 (any negative) stops the stream."""
         stream = self._streams[(component, number)]
         stream.interval_us = stream.default_us if interval_us == 0 else max(-1, interval_us)
         stream.next_ns = 0
@@ -128,21 +128,21 @@ class Streams:
         self._outbox.put(component, message, link)
 
     def tick(self, now_ns: int) -> None:
-        """Send what is due."""
+        """Send messages that are due."""
         for stream in self._streams.values():
             if stream.interval_us > 0 and now_ns >= stream.next_ns:
                 stream.next_ns = now_ns + stream.interval_us * 1000
                 stream.send()
 
     def next_timer(self) -> int | None:
-        """When :meth:`tick` has something to do, in ns."""
+        """Time in ns at which :meth:`tick` is due."""
         running = [s.next_ns for s in self._streams.values() if s.interval_us > 0]
         return min(running, default=None)
 
 
 @dataclass(frozen=True, slots=True)
 class LinkReport:
-    """How one link does."""
+    """State of one link."""
 
     name: str
     is_up: bool
@@ -155,7 +155,7 @@ class LinkReport:
 
 
 class Links:
-    """All links: packets in, in the threads that read them; messages out."""
+    """All links: delivers received packets in the reading threads; sends messages."""
 
     def __init__(
         self,
@@ -186,7 +186,7 @@ class Links:
             self._on_packet(index, packet, now_ns)
 
     def send(self, system: int, messages: Sequence[Outgoing]) -> list[bytes]:
-        """Send each message on the links that it is for; the packets sent."""
+        """Send each message on its links; returns the packets sent."""
         unix_ns, sent = time.time_ns(), []
         for outgoing in messages:
             for i, link in enumerate(self._links):
@@ -199,7 +199,7 @@ class Links:
         return sent
 
     def report(self) -> tuple[LinkReport, ...]:
-        """How each does."""
+        """State of each link."""
         return tuple(
             LinkReport(
                 link.spec.name,

@@ -1,10 +1,9 @@
-"""Ports to the outside: serial, UDP, TCP, and recorded logs; the only I/O of this package.
+"""Ports: serial, UDP, TCP and recorded logs; the only I/O of this package.
 
-A link is named as pymavlink does it:
-
+A link is written as in pymavlink:
 ``serial:/dev/serial/by-id/NAME:921600``, ``udpin:0.0.0.0:14550`` (also ``udp:``),
-``udpout:192.168.1.2:14550``, ``tcp:HOST:PORT``, ``tcpin:0.0.0.0:5760``; and for the bench
-``tlog:PATH``, a recorded log at the pace at which it was recorded.
+``udpout:192.168.1.2:14550``, ``tcp:HOST:PORT``, ``tcpin:0.0.0.0:5760``; and for tests
+``tlog:PATH``, a recorded log replayed at its original pace.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ class LinkSpec:
 
 
 def parse_link(text: str) -> LinkSpec:
-    """The address in a link's notation; ValueError says what is wrong with it."""
+    """The address in a link's notation; ValueError names the error."""
     if text.startswith("/dev/"):
         text = "serial:" + text.replace(",", ":")
     kind, _, rest = text.partition(":")
@@ -63,16 +62,16 @@ def parse_link(text: str) -> LinkSpec:
 class Port(Protocol):
     """An open link. Failures are OSErrors."""
 
-    is_quick: bool  # writing never waits, so whoever has something to send may do it
+    is_quick: bool  # writing never blocks, so any thread may write
 
     def read(self) -> bytes:
-        """What came; empty when nothing did within ``READ_S``."""
+        """Received data; empty when there is none within ``READ_S``."""
 
     def write(self, data: bytes) -> None:
         """Send to everyone at the other end."""
 
     def close(self) -> None:
-        """Free it."""
+        """Release it."""
 
 
 class SerialPort:
@@ -88,11 +87,11 @@ class SerialPort:
         )
 
     def read(self) -> bytes:
-        """What came."""
+        """Received data."""
         try:
             first: bytes = self._line.read(1)
             return first + self._line.read(self._line.in_waiting) if first else b""
-        except TypeError as error:  # pyserial's way to say that it was closed meanwhile
+        except TypeError as error:  # pyserial raises this when it was closed meanwhile
             raise OSError("closed") from error
 
     def write(self, data: bytes) -> None:
@@ -103,12 +102,12 @@ class SerialPort:
             raise OSError("closed") from error
 
     def close(self) -> None:
-        """Free the line."""
+        """Close the line."""
         self._line.close()
 
 
 class UdpPort:
-    """Datagrams: to a fixed place (out), or to those who were heard (in)."""
+    """Datagrams: to a fixed address (out), or to the peers heard (in)."""
 
     is_quick = True
 
@@ -140,7 +139,7 @@ class UdpPort:
         return bytes(self._buffer[:length])
 
     def write(self, data: bytes) -> None:
-        """Send to all; a peer that is not there is no failure of the link."""
+        """Send to all; a missing peer is no failure of the link."""
         now = time.monotonic_ns()
         for peer, heard in list(self._peers.items()):
             if now - heard > PEER_NS:
@@ -150,7 +149,7 @@ class UdpPort:
                 self._socket.sendto(data, peer)
 
     def close(self) -> None:
-        """Free the socket."""
+        """Close the socket."""
         self._socket.close()
 
 
@@ -164,7 +163,7 @@ class TcpPort:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def read(self) -> bytes:
-        """What came."""
+        """Received data."""
         if not select.select([self._socket], [], [], READ_S)[0]:
             return b""
         data = self._socket.recv(LONGEST)
@@ -177,7 +176,7 @@ class TcpPort:
         self._socket.sendall(data)
 
     def close(self) -> None:
-        """Free the socket."""
+        """Close the socket."""
         self._socket.close()
 
 
@@ -191,7 +190,7 @@ class TcpServerPort:
         self._clients: list[socket.socket] = []
 
     def read(self) -> bytes:
-        """What came from any client."""
+        """Received data of any client."""
         ready = select.select([self._server, *self._clients], [], [], READ_S)[0]
         data = b""
         for source in ready:
@@ -226,14 +225,14 @@ class TcpServerPort:
         client.close()
 
     def close(self) -> None:
-        """Free all sockets."""
+        """Close all sockets."""
         for client in list(self._clients):
             self._drop(client)
         self._server.close()
 
 
 class LogPort:
-    """A recorded .tlog as if it came in now; what is sent goes nowhere."""
+    """A recorded .tlog, replayed at its pace; sent data is discarded."""
 
     is_quick = True
 
@@ -246,7 +245,7 @@ class LogPort:
         self._ahead_ns = 0 if self._next is None else time.monotonic_ns() - self._next[0]
 
     def read(self) -> bytes:
-        """The next packet when its time has come."""
+        """The next packet when it is due."""
         if self._next is None:
             time.sleep(READ_S)
             return b""
@@ -260,10 +259,10 @@ class LogPort:
         return data
 
     def write(self, data: bytes) -> None:
-        """Nobody listens."""
+        """Discard."""
 
     def close(self) -> None:
-        """Free the file."""
+        """Close the file."""
         self._file.close()
 
 
@@ -275,4 +274,4 @@ PORTS: dict[str, Callable[[LinkSpec], Port]] = {
     "tcpin": TcpServerPort,
     "tlog": LogPort,
 }
-"""Kind of link to its port. The next kind is one class and one line."""
+"""Kind of link to its port. A new kind is one class and one line."""

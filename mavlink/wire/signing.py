@@ -1,8 +1,8 @@
 """MAVLink 2 signing: 13 bytes after a packet (link, 48-bit time, 48 bits of SHA-256).
 
-A packet is taken when its signature is right and its time is newer than the last one of its
-stream (link, system, component), and, for a new stream, not more than a minute behind ours.
-The stream's time only moves on packets that were verified.
+A packet is accepted when its signature is correct and its time is newer than the last one of its
+stream (link, system, component), and, for a new stream, at most a minute behind ours.
+Only verified packets advance the stream's time.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def timestamp_of(unix_ns: int) -> int:
 
 
 def sign(packet: bytes, key: bytes, link: int, timestamp: int) -> bytes:
-    """The signed packet of one whose signed flag and checksum are already right."""
+    """The signed packet of one whose signed flag and checksum are already set."""
     tail = bytes((link & 0xFF,)) + timestamp.to_bytes(6, "little")
     return packet + tail + _digest(key, packet + tail)
 
@@ -57,7 +57,7 @@ def _digest(key: bytes, data: bytes) -> bytes:
 
 
 class Signing:
-    """One key, the times of the streams heard with it, our own time. Safe between threads."""
+    """One key, the times of the streams received with it, and our own time. Thread-safe."""
 
     def __init__(self, key: bytes, timestamp: int = 0) -> None:
         if len(key) != KEY_LENGTH:
@@ -65,17 +65,17 @@ class Signing:
         self._key = key
         self._lock = threading.Lock()
         self._streams: dict[tuple[int, int, int], int] = {}
-        self.timestamp = timestamp  # of the newest packet sent or verified; keep it over restarts
+        self.timestamp = timestamp  # of the newest packet sent or verified; survives restarts
         self.refused = 0
 
     def sign(self, packet: bytes, link: int, unix_ns: int) -> bytes:
-        """The packet with our signature; times strictly grow even when the clock steps back."""
+        """The packet with our signature; times increase strictly even when the clock steps back."""
         with self._lock:
             self.timestamp = min(LARGEST, max(self.timestamp + 1, timestamp_of(unix_ns)))
             return sign(packet, self._key, link, self.timestamp)
 
     def accepts(self, packet: Packet) -> bool:
-        """True when the packet may be believed."""
+        """True when the packet may be trusted."""
         with self._lock:
             if self._verify(packet):
                 return True

@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 STAMP = 8
 BLOCK = 1 << 16
 LATEST_USEC = 4_102_444_800 * 10**6  # the year 2100
-STEP_USEC = 3_600 * 10**6  # a longer way between two packets wants confirmation
+STEP_USEC = 3_600 * 10**6  # a longer gap between two packets needs confirmation
 
 
 def packets(file: BinaryIO, counts: Counter[str]) -> Iterator[tuple[int, Packet]]:
@@ -34,7 +34,7 @@ def packets(file: BinaryIO, counts: Counter[str]) -> Iterator[tuple[int, Packet]
                 continue
             if at >= len(buffer):
                 return
-            length = 0  # a torn end
+            length = 0  # truncated
         usec = int.from_bytes(buffer[at : at + STAMP], "big")
         if length and usec < LATEST_USEC:
             end = at + STAMP + length
@@ -51,10 +51,10 @@ def packets(file: BinaryIO, counts: Counter[str]) -> Iterator[tuple[int, Packet]
 def _stamp_stands(
     packet: Packet, usec: int, last_usec: int | None, buffer: bytearray, end: int
 ) -> bool:
-    """True when the stamp goes on from the last one, or the next stamp goes on from it.
+    """True when the stamp continues the last one, or the next stamp continues it.
 
-    So a clock that was set in mid-log is followed and a damaged stamp is not. A packet of a
-    kind without a checksum known here must be followed by another one as well.
+    So a clock that was set in mid-log is followed and a damaged stamp is not. A packet whose
+    checksum is unknown here must also be followed by another packet.
     """
     steady = last_usec is not None and abs(usec - last_usec) < STEP_USEC
     if steady and packet.known:
@@ -66,7 +66,7 @@ def _stamp_stands(
 
 
 class Recorder:
-    """Writes a .tlog while one is open; safe between threads, and never raises on a full disk."""
+    """Writes a .tlog while one is open; thread-safe, and never raises on a full disk."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -75,10 +75,10 @@ class Recorder:
         self.packets = 0
 
     def open(self, path: Path, unix_offset_ns: int) -> None:
-        """Start a log (OSError when it cannot be made); one that is open is closed first.
+        """Start a log (OSError when it cannot be created); an open one is closed first.
 
-        The stamps are the monotonic clock's times with ``unix_offset_ns`` added, so that setting
-        the clock in flight does not tear the log.
+        Stamps are monotonic times plus ``unix_offset_ns``, so that setting the clock in flight
+        causes no jump in the log.
         """
         file = path.open("ab")
         with self._lock:
@@ -97,10 +97,10 @@ class Recorder:
             try:
                 file.close()
             except OSError as error:
-                log.error("the telemetry log was not closed well: %s", error)
+                log.error("the telemetry log was not closed cleanly: %s", error)
 
     def write(self, packet: bytes, monotonic_ns: int) -> None:
-        """Keep one packet."""
+        """Write one packet."""
         if self._file is None:
             return
         with self._lock:

@@ -1,4 +1,4 @@
-"""Recorded telemetry: a log of any kind into a vehicle history, ``load_telemetry(path)``."""
+"""Recorded telemetry: ``load_telemetry(path)`` reads any supported log into a vehicle history."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ READERS: dict[str, str] = {
     ".ulg": "mavlink.telemetry.logs.ulog:load",
     ".srt": "mavlink.telemetry.logs.srt:load",
 }
-"""File name's end (lower case) to ``module:function``. The next kind is one file, one line."""
+"""File name extension (lower case) to ``module:function``. A new format is one file, one line."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TelemetryLog:
-    """A log's history and what was found on the way."""
+    """A log's history and what its reader reports."""
 
     history: VehicleHistory
     clock: str  # "unix", or "boot" when the log holds no date
@@ -34,8 +34,8 @@ class TelemetryLog:
 def load_telemetry(path: str | Path, config: HistoryConfig | None = None) -> TelemetryLog:
     """The vehicle history in a .tlog, .BIN, .ulg or DJI .SRT file, on the unix clock in ns.
 
-    ValueError in one line when there is no such file, or when it holds no attitude and no
-    position that can be used. Damaged parts are skipped and counted.
+    ValueError in one line when there is no such file, or when it holds no usable attitude and
+    position. Damaged parts are skipped and counted.
     """
     path = Path(path)
     if not path.is_file():
@@ -45,7 +45,7 @@ def load_telemetry(path: str | Path, config: HistoryConfig | None = None) -> Tel
     target = READERS.get(path.suffix.lower())
     if target is None:
         kinds = ", ".join(READERS)
-        raise ValueError(f"{path}: not a telemetry file; its name must end in one of {kinds}")
+        raise ValueError(f"{path}: not a telemetry file; supported extensions: {kinds}")
     module, _, function = target.partition(":")
     load: Any = getattr(import_module(module), function)
     log: TelemetryLog = load(path, config or HistoryConfig())
@@ -59,7 +59,7 @@ def finish(
     warnings: list[str],
     clock: str = "unix",
 ) -> TelemetryLog:
-    """The log around a filled history; ValueError when nothing in it can be used."""
+    """The log of a filled history; ValueError when it holds no usable data."""
     first, last = history.first_ns, history.last_ns
     if first is None or last is None:
         raise ValueError(f"{path}: no attitude and no position of a vehicle in this log")

@@ -30,7 +30,7 @@ GOOD = 4  # RangeFinder status
 
 
 def load(path: Path, config: HistoryConfig) -> TelemetryLog:
-    """The history in a .BIN log, on GPS time when the log has it, else since boot."""
+    """The history in a .BIN log, on GPS time when the log has it, otherwise since boot."""
     with path.open("rb") as file:
         if file.read(2) != HEADER:
             raise ValueError(f"{path}: not an ArduPilot .BIN log")
@@ -62,7 +62,7 @@ def _messages(path: Path) -> Iterator[Any]:
             try:
                 message = log.recv_match(type=list(_Reader.TABLE))
             except Exception:
-                return  # torn at this point: what came before stands
+                return  # truncated here: keep what was read before
             if message is None:
                 return
             yield message
@@ -71,7 +71,7 @@ def _messages(path: Path) -> Iterator[Any]:
 
 
 class _Reader:
-    """Messages into samples; remembers the last velocity, which has a message of its own."""
+    """Messages into samples; remembers the last velocity, which has its own message."""
 
     def __init__(self) -> None:
         self._velocity: tuple[float, tuple[float, float, float]] | None = None
@@ -82,7 +82,7 @@ class _Reader:
         try:
             return self.TABLE[name](self, m)
         except (AttributeError, TypeError, ValueError):
-            return None  # a field of another firmware generation is missing
+            return None  # a field is missing in this firmware version
 
     def _attitude(self, m: Any) -> Sample | None:
         angles = (m.Roll, m.Pitch, m.Yaw)

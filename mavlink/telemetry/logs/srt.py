@@ -33,7 +33,7 @@ GPS = re.compile(rf"GPS\s*\(\s*{NUMBER}\s*,\s*{NUMBER}\s*,\s*{NUMBER}\s*(M?)", r
 HEIGHT = re.compile(rf"\bH\s+{NUMBER}\s*m\b")
 PRY = re.compile(rf"\b([FG])\.PRY\s*\(\s*{NUMBER}°?\s*,\s*{NUMBER}°?\s*,\s*{NUMBER}")
 LONGEST_LINE = 4096
-CAMERA = 100  # the component that the head's attitude is filed under
+CAMERA = 100  # component id for the head's attitude
 
 
 def load(path: Path, config: HistoryConfig) -> TelemetryLog:

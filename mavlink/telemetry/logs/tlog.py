@@ -43,7 +43,7 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
             _place(history, key, stream, streams, speaks, warnings)
     restarts = max((n for *sender, n in streams if tuple(sender) in autopilots), default=0)
     if restarts:
-        warnings.append(f"the autopilot started again {restarts} time(s) in this log")
+        warnings.append(f"the autopilot rebooted {restarts} time(s) in this log")
     if counts["skipped_bytes"]:
         warnings.append(f"{counts['skipped_bytes']} damaged bytes were skipped")
     return finish(path, history, counts, warnings)
@@ -86,7 +86,7 @@ def _collect(path: Path, counts: Counter[str]) -> tuple[dict[Key, _Stream], set[
 
 
 def _vehicle(streams: dict[Key, _Stream], autopilots: set[int], warnings: list[str]) -> int | None:
-    """The system whose telemetry is used: the autopilot that says most of its attitude."""
+    """The system whose telemetry is used: the autopilot with the most attitude samples."""
     says: Counter[int] = Counter()
     for (system, _, _), stream in streams.items():
         if not autopilots or system in autopilots:
@@ -108,9 +108,9 @@ def _place(
     speaks: bool,
     warnings: list[str],
 ) -> None:
-    """Put a stream's samples in; those of the vehicle itself only when its autopilot speaks."""
+    """Add a stream's samples; those of the vehicle itself only when its autopilot sends them."""
     fit = _fit(stream)
-    if fit is None:  # a sender without a clock of its own goes by the autopilot's
+    if fit is None:  # a sender without a boot clock uses the autopilot's
         others = (_fit(s) for k, s in streams.items() if k[0] == key[0] and k != key)
         fit = next((f for f in others if f is not None), None)
     if fit is not None and not fit.is_real_time and speaks:

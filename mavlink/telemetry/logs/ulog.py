@@ -45,13 +45,13 @@ Columns = dict[str, Any]
 
 
 def load(path: Path, config: HistoryConfig) -> TelemetryLog:
-    """The history in a .ulg log, on GPS time when the log has it, else since boot."""
+    """The history in a .ulg log, on GPS time when the log has it, otherwise since boot."""
     topics, counts, warnings = _topics(path)
     history = VehicleHistory(config)
     offset_us = _unix_offset_us(topics)
     if offset_us is None:
         warnings.append("no GPS time in this log: its clock starts at boot")
-    # The global position is the estimator's; the local one stands in for it in older logs.
+    # The global position is the estimator's; older logs have only the local one.
     if len(topics.get("vehicle_global_position", {}).get("timestamp", ())):
         topics.pop("vehicle_local_position", None)
     for name, columns in topics.items():
@@ -85,10 +85,10 @@ def _topics(path: Path) -> tuple[dict[str, Columns], Counter[str], list[str]]:
 
 
 class _Bounded(io.BufferedReader):
-    """A file that may be read only as often as reading it once can take.
+    """A file with a limit on the bytes read.
 
-    pyulog steps back over a message that is damaged; where the file breaks off within it, it
-    steps back too far and would read the same bytes for ever.
+    pyulog seeks back over a damaged message. Where the file is truncated within it, pyulog seeks
+    too far back and would read the same bytes forever.
     """
 
     def __init__(self, path: Path) -> None:
@@ -96,10 +96,10 @@ class _Bounded(io.BufferedReader):
         self._left = 2 * path.stat().st_size + 10_000
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """As of any file; raises OSError when the reader goes round in circles."""
+        """Read like any file; raises OSError when the reader loops."""
         self._left -= 1
         if self._left < 0:
-            raise OSError("it breaks off within a damaged message")
+            raise OSError("it is truncated within a damaged message")
         return super().read(size)
 
 
@@ -177,4 +177,4 @@ TABLE: dict[str, Callable[[Columns, int], list[Sample]]] = {
     "vehicle_gps_position": _nothing,  # read for its UTC alone
     "sensor_gps": _nothing,
 }
-"""Topic to reader. The next topic is one function and one line."""
+"""Topic to reader. A new topic is one function and one line."""
