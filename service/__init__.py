@@ -1,8 +1,8 @@
-"""What touches the world: cameras, files, datalink, commands; joins recon and mavlink."""
+"""Everything with side effects: cameras, files, datalink, commands; joins recon and mavlink."""
 
 import os
 
 # Compiled loops of several stages share few cores. By default GNU OpenMP's idle threads spin
-# for milliseconds after each loop, on the very core that another stage needs. It is read when
+# for milliseconds after each loop, on a core that another stage needs. The variable is read when
 # the first loop starts, so it must be set before any stage is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

@@ -1,4 +1,4 @@
-"""Work and data handed from one thread to another, always bounded."""
+"""Bounded hand-over of work and data between threads."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ Out = TypeVar("Out")
 
 
 class Channel(Generic[T]):
-    """A bounded queue between two threads: iterate over it in one, :meth:`fill` it in the other.
+    """A bounded queue between two threads: one iterates over it, the other calls :meth:`fill`.
 
-    A full one makes the filling thread wait or, where it ``drops``, loses its oldest entry.
+    When it is full, the filling thread waits, or with ``drops`` the oldest entry is lost.
     """
 
     def __init__(self, bound: int, drops: bool) -> None:
@@ -38,12 +38,12 @@ class Channel(Generic[T]):
 
     @property
     def lag_s(self) -> float:
-        """Seconds for which the oldest entry has waited."""
+        """Seconds that the oldest entry has waited."""
         with self._change:
             return time.monotonic() - self._items[0][0] if self._items else 0.0
 
     def fill(self, items: Iterable[T]) -> None:
-        """Put all ``items`` in, then end; what they raise is raised where they are taken."""
+        """Put all ``items`` in, then end; their exception is raised to the iterating thread."""
         try:
             for item in items:
                 if not self._put(item):
@@ -55,7 +55,7 @@ class Channel(Generic[T]):
             self._change.notify_all()
 
     def _put(self, item: T) -> bool:
-        """Add an entry; False when nobody wants it any more."""
+        """Add an entry; False once the queue is closed."""
         with self._change:
             if not self._drops:
                 self._change.wait_for(lambda: self._is_closed or len(self._items) < self._bound)
@@ -69,7 +69,7 @@ class Channel(Generic[T]):
             return True
 
     def close(self) -> None:
-        """Want no more: both threads go on at once."""
+        """Discard what is queued; both threads continue at once."""
         with self._change:
             self._is_closed = True
             self._change.notify_all()
@@ -88,10 +88,10 @@ class Channel(Generic[T]):
 
 
 class BackgroundWorker(Generic[In, Out]):
-    """Runs ``work`` on what is offered, on a thread of the table and in order.
+    """Runs ``work`` on offered items, in order, on a thread of the table.
 
-    A full queue makes :meth:`offer` wait. Live, the oldest work that has not begun gives way and
-    :attr:`dropped` counts it. Without a row the work is done within :meth:`offer`.
+    When the queue is full, :meth:`offer` waits; live, the oldest item that has not begun is dropped
+    instead and counted in :attr:`dropped`. Without a row, :meth:`offer` does the work itself.
     """
 
     def __init__(
@@ -104,9 +104,9 @@ class BackgroundWorker(Generic[In, Out]):
     ) -> None:
         """``prepare`` is called once on the thread, before any work."""
         self._work, self._bound, self._live = work, bound, live
-        self._offered: dict[Future[Out], In] = {}  # in order; what gives way is out at once
+        self._offered: dict[Future[Out], In] = {}  # in order; dropped items leave at once
         self.dropped = 0
-        self._began_s: list[float] = []  # when the work at hand began, if there is any
+        self._began_s: list[float] = []  # start of the current work, if any
         self._todo: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._worker: Worker | None = None
         if row is not None:
@@ -114,15 +114,15 @@ class BackgroundWorker(Generic[In, Out]):
             self._worker = PROCESS.start(
                 row, lambda _: _run(todo, prepare), todo.qsize, lambda: _since(began_s)
             )
-            weakref.finalize(self, todo.put, None)  # also where nobody closes it
+            weakref.finalize(self, todo.put, None)  # also when it is never closed
 
     @property
     def busy_s(self) -> float:
-        """Seconds for which the work at hand has been going on; 0 when there is none."""
+        """Seconds since the current work began; 0 when idle."""
         return _since(self._began_s)
 
     def offer(self, item: In) -> None:
-        """Hand over one piece of work."""
+        """Queue one item."""
         future: Future[Out] = Future()
         self._offered[future] = item
         if self._worker is None:
@@ -139,7 +139,7 @@ class BackgroundWorker(Generic[In, Out]):
             self.dropped += 1
 
     def finished(self, everything: bool = False) -> list[tuple[In, Out]]:
-        """What is done, in order; ``everything`` waits for the rest. Raises what work raised."""
+        """Finished work, in order; ``everything`` waits for the rest. Raises what work raised."""
         out = []
         while self._offered:
             future = next(iter(self._offered))
@@ -150,7 +150,7 @@ class BackgroundWorker(Generic[In, Out]):
         return out
 
     def close(self) -> None:
-        """End the thread; what has not begun is not done."""
+        """End the thread; queued items are discarded."""
         for future in list(self._offered):
             if future.cancel():
                 del self._offered[future]
@@ -176,7 +176,7 @@ def _run(todo: SimpleQueue[Callable[[], None] | None], prepare: Callable[[], obj
     prepare()
     while (job := todo.get()) is not None:
         job()
-        del job  # and with it the owner, whose end ends this
+        del job  # releases the owner, whose finaliser ends this thread
 
 
 def _since(began_s: list[float]) -> float:

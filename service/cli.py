@@ -20,31 +20,37 @@ from service.packages import needing
 from service.redaction import without_credentials
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("service.commands.demo:demo", "A real flight through both ends, here."),
-    "replay": ("service.commands.replay:replay", "Recorded video through the onboard path."),
-    "run": ("service.commands.run:run", "The daemon."),
-    "keys": ("service.commands.setup:keys", "Certificates for a fleet's datalink."),
-    "ctl": ("service.commands.ctl:ctl", "Start, stop, watch and steer a scan by MAVLink."),
+    "demo": (
+        "service.commands.demo:demo",
+        "Run a recorded flight through both ends.",
+    ),
+    "replay": ("service.commands.replay:replay", "Reconstruct a recorded video."),
+    "run": ("service.commands.run:run", "Run the onboard service."),
+    "keys": ("service.commands.setup:keys", "Make certificates for a fleet's datalink."),
+    "ctl": ("service.commands.ctl:ctl", "Start, stop, watch and control a scan by MAVLink."),
     "ground": ("service.commands.ground:ground", "Receive scans from drones."),
-    "simulate": ("service.commands.simulate:simulate", "A synthetic flight with exact truth."),
-    "score": ("service.commands.simulate:score", "Compare a scan folder with the truth."),
-    "export": ("service.commands.deliverables:export", "Deliverables of a scan folder."),
-    "mesh": ("service.commands.deliverables:mesh", "Offline mesh and texture of a scan folder."),
-    "refine": ("service.commands.refine:refine", "A finished scan adjusted as a whole."),
-    "refly": ("service.commands.refine:refly", "A mission over what was seen too little of."),
+    "simulate": (
+        "service.commands.simulate:simulate",
+        "Render a flight with exact ground truth.",
+    ),
+    "score": ("service.commands.simulate:score", "Compare a scan folder with the ground truth."),
+    "export": ("service.commands.deliverables:export", "Export deliverables of a scan folder."),
+    "mesh": ("service.commands.deliverables:mesh", "Make a textured mesh of a scan folder."),
+    "refine": ("service.commands.refine:refine", "Adjust a finished scan as a whole."),
+    "refly": ("service.commands.refine:refly", "Plan a mission over poorly covered areas."),
     "inspect": (
         "service.commands.deliverables:inspect",
-        "Every stage of a keyframe as one picture.",
+        "Draw every stage of a keyframe as one image.",
     ),
-    "calibrate": ("service.commands.calibrate:calibrate", "Camera model from a chessboard."),
-    "stereo": ("service.commands.stereo:stereo", "The stereo stage alone."),
-    "export-model": ("service.commands.stereo:export_model", "The dense stage as ONNX."),
+    "calibrate": ("service.commands.calibrate:calibrate", "Calibrate a camera with a chessboard."),
+    "stereo": ("service.commands.stereo:stereo", "Run the stereo stage on an image pair."),
+    "export-model": ("service.commands.stereo:export_model", "Export the dense stage as ONNX."),
     "config": ("service.commands.setup:config", "Check, show or print the configuration."),
-    "doctor": ("service.commands.setup:doctor", "What works here, what does not."),
-    "warm-up": ("service.commands.setup:warm_up", "Compile before the first flight."),
-    "bench": ("service.commands.bench:bench", "Benchmarks, each against a peer."),
+    "doctor": ("service.commands.setup:doctor", "Check what works on this machine."),
+    "warm-up": ("service.commands.setup:warm_up", "Compile kernels before the first flight."),
+    "bench": ("service.commands.bench:bench", "Run benchmarks, each against a peer."),
 }
-"""Name to (``module:function``, one line of help). The next command is a function and a line."""
+"""Name to (``module:function``, one line of help). A new command is a function and a line."""
 
 
 SERVICES = ("run", "ground")
@@ -62,13 +68,13 @@ class LazyCommands(typer.core.TyperGroup):
         return list(COMMANDS)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """What the overview shows of a command, without importing it; None for no such name."""
+        """A command's help line, without importing its module; None for an unknown name."""
         if cmd_name not in COMMANDS:
             return None
         return typer.core.TyperCommand(cmd_name, help=COMMANDS[cmd_name][1])
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """(name, command, its arguments) of what was typed."""
+        """(name, command, its arguments) of a command line."""
         name, _, rest = super().resolve_command(ctx, args)
         return name, load_command(str(name)), rest
 
@@ -92,7 +98,7 @@ app = typer.Typer(
 @app.callback()
 def _root(
     context: typer.Context,
-    verbose: bool = typer.Option(False, "--verbose", "-v", help="Log what every stage does."),
+    verbose: bool = typer.Option(False, "--verbose", "-v", help="Log details of every stage."),
 ) -> None:
     """Terrain and buildings in 3D, in real time, from the camera of a drone."""
     quiet = logging.INFO if context.invoked_subcommand in SERVICES else logging.WARNING
@@ -100,7 +106,7 @@ def _root(
 
 
 def main() -> None:
-    """Run the command line; exit codes: 0 done, 2 usage or input, 3 outside world, 1 ours."""
+    """Run the command line; exit codes: 0 done, 2 usage or input, 3 environment, 1 internal."""
     threading.excepthook = lambda hook: _print_fault(
         hook.exc_type, hook.exc_value or hook.exc_type(), hook.exc_traceback
     )
@@ -111,13 +117,13 @@ def main() -> None:
         print(f"skyrelief: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
     finally:
-        sys.excepthook = _print_fault  # typer has put its own in place
+        sys.excepthook = _print_fault  # replaces typer's
 
 
 def _print_fault(
     kind: type[BaseException], error: BaseException, trace: TracebackType | None
 ) -> None:
-    """Print the traceback of our own fault, with the credentials in it hidden."""
+    """Print the traceback of an internal fault, with credentials hidden."""
     text = "".join(traceback.format_exception(kind, error, trace))
     print(without_credentials(text), end="", file=sys.stderr)
 

@@ -1,7 +1,7 @@
 """The configuration: strict TOML composed of frozen dataclasses, one per section.
 
-Every key has a default that works and one line of documentation beside it, which
-``skyrelief config default`` prints. Unknown keys are errors with a suggestion.
+Every key has a working default and one line of documentation, which ``skyrelief config default``
+prints. Unknown keys are errors with a suggestion.
 """
 
 from __future__ import annotations
@@ -23,34 +23,36 @@ from service.errors import InputError
 from service.small_file import read_small
 
 LARGEST_FILE_BYTES, LONGEST_LINE_BYTES = 65_536, 4_096
-"""The memory that a dotted key takes grows with the square of its length."""
+"""The memory for parsing a dotted key grows with the square of its length."""
 T = TypeVar("T")
 
 
 def key(default: T, doc: str, live: bool = False) -> T:
-    """A field with its documentation; ``live`` keys may change while the daemon runs."""
+    """A field with its documentation; ``live`` keys may change while the service runs."""
     field: T = dataclasses.field(default=default, metadata={"doc": doc, "live": live})
     return field
 
 
 @dataclass(frozen=True, slots=True)
 class CameraConfig:
-    """[camera]: where pictures come from and how the camera hangs."""
+    """[camera]: source of the images and mount of the camera."""
 
     source: str = key("", "file:V.mp4, images:DIR, pipe:-, rtsp://…, v4l2:/dev/video0, gst:…, sim:")
-    model: str = key("", "camera model, ROS camera_info YAML as 'skyrelief calibrate' writes it")
+    model: str = key("", "camera model, ROS camera_info YAML as written by 'skyrelief calibrate'")
     mount: Literal["auto", "gimbal", "fixed"] = key(
-        "auto", "auto: gimbal attitude when telemetry has it, else fixed to the body"
+        "auto", "auto: gimbal attitude if telemetry has it, otherwise fixed to the body"
     )
     mount_roll_deg: float = key(0.0, "fixed mount: roll of the optical axis in the body frame")
     mount_pitch_deg: float = key(-90.0, "fixed mount: -90 looks straight down, 0 looks ahead")
-    mount_yaw_deg: float = key(0.0, "fixed mount: 0 puts the picture's top towards the nose")
+    mount_yaw_deg: float = key(0.0, "fixed mount: 0 points the image's top to the nose")
     lever_forward_m: float = key(0.0, "camera ahead of the autopilot's position, body frame")
     lever_right_m: float = key(0.0, "the same to the right")
     lever_down_m: float = key(0.0, "the same downwards")
-    latency_ms: float = key(0.0, "from mid-exposure to the picture's time stamp", live=True)
+    latency_ms: float = key(0.0, "from mid-exposure to the image's time stamp", live=True)
     latency: Literal["fixed", "auto"] = key(
-        "fixed", "fixed: latency_ms; auto: latency_ms until the pictures' rotation says", live=True
+        "fixed",
+        "fixed: latency_ms; auto: measured from image rotation",
+        live=True,
     )
 
     def __post_init__(self) -> None:
@@ -65,22 +67,20 @@ class CameraConfig:
 
 @dataclass(frozen=True, slots=True)
 class MavlinkConfig:
-    """[mavlink]: links to the autopilot and who we are on them."""
+    """[mavlink]: links to the autopilot and our identity on them."""
 
     links: tuple[str, ...] = key(
-        (), "as pymavlink writes them: serial:/dev/…:921600, udpin:…, tcp:…"
+        (), "in pymavlink's notation: serial:/dev/…:921600, udpin:…, tcp:…"
     )
-    system_id: int = key(
-        0, "the vehicle's system id; 0 takes that of the autopilot we are connected to"
-    )
+    system_id: int = key(0, "the vehicle's system id; 0: that of the connected autopilot")
     gimbal_yaw_frame: Literal["auto", "vehicle", "earth", "body", "servo"] = key(
-        "auto", "what the gimbal's angles refer to; auto trusts its flags unless they cannot be"
+        "auto", "reference of the gimbal's angles; auto: by its flags unless refuted"
     )
     signing_key: str = key("", "file with the 32-byte key of signed links, mode 600")
     odometry: bool = key(False, "send our motion estimate to the autopilot (ODOMETRY)")
     memory: str = key(
         "",
-        "folder that keeps tuned parameters, signing time and system id; empty: scan.folder",
+        "folder for tuned parameters, signing time and system id; empty: scan.folder",
     )
 
     def __post_init__(self) -> None:
@@ -90,30 +90,30 @@ class MavlinkConfig:
 
 @dataclass(frozen=True, slots=True)
 class ScanConfig:
-    """[scan]: what is recorded and how densely."""
+    """[scan]: recording and its density."""
 
-    folder: str = key("/var/lib/skyrelief/scans", "each scan becomes a folder in here")
+    folder: str = key("/var/lib/skyrelief/scans", "parent folder of the scans")
     drone: str = key("", "name of this aircraft in scans and on the datalink; empty: host name")
-    start: Literal["on-command", "on-boot", "on-arm"] = key("on-command", "when a scan starts")
+    start: Literal["on-command", "on-boot", "on-arm"] = key("on-command", "start of a scan")
     close_after_landing_s: float = key(
         60.0,
-        "a scan by command that is not stopped is closed so long after disarming; 0: never",
+        "a commanded scan is closed this long after disarming; 0: never",
         live=True,
     )
     baseline: float | str = key(
-        "auto", "auto: by altitude; or metres; or 'n/m', frames as in the paper: '2/10'", live=True
+        "auto", "auto: by altitude; or metres; or 'n/m' frames as in the paper: '2/10'", live=True
     )
     base_to_height: float = key(0.1, "auto baseline: metres of baseline per metre above ground")
     assumed_agl_m: float | None = key(
         None, "height above ground when telemetry has none; gives the scan its scale"
     )
     keep_free_mib: float = key(
-        2048.0, "the oldest finished scans are deleted to keep so much of the disk; 0: never", True
+        2048.0, "free disk space; the oldest finished scans are deleted to keep it; 0: never", True
     )
     resolution_m: float = key(
-        0.0, "edge of the map's voxels, from the next scan on; 0: as the pictures allow", live=True
+        0.0, "voxel size of the map, from the next scan on; 0: by image resolution", live=True
     )
-    keep_debug: bool = key(False, "keep what 'skyrelief inspect' shows of every stage")
+    keep_debug: bool = key(False, "keep every stage for 'skyrelief inspect'")
 
     def __post_init__(self) -> None:
         """Check ranges and the notation of the baseline."""
@@ -134,40 +134,36 @@ class ScanConfig:
 
 @dataclass(frozen=True, slots=True)
 class ComputeConfig:
-    """[compute]: where and how finely it is computed."""
+    """[compute]: backend and quality settings."""
 
-    backend: str = key("auto", "auto, cpu, torch or onnx; one that is named must run")
+    backend: str = key("auto", "auto, cpu, torch or onnx; a named one must run")
     model: str = key(
         "",
-        "a learned stereo model by ONNX Runtime in place of belief propagation: the TOML that "
-        "declares it",
+        "TOML file of a learned stereo model that replaces belief propagation; needs ONNX Runtime",
     )
     threads: int = key(0, "threads of the CPU backend; 0: one per core")
     stereo_width: int = key(
         320,
-        "width of the stereo pair in pixels; the paper's is 320. Where it is not set, a replay "
-        "that need not keep pace takes 640 of a recording that has as many",
+        "width of the stereo pair in pixels; the paper's is 320. If unset, an offline replay uses "
+        "640 where the recording is at least that wide",
     )
-    labels: int = key(16, "least number of disparity labels; the paper's is 16")
-    iterations: int = key(5, "belief propagation's iterations per level; the paper's is 5")
-    guide_width: int = key(1280, "width of the picture that guides the upsampling")
-    upsample: bool = key(
-        True, "joint bilateral upsampling; without it depth is coarser and quicker"
-    )
+    labels: int = key(16, "minimum number of disparity labels; the paper's is 16")
+    iterations: int = key(5, "iterations of belief propagation per level; the paper's is 5")
+    guide_width: int = key(1280, "width of the image that guides the upsampling")
+    upsample: bool = key(True, "joint bilateral upsampling; without it depth is coarser and faster")
     pairs: int = key(4, "stereo pairs fused into a keyframe, at most")
     relief: bool = key(
         True,
-        "too slow, too hot or short of memory: lower rate, lower resolution, no upsampling, at "
-        "last only record; undone when it passes",
+        "shed load when too slow, too hot or short of memory: lower rate, lower resolution, no "
+        "upsampling, finally record only; reversed on recovery",
         live=True,
     )
     map_voxels: int = key(
         2_000_000,
-        "known surface held in memory, some 40 bytes a voxel; what was flown longest ago is paged "
-        "to the scan's folder",
+        "map voxels in memory, about 40 bytes each; the oldest are paged to the scan's folder",
     )
-    hottest_c: float = key(90.0, "degrees of the hottest sensor that count as too hot", live=True)
-    least_memory_mib: float = key(300.0, "memory left that counts as short", live=True)
+    hottest_c: float = key(90.0, "too hot from this temperature, degrees C", live=True)
+    least_memory_mib: float = key(300.0, "short of memory below this", live=True)
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -183,28 +179,28 @@ class ComputeConfig:
         if self.guide_width < self.stereo_width:
             raise ValueError(
                 f"compute.guide_width {self.guide_width} is less than compute.stereo_width "
-                f"{self.stereo_width}; the guide must be the finer one"
+                f"{self.stereo_width}; the guide must not be coarser"
             )
 
 
 @dataclass(frozen=True, slots=True)
 class DatalinkConfig:
-    """[datalink]: Zenoh endpoints and what the link may carry."""
+    """[datalink]: Zenoh endpoints and link budget."""
 
-    connect: tuple[str, ...] = key((), "ground stations to call: tcp/192.168.144.11:7447")
-    listen: tuple[str, ...] = key((), "endpoints to be called on")
+    connect: tuple[str, ...] = key((), "ground stations to connect to: tcp/192.168.144.11:7447")
+    listen: tuple[str, ...] = key((), "endpoints to listen on")
     budget_kbit_s: float = key(1000.0, "rate of the link to the ground", live=True)
-    share: float = key(0.65, "of that rate, how much all of ours together may use", live=True)
-    plain: bool = key(False, "allow endpoints without TLS beyond this machine")
+    share: float = key(0.65, "share of that rate for all our traffic", live=True)
+    plain: bool = key(False, "allow remote endpoints without TLS")
     tls_ca: str = key("", "fleet's certificate authority (PEM), from 'skyrelief keys'")
     tls_certificate: str = key("", "this aircraft's certificate (PEM)")
     tls_key: str = key("", "this aircraft's private key (PEM)")
     radio: str = key(
-        "", "narrow fallback: 'mavlink' for our own links, or an endpoint: udpout:127.0.0.1:14551"
+        "", "narrow fallback: 'mavlink' for [mavlink] links, or an endpoint: udpout:127.0.0.1:14551"
     )
-    radio_baud: int = key(57600, "speed of that telemetry radio")
-    radio_share: float = key(0.3, "how much of it we may use")
-    drain_s: float = key(20.0, "after a replay, wait so long for the ground to fetch the rest")
+    radio_baud: int = key(57600, "baud rate of that telemetry radio")
+    radio_share: float = key(0.3, "share of it for our traffic")
+    drain_s: float = key(20.0, "after a replay, maximum wait for the ground to fetch the rest")
 
     def __post_init__(self) -> None:
         """Check ranges and the form of the endpoints."""
@@ -220,17 +216,17 @@ class DatalinkConfig:
 
 @dataclass(frozen=True, slots=True)
 class FusionConfig:
-    """[fusion]: which parts of the telemetry may move the poses."""
+    """[fusion]: which telemetry may correct the poses."""
 
     gnss: bool = key(True, "use positions")
     attitude: bool = key(True, "use roll, pitch and yaw")
     altitude: bool = key(True, "use the height above ground")
-    loops: bool = key(True, "look for places seen before and close the loop")
+    loops: bool = key(True, "detect revisited places and close the loop")
     loop_views: int = key(
-        400, "keyframes remembered for that, 0.1 MB each; of more, every second old one goes"
+        400, "keyframes kept for loop detection, 0.1 MB each; above that, old ones are thinned"
     )
     graph_keyframes: int = key(
-        400, "keyframes in the pose graph, 0.04 MB each; of more, older ones ride on neighbours"
+        400, "keyframes in the pose graph, 0.04 MB each; above that, older ones are interpolated"
     )
 
     def __post_init__(self) -> None:
@@ -241,7 +237,7 @@ class FusionConfig:
 
 @dataclass(frozen=True, slots=True)
 class HealthConfig:
-    """[health]: who may ask how it goes."""
+    """[health]: status over HTTP."""
 
     http: str = key("127.0.0.1:9560", "address of /healthz, /status and /metrics; empty: off")
 
@@ -253,7 +249,7 @@ class HealthConfig:
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """All sections; the defaults replay a recording with nothing else said."""
+    """All sections; the defaults replay a recording without further settings."""
 
     camera: CameraConfig = dataclasses.field(default_factory=CameraConfig)
     mavlink: MavlinkConfig = dataclasses.field(default_factory=MavlinkConfig)
@@ -264,7 +260,7 @@ class Config:
     health: HealthConfig = dataclasses.field(default_factory=HealthConfig)
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
-        """Sections of plain values, fit for JSON."""
+        """Sections of plain values, for JSON."""
         plain: dict[str, dict[str, Any]] = msgspec.to_builtins(self)
         return plain
 
@@ -272,9 +268,8 @@ class Config:
 def load_config(path: Path | None = None, overrides: Sequence[str] = (), only: str = "") -> Config:
     """The configuration of ``path`` (None: defaults) with ``section.key=value`` overrides.
 
-    ``only`` names a section: whatever the others hold, they stay at their defaults. Raises
-    InputError, in one line, for a file that cannot be read, is not TOML, or holds a key, type
-    or value that is not known.
+    ``only`` names a section: all other sections keep their defaults. Raises InputError, in one
+    line, for a file that cannot be read, is not TOML, or holds an unknown key, type or value.
     """
     data = _read(path) if path is not None else {}
     where = str(path) if path is not None else "configuration"
@@ -299,10 +294,10 @@ def is_given(name: str, path: Path | None, overrides: Sequence[str] = ()) -> boo
 def reload(
     running: Config, wanted: Config, before: Config | None = None
 ) -> tuple[Config, list[str], list[str]]:
-    """``running`` with what of ``wanted`` may change live; names of the taken and the waiting.
+    """``running`` with the live keys of ``wanted``; names of the applied and the pending keys.
 
-    The waiting ones differ too, but need a restart. What ``wanted`` has in common with
-    ``before``, the last one wanted, stays as it is running: an operator may have tuned it.
+    Pending keys differ too, but need a restart. Keys that ``wanted`` shares with ``before``, the
+    last wanted configuration, keep their running value: an operator may have tuned it.
     """
     taken, waiting = [], []
     for section, field in keys():
@@ -328,7 +323,7 @@ def change(config: Config, name: str, value: object) -> Config:
 def parse_baseline(value: float | str) -> tuple[Literal["auto", "metres", "frames"], float, int]:
     """("auto", 0, 0), ("metres", m, 0) or ("frames", n, m) of ``scan.baseline``.
 
-    "n/m" is the paper's notation: n of every m frames take part, evenly spread.
+    "n/m" is the paper's notation: n of every m frames are used, evenly spread.
     Raises ValueError for anything else.
     """
     if isinstance(value, str) and value.strip() == "auto":
@@ -358,7 +353,7 @@ def _read(path: Path) -> dict[str, Any]:
         data = read_small(path, LARGEST_FILE_BYTES, "configuration file")
         if max(map(len, data.splitlines()), default=0) > LONGEST_LINE_BYTES:
             raise InputError(
-                f"{path} is not TOML of ours: a line of over {LONGEST_LINE_BYTES} bytes"
+                f"{path} is not a valid configuration: a line of over {LONGEST_LINE_BYTES} bytes"
             )
         return msgspec.toml.decode(data, type=dict[str, Any])
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -407,7 +402,7 @@ def _in_words(error: msgspec.ValidationError) -> str:
 
 
 def _override(config: Config, override: str) -> Config:
-    """``config`` with one ``section.key=value``; bare words and single items are understood."""
+    """``config`` with one ``section.key=value``; accepts bare words and single items."""
     name, equals, text = override.partition("=")
     section, dot, field = name.strip().partition(".")
     where = f"--set {override[:200]}"
@@ -415,7 +410,7 @@ def _override(config: Config, override: str) -> Config:
         raise InputError(f"{where}: write section.key=value")
     text = text.strip()
     data: dict[str, dict[str, Any]] = config.to_dict()
-    readings: list[Any] = [text, [text]]  # a name made of digits; one item of a list
+    readings: list[Any] = [text, [text]]  # a name of digits; one item of a list
     with contextlib.suppress(msgspec.DecodeError, RecursionError):
         readings.insert(0, msgspec.toml.decode(f"value = {text}", type=dict[str, Any])["value"])
     _check_keys({section: {field: readings[0]}}, where)

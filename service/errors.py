@@ -8,7 +8,7 @@ from service.redaction import without_credentials
 class SkyreliefError(Exception):
     """A failure that a person can act on; its text is one line: what, where, what to do.
 
-    The text travels far (status, MAVLink, scan.json, logs), so credentials in it are hidden.
+    The text is published (status, MAVLink, scan.json, logs), so credentials in it are hidden.
     """
 
     exit_code = 1
@@ -18,12 +18,12 @@ class SkyreliefError(Exception):
 
 
 class InputError(SkyreliefError):
-    """Wrong usage, configuration or input: the caller can put it right."""
+    """Wrong usage, configuration or input: the caller can fix it."""
 
     exit_code = 2
 
 
 class OutsideError(SkyreliefError):
-    """A part of the outside world failed: camera, link, disk, a missing optional package."""
+    """The environment failed: camera, link, disk, a missing optional package."""
 
     exit_code = 3

@@ -1,12 +1,12 @@
-"""The scan's local frame on the globe: ENU metres to latitude and longitude, and to UTM.
+"""The scan's local frame: ENU metres to latitude and longitude, and to UTM.
 
-ENU here is the tangent plane at the scan's origin (EPSG method 9837, geocentric/topocentric),
-so one kilometre out the ground lies 8 cm below it. The way to UTM goes through geodetic
-coordinates: scale, meridian convergence and the curvature of the Earth are all in it.
+ENU is the tangent plane at the scan's origin (EPSG method 9837, geocentric/topocentric), so
+the ground lies 8 cm below it at one kilometre. The conversion to UTM goes through geodetic
+coordinates, which covers scale, meridian convergence and the curvature of the Earth.
 
-Heights are above mean sea level, as autopilots report them, and go through the ellipsoidal
-formulas as they are: no geoid model is needed, because the origin and the points carry the
-same offset. What remains is the offset over the Earth's radius, at most 17 mm per kilometre.
+Heights are above mean sea level, as autopilots report them, and are used in the ellipsoidal
+formulas without a geoid model: origin and points share the same offset. The remaining error is
+the offset over the Earth's radius, at most 17 mm per kilometre.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a service says to the init system (sd_notify(3)): one datagram, no packages."""
+"""Notifications to the init system (sd_notify(3)): one datagram, no packages."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import socket
 log = logging.getLogger(__name__)
 
 EXTENSION_US = 30_000_000
-"""Without progress for so long, systemd ends a service that is closing its scan."""
+"""systemd ends a service that closes its scan without progress for this long."""
 
 
 class Notifier:
-    """Notifications to systemd; silent where nobody listens."""
+    """Notifications to systemd; no effect without it."""
 
     def __init__(self, address: str | None = None) -> None:
-        """Speak to ``address``, by default the one in NOTIFY_SOCKET."""
+        """Send to ``address``, by default the one in NOTIFY_SOCKET."""
         address = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
         self._address = "\0" + address[1:] if address.startswith("@") else address
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) if address else None
@@ -27,23 +27,23 @@ class Notifier:
         return self._socket is not None
 
     def status(self, text: str) -> None:
-        """A line for ``systemctl status``."""
+        """Set the line of ``systemctl status``."""
         self._send(f"STATUS={text}")
 
     def ready(self) -> None:
-        """The service is up."""
+        """Report that the service has started."""
         self._send("READY=1")
 
     def alive(self, status: str = "") -> None:
-        """Progress was made; feeds the watchdog."""
+        """Report progress, for the watchdog."""
         self._send("WATCHDOG=1" + (f"\nSTATUS={status}" if status else ""))
 
     def closing(self) -> None:
-        """Closing makes progress: systemd waits for another :data:`EXTENSION_US`."""
+        """Report that closing makes progress: systemd waits for another :data:`EXTENSION_US`."""
         self._send(f"EXTEND_TIMEOUT_USEC={EXTENSION_US}")
 
     def stopping(self) -> None:
-        """The service is stopping."""
+        """Report that the service is stopping."""
         self._send("STOPPING=1")
 
     def _send(self, text: str) -> None:

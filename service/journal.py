@@ -1,7 +1,7 @@
-"""Log records as journald keeps them: priority, logger and thread as fields of their own.
+"""Log records for journald, with priority, logger and thread as separate fields.
 
-Speaks the journal's native protocol (systemd, "Native Journal Protocol"): one datagram of
-``NAME=value`` lines, values of several lines with their length before them.
+Uses the journal's native protocol (systemd, "Native Journal Protocol"): one datagram of
+``NAME=value`` lines; values of several lines are preceded by their length.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MAX_BYTES = 100_000
 
 
 class JournalHandler(logging.Handler):
-    """Sends every record to the journal; what it does not take goes to standard error."""
+    """Sends every record to the journal; rejected ones go to standard error."""
 
     def __init__(self, address: str = SOCKET) -> None:
         super().__init__()
@@ -42,7 +42,7 @@ class JournalHandler(logging.Handler):
             print(f"{record.levelname} {record.name}: {text}", file=sys.stderr)
 
     def close(self) -> None:
-        """Let go of the socket."""
+        """Close the socket."""
         self._socket.close()
         super().close()
 
@@ -70,7 +70,7 @@ def _field(name: str, value: str) -> bytes:
 
 
 class PublicFormatter(logging.Formatter):
-    """Formats a record, traceback included, with the credentials in it hidden."""
+    """Formats a record, including its traceback, with credentials hidden."""
 
     def format(self, record: logging.LogRecord) -> str:
         """The text of one record."""
@@ -78,7 +78,7 @@ class PublicFormatter(logging.Formatter):
 
 
 def log_handler() -> logging.Handler:
-    """The journal where it reads our standard error, else standard error itself."""
+    """A handler for the journal if it reads our standard error, otherwise for standard error."""
     if _journal_reads_us() and os.path.exists(SOCKET):
         handler: logging.Handler = JournalHandler()
         handler.setFormatter(PublicFormatter("%(message)s"))

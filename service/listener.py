@@ -1,9 +1,9 @@
-"""A listening socket that strangers cannot exhaust, and what belongs to serving on one.
+"""A listening socket with limits against exhaustion.
 
-Descriptors are shared by the whole process: who opens thousands of connections to a web page would
-stop the datalink with it. So a listener has a limit in total and one per address, and a connection
-that waits too long for its request is closed. At a limit the connection that has waited longest
-gives way, so that half-open connections lock no operator out.
+Descriptors are shared by the whole process: thousands of connections to a web page would stop
+the datalink too. So a listener has a limit in total and one per address, and a connection that
+waits too long for its request is closed. At a limit the connection that has waited longest is
+closed, so that half-open connections lock no operator out.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ Peer = tuple[str, int]
 """Address and port at the other end."""
 
 DESCRIPTORS = 8192
-"""What a service asks for; the same number stands in its systemd unit."""
+"""Descriptors that a service requests; its systemd unit has the same number."""
 
 
 @dataclass(frozen=True, slots=True)
 class ListenerLimits:
-    """How many connections may be open, and how long one may wait for its request."""
+    """Limits of open connections and of the wait for a request."""
 
     total: int = 256
     per_address: int = 32  # IPv6: per /64 network
@@ -47,10 +47,10 @@ class _Connection:
     socket: socket.socket
     network: str
     waits_since: float  # monotonic
-    is_busy: bool = False  # with a request or as a WebSocket
+    is_busy: bool = False  # serves a request or a WebSocket
 
     def end(self) -> None:
-        """Make its owner, who reads from it, close it."""
+        """Make its owner, which reads from it, close it."""
         with contextlib.suppress(OSError):
             self.socket.shutdown(socket.SHUT_RDWR)
 
@@ -58,7 +58,7 @@ class _Connection:
 class BoundedListener(socket.socket):
     """A listening TCP socket with limits. Use from one thread.
 
-    Raises OSError when HOST:PORT cannot be listened on.
+    Raises OSError when HOST:PORT is not available.
     """
 
     def __init__(
@@ -86,12 +86,12 @@ class BoundedListener(socket.socket):
         return connection, address
 
     def begin(self, peer: Peer | None) -> None:
-        """A request of ``peer`` is being served: it waits no longer."""
+        """Note that a request of ``peer`` is being served."""
         if peer is not None and (found := self._open.get(peer)):
             found.is_busy = True
 
     def end(self, peer: Peer | None) -> None:
-        """The request of ``peer`` was served: it waits for the next one."""
+        """Note that the request of ``peer`` was served; it waits for the next one."""
         if peer is not None and (found := self._open.get(peer)):
             found.is_busy, found.waits_since = False, self._clock()
 
@@ -101,7 +101,7 @@ class BoundedListener(socket.socket):
             found.end()
 
     def sweep(self) -> None:
-        """Close the connections that have waited too long; call it about once a second."""
+        """Close connections that have waited too long; call it about once a second."""
         self._forget_closed()
         latest = self._clock() - self._limits.wait_s
         for peer, connection in list(self._open.items()):
@@ -109,7 +109,7 @@ class BoundedListener(socket.socket):
                 self.drop(peer)
 
     def _make_room(self, network: str) -> bool:
-        """Whether one more connection of ``network`` fits, perhaps in place of one that waits."""
+        """Whether one more connection of ``network`` fits, possibly replacing a waiting one."""
         same = [peer for peer, found in self._open.items() if found.network == network]
         if len(same) >= self._limits.per_address:
             return self._drop_longest_waiting(same)
@@ -130,7 +130,7 @@ class BoundedListener(socket.socket):
 
 
 def network_of(host: str) -> str:
-    """What one limit is for: an IPv4 address, or the /64 network of an IPv6 address."""
+    """The unit of the per-address limit: an IPv4 address, or the /64 network of an IPv6 address."""
     try:
         address = ipaddress.ip_address(host)
     except ValueError:
@@ -159,7 +159,7 @@ def host_name(header: str) -> str:
 
 
 def raise_descriptor_limit(wanted: int = DESCRIPTORS) -> int:
-    """Let this process open ``wanted`` descriptors, or as many as it may; how many that are."""
+    """Let this process open ``wanted`` descriptors, or as many as allowed; returns the limit."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     target = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
     if soft >= target:

@@ -1,4 +1,4 @@
-"""Optional packages, the system libraries that they load, and one line for what is missing."""
+"""Optional packages, their system libraries, and error texts for missing ones."""
 
 from __future__ import annotations
 
@@ -44,18 +44,17 @@ LIBRARIES = {
     },
     "rasterio": {"libexpat.so.1": "libexpat1"},
 }
-"""Import name to the libraries that its wheel takes from the system, each with its Debian
-package."""
+"""Import name to the system libraries that its wheel needs, each with its Debian package."""
 
 OURS = ("service", "recon", "mavlink")
 NOT_LOADED = re.compile(
     r"(?:\S*/)?([^\s/]+\.so[.\d]*): (?:cannot open shared|file too short|invalid ELF header)"
 )
-"""What the system's loader says of a library that is missing or broken."""
+"""The dynamic loader's message about a missing or broken library."""
 
 
 def missing_libraries(package: str) -> list[str]:
-    """The Debian packages that ``package`` needs and this system lacks; loads no Python."""
+    """The Debian packages that ``package`` needs and this system lacks, without importing it."""
     return [deb for name, deb in LIBRARIES.get(package, {}).items() if not loads(name)]
 
 
@@ -66,7 +65,7 @@ def unusable_packages() -> dict[str, list[str]]:
 
 
 def loads(library: str) -> bool:
-    """True when the system's loader finds ``library`` (its soname)."""
+    """True when the dynamic loader finds ``library`` (its soname)."""
     try:
         ctypes.CDLL(library)
     except OSError:
@@ -93,7 +92,7 @@ def remedy(error: ImportError) -> str | None:
 
 
 def _package(error: ImportError) -> str:
-    """The import name of the package that failed; extension modules name only themselves."""
+    """The import name of the failed package; extension modules name only themselves."""
     inside = Path(error.path or "").parts
     return next((name for name in LIBRARIES if name in inside), (error.name or "").split(".")[0])
 
@@ -110,6 +109,6 @@ def needing(what: str) -> Iterator[None]:
         raise OutsideError(f"{what} needs {line}") from error
 
 
-if __name__ == "__main__":  # for scripts that install what is missing
+if __name__ == "__main__":  # for scripts that install missing packages
     for _debian in sorted({name for names in unusable_packages().values() for name in names}):
         print(_debian)

@@ -1,8 +1,7 @@
-"""The narrow radio on MAVLink: TUNNEL out and in, RADIO_STATUS handed on.
+"""The narrow radio on MAVLink: sends and receives TUNNEL, forwards RADIO_STATUS.
 
-Either an endpoint of its own, or the links that the daemon already holds: a serial port has one
-owner, so where the telemetry radio hangs on the autopilot the coarse map goes through the
-vehicle's own link.
+It uses an endpoint of its own or the links of the service: a serial port has one owner, so a
+telemetry radio on the autopilot carries the coarse map through the vehicle's link.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ GROUND = (254, 190)
 
 
 class RadioLink:
-    """One MAVLink endpoint that carries tunnelled payloads; threads of its own.
+    """One MAVLink endpoint that carries tunnelled payloads; has its own threads.
 
     ``on_payload`` gets the payloads of TUNNEL messages of our type, ``on_status`` the free
     share of the radio's buffer in percent; both are called on the reading thread. Raises
-    InputError for an endpoint that cannot be.
+    InputError for an invalid endpoint.
     """
 
     def __init__(
@@ -48,7 +47,7 @@ class RadioLink:
         self._decoder = Decoder()
 
     def start(self) -> None:
-        """Open the endpoint, again and again until it is there."""
+        """Open the endpoint, and reopen it whenever it fails."""
         self._link.start()
 
     def close(self) -> None:
@@ -56,12 +55,12 @@ class RadioLink:
         self._link.stop()
 
     def send(self, payload: bytes) -> None:
-        """Send a payload to everybody."""
+        """Send a payload to all."""
         padded = list(payload.ljust(MAX_BYTES, b"\0"))
         self._send(dialect.MAVLink_tunnel_message(0, 0, PAYLOAD_TYPE, len(payload), padded))
 
     def beat(self, kind: int) -> None:
-        """Send a heartbeat as a vehicle part of MAV_TYPE ``kind``, so that links route to us."""
+        """Send a heartbeat of MAV_TYPE ``kind``, so that routers forward messages to us."""
         self._send(dialect.MAVLink_heartbeat_message(kind, 8, 0, 0, 4, 3))
 
     def _send(self, message: Any) -> None:
@@ -83,7 +82,7 @@ class RadioLink:
 
 
 class EndpointCarrier:
-    """A radio on a MAVLink endpoint of our own; InputError for one that cannot be."""
+    """A radio on its own MAVLink endpoint; InputError for an invalid one."""
 
     def __init__(self, endpoint: str) -> None:
         self._on_status: Callable[[int], None] = lambda _: None
@@ -95,11 +94,11 @@ class EndpointCarrier:
         self._link.start()
 
     def beat(self) -> None:
-        """Send a heartbeat, so that routers on the way know the path."""
+        """Send a heartbeat, so that routers learn the route."""
         self._link.beat(dialect.MAV_TYPE_ONBOARD_CONTROLLER)
 
     def send(self, payload: bytes) -> None:
-        """Send a payload to everybody."""
+        """Send a payload to all."""
         self._link.send(payload)
 
     def close(self) -> None:
@@ -108,7 +107,7 @@ class EndpointCarrier:
 
 
 class VehicleRadio:
-    """A carrier of one scan's tunnelled payloads after the other; made once per vehicle."""
+    """Carries tunnelled payloads of one scan at a time on the vehicle's link."""
 
     def __init__(self, vehicle: VehicleLink) -> None:
         self._vehicle = vehicle
@@ -120,10 +119,10 @@ class VehicleRadio:
         self._on_status = on_status
 
     def beat(self) -> None:
-        """Nothing: the vehicle's link has heartbeats of its own."""
+        """Nothing: the vehicle's link sends its own heartbeats."""
 
     def send(self, payload: bytes) -> None:
-        """Send a payload to everybody."""
+        """Send a payload to all."""
         self._vehicle.send_tunnel(PAYLOAD_TYPE, payload)
 
     def close(self) -> None:

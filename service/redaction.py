@@ -1,7 +1,7 @@
-"""Secrets out of everything that leaves the process: scans, status, logs, reports, errors.
+"""Removes secrets from everything that leaves the process: scans, status, logs, reports, errors.
 
-One list of configuration keys whose values stay here, and the credentials that people write into
-addresses and pipelines: ``rtsp://user:secret@host``, ``…?pwd=secret``, ``user-pw=secret``.
+One list of secret configuration keys, and patterns for credentials in addresses and pipelines:
+``rtsp://user:secret@host``, ``…?pwd=secret``, ``user-pw=secret``.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from typing import Any
 
 HIDDEN = "***"
-"""Stands in place of a secret."""
+"""Replaces a secret."""
 
 SECRET_KEYS = frozenset({"mavlink.signing_key", "datalink.tls_key"})
-"""Configuration keys whose whole value stays in the process, as ``section.key``."""
+"""Configuration keys whose whole value is secret, as ``section.key``."""
 
 _USER = re.compile(
     r"(?<=://)(?:"
@@ -38,7 +38,7 @@ def without_credentials(text: str) -> str:
 
 
 def redacted(value: Any) -> Any:
-    """``value`` with the credentials hidden in every text of its dicts, lists and tuples."""
+    """``value`` with credentials hidden in every text of its dicts, lists and tuples."""
     if isinstance(value, str):
         return without_credentials(value)
     if isinstance(value, Mapping):
@@ -49,7 +49,7 @@ def redacted(value: Any) -> Any:
 
 
 def public_configuration(configuration: Mapping[str, Any]) -> dict[str, Any]:
-    """Sections of a configuration as they may leave the process."""
+    """Sections of a configuration without secrets."""
     return {
         section: {
             name: HIDDEN if value and f"{section}.{name}" in SECRET_KEYS else redacted(value)

@@ -1,4 +1,4 @@
-"""Small files that a person names: read whole, and never more than they may be."""
+"""Reads small files that a user names, up to a maximum size."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from service.errors import InputError
 
 
 def read_small(path: Path, max_bytes: int, what: str) -> bytes:
-    """The bytes of the regular file at ``path``, a ``what``.
+    """The bytes of the regular file at ``path``; errors call it a ``what``.
 
     Raises InputError, in one line, for a missing file, a folder, a device or pipe, and a file
     larger than ``max_bytes``.
     """
     try:
-        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # no pipe makes us wait
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # never blocks on a pipe
         with open(handle, "rb") as file:
             if not stat.S_ISREG(os.fstat(handle).st_mode):
-                raise InputError(f"{path} is no regular file; give the {what} itself")
+                raise InputError(f"{path} is not a regular file; give the {what} itself")
             data = file.read(max_bytes + 1)
     except FileNotFoundError:
         raise InputError(f"{path} cannot be read: no such file; give the {what}") from None

@@ -1,4 +1,4 @@
-"""Which software this is."""
+"""Name and version of this software."""
 
 from __future__ import annotations
 

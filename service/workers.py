@@ -1,10 +1,9 @@
-"""Every thread and process of the service: one table of rows, and the one place that starts them.
+"""Every thread and process of the service: one table of rows, and the only place that starts them.
 
-A row says what its workers do, how their queue is bounded, how long they may take without
-progress, and when they are stopped. ``/status`` and ``skyrelief doctor`` show the workers that
-run, each by its row. This is also the only place that catches every exception: a fault in one
-worker is logged with its traceback, never ends another one, and the worker is started again
-where its row says so.
+A row gives the worker's task, the bound of its queue, its deadline for progress, and its order of
+stopping. ``/status`` and ``skyrelief doctor`` list running workers by row. This is also the place
+that catches every exception: a fault in one worker is logged with its traceback, never ends
+another worker, and the worker is restarted where its row says so.
 """
 
 from __future__ import annotations
@@ -24,42 +23,42 @@ from service.errors import SkyreliefError
 log = logging.getLogger(__name__)
 
 MAX_RESTARTS, WINDOW_S = 5, 60.0
-"""A worker that fails more often than this within the window is not restarted any more."""
+"""A worker that fails more often than this within the window is not restarted again."""
 MAX_FAILED = 100
 """Workers that are no longer restarted, kept for the report."""
 PAUSE_S = 0.5
-"""From a fault to the restart."""
+"""Pause between a fault and the restart."""
 DROP, WAIT = "drop oldest", "wait"
-"""What a full queue does: its oldest entry gives way, or whoever fills it waits."""
+"""What a full queue does: drop its oldest entry, or make the filling thread wait."""
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
     """One kind of thread or process."""
 
-    name: str  # its workers have this name, or one that begins with it and a blank
+    name: str  # name of its workers, or the first word of their names
     does: str
     stop: int = 0  # order of stopping: the lowest first
     bound: int | None = None  # entries of its queue; None: it has none
     full: str = ""  # DROP or WAIT
-    deadline_s: float | None = None  # without progress for so long it hangs; None: it may wait
-    restarts: bool = False  # run again after a fault
-    is_essential: bool = False  # without it the process is of no use
-    is_awaited: bool = False  # the process does not end before it
-    starts_itself: str = ""  # why it is not started here
+    deadline_s: float | None = None  # stalled without progress for this long; None: never
+    restarts: bool = False  # restarted after a fault
+    is_essential: bool = False  # the process ends without it
+    is_awaited: bool = False  # the process waits for its end
+    starts_itself: str = ""  # reason why it is not started here
 
 
-_BELOW = "mavlink knows nothing of service"
+_BELOW = "mavlink does not import service"
 _HANG_S, _STALL_S = 20.0, 120.0
 
 ROWS: tuple[Row, ...] = (
     # A scan, live or replayed.
     Row("camera", "images of a camera when they are due", 1, 2, DROP),
     Row("decoder", "images of a recording, decoded ahead", 1, 4, WAIT),
-    Row("gst", "process: a GStreamer pipeline, and what it complains of", 1),
+    Row("gst", "process: a GStreamer pipeline, and its error messages", 1),
     Row("scan", "one scan: tracking, map and store", 2, deadline_s=_HANG_S),
     Row("dense", "reconstruction, pose graph; a replay waits, drops nothing", 2, 3, DROP, _HANG_S),
-    Row("coverage", "coverage.png beside the growing scan", 2),
+    Row("coverage", "coverage.png of the growing scan", 2),
     Row("files", "the files of a scan that has ended", 3),
     # The daemon.
     Row("backlog", "opens the earlier scans that the ground lacks", 4),
@@ -80,8 +79,8 @@ ROWS: tuple[Row, ...] = (
     Row("simulated flight", "process: camera and autopilot of sim:", 8, restarts=True),
     # The ground.
     Row("receiver", "the session with the drones", 1, None, "", _STALL_S, True, True),
-    Row("heads", "takes what drones announce", 1, restarts=True, is_essential=True),
-    Row("items", "takes what drones send", 1, restarts=True, is_essential=True),
+    Row("heads", "receives what drones announce", 1, restarts=True, is_essential=True),
+    Row("items", "receives what drones send", 1, restarts=True, is_essential=True),
     Row("replies", "answers that drones wait for", 2, None, "", _STALL_S, True, True),
     Row("drone", "the scans of one drone", 3, None, "", _STALL_S, True),
     Row("deliverables", "files of received scans", 4, restarts=True, is_essential=True),
@@ -94,7 +93,7 @@ ROWS: tuple[Row, ...] = (
 
 
 def row_of(name: str) -> Row:
-    """The row of a worker's name; KeyError for a worker that is not in the table."""
+    """The row of a worker's name; KeyError for an unknown worker."""
     found = [row for row in ROWS if name == row.name or name.startswith(f"{row.name} ")]
     if not found:
         raise KeyError(f"no row of ROWS is called {name!r}")
@@ -115,8 +114,8 @@ class Worker:
     beat_at: float = field(default_factory=time.monotonic)
     stop: threading.Event = field(default_factory=threading.Event)
     thread: threading.Thread | None = None
-    depth: Callable[[], int] = lambda: 0  # entries that wait in its queue
-    lag_s: Callable[[], float] = lambda: 0.0  # for which the entry at hand, or the oldest, waits
+    depth: Callable[[], int] = lambda: 0  # entries in its queue
+    lag_s: Callable[[], float] = lambda: 0.0  # age of the current or oldest entry
 
     @property
     def thread_id(self) -> int:
@@ -124,14 +123,14 @@ class Worker:
         return (self.thread.ident if self.thread is not None else None) or 0
 
     def beat(self) -> None:
-        """Note that the worker makes progress."""
+        """Note progress."""
         self.beat_at = time.monotonic()
 
     @property
     def is_stalled(self) -> bool:
-        """Whether it runs and has not made progress for its row's deadline.
+        """Whether it runs and has made no progress for its row's deadline.
 
-        Only a worker that restarts is judged by its beats; of a scan the daemon judges itself.
+        Only restarting workers are judged by their beats; the service judges a scan itself.
         """
         if self.row.deadline_s is None or not self.row.restarts or self.is_done:
             return False
@@ -156,7 +155,7 @@ class Worker:
         return not thread.is_alive()
 
     def to_dict(self) -> dict[str, Any]:
-        """For a report: name, state, restarts, last fault, and what its row bounds."""
+        """For a report: name, state, restarts, last fault, and the bounds of its row."""
         return {
             "name": self.name,
             "state": self.state,
@@ -178,7 +177,7 @@ def _bounds(row: Row) -> dict[str, Any]:
 
 
 class Workers:
-    """Workers that one owner starts, watches and ends. Safe between threads."""
+    """Workers that one owner starts, supervises and ends. Thread-safe."""
 
     def __init__(self, max_restarts: int = MAX_RESTARTS, pause_s: float = PAUSE_S) -> None:
         self._max_restarts, self._pause_s = max_restarts, pause_s
@@ -196,8 +195,8 @@ class Workers:
     ) -> Worker:
         """Run ``work(worker)`` on a thread until it returns; ``row`` is the worker's name.
 
-        After an exception it runs again where the row says so. ``work`` ends soon after
-        ``worker.stop`` is set. ``depth`` and ``lag_s`` are of its queue, for the report.
+        After an exception it is restarted where the row says so. ``work`` must end soon after
+        ``worker.stop`` is set. ``depth`` and ``lag_s`` describe its queue, for the report.
         """
         name, row = (row, row_of(row)) if isinstance(row, str) else (row.name, row)
         worker = Worker(name, row, work, depth=depth, lag_s=lag_s)
@@ -212,7 +211,7 @@ class Workers:
         return worker
 
     def every(self, row: str, period_s: float, work: Callable[[], None]) -> Worker:
-        """Run ``work()`` again and again with pauses of ``period_s``, also after faults."""
+        """Run ``work()`` repeatedly with pauses of ``period_s``, also after faults."""
 
         def repeat(worker: Worker) -> None:
             while not worker.stop.wait(period_s):
@@ -227,7 +226,7 @@ class Workers:
 
     @property
     def stalled(self) -> list[Worker]:
-        """Workers that hang."""
+        """Stalled workers."""
         return [worker for worker in self.table() if worker.is_stalled]
 
     def report(self) -> list[dict[str, Any]]:
@@ -240,7 +239,7 @@ class Workers:
             return list(self._workers)
 
     def stop(self, patience_s: float = 1.0) -> None:
-        """Stop all in the order of the table; none is waited for longer than ``patience_s``."""
+        """Stop all in the order of the table, each within ``patience_s``."""
         for worker in sorted(self.table(), key=lambda worker: worker.row.stop):
             worker.join(patience_s)
 
@@ -267,23 +266,23 @@ class Workers:
                 worker.stop.wait(self._pause_s)
         finally:
             worker.is_done = True
-            worker.work = lambda _: None  # lets go of what it worked on
+            worker.work = lambda _: None  # releases what it worked on
             worker.depth, worker.lag_s = (lambda: 0), (lambda: 0.0)
 
 
 _ALL: weakref.WeakSet[Workers] = weakref.WeakSet()
 _ALL_LOCK = threading.Lock()
-"""A set must not grow while it is listed."""
+"""A set must not change while it is iterated."""
 _PROCESSES: list[tuple[str, subprocess.Popen[bytes]]] = []
 
 PROCESS = Workers()
-"""The workers that nobody watches more closely."""
+"""The workers without a closer supervisor."""
 
 
 def open_process(name: str, command: Sequence[str], **streams: Any) -> subprocess.Popen[bytes]:
     """Start a process of the table, with the ``streams`` of Popen; its owner ends it.
 
-    Ctrl-C in a terminal does not reach it: it ends in its turn.
+    Ctrl-C in a terminal does not reach it; its owner ends it in order.
     """
     row_of(name)
     _PROCESSES[:] = [(n, p) for n, p in _PROCESSES if p.poll() is None]
@@ -303,9 +302,9 @@ def end_process(process: subprocess.Popen[bytes], patience_s: float = 2.0) -> No
 
 
 def running() -> list[dict[str, Any]]:
-    """The threads and processes of this process that run or have failed, in the table's order.
+    """Running and failed threads and processes of this process, in the table's order.
 
-    Threads that start themselves are found by their names.
+    Threads that start themselves are found by name.
     """
     with _ALL_LOCK:
         groups = list(_ALL)
@@ -324,18 +323,18 @@ def running() -> list[dict[str, Any]]:
 
 
 def _plain(name: str, row: Row) -> dict[str, Any]:
-    """The entry of what runs without a :class:`Worker`."""
+    """The entry of a thread or process without a :class:`Worker`."""
     return Worker(name, row, lambda _: None).to_dict()
 
 
 def guarded(name: str, work: Callable[[], object]) -> str:
-    """Run ``work``; the exception that ended it in one line, empty when there was none."""
+    """Run ``work``; returns its exception in one line, empty without one."""
     try:
         work()
     except (SkyreliefError, OSError) as error:
         log.error("%s: %s", name, error)
         return str(error) or type(error).__name__
-    except Exception as error:  # a fault of ours; it must not end anything else
+    except Exception as error:  # an internal fault; it must not end anything else
         log.exception("fault in %s", name)
         return f"{type(error).__name__}: {error}".splitlines()[0][:200]
     return ""

@@ -187,4 +187,4 @@ def test_a_dataflash_log_of_formats_that_do_not_exist_is_refused(tmp_path: Path)
 def test_an_endless_device_is_no_recording() -> None:
     command = [sys.executable, "-m", "service.cli", "replay", "file:/dev/zero"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert ended.returncode == 2 and "no regular file" in ended.stderr
+    assert ended.returncode == 2 and "not a regular file" in ended.stderr

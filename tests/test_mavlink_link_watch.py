@@ -99,7 +99,7 @@ def test_a_private_port_is_reported() -> None:
     assert "answers" not in net.companion.watch.troubles(net.now_ns)[0].text
     order = dialect.MAVLink_command_long_message(1, 191, 512, 0, 390, 0, 0, 0, 0, 0, 0)
     net.feed(order, GCS)
-    assert "answers stay here" in net.companion.watch.troubles(net.now_ns)[0].text
+    assert "do not reach the ground" in net.companion.watch.troubles(net.now_ns)[0].text
     net.has_ground = True
     net.wait(3)
     assert net.troubles() == [] and net.state() is Health.STANDBY
@@ -112,7 +112,7 @@ def test_a_port_of_px4_that_forwards_in_one_direction_is_reported(
     net = Watched(Vehicle(1, 0.002, firmware=firmware))
     net.wait(65)
     assert net.troubles() == troubles and net.state() is Health.STANDBY
-    assert ("MAV_n_FORWARD = 1 for this port" in net.said()) is bool(troubles)
+    assert ("MAV_n_FORWARD = 1 on this port" in net.said()) is bool(troubles)
     elsewhere = dialect.MAVLink_command_long_message(1, 1, 512, 0, 259, 0, 0, 0, 0, 0, 0)
     net.feed(elsewhere, GCS)
     assert net.troubles() == troubles

@@ -136,7 +136,7 @@ def test_a_reboot_starts_a_session_of_its_own(tmp_path: Path) -> None:
     fly(writer, 20, lambda t: T0_US + round(t * US), lambda t: 300_000 + t * 1000)
     fly(writer, 20, lambda t: T0_US + round((t + 40) * US), lambda t: 2_000 + t * 1000)
     log = load_telemetry(writer.save(tmp_path / "a.tlog"))
-    assert any("started again" in warning for warning in log.warnings)
+    assert any("rebooted" in warning for warning in log.warnings)
     assert yaw_at(log.history, T0_US + 5 * US) == pytest.approx(1.5, abs=1e-3)
     assert yaw_at(log.history, T0_US + 45 * US) == pytest.approx(1.5, abs=1e-3)
     assert yaw_at(log.history, T0_US + 30 * US) is None

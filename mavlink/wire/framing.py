@@ -142,8 +142,8 @@ class Decoder:
 class Framer:
     """Splits a byte stream into packets; keeps at most one unfinished packet.
 
-    Noise may look like the start of a long packet. If the next data begins with a whole packet, that
-    start is discarded; otherwise a single command would wait for the next hundred bytes.
+    Noise may look like the start of a long packet. If the next data begins with a whole packet,
+    that start is discarded; otherwise a single command would wait for the next hundred bytes.
     """
 
     def __init__(self) -> None:

@@ -253,7 +253,7 @@ def open_file(rest: str, options: Mapping[str, str]) -> VideoSource:
     if path.is_dir():
         raise InputError(f"{path} is a folder; for a folder of pictures write images:{path}")
     if not path.is_file():
-        raise InputError(f"{path} is no regular file; for a named pipe write pipe:{path}")
+        raise InputError(f"{path} is not a regular file; for a named pipe write pipe:{path}")
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty (0 bytes); copy it from the camera again")
     try:
