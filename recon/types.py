@@ -104,6 +104,36 @@ class StereoPair:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class PolarPair:
+    """Two frames flown along the line of sight, in polar coordinates about the baseline.
+
+    Column u of the left view lies ``a = first_rad - u / px_per_rad`` away from the direction to
+    the right camera, row v at ``first_row_rad + v / rows_per_rad`` about it, in axes whose z is
+    that direction. A left pixel with label ``l`` has its partner at ``right[v, u - l]``: the
+    right camera sees the point as it sees the plane at ``a + (first_label + l) / px_per_rad``.
+    """
+
+    left: U8  # (h, w) gray
+    right: U8  # (h, w) gray, shifted by the plane
+    baseline_m: float
+    labels: int
+    px_per_rad: float
+    rows_per_rad: float
+    first_rad: float
+    first_row_rad: float
+    plane: F64  # (3,) n with n . X = 1 on the ground, in the polar axes of the left camera, 1/m
+    first_label: float  # columns from the plane to label 0
+    relief: tuple[float, float]  # of what is believed: shares of the distance nearer than the plane
+    R_left_keyframe: F64  # (3, 3) keyframe camera to polar axes
+    guide: U8 | None = None  # (H, W, 3) left in colour, at guidance resolution
+    left_seen: Bool | None = None  # (h, w) False where the left view has nothing
+    right_seen: Bool | None = None  # (h, w) the same of the shifted right view
+
+
+RectifiedPair = StereoPair | PolarPair
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class DisparityMap:
     """Disparity of the left view, in pixels of its own grid; NaN where unknown."""
 

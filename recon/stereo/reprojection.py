@@ -65,7 +65,7 @@ def reproject(
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _label(px: Any, x: Any, y: Any) -> Any:  # pragma: no cover - compiled
+def label_at(px: Any, x: Any, y: Any) -> Any:  # pragma: no cover - compiled
     """Label at a place: bilinear where the four around it agree, else the nearest; or NaN."""
     height, width = px.shape
     i, j = int(np.rint(x)), int(np.rint(y))
@@ -106,7 +106,7 @@ def _reproject(
             x = (to_left[0, 0] * u + to_left[0, 1] * v + to_left[0, 2]) / z
             y = (to_left[1, 0] * u + to_left[1, 1] * v + to_left[1, 2]) / z
             X, Y = (x + 0.5) * finer[1] - 0.5, (y + 0.5) * finer[0] - 0.5
-            label = _label(px, X, Y)
+            label = label_at(px, X, Y)
             if np.isnan(label):
                 continue
             trust = confidence[int(np.rint(Y)), int(np.rint(X))]

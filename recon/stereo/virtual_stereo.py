@@ -16,7 +16,17 @@ import numpy as np
 from recon import se3
 from recon.camera_model import scaled_K
 from recon.image_quality import stretch
-from recon.types import F64, U8, Bool, DepthMap, DisparityMap, StereoPair
+from recon.stereo.polar import rectify_polar
+from recon.types import (
+    F64,
+    U8,
+    Bool,
+    DepthMap,
+    DisparityMap,
+    PolarPair,
+    RectifiedPair,
+    StereoPair,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +43,10 @@ class VirtualStereoConfig:
     labels: int = 16  # the fewest; relief may widen it
     max_labels: int = 96
     margin_labels: float = 3.0  # on either side of the relief that the landmarks show
-    epipole_margin: float = 1.3  # the epipole must be this many half pictures away
+    epipole_margin: float = 1.3  # half images; a polar pair where the epipole is nearer
+    max_sigma_share: float = 0.04  # of the distance; about the epipole, where it is more, a mask
+    margin_share: float = 0.25  # of the camera's height, beyond the relief that landmarks show
+    min_usable: float = 0.1  # share of the left view outside that mask and on the ground
 
     def __post_init__(self) -> None:
         if not 0 < self.min_base_to_height < self.max_base_to_height:
@@ -79,13 +92,21 @@ def check_pair(
     if base > config.max_base_to_height * depth_m:
         return PairRejection("baseline too long")
     H, W = left.gray.shape
-    reach = np.hypot(W, H) / 2 / left.K[0, 0]
-    for axis in (t, T_left_right[:3, :3].T @ t):  # seen from the left and from the right view
-        if np.hypot(axis[0], axis[1]) < config.epipole_margin * reach * abs(axis[2]):
-            return PairRejection("flying along the line of sight")
     if _overlap(T_left_right, left.K, (W, H), depth_m) < config.min_overlap:
         return PairRejection("too little overlap")
     return None
+
+
+def is_along_the_view(left: View, right: View, config: VirtualStereoConfig) -> bool:
+    """True where the epipole lies in or near one of the images: no plane holds both rectified."""
+    T_left_right = se3.inverse(left.T_odom_camera) @ right.T_odom_camera
+    t = T_left_right[:3, 3]
+    H, W = left.gray.shape
+    reach = np.hypot(W, H) / 2 / left.K[0, 0]
+    return any(
+        np.hypot(axis[0], axis[1]) < config.epipole_margin * reach * abs(axis[2])
+        for axis in (t, T_left_right[:3, :3].T @ t)  # seen from the left and from the right view
+    )
 
 
 def _overlap(T_left_right: F64, K: F64, size: tuple[int, int], depth_m: float) -> float:
@@ -107,8 +128,10 @@ def rectify(
     points_m: F64,
     config: VirtualStereoConfig,
     relief_m: tuple[float, float] = (0.0, 0.0),
-) -> StereoPair | PairRejection:
+) -> RectifiedPair | PairRejection:
     """The rectified pair of two views with its disparity window, or why there is none.
+
+    Flown along the line of sight the pair is a polar one (:mod:`recon.stereo.polar`).
 
     Args:
         points_m: (N, 3) some points of the scene in the left camera; their disparities
@@ -121,6 +144,9 @@ def rectify(
     rejection = check_pair(left, right, float(np.median(points_m[:, 2])), config)
     if rejection is not None:
         return rejection
+    if is_along_the_view(left, right, config):
+        pair = _polar(left, right, points_m, config, relief_m)
+        return PairRejection(pair) if isinstance(pair, str) else pair
     T_left_right = se3.inverse(left.T_odom_camera) @ right.T_odom_camera
     base = float(np.linalg.norm(T_left_right[:3, 3]))
     R_rect_left = _rectifying_rotation(T_left_right)
@@ -151,7 +177,24 @@ def rectify(
     )
 
 
-def drop_unseen(labels: DisparityMap, pair: StereoPair) -> DisparityMap:
+def _polar(
+    left: View,
+    right: View,
+    points_m: F64,
+    config: VirtualStereoConfig,
+    relief_m: tuple[float, float],
+) -> PolarPair | str:
+    """The pair about its epipole, or why there is none; the ground is a plane through points."""
+    points = points_m[points_m[:, 2] > 0]
+    depth = float(np.median(points[:, 2]))
+    xy = config.width_px * points[:, :2] / points[:, 2:]
+    fitted, _ = _fit_plane(xy[:, 0], xy[:, 1], config.width_px * depth / points[:, 2])
+    plane = fitted * [1.0, 1.0, 1.0 / config.width_px] / depth
+    low, high = relief_m
+    return rectify_polar(left, right, points, plane, config, (low / depth, high / depth))
+
+
+def drop_unseen(labels: DisparityMap, pair: RectifiedPair) -> DisparityMap:
     """``labels`` (h, w) of the pair without those that rest on nothing in either picture."""
     h, w = labels.px.shape
     if pair.left_seen is None or pair.right_seen is None:
@@ -319,6 +362,7 @@ def plane_relief(depth: DepthMap, known: tuple[float, float]) -> tuple[float, fl
     if good.sum() < 50:
         return known
     plane, _ = _fit_plane(u[good].astype(np.float64), v[good].astype(np.float64), 1.0 / z[good])
-    flat = 1.0 / np.maximum(plane[0] * u[good] + plane[1] * v[good] + plane[2], 1e-6)
-    low, high = np.percentile(flat - z[good], [0.5, 99.5])
+    nearness = plane[0] * u[good] + plane[1] * v[good] + plane[2]
+    share = 1.0 - z[good] * nearness  # of the distance: the same all over an oblique image
+    low, high = np.percentile(share, [0.5, 99.5]) * float(np.median(z[good]))
     return min(0.9 * known[0], float(low)), max(0.9 * known[1], float(high))

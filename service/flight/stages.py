@@ -22,6 +22,7 @@ from recon.posegraph.interpolated import KEYFRAME
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.trajectory import Placed, Trajectory
 from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.polar import reproject_polar
 from recon.stereo.reprojection import FusionConfig, PairDepth, fuse, reproject
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.stereo.virtual_stereo import (
@@ -44,7 +45,9 @@ from recon.types import (
     DisparityMap,
     Frame,
     Keyframe,
+    PolarPair,
     Pose,
+    RectifiedPair,
     StereoPair,
 )
 from service.background import BackgroundWorker
@@ -141,14 +144,14 @@ class Rectify:
         self._relief_m = (0.0, 0.0)
         self.pairs = 0
 
-    def __call__(self, candidate: StereoCandidate) -> tuple[list[StereoPair], Grid]:
+    def __call__(self, candidate: StereoCandidate) -> tuple[list[RectifiedPair], Grid]:
         """The pairs that stereo can use, and the grid of the view's depth."""
         config = self._config  # another thread may set it meanwhile
         view = candidate.view
         H, W = view.gray.shape
         w, h = config.width_px, round(config.width_px * H / W)
         grid = Grid(scaled_K(view.K, w / W, h / H), (w, h), view.T_odom_camera)
-        pairs = []
+        pairs: list[RectifiedPair] = []
         for partner in candidate.partners:
             with self._stopwatch("rectify"):
                 pair = rectify(view, partner, candidate.points, config, self._relief_m)
@@ -189,7 +192,7 @@ class PairStages:
         self._backend, self._config = backend, config
         self._debug, self._stopwatch = debug, stopwatch
 
-    def match(self, pair: StereoPair) -> DisparityMap:
+    def match(self, pair: RectifiedPair) -> DisparityMap:
         """Labels of the left view by belief propagation, Eq. 1."""
         with self._stopwatch("belief propagation"):
             coarse = self._backend.belief_propagation(
@@ -199,7 +202,7 @@ class PairStages:
         self._keep(rect_left=pair.left, rect_right=pair.right, disparity=coarse.px)
         return coarse
 
-    def upsample(self, coarse: DisparityMap, pair: StereoPair) -> DisparityMap:
+    def upsample(self, coarse: DisparityMap, pair: RectifiedPair) -> DisparityMap:
         """The labels at the size of the pair's guide, Eq. 2; as they are without one."""
         fine = coarse
         if pair.guide is not None:
@@ -208,9 +211,11 @@ class PairStages:
         self._keep(upsampled=fine.px)
         return fine
 
-    def reproject(self, disparity: DisparityMap, pair: StereoPair, grid: Grid) -> PairDepth:
+    def reproject(self, disparity: DisparityMap, pair: RectifiedPair, grid: Grid) -> PairDepth:
         """The pair's depth on the view's grid, Eq. 3."""
         with self._stopwatch("reproject"):
+            if isinstance(pair, PolarPair):
+                return reproject_polar(disparity, pair, grid.K, grid.size_px)
             return reproject(disparity, pair, grid.K, grid.size_px)
 
     def fuse(self, depths: Sequence[PairDepth], grid: Grid) -> DepthMap:
@@ -223,21 +228,24 @@ class PairStages:
             self._debug |= arrays
 
 
-WholePath = Callable[[Sequence[StereoPair], Grid], DepthMap | None]
+WholePath = Callable[[Sequence[RectifiedPair], Grid], DepthMap | None]
 
 
 def whole_path(backend: Backend, config: DenseStages, stopwatch: Stopwatch) -> WholePath:
     """Eq. 1 to 3 without leaving the device; gives None where the stages must do it."""
 
-    def on_device(pairs: Sequence[StereoPair], grid: Grid) -> DepthMap | None:
+    def on_device(pairs: Sequence[RectifiedPair], grid: Grid) -> DepthMap | None:
         assert isinstance(backend, PathBackend)
+        plain = [pair for pair in pairs if isinstance(pair, StereoPair)]
+        if len(plain) < len(pairs):
+            return None  # no device knows polar pairs
         with stopwatch("dense path"):
-            return backend.fused_depth(pairs, grid.K, grid.size_px, grid.T_odom_camera, config)
+            return backend.fused_depth(plain, grid.K, grid.size_px, grid.T_odom_camera, config)
 
     return on_device if isinstance(backend, PathBackend) else by_stages
 
 
-def by_stages(pairs: Sequence[StereoPair], grid: Grid) -> None:
+def by_stages(pairs: Sequence[RectifiedPair], grid: Grid) -> None:
     """No device does the whole path."""
 
 
@@ -314,9 +322,9 @@ class Stages:
     views: StereoViews
     rectify: Rectify
     whole_path: WholePath
-    match: Callable[[StereoPair], DisparityMap]
-    upsample: Callable[[DisparityMap, StereoPair], DisparityMap]
-    reproject: Callable[[DisparityMap, StereoPair, Grid], PairDepth]
+    match: Callable[[RectifiedPair], DisparityMap]
+    upsample: Callable[[DisparityMap, RectifiedPair], DisparityMap]
+    reproject: Callable[[DisparityMap, RectifiedPair, Grid], PairDepth]
     fuse: Callable[[Sequence[PairDepth], Grid], DepthMap]
     plausible: Plausible
     register: Register

@@ -1,0 +1,383 @@
+"""Virtual stereo along the line of sight: a pair in polar coordinates about the epipole.
+
+Both views are turned so that their z axis lies along the baseline. A point keeps its angle about
+that axis (the row) and moves away from it (along the row) by an angle that depends on distance
+over baseline alone. Columns are spaced evenly in that angle, which stays finite in any direction;
+planar versions use the radius or its logarithm (Pollefeys et al.,
+https://doi.org/10.1109/ICCV.1999.791270). Belief propagation and upsampling take such a pair as
+they take any other: partners lie on one row, and the labels lie about the plane of the ground.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numba import njit, prange
+
+from recon import se3
+from recon.image_quality import stretch
+from recon.stereo.reprojection import LABEL_SIGMA_PX, MIN_CONFIDENCE, PairDepth, label_at
+from recon.types import F32, F64, U8, Bool, DisparityMap, PolarPair
+
+if TYPE_CHECKING:
+    from recon.stereo.virtual_stereo import View, VirtualStereoConfig
+
+SEAM_GAP_RAD = 0.3
+"""A gap between the directions of the pixels that is wider is no part of the image."""
+
+MIN_DETAIL = 1.5
+"""Gray levels of standard deviation in 5x5 pixels: less is sky, water or plain paint."""
+
+SAMPLES = (64, 36)
+"""Pixels across and down that stand for an image when its sector is measured."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sampling:
+    """Rows and columns of a polar pair: the angle about the axis, and away from it."""
+
+    px_per_rad: float  # columns per radian away from the axis
+    rows_per_rad: float
+    first_rad: float  # angle away from the axis of column 0; it falls with the column
+    first_row_rad: float  # angle about the axis of row 0
+    size: tuple[int, int]  # (w, h)
+
+    def angles(self, finer: float = 1.0) -> tuple[F64, F64]:
+        """(w,) angles away from the axis and (h,) about it, on a grid ``finer`` times as fine."""
+        w, h = (int(n * finer) for n in self.size)
+        columns, rows = (np.arange(w) + 0.5) / finer - 0.5, (np.arange(h) + 0.5) / finer - 0.5
+        away = self.first_rad - columns / self.px_per_rad
+        about = self.first_row_rad + rows / self.rows_per_rad
+        return np.asarray(away, np.float64), np.asarray(about, np.float64)
+
+
+def axis_rotation(axis: F64) -> F64:
+    """(3, 3) R_polar_left with z along ``axis`` (3,)."""
+    z = axis / np.linalg.norm(axis)
+    x = np.eye(3)[int(np.argmin(np.abs(z)))]
+    x = x - (x @ z) * z
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def polar_angles(rays: F64) -> tuple[F64, F64]:
+    """Angle away from z and angle about it of ``rays`` (..., 3), rad."""
+    away = np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])
+    return away, np.arctan2(rays[..., 1], rays[..., 0])
+
+
+def directions(away: F64, about: F64) -> F64:
+    """(..., 3) unit rays of the angles away from z and about it."""
+    s = np.sin(away)
+    return np.stack(np.broadcast_arrays(s * np.cos(about), s * np.sin(about), np.cos(away)), -1)
+
+
+def seen_from_right(away: F64, about: F64, plane: F64, baseline: float) -> F64:
+    """Angle away from the axis at which the right view sees the plane where the left ray meets it.
+
+    ``plane`` (3,) n with ``n . X = 1`` in polar axes about the left camera. A ray that misses the
+    plane ends at infinity.
+    """
+    nearness = baseline * np.maximum(directions(away, about) @ plane, 0.0)
+    return np.asarray(np.arctan2(np.sin(away), np.cos(away) - nearness))
+
+
+def seen_from_left(away: F64, about: F64, plane: F64, baseline: float) -> F64:
+    """The inverse of :func:`seen_from_right`."""
+    at = max(1.0 - baseline * float(plane[2]), 1e-6)
+    nearness = baseline * np.maximum(directions(away, about) @ plane, 0.0) / at
+    return np.asarray(np.arctan2(np.sin(away), np.cos(away) + nearness))
+
+
+def sigma_share(away: F64, right: F64, slope: F64 | float, px_per_rad: float) -> F64:
+    """Sigma of a label of full confidence as a share of the distance.
+
+    ``away`` and ``right`` are the angles at which left and right see the point, ``slope`` is
+    d(right) / d(label) in columns. It grows with one over the angle from the epipole.
+    """
+    shift = np.sin(right - away)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.sin(away) / (shift * np.sin(right)) * slope * LABEL_SIGMA_PX / px_per_rad
+    return np.asarray(np.where(shift > 1e-9, share, np.inf))
+
+
+def masked_rad(distance: float, baseline: float, px_per_rad: float, share: float) -> float:
+    """Angle about the epipole inside which sigma at ``distance`` exceeds ``share`` of it."""
+    need = LABEL_SIGMA_PX * distance / (share * baseline * px_per_rad)
+    return float(np.arcsin(min(need, 1.0)))
+
+
+def sampling(rays: F64, px_per_rad: float, masked: float) -> Sampling | None:
+    """The sector that ``rays`` (N, 3) of an image in polar axes fill; None when all is masked.
+
+    At the rim of the sector rows lie as far apart as columns do.
+    """
+    away, about = polar_angles(rays)
+    good = (away > masked) & (away < np.pi - masked)
+    if good.sum() < 8:
+        return None
+    low, high = float(away[good].min()), float(away[good].max())
+    about = np.sort(about[good])
+    gaps = np.diff(about, append=about[0] + 2 * np.pi)
+    widest = int(np.argmax(gaps))
+    span = 2 * np.pi - (gaps[widest] if gaps[widest] > SEAM_GAP_RAD else 0.0)
+    rim = 1.0 if low < np.pi / 2 < high else max(np.sin(low), np.sin(high))
+    rows_per_rad = px_per_rad * rim
+    w, h = int(np.ceil((high - low) * px_per_rad)) + 1, int(np.ceil(span * rows_per_rad)) + 1
+    first_row = about[(widest + 1) % len(about)]
+    return Sampling(px_per_rad, rows_per_rad, high, float(first_row), (max(w, 32), max(h, 32)))
+
+
+def relief_of(
+    points: F64, plane: F64, known: tuple[float, float], margin: float
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """(lowest, highest) surface that labels must reach, and that is believed at all.
+
+    Shares of the distance nearer than the plane: of the camera's height, so that one surface
+    has one share in the whole of an oblique image, and 1 at the horizon. ``points`` (N, 3) show
+    the relief, ``margin`` more is believed, and ``known`` widens what the labels reach up to that.
+    """
+    low, high = np.percentile(1.0 - points @ plane, [1.0, 99.0])
+    believed = float(low) - margin, float(high) + margin
+    low, high = (float(np.clip(k, *believed)) for k in (min(low, known[0]), max(high, known[1])))
+    return (low, high), believed
+
+
+def label_window(
+    points: F64, plane: F64, baseline: float, px_per_rad: float, relief: tuple[float, float]
+) -> tuple[float, float]:
+    """Lowest and highest shift from the plane, columns, of ``points`` (N, 3) in polar axes.
+
+    Half of the plane below ``points`` keeps in it when raised or lowered to ``relief``.
+    """
+
+    def shift(P: F64) -> F64:
+        away, about = polar_angles(P)
+        right, _ = polar_angles(P - np.array([0.0, 0.0, baseline]))
+        return np.asarray((seen_from_left(right, about, plane, baseline) - away) * px_per_rad)
+
+    low, high = (float(p) for p in np.percentile(shift(points), [1.0, 99.0]))
+    height = points @ plane
+    on_plane = points[height > 1e-9] / height[height > 1e-9, None]
+    if len(on_plane):
+        low = min(low, float(np.median(shift(on_plane * (1.0 - relief[0])))))
+        high = max(high, float(np.median(shift(on_plane * max(1.0 - relief[1], 0.5)))))
+    return low, high
+
+
+def is_usable(rays: F64, plane: F64, baseline: float, px_per_rad: float, share: float) -> Bool:
+    """(N,) True where the expected sigma of the plane along ``rays`` is within ``share`` of it."""
+    away, about = polar_angles(rays)
+    step = 1e-4
+    near, far = (seen_from_right(away + d, about, plane, baseline) for d in (-step, step))
+    right = seen_from_right(away, about, plane, baseline)
+    sigma = sigma_share(away, right, (far - near) / (2 * step), px_per_rad)
+    return np.asarray(sigma < share)
+
+
+def rectify_polar(
+    left: View,
+    right: View,
+    points_m: F64,
+    plane: F64,
+    config: VirtualStereoConfig,
+    relief: tuple[float, float],
+) -> PolarPair | str:
+    """The pair about the epipole, or why there is none.
+
+    Args:
+        points_m: (N, 3) points of the scene in the left camera; they place the labels.
+        plane: (3,) n with ``n . X = 1`` for the ground, in the left camera.
+        relief: lowest and highest surface known, as shares of the distance nearer than the plane.
+    """
+    T_left_right = se3.inverse(left.T_odom_camera) @ right.T_odom_camera
+    baseline = float(np.linalg.norm(T_left_right[:3, 3]))
+    R_left = axis_rotation(T_left_right[:3, 3])
+    R_right = R_left @ T_left_right[:3, :3]
+    f = float(left.K[0, 0]) * config.width_px / left.gray.shape[1]
+    points, plane, rays = points_m @ R_left.T, R_left @ plane, _rays(left) @ R_left.T
+    distance = float(np.median(np.linalg.norm(points, axis=1)))
+    sector = sampling(rays, f, masked_rad(distance, baseline, f, config.max_sigma_share))
+    usable = is_usable(rays, plane, baseline, f, config.max_sigma_share)
+    if sector is None or usable.mean() < config.min_usable:
+        return "flying along the line of sight"
+    reached, believed = relief_of(points, plane, relief, config.margin_share)
+    low, high = label_window(points, plane, baseline, f, reached)
+    need = (high - low) + 2 * config.margin_labels
+    labels = max(config.labels, int(np.ceil(need / 16) * 16))
+    if labels > config.max_labels:
+        return "relief too large for the baseline"
+    lowest = 0.5 * (low + high) - 0.5 * (labels - 1)
+
+    def left_rays(finer: float) -> F32:
+        away, about = sector.angles(finer)
+        return directions(away[None], about[:, None]).astype(np.float32)
+
+    def right_rays(finer: float) -> F32:
+        away, about = sector.angles(finer)
+        away = np.maximum(away + lowest / f, 0.0)[None]
+        seen = seen_from_right(away, about[:, None], plane, baseline)
+        return directions(seen, about[:, None]).astype(np.float32)
+
+    left_gray, left_seen = _stereo_view(left, R_left, left_rays, f)
+    right_gray, right_seen = _stereo_view(right, R_right, right_rays, f)
+    guide = None
+    if config.guided and left.bgr is not None:
+        finer = max(1.0, config.guide_width_px / config.width_px)
+        guide = _warp(left.bgr, left, R_left, left_rays(finer), f * finer)
+    return PolarPair(
+        left=left_gray,
+        right=right_gray,
+        baseline_m=baseline,
+        labels=labels,
+        px_per_rad=f,
+        rows_per_rad=sector.rows_per_rad,
+        first_rad=sector.first_rad,
+        first_row_rad=sector.first_row_rad,
+        plane=plane,
+        first_label=lowest,
+        relief=believed,
+        R_left_keyframe=R_left,
+        guide=guide,
+        left_seen=left_seen,
+        right_seen=right_seen,
+    )
+
+
+def _rays(view: View) -> F64:
+    """(N, 3) rays of pixels spread evenly over the view, to its border."""
+    H, W = view.gray.shape
+    u, v = np.meshgrid(np.linspace(0, W - 1, SAMPLES[0]), np.linspace(0, H - 1, SAMPLES[1]))
+    pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)
+    return np.asarray(pixels @ np.linalg.inv(view.K).T)
+
+
+def _maps(view: View, R_polar_view: F64, rays: F32) -> tuple[F32, F32]:
+    """Columns and rows (h, w) of the view's pixels on ``rays`` (h, w, 3); far off behind it."""
+    P = rays @ (view.K @ R_polar_view.T).T.astype(np.float32)
+    z = P[..., 2]
+    behind = z < 1e-3
+    z = np.where(behind, np.float32(1.0), z)
+    x, y = (np.where(behind, np.float32(-1e4), P[..., k] / z) for k in range(2))
+    return np.clip(x, -1e4, 3e4), np.clip(y, -1e4, 3e4)
+
+
+def _warp(image: U8, view: View, R_polar_view: F64, rays: F32, px_per_rad: float) -> U8:
+    """The view's ``image`` along ``rays``; halved first until no pixel is skipped."""
+    x, y = _maps(view, R_polar_view, rays)
+    ratio = float(view.K[0, 0]) / px_per_rad
+    while ratio > 1.9:
+        H, W = image.shape[:2]
+        half = (W // 2, H // 2)
+        x, y = (
+            (m + 0.5) * np.float32(b / a) - 0.5 for m, a, b in ((x, W, half[0]), (y, H, half[1]))
+        )
+        image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
+        ratio /= 2
+    out = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(out, np.uint8)
+
+
+def _stereo_view(
+    view: View, R_polar_view: F64, rays: Callable[[float], F32], px_per_rad: float
+) -> tuple[U8, Bool]:
+    """Gray view (h, w) in polar coordinates, from twice its size, and where it is seen."""
+    H, W = view.gray.shape
+    rim = int(np.ceil(1.0 + view.K[0, 0] / px_per_rad))
+    inside = np.zeros((H, W), np.uint8)
+    inside[rim:-rim, rim:-rim] = 1 if view.seen is None else view.seen[rim:-rim, rim:-rim]
+    seen = cv2.remap(inside, *_maps(view, R_polar_view, rays(1.0)), cv2.INTER_NEAREST) > 0
+    double = _warp(view.gray, view, R_polar_view, rays(2.0), 2.0 * px_per_rad)
+    size = (seen.shape[1], seen.shape[0])
+    gray = np.asarray(cv2.resize(double, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return stretch(gray, seen), seen & _has_detail(gray)
+
+
+def _has_detail(gray: U8) -> Bool:
+    """(h, w) False where 5x5 pixels are plain, as the sky is: neighbours make the labels there."""
+    mean = cv2.boxFilter(gray, cv2.CV_32F, (5, 5), borderType=cv2.BORDER_REPLICATE)
+    square = cv2.sqrBoxFilter(gray, cv2.CV_32F, (5, 5), borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(square - mean * mean > MIN_DETAIL**2)
+
+
+def reproject_polar(
+    disparity: DisparityMap, pair: PolarPair, K: F64, size_px: tuple[int, int]
+) -> PairDepth:
+    """Depth along the keyframe's z on its own grid, and its sigma; as ``reproject`` does it.
+
+    With the angles a and a' from the axis at which left and right see a point, its distance is
+    ``B sin(a') / sin(a' - a)`` (the law of sines; Eq. 3 where a is a right angle).
+    """
+    w, h = size_px
+    out = PairDepth(np.empty((h, w), np.float32), np.empty((h, w), np.float32))
+    sampling = [
+        pair.px_per_rad, pair.rows_per_rad, pair.first_rad, pair.first_row_rad,
+        pair.first_label, pair.baseline_m, *pair.relief,
+    ]  # fmt: skip
+    _reproject(
+        disparity.px,
+        disparity.confidence,
+        np.ascontiguousarray(pair.R_left_keyframe @ np.linalg.inv(K)),
+        np.array(disparity.px.shape, np.float64) / pair.left.shape,
+        np.array(sampling),
+        np.asarray(pair.plane, np.float64),
+        out.depth_m,
+        out.sigma_m,
+    )
+    return out
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _reproject(
+    px: Any,
+    confidence: Any,
+    to_polar: Any,
+    finer: Any,
+    sampling: Any,
+    plane: Any,
+    depth_m: Any,
+    sigma_m: Any,
+) -> None:  # pragma: no cover - compiled
+    height, width = depth_m.shape
+    f, rows_per_rad, first, first_row, lowest, base, low, high = sampling
+    for v in prange(height):
+        for u in range(width):
+            depth_m[v, u] = np.nan
+            sigma_m[v, u] = np.nan
+            x = to_polar[0, 0] * u + to_polar[0, 1] * v + to_polar[0, 2]
+            y = to_polar[1, 0] * u + to_polar[1, 1] * v + to_polar[1, 2]
+            z = to_polar[2, 0] * u + to_polar[2, 1] * v + to_polar[2, 2]
+            away, about = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)
+            row = ((about - first_row) % (2 * np.pi)) * rows_per_rad
+            X = ((first - away) * f + 0.5) * finer[1] - 0.5
+            Y = (row + 0.5) * finer[0] - 0.5
+            label = label_at(px, X, Y)
+            if np.isnan(label):
+                continue
+            trust = confidence[int(np.rint(Y)), int(np.rint(X))]
+            if trust < MIN_CONFIDENCE:
+                continue
+            # where the right view sees the plane that the label shifted the column to
+            a = away + (lowest + label) / f
+            s, c = np.sin(a), np.cos(a)
+            p, q = plane[0] * np.cos(about) + plane[1] * np.sin(about), plane[2]
+            near, turn = base * (p * s + q * c), base * (p * c - q * s)
+            if near < 0.0:
+                near, turn = 0.0, 0.0
+            right = np.arctan2(s, c - near)
+            slope = (1.0 - near * c + turn * s) / (1.0 - 2.0 * near * c + near * near)
+            shift = np.sin(right - away)
+            if shift < 1e-6:
+                continue
+            distance = base * np.sin(right) / shift  # Eq. 3, by the law of sines
+            nearer = 1.0 - distance * (p * np.sin(away) + q * np.cos(away))
+            if nearer < low or nearer > high:
+                continue
+            per_rad = base * np.sin(away) / (shift * shift)
+            along = np.sqrt(x * x + y * y + z * z)  # the ray's length at depth 1
+            depth_m[v, u] = distance / along
+            sigma_m[v, u] = per_rad * abs(slope) / along * LABEL_SIGMA_PX / f / np.sqrt(trust)

@@ -1,0 +1,123 @@
+"""A camera 20 degrees below the horizon that flies where it looks, from images to depth.
+
+The flight is exact: 40 m above a level, textured plane under a plain sky.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.backends import load_backend
+from recon.types import F64, U8, Camera, Frame, Keyframe, PosePrior
+from service.config import load_config
+from service.flight.pipeline import Pipeline
+from service.flight.stages import build_stages
+
+K: F64 = np.array([[360.0, 0, 239.5], [0, 360.0, 134.5], [0, 0, 1]])
+CAMERA = Camera(K, np.zeros(5), (480, 270))
+M_PER_PX, HEIGHT_M, STEP_M, FRAMES, PITCH_DEG = 0.2, 40.0, 1.5, 40, -20.0
+LEVEL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # looks east
+FAR_M = 400.0
+
+
+def ground() -> list[U8]:
+    """A texture about the world's origin, 800 m by 600 m, and the same at half its size, twice."""
+    rng = np.random.default_rng(0)
+    size = (4000, 3000)
+    out = np.zeros(size[::-1], np.float32)
+    for cell in (2, 5, 12, 30, 80, 300):
+        layer = rng.normal(0, 1, (size[1] // cell + 2, size[0] // cell + 2)).astype(np.float32)
+        out += cv2.resize(layer, size, interpolation=cv2.INTER_LINEAR)
+    levels = [np.asarray(np.clip(out / out.std() * 40 + 110, 0, 255), np.uint8)]
+    for _ in range(3):
+        levels.append(np.asarray(cv2.pyrDown(levels[-1]), np.uint8))
+    return levels
+
+
+def pose(i: int) -> F64:
+    rng = np.random.default_rng(i)
+    tilt = se3.so3_exp(np.array([np.radians(PITCH_DEG), 0.0, 0.0]) + rng.normal(0, 0.004, 3))
+    return se3.compose(LEVEL @ tilt, np.array([STEP_M * i, 0.3 * np.sin(0.2 * i), HEIGHT_M]))
+
+
+def ground_depth(T: F64, K: F64, size: tuple[int, int]) -> F64:
+    """(h, w) depth of the plane; NaN in the sky and far off."""
+    u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.shape)], -1)
+    down = -(rays @ T[2, :3])
+    depth = T[2, 3] / np.maximum(down, 1e-6)
+    return np.where(depth < FAR_M, depth, np.nan)
+
+
+def photograph(levels: list[U8], T: F64) -> U8:
+    """(H, W, 3) image with as much detail as its pixels hold."""
+    W, H = CAMERA.size_px
+    depth = ground_depth(T, K, CAMERA.size_px)
+    u, v = np.meshgrid(np.arange(W), np.arange(H))
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones((H, W))], -1)
+    places = np.nan_to_num(depth)[..., None] * rays @ T[:3, :3].T + T[:3, 3]
+    gray = np.full((H, W), 210, np.uint8)
+    for k, level in enumerate(levels):
+        texel = M_PER_PX * 2**k
+        x = ((places[..., 0] + 100.0) / texel).astype(np.float32)
+        y = ((places[..., 1] + 300.0) / texel).astype(np.float32)
+        found = cv2.remap(level, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        fits = depth / K[0, 0] >= 0.7 * texel if k else np.isfinite(depth)
+        gray[fits] = found[fits]
+    return np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def keyframes() -> list[Keyframe]:
+    levels = ground()
+    config = load_config(None, ["compute.upsample=false"])
+    pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu")))
+    out: list[Keyframe] = []
+    for i in range(FRAMES):
+        T = pose(i)
+        prior = PosePrior(T[:3, :3], 0.005, 0.01, T[:3, 3], np.full(3, 0.1), HEIGHT_M, 0.1)
+        frame = Frame(photograph(levels, T), i * 100_000_000, i, prior)
+        out += pipeline.step(frame).keyframes
+    return out + list(pipeline.finish().keyframes)
+
+
+def test_the_ground_ahead_is_measured(keyframes: list[Keyframe]) -> None:
+    """Of what lies within 150 m nearly all, to a hundredth of the distance once scale is known."""
+    assert len(keyframes) >= 3
+    for keyframe in keyframes[1:]:
+        depth = keyframe.depth
+        h, w = depth.depth_m.shape
+        truth = ground_depth(pose(keyframe.seq), depth.K, (w, h))
+        near = truth < 150.0
+        known = near & np.isfinite(depth.depth_m)
+        ratio = depth.depth_m[known] / truth[known]
+        scale = float(np.median(ratio))  # of so short a track the fixes leave it open
+        error = np.abs(ratio / scale - 1.0)
+        assert known.sum() > 0.9 * near.sum()
+        assert abs(scale - 1.0) < 0.04
+        assert np.median(error) < 0.01
+        assert np.mean(error > 0.05) < 0.02
+
+
+def test_sigma_grows_with_the_distance(keyframes: list[Keyframe]) -> None:
+    """On a plane that fills with the distance: once for it, once for the angle to the epipole."""
+    depth = keyframes[1].depth
+    h, w = depth.depth_m.shape
+    truth = ground_depth(pose(keyframes[1].seq), depth.K, (w, h))
+    near, far = (
+        float(np.nanmedian((depth.sigma_m / truth)[(truth > a) & (truth < b)]))
+        for a, b in ((60.0, 75.0), (140.0, 170.0))
+    )
+    assert 2.0 < far / near < 12.0
+
+
+def test_the_sky_has_no_surface(keyframes: list[Keyframe]) -> None:
+    for keyframe in keyframes:
+        depth = keyframe.depth
+        h, w = depth.depth_m.shape
+        T = pose(keyframe.seq)
+        sky = ~np.isfinite(ground_depth(T, depth.K, (w, h)))
+        assert np.isfinite(depth.depth_m[sky]).mean() < 0.02
