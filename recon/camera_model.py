@@ -6,6 +6,8 @@ keeps the radial part only (section 2.1); ``skyrelief calibrate`` does so by def
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -36,7 +38,7 @@ def check_camera(camera: Camera) -> None:
 def scaled(camera: Camera, size_px: tuple[int, int]) -> Camera:
     """The same camera for its image resized to ``size_px`` (W, H); pixel centres at integers."""
     sx, sy = size_px[0] / camera.size_px[0], size_px[1] / camera.size_px[1]
-    return Camera(scaled_K(camera.K, sx, sy), camera.distortion, size_px)
+    return replace(camera, K=scaled_K(camera.K, sx, sy), size_px=size_px)
 
 
 def scaled_K(K: F64, sx: float, sy: float) -> F64:
@@ -58,6 +60,23 @@ def project(K: F64, xyz_m: F64) -> F64:
     return np.stack(
         [K[0, 0] * xyz_m[:, 0] / z + K[0, 2], K[1, 1] * xyz_m[:, 1] / z + K[1, 2]], axis=1
     )
+
+
+def inverse_depth_plane(P: F64) -> F64:
+    """(3,) q with ``1 / z = q . ray`` for the plane through camera points (N, 3)."""
+    if len(P) < 3:
+        return np.array([0.0, 0.0, 1.0 / max(float(np.median(P[:, 2])) if len(P) else 1.0, 1e-6)])
+    ray = P / P[:, 2:]
+    target = 1.0 / P[:, 2]
+    weights = np.ones(len(P))
+    q = np.zeros(3)
+    for _ in range(5):
+        A = ray * weights[:, None]
+        q = np.linalg.solve(A.T @ ray + 1e-9 * np.eye(3), A.T @ target)
+        error = np.abs(ray @ q - target)
+        scale = max(1.4826 * float(np.median(error)), 1e-9)
+        weights = 1.0 / (1.0 + (error / (2 * scale)) ** 2)
+    return np.asarray(q)
 
 
 class Undistorter:

@@ -19,6 +19,21 @@ Bool = npt.NDArray[np.bool_]
 Array = npt.NDArray[Any]
 
 
+DIRECTIONS = ("down", "up", "right", "left")
+"""Ways in which a rolling shutter moves over the image."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shutter:
+    """When the rows of an image are exposed; the time of an image is that of its middle row."""
+
+    readout_s: float = 0.0  # from the first row to the last; 0: a global shutter
+    direction: str = "down"  # of DIRECTIONS; right and left: columns take the part of rows
+
+
+GLOBAL_SHUTTER = Shutter()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
     """A pinhole camera with Brown-Conrady distortion (``plumb_bob``: k1 k2 p1 p2 k3)."""
@@ -26,6 +41,7 @@ class Camera:
     K: F64  # (3, 3) px
     distortion: F64  # (5,) k1 k2 p1 p2 k3; zeros for an undistorted image
     size_px: tuple[int, int]  # (W, H)
+    shutter: Shutter = GLOBAL_SHUTTER
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +75,7 @@ class PosePrior:
     is_agl_measured: bool = True  # False: above the take-off point, or assumed
     velocity_m_s: F64 | None = None  # (3,) ENU, of the vehicle
     travel: Travel | None = None  # the velocity integrated up to this moment
+    turn_rad_s: F64 | None = None  # (3,) angular velocity of the camera, in its own frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -54,6 +54,13 @@ class CameraConfig:
         "fixed: latency_ms; auto: measured from image rotation",
         live=True,
     )
+    readout_ms: float | Literal["model"] = key(
+        "model",
+        "rolling shutter, first to last row; 0: global shutter; model: as the camera model says",
+    )
+    readout_direction: Literal["down", "up", "right", "left"] = key(
+        "down", "way of the rolling shutter over the picture, with a readout_ms in numbers"
+    )
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -63,6 +70,8 @@ class CameraConfig:
         for axis in ("forward", "right", "down"):
             _within(f"camera.lever_{axis}_m", getattr(self, f"lever_{axis}_m"), -100, 100)
         _within("camera.latency_ms", self.latency_ms, -10_000, 10_000)
+        if self.readout_ms != "model":
+            _within("camera.readout_ms", self.readout_ms, 0, 200)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,9 @@ import numpy as np
 import pytest
 import yaml
 
-from recon.types import Camera
-from service.cameras.camera_file import load_camera, save_camera
+from recon.types import Camera, Shutter
+from service.cameras.camera_file import load_camera, save_camera, with_shutter
+from service.config import CameraConfig
 from service.errors import InputError, OutsideError
 
 CAMERA = Camera(
@@ -145,3 +147,34 @@ def test_save_checks_what_it_writes(tmp_path: Path) -> None:
         save_camera(tmp_path / "c.yaml", CAMERA, extra={"image_width": 3})
     with pytest.raises(OutsideError, match="cannot be written"):
         save_camera(tmp_path / "no" / "folder" / "c.yaml", CAMERA)
+
+
+def test_a_rolling_shutter_round_trips(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    save_camera(path, replace(CAMERA, shutter=Shutter(0.0213, "left")))
+    back = load_camera(path).shutter
+    assert back.readout_s == pytest.approx(0.0213) and back.direction == "left"
+    save_camera(path, CAMERA)
+    assert "readout" not in path.read_text() and load_camera(path).shutter == Shutter()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("readout_ms", -1), ("readout_ms", 201), ("readout_ms", "fast"), ("readout_ms", True),
+     ("readout_direction", "sideways")],
+)  # fmt: skip
+def test_an_impossible_shutter_is_refused(tmp_path: Path, key: str, value: object) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(yaml.safe_dump(document() | {key: value}))
+    with pytest.raises(InputError, match=key):
+        load_camera(path)
+
+
+def test_the_configuration_overrules_the_camera_file() -> None:
+    rolling = replace(CAMERA, shutter=Shutter(0.02, "up"))
+    assert with_shutter(rolling, CameraConfig()).shutter == Shutter(0.02, "up")
+    assert with_shutter(rolling, CameraConfig(readout_ms=0)).shutter.readout_s == 0
+    chosen = CameraConfig(readout_ms=33.0, readout_direction="right")
+    assert with_shutter(rolling, chosen).shutter == Shutter(0.033, "right")
+    with pytest.raises(ValueError, match=r"camera\.readout_ms"):
+        CameraConfig(readout_ms=300.0)

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from mavlink.telemetry.logs import load_telemetry
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
 from recon.se3 import rotation_from_quaternion
-from recon.types import F64
+from recon.types import F64, Shutter
 from service.cameras.camera_file import load_camera
 from service.cli import app
 from service.errors import InputError
@@ -304,3 +304,31 @@ def test_damaged_surface_is_refused(cut: int, tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match="no such file"):
         read_surface(tmp_path / "none.ply")
+
+
+def test_a_rolling_shutter_is_in_the_camera_file_and_the_truth_is_the_middle_row(
+    tmp_path: Path,
+) -> None:
+    """Only the images differ from those of a global shutter: poses and depths are the same."""
+    flags = ["--swing-deg", "4", "--depth-frames", "2", "--duration-s", "1"]
+    simulate(tmp_path / "global", *flags)
+    simulate(tmp_path / "rolling", *flags, "--readout-ms", "30", "--readout-direction", "up")
+    assert load_camera(tmp_path / "global" / "camera.yaml").shutter == Shutter()
+    assert load_camera(tmp_path / "rolling" / "camera.yaml").shutter == Shutter(0.03, "up")
+    np.testing.assert_array_equal(trajectory(tmp_path / "global"), trajectory(tmp_path / "rolling"))
+    maps = [np.load(tmp_path / n / "truth" / "depth_000004.npz") for n in ("global", "rolling")]
+    np.testing.assert_array_equal(maps[0]["depth_m"], maps[1]["depth_m"])
+    a, b = (
+        frames(tmp_path / n / "flight.mp4")[2].to_ndarray(format="gray").astype(float)
+        for n in ("global", "rolling")
+    )
+    assert np.abs(a - b)[88:92].mean() < 0.5 * np.abs(a - b)[:8].mean()  # the middle is the same
+
+
+def test_a_readout_longer_than_a_frame_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="readout of 150 ms is not within 0 and the 100 ms"):
+        simulate(tmp_path / "long", "--readout-ms", "150", "--fps", "10")
+    with pytest.raises(InputError, match=r"readout_ms 200\.5 is not within"):
+        simulate(tmp_path / "slow", "--readout-ms", "200.5")
+    with pytest.raises(InputError, match="readout_direction 'around' is not one of down, up"):
+        simulate(tmp_path / "odd", "--readout-direction", "around")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -9,7 +10,8 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.types import F64, Camera
+from recon.rolling_shutter import row_times_s
+from recon.types import F64, Camera, Shutter
 from service.sim import picture, scene, shapes
 from service.sim.noise import fractal2, hash01, normal
 from service.sim.render import Look, Renderer, camera_rays
@@ -204,3 +206,25 @@ def test_water_covers_what_lies_below_it_and_never_holds_still() -> None:
     ground = 40.0 - renderer().depth(shallow)  # the height of what is seen
     np.testing.assert_array_equal(covered, ~(ground >= 20.0))
     assert np.isfinite(renderer().depth(shallow, -20.0)).all()
+
+
+@pytest.mark.parametrize("direction", ["down", "left"])
+def test_each_row_is_rendered_at_its_own_pose(direction: str) -> None:
+    """A row of a rolling shutter is that row of the whole image taken from the row's pose."""
+    camera = replace(CAMERA, shutter=Shutter(0.03, direction))
+    sideways = direction == "left"
+    n = camera.size_px[0] if sideways else camera.size_px[1]
+    times = row_times_s(camera)
+    assert times.shape == (n,) and times.sum() == pytest.approx(0.0, abs=1e-12)
+    assert np.ptp(times) == pytest.approx(0.03 * (n - 1) / n)
+    assert (times[0] < 0) == (direction == "down")
+    poses = np.array(
+        [looking_down(3.0 + 20 * t, 1.0, 40.0, np.array([2 * t, t, 0])) for t in times]
+    )
+    rolling = Renderer(place(), picture.make(place(), 0.12), camera).frame(poses, 0, QUIET)
+    for k in (0, n // 3, n - 1):
+        whole = renderer().frame(poses[k], 0, QUIET)
+        ours, row = (rolling[:, k], whole[:, k]) if sideways else (rolling[k], whole[k])
+        # Outlines are smoothed by what the neighbouring rows see, a little elsewhere.
+        assert (ours == row).all(axis=-1).mean() > 0.97
+    assert (rolling != renderer().frame(poses[n // 2], 0, QUIET)).mean() > 0.2

@@ -1,14 +1,16 @@
 """Camera models on disk: the YAML that ROS's ``camera_info_manager`` and ``calibrate`` write.
 
 Keys: ``image_width``, ``image_height``, ``camera_matrix.data`` (9, row by row),
-``distortion_model: plumb_bob``, ``distortion_coefficients.data`` (k1 k2 p1 p2 k3). Other keys
-of the format are allowed and not read.
+``distortion_model: plumb_bob``, ``distortion_coefficients.data`` (k1 k2 p1 p2 k3), and of a
+rolling shutter ``readout_ms`` and ``readout_direction``. Other keys of the format are allowed
+and not read.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,8 @@ import numpy as np
 import yaml
 
 from recon.camera_model import check_camera
-from recon.types import F64, Camera
+from recon.types import DIRECTIONS, F64, Camera, Shutter
+from service.config import CameraConfig
 from service.errors import InputError, OutsideError
 from service.small_file import read_small
 
@@ -29,6 +32,7 @@ REQUIRED = (
     "distortion_coefficients",
 )
 LARGEST_FILE_BYTES = 1 << 20
+LONGEST_READOUT_MS = 200.0
 
 
 def load_camera(path: str | Path) -> Camera:
@@ -48,13 +52,32 @@ def load_camera(path: str | Path) -> Camera:
     size = _size(path, document)
     K = _numbers(path, document, "camera_matrix", 9).reshape(3, 3)
     distortion = _numbers(path, document, "distortion_coefficients", 5)
-    camera = Camera(K, distortion, size)
     try:
+        readout_ms, direction = document.get("readout_ms", 0), document.get("readout_direction")
+        camera = Camera(K, distortion, size, shutter_of(readout_ms, direction or "down"))
         _check_matrix(K)
         check_camera(camera)
     except ValueError as error:
         raise InputError(f"camera model {path}: {error}; calibrate again") from error
     return camera
+
+
+def shutter_of(readout_ms: object, direction: object) -> Shutter:
+    """The shutter of a camera file's or the configuration's words; ValueError for others."""
+    if isinstance(readout_ms, bool) or not isinstance(readout_ms, (int, float)):
+        raise ValueError(f"readout_ms {readout_ms!r} is not a number of milliseconds")
+    if not 0 <= readout_ms <= LONGEST_READOUT_MS:
+        raise ValueError(f"readout_ms {readout_ms:g} is not within 0 to {LONGEST_READOUT_MS:g}")
+    if direction not in DIRECTIONS:
+        raise ValueError(f"readout_direction {direction!r} is not one of {', '.join(DIRECTIONS)}")
+    return Shutter(1e-3 * readout_ms, str(direction))
+
+
+def with_shutter(camera: Camera, config: CameraConfig) -> Camera:
+    """The camera with the shutter that the configuration asks for, by default its own."""
+    if config.readout_ms == "model":
+        return camera
+    return replace(camera, shutter=shutter_of(config.readout_ms, config.readout_direction))
 
 
 def check_size(camera: Camera, size_px: tuple[int, int], source: str) -> None:
@@ -89,6 +112,9 @@ def save_camera(
         "rectification_matrix": _matrix(np.eye(3)),
         "projection_matrix": _matrix(np.hstack([K, np.zeros((3, 1))])),
     }
+    if camera.shutter.readout_s:
+        document["readout_ms"] = 1e3 * camera.shutter.readout_s
+        document["readout_direction"] = camera.shutter.direction
     clash = sorted(set(document) & set(extra or {}))
     if clash:
         raise ValueError(f"extra keys of the camera model already exist: {', '.join(clash)}")

@@ -38,6 +38,13 @@ def simulate(
     wobble_deg: Annotated[float, typer.Option(help="Unsteadiness of the gimbal.")] = 1.0,
     sway_m: Annotated[float, typer.Option(help="Unsteadiness of the path.")] = 0.15,
     climb_m: Annotated[float, typer.Option(help="Higher at the end than at the start.")] = 0.0,
+    swing_deg: Annotated[float, typer.Option(help="Swing of the camera at about 1 Hz.")] = 0.0,
+    readout_ms: Annotated[
+        float, typer.Option(help="Rolling shutter, first to last row; 0: global.")
+    ] = 0.0,
+    readout_direction: Annotated[
+        str, typer.Option(help="Way of the shutter: down, up, right, left.")
+    ] = "down",
     relief_m: Annotated[float, typer.Option(help="Height of the hills; 0 is flat.")] = 8.0,
     water_m: Annotated[
         float | None, typer.Option(help="Level of a sea with waves, above the origin's ground.")
@@ -84,6 +91,7 @@ def simulate(
     if live and (out / "flight.mp4").exists():
         _play(out, LiveOptions(video_to, mavlink_to, loop, until_stdin_ends), as_json)
         return
+    from service.cameras.camera_file import shutter_of
     from service.sim import recording
     from service.sim.flight import FlightPlan, SensorNoise
     from service.sim.render import Look
@@ -94,7 +102,7 @@ def simulate(
         options = recording.SimulationOptions(
             FlightPlan(
                 pattern, duration_s, height_m, speed_m_s, heading_deg, camera_pitch_deg, legs,
-                spacing_m, wobble_deg, sway_m, climb_m,
+                spacing_m, wobble_deg, sway_m, climb_m, swing_deg,
             ),
             SensorNoise.of(
                 gnss_noise,
@@ -116,6 +124,7 @@ def simulate(
             seed, _size(size), fps, focal,
             recording.DISTORTION if distortion else (0.0, 0.0, 0.0, 0.0, 0.0),
             relief_m, density, photos, depth_frames, crf, telemetry, video,
+            shutter_of(readout_ms, readout_direction),
         )  # fmt: skip
         simulation = recording.prepare(options)
     except ValueError as error:

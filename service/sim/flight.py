@@ -17,6 +17,8 @@ LEAD_S = 5.0
 """Seconds of flight before the first and after the last frame, and of telemetry after it."""
 STEP_S = 0.02
 G_M_S2 = 9.81
+SWING_HZ = np.array([1.0, 0.9, 0.0])
+"""Of a head that swings: about the axes of its roll and pitch."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +36,7 @@ class FlightPlan:
     wobble_deg: float = 1.0  # of the stabilised camera, 1 sigma per axis
     sway_m: float = 0.15  # of the position about the path, 1 sigma per axis
     climb_m: float = 0.0  # higher at the end than at the start, evenly
+    swing_deg: float = 0.0  # amplitude of the head's swing about two axes, at SWING_HZ
 
     def __post_init__(self) -> None:
         if self.pattern not in PATTERNS:
@@ -54,6 +57,8 @@ class FlightPlan:
             raise ValueError("wobble must be 0 to 20 deg and sway 0 to 5 m")
         if not 2.0 <= self.lowest_m <= self.highest_m <= 1000:
             raise ValueError(f"climb of {self.climb_m:g} m does not end within 2 to 1000 m")
+        if not 0 <= self.swing_deg <= 20:
+            raise ValueError(f"swing of {self.swing_deg:g} deg is not within 0 to 20 deg")
 
     @property
     def lowest_m(self) -> float:
@@ -122,6 +127,7 @@ class Flight:
     def R_ned_gimbal(self, t_s: F64) -> F64:
         """(T, 3, 3) attitude of the stabilised head."""
         turn = np.radians(self.plan.wobble_deg) * self.wobble.at(t_s)
+        turn += np.radians(self.plan.swing_deg) * np.sin(2 * np.pi * SWING_HZ * t_s[:, None])
         pitch = np.radians(self.plan.pitch_deg)
         return np.array(
             [

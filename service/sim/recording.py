@@ -15,8 +15,9 @@ import av
 import numpy as np
 import numpy.typing as npt
 
+from recon.rolling_shutter import row_times_s
 from recon.se3 import quaternion_from_rotation
-from recon.types import F64, U8, Camera
+from recon.types import F64, GLOBAL_SHUTTER, U8, Camera, Shutter
 from service.cameras.camera_file import save_camera
 from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
@@ -71,6 +72,7 @@ class SimulationOptions:
     crf: int = 18
     with_telemetry: bool = True
     with_video: bool = True
+    shutter: Shutter = GLOBAL_SHUTTER
 
     def __post_init__(self) -> None:
         W, H = self.size_px
@@ -84,6 +86,11 @@ class SimulationOptions:
             raise ValueError("relief must be 0 to 200 m and density 0 to 3")
         if not (0 <= self.depth_frames <= 10000 and 0 <= self.crf <= 51):
             raise ValueError("depth frames must be 0 to 10000 and crf 0 to 51")
+        if not 0 <= self.shutter.readout_s <= 1 / self.fps:
+            raise ValueError(
+                f"readout of {1e3 * self.shutter.readout_s:g} ms is not within 0 and the "
+                f"{1e3 / self.fps:g} ms between frames"
+            )
 
     @property
     def camera(self) -> Camera:
@@ -92,7 +99,7 @@ class SimulationOptions:
         f = self.focal_share * W
         cx, cy = 0.5 * (W - 1) + 0.003 * W, 0.5 * (H - 1) - 0.004 * H
         K = np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
-        return Camera(K, np.array(self.distortion), (W, H))
+        return Camera(K, np.array(self.distortion), (W, H), self.shutter)
 
     @property
     def frames(self) -> int:
@@ -120,8 +127,15 @@ class Simulation:
         for start, factor in options.faults.exposure:
             if self.times_s[index] >= start:
                 gain = factor
-        look = replace(options.look, exposure=gain)
-        return self.renderer.frame(self.poses[index], index, look, float(self.times_s[index]))
+        look, time_s = replace(options.look, exposure=gain), float(self.times_s[index])
+        return self.renderer.frame(self._poses_of_rows(index), index, look, time_s)
+
+    def _poses_of_rows(self, index: int) -> F64:
+        """(4, 4) pose of frame ``index``, or one of each row (N, 4, 4) of a rolling shutter."""
+        camera = self.options.camera
+        if not camera.shutter.readout_s:
+            return np.asarray(self.poses[index])
+        return self.flight.T_world_camera(self.times_s[index] + row_times_s(camera))
 
     def surface_range(self, origins: F64, directions: F64) -> F64:
         """(N,) metres from (N, 3) places along (N, 3) unit directions to the first surface.
@@ -172,7 +186,8 @@ def _area(flight: Flight, options: SimulationOptions) -> Area:
     W, H = options.size_px
     diagonal = np.arctan(0.55 * np.hypot(W, H) / (options.focal_share * W))
     tilt = np.radians(90.0 + plan.pitch_deg)
-    steepest = min(tilt + diagonal + np.radians(3.0 * plan.wobble_deg), np.radians(74.0))
+    unsteady = np.radians(3.0 * plan.wobble_deg + plan.swing_deg)
+    steepest = min(tilt + diagonal + unsteady, np.radians(74.0))
     reach = (plan.highest_m + options.relief_m) * np.tan(steepest) + 12.0
     low, high = xy.min(axis=0) - reach, xy.max(axis=0) + reach
     return Area(float(low[0]), float(low[1]), float(high[0]), float(high[1]))

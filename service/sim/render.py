@@ -74,20 +74,25 @@ class Renderer:
         self._trees = scene.trees if len(scene.trees) else np.zeros((1, 8))
 
     def frame(self, T_world_camera: F64, index: int, look: Look, time_s: float = 0.0) -> U8:
-        """(H, W, 3) BGR picture as the distorted camera takes it; water moves with the time."""
+        """(H, W, 3) BGR image as the distorted camera takes it.
+
+        ``T_world_camera`` is one pose (4, 4), or one for each row (H, 4, 4); for each column
+        (W, 4, 4) where the shutter moves sideways. Water moves with ``time_s``.
+        """
         H, W = self.rays.shape[:2]
         colour = np.empty((H, W, 3), np.float32)
         depth = np.empty((H, W))
         body = np.empty((H, W), np.int32)
         tables = self._tables()
-        R, c = np.ascontiguousarray(T_world_camera[:3, :3]), T_world_camera[:3, 3].copy()
+        sideways = self.camera.shutter.direction in ("right", "left")
+        poses = np.broadcast_to(T_world_camera, (W if sideways else H, 4, 4))
+        R, c = np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
         focal = float(0.5 * (self.camera.K[0, 0] + self.camera.K[1, 1]))
-        _render(*self.scene.grid.arrays(), *tables, self.rays, R, c, focal, colour, depth, body)
-        _smooth_edges(
-            *self.scene.grid.arrays(), *tables, self.rays, R, c, focal, colour, depth, body
-        )
+        scene = (*self.scene.grid.arrays(), *tables, self.rays, R, c, sideways, focal)
+        _render(*scene, colour, depth, body)
+        _smooth_edges(*scene, colour, depth, body)
         if look.water_m is not None:
-            flood(colour, depth, self.rays, R, c, focal, look.water_m, time_s)
+            flood(colour, depth, self.rays, R, c, sideways, focal, look.water_m, time_s)
         out = np.empty((H, W, 3), np.uint8)
         _develop(colour, self.rays, look.noise, look.vignette, look.exposure, index, out)
         return out
@@ -174,10 +179,11 @@ def _seen(  # type: ignore[no-untyped-def]
 def _render(  # type: ignore[no-untyped-def]
     corners, start, items, column_z, block_z, bounds, cell_m,
     normals, material, owner, blocks, trees, bgr, levels, x0, y0, texel_m, sun,
-    rays, R, c, focal, colour, depth, body,
+    rays, poses_R, poses_c, sideways, focal, colour, depth, body,
 ):  # fmt: skip
     for v in prange(rays.shape[0]):
         for u in range(rays.shape[1]):
+            R, c = (poses_R[u], poses_c[u]) if sideways else (poses_R[v], poses_c[v])
             a, b = rays[v, u, 0], rays[v, u, 1]
             cb, cg, cr, t, m = _seen(
                 corners, start, items, column_z, block_z, bounds, cell_m,
@@ -206,7 +212,7 @@ def _is_edge(depth, body, u, v):  # type: ignore[no-untyped-def]
 def _smooth_edges(  # type: ignore[no-untyped-def]
     corners, start, items, column_z, block_z, bounds, cell_m,
     normals, material, owner, blocks, trees, bgr, levels, x0, y0, texel_m, sun,
-    rays, R, c, focal, colour, depth, body,
+    rays, poses_R, poses_c, sideways, focal, colour, depth, body,
 ):  # fmt: skip
     """Average a rotated square of four rays wherever an outline crosses the pixel."""
     H, W = rays.shape[0], rays.shape[1]
@@ -218,6 +224,7 @@ def _smooth_edges(  # type: ignore[no-untyped-def]
             su, sv = un - u, vn - v
             ax, ay = su * (rays[v, un, 0] - rays[v, u, 0]), su * (rays[v, un, 1] - rays[v, u, 1])
             bx, by = sv * (rays[vn, u, 0] - rays[v, u, 0]), sv * (rays[vn, u, 1] - rays[v, u, 1])
+            R, c = (poses_R[u], poses_c[u]) if sideways else (poses_R[v], poses_c[v])
             tb, tg, tr = 0.0, 0.0, 0.0
             for n in range(4):
                 p = 0.375 if n == 0 else (-0.125 if n == 1 else (-0.375 if n == 2 else 0.125))

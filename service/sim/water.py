@@ -18,18 +18,22 @@ CLOUDS_ABOVE_M, CLOUD_M, CLOUD_SPEED_M_S = 600.0, 500.0, 9.0
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def flood(
-    colour: F32, depth: F64, rays: F64, R: F64, c: F64, focal: float, level_m: float, time_s: float
-) -> None:
+    colour: F32, depth: F64, rays: F64, poses_R: F64, poses_c: F64, sideways: bool, focal: float,
+    level_m: float, time_s: float,
+) -> None:  # fmt: skip
     """Draw water at ``level_m`` where it is nearer than what is seen, and clouds behind all.
 
     Args:
         colour: (H, W, 3) BGR, drawn into.
         depth: (H, W) along the camera's z, infinite in the sky; NaN where water is drawn.
         rays: (H, W, 3) with z = 1 in the camera frame.
-        R: (3, 3) R_world_camera, ``c`` (3,) the camera's place, ``focal`` in px.
+        poses_R: (N, 3, 3) R_world_camera of each row, ``poses_c`` (N, 3) the camera's place;
+            of each column with ``sideways``.
+        focal: px.
     """
     for v in prange(rays.shape[0]):
         for u in range(rays.shape[1]):
+            R, c = (poses_R[u], poses_c[u]) if sideways else (poses_R[v], poses_c[v])
             a, b = rays[v, u, 0], rays[v, u, 1]
             dx = R[0, 0] * a + R[0, 1] * b + R[0, 2]
             dy = R[1, 0] * a + R[1, 1] * b + R[1, 2]

@@ -1,0 +1,188 @@
+"""Rolling shutter: when each pixel is exposed, and where it would be at the middle row's time.
+
+An image's pose is that of its middle row. Within the readout the camera moves by a twist and
+its change, which the poses of neighbouring frames give, or telemetry where they are far apart.
+A free velocity per frame would be degenerate over flat ground (arXiv:2209.08503).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon import se3
+from recon.camera_model import rays
+from recon.types import F64, Camera, PosePrior
+
+NEAR_S = 0.25
+"""Frames further apart say nothing of the turn within a readout."""
+
+STEADY_S = 0.15
+"""All frames within it shape the motion; of those further away the two nearest on each side."""
+
+
+def row_times_s(camera: Camera) -> F64:
+    """(N,) times of the rows from the middle, of columns where the shutter moves sideways."""
+    W, H = camera.size_px
+    n = W if camera.shutter.direction in ("right", "left") else H
+    sign = -1.0 if camera.shutter.direction in ("up", "left") else 1.0
+    return np.asarray(sign * camera.shutter.readout_s * ((np.arange(n) + 0.5) / n - 0.5))
+
+
+class RowClock:
+    """When a camera with a rolling shutter exposes what it sees."""
+
+    def __init__(self, camera: Camera) -> None:
+        """``camera`` is the one with distortion, at any size of its images."""
+        W, H = camera.size_px
+        self._sideways = camera.shutter.direction in ("right", "left")
+        axis, n = (0, W) if self._sideways else (1, H)
+        sign = -1.0 if camera.shutter.direction in ("up", "left") else 1.0
+        self._distortion = camera.distortion
+        self._scale_s = sign * camera.shutter.readout_s * camera.K[axis, axis] / n
+        self._offset_s = sign * camera.shutter.readout_s * ((camera.K[axis, 2] + 0.5) / n - 0.5)
+
+    def seconds(self, ray: F64) -> F64:
+        """(N,) seconds from the middle row of undistorted rays (N, 3) with z = 1."""
+        x, y = ray[:, 0], ray[:, 1]
+        k1, k2, p1, p2, k3 = self._distortion
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        if self._sideways:
+            distorted = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        else:
+            distorted = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        return np.asarray(self._scale_s * distorted + self._offset_s)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """The motion of a camera while it reads an image.
+
+    At ``t`` seconds from the middle row, T_camera_world is ``exp(rate t + change t^2 / 2)``
+    times that of the middle row. Twists are rotation (rad), then translation.
+    """
+
+    clock: RowClock
+    rate: F64  # (6,) per s
+    change: F64  # (6,) per s^2
+
+    def twists(self, ray: F64) -> F64:
+        """(N, 6) motion from the middle row to the rows that expose the rays (N, 3)."""
+        t = self.clock.seconds(ray)[:, None]
+        return np.asarray(t * self.rate + 0.5 * t * t * self.change)
+
+    def at_middle(self, K: F64, uv: F64, inverse_depth: F64) -> F64:
+        """(N, 2) where the pixels (N, 2) of the image would be at the middle row's time."""
+        ray = rays(K, uv)
+        return _moved(K, ray, inverse_depth, -self.twists(ray))
+
+    def at_rows(self, K: F64, uv: F64, inverse_depth: F64) -> F64:
+        """(N, 2) pixels of the image that show what the middle row's camera sees at (N, 2)."""
+        ray = rays(K, uv)
+        there = uv
+        for _ in range(3):
+            there = _moved(K, ray, inverse_depth, self.twists(rays(K, there)))
+        return there
+
+
+def _moved(K: F64, ray: F64, inverse_depth: F64, twist: F64) -> F64:
+    """(N, 2) pixels of points on rays (N, 3) after small motions (N, 6), to second order."""
+    step = np.cross(twist[:, :3], ray) + twist[:, 3:] * inverse_depth[:, None]
+    there = ray + step + 0.5 * np.cross(twist[:, :3], step)
+    return np.asarray(there[:, :2] / there[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2])
+
+
+@dataclass(slots=True, eq=False)
+class FrameRows:
+    """A frame's place and its rows' motion, which gets better as its neighbours are found."""
+
+    time_ns: int
+    prior: PosePrior
+    T_camera_odom: F64  # (4, 4)
+    rows: Rows | None = None  # None: a global shutter
+    is_settled: bool = True  # no frame to come changes it
+
+    def at_middle(self, K: F64, uv: F64, inverse_depth: F64) -> F64:
+        """(N, 2) where the frame's pixels (N, 2) would be at the middle row's time."""
+        return uv if self.rows is None else self.rows.at_middle(K, uv, inverse_depth)
+
+
+class RowTrack:
+    """The motion of each frame's rows, from its neighbours' poses in the odometry."""
+
+    def __init__(self, camera: Camera) -> None:
+        """``camera`` is the one with distortion, at any size of its images."""
+        self._clock = RowClock(camera) if camera.shutter.readout_s else None
+        self._frames: deque[FrameRows] = deque(maxlen=32)
+
+    def begin(self) -> None:
+        """Forget the segment before."""
+        self._frames.clear()
+
+    def expect(self, time_ns: int, prior: PosePrior, T_camera_odom: F64) -> FrameRows:
+        """A new frame, whose pose is about ``T_camera_odom`` (4, 4)."""
+        frame = FrameRows(time_ns, prior, T_camera_odom)
+        self._refresh(frame)
+        return frame
+
+    def place(self, frame: FrameRows, T_camera_odom: F64) -> None:
+        """Take ``T_camera_odom`` (4, 4) for the frame's pose."""
+        frame.T_camera_odom = T_camera_odom
+        self._refresh(frame)
+
+    def add(self, frame: FrameRows, T_camera_odom: F64) -> None:
+        """Keep the frame with its final pose; it tells how those before it moved."""
+        if self._clock is None:
+            return
+        self.place(frame, T_camera_odom)
+        self._frames.append(frame)
+        for before in list(self._frames)[:-1]:
+            if not before.is_settled:
+                self._refresh(before)
+
+    def _refresh(self, frame: FrameRows) -> None:
+        """Fit the motion of its rows to its neighbours; by telemetry where it has none."""
+        if self._clock is None:
+            return
+        times = np.array([(f.time_ns - frame.time_ns) * 1e-9 for f in self._frames])
+        near = np.zeros(0, np.int64)
+        after = 0
+        if times.size:
+            before, later = np.flatnonzero(times < 0), np.flatnonzero(times > 0)
+            chosen = np.abs(times) <= STEADY_S
+            chosen[before[-2:]] = chosen[later[:2]] = True
+            near = np.flatnonzero(chosen & (times != 0) & (np.abs(times) < NEAR_S))
+            after = int((times[near] > 0).sum())
+        since_s = float(times[-1]) if times.size else 0.0
+        frame.is_settled = since_s >= NEAR_S or (after >= 2 and since_s >= STEADY_S)
+        if near.size < (1 if frame.prior.turn_rad_s is None else 2):
+            frame.rows = Rows(self._clock, _by_telemetry(frame), np.zeros(6))
+            return
+        from_odom = se3.inverse(frame.T_camera_odom)
+        twists = np.array([se3.log(self._frames[i].T_camera_odom @ from_odom) for i in near])
+        both_sides = min(after, near.size - after)
+        degree = min(near.size, 2 + min(both_sides, 2))
+        rate, change = _polynomial(times[near], twists, degree)
+        frame.rows = Rows(self._clock, rate, change)
+
+
+def _polynomial(t: F64, twists: F64, degree: int) -> tuple[F64, F64]:
+    """(6,) first and second derivative at 0 of a polynomial that is 0 there, of (N, 6) at (N,)."""
+    scale = float(np.abs(t).max())
+    A = (t[:, None] / scale) ** np.arange(1, degree + 1)
+    c = np.linalg.lstsq(A, twists, rcond=None)[0]
+    second = 2.0 * c[1] / scale**2 if degree > 1 else np.zeros(6)
+    return np.asarray(c[0] / scale), np.asarray(second)
+
+
+def _by_telemetry(frame: FrameRows) -> F64:
+    """(6,) rate by the prior's turn and velocity; what it lacks is zero."""
+    rate = np.zeros(6)
+    if frame.prior.turn_rad_s is not None:
+        rate[:3] = -frame.prior.turn_rad_s
+    if frame.prior.velocity_m_s is not None:
+        rate[3:] = -frame.T_camera_odom[:3, :3] @ frame.prior.velocity_m_s
+    return rate
