@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from recon import se3
+from recon.rolling_shutter import FrameRows
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
 from recon.tracking.matching import Pyramid
 from recon.tracking.odometry import Tracked
@@ -19,7 +20,7 @@ def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> View
     T = se3.compose(np.eye(3), np.array([x_m, 0.0, 50.0]))
     key = OdometryKeyframe(
         seq, seq, segment, se3.inverse(T), np.eye(6), PosePrior(), Pyramid(()),
-        np.zeros((0, 2)), np.zeros(0, np.int64), Landmarks(),
+        np.zeros((0, 2)), np.zeros(0, np.int64), Landmarks(), FrameRows(seq, PosePrior(), T),
     )  # fmt: skip
     picture = np.zeros((32, 32, 3), np.uint8)
     anchor = Anchorage(seq, key, np.eye(4))

@@ -8,16 +8,18 @@ ground plane, so that 16 of them cover relief instead of empty air.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from recon import se3
-from recon.camera_model import scaled_K
+from recon.camera_model import rays, scaled_K
 from recon.image_quality import stretch
+from recon.rolling_shutter import Rows
 from recon.stereo.polar import rectify_polar
 from recon.types import (
+    F32,
     F64,
     U8,
     Bool,
@@ -27,6 +29,9 @@ from recon.types import (
     RectifiedPair,
     StereoPair,
 )
+
+CELL = 8
+"""Pixels between two places where the warp of a rolling shutter is computed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +71,8 @@ class View:
     K: F64  # (3, 3) px of that picture
     T_odom_camera: F64  # (4, 4)
     seen: U8 | None = None  # (H, W) zero where the picture has nothing; None: all of it
+    rows: Rows | None = None  # how the camera moved while it read the image; None: not at all
+    scene: F64 | None = None  # (3,) inverse depth of the ground, times a ray with z = 1; with rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,6 +163,7 @@ def rectify(
         return window
     plane, labels = window
     R_rect_right = R_rect_left @ T_left_right[:3, :3]
+    shown, base = _row_baseline(left, right, T_left_right, points_m, R_rect_left, K, plane, base)
     scale = max(1.0, config.guide_width_px / config.width_px)
     left_gray, left_seen = _stereo_view(left, R_rect_left, K, size, None)
     right_gray, right_seen = _stereo_view(right, R_rect_right, K, size, plane)
@@ -168,7 +176,7 @@ def rectify(
         baseline_m=base,
         K=K,
         labels=labels,
-        plane=plane,
+        plane=shown,
         slope=1.0 - float(plane[0]),
         R_left_keyframe=R_rect_left,
         guide=guide,
@@ -191,7 +199,36 @@ def _polar(
     fitted, _ = _fit_plane(xy[:, 0], xy[:, 1], config.width_px * depth / points[:, 2])
     plane = fitted * [1.0, 1.0, 1.0 / config.width_px] / depth
     low, high = relief_m
-    return rectify_polar(left, right, points, plane, config, (low / depth, high / depth))
+    return rectify_polar(
+        _still(left), _still(right), points, plane, config, (low / depth, high / depth)
+    )
+
+
+def _row_baseline(
+    left: View, right: View, T_left_right: F64, points_m: F64, R_rect_left: F64, K: F64,
+    plane: F64, base: float,
+) -> tuple[F64, float]:  # fmt: skip
+    """Disparity plane of label 0 and baseline of what two rolling shutters show.
+
+    The images are warped to their middle rows as level ground. What lies off that ground is
+    seen along the baseline between the rows themselves, which differs from ``base`` by
+    ``more``: d' = f base w + f more (w - w0) for inverse depths w and w0 of the ground.
+    """
+    if left.rows is None or right.rows is None or left.scene is None:
+        return plane, base
+    T_right_left = se3.inverse(T_left_right)
+    there = se3.transform(T_right_left, points_m)
+    seen = (points_m[:, 2] > 0) & (there[:, 2] > 0)
+    rays_left = points_m[seen] / points_m[seen, 2:]
+    rays_right = there[seen] / there[seen, 2:]
+    # To first order the camera of a row stands at minus the translation of its twist.
+    apart = left.rows.twists(rays_left)[:, 3:]
+    apart = apart - right.rows.twists(rays_right)[:, 3:] @ T_left_right[:3, :3].T
+    more = float(np.median(apart @ R_rect_left[0]))
+    ground = R_rect_left @ left.scene
+    in_pixels = np.array([ground[0] / K[0, 0], ground[1] / K[1, 1], ground[2]])
+    in_pixels[2] -= in_pixels[0] * K[0, 2] + in_pixels[1] * K[1, 2]
+    return plane + K[0, 0] * more * in_pixels, base + more
 
 
 def drop_unseen(labels: DisparityMap, pair: RectifiedPair) -> DisparityMap:
@@ -306,9 +343,7 @@ def _seen(
     inside = np.zeros((H, W), np.uint8)
     inside[rim:-rim, rim:-rim] = 1 if view.seen is None else view.seen[rim:-rim, rim:-rim]
     M = _homography(view, R_rect_view, K, 1.0, plane)
-    flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-    seen = cv2.warpPerspective(inside, M, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
-    return np.asarray(seen > 0)
+    return _sampled(inside, view, M, size, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT) > 0
 
 
 def _warp(
@@ -330,13 +365,55 @@ def _warp(
     while ratio > 1.9:
         H, W = picture.shape[:2]
         half = (W // 2, H // 2)
-        M = scaled_K(M, half[0] / W, half[1] / H)
         picture = np.asarray(cv2.resize(picture, half, interpolation=cv2.INTER_AREA), np.uint8)
         ratio /= 2
     fine = (int(size[0] * oversample), int(size[1] * oversample))
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    out = cv2.warpPerspective(picture, M, fine, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(out, dtype=np.uint8)
+    return _sampled(picture, view, M, fine, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+
+
+def _sampled(image: U8, view: View, M: F64, size: tuple[int, int], flags: int, border: int) -> U8:
+    """The view's ``image``, at any scale, of ``size`` (w, h) by ``M`` (3, 3) to the view's pixels.
+
+    A rolling shutter's rows are brought to the middle row's time in the same step.
+    """
+    H, W = view.gray.shape
+    sx, sy = image.shape[1] / W, image.shape[0] / H
+    if view.rows is None:
+        M = scaled_K(M, sx, sy)
+        out = cv2.warpPerspective(
+            image, M, size, flags=flags | cv2.WARP_INVERSE_MAP, borderMode=border
+        )
+        return np.asarray(out, np.uint8)
+    there = _row_field(view, M, size)
+    x, y = (there[..., 0] + 0.5) * sx - 0.5, (there[..., 1] + 0.5) * sy - 0.5
+    return np.asarray(cv2.remap(image, x, y, flags, borderMode=border), np.uint8)
+
+
+def _row_field(view: View, M: F64, size: tuple[int, int]) -> F32:
+    """(h, w, 2) pixels of the view's image that show what ``M`` (3, 3) leads to at its middle row.
+
+    Computed on a grid of CELL pixels and interpolated: the field is smooth.
+    """
+    assert view.rows is not None and view.scene is not None
+    w, h = size
+    cols, rows = -(-w // CELL) + 2, -(-h // CELL) + 2
+    x, y = np.meshgrid(np.arange(cols) - 0.5, np.arange(rows) - 0.5)
+    at = np.stack([x.ravel() * CELL - 0.5, y.ravel() * CELL - 0.5, np.ones(x.size)], axis=1) @ M.T
+    uv = at[:, :2] / at[:, 2:]
+    inverse_depth = np.maximum(rays(view.K, uv) @ view.scene, 0.0)
+    coarse = view.rows.at_rows(view.K, uv, inverse_depth).reshape(rows, cols, 2)
+    fine = cv2.resize(
+        coarse.astype(np.float32), (cols * CELL, rows * CELL), interpolation=cv2.INTER_LINEAR
+    )
+    return np.asarray(fine[CELL : CELL + h, CELL : CELL + w])
+
+
+def at_middle_row(view: View, image: U8) -> U8:
+    """The view's ``image`` (H, W, 3) as a pinhole camera sees it at the middle row's time."""
+    if view.rows is None:
+        return image
+    H, W = view.gray.shape
+    return _sampled(image, view, np.eye(3), (W, H), cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
 
 
 def _stereo_view(
@@ -347,6 +424,14 @@ def _stereo_view(
     double = _warp(view.gray, view, R_rect_view, K, size, 2.0, plane)
     gray = np.asarray(cv2.resize(double, size, interpolation=cv2.INTER_AREA), np.uint8)
     return stretch(gray, seen), seen
+
+
+def _still(view: View) -> View:
+    """The view as a pinhole camera sees it at the middle row's time."""
+    if view.rows is None:
+        return view
+    bgr = None if view.bgr is None else at_middle_row(view, view.bgr)
+    return replace(view, bgr=bgr, gray=at_middle_row(view, view.gray), rows=None)
 
 
 def plane_relief(depth: DepthMap, known: tuple[float, float]) -> tuple[float, float]:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon import se3
+from recon.rolling_shutter import FrameRows
 from recon.tracking import bundle, matching, two_view
 from recon.types import F64, U8, Bool, PosePrior
 
@@ -83,6 +84,7 @@ class OdometryKeyframe:
     uv: F64  # (N, 2) corners
     landmark: I64  # (N,) number in ``map``, -1 none yet
     map: Landmarks  # of its segment, in the odometry's frame
+    moving: FrameRows  # its corners lie where their own rows saw them
 
     @property
     def T_odom_camera(self) -> F64:
@@ -98,6 +100,7 @@ class TrackingFrame:
     seq: int
     time_ns: int
     prior: PosePrior
+    moving: FrameRows
     mask: U8 | None  # (H, W) non-zero where the picture is valid
     blurred: bool
 
@@ -113,6 +116,7 @@ def landmarks(key: OdometryKeyframe) -> tuple[F64, F64]:
 def triangulate(
     key: OdometryKeyframe,
     T_camera_odom: F64,
+    moving: FrameRows,
     uv: F64,
     ok: Bool,
     K: F64,
@@ -121,15 +125,20 @@ def triangulate(
 ) -> None:
     """Landmarks for the keyframe's corners that were matched (``ok``) at ``uv`` and have none.
 
+    The rows that saw them count as level ground; the window's adjustment knows their depths.
+
     Matches whose rays miss each other are taken out of ``ok``.
     """
     rows = np.flatnonzero(ok & (key.landmark < 0))
     if rows.size == 0:
         return
-    points, angle = bundle.triangulate(key.T_camera_odom, T_camera_odom, K, key.uv[rows], uv[rows])
+    _, depths = landmarks(key)
+    far = np.full(rows.size, 1.0 / np.median(depths) if depths.size else 0.0)
+    uv_a, uv_b = key.moving.at_middle(K, key.uv[rows], far), moving.at_middle(K, uv[rows], far)
+    points, angle = bundle.triangulate(key.T_camera_odom, T_camera_odom, K, uv_a, uv_b)
     error = np.maximum(
-        two_view.reprojection_error(key.T_camera_odom, points, K, key.uv[rows]),
-        two_view.reprojection_error(T_camera_odom, points, K, uv[rows]),
+        two_view.reprojection_error(key.T_camera_odom, points, K, uv_a),
+        two_view.reprojection_error(T_camera_odom, points, K, uv_b),
     )
     gate_px = max(1.5, 2.0 * float(np.median(error)))
     good = (error < min(gate_px, loose_px)) & (angle > least_parallax_rad)
@@ -145,7 +154,8 @@ def adjust_window(window: list[OdometryKeyframe], K: F64) -> None:
         rows = np.flatnonzero(key.map.known(key.landmark))
         cam.append(np.full(rows.size, c, np.int64))
         pt.append(key.landmark[rows])
-        uv.append(key.uv[rows])
+        depth = se3.transform(key.T_camera_odom, key.map[key.landmark[rows]])[:, 2]
+        uv.append(key.moving.at_middle(K, key.uv[rows], 1.0 / depth))
     point = np.concatenate(pt)
     ids, index, counts = np.unique(point, return_inverse=True, return_counts=True)
     use = counts[index] >= 2

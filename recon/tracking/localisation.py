@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 
 from recon import se3
+from recon.rolling_shutter import FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, robust_geometry, two_view
 from recon.tracking.common_view import CommonView, FeatureCache, common_view
-from recon.tracking.keyframe_window import OdometryKeyframe, TrackingFrame
+from recon.tracking.keyframe_window import OdometryKeyframe, TrackingFrame, landmarks
 from recon.tracking.prediction import Motion
 from recon.types import F64, Bool, Camera, PosePrior
 
@@ -91,9 +92,11 @@ class Bridge:
 class Localiser:
     """Poses of frames of one camera without distortion."""
 
-    def __init__(self, camera: Camera, config: OdometryConfig, features: FeatureCache) -> None:
+    def __init__(
+        self, camera: Camera, config: OdometryConfig, features: FeatureCache, row_track: RowTrack
+    ) -> None:
         """``features`` finds views that no motion predicts."""
-        self.camera, self.config = camera, config
+        self.camera, self.config, self._row_track = camera, config, row_track
         self._features = features
 
     def locate(
@@ -112,7 +115,7 @@ class Localiser:
         most = None if still else self.config.tracked_landmarks
         for start in self._starts(new, keyframes, motion, lost):
             key, T_camera_odom = start.key, start.T_camera_odom
-            found = self.pose_from(key, new.pyramid, T_camera_odom, start.share, least, most)
+            found = self.pose_from(key, new, T_camera_odom, start.share, least, most)
             if isinstance(found, str):
                 reason = found
                 continue
@@ -132,7 +135,7 @@ class Localiser:
         share, least = 0.5 * self.config.search_share, self.config.min_tracks // 3
         T = found.pose.T_camera_points
         rest = [key for key in keyframes[-RECALLED:] if key is not found.key]
-        located = [self.pose_from(key, new.pyramid, T, share, least) for key in rest]
+        located = [self.pose_from(key, new, T, share, least) for key in rest]
         return [other for other in located if not isinstance(other, str)]
 
     def bridge(self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe]) -> Bridge | None:
@@ -160,10 +163,13 @@ class Localiser:
             return None
         turn = prediction.relative_rotation(key.prior, new.prior)
         largest = np.pi if turn is None else self.config.max_tilt_error_rad
-        up = key.T_camera_odom[:3, 2]
-        seen = two_view.solve(key.uv[ok], uv[ok], self.camera.K, turn, largest, up)
+        up, K = key.T_camera_odom[:3, 2], self.camera.K
+        depths = landmarks(key)[1]
+        far = np.full(int(ok.sum()), 1.0 / np.median(depths) if depths.size else 0.0)
+        uv_a, uv_b = key.moving.at_middle(K, key.uv[ok], far), new.moving.at_middle(K, uv[ok], far)
+        seen = two_view.solve(uv_a, uv_b, K, turn, largest, up)
         if seen is None and turn is not None:  # tags are often wrong
-            seen = two_view.solve(key.uv[ok], uv[ok], self.camera.K, None, np.pi, up)
+            seen = two_view.solve(uv_a, uv_b, K, None, np.pi, up)
         if seen is None or seen.parallax_rad < self.config.min_base_to_height:
             return None
         rows = np.flatnonzero(ok)[seen.inliers]
@@ -186,7 +192,7 @@ class Localiser:
             return found
         T, share = found.pose.T_camera_points, 0.5 * self.config.search_share
         least, most = self.config.min_tracks // 3, self.config.tracked_landmarks // 2
-        left = self.pose_from(keyframes[-2], new.pyramid, T, share, least, most)
+        left = self.pose_from(keyframes[-2], new, T, share, least, most)
         if isinstance(left, str):
             return found
         return replace(found, pose=pnp.average_left_right(left.pose, found.pose))
@@ -243,7 +249,7 @@ class Localiser:
     def pose_from(
         self,
         key: OdometryKeyframe,
-        pyramid: matching.Pyramid,
+        new: TrackingFrame,
         T_camera_odom: F64,
         share: float,
         least: int,
@@ -270,7 +276,7 @@ class Localiser:
         found = matching.match(
             key.pyramid,
             key.uv[index].astype(np.float32),
-            pyramid,
+            new.pyramid,
             guess.uv[index].astype(np.float32),
             guess.radius_px,
             guess.warp[index].astype(np.float32),
@@ -285,21 +291,39 @@ class Localiser:
         if known.size < max(least, self.config.min_track_share * expected):
             return "too few matches"
         points = key.map[key.landmark[known]]
-        solved = self._solve(points, uv[known], T_camera_odom, max(least, int(0.5 * known.size)))
+        enough = max(least, int(0.5 * known.size))
+        solved = self._solve(points, uv[known], T_camera_odom, enough, new.moving)
         if solved is None:
             return "no pose fits the matches"
         ok[known[~solved.inliers]] = False
         share = float(ok[index].mean())
         return Located(key, solved, uv, ok, in_view * share, share)
 
-    def _solve(self, points: F64, uv: F64, start: F64, least: int) -> pnp.PnpResult | None:
-        """EPnP with a tight gate, else with a loose one; None with fewer than ``least``."""
+    def _solve(
+        self, points: F64, uv: F64, start: F64, least: int, moving: FrameRows
+    ) -> pnp.PnpResult | None:
+        """EPnP with a tight gate, else with a loose one; None with fewer than ``least``.
+
+        The pose says how the rows moved, so it is solved again with that motion.
+        """
         for gate_px in (self.config.pnp.threshold_px, self.config.loose_px):
             config = replace(self.config.pnp, threshold_px=gate_px)
-            solved = pnp.solve(points, uv, self.camera.K, config, start)
+            solved = self._solve_rows(points, uv, start, config, moving)
+            if solved is not None and moving.rows is not None:
+                self._row_track.place(moving, solved.T_camera_points)
+                again = self._solve_rows(points, uv, solved.T_camera_points, config, moving)
+                solved = again or solved
             if solved is not None and solved.inliers.sum() >= least:
                 return solved
         return None
+
+    def _solve_rows(
+        self, points: F64, uv: F64, start: F64, config: pnp.PnpConfig, moving: FrameRows
+    ) -> pnp.PnpResult | None:
+        """EPnP on pixels (N, 2) as they would be at the middle row's time."""
+        depth = se3.transform(start, points)[:, 2]
+        middle = moving.at_middle(self.camera.K, uv, 1.0 / np.maximum(depth, 1e-6))
+        return pnp.solve(points, middle, self.camera.K, config, start)
 
     def _agrees(
         self, T_camera_odom: F64, prior: PosePrior, key: OdometryKeyframe, tilt_only: bool

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon import se3
+from recon.rolling_shutter import FrameRows, RowTrack
 from recon.tracking import matching, prediction, two_view
 from recon.tracking.common_view import FeatureCache
 from recon.tracking.keyframe_window import (
@@ -45,6 +46,7 @@ class Tracked:
     T_odom_camera: F64 | None = None  # (4, 4)
     tracks: int = 0
     reason: str = ""
+    moving: FrameRows | None = None  # its rows' motion, better once its neighbours are known
 
 
 class Odometry:
@@ -54,8 +56,12 @@ class Odometry:
         self,
         camera: Camera,
         config: OdometryConfig | None = None,
+        lens: Camera | None = None,
     ) -> None:
-        """``camera`` has no distortion and the size of the frames to come."""
+        """``camera`` has no distortion and the size of the frames to come.
+
+        ``lens`` is the camera with its distortion and shutter; None: a global shutter.
+        """
         self.camera = camera
         self.K = camera.K
         self.config = config or OdometryConfig()
@@ -66,7 +72,9 @@ class Odometry:
         self._missed_still: TrackingFrame | None = None  # the last frame, when it has no pose
         self._motion: Motion | None = None
         features = FeatureCache()
-        self._localiser = Localiser(camera, self.config, features)
+        self._row_track = RowTrack(lens or camera)
+        self._unsettled: OdometryKeyframe | None = None  # its rows' motion will be known better
+        self._localiser = Localiser(camera, self.config, features, self._row_track)
         self._first_views = FirstViews(
             camera,
             self.config.matching,
@@ -95,7 +103,8 @@ class Odometry:
             blurred: a later frame makes a better keyframe, if it comes soon.
         """
         pyramid = Pyramid.build(gray, self.config.matching.search_levels)
-        new = TrackingFrame(gray, pyramid, seq, time_ns, prior, mask, blurred)
+        moving = self._row_track.expect(time_ns, prior, self._expected(time_ns, prior))
+        new = TrackingFrame(gray, pyramid, seq, time_ns, prior, moving, mask, blurred)
         self._gap_ns, self._frame_ns = time_ns - self._frame_ns, time_ns
         if not self.keyframes:
             return self._start(new)
@@ -108,6 +117,13 @@ class Odometry:
             return self._accept(new, found)
         bridge = self._localiser.bridge(new, self.keyframes) if self._still else None
         return self._missed(new, found) if bridge is None else self._cross(new, bridge)
+
+    def _expected(self, time_ns: int, prior: PosePrior) -> F64:
+        """(4, 4) T_camera_odom of a new frame, as far as it can be foreseen."""
+        if self._motion is not None and self.keyframes:
+            return se3.inverse(self._motion.ahead(time_ns, prior)[0])
+        R = prior.R_world_camera
+        return np.eye(4) if R is None else se3.compose(R.T, np.zeros(3))
 
     @property
     def _still(self) -> bool:
@@ -140,6 +156,8 @@ class Odometry:
         self.segment += 1
         self._metric, self._lost = False, 0
         self._first_views.begin()
+        self._row_track.begin()
+        self._unsettled = None
         R = (
             new.prior.R_world_camera
             if new.prior.R_world_camera is not None
@@ -159,10 +177,12 @@ class Odometry:
                 uv,
                 np.full(len(uv), -1, np.int64),
                 Landmarks(),
+                new.moving,
             )
         ]
+        self._row_track.add(new.moving, se3.inverse(T_odom_camera))
         self._motion = Motion(new.time_ns, T_odom_camera, new.prior)
-        return Tracked("started", self.segment, T_odom_camera)
+        return Tracked("started", self.segment, T_odom_camera, moving=new.moving)
 
     def _corners(self, new: TrackingFrame) -> F64:
         """(N, 2) Harris corners of the frame, Eq. 4-5."""
@@ -188,9 +208,12 @@ class Odometry:
             )
         up_a = first.T_camera_odom[:3, 2]
         turn = 0.12 if R_b_a is not None else np.pi
-        view = two_view.solve(first.uv[ok], uv[ok], self.K, R_b_a, turn, up_a)
+        far = np.full(int(ok.sum()), 1.0 / new.prior.agl_m if new.prior.agl_m else 0.0)
+        uv_a = first.moving.at_middle(self.K, first.uv[ok], far)
+        uv_b = new.moving.at_middle(self.K, uv[ok], far)
+        view = two_view.solve(uv_a, uv_b, self.K, R_b_a, turn, up_a)
         if view is None and R_b_a is not None and self._still:  # tags are often wrong
-            view = two_view.solve(first.uv[ok], uv[ok], self.K, None, np.pi, up_a)
+            view = two_view.solve(uv_a, uv_b, self.K, None, np.pi, up_a)
         if view is None or view.parallax_rad < self.config.min_base_to_height:
             return self._missed(new, "no certain motion between two frames")
         matched = np.flatnonzero(ok)
@@ -200,9 +223,9 @@ class Odometry:
         T_camera_odom = second @ first.T_camera_odom
         self._metric = True
         self._add_keyframe(new, T_camera_odom, [(first, uv, ok)])
-        self._moving.update(new.time_ns, self.keyframes[-1].T_odom_camera, new.prior)
         T_odom_camera = self.keyframes[-1].T_odom_camera
-        return Tracked("keyframe", self.segment, T_odom_camera, int(ok.sum()))
+        self._moving.update(new.time_ns, T_odom_camera, new.prior)
+        return Tracked("keyframe", self.segment, T_odom_camera, int(ok.sum()), moving=new.moving)
 
     def _first_landmarks(self, view: two_view.TwoView, rows: I64, prior: PosePrior) -> float:
         """Enter the two-view points into the table; return metres per unit of the baseline."""
@@ -229,11 +252,11 @@ class Odometry:
         self._lost = 0
         due = self.config.base_to_height * (OVERDUE if new.blurred else 1.0)
         if base < due and found.share > 0.45 and turned < 0.25:
-            return Tracked("tracked", self.segment, T_odom_camera, tracks)
+            self._row_track.add(new.moving, T_camera_odom)
+            self._settle()
+            return Tracked("tracked", self.segment, T_odom_camera, tracks, moving=new.moving)
         share = 0.5 * self.config.search_share
-        whole = self._localiser.pose_from(
-            key, new.pyramid, T_camera_odom, share, self.config.min_tracks
-        )
+        whole = self._localiser.pose_from(key, new, T_camera_odom, share, self.config.min_tracks)
         found = found if isinstance(whole, str) else whole
         seen = [found]
         if self._still:  # little overlap: every keyframe that sees the same ground counts
@@ -243,7 +266,7 @@ class Odometry:
         )
         last, tracks = self.keyframes[-1], int(found.ok.sum())
         self._moving.correct(last.T_odom_camera)
-        return Tracked("keyframe", self.segment, last.T_odom_camera, tracks)
+        return Tracked("keyframe", self.segment, last.T_odom_camera, tracks, moving=new.moving)
 
     def _cross(self, new: TrackingFrame, bridge: Bridge) -> Tracked:
         """Make a keyframe of a frame that two views alone place."""
@@ -252,7 +275,7 @@ class Odometry:
         last = self.keyframes[-1]
         self._moving.update(new.time_ns, last.T_odom_camera, new.prior)
         tracks = int(bridge.ok.sum())
-        return Tracked("keyframe", self.segment, last.T_odom_camera, tracks)
+        return Tracked("keyframe", self.segment, last.T_odom_camera, tracks, moving=new.moving)
 
     def _add_keyframe(
         self, new: TrackingFrame, T_camera_odom: F64, seen: list[tuple[OdometryKeyframe, F64, Bool]]
@@ -263,9 +286,10 @@ class Odometry:
         the one that gave the pose first. Of the others only corners with landmarks count.
         """
         least = 0.5 * self.config.min_base_to_height
+        self._row_track.add(new.moving, T_camera_odom)
         kept, landmark = np.zeros((0, 2)), np.zeros(0, np.int64)
         for key, uv, ok in seen:
-            triangulate(key, T_camera_odom, uv, ok, self.K, least, self.config.loose_px)
+            triangulate(key, T_camera_odom, new.moving, uv, ok, self.K, least, self.config.loose_px)
             if key is not seen[0][0]:
                 ok = ok & (key.landmark >= 0) & ~np.isin(key.landmark, landmark)
             kept = np.vstack([kept, uv[ok]])
@@ -284,10 +308,18 @@ class Odometry:
             np.vstack([kept, fresh]),
             np.concatenate([landmark, np.full(len(fresh), -1, np.int64)]),
             seen[0][0].map,
+            new.moving,
         )
         self.keyframes.append(key_new)
+        self._unsettled = key_new if new.moving.rows is not None else None
         adjust_window(self.keyframes[-self.config.window - 2 :], self.K)
         self._forget()
+
+    def _settle(self) -> None:
+        """Adjust the window again once frames after its last keyframe say how its rows moved."""
+        if self._unsettled is not None and self._unsettled.moving.is_settled:
+            adjust_window(self.keyframes, self.K)
+            self._unsettled = None
 
     def _forget(self) -> None:
         """Let go of what left the window: pictures, corners, and landmarks nobody sees."""

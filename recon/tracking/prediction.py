@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from recon import se3
-from recon.camera_model import rays
+from recon.camera_model import inverse_depth_plane, rays
 from recon.tracking import robust_geometry, two_view
 from recon.tracking.keyframe_window import I64, OdometryKeyframe
 from recon.types import F64, Bool, PosePrior
@@ -46,7 +46,7 @@ def on_landmarks(
     T_new_key = T_camera_odom @ key.T_odom_camera
     known = key.map.known(key.landmark)
     P_key = se3.transform(key.T_camera_odom, key.map[key.landmark[known]])
-    plane = _inverse_depth_plane(K, P_key)
+    plane = inverse_depth_plane(P_key)
     H = K @ (T_new_key[:3, :3] + np.outer(T_new_key[:3, 3], plane)) @ np.linalg.inv(K)
     uv = cv2.perspectiveTransform(key.uv[:, None], H)[:, 0].astype(np.float64)
     warp = _local_affine(H, key.uv, uv)
@@ -71,7 +71,7 @@ def landmark_depths(key: OdometryKeyframe, K: F64, rows: I64) -> F64 | None:
         return np.asarray(z[rows])
     if len(P) < MIN_MEASURED:
         return None
-    inverse = rays(K, key.uv[rows]) @ _inverse_depth_plane(K, P)
+    inverse = rays(K, key.uv[rows]) @ inverse_depth_plane(P)
     return np.asarray(1.0 / inverse) if np.all(inverse > 0) else None
 
 
@@ -121,23 +121,6 @@ def _local_affine(H: F64, uv: F64, there: F64) -> F64:
     """(N, 2, 2) Jacobian of the homography at each pixel."""
     w = uv @ H[2, :2] + H[2, 2]
     return np.asarray((H[None, :2, :2] - there[:, :, None] * H[2, :2]) / w[:, None, None])
-
-
-def _inverse_depth_plane(K: F64, P: F64) -> F64:
-    """(3,) q with ``1 / z = q . ray`` for the plane through camera points (N, 3)."""
-    if len(P) < 3:
-        return np.array([0.0, 0.0, 1.0 / max(float(np.median(P[:, 2])) if len(P) else 1.0, 1e-6)])
-    ray = P / P[:, 2:]
-    target = 1.0 / P[:, 2]
-    weights = np.ones(len(P))
-    q = np.zeros(3)
-    for _ in range(5):
-        A = ray * weights[:, None]
-        q = np.linalg.solve(A.T @ ray + 1e-9 * np.eye(3), A.T @ target)
-        error = np.abs(ray @ q - target)
-        scale = max(1.4826 * float(np.median(error)), 1e-9)
-        weights = 1.0 / (1.0 + (error / (2 * scale)) ** 2)
-    return np.asarray(q)
 
 
 def fresh_corners(corners: F64, kept: F64, size_px: tuple[int, int], grid: int) -> F64:

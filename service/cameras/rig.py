@@ -104,6 +104,15 @@ class Rig:
             prior = replace(prior, altitude_m=None if altitude is None else altitude + lever[2])
         return prior
 
+    def turn(self, before: VehicleState | None, after: VehicleState | None) -> F64 | None:
+        """(3,) rad/s of the camera in its own frame between two states; None without attitude."""
+        if before is None or after is None or after.time_ns <= before.time_ns:
+            return None
+        if not (self.attitude_known(before, None) and self.attitude_known(after, None)):
+            return None
+        turned = self._rotation(before, None)[0].T @ self._rotation(after, None)[0]
+        return se3.so3_log(turned) * (1e9 / (after.time_ns - before.time_ns))
+
     def _lever(self, state: VehicleState | None) -> F64:
         """(3,) ENU metres from the vehicle's position to the camera; zero without its attitude."""
         if state is None or state.q_ned_body_wxyz is None:

@@ -7,7 +7,7 @@ import secrets
 import time
 from collections.abc import Callable
 from contextlib import closing, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event
 from typing import Any, Protocol
@@ -16,7 +16,8 @@ from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import VehicleState
 from recon.backends import Backend
 from recon.posegraph.between_keyframes import Odometer
-from recon.types import Camera, Frame, Keyframe
+from recon.types import F64, Camera, Frame, Keyframe
+from service.cameras.camera_file import with_shutter
 from service.cameras.rig import ASSUMED_AGL_M, Rig
 from service.cameras.source import CameraFrame, CameraSource, ahead
 from service.config import Config
@@ -39,6 +40,10 @@ log = logging.getLogger(__name__)
 
 TIME_STEP_NS = 100_000
 """Frame times are rounded to this; no camera's clock is finer."""
+
+
+TURN_NS = 20_000_000
+"""Before and after an exposure: how telemetry's attitude changes there is the camera's turn."""
 
 
 class Datalink(Protocol):
@@ -115,6 +120,7 @@ class Scan:
         self.pipeline = Pipeline(
             build_stages(inputs.camera, config, inputs.backend, live=live, pages=pages)
         )
+        self._is_rolling = with_shutter(inputs.camera, config.camera).shutter.readout_s > 0
         self.rig, self._odometer = Rig(config.camera, config.scan, config.fusion), Odometer()
         self.recorder = Recorder(
             store, self.pipeline, self.rig, inputs.unix_offset_ns, inputs.on_keyframe
@@ -145,6 +151,8 @@ class Scan:
         self.heights += self.rig.height_known(state, frame.geotag)
         self.attitudes += self.rig.attitude_known(state, frame.geotag)
         prior = self._odometer.take(exposed_ns, self.rig.prior(state, frame.geotag))
+        if self._is_rolling:
+            prior = replace(prior, turn_rad_s=self._turn(exposed_ns))
         step = self.pipeline.step(Frame(frame.image, exposed_ns, frame.seq, prior))
         self.check.add(time_ns, step.tracked)
         self.tracking.look(step.tracked, time_ns)
@@ -154,6 +162,14 @@ class Scan:
         if inputs.on_step is not None:
             inputs.on_step(step, state, exposed_ns)
         return step
+
+    def _turn(self, exposed_ns: int) -> F64 | None:
+        """(3,) rad/s of the camera about the moment of exposure, in its frame, by telemetry."""
+        history = self.inputs.history
+        if history is None:
+            return None
+        before, after = (history.state_at(exposed_ns + d) for d in (-TURN_NS, TURN_NS))
+        return self.rig.turn(before, after)
 
     def run(
         self,

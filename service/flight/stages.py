@@ -28,6 +28,7 @@ from recon.stereo.upsampling import UpsamplingConfig
 from recon.stereo.virtual_stereo import (
     PairRejection,
     VirtualStereoConfig,
+    at_middle_row,
     drop_unseen,
     plane_relief,
     rectify,
@@ -51,6 +52,7 @@ from recon.types import (
     StereoPair,
 )
 from service.background import BackgroundWorker
+from service.cameras.camera_file import with_shutter
 from service.compute.stopwatch import Stopwatch
 from service.compute.threading_layer import kernels_may_overlap, share_cores
 from service.config import ComputeConfig, Config
@@ -306,7 +308,8 @@ class MakeKeyframe:
         metric = DepthMap(
             depth.depth_m * scale, sigma_m * scale, depth.views, depth.K, placed.T_world_camera
         )
-        bgr = np.asarray(cv2.resize(view.bgr, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
+        bgr = at_middle_row(view.view, view.bgr)
+        bgr = np.asarray(cv2.resize(bgr, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
         if self._debug is not None:
             self._debug |= {"depth_m": metric.depth_m, "sigma_m": metric.sigma_m, "bgr": bgr}
         pose = Pose(placed.T_world_camera, placed.covariance, placed.sources)
@@ -360,10 +363,12 @@ def build_stages(
     refused: Counter[str] = Counter()
     rejected: Counter[str] = Counter()
     debug: dict[str, Array] | None = {} if config.scan.keep_debug else None
+    camera = with_shutter(camera, config.camera)
     undistort = Undistort(camera, compute.guide_width, stopwatch)
     odometry = Odometry(
         undistort.tracking_camera,
         OdometryConfig(base_to_height=config.scan.base_to_height),
+        camera,
     )
     track = Track(odometry, refused, stopwatch)
     selection = Viewpoints(config.scan, compute.pairs)

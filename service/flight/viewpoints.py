@@ -14,7 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from recon import se3
+from recon.camera_model import inverse_depth_plane
 from recon.posegraph.between_keyframes import FixAverage
+from recon.rolling_shutter import FrameRows
 from recon.stereo.virtual_stereo import View
 from recon.tracking.keyframe_window import OdometryKeyframe, landmarks
 from recon.tracking.odometry import Odometry, Tracked
@@ -53,6 +55,7 @@ class Viewpoint:
     key: OdometryKeyframe  # the last one when it was tracked
     anchor: Anchorage
     is_blurred: bool = False  # takes no part in stereo, only in the track
+    moving: FrameRows | None = None
 
     @property
     def segment(self) -> int:
@@ -189,7 +192,12 @@ class Viewpoints:
         """True when the view has two neighbours to pair with, or its segment is over."""
         if not self._kept or self._kept[-1] is view:
             return False
-        if self._mode != "auto" or self._kept[-1].segment != view.segment:
+        if self._kept[-1].segment != view.segment:
+            return True
+        newest = self._kept[-1].moving
+        if newest is not None and not newest.is_settled:
+            return False
+        if self._mode != "auto":
             return True
         return sum(v.segment == view.segment for v in self._kept) >= 3
 
@@ -273,7 +281,7 @@ class StereoViews:
         anchor = Anchorage(image.seq, key, se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera)
         frame = Viewpoint(
             image.seq, image.time_ns, image.prior, image.bgr, image.gray, key, anchor,
-            image.is_blurred,
+            image.is_blurred, tracked.moving,
         )  # fmt: skip
         is_view = self.selection.offer(frame, tracked)
         self._fixes.take(tracked.T_odom_camera, image.prior)
@@ -308,6 +316,8 @@ class StereoViews:
 
     def _candidate(self, view: Viewpoint, prior: PosePrior) -> StereoCandidate:
         points, _ = landmarks(view.key)
+        points = se3.transform(se3.inverse(view.anchor.T_key_camera), points)
+        in_odom = se3.transform(view.T_odom_camera, points)
         assert view.bgr is not None
         return StereoCandidate(
             view.seq,
@@ -315,13 +325,20 @@ class StereoViews:
             view.segment,
             prior,
             view.bgr,
-            self._posed(view),
-            tuple(self._posed(partner) for partner in self.selection.partners(view)),
+            self._posed(view, in_odom),
+            tuple(self._posed(partner, in_odom) for partner in self.selection.partners(view)),
             view.anchor,
-            se3.transform(se3.inverse(view.anchor.T_key_camera), points),
+            points,
             view.key.covariance,
             {v.seq: v.T_odom_camera for v in self._given if v.segment == view.segment},
         )
 
-    def _posed(self, view: Viewpoint) -> View:
-        return View(view.bgr, view.gray, self._K, view.T_odom_camera, self._seen)
+    def _posed(self, view: Viewpoint, points: F64) -> View:
+        """The view with its pose; ``points`` (N, 3) of the odometry are the ground before it."""
+        posed = View(view.bgr, view.gray, self._K, view.T_odom_camera, self._seen)
+        rows = None if view.moving is None else view.moving.rows
+        if rows is None:
+            return posed
+        ground = se3.transform(se3.inverse(view.T_odom_camera), points)
+        scene = inverse_depth_plane(ground[ground[:, 2] > 0])
+        return replace(posed, rows=rows, scene=scene)

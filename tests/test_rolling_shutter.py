@@ -1,0 +1,236 @@
+"""Rows of a rolling shutter against a brute-force projection by each row's own pose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.camera_model import inverse_depth_plane, project, rays
+from recon.rolling_shutter import RowClock, Rows, RowTrack, row_times_s
+from recon.stereo.virtual_stereo import View, VirtualStereoConfig, at_middle_row, rectify
+from recon.tracking.localisation import OdometryConfig
+from recon.tracking.odometry import Odometry
+from recon.types import DIRECTIONS, F64, U8, Camera, PosePrior, Shutter, StereoPair
+
+K = np.array([[400.0, 0, 239.5], [0, 400.0, 179.5], [0, 0, 1]])
+W, H = 480, 360
+PLAIN = Camera(K, np.zeros(5), (W, H))
+LENS = replace(PLAIN, distortion=np.array([-0.2, 0.05, 0.001, -0.002, 0.01]))
+RATE = np.array([0.4, -0.5, 0.2, 6.0, -5.0, 1.0])
+CHANGE = np.array([-3.0, 2.0, 1.0, 0.5, 0.3, 0.1])
+
+
+def rows_of(camera: Camera, readout_s: float = 0.03, direction: str = "down") -> Rows:
+    return Rows(RowClock(replace(camera, shutter=Shutter(readout_s, direction))), RATE, CHANGE)
+
+
+def seen(points: F64, rate: F64, change: F64, readout_s: float, axis: int = 1) -> F64:
+    """(N, 2) where rows exposed from the top down, or columns from the left (``axis`` 0), see
+    points (N, 3) of the middle row's camera."""
+    out = project(K, points)
+    for i, X in enumerate(points):
+        for _ in range(20):
+            t = readout_s * ((out[i, axis] + 0.5) / (W, H)[axis] - 0.5)
+            T = se3.exp(t * rate + 0.5 * t * t * change)
+            out[i] = project(K, se3.transform(T, X[None]))[0]
+    return out
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_the_clock_counts_rows_of_the_distorted_image(direction: str) -> None:
+    lens = replace(LENS, shutter=Shutter(0.02, direction))
+    xy = np.random.default_rng(0).uniform(-0.4, 0.4, (50, 2))
+    ray = np.c_[xy, np.ones(50)]
+    uv = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), K, LENS.distortion)[0][:, 0]
+    axis = 0 if direction in ("right", "left") else 1
+    times = row_times_s(lens)
+    expected = np.interp(uv[:, axis], np.arange(len(times)), times)
+    np.testing.assert_allclose(RowClock(lens).seconds(ray), expected, atol=2e-5)
+    assert (times[0] < 0) == (direction in ("down", "right"))
+
+
+def test_pixels_go_to_the_middle_row_and_back() -> None:
+    rng = np.random.default_rng(1)
+    uv = rng.uniform([10, 10], [W - 10, H - 10], (200, 2))
+    depth = rng.uniform(40, 70, 200)
+    points = rays(K, uv) * depth[:, None]
+    there = seen(points, RATE, CHANGE, 0.03)
+    rows = rows_of(PLAIN)
+    assert np.linalg.norm(there - uv, axis=1).max() > 3.0
+    np.testing.assert_allclose(rows.at_rows(K, uv, 1 / depth), there, atol=0.01)
+    np.testing.assert_allclose(rows.at_middle(K, there, 1 / depth), uv, atol=0.02)
+
+
+def swinging(t: float) -> F64:
+    """(4, 4) T_camera_world of a head that swings at 1 Hz and up to 30 degrees per second."""
+    turn = 0.083 * np.array([np.sin(2 * np.pi * t), np.sin(5.6 * t + 1.0), 0.0])
+    R = se3.so3_exp(np.array([0.0, 0.0, 0.4])) @ np.diag([1.0, -1, -1]) @ se3.so3_exp(turn)
+    return se3.inverse(se3.compose(R, np.array([8.0 * t - 20, 1.0 * t, 60.0])))
+
+
+def derivative(t: float) -> F64:
+    step = 1e-4
+    there, back = swinging(t + step), swinging(t - step)
+    return se3.log(there @ se3.inverse(back)) / (2 * step)
+
+
+def test_neighbours_tell_how_the_rows_moved() -> None:
+    track = RowTrack(replace(PLAIN, shutter=Shutter(0.03)))
+    frames = []
+    for i in range(12):
+        frame = track.expect(int(i * 1e9 / 15), PosePrior(), swinging(i / 15))
+        track.add(frame, swinging(i / 15))
+        frames.append(frame)
+    assert [f.is_settled for f in frames] == [True] * 9 + [False] * 3
+    for i in (3, 6, 8):
+        rows = frames[i].rows
+        assert rows is not None
+        np.testing.assert_allclose(rows.rate[:3], derivative(i / 15)[:3], atol=0.006)
+        np.testing.assert_allclose(rows.rate[3:], derivative(i / 15)[3:], atol=0.35)
+
+
+def test_telemetry_speaks_for_frames_far_apart() -> None:
+    turn, velocity = np.array([0.1, 0.2, -0.3]), np.array([8.0, 1.0, 0.0])
+    prior = PosePrior(velocity_m_s=velocity, turn_rad_s=turn)
+    track = RowTrack(replace(PLAIN, shutter=Shutter(0.03)))
+    for i in range(4):
+        frame = track.expect(i * 2_000_000_000, prior, swinging(2.0 * i))
+        track.add(frame, swinging(2.0 * i))
+        assert frame.rows is not None
+        moved = se3.exp(0.01 * frame.rows.rate) @ swinging(2.0 * i)
+        centre = se3.inverse(moved)[:3, 3] - se3.inverse(swinging(2.0 * i))[:3, 3]
+        np.testing.assert_allclose(centre, 0.01 * velocity, atol=2e-4)
+        turned = swinging(2.0 * i)[:3, :3] @ moved[:3, :3].T
+        np.testing.assert_allclose(se3.so3_log(turned), 0.01 * turn, atol=1e-9)
+
+
+def test_a_global_shutter_has_no_rows() -> None:
+    track = RowTrack(LENS)
+    frame = track.expect(0, PosePrior(turn_rad_s=np.ones(3)), swinging(0.0))
+    track.add(frame, swinging(0.0))
+    uv = np.array([[3.0, 4.0]])
+    assert frame.rows is None and frame.is_settled and frame.at_middle(K, uv, np.ones(1)) is uv
+
+
+def texture() -> U8:
+    rng = np.random.default_rng(0)
+    out = np.zeros((2000, 2000), np.float32)
+    for size in (8, 25, 80, 250, 1000, 2000):
+        layer = rng.normal(0, 1, (size, size)).astype(np.float32)
+        out += cv2.resize(layer, (2000, 2000), interpolation=cv2.INTER_CUBIC)
+    return np.asarray(np.clip((out - out.mean()) / out.std() * 45 + 128, 0, 255), np.uint8)
+
+
+def photograph(ground: U8, t: float, readout_s: float) -> U8:
+    """(H, W) level ground of 0.12 m a pixel, each row by its own pose, downwards."""
+    ray = rays(K, np.stack(np.meshgrid(np.arange(W), np.arange(H)), -1).reshape(-1, 2) * 1.0)
+    there = np.empty((H, W, 3))
+    for row, s in enumerate(readout_s * ((np.arange(H) + 0.5) / H - 0.5)):
+        T = se3.inverse(swinging(t + s))
+        direction = ray.reshape(H, W, 3)[row] @ T[:3, :3].T
+        there[row] = T[:3, 3] - direction * (T[2, 3] / direction[:, 2:])
+    at = ((there[..., :2] + 120.0) / 0.12).astype(np.float32)
+    return np.asarray(cv2.remap(ground, at[..., 0], at[..., 1], cv2.INTER_LINEAR), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def flown() -> list[U8]:
+    ground = texture()
+    return [photograph(ground, i / 15, 0.03) for i in range(40)]
+
+
+def height_errors(flown: list[U8], shutter: Shutter) -> F64:
+    """(N,) metres that the landmarks of the odometry's keyframes lie off the level ground."""
+    odometry = Odometry(PLAIN, OdometryConfig(), lens=replace(PLAIN, shutter=shutter))
+    for i, image in enumerate(flown):
+        T = se3.inverse(swinging(i / 15))
+        turn = -derivative(i / 15)[:3]
+        prior = PosePrior(
+            T[:3, :3], 0.01, 0.03, T[:3, 3], np.full(3, 0.5), 60.0, 1.0,
+            velocity_m_s=np.array([8.0, 1.0, 0.0]), turn_rad_s=turn,
+        )  # fmt: skip
+        assert odometry.track(image, i, int(i * 1e9 / 15), prior).state != "lost"
+    off = []
+    for key in odometry.keyframes:
+        points = key.map[key.landmark[key.map.known(key.landmark)]]
+        off.append(points[:, 2] - np.median(points[:, 2]))
+    return np.concatenate(off)
+
+
+def test_the_odometry_sees_level_ground_through_a_rolling_shutter(flown: list[U8]) -> None:
+    known = np.median(np.abs(height_errors(flown, Shutter(0.03))))
+    ignored = np.median(np.abs(height_errors(flown, Shutter())))
+    assert known < 0.12 and ignored > 4 * known
+
+
+def pair_of(rolling: bool) -> tuple[View, View, F64]:
+    """Two views 6 m apart and points (N, 3) of rough ground in the left one's camera.
+
+    The shutter moves with the flight, from the left to the right.
+    """
+    rng = np.random.default_rng(4)
+    world = np.c_[rng.uniform([-39, -18], [11, 18], (300, 2)), rng.uniform(0, 12, 300)]
+    clock = RowClock(replace(PLAIN, shutter=Shutter(0.03, "right")))
+    views = []
+    for t in (0.4, 1.15):
+        rows = Rows(clock, derivative(t), np.zeros(6)) if rolling else None
+        scene = inverse_depth_plane(se3.transform(swinging(t), world))
+        blank = np.zeros((H, W), np.uint8)
+        views.append(View(None, blank, K, se3.inverse(swinging(t)), rows=rows, scene=scene))
+    return views[0], views[1], se3.transform(swinging(0.4), world)
+
+
+def test_stereo_measures_along_the_baseline_between_the_rows() -> None:
+    """Points above the ground keep their depth though their rows stood elsewhere."""
+    left, right, points = pair_of(rolling=True)
+    pair = rectify(left, right, points, VirtualStereoConfig(width_px=160, guided=False))
+    assert isinstance(pair, StereoPair) and left.scene is not None and right.scene is not None
+    T_right_left = se3.inverse(right.T_odom_camera) @ left.T_odom_camera
+    R_right = pair.R_left_keyframe @ T_right_left[:3, :3].T
+    x = []
+    for view, X, R in (
+        (left, points, pair.R_left_keyframe), (right, se3.transform(T_right_left, points), R_right),
+    ):  # fmt: skip
+        assert view.rows is not None and view.scene is not None
+        there = seen(X, view.rows.rate, view.rows.change, 0.03, axis=0)
+        flat = view.rows.at_middle(K, there, rays(K, project(K, X)) @ view.scene)
+        x.append(project(pair.K, rays(K, flat) @ R.T))
+    disparity = x[0][:, 0] - x[1][:, 0]
+    at = np.c_[x[0], np.ones(len(points))]
+    z = (points @ pair.R_left_keyframe.T)[:, 2]
+    ground = rays(pair.K, x[0]) @ (pair.R_left_keyframe @ left.scene)
+    # What the pair adds to the disparity of the shifted images is the same for all labels.
+    base = float(np.linalg.norm(T_right_left[:3, 3]))
+    shift = pair.K[0, 0] * (pair.baseline_m - base) * ground
+    corrected = pair.K[0, 0] * pair.baseline_m / (disparity + shift)
+    plain = pair.K[0, 0] * base / disparity
+    assert np.median(np.abs(plain / z - 1)) > 3 * np.median(np.abs(corrected / z - 1))
+    assert np.median(np.abs(corrected / z - 1)) < 2e-4
+    global_pair = rectify(
+        *pair_of(rolling=False)[:2], points, VirtualStereoConfig(width_px=160, guided=False)
+    )
+    assert isinstance(global_pair, StereoPair)
+    np.testing.assert_allclose((pair.plane - global_pair.plane) @ at.T, shift, atol=1e-9)
+
+
+def test_the_image_becomes_that_of_the_middle_row() -> None:
+    ground = texture()
+    T = swinging(0.5)
+    rows = Rows(RowClock(replace(PLAIN, shutter=Shutter(0.03))), derivative(0.5), np.zeros(6))
+    corners = rays(K, np.array([[0.0, 0], [W, 0], [0, H], [W, H]]))
+    down = corners @ T[:3, :3]
+    scene = inverse_depth_plane(corners * (-60.0 / down[:, 2])[:, None])
+    image = photograph(ground, 0.5, 0.03)
+    view = View(None, image, K, se3.inverse(T), rows=rows, scene=scene)
+    middle, pinhole = at_middle_row(view, image), photograph(ground, 0.5, 0.0)
+    inside = (slice(8, -8), slice(8, -8))
+    images = [
+        cv2.GaussianBlur(i[inside].astype(float), (0, 0), 3) for i in (middle, image, pinhole)
+    ]
+    off = [np.abs(i - images[2]).mean() for i in images[:2]]
+    assert off[0] < 0.2 * off[1]
+    assert at_middle_row(replace(view, rows=None), image) is image
