@@ -1,4 +1,4 @@
-"""A token bucket: how many bytes may be handed to the link now."""
+"""A token bucket that limits how many bytes may be sent now, and an estimate of the link's rate."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import math
 from collections import deque
 
 WINDOW_SHARE = 0.03
-"""The bucket holds this share of a second, so no 1 s window exceeds the rate by more; the rest
-of 5 % is left to what buffers add on the way."""
+"""The bucket holds this share of a second, so that no 1 s window exceeds the rate by more; the rest
+of 5 % covers buffers on the way."""
 MIN_PART_BYTES = 512
 MAX_PART_BYTES = 16_384
 _ENVELOPE_BYTES = 80  # key expression, Zenoh framing
@@ -15,13 +15,13 @@ _SEGMENT_BYTES, _SEGMENT_HEADER_BYTES = 1400, 52  # TCP/IP
 
 
 def wire_bytes(payload: int) -> int:
-    """Bytes on the link, about, for one message of ``payload`` bytes."""
+    """Approximate bytes on the link for one message of ``payload`` bytes."""
     size = payload + _ENVELOPE_BYTES
     return size + _SEGMENT_HEADER_BYTES * -(-size // _SEGMENT_BYTES)
 
 
 class TokenBucket:
-    """Bytes against time; the clock is the caller's, in seconds."""
+    """A token bucket; the caller supplies the time in seconds."""
 
     def __init__(self, rate_bytes_s: float, now: float) -> None:
         self._rate = rate_bytes_s
@@ -40,18 +40,18 @@ class TokenBucket:
 
     @property
     def depth_bytes(self) -> float:
-        """The most that may be saved up: 3 % of a second, but room for one small part."""
+        """Capacity: 3 % of a second, but at least one small part."""
         return max(self._rate * WINDOW_SHARE, float(wire_bytes(MIN_PART_BYTES)))
 
     @property
     def part_bytes(self) -> int:
-        """How large a part may be so that the bucket can hold it with its envelope."""
+        """Maximum size of a part that fits into the bucket with its envelope."""
         room = int(self.depth_bytes / (1 + _SEGMENT_HEADER_BYTES / _SEGMENT_BYTES))
         room -= _ENVELOPE_BYTES + _SEGMENT_HEADER_BYTES
         return max(MIN_PART_BYTES, min(MAX_PART_BYTES, room))
 
     def ready_in(self, size: int, now: float) -> float:
-        """Seconds until ``size`` bytes may go; zero when they may go now."""
+        """Seconds until ``size`` bytes may be sent; zero when they may be sent now."""
         self._refill(now)
         lacking = min(float(size), self.depth_bytes) - self._tokens
         if lacking <= 1e-6:
@@ -59,7 +59,7 @@ class TokenBucket:
         return lacking / self._rate if self._rate > 0 else math.inf
 
     def take(self, size: int, now: float) -> None:
-        """Spend ``size`` bytes; what exceeds the bucket is owed."""
+        """Spend ``size`` bytes; the bucket may go negative."""
         self._refill(now)
         self._tokens -= size
 
@@ -70,26 +70,26 @@ class TokenBucket:
 
 
 class RateEstimate:
-    """What the link really carries, from what the far end says it received.
+    """The rate that the link really carries, from the receiver's reports.
 
-    Bytes sent and not yet received beyond the least of late are a queue, or lost. When two
-    reports in a row find more than half a second of them, the allowed rate falls below what
-    came through at best of late; then it climbs, fast to where that began and slowly from
-    there on. One stall of a lossy link is no queue. Losses that a lower rate does not lessen
-    are the link's own and no reason to fall again.
+    Bytes sent and not yet received, beyond their recent minimum, are queued or lost. When two
+    consecutive reports show more than half a second of them, the allowed rate falls below the best
+    recent throughput; then it climbs, fast up to where the queue began and slowly from there. A
+    single stall of a lossy link is no queue. Losses that a lower rate does not reduce belong to the
+    link and are no reason to fall again.
     """
 
     QUEUE_S = 0.5
     MIN_QUEUE_BYTES = 8_000
-    FALL = 0.8  # of what came through
+    FALL = 0.8  # of the throughput
     CLIMB, CREEP = 0.05, 0.005  # of the configured rate, per report
     FLOOR = 0.03  # of the configured rate
-    MIN_REPORT_S = 0.8  # reports closer together are joined
+    MIN_REPORT_S = 0.8  # reports closer together are merged
     MAX_GAP_S = 10.0  # after a longer gap the estimate restarts
-    REST = 2  # reports after a fall that are not judged
+    REST = 2  # reports after a fall that are ignored
     PATIENCE = 2  # bad reports in a row before the rate falls
-    SAME = 0.6  # a share lost that shrank by less than this did not depend on the rate
-    FORGET = 0.99  # per report, of the share lost that is taken for the link's own
+    SAME = 0.6  # a loss that shrank by less than this factor does not depend on the rate
+    FORGET = 0.99  # decay per report of the loss attributed to the link
 
     def __init__(self, configured_bytes_s: float) -> None:
         self.configured_bytes_s = configured_bytes_s
@@ -105,13 +105,13 @@ class RateEstimate:
         self._own_loss = 0.0
 
     def restart(self) -> None:
-        """Forget what was under way, such as on a connection that died; the rate stays."""
+        """Forget bytes in flight, such as those on a dead connection; the rate stays."""
         self._totals.clear()
         self._through.clear()
         self._bad = 0
 
     def report(self, sent_bytes: int, received_bytes: int, now: float) -> float:
-        """The rate to use, given the totals sent and received so far."""
+        """The rate to use, given the total bytes sent and received so far."""
         passed = now - self._at
         if passed < self.MIN_REPORT_S:
             return self.rate_bytes_s
@@ -141,7 +141,7 @@ class RateEstimate:
         return queue - own > max(self.MIN_QUEUE_BYTES, self.QUEUE_S * max(self._through))
 
     def _judge(self) -> None:
-        """Fall, or take what is lost for the link's own."""
+        """Lower the rate, or attribute the loss to the link."""
         (sent0, received0), (sent1, received1) = self._totals[0], self._totals[-1]
         lost = 1.0 - (received1 - received0) / max(1, sent1 - sent0)
         if lost > 0 and self._lost_at_fall > 0 and lost > self.SAME * self._lost_at_fall:

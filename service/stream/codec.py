@@ -1,10 +1,9 @@
 """Keyframes as coded layers, and back.
 
-A keyframe becomes a coarse layer and a fine layer. Each layer is a message of its own that
-decodes alone; the fine layer replaces the coarse one. Only ``fresh`` pixels with a known
-depth are carried. A layer is an envelope (header, sizes, checksum) around five sections; every
-bound on what a decoder may allocate is checked in :func:`unpack`, before any section is opened.
-The bytes are specified in ``docs/wire.md``.
+A keyframe becomes a coarse layer and a fine layer. Each layer is one message that decodes
+independently; the fine layer replaces the coarse one. Only ``fresh`` pixels with known depth are
+coded. A layer is an envelope (header, sizes, checksum) around five sections; :func:`unpack` checks
+every bound on a decoder's memory before a section is opened. ``docs/wire.md`` specifies the bytes.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ MAX_LAYERS = 8
 _ID = struct.Struct("<4sBBBBIq")  # magic, version, layer, layers, sources, seq, time
 _GRID = struct.Struct("<HHBB4H")  # full w, full h, factor, depth method, box x y w h
 _OPTICS = struct.Struct("<6f")  # inverse min, inverse step, fx, fy, cx, cy
-_PLACE = struct.Struct(f"<{PLACE_BYTES}s")  # pose and covariance, as records have them
+_PLACE = struct.Struct(f"<{PLACE_BYTES}s")  # pose and covariance, as in records
 _SIZES = struct.Struct("<5I")
 _CRC = struct.Struct("<I")
 _PARTS = (_ID, _GRID, _OPTICS, _PLACE, _SIZES)
@@ -54,7 +53,7 @@ class LayerHead:
     full_px: tuple[int, int]  # (w, h) of the keyframe's grid
     factor: int  # one pixel of this layer is factor x factor pixels of the full grid
     method: int  # how the depth section is coded
-    box: tuple[int, int, int, int]  # x, y, w, h in this layer's grid; all else is unknown
+    box: tuple[int, int, int, int]  # x, y, w, h in this layer's grid; pixels outside are unknown
     inverse_min: float  # 1/m of depth code 0
     inverse_step: float  # 1/m
     K: F64  # (3, 3) of the full grid
@@ -76,7 +75,7 @@ class LayerHead:
 def pack(head: LayerHead, sections: Sequence[bytes], place: bytes = b"") -> bytes:
     """The layer: ``head``, checksum, then mask, depth, sigma, views and colour sections.
 
-    ``place`` is what pack_place makes of the head's pose and covariance, if known already.
+    ``place`` is the head's pose and covariance packed by pack_place, if available.
     """
     K = head.K
     sealed = b"".join(
@@ -107,7 +106,7 @@ def peek(data: bytes) -> LayerHead | None:
 
 
 def unpack(data: bytes) -> tuple[LayerHead, tuple[bytes, ...]] | None:
-    """Header and the five sections of a layer; None for bytes that are no valid layer."""
+    """Header and the five sections of a layer; None for an invalid layer."""
     if not HEADER_BYTES <= len(data) <= MAX_LAYER_BYTES or data[:5] != MAGIC + bytes([VERSION]):
         return None
     crc = zlib.crc32(memoryview(data)[HEADER_BYTES:], zlib.crc32(data[:_SEALED_BYTES]))
@@ -178,10 +177,10 @@ def _plausible(head: LayerHead) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class CodecConfig:
-    """How finely keyframes are coded.
+    """Quality of coded keyframes.
 
-    The step of inverse depth is uniform and set so that its rounding alone gives
-    ``depth_rms_m`` at ``reference_depth_m``; the error grows with the depth squared.
+    The step of inverse depth is uniform and set so that its rounding error is ``depth_rms_m`` at
+    ``reference_depth_m``; the error grows with the depth squared.
     """
 
     depth_rms_m: float = 0.00398
@@ -311,8 +310,8 @@ def _layer(
 def decode(layers: Sequence[bytes]) -> Keyframe | None:
     """The keyframe at the finest of ``layers`` that decodes; None when none does.
 
-    Any bytes are survived. ``time_ns`` is unix time, ``fresh`` marks the pixels carried, and
-    the depth of all others is NaN. A coarse layer gives a keyframe of its own, smaller grid.
+    Any bytes are safe. ``time_ns`` is unix time, ``fresh`` marks the coded pixels, and the depth
+    of all others is NaN. A coarse layer gives a keyframe with its own, smaller grid.
     """
     opened = [unpacked for data in layers if (unpacked := unpack(data)) is not None]
     for head, sections in sorted(opened, key=lambda o: -o[0].layer):
@@ -336,7 +335,7 @@ def _open_planes(head: LayerHead, sections: Sequence[bytes]) -> planes.Planes | 
     bgr = planes.decode_colour(colour, w, h)
     if depth_m is None or sigma_m is None or count is None or bgr is None:
         return None
-    known &= depth_m >= 0.5 * np.float32(MIN_DEPTH_M)  # what no encoder writes, but for rounding
+    known &= depth_m >= 0.5 * np.float32(MIN_DEPTH_M)  # minimum of any encoder
     return planes.Planes(depth_m, sigma_m, count, bgr, known)
 
 

@@ -1,9 +1,9 @@
-"""The SQLite file of a scan: its tables, one connection for all threads, and its repair.
+"""The SQLite file of a scan: tables, one connection for all threads, and repair.
 
-A store may come from a stranger's card. SQLite then runs whatever the file's schema says: a view
-instead of a table may never end, a trigger writes. So functions in the schema are not trusted,
-values have a largest length, a statement has a deadline, and a schema that is not exactly ours
-is refused before anything is read.
+A store may come from an untrusted source, and SQLite runs what the file's schema contains: a view
+in place of a table may never end, a trigger writes. So functions in the schema are not trusted,
+values have a maximum length, statements have a deadline, and a schema that is not exactly ours is
+refused before anything is read.
 """
 
 from __future__ import annotations
@@ -45,23 +45,23 @@ CREATE TABLE IF NOT EXISTS held (
 """
 
 MAX_VALUE_BYTES = 1 << 25
-"""Of a text or blob; the largest record has half of that."""
+"""Maximum length of a text or blob; the largest record has half of that."""
 MAX_OBJECTS = 64
 STATEMENT_S = 60.0
 SLOWEST_BYTES_S = 1e6
 """A statement may take STATEMENT_S, and longer where a slow card has that much to read."""
 STEPS = 100_000
-"""Of SQLite's machine between two looks at the clock; a statement of a scan has some hundred."""
+"""Steps of SQLite's virtual machine between two clock checks; a statement takes some hundred."""
 
 OUTSIDE = (
     "readonly", "read-only", "unable to open", "disk i/o", "disk is full", "is locked",
     "authorization denied",
 )  # fmt: skip
-"""Words in SQLite's messages that speak of the disk, not of the file."""
+"""Words in SQLite's messages that indicate a disk failure, not a damaged file."""
 
 
 class Deadline:
-    """Ends statements of one connection that take too long."""
+    """Aborts statements of one connection that take too long."""
 
     def __init__(self, connection: sqlite3.Connection, size_bytes: int) -> None:
         self._allowed_s = STATEMENT_S + size_bytes / SLOWEST_BYTES_S
@@ -69,7 +69,7 @@ class Deadline:
         connection.set_progress_handler(self._is_over, STEPS)
 
     def start(self) -> None:
-        """Give the next statement its time."""
+        """Start the time limit of the next statement."""
         self._end_s = time.monotonic() + self._allowed_s
 
     def _is_over(self) -> bool:
@@ -84,7 +84,7 @@ def connect(path: Path, read_only: bool = False) -> tuple[sqlite3.Connection, De
     except sqlite3.OperationalError:
         if not read_only or _has_log(path):
             raise
-        connection = _opened(path, "immutable=1")  # a disk on which not even locks can be written
+        connection = _opened(path, "immutable=1")  # a disk that cannot even hold locks
     size_bytes = path.stat().st_size if path.exists() else 0
     return connection, Deadline(connection, size_bytes)
 
@@ -101,7 +101,7 @@ def _opened(path: Path, how: str) -> sqlite3.Connection:
             connection.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
             connection.setlimit(sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH, 1)
         connection.execute("SELECT COUNT(*) FROM sqlite_master")  # opens the file
-    except UnicodeDecodeError as error:  # of SQLite's own message, which quotes the file
+    except UnicodeDecodeError as error:  # from SQLite's own message, which quotes the file
         connection.close()
         raise sqlite3.DatabaseError("its schema is damaged") from error
     except BaseException:
@@ -136,7 +136,7 @@ def check_schema(connection: sqlite3.Connection, path: Path) -> None:
 
 
 def _version(connection: sqlite3.Connection) -> int:
-    """Of the schema, as the file says; 0 when its meta table is not ours."""
+    """Schema version in the file; 0 when its meta table is not ours."""
     found = "SELECT type, tbl_name, sql FROM sqlite_master WHERE name = 'meta'"
     row = connection.execute(found).fetchone()
     if row is None or _ours()["meta"] != (row[0], row[1], _plain(row[2])):
@@ -148,7 +148,7 @@ def _version(connection: sqlite3.Connection) -> int:
 
 @cache
 def _ours() -> dict[str, tuple[str, str, str]]:
-    """Name to kind, table and text of what belongs in the file."""
+    """Name to kind, table and SQL of everything that belongs in the file."""
     connection = sqlite3.connect(":memory:")
     try:
         connection.executescript(SCHEMA)
@@ -163,10 +163,10 @@ def _plain(text: object) -> str:
 
 
 def as_error(path: Path, error: sqlite3.Error) -> InputError | OutsideError:
-    """What a failure to open a store means to a person."""
+    """The error to report for a failure to open a store."""
     text = str(error)
     if text == "interrupted":
-        return InputError(f"{path} takes too long to read; it is no scan database of ours")
+        return InputError(f"{path} takes too long to read; it is not a valid scan database")
     if any(word in text.lower() for word in OUTSIDE):
         return OutsideError(
             f"{path} cannot be opened ({text}); where its disk cannot be written, copy the scan's "
@@ -176,7 +176,7 @@ def as_error(path: Path, error: sqlite3.Error) -> InputError | OutsideError:
 
 
 def peek_meta(path: Path, key: str) -> str | None:
-    """A text of the meta table of a file that may be open elsewhere; None when there is none."""
+    """A text of the meta table, also while the file is open elsewhere; None without one."""
     try:
         connection, _ = connect(path, read_only=True)
         try:
@@ -195,12 +195,12 @@ Statement = tuple[str, tuple[Any, ...]]
 
 
 def blob(value: object) -> bytes:
-    """The bytes in a column; none when the file has something else there."""
+    """The bytes in a column; empty when the file has something else there."""
     return value if isinstance(value, bytes) else b""
 
 
 def json_value(text: object) -> Any:
-    """What a text of the file says; None unless it is JSON."""
+    """The value of a JSON text in the file; None for anything else."""
     try:
         return json.loads(text) if isinstance(text, str) else None
     except (ValueError, RecursionError):
@@ -216,13 +216,13 @@ def json_object(text: object) -> dict[str, Any]:
 class Database:
     """A connection in write-ahead mode with full synchronisation, safe between threads.
 
-    With ``read_only``, or where the disk cannot be written, nothing in the file is changed.
-    Raises InputError when the file is no database of this kind, OutsideError when the disk fails.
+    With ``read_only``, or on a disk that cannot be written, the file stays unchanged.
+    Raises InputError when the file is not such a database, OutsideError when the disk fails.
     """
 
     def __init__(self, path: Path, read_only: bool = False) -> None:
         self.path = path
-        self.uses: Counter[int] = Counter()  # queries that came back, by thread
+        self.uses: Counter[int] = Counter()  # completed queries, by thread
         self.lock = threading.RLock()
         self.read_only = read_only or not can_write(path)
         try:
@@ -263,9 +263,9 @@ class Database:
             raise OutsideError(f"cannot read {self.path} ({error}); check the disk") from error
 
     def write(self, statements: list[Statement]) -> int:
-        """Run statements in one transaction; how many rows changed.
+        """Run statements in one transaction; returns the number of changed rows.
 
-        Raises OutsideError when the disk is full or fails; nothing is changed then.
+        Raises OutsideError when the disk is full or fails; then nothing is changed.
         """
         with self.lock:
             self._deadline.start()
@@ -291,7 +291,7 @@ class Database:
         self.write([("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, value))])
 
     def close(self) -> None:
-        """Fold the write-ahead log into the file and close it."""
+        """Merge the write-ahead log into the file and close it."""
         with self.lock:
             try:
                 self._deadline.start()
@@ -306,7 +306,7 @@ TABLES = ("meta", "chunks", "poses", "reposes", "radio", "held")
 
 
 def is_sound(path: Path) -> bool:
-    """Whether SQLite finds no fault in the file; one that is merely busy counts as sound.
+    """Whether SQLite finds no fault in the file; a busy file counts as sound.
 
     Raises InputError when its schema is not that of a scan.
     """
@@ -324,10 +324,10 @@ def is_sound(path: Path) -> bool:
 
 
 def rescue(path: Path) -> int:
-    """Replace the database at ``path`` by one of all rows that can be read; how many.
+    """Replace the database at ``path`` by one with all readable rows; returns their number.
 
-    The damaged file stays beside it as ``<name>.damaged``. Raises InputError when not even
-    the scan's header can be read, and changes nothing then.
+    The damaged file is kept as ``<name>.damaged``. Raises InputError and changes nothing when the
+    scan's header cannot be read.
     """
     fresh = path.with_name(path.name + ".rescued")
     fresh.unlink(missing_ok=True)
@@ -353,7 +353,9 @@ def rescue(path: Path) -> int:
         path.with_name(path.name + suffix).unlink(missing_ok=True)
     path.replace(path.with_name(path.name + ".damaged"))
     fresh.replace(path)
-    log.warning("%s was damaged; %d rows are kept, the old file is beside it", path, kept)
+    log.warning(
+        "%s was damaged; %d rows are recovered, the old file is kept as .damaged", path, kept
+    )
     return kept
 
 

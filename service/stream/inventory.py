@@ -1,4 +1,4 @@
-"""What a store holds, by kind and number, kept in memory; and who hears of news."""
+"""The items of a store, by kind and number, in memory; notifies listeners of new ones."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ SELECT id FROM reposes one WHERE {is_number("one.id")} AND NOT EXISTS (
 class Inventory:
     """The numbers of the items of one scan; guarded by the database's lock.
 
-    Header and summary are numbered by the CRC-32 of their JSON, so that a change shows. Of the
-    re-poses of a keyframe only the one in force counts.
+    Header and summary are numbered by the CRC-32 of their JSON, so that changes are visible.
+    Only the re-pose in force of each keyframe counts.
     """
 
     def __init__(self, database: Database) -> None:
@@ -53,27 +53,26 @@ class Inventory:
             return {kind: ranges.copy() for kind, ranges in self._numbers.items() if ranges}
 
     def of(self, kind: str) -> RangeSet:
-        """The numbers of one kind; not to be changed."""
+        """The numbers of one kind; do not modify."""
         return self._numbers.setdefault(kind, RangeSet())
 
     def has_repose(self, number: int) -> bool:
-        """Whether that re-pose is stored, in force or not."""
+        """Whether this re-pose is stored, in force or not."""
         return number in self._reposes
 
     def note(self, kind: str, number: int) -> None:
-        """Take in a new item and tell the listeners."""
+        """Add an item and notify the listeners."""
         self.of(kind).add(number)
         for listener in self._listeners:
             listener(kind, number)
 
     def note_whole(self, kind: str, data: bytes) -> None:
-        """Take in a new header or summary, which replaces the former."""
+        """Set a new header or summary, which replaces the previous one."""
         self._numbers[kind] = RangeSet()
         self.note(kind, zlib.crc32(data))
 
     def note_repose(self, number: int, seq: int, revision: int) -> None:
-        """Take in a re-pose that was stored; the highest revision, then the highest number, is in
-        force."""
+        """Add a stored re-pose; the highest revision, then the highest number, is in force."""
         self._reposes.add(number)
         sql = "SELECT revision, id FROM reposes WHERE seq = ? AND id != ? ORDER BY 1 DESC, 2 DESC"
         before = self._database.one(f"{sql} LIMIT 1", (seq, number))
@@ -84,12 +83,12 @@ class Inventory:
         self.note("repose", number)
 
     def listen(self, listener: Listener) -> None:
-        """Have ``listener(kind, number)`` called after each new item, by the writing thread."""
+        """Call ``listener(kind, number)`` after each new item, on the writing thread."""
         with self._lock:
             self._listeners.append(listener)
 
     def unlisten(self, listener: Listener) -> None:
-        """End what :meth:`listen` began."""
+        """Remove a listener."""
         with self._lock:
             self._listeners.remove(listener)
 

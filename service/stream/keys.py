@@ -1,10 +1,10 @@
-"""A fleet: its members, what each may do, and their keys.
+"""A fleet: its members, their rights, and their keys.
 
-There is one authority, and a certificate per drone, ground station and viewer with the common
-name ``<role>.<name>``. Only ground stations may be called (server use), so a drone's stolen key
-cannot pose as a ground station. ``fleet.json`` in a ground station's folder names the members,
-and so takes the rights of a revoked drone or viewer. A drone trusts every ground station of its
-authority, so a ground station is revoked by a new authority.
+There is one authority, and one certificate per drone, ground station and viewer with the common
+name ``<role>.<name>``. Only ground stations have server certificates, so a drone's stolen key
+cannot impersonate a ground station. ``fleet.json`` in a ground station's folder lists the members;
+removing a drone or viewer from it revokes its rights. A drone trusts every ground station of its
+authority, so revoking a ground station needs a new authority.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ ROLES = ("drone", "ground", "viewer")
 
 @dataclass(frozen=True, slots=True)
 class Fleet:
-    """The members of a fleet by role, and how many certificates of each subject are revoked."""
+    """The members of a fleet by role, and the number of revoked certificates per subject."""
 
     members: dict[str, tuple[str, ...]] = field(default_factory=dict)
     revoked: dict[str, int] = field(default_factory=dict)  # by "<role>.<name>"
@@ -41,17 +41,17 @@ class Fleet:
         return Fleet({**self.members, role: merged}, self.revoked)
 
     def without(self, role: str, name: str) -> Fleet:
-        """The fleet without a member, whose certificate never has rights again."""
+        """The fleet without a member, whose certificates lose all rights permanently."""
         subject = f"{role}.{name}"
         rest = tuple(other for other in self.members[role] if other != name)
         revoked = {**self.revoked, subject: self.revoked.get(subject, 0) + 1}
         return Fleet({**self.members, role: rest}, revoked)
 
     def common_name(self, role: str, name: str) -> str:
-        """The common name of the only valid certificate of a member.
+        """The common name of a member's only valid certificate.
 
         ``<role>.<name>``, and after a revocation ``<role>.<name>~2``, ``~3`` and so on: no name
-        holds a tilde, so an old certificate never matches again.
+        contains a tilde, so an old certificate never matches again.
         """
         subject = f"{role}.{name}"
         count = self.revoked.get(subject, 0)
@@ -59,7 +59,7 @@ class Fleet:
 
 
 def load_fleet(path: Path) -> Fleet:
-    """The fleet that a ``fleet.json`` names; raises InputError when there is none."""
+    """The fleet in a ``fleet.json``; raises InputError when it is missing or invalid."""
     try:
         raw = json.loads(path.read_text(encoding="utf-8"))
         members = {role: tuple(map(str, raw[role])) for role in ROLES if role in raw}
@@ -75,10 +75,9 @@ def load_fleet(path: Path) -> Fleet:
 def access_control(fleet: Fleet) -> dict[str, Any]:
     """Zenoh's access control for a ground station's router.
 
-    A drone reaches only what lies under its own key. A viewer only reads. A ground station
-    reads, asks, and reports under its own name. Whoever is not of the fleet, or no longer, may
-    do nothing: Zenoh checks no revocation lists, so a revoked certificate still connects but has
-    no rights.
+    A drone may only use keys below its own. A viewer may only read. A ground station may read,
+    query, and report under its own name. Others may do nothing: Zenoh checks no revocation lists,
+    so a revoked certificate still connects but has no rights.
     """
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
@@ -133,7 +132,7 @@ def access_control(fleet: Fleet) -> dict[str, Any]:
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
 CA_DAYS = 3650
 EVER = datetime.datetime(1970, 1, 1, tzinfo=datetime.timezone.utc)
-"""Certificates hold from then on: an aircraft's clock may be at its very beginning."""
+"""Certificates are valid from this date, because an aircraft's clock may be unset."""
 
 
 def tls_files(folder: Path) -> tuple[str, str, str]:
@@ -146,7 +145,7 @@ def tls_files(folder: Path) -> tuple[str, str, str]:
 
 
 def expiry_unix_s(certificate: Path) -> float:
-    """Until when a certificate (PEM) holds; InputError for a file that is none.
+    """Expiry of a certificate (PEM), unix s; InputError for any other file.
 
     Raises OutsideError without the ``cryptography`` package.
     """
@@ -154,7 +153,7 @@ def expiry_unix_s(certificate: Path) -> float:
 
 
 def member_name(certificate: Path) -> str:
-    """The name of the member whose certificate (PEM) this is; InputError for another file.
+    """Name of the member in a certificate (PEM); InputError for any other file.
 
     Raises OutsideError without the ``cryptography`` package.
     """
@@ -174,16 +173,16 @@ def _read(certificate: Path) -> x509.Certificate:
     try:
         return x509.load_pem_x509_certificate(certificate.read_bytes())
     except (OSError, ValueError) as error:
-        raise InputError(f"{certificate} is no certificate ({error})") from error
+        raise InputError(f"{certificate} is not a certificate ({error})") from error
 
 
 def make_keys(
     folder: Path, members: Mapping[str, Sequence[str]], days: int = 365, now: float | None = None
 ) -> list[Path]:
-    """Certificates for new ``members`` (role to names) under ``folder``; their folders.
+    """Make certificates for new ``members`` (role to names); returns their folders.
 
-    The authority is made the first time and used again after. Members that have keys keep
-    them. Raises InputError for bad names, OutsideError without the ``cryptography`` package.
+    The authority is created once and reused. Members with keys keep them. Raises InputError for
+    invalid names, OutsideError without the ``cryptography`` package.
     """
     for names in members.values():
         for name in names:
@@ -210,11 +209,11 @@ def make_keys(
 
 
 def revoke(folder: Path, member: str, days: int = 365, now: float | None = None) -> list[Path]:
-    """Revoke the certificate of ``member`` (a name, or ``<role>.<name>``); what to copy again.
+    """Revoke the certificate of ``member`` (a name, or ``<role>.<name>``); returns files to copy.
 
-    A drone or viewer loses its rights with the ``fleet.json`` of every ground station. With a
-    ground station the authority ends: all other members get new keys under a new one. What was
-    valid is kept under ``folder/revoked``. Raises InputError for an unknown name.
+    A drone or viewer loses its rights through the ``fleet.json`` of every ground station. For a
+    ground station the authority is replaced, and all other members get new keys. Revoked files are
+    moved to ``folder/revoked``. Raises InputError for an unknown name.
     """
     fleet = load_fleet(folder / FLEET)
     role, name = _named(fleet, member)
@@ -238,10 +237,10 @@ def _named(fleet: Fleet, member: str) -> tuple[str, str]:
     everybody = [(role, name) for role, names in fleet.members.items() for name in names]
     found = [both for both in everybody if member in (both[1], ".".join(both))]
     if not found:
-        raise InputError(f"no member of this fleet is called {member!r}")
+        raise InputError(f"this fleet has no member {member!r}")
     if len(found) > 1:
         names = " or ".join(".".join(both) for both in found)
-        raise InputError(f"{member!r} is the name of several: give {names}")
+        raise InputError(f"{member!r} is ambiguous: give {names}")
     return found[0]
 
 
@@ -257,7 +256,7 @@ def _put_away(folder: Path, home: Path) -> None:
 
 
 def _write_fleet(folder: Path, fleet: Fleet) -> list[Path]:
-    """Write ``fleet.json`` for the folder and every ground station; the ground stations'."""
+    """Write ``fleet.json`` for the folder and every ground station; returns the latter."""
     text = json.dumps({**fleet.members, "revoked": fleet.revoked}, indent=2) + "\n"
     stations = [folder / "ground" / name for name in fleet.members.get("ground", ())]
     copies = [home / FLEET for home in stations if home.is_dir()]

@@ -1,4 +1,4 @@
-"""The drone's end of the datalink: offers what the store gets to whoever listens."""
+"""The drone's end of the datalink: sends the items of its stores to ground stations."""
 
 from __future__ import annotations
 
@@ -31,31 +31,31 @@ log = logging.getLogger(__name__)
 
 MAX_WAITING_EVENTS = 100_000
 CHANNEL = 256
-"""Messages that may wait between the session and each of our threads."""
+"""Maximum queued messages between the session and each of our threads."""
 MAX_WAITING_ASKS = 64
 RETRY_S = 1.0
-"""From one attempt to open a session to the next, at least; a tenth of it after a timeout."""
+"""Minimum interval between attempts to open a session; a tenth of it after a timeout."""
 SILENCE_S = 5.0
-"""When stations that were heard fall silent for so long, a new session is opened: TCP
-waits longer and longer before it tries a dead connection again."""
+"""When all stations heard so far are silent for this long, a new session is opened: TCP backs off
+before it retries a dead connection."""
 FIRST_PATIENCE_S, MIN_PATIENCE_S = 10.0, 1.5
 PATIENCE = 3.0
-"""An attempt to open a session may take so many times what the last one took: a fresh call finds
-a link that is back sooner than one whose waits have grown."""
+"""Timeout of an attempt, as a multiple of the last one: a new session finds a recovered link sooner
+than one whose retries have backed off."""
 PATIENT_ATTEMPT = 20
 CLOSING_S, PROMPT_CLOSING_S = 15.0, 1.0
 """Closing a session over a dead link takes Zenoh 10 s and more; only the process's end waits."""
 PRIORITIES = ("REAL_TIME", "INTERACTIVE_HIGH", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND")
-"""Zenoh's priority of each lane of the outbox."""
+"""Zenoh's priority for each lane of the outbox."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkProgress:
-    """How far the datalink has got with the scans it offers."""
+    """Progress of the datalink with the scans it offers."""
 
-    connected: bool  # to a router
-    listened: bool  # a ground station was heard of late
-    items: int  # in the stores: poses, layers …
+    connected: bool  # connected to a router
+    listened: bool  # a ground station was heard recently
+    items: int  # items in the stores: poses, layers …
     lacking: dict[str, int] = field(default_factory=dict)  # by kind, at the best ground station
     sent_bytes: int = 0
     rate_kbit_s: float = 0.0  # allowed now; below the budget when less comes through

@@ -1,9 +1,8 @@
-"""What travels on the datalink: records cut into paced parts, and small JSON messages.
+"""Messages of the datalink: records cut into paced parts, and small JSON messages.
 
-A message of items is a run of parts; a part carries a piece of one record (a chunk layer, a
-pose …). Bytes are in ``docs/wire.md``. Foreign bytes are dropped and counted. Every number in
-the JSON messages (what a drone has, what a ground holds and asks) is bounded by what it means; a
-message that breaks a bound is no message.
+A message of items is a sequence of parts; a part carries a piece of one record (a chunk layer, a
+pose …). ``docs/wire.md`` specifies the bytes. Invalid bytes are dropped and counted. Every number
+in the JSON messages has a plausible range; a message that violates one is invalid.
 """
 
 from __future__ import annotations
@@ -38,15 +37,15 @@ MAX_COUNTED = (1 << 24) - 1
 """The highest number of a pose, re-pose or keyframe: ten a second for 19 days."""
 MAX_OPEN_RECORDS = 64
 MAX_OPEN_BYTES = 1 << 25
-"""Unfinished records beyond either limit make way, the stalest first."""
+"""Above either limit unfinished records are dropped, the oldest first."""
 PIECE_BYTES = 160
-"""What keeping a part takes beyond its payload."""
+"""Memory per part beyond its payload."""
 
 KINDS = {0: "header", 1: "summary", 2: "pose", 3: "repose"} | {16 + k: f"k{k}" for k in range(8)}
 """Code of a part to the kind of its record: ``k0`` is the coarsest layer of a keyframe."""
 CODES = {name: code for code, name in KINDS.items()}
 WHOLE = ("header", "summary")
-"""Kinds of which a scan has one; a new one replaces the former."""
+"""Kinds of which a scan has one; a new one replaces the previous one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +79,7 @@ class Part:
 
 
 def split(kind: str, number: int, record: bytes, part_bytes: int) -> list[Part]:
-    """The parts of ``record``, equally large but for the last, each of at most ``part_bytes``."""
+    """The parts of ``record``, of equal size except the last, each at most ``part_bytes``."""
     count = max(1, -(-len(record) // max(part_bytes, 1)))
     return split_in(kind, number, record, min(count, MAX_PARTS))
 
@@ -97,7 +96,7 @@ def split_in(kind: str, number: int, record: bytes, count: int) -> list[Part]:
 
 
 def parse(message: bytes) -> Iterator[Part]:
-    """The parts in a message, up to the first byte that does not belong."""
+    """The parts in a message, up to the first invalid byte."""
     at = 0
     while at + HEAD_BYTES <= len(message):
         magic, version, code, number, index, count, total, crc, size = _HEAD.unpack_from(
@@ -123,8 +122,8 @@ def parse(message: bytes) -> Iterator[Part]:
 
 
 def _size_of(index: int, count: int, total: int) -> int:
-    """Bytes of a part: all but the last have the same size, and none is empty but that of an
-    empty record. -1 when no record is cut like that."""
+    """Bytes of a part: all but the last have the same size, and only an empty record has an empty
+    part. -1 when no record is cut like that."""
     step = max(1, -(-total // count))
     left = total - index * step
     if count > 1 and total - (count - 1) * step <= 0:
@@ -146,13 +145,13 @@ class _Open:
 
 
 class Assembler:
-    """Collects parts in any order and gives each record once it is whole and sound."""
+    """Collects parts in any order and returns each record once it is complete and valid."""
 
     def __init__(self) -> None:
         self._open: dict[tuple[str, int], _Open] = {}
         self._bytes = 0
         self.spoiled = 0  # records whose checksum failed
-        self.repeated = 0  # parts that came twice
+        self.repeated = 0  # duplicate parts
 
     def add(self, part: Part, now: float) -> bytes | None:
         """The record that ``part`` completes, or None."""
@@ -180,28 +179,28 @@ class Assembler:
 
     @property
     def held_bytes(self) -> int:
-        """What the unfinished records take."""
+        """Memory used by unfinished records."""
         return self._bytes
 
     def missing_parts(self, kind: str, number: int) -> list[int] | None:
-        """The parts still to come of a record that has begun; None when it has not."""
+        """The missing parts of a record in progress; None for any other."""
         entry = self._open.get((kind, number))
         if entry is None:
             return None
         return [k for k in range(entry.count) if k not in entry.pieces]
 
     def count(self, kind: str, number: int) -> int:
-        """How many parts a record that has begun is cut into; 0 when it has not."""
+        """Number of parts of a record in progress; 0 for any other."""
         entry = self._open.get((kind, number))
         return 0 if entry is None else entry.count
 
     def touched(self, kind: str, number: int) -> float | None:
-        """When a part of the record came last; None when it has not begun."""
+        """Time of the last part of a record in progress; None for any other."""
         entry = self._open.get((kind, number))
         return None if entry is None else entry.touched
 
     def forget(self, kind: str, number: int) -> None:
-        """Drop what came of a record."""
+        """Discard the parts of a record."""
         entry = self._open.pop((kind, number), None)
         if entry is not None:
             self._bytes -= entry.held_bytes
@@ -226,7 +225,7 @@ Numbers = dict[str, RangeSet]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Head:
-    """What the drone has of a scan, and which of it is about to come by itself."""
+    """The items of a scan that the drone has, and those it is about to send unrequested."""
 
     numbers: Numbers
     live: Numbers = field(default_factory=dict)
@@ -243,7 +242,7 @@ class Held:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ask:
-    """What goes with a request for items: who asks and, for one record, which parts."""
+    """Details of a request for items: the sender and, for one record, its parts."""
 
     peer: str
     parts: RangeSet | None = None  # None for all
@@ -347,9 +346,9 @@ def pairs_of(numbers: Numbers) -> dict[str, Pairs]:
 
 
 def numbers_from(raw: dict[str, Pairs]) -> Numbers | None:
-    """The sets in decoded JSON; kinds that this version does not know are passed over.
+    """The sets in decoded JSON; unknown kinds are ignored.
 
-    None when a number cannot be: a scan has one header, one summary, and counts the rest.
+    None for an implausible number: a scan has one header, one summary, and numbers the rest.
     """
     out: Numbers = {}
     for kind, pairs in raw.items():
@@ -363,11 +362,11 @@ def numbers_from(raw: dict[str, Pairs]) -> Numbers | None:
 
 
 def missing(wanted: Numbers, held: Numbers) -> Numbers:
-    """What is in ``wanted`` and not in ``held``; kinds of which nothing lacks are left out."""
+    """Items in ``wanted`` and not in ``held``; kinds without any are left out."""
     lacks = {kind: ranges - held.get(kind, RangeSet()) for kind, ranges in wanted.items()}
     return {kind: ranges for kind, ranges in lacks.items() if ranges}
 
 
 def count(numbers: Numbers) -> int:
-    """How many items there are in all."""
+    """Total number of items."""
     return sum(len(ranges) for ranges in numbers.values())

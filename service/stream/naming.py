@@ -1,4 +1,4 @@
-"""What drones, scans and stations may be called, and the keys that are made of it."""
+"""Valid names of drones, scans and stations, and the keys made of them."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ ROOT = "skyrelief"
 
 MAX_NAME = 64
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-"""What a drone, scan or station may be called."""
+"""Pattern of a drone, scan or station name."""
 
 RUN = re.compile(r"(.+)\.([0-9a-f]{32})")
-"""A scan as it is called on the datalink: its own name, a dot, and its run."""
+"""Name of a scan on the datalink: its own name, a dot, and its run."""
 
 
 def scan_name(scan_id: str, run_id: str) -> str:
-    """What a scan is called on the datalink: two runs of the same time have different names."""
+    """The scan's name on the datalink; two runs at the same time have different names."""
     return f"{scan_id}.{run_id}" if run_id else scan_id
 
 
 def split_scan_name(name: str) -> tuple[str, str]:
-    """Scan and run of a name; the run is empty for drones that do not tell it."""
+    """Scan and run of a name; the run is empty for drones that do not send it."""
     found = RUN.fullmatch(name)
     return (found[1], found[2]) if found else (name, "")
 
@@ -42,7 +42,7 @@ def check_name(name: str, what: str) -> str:
 
 
 def place_of(key: str) -> tuple[str, str] | None:
-    """(drone, scan) of a key; None when either name could not be a folder."""
+    """(drone, scan) of a key; None when either is not a valid folder name."""
     parts = key.split("/")
     if len(parts) < 4 or not (NAME.fullmatch(parts[1]) and NAME.fullmatch(parts[2])):
         return None
@@ -50,7 +50,7 @@ def place_of(key: str) -> tuple[str, str] | None:
 
 
 def station_name(store: Path) -> str:
-    """The name of the ground station with this store, made once and kept in it."""
+    """The name of the ground station with this store, created once and kept in it."""
     path = store / "station.txt"
     if path.exists():
         name = path.read_text(encoding="utf-8").strip()

@@ -1,8 +1,8 @@
 """The drone's side of the datalink, without sockets or clocks: what to send next, and when.
 
-Lanes in order: status, pose, coarse live, small records and coarse layers asked for, fine
-live, fine layers asked for. Everything is paid from one token bucket. Live lanes are short
-and newest first: what does not fit waits in the store until a ground station asks for it.
+Lanes in order: status, pose, coarse live, requested small records and coarse layers, fine live,
+requested fine layers. One token bucket limits all. Live lanes are short, newest first; items that
+do not fit wait in the store until a ground station requests them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from service.stream.ranges import RangeSet
 from service.stream.store import ScanStore
 
 MAX_ASKED = 512
-"""Numbers of one request that are answered; the ground asks again for the rest."""
+"""Maximum numbers answered per request; the ground requests the rest again."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,51 +43,51 @@ class Outgoing:
     topic: str  # "head", or "item/<kind>/<numbers>"
     payload: bytes
     lane: int = 0
-    token: Hashable | None = None  # of the request that it answers; None for a live message
-    last: bool = False  # no more will answer that request
+    token: Hashable | None = None  # the request that it answers; None for a live message
+    last: bool = False  # it completes that request
 
 
 def load(store: ScanStore, kind: str, number: int, part_bytes: int) -> list[Part]:
-    """The parts of a stored record; none when the store does not hold it."""
+    """The parts of a stored record; empty when the store does not hold it."""
     record = store.record(kind, number)
     return [] if record is None else split(kind, number, record, part_bytes)
 
 
 class LiveLane:
-    """New items on their way to whoever listens; at most ``room``, the oldest make way."""
+    """New items to send unrequested; holds at most ``room``, then drops the oldest."""
 
     def __init__(self, room: int) -> None:
         self._room = room
         self._queue: deque[tuple[ScanStore, str, int]] = deque()
         self._messages: deque[Outgoing] = deque()
         self._current: tuple[ScanStore, str, int] | None = None
-        self.skipped = 0  # items that made way
+        self.skipped = 0  # dropped items
 
     def push(self, store: ScanStore, kind: str, number: int) -> None:
-        """Put a new item in front."""
+        """Add a new item at the front."""
         self._queue.append((store, kind, number))
         while len(self._queue) > self._room:
             self._queue.popleft()
             self.skipped += 1
 
     def clear(self) -> None:
-        """Drop everything: nobody listens."""
+        """Drop everything: no station listens."""
         self.skipped += len(self._queue)
         self._queue.clear()
         self._messages.clear()
         self._current = None
 
     def sending(self, store: ScanStore, kind: str, number: int) -> bool:
-        """Whether parts of this item are being sent right now."""
+        """Whether parts of this item are being sent now."""
         return self._current == (store, kind, number)
 
     def discard(self, store: ScanStore, kind: str, number: int) -> None:
-        """Take out an item that is about to travel as an answer."""
+        """Remove an item that is about to be sent as an answer."""
         if (store, kind, number) in self._queue:
             self._queue.remove((store, kind, number))
 
     def numbers(self, store: ScanStore) -> dict[str, RangeSet]:
-        """What of ``store`` is still to come."""
+        """Items of ``store`` still queued."""
         out: dict[str, RangeSet] = {}
         for item in (*self._queue, self._current):
             if item is not None and item[0] is store:
@@ -107,7 +107,7 @@ class LiveLane:
         return self._messages[0]
 
     def pop(self) -> None:
-        """Remove the message that :meth:`peek` gave."""
+        """Remove the message that :meth:`peek` returned."""
         self._messages.popleft()
         if not self._messages:
             self._current = None
@@ -115,7 +115,7 @@ class LiveLane:
 
 @dataclass(slots=True, eq=False)
 class Request:
-    """Items of one kind that a ground station asked for."""
+    """Items of one kind that a ground station requested."""
 
     store: ScanStore
     ask: Ask
@@ -126,14 +126,14 @@ class Request:
 
 
 class AskedLane:
-    """Answers, in turn to each ground station that asked; one request of each at a time."""
+    """Answers to each ground station in turn; one request of each at a time."""
 
     def __init__(self) -> None:
         self._turn: deque[Request] = deque()
         self._messages: deque[Outgoing] = deque()
 
     def push(self, request: Request) -> Hashable | None:
-        """Queue a request; the token of the one it takes the place of, if any."""
+        """Queue a request; returns the token of the request it replaces, if any."""
         replaced = None
         for old in list(self._turn):
             if old.ask.peer == request.ask.peer and old.store is request.store:
@@ -166,7 +166,7 @@ class AskedLane:
         return self._messages[0] if self._messages else None
 
     def pop(self) -> None:
-        """Remove the message that :meth:`peek` gave."""
+        """Remove the message that :meth:`peek` returned."""
         self._messages.popleft()
 
     def _some(self, request: Request, part_bytes: int) -> list[Part]:
@@ -181,7 +181,7 @@ class AskedLane:
 
 
 def _wanted(request: Request, number: int, part_bytes: int) -> list[Part]:
-    """The parts of a record that the request names, cut as the station knows it."""
+    """The parts of a record that the request names, cut as the station has it."""
     record = request.store.record(request.kind, number)
     if record is None:
         return []
@@ -210,25 +210,25 @@ STATUS, POSE, COARSE, ASKED, FINE, BACKFILL = range(6)
 
 PEER_TIMEOUT_S = 8.0
 MAX_STATIONS = 8
-"""Ground stations that a drone serves; another one has to wait until one of them is silent."""
+"""Maximum ground stations served; another one waits until one of them is silent."""
 MAX_ESTIMATES = 256
-"""Rates of stations that are kept over a new session."""
+"""Rates of stations that are kept across sessions."""
 HEAD_AFTER_NEWS_S = 0.5
 HEAD_IDLE_S = 2.0
 HEAD_COMPLETE_S = 10.0
 POSE_ROOM, COARSE_ROOM, FINE_ROOM = 64, 32, 2
-"""Items that may wait in each live lane."""
+"""Capacity of each live lane."""
 
 
 @dataclass(slots=True, eq=False)
 class _Feed:
-    """One scan on offer."""
+    """One offered scan."""
 
     store: ScanStore
     head_due: float
     head_sent: float = -1e9
     held: dict[str, Numbers] = field(default_factory=dict)
-    sent_bytes: int = 0  # parts of this scan's items
+    sent_bytes: int = 0  # for parts of this scan's items
 
 
 class Outbox:
@@ -236,7 +236,7 @@ class Outbox:
 
     def __init__(self, rate_bytes_s: float, now: float) -> None:
         self.bucket = TokenBucket(rate_bytes_s, now)
-        self.sent_bytes = 0  # on the wire, as the bucket counts
+        self.sent_bytes = 0  # on the wire, as counted by the bucket
         self._feeds: dict[str, _Feed] = {}
         self._live = {
             POSE: LiveLane(POSE_ROOM),
@@ -250,19 +250,19 @@ class Outbox:
         self._head: Outgoing | None = None
 
     def add(self, store: ScanStore, now: float) -> None:
-        """Offer a scan; one with the same id takes the place of the former."""
+        """Offer a scan; it replaces a scan of the same id."""
         self._feeds[store.header.name] = _Feed(store, head_due=now)
 
     def remove(self, scan_id: str) -> None:
-        """Offer a scan no more."""
+        """Stop offering a scan."""
         self._feeds.pop(scan_id, None)
 
     @property
     def skipped(self) -> int:
-        """Live items that made way and wait in the store."""
+        """Live items that were dropped; they remain in the store."""
         return sum(lane.skipped for lane in self._live.values())
 
-    # What happens
+    # Events
 
     def news(self, scan_id: str, kind: str, number: int, now: float) -> None:
         """The store of ``scan_id`` has a new item."""
@@ -276,15 +276,15 @@ class Outbox:
         self._live[lane].push(feed.store, kind, number)
 
     def offers(self, scan_id: str) -> bool:
-        """Whether a scan is on offer."""
+        """Whether a scan is offered."""
         return scan_id in self._feeds
 
     def serves(self, peer: str) -> bool:
-        """Whether a ground station is one of those served."""
+        """Whether a ground station is served."""
         return peer in self._heard
 
     def held(self, scan_id: str, peer: str, report: Held, now: float) -> bool:
-        """A ground station reports what it holds; False when it is not served."""
+        """A ground station reports its items; False when it is not served."""
         feed = self._feeds.get(scan_id)
         is_first = not self.listened(now)
         if feed is None or not self._hear(peer, now):
@@ -301,13 +301,13 @@ class Outbox:
         return True
 
     def _catch_up(self, feed: _Feed, held: Numbers) -> None:
-        """Put the newest coarse layers that a station lacks, when it listens at last."""
+        """Queue the newest coarse layers that a new station lacks."""
         lacks = feed.store.numbers().get("k0", RangeSet()) - held.get("k0", RangeSet())
         for number in reversed(list(islice(lacks.newest_first(), COARSE_ROOM))):
             self._live[COARSE].push(feed.store, "k0", number)
 
     def reconnected(self, now: float) -> None:
-        """The connection is a new one: nobody was heard on it, and nothing is under way."""
+        """The connection is new: no station was heard on it, and nothing is in flight."""
         self._heard.clear()
         self._estimates = dict(list(self._estimates.items())[-MAX_ESTIMATES:])
         for estimate in self._estimates.values():
@@ -319,13 +319,13 @@ class Outbox:
             feed.head_due = now
 
     def set_rate(self, rate_bytes_s: float, now: float) -> None:
-        """Change what may be sent per second; the link's own pace may keep it lower."""
+        """Change the maximum rate; congestion may lower it."""
         self._configured = rate_bytes_s
         self._estimates.clear()
         self._adapt(now)
 
     def _adapt(self, now: float) -> None:
-        """Keep to what the best supplied ground station receives."""
+        """Adapt to the rate that the best supplied ground station receives."""
         rates = [
             estimate.rate_bytes_s
             for (_, peer), estimate in self._estimates.items()
@@ -336,9 +336,9 @@ class Outbox:
     def ask(
         self, scan_id: str, kind: str, numbers: RangeSet, ask: Ask, token: Hashable, now: float
     ) -> list[Hashable]:
-        """A ground station asks for items; the tokens of requests that are over by this.
+        """A ground station requests items; returns the tokens of requests that this ends.
 
-        A request takes the place of the same station's former one in its lane.
+        A request replaces the station's previous one in its lane.
         """
         feed = self._feeds.get(scan_id)
         if feed is None or kind not in CODES or not self._hear(ask.peer, now):
@@ -356,12 +356,12 @@ class Outbox:
         return [] if replaced is None else [replaced]
 
     def publish_heads(self, now: float) -> None:
-        """Send the heads as soon as may be: somebody new looks around."""
+        """Send the heads as soon as possible, for a new station."""
         for feed in self._feeds.values():
             feed.head_due = min(feed.head_due, max(now, feed.head_sent + HEAD_AFTER_NEWS_S))
 
     def _hear(self, peer: str, now: float) -> bool:
-        """Note that a station listens; False for one too many."""
+        """Note that a station listens; False when too many do."""
         if peer not in self._heard and len(self._heard) >= MAX_STATIONS:
             silent = min(self._heard, key=self._heard.__getitem__)
             if now - self._heard[silent] < PEER_TIMEOUT_S:
@@ -374,7 +374,7 @@ class Outbox:
         self._heard[peer] = now
         return True
 
-    # What to do
+    # Output
 
     def next(self, now: float) -> Outgoing | float:
         """The message to send now, or the seconds to wait; any event may shorten the wait."""
@@ -426,7 +426,7 @@ class Outbox:
         return self._head
 
     def head(self, scan_id: str) -> Head:
-        """What the drone has of a scan it offers. Raises KeyError for another."""
+        """The head of an offered scan. Raises KeyError for any other."""
         store = self._feeds[scan_id].store
         live: Numbers = {}
         for lane in self._live.values():
@@ -434,17 +434,17 @@ class Outbox:
         return Head(store.numbers(), live, store.finished)
 
     def listened(self, now: float) -> bool:
-        """Whether any ground station was heard of late."""
+        """Whether a ground station was heard recently."""
         return any(now - at < PEER_TIMEOUT_S for at in self._heard.values())
 
     def lacking(self, scan_id: str) -> Numbers:
-        """What the best supplied ground station still lacks of a scan on offer."""
+        """Items of an offered scan that the best supplied ground station lacks."""
         best = self.best(scan_id)
         numbers = self._feeds[scan_id].store.numbers()
         return numbers if best is None else missing(numbers, best[1])
 
     def best(self, scan_id: str) -> tuple[str, Numbers] | None:
-        """The best supplied ground station and what it holds; None when none has reported."""
+        """The best supplied ground station and its items; None without a report."""
         feed = self._feeds[scan_id]
         numbers = feed.store.numbers()
         return min(
@@ -452,5 +452,5 @@ class Outbox:
         )
 
     def complete(self, scan_id: str) -> bool:
-        """Whether some ground station holds everything that the scan has so far."""
+        """Whether some ground station holds all items of the scan so far."""
         return not self.lacking(scan_id)

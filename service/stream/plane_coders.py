@@ -1,13 +1,12 @@
 """Lossless coding of a keyframe's mask, and of its depth codes with the holes of that mask.
 
-The mask is coded by an adaptive binary range coder: each pixel's probability is learnt per
-context of 12 neighbours that were coded before it, so that ragged outlines cost a fraction of
-what zlib makes of the bits.
+The mask is coded by an adaptive binary range coder: the probability of each pixel is learnt per
+context of 12 previously coded neighbours, which codes ragged outlines far better than zlib.
 
-Depth codes: each known pixel is predicted from up to ten known neighbours that were coded before
-it, with weights fitted to the picture; unknown pixels cost nothing and disturb nobody. JPEG-LS
-knows no holes, and its three-neighbour predictor triples the variance of noise. The section is
-nine int16 weights (little-endian, 4096 is one) and a zlib stream (Huffman only).
+Depth codes: each known pixel is predicted from up to ten known, previously coded neighbours, with
+weights fitted to the image; unknown pixels cost nothing. JPEG-LS has no notion of holes, and its
+three-neighbour predictor triples the variance of noise. The section is nine int16 weights
+(little-endian, 4096 is one) and a zlib stream (Huffman only).
 
 The bytes are specified in ``docs/wire.md``.
 """
@@ -74,7 +73,7 @@ def _encode_bits(padded: U8, h: int, w: int) -> tuple[U8, int]:
                 low += bound
                 span -= bound
                 chances[context] = chance - (chance >> RATE)
-                if low > 0xFFFFFFFF:  # the carry runs back through bytes written
+                if low > 0xFFFFFFFF:  # propagate the carry through written bytes
                     low &= 0xFFFFFFFF
                     k = at - 1
                     while out[k] == 255:
@@ -125,14 +124,14 @@ def _decode_bits(data: U8, padded: U8, h: int, w: int) -> None:
 
 
 def encode_mask(known: Bool) -> bytes:
-    """The section for a mask (h, w); zeros at its end are left out."""
+    """The section for a mask (h, w), without trailing zeros."""
     h, w = known.shape
     out, size = _encode_bits(np.pad(known.astype(np.uint8), _MARGIN), h, w)
     return bytes(out[:size].tobytes().rstrip(b"\0"))
 
 
 def decode_mask(data: bytes, w: int, h: int) -> Bool:
-    """(h, w) mask; any bytes give one."""
+    """(h, w) mask; accepts any bytes."""
     padded = np.zeros((h + 2 * _MARGIN, w + 2 * _MARGIN), np.uint8)
     _decode_bits(np.frombuffer(data, np.uint8), padded, h, w)
     return padded[_MARGIN : _MARGIN + h, _MARGIN : _MARGIN + w] > 0
@@ -158,19 +157,19 @@ WEIGHTS = len(NEIGHBOURS) - 1
 SHIFT = 12
 ESCAPE = 255
 _PLANE = np.array([1.0, -1.0, 0, 0, 0, 0, 0, 0, 0])
-"""Weights of plane prediction, W + N - NW: what the fit starts from."""
+"""Weights of plane prediction, W + N - NW: the prior of the fit."""
 _PRIOR = 20.0
 FIT_PIXELS = 2_500
-"""Known pixels that the weights are fitted to, about."""
+"""Approximate number of known pixels in the fit."""
 
 
 MARGIN = 2
-"""Unknown pixels around the plane, so that every neighbour exists."""
+"""Margin of unknown pixels around the plane, so that every neighbour exists."""
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _base(c: Any, k: Any, i: int, row: int, last: Any) -> Any:
-    """The first known of W, N, NE, NW; else the pixel coded last."""
+    """The first known of W, N, NE, NW; otherwise the pixel coded last."""
     if k[i - 1] != 0:
         return c[i - 1]
     if k[i - row] != 0:
@@ -201,7 +200,7 @@ def _guess(c: I64, k: I64, i: int, row: int, base: int, w: I64) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _normal_equations(c: F64, k: F64, size: tuple[int, int], step: int) -> tuple[F64, F64]:
-    """Weighted sums of the fit over every ``step``-th pixel; calm surroundings weigh more."""
+    """Weighted sums of the fit over every ``step``-th pixel; smooth surroundings weigh more."""
     h, w = size
     row = w + 2 * MARGIN
     A = np.zeros((9, 9))
@@ -229,7 +228,7 @@ def _normal_equations(c: F64, k: F64, size: tuple[int, int], step: int) -> tuple
 def _residuals(c: F64, k: F64, size: tuple[int, int], weights: I64) -> U16:
     """Zigzag residuals of the known pixels in scan order.
 
-    A row's predictions are made at once in float64, where these integers are exact.
+    The predictions of a row are computed at once in float64, where these integers are exact.
     """
     h, w = size
     row = w + 2 * MARGIN
@@ -328,7 +327,7 @@ def encode_codes(codes: U16, known: Bool) -> bytes:
 
 
 def decode_codes(data: bytes, known: Bool) -> U16 | None:
-    """(h, w) codes, zero where not known; None for bytes that are no such section."""
+    """(h, w) codes, zero where unknown; None for invalid bytes."""
     count = int(np.count_nonzero(known))
     if len(data) < 2 * WEIGHTS:
         return None

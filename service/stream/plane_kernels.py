@@ -1,4 +1,4 @@
-"""The loops over pixels behind :mod:`service.stream.planes`, compiled."""
+"""Compiled pixel loops of :mod:`service.stream.planes`."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def reduce(
 ) -> tuple[F32, F32, U8, U8, Bool]:
     """Depth, sigma, views, colour and mask at 1/factor of the size.
 
-    Inverse depth is averaged; where it differs within a block by more than ``spread`` of its
-    mean (rms), the middle pixel is taken. A block is known when a quarter of it is.
+    Inverse depth is averaged; where it varies within a block by more than ``spread`` of its
+    mean (rms), the middle pixel is used. A block is known when a quarter of it is.
     """
     h, w = depth.shape
     rows, columns = -(-h // factor), -(-w // factor)
@@ -73,7 +73,7 @@ def reduce(
 
 @numba.njit(cache=True, nogil=True)
 def block_means(sigma: F32, block: int) -> F32:
-    """Mean of the values above 0 in each block, of which the others are 0; 0 for none."""
+    """Mean of the positive values in each block; 0 for none."""
     h, w = sigma.shape
     rows, columns = -(-h // block), -(-w // block)
     out = np.zeros((rows, columns), np.float32)
@@ -112,8 +112,8 @@ def block_min(views: U8, known: Bool, block: int, max_value: int) -> U8:
 
 @numba.njit(cache=True, nogil=True)
 def calm(bgr: U8, known: Bool, block: int) -> U8:
-    """The picture with unknown pixels at the mean of the known ones in their block; blocks
-    without any repeat the mean before them."""
+    """The image with unknown pixels set to the mean of the known ones in their block; blocks
+    without any repeat the previous mean."""
     h, w = known.shape
     out = np.empty((h, w, 3), np.uint8)
     mean = np.full(3, 128, np.int64)

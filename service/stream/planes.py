@@ -1,7 +1,7 @@
 """The planes of a keyframe (mask, depth, sigma, views, colour) as coded sections, and back.
 
-Decoders return None for anything malformed. They read the size that an embedded picture
-claims before opening it, so no more is allocated than the caller's own grid needs.
+Decoders return None for malformed data. They check the size in an embedded image's header before
+decoding it, so that they allocate no more than the caller's grid needs.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ MCU_PX = 16
 """JPEG codes colour in blocks of this size."""
 MAX_CODE = 65535
 SPREAD = 0.03
-"""A coarse pixel whose inverse depths differ by more than this share (rms) takes the middle
-pixel instead of the mean, so that no point hangs in the air between roof and ground."""
+"""A coarse pixel whose inverse depths vary by more than this share (rms) uses the middle pixel
+instead of the mean, so that no points appear in the air between roof and ground."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Planes:
-    """What a layer carries, pixel by pixel; all but ``known`` is arbitrary where not known."""
+    """The contents of a layer per pixel; all but ``known`` is arbitrary where unknown."""
 
     depth_m: F32  # (h, w)
     sigma_m: F32  # (h, w), 0 where there is none
@@ -97,7 +97,7 @@ def encode_mask(known: Bool) -> bytes:
 
 
 def decode_mask(data: bytes, w: int, h: int) -> Bool:
-    """(h, w) known pixels; any bytes give some."""
+    """(h, w) known pixels; accepts any bytes."""
     return plane_coders.decode_mask(data, w, h) if data else np.ones((h, w), np.bool_)
 
 
@@ -123,7 +123,7 @@ def quantise(planes: Planes, step: float) -> tuple[U16, float, float]:
 
 
 def encode_depth(codes: U16, known: Bool, method: int) -> bytes:
-    """The codes by prediction, or as one JPEG-LS image (8 bits deep when they fit)."""
+    """The codes by prediction, or as a JPEG-LS image (8 bits deep when they fit)."""
     if method == METHOD_PREDICTION:
         return plane_coders.encode_codes(codes, known)
     codes = _fill_back(codes, known)
@@ -132,7 +132,7 @@ def encode_depth(codes: U16, known: Bool, method: int) -> bytes:
 
 
 def decode_depth(data: bytes, known: Bool, method: int, low: float, step: float) -> F32 | None:
-    """(h, w) depth in metres; arbitrary where not known."""
+    """(h, w) depth in metres; arbitrary where unknown."""
     h, w = known.shape
     codes: Array | None = None
     if method == METHOD_PREDICTION:
@@ -170,7 +170,7 @@ def decode_sigma(data: bytes, w: int, h: int) -> F32 | None:
     return _enlarge(table.astype(np.float32)[np.minimum(codes, 255)], SIGMA_BLOCK_PX, w, h)
 
 
-# Views: least count of 2x2 blocks; coarse layers do not tell.
+# Views: minimum count of 2x2 blocks; coarse layers have none.
 
 
 def encode_views(planes: Planes) -> bytes:
@@ -193,7 +193,7 @@ def decode_views(data: bytes, w: int, h: int) -> U8 | None:
 
 
 def encode_colour(planes: Planes, quality: int) -> bytes:
-    """The box as a JPEG; blocks without known pixels are flat, so they cost next to nothing."""
+    """The box as a JPEG; blocks without known pixels are flat and cost little."""
     whole = planes.known.all()
     image = planes.bgr if whole else plane_kernels.calm(planes.bgr, planes.known, MCU_PX)
     ok, data = cv2.imencode(
@@ -224,7 +224,7 @@ def _enlarge(blocks: Array, factor: int, w: int, h: int) -> Array:
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
-    """(w, h) that a JPEG or JPEG-LS picture claims in its frame header; None if it has none."""
+    """(w, h) in the frame header of a JPEG or JPEG-LS image; None if it has none."""
     at = 2
     if data[:2] != b"\xff\xd8":
         return None
@@ -244,7 +244,7 @@ def image_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _open_jpeg_ls(data: bytes, w: int, h: int) -> Array | None:
-    """(h, w) codes of a JPEG-LS picture of exactly that size and one component."""
+    """(h, w) codes of a JPEG-LS image of exactly that size and one component."""
     if image_size(data) != (w, h):
         return None
     try:

@@ -1,7 +1,7 @@
 """The messages of the narrow radio: each fits a MAVLink TUNNEL and decodes alone.
 
-An announcement says which scan is flown, a pose where the camera is, a tile is 8 x 8 cells of
-a keyframe's coarse depth and colour with its own pose and camera. Bytes: ``docs/wire.md``.
+An announcement names the scan in progress, a pose locates the camera, a tile holds 8 x 8 cells of
+a keyframe's coarse depth and colour with its pose and camera. Bytes: ``docs/wire.md``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PAYLOAD_TYPE = 42_432
 """TUNNEL.payload_type of these messages; 32768 and above is for private use."""
 MAX_BYTES = 128
 RADIO_NOTE = "from the narrow radio"
-"""In the notes of a header that came by radio; the drone's own takes its place later."""
+"""Note in a header that was received by radio; the drone's own header replaces it later."""
 ANNOUNCE, POSE, TILE = 0x11, 0x12, 0x13
 CELLS = 8
 """A tile is CELLS x CELLS."""
@@ -41,7 +41,7 @@ _TILE = struct.Struct("<BIHIBBB3i4h3HHHBbb")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tile:
-    """A part of a keyframe, as the narrow radio carries it."""
+    """A part of a keyframe, as sent over the narrow radio."""
 
     seq: int
     time_unix_ns: int  # to a second
@@ -55,7 +55,7 @@ class Tile:
 
 
 def tag_of(drone: str, scan: str) -> int:
-    """The number that stands for a scan of a drone (:attr:`ScanHeader.name`) on the radio."""
+    """The number that identifies a scan of a drone (:attr:`ScanHeader.name`) on the radio."""
     return zlib.crc32(f"{drone}/{scan}".encode())
 
 
@@ -119,7 +119,7 @@ def _finite(value: float) -> float | None:
 
 
 def pack_pose(tag: int, number: int, pose: PoseRecord) -> bytes:
-    """A pose, to a centimetre and 3e-5."""
+    """A pose, rounded to a centimetre and 3e-5."""
     lat = math.nan if pose.lat_deg is None else pose.lat_deg
     lon = math.nan if pose.lon_deg is None else pose.lon_deg
     no_fix = math.isnan(lat) or math.isnan(lon)
@@ -241,7 +241,7 @@ def unpack_tile(data: bytes) -> tuple[int, Tile] | None:
 
 
 def _extended(data: bytes, size: int) -> bytes:
-    """``data`` with the zeros at its end that MAVLink cuts off."""
+    """``data`` with the trailing zeros that MAVLink cut off."""
     return data + bytes(size - len(data)) if 0 < len(data) < size else data
 
 

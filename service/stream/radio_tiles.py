@@ -1,4 +1,4 @@
-"""A keyframe's coarse layer as the tiles of the narrow radio, and back; a store's table of them."""
+"""A keyframe's coarse layer as tiles of the narrow radio, and back; their table in a store."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ GRID_WIDTH_PX = 40
 
 
 def tiles_of(coarse: Keyframe) -> list[Tile]:
-    """The tiles of a keyframe's coarse layer that hold anything, at most 40 px across."""
+    """The non-empty tiles of a keyframe's coarse layer, at most 40 px across."""
     depth = coarse.depth
     full = planes.planes_of(depth, coarse.bgr, coarse.fresh)
     factor = -(-full.known.shape[1] // GRID_WIDTH_PX)
@@ -56,10 +56,10 @@ def tiles_of(coarse: Keyframe) -> list[Tile]:
 
 
 def keyframe_of(tiles: Sequence[Tile]) -> Keyframe | None:
-    """The keyframe that tiles of one grid show; None when there are none.
+    """The keyframe shown by the tiles of one grid; None without tiles.
 
-    While a correction is under way some tiles have the old pose and scale and some the new:
-    only those of the pose that most of them share are used.
+    During a correction some tiles have the old pose and scale and some the new; only tiles of the
+    most frequent pose are used.
     """
     if not tiles:
         return None
@@ -100,7 +100,7 @@ class RadioStore:
         self._db = database
 
     def add(self, kind: str, number: int, part: int, data: bytes) -> bool:
-        """Store a message ("tile" or "pose"), the newest of its number; False if no news."""
+        """Store a message ("tile" or "pose"), the newest of its number; False if already known."""
         with self._db.lock:
             sql = "SELECT 1 FROM radio WHERE kind = ? AND number = ? AND part = ? AND data = ?"
             if self._db.one(sql, (kind, number, part, data)) is not None:
@@ -110,13 +110,13 @@ class RadioStore:
             return True
 
     def keyframe(self, seq: int) -> Keyframe | None:
-        """The keyframe that its tiles show; None without any."""
+        """The keyframe shown by its tiles; None without any."""
         sql = "SELECT data FROM radio WHERE kind = 'tile' AND number = ? ORDER BY part"
         tiles = [unpack_tile(blob(row[0])) for row in self._db.all(sql, (seq,))]
         return keyframe_of([tile[1] for tile in tiles if tile is not None])
 
     def seqs(self) -> set[int]:
-        """Numbers of the keyframes of which there are tiles."""
+        """Numbers of the keyframes that have tiles."""
         sql = f"SELECT DISTINCT number FROM radio WHERE kind = 'tile' AND {is_number('number')}"
         return {row[0] for row in self._db.all(sql)}
 

@@ -1,4 +1,4 @@
-"""Sets of item numbers as inclusive ranges: what a scan has, holds or lacks."""
+"""Sets of item numbers as inclusive ranges: the items that a scan has, holds or lacks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from itertools import chain
 from typing import Any
 
 MAX_RANGES = 4096
-"""A message may name this many ranges; the rest is for the next message."""
+"""Maximum ranges per message; the rest goes into the next message."""
 MAX_NUMBER = (1 << 32) - 1
 
 Pairs = list[tuple[int, int]]
@@ -43,7 +43,7 @@ class RangeSet:
         return cls((n, n) for n in numbers)
 
     def add(self, number: int) -> None:
-        """Put ``number`` into the set."""
+        """Add ``number``."""
         at = bisect_right(self._firsts, number)
         if at and self._lasts[at - 1] >= number:
             return
@@ -61,7 +61,7 @@ class RangeSet:
             self._lasts.insert(at, number)
 
     def discard(self, number: int) -> None:
-        """Take ``number`` out of the set if it is there."""
+        """Remove ``number`` if present."""
         at = bisect_right(self._firsts, number) - 1
         if at < 0 or self._lasts[at] < number:
             return
@@ -128,14 +128,14 @@ class RangeSet:
         self._lasts.append(last)
 
     def copy(self) -> RangeSet:
-        """A set of its own with the same numbers."""
+        """An independent copy."""
         same = RangeSet()
         same._firsts, same._lasts = self._firsts[:], self._lasts[:]
         return same
 
     @property
     def range_count(self) -> int:
-        """How many ranges there are: what it takes to keep or compare the set."""
+        """Number of ranges: the cost of storing or comparing the set."""
         return len(self._firsts)
 
     def pairs(self) -> Pairs:
@@ -163,9 +163,9 @@ def ranges_from_text(text: str) -> RangeSet | None:
 
 
 def ranges_from_pairs(pairs: Any, max_number: int = MAX_NUMBER) -> RangeSet | None:
-    """The set of decoded JSON ``[[first, last], …]``; None when it is anything else.
+    """The set of decoded JSON ``[[first, last], …]``; None for anything else.
 
-    A number above ``max_number`` makes it anything else.
+    A number above ``max_number`` is invalid.
     """
     if not isinstance(pairs, list) or len(pairs) > MAX_RANGES:
         return None

@@ -1,4 +1,4 @@
-"""The small records of a scan: header, poses, re-poses; each with its form on the wire.
+"""The small records of a scan: header, poses, re-poses; each with its wire format.
 
 Poses and re-poses are fixed little-endian structures with a CRC-32 at their end; the scan
 header is JSON. ``docs/wire.md`` is the reference. Decoders return None for anything that is
@@ -29,7 +29,7 @@ SOURCES = ("vision", "attitude", "altitude", "gnss", "exif", "loop", "dead recko
 
 @dataclass(frozen=True, slots=True)
 class ScanHeader:
-    """What a scan is: who flew it, about which origin, with which camera and settings."""
+    """Identity of a scan: drone, origin, camera and settings."""
 
     scan_id: validity.Name
     drone: validity.Name
@@ -43,16 +43,16 @@ class ScanHeader:
     software: validity.Text = ""
     georeference: validity.Text = "none"  # "gnss", "exif" or "none"
     notes: validity.Notes = ()
-    run_id: validity.RunId = ""  # 32 hexadecimal digits, drawn for each run; old scans have none
+    run_id: validity.RunId = ""  # 32 hexadecimal digits, random for each run; old scans have none
 
     @property
     def name(self) -> str:
-        """What the scan is called on the datalink and the radio."""
+        """The scan's name on the datalink and the radio."""
         return scan_name(self.scan_id, self.run_id)
 
     @property
     def identity(self) -> tuple[str, str, str]:
-        """Drone, scan and run: what tells this scan from all others, and never changes."""
+        """Drone, scan and run: identifies this scan and never changes."""
         return self.drone, self.scan_id, self.run_id
 
     def to_json(self) -> bytes:
@@ -61,13 +61,13 @@ class ScanHeader:
 
 
 def header_from_json(data: bytes) -> ScanHeader | None:
-    """The header in ``data``, or None when it is none, too large, or says what cannot be."""
+    """The header in ``data``, or None when it is invalid or too large."""
     found = read_header(data)
     return None if isinstance(found, str) else found
 
 
 def read_header(data: bytes) -> ScanHeader | str:
-    """The header in ``data``, or the fault in it."""
+    """The header in ``data``, or the error in it."""
     if len(data) > MAX_HEADER_BYTES:
         return f"it has {len(data)} bytes, at most {MAX_HEADER_BYTES} are allowed"
     try:
@@ -79,7 +79,7 @@ def read_header(data: bytes) -> ScanHeader | str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseRecord:
-    """Where the camera was at one time, in the world and on the globe, and how surely."""
+    """The camera's pose at one time, in the world and on the globe, with its uncertainty."""
 
     time_unix_ns: int
     T_world_camera: F64  # (4, 4) m
@@ -101,7 +101,7 @@ class PoseRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Repose:
-    """A better pose of a keyframe that was sent before; the highest revision holds."""
+    """A better pose of a published keyframe; the highest revision is in force."""
 
     seq: int
     revision: int
@@ -110,7 +110,7 @@ class Repose:
     covariance: F64  # (6, 6) left perturbation in the world frame: rotation rad, translation m
 
     def applied_to(self, keyframe: Keyframe) -> Keyframe:
-        """The keyframe at this pose, its depth and sigma scaled; depth out of reach is NaN."""
+        """The keyframe at this pose, its depth and sigma scaled; implausible depth is NaN."""
         depth, scale = keyframe.depth, np.float32(self.scale)
         T = self.T_world_camera
         scaled_m = depth.depth_m * scale
@@ -127,12 +127,12 @@ _UPPER = np.triu_indices(6)
 
 
 def source_bits(sources: Sequence[str]) -> int:
-    """One byte with bit k set for ``SOURCES[k]``; names outside the table are not carried."""
+    """One byte with bit k set for ``SOURCES[k]``; unknown names are dropped."""
     return sum(1 << k for k, name in enumerate(SOURCES) if name in sources)
 
 
 def sources_of(bits: int) -> tuple[str, ...]:
-    """The names that the byte ``bits`` stands for."""
+    """The names in the byte ``bits``."""
     return tuple(name for k, name in enumerate(SOURCES) if bits >> k & 1)
 
 
@@ -167,12 +167,12 @@ _PLACE = struct.Struct("<7d21f")
 
 
 def pack_place(T: F64, covariance: F64) -> bytes:
-    """Position, quaternion and covariance as they travel: 7 f64, 21 f32."""
+    """Position, quaternion and covariance in wire format: 7 f64, 21 f32."""
     return _PLACE.pack(*pack_motion(T), *pack_covariance(covariance))
 
 
 def unpack_place(data: bytes) -> tuple[F64, F64] | None:
-    """Motion and covariance of what :func:`pack_place` gave; None for what cannot be."""
+    """Motion and covariance from :func:`pack_place`; None for implausible values."""
     fields = _PLACE.unpack(data)
     motion = unpack_motion(fields[:7])
     if motion is None or not all(map(math.isfinite, fields[7:])):
@@ -184,10 +184,10 @@ PLACE_BYTES = _PLACE.size
 
 
 class _Placed:
-    """A record that begins with fields of its own, places a camera, and ends with more fields.
+    """A record with leading fields, a camera pose, and trailing fields.
 
-    Magic, version 1, the first fields, position and quaternion (7 f64), covariance (21 f32),
-    the last fields, CRC-32.
+    Magic, version 1, the leading fields, position and quaternion (7 f64), covariance (21 f32),
+    the trailing fields, CRC-32.
     """
 
     def __init__(self, magic: bytes, first: str, last: str) -> None:
@@ -233,7 +233,7 @@ def _or_none(value: float) -> float | None:
 
 
 def pack_pose(pose: PoseRecord) -> bytes:
-    """``pose`` as it travels and as it is stored."""
+    """``pose`` in the format of wire and store."""
     seq = -1 if pose.keyframe_seq is None else pose.keyframe_seq
     place = (pose.lat_deg, pose.lon_deg, pose.alt_amsl_m, pose.agl_m)
     return _POSE.pack(
@@ -286,7 +286,7 @@ def unpack_pose(data: bytes) -> PoseRecord | None:
 
 
 def pack_repose(repose: Repose) -> bytes:
-    """``repose`` as it travels and as it is stored."""
+    """``repose`` in the format of wire and store."""
     return _REPOSE.pack(
         (0, repose.seq, repose.revision), repose.T_world_camera, repose.covariance, (repose.scale,)
     )

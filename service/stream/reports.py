@@ -1,6 +1,6 @@
-"""What ground stations say they hold: the newest report of each waits, the best one is kept.
+"""Reports of ground stations about their items: queues the newest of each, stores the best one.
 
-From it follows which scans of earlier flights no ground station holds completely yet.
+They determine which earlier scans no ground station holds completely yet.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from service.stream.store import ScanStore
 log = logging.getLogger(__name__)
 
 MAX_OFFERED = 20
-"""How many scans are offered at once, the newest."""
+"""Maximum scans offered at once, the newest first."""
 
 
 def delivered(store: ScanStore) -> bool:
-    """Whether some ground station has said that it holds everything."""
+    """Whether some ground station has reported that it holds everything."""
     numbers = store.numbers()
     return any(not missing(numbers, held) for held in store.held().values())
 
 
 def open_undelivered(scans: Path, but: Path | None = None) -> list[ScanStore]:
-    """The newest scans under ``scans`` (a folder of scan folders) that were not delivered.
+    """The newest undelivered scans under ``scans`` (a folder of scan folders).
 
-    ``but`` is a database to leave out, such as that of the scan being flown. A scan that was
-    cut short by a crash is closed with ``{"interrupted": true}``, so that the ground can tell
-    that no more will come. Unreadable ones are passed over with a warning.
+    ``but`` is a database to leave out, such as that of the scan in progress. A scan that a crash
+    cut short is closed with ``{"interrupted": true}``, so that the ground knows that it is
+    complete. Unreadable scans are skipped with a warning.
     """
     out: list[ScanStore] = []
     for path in sorted(scans.glob("*/scan.db"), key=_changed, reverse=True):
@@ -58,7 +58,7 @@ def _was_delivered(path: Path) -> bool:
         with ScanStore(path, None, None) as store:
             return store.finished and delivered(store)
     except SkyreliefError:
-        return False  # it is opened with more care
+        return False  # it is then opened and checked
 
 
 def _changed(path: Path) -> float:
@@ -69,15 +69,15 @@ def _changed(path: Path) -> float:
 
 
 TAKE_S = 0.2
-"""From one look at the reports to the next."""
+"""Interval between two evaluations of the reports."""
 KEEP_S = 10.0
-"""How often a scan's store notes what its best supplied ground station holds, at most."""
+"""Minimum interval between two notes in a scan's store about the best supplied ground station."""
 
 
 class Reports:
-    """Reports that wait for the datalink's next turn. :meth:`put` is safe from any thread.
+    """Reports queued for the datalink's next turn. :meth:`put` is thread-safe.
 
-    However many come, from however many stations, a few are looked at in a turn.
+    However many arrive, only a few are processed per turn.
     """
 
     def __init__(self, outbox: Outbox) -> None:
@@ -89,7 +89,7 @@ class Reports:
         return bool(self._waiting)
 
     def put(self, key: str, payload: bytes) -> bool:
-        """Keep the newest report of a key; whether it is the first one that waits."""
+        """Queue the newest report of a key; whether it is the first one queued."""
         parts = key.split("/")
         if len(parts) != 5 or not (self._outbox.offers(parts[2]) and NAME.fullmatch(parts[4])):
             return False
@@ -103,7 +103,7 @@ class Reports:
         return is_first
 
     def take(self, now: float) -> list[tuple[str, str, bytes]]:
-        """Scan, station and report of those that wait, every :data:`TAKE_S`."""
+        """Scan, station and report of queued reports, every :data:`TAKE_S`."""
         if not self._waiting or now - self._taken_at < TAKE_S:
             return []
         self._taken_at = now
@@ -112,15 +112,15 @@ class Reports:
 
 
 class HeldNotes:
-    """Notes in each scan's store what its best supplied ground station holds, now and then."""
+    """Periodically notes in each scan's store what its best supplied ground station holds."""
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
         self._kept: dict[str, tuple[float, str, Numbers]] = {}  # by scan
 
     def keep(self, store: ScanStore, now: float, is_last: bool = False) -> None:
-        """Write the note if it is due: at once for a finished scan that is whole there, which
-        is not offered again, and with ``is_last``."""
+        """Write the note if it is due: at once with ``is_last``, and for a finished scan that is
+        complete at the ground, which is then not offered again."""
         name = store.header.name
         best = self._outbox.best(name) if self._outbox.offers(name) else None
         if best is None:

@@ -1,4 +1,4 @@
-"""Zenoh sessions as the datalink needs them: no shared memory, small buffers, TLS, rights."""
+"""Zenoh sessions for the datalink: no shared memory, small buffers, TLS, access rights."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ _ENCRYPTED = ("tls", "quic")
 _LOOPBACK = ("localhost", "[::1]")
 
 SEND_BUFFER_BYTES, SEND_BUFFER_S = 16_384, 0.2
-"""Least send buffer, and how long the budget takes to empty a larger one: what the system holds
-must cover a round trip, and nothing urgent may wait behind more."""
+"""Minimum send buffer, and the time in which the budget empties a larger one: the kernel's buffer
+must cover a round trip, but urgent messages must not queue behind more."""
 BATCH_BYTES = 8_192
 LEASE_MS = 8_000
 MAX_MESSAGE_BYTES = 1 << 19
-"""A larger message is dropped by Zenoh as it comes in: heads have at most half of it."""
+"""Zenoh drops larger received messages; heads have at most half of it."""
 
 
 @dataclass(frozen=True, slots=True)
 class SessionConfig:
-    """How one end joins the link; the TLS files are PEM."""
+    """How one end connects; the TLS files are PEM."""
 
     mode: str = "client"  # "client" or "router"
     connect: tuple[str, ...] = ()
     listen: tuple[str, ...] = ()
-    plain: bool = False  # allow endpoints without TLS beyond this machine
+    plain: bool = False  # allow remote endpoints without TLS
     tls_ca: str = ""
     tls_certificate: str = ""
     tls_key: str = ""
-    fleet_rights: bool = False  # enforce, as a router, what fleet.json beside tls_key allows
+    fleet_rights: bool = False  # as a router, enforce the fleet.json next to tls_key
     open_timeout_s: float = 10.0  # of one attempt to reach the other end
-    rate_bytes_s: float = 0.0  # that we shall send; sizes the send buffer
+    rate_bytes_s: float = 0.0  # our send rate; determines the send buffer
 
 
 def check_endpoints(config: SessionConfig) -> None:
-    """Raise InputError for endpoints that are malformed, plain beyond this machine, or lack
-    their certificates."""
+    """Raise InputError for endpoints that are malformed, unencrypted to another machine, or lack
+    certificates."""
     for endpoint in (*config.connect, *config.listen):
         match = ENDPOINT.fullmatch(endpoint)
         if match is None:
@@ -105,14 +105,14 @@ def zenoh_config(config: SessionConfig) -> zenoh.Config:
         "listen/endpoints": list(config.listen),
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        # Between processes of one machine Zenoh would bypass the link, its rate and its rules.
+        # Shared memory would bypass the link, its rate limit and its access rules.
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/batch_size": BATCH_BYTES,
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
         "adminspace/enabled": False,
-        # Zenoh answers a query with the query's own quality of service. Whoever asks must not
-        # make the drone or the router wait for them (BLOCK), nor pass what is live.
+        # Zenoh answers a query with the query's own quality of service. A query must neither make
+        # the drone or the router wait (BLOCK) nor overtake live data.
         "qos/network": [
             {
                 "id": "answers-yield",
@@ -131,7 +131,7 @@ def zenoh_config(config: SessionConfig) -> zenoh.Config:
             "transport/link/tls/connect_private_key": config.tls_key,
             "transport/link/tls/enable_mtls": True,
             "transport/link/tls/close_link_on_expiration": True,
-            # Ground stations change addresses; only their certificates may serve.
+            # Ground stations change addresses; their certificates identify them.
             "transport/link/tls/verify_name_on_connect": False,
         }
     if config.fleet_rights:
@@ -143,7 +143,7 @@ def zenoh_config(config: SessionConfig) -> zenoh.Config:
 
 
 def _small_buffer(endpoint: str, rate_bytes_s: float) -> str:
-    """A small send buffer keeps control from waiting behind bulk in the kernel."""
+    """The endpoint with a small send buffer, so that control does not queue behind bulk data."""
     if "#" in endpoint or not endpoint.startswith(("tcp/", "tls/")):
         return endpoint
     return f"{endpoint}#so_sndbuf={max(SEND_BUFFER_BYTES, round(rate_bytes_s * SEND_BUFFER_S))}"

@@ -1,9 +1,9 @@
-"""The scan on disk: one SQLite file, the same onboard and on the ground.
+"""The scan on disk: one SQLite file, identical onboard and on the ground.
 
-Everything produced is committed here before it is offered to the link. Write-ahead logging
-with full synchronisation: a killed process loses at most the transaction in the making.
-Chunks are coded layers, keyed by keyframe and layer; poses and re-poses carry the number
-that the drone gave them, so that both ends can name what is missing.
+Everything is committed here before it is offered to the link. Write-ahead logging with full
+synchronisation: a killed process loses at most the current transaction. Chunks are coded layers,
+keyed by keyframe and layer; poses and re-poses keep the drone's numbers, so that both ends can
+name missing items.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ from service.stream.validity import summary_from_json
 _NOT_TOO_LARGE = f"LENGTH(data) <= {codec.MAX_LAYER_BYTES}"
 _IS_LAYER = f"typeof(layer) = 'integer' AND layer BETWEEN 0 AND {codec.MAX_LAYERS - 1}"
 MAX_HELD_PEERS = 8
-"""Ground stations whose holdings are kept."""
+"""Maximum ground stations whose items are noted."""
 
 
 class ScanStore:
     """One scan's database. Safe for one writer and several readers, in threads.
 
-    ``chunks`` of a keyframe that exceed ``quota_bytes`` are kept coarse only; :attr:`refused`
-    counts what was not stored. A full disk raises OutsideError and leaves the file sound.
+    Above ``quota_bytes`` keyframes are stored coarse only; :attr:`refused` counts layers not
+    stored. A full disk raises OutsideError and leaves the file intact.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class ScanStore:
     def create(
         cls, path: Path | str, header: ScanHeader, quota_bytes: int | None = None
     ) -> ScanStore:
-        """A new store; raises InputError when ``path`` exists or cannot be written."""
+        """A new store; raises InputError when ``path`` exists or cannot be created."""
         path = Path(path)
         if path.exists():
             raise InputError(f"{path} exists; open it or choose another folder")
@@ -97,7 +97,7 @@ class ScanStore:
     def open(
         cls, path: Path | str, quota_bytes: int | None = None, read_only: bool = False
     ) -> ScanStore:
-        """An existing store, whatever state a crash left it in; what is sound is kept.
+        """An existing store, also after a crash; valid data is kept.
 
         With ``read_only`` nothing is written, and a damaged file is refused. Raises InputError
         when there is no such file or it holds no scan, OutsideError when the disk fails.
@@ -112,7 +112,7 @@ class ScanStore:
         return cls(path, None, quota_bytes, read_only)
 
     def close(self) -> None:
-        """Fold the write-ahead log into the file and close it."""
+        """Merge the write-ahead log into the file and close it."""
         self._db.close()
 
     def __enter__(self) -> ScanStore:
@@ -122,14 +122,14 @@ class ScanStore:
         self.close()
 
     def uses(self, thread: int) -> int:
-        """How often a thread (``Thread.ident``) has read or written it so far."""
+        """Number of reads and writes by a thread (``Thread.ident``) so far."""
         return self._db.uses[thread]
 
     # Header and summary
 
     @property
     def header(self) -> ScanHeader:
-        """What the scan is."""
+        """The scan's header."""
         return self._header
 
     def update_header(self, **fields: Any) -> None:
@@ -143,7 +143,7 @@ class ScanStore:
 
     @property
     def summary(self) -> dict[str, Any] | None:
-        """What :meth:`finish` was given; None while the scan goes on."""
+        """The argument of :meth:`finish`; None for a scan in progress."""
         text = self._db.get("summary")
         return None if text is None else summary_from_json(text.encode()) or {}
 
@@ -160,9 +160,9 @@ class ScanStore:
         return self._db.get("summary") is not None
 
     def finish(self, summary: dict[str, Any]) -> None:
-        """Close the scan with its ``summary``, plain values; those that are not finite are null.
+        """Close the scan with its ``summary`` of plain values; non-finite numbers become null.
 
-        Raises ValueError for a summary that no receiver would take.
+        Raises ValueError for a summary that receivers would reject.
         """
         strict = json.loads(json.dumps(summary), parse_constant=lambda _: None)
         data = json.dumps(strict, sort_keys=True).encode()
@@ -173,7 +173,7 @@ class ScanStore:
     # Chunks
 
     def add_keyframe(self, seq: int, layers: Sequence[bytes]) -> int:
-        """Store the coded ``layers`` of keyframe ``seq`` at once; how many were new.
+        """Store the coded ``layers`` of keyframe ``seq`` at once; returns the number of new ones.
 
         Over the quota only the coarse layer is kept. Raises ValueError for bytes that are no
         layer of this keyframe, OutsideError when the disk is full.
@@ -188,7 +188,7 @@ class ScanStore:
             return self._put_chunks(kept)
 
     def add_chunk(self, data: bytes) -> bool:
-        """Store one coded layer; False when it is there already, unsound or over the quota."""
+        """Store one coded layer; False when it is known, invalid or above the quota."""
         head = codec.peek(data)
         if head is None:
             return False
@@ -222,7 +222,7 @@ class ScanStore:
     def keyframe(self, seq: int) -> Keyframe | None:
         """Keyframe ``seq`` at its finest stored layer, with the newest re-pose applied.
 
-        What came only by the narrow radio stands in until a layer is stored.
+        Without a layer, the tiles of the narrow radio are used.
         """
         sql = f"SELECT layer FROM chunks WHERE seq = ? AND {_IS_LAYER} ORDER BY layer DESC"
         for (number,) in self._db.all(sql, (seq,)):
@@ -242,7 +242,7 @@ class ScanStore:
                 yield found
 
     def seqs(self) -> list[int]:
-        """Numbers of the keyframes of which any layer is stored."""
+        """Numbers of the keyframes with any stored layer."""
         sql = f"SELECT DISTINCT seq FROM chunks WHERE {is_number('seq')}"
         stored = {row[0] for row in self._db.all(sql)}
         return sorted(stored | self._radio.seqs())
@@ -256,14 +256,14 @@ class ScanStore:
     # Poses and re-poses
 
     def add_pose(self, pose: PoseRecord) -> int:
-        """Store a pose under the next number, which is returned."""
+        """Store a pose under the next number; returns it."""
         with self._lock:
             number = self._next_id("poses")
             self.put_pose(number, pack_pose(pose))
             return number
 
     def put_pose(self, number: int, data: bytes) -> bool:
-        """Store a packed pose under the number the drone gave it; False if it is no news."""
+        """Store a packed pose under the drone's number; False if already known."""
         pose = unpack_pose(data)
         if pose is None:
             return False
@@ -276,7 +276,7 @@ class ScanStore:
             return True
 
     def poses(self) -> Iterator[PoseRecord]:
-        """All poses in order of time; of several for one time the newest, which corrects it."""
+        """All poses in order of time; of several at one time only the newest."""
         newest = "SELECT MAX(id) FROM poses GROUP BY time_unix_ns"
         for (data,) in self._db.all(
             f"SELECT data FROM poses WHERE id IN ({newest}) ORDER BY time_unix_ns"
@@ -288,7 +288,7 @@ class ScanStore:
             yield from self._radio.poses()
 
     def add_repose(self, repose: Repose) -> int:
-        """Store a re-pose under the next number, which is returned."""
+        """Store a re-pose under the next number; returns it."""
         with self._lock:
             number = self._next_id("reposes")
             self.put_repose(number, pack_repose(repose))
@@ -305,7 +305,7 @@ class ScanStore:
                 self._inventory.note_repose(number, seq, revision)
 
     def put_repose(self, number: int, data: bytes) -> bool:
-        """Store a packed re-pose under the drone's number; False if it is no news."""
+        """Store a packed re-pose under the drone's number; False if already known."""
         repose = unpack_repose(data)
         if repose is None:
             return False
@@ -325,15 +325,15 @@ class ScanStore:
 
     def add_radio(self, kind: str, number: int, part: int, data: bytes) -> bool:
         """Store a message of the narrow radio ("tile" or "pose"), the newest of its number;
-        False if it is no news."""
+        False if already known."""
         return self._radio.add(kind, number, part, data)
 
-    # What the link asks
+    # For the link
 
     def record(self, kind: str, number: int) -> bytes | None:
         """The stored bytes of item ``number`` of a kind of :mod:`service.stream.messages`.
 
-        Header and summary are numbered by the CRC-32 of their JSON, so that a change shows.
+        Header and summary are numbered by the CRC-32 of their JSON, so that changes are visible.
         """
         if kind in ("header", "summary"):
             text = self._db.get(kind)
@@ -346,7 +346,7 @@ class ScanStore:
         return None if row is None else blob(row[0])
 
     def put_record(self, kind: str, number: int, data: bytes) -> bool:
-        """Store what :meth:`record` gave at the other end; False if unsound or no news."""
+        """Store a record from the other end; False if invalid or already known."""
         if kind == "pose":
             return self.put_pose(number, data)
         if kind == "repose":
@@ -368,19 +368,19 @@ class ScanStore:
             return True
 
     def numbers(self) -> dict[str, RangeSet]:
-        """Kind to the numbers of what is stored; of re-poses only those in force."""
+        """Kind to the numbers of stored items; only re-poses in force are listed."""
         return self._inventory.all()
 
     def numbers_of(self, kind: str) -> RangeSet:
-        """The numbers of what is stored of one kind; not to be changed."""
+        """The numbers of the stored items of one kind; do not modify."""
         return self._inventory.of(kind)
 
     def listen(self, listener: Listener) -> None:
-        """Have ``listener(kind, number)`` called after each new item, by the writing thread."""
+        """Call ``listener(kind, number)`` after each new item, on the writing thread."""
         self._inventory.listen(listener)
 
     def unlisten(self, listener: Listener) -> None:
-        """End what :meth:`listen` began."""
+        """Remove a listener."""
         self._inventory.unlisten(listener)
 
     def _set_whole(self, kind: str, data: bytes, header: ScanHeader) -> None:
@@ -390,7 +390,7 @@ class ScanStore:
             self._inventory.note_whole(kind, data)
 
     def set_held(self, peer: str, numbers: dict[str, RangeSet]) -> None:
-        """Note what ``peer`` says it holds; those noted longest ago make way for it."""
+        """Note the items that ``peer`` reports; beyond the maximum the oldest notes are deleted."""
         sql = "INSERT OR REPLACE INTO held VALUES (?, ?, ?)"
         rows = [(peer, kind, json.dumps(ranges.pairs())) for kind, ranges in numbers.items()]
         newest = "SELECT peer FROM held GROUP BY peer ORDER BY MAX(rowid) DESC LIMIT ?"
@@ -398,7 +398,7 @@ class ScanStore:
         self._db.write([*((sql, row) for row in rows), forget])
 
     def held(self) -> dict[str, dict[str, RangeSet]]:
-        """Peer to what it said it holds."""
+        """Peer to its reported items."""
         out: dict[str, dict[str, RangeSet]] = {}
         for peer, kind, text in self._db.all("SELECT peer, kind, ranges FROM held"):
             ranges = ranges_from_pairs(json_value(text))
@@ -429,7 +429,7 @@ class ScanStore:
 
 
 def header_of(path: Path) -> ScanHeader | None:
-    """The header of a store that may be open elsewhere; None when it cannot be read."""
+    """The header of a store, also while it is open elsewhere; None when it cannot be read."""
     text = peek_meta(path, "header")
     header = None if text is None else read_header(text.encode())
     return header if isinstance(header, ScanHeader) else None

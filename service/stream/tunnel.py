@@ -1,8 +1,8 @@
 """The narrow radio, both ends: coarse tiles and poses by TUNNEL.
 
-When there is no IP link, the drone sends small messages over the telemetry radio, each
-decodable alone, within a share of the radio's rate and slower when RADIO_STATUS says that
-the radio's buffer fills. What was sent is repeated while there is nothing new.
+Without an IP link the drone sends small messages over the telemetry radio, each independently
+decodable, within a share of the radio's rate, and slower when RADIO_STATUS reports that its buffer
+fills. Sent messages are repeated while there is nothing new.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ POSE_EVERY_S = 1.0
 REPEATS = 2
 MAX_WAITING = 2000
 MAX_ANNOUNCED = 64
-"""Scans that the ground knows by their announcement; the one announced longest ago makes way."""
+"""Scans that the ground knows by announcement; beyond it the oldest is dropped."""
 MOVED_M, TURNED, RESCALED = 0.5, 0.01, 0.01
-"""A correction beyond any of these is worth sending a keyframe's tiles again."""
+"""A correction beyond any of these is worth resending a keyframe's tiles."""
 MAVLINK_OVERHEAD_BYTES = 17
 """Header, checksum and TUNNEL's own fields around each payload."""
 
 
 @dataclass(frozen=True, slots=True)
 class TunnelConfig:
-    """What of the telemetry radio may be used."""
+    """Permitted use of the telemetry radio."""
 
     radio_bytes_s: float = 5760.0  # 57,600 baud
     share: float = 0.3
@@ -61,18 +61,18 @@ class TunnelConfig:
 class _Waiting:
     tile: Tile
     repeats: int = REPEATS
-    payload: bytes = b""  # as it was offered last
+    payload: bytes = b""  # as last offered
 
 
 class TunnelSender:
-    """What the drone sends over the radio. Times are the caller's: seconds, monotonic."""
+    """The drone's sender over the radio. The caller supplies times: seconds, monotonic."""
 
     def __init__(self, store: ScanStore, config: TunnelConfig, now: float) -> None:
-        """Raises ValueError when drone and scan have names too long for the radio."""
+        """Raises ValueError when the names of drone and scan are too long for the radio."""
         self._store = store
         self._config = config
         self._announcement = pack_announce(store.header)
-        self._tiles: deque[Tile] = deque(maxlen=MAX_WAITING)  # all that were ever made
+        self._tiles: deque[Tile] = deque(maxlen=MAX_WAITING)  # all tiles of the scan
         self._moved: dict[int, Repose] = {}  # keyframe to the correction last sent
         self._tag = tag_of(store.header.drone, store.header.name)
         self._factor = 1.0
@@ -106,7 +106,7 @@ class TunnelSender:
             self._fresh.extend(_Waiting(tile) for tile in tiles)
 
     def _correct(self, repose: Repose) -> None:
-        """Send a keyframe's tiles once more when it moved by more than they are coarse."""
+        """Resend a keyframe's tiles when it moved by more than their resolution."""
         before = self._moved.get(repose.seq)
         tiles = [tile for tile in self._tiles if tile.seq == repose.seq]
         if not tiles:
@@ -134,7 +134,7 @@ class TunnelSender:
         return pack_tile(self._tag, tile)
 
     def radio_status(self, free_percent: int, now: float) -> None:
-        """The radio says how much of its buffer is free (RADIO_STATUS.txbuf)."""
+        """The radio reports the free share of its buffer (RADIO_STATUS.txbuf)."""
         if free_percent < self._config.low_buffer_percent // 2:
             self._factor = max(0.05, self._factor * 0.5)
         elif free_percent < self._config.low_buffer_percent:
@@ -190,23 +190,23 @@ class TunnelSender:
 
 
 class Carrier(Protocol):
-    """What takes tunnelled payloads to the ground."""
+    """Carries tunnelled payloads to the ground."""
 
     def open(self, on_status: Callable[[int], None]) -> None:
         """Begin; ``on_status`` gets the free share of the radio's buffer in percent."""
 
     def beat(self) -> None:
-        """Say that we are there; asked every second."""
+        """Send a heartbeat; called every second."""
 
     def send(self, payload: bytes) -> None:
-        """Send a payload to everybody."""
+        """Send a payload to all."""
 
     def close(self) -> None:
         """End."""
 
 
 class RadioSender:
-    """Sends a scan's coarse tiles and poses over the radio while ``needed`` says so."""
+    """Sends a scan's coarse tiles and poses over the radio while ``needed`` returns True."""
 
     def __init__(
         self,
@@ -235,7 +235,7 @@ class RadioSender:
 
     @property
     def all_sent(self) -> bool:
-        """Whether everything has been sent at least once; nobody confirms it on the radio."""
+        """Whether everything has been sent at least once; the radio has no acknowledgement."""
         return not self._events and self._tunnel.all_sent
 
     def close(self) -> None:
@@ -268,10 +268,10 @@ class RadioSender:
 
 @dataclass(slots=True, eq=False)
 class TunnelIntake:
-    """What the ground makes of the radio's messages: (header, kind, number, part, bytes).
+    """Decodes the radio's messages on the ground: (header, kind, number, part, bytes).
 
-    The kind is "header" for an announcement, else "tile" or "pose".
-    Messages that come before their scan's announcement are kept, up to MAX_WAITING.
+    The kind is "header" for an announcement, otherwise "tile" or "pose".
+    Messages that arrive before their scan's announcement are kept, up to MAX_WAITING.
     """
 
     headers: dict[int, ScanHeader] = field(default_factory=dict)
@@ -281,7 +281,7 @@ class TunnelIntake:
     dropped: int = 0
 
     def receive(self, payload: bytes) -> list[tuple[ScanHeader, str, int, int, bytes]]:
-        """What ``payload`` gives to store; nothing for foreign bytes."""
+        """Records to store from ``payload``; empty for invalid bytes."""
         header = unpack_announce(payload)
         if header is not None:
             tag = tag_of(header.drone, header.name)

@@ -1,7 +1,7 @@
-"""What records may say: the bounds that follow from what their numbers mean.
+"""Valid ranges of the numbers in records, derived from their meaning.
 
-Every decoder asks here, so a record is checked when it is received, taken in or read from an
-opened store, always by the same rules. ``docs/wire.md`` lists them.
+Every decoder uses these rules, so a record is checked in the same way when it is received, imported
+or read from a store. ``docs/wire.md`` lists them.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ from msgspec import Meta
 from recon.types import F64
 
 MAX_POSITION_M = 1e6
-"""Of a camera from the scan's origin: the local frame is a plane, and means nothing beyond."""
+"""Maximum distance from the scan's origin: the local frame is a plane and only valid nearby."""
 MAX_ALTITUDE_M = 1e5
-"""Height above sea level or ground, either way."""
+"""Maximum height above or below sea level or ground."""
 MIN_DEPTH_M, MAX_DEPTH_M = 1e-3, 1e5
 MIN_SCALE, MAX_SCALE = 1e-3, 1e3
-"""Of a re-pose: an assumed height of 60 m stands for 6 cm to 60 km."""
+"""Scale of a re-pose: an assumed height of 60 m covers 6 cm to 60 km."""
 MAX_SLOPE = 57.3
-"""No pixel looks farther than 89 degrees off the optical axis."""
+"""No pixel is further than 89 degrees off the optical axis."""
 MAX_FOCAL_WIDTHS = 1000.0
-"""A focal length of so many widths sees a twentieth of a degree."""
+"""Maximum focal length in image widths: a field of view of a twentieth of a degree."""
 MAX_PIXEL_RATIO = 5.0
-"""Between fx and fy."""
+"""Maximum ratio of fx and fy."""
 MAX_SIGMA_M = 1e6
 
 MAX_HEADER_BYTES = 262_144
-"""A scan header larger than this is refused."""
+"""Maximum size of a scan header."""
 MAX_SUMMARY_BYTES = 1_048_576
 MAX_NOTES = 10_000
 MAX_NAME = 128
 MIN_TIME_NS, MAX_TIME_NS = -86_400 * 10**9, (1 << 32) * 10**9
-"""Unix time up to 2106; a clock that starts at 0 may be corrected to a little before."""
+"""Unix time up to 2106; a clock that starts at 0 may be corrected to slightly before."""
 
 NAME_TEXT = r"^[^\x00-\x1f\x7f/\\]+$"
-"""No control character and no slash: names stand in file names, XML and keys."""
+"""No control characters and no slashes: names are used in file names, XML and keys."""
 
 Latitude = Annotated[float, Meta(ge=-90.0, le=90.0)]
 Longitude = Annotated[float, Meta(ge=-360.0, le=360.0)]
@@ -57,7 +57,7 @@ _Side = Annotated[int, Meta(ge=1, le=65_535)]
 
 
 class _CameraJson(msgspec.Struct):
-    """The camera in a header; other keys are passed over."""
+    """The camera in a header; other keys are ignored."""
 
     width: _Side | None = None
     height: _Side | None = None
@@ -66,13 +66,13 @@ class _CameraJson(msgspec.Struct):
 
 
 class _ScaleJson(msgspec.Struct):
-    """What the metric scale rests on."""
+    """Origin of the metric scale."""
 
     sigma: float | None = None
 
 
 class _SummaryJson(msgspec.Struct):
-    """The fields of a summary that are read; the rest is kept as it came."""
+    """The fields of a summary that are read; the rest is kept unchanged."""
 
     frames: _Count | None = None
     pairs: _Count | None = None
@@ -95,7 +95,7 @@ class _SummaryJson(msgspec.Struct):
 
 
 def summary_from_json(data: bytes) -> dict[str, Any] | None:
-    """The summary in ``data``; None unless it is a JSON object in UTF-8 with fields that fit."""
+    """The summary in ``data``; None unless it is a JSON object in UTF-8 with valid fields."""
     if len(data) > MAX_SUMMARY_BYTES:
         return None
     try:
@@ -107,7 +107,7 @@ def summary_from_json(data: bytes) -> dict[str, Any] | None:
 
 
 def fault_of_camera(camera: dict[str, Any]) -> str:
-    """The fault in a header's camera; empty when there is none."""
+    """The error in a header's camera; empty when valid."""
     try:
         found = msgspec.convert(camera, _CameraJson)
     except msgspec.ValidationError as error:
@@ -124,7 +124,7 @@ def fault_of_camera(camera: dict[str, Any]) -> str:
 
 
 def is_pinhole(optics_px: tuple[float, float, float, float], size_px: tuple[int, int]) -> bool:
-    """Whether fx, fy, cx, cy are those of a pinhole camera with images of (W, H) pixels."""
+    """Whether fx, fy, cx, cy describe a pinhole camera with images of (W, H) pixels."""
     fx, fy, cx, cy = optics_px
     w, h = size_px
     if not (all(map(math.isfinite, optics_px)) and fx > 0.0 and fy > 0.0):
@@ -137,32 +137,32 @@ def is_pinhole(optics_px: tuple[float, float, float, float], size_px: tuple[int,
 
 
 def is_position(xyz_m: F64) -> bool:
-    """Whether (3,) metres lie within reach of the scan's origin."""
+    """Whether (3,) metres are near enough to the scan's origin."""
     return bool(np.abs(xyz_m).max() <= MAX_POSITION_M)  # False for NaN
 
 
 def is_rotation(quaternion: F64) -> bool:
-    """Whether w x y z can be made a rotation."""
+    """Whether w x y z can be normalised to a rotation."""
     return 0.5 < math.hypot(*quaternion) < 2.0
 
 
 def is_time(time_unix_ns: int) -> bool:
-    """Whether a camera may have been exposed then."""
+    """Whether the time of an exposure is plausible."""
     return MIN_TIME_NS <= time_unix_ns < MAX_TIME_NS
 
 
 def is_scale(scale: float) -> bool:
-    """Whether a re-pose may scale depth so."""
+    """Whether the scale of a re-pose is plausible."""
     return MIN_SCALE <= scale <= MAX_SCALE
 
 
 def is_inverse_depth(low: float, step: float) -> bool:
-    """Whether codes from ``low`` on, ``step`` apart (1/m), stand for depths within reach."""
+    """Whether codes from ``low`` in steps of ``step`` (1/m) cover plausible depths."""
     return 0.999 / MAX_DEPTH_M <= low < 1e4 and 0.0 < step < 1e4
 
 
 def is_on_globe(lat_deg: float | None, lon_deg: float | None, *heights_m: float | None) -> bool:
-    """Whether a place that is known in part may be; NaN may not."""
+    """Whether a partly known position is plausible; NaN is not."""
     return (
         (lat_deg is None or abs(lat_deg) <= 90.0)
         and (lon_deg is None or abs(lon_deg) <= 360.0)
