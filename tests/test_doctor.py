@@ -92,7 +92,7 @@ def test_camera_model_of_another_size_is_told(tmp_path: Path) -> None:
 
 def test_foreign_package_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.daemon.diagnosis._parent", lambda name: f"/somewhere/{name}")
-    assert "hides one of ours" in findings()["packages"][1]
+    assert "shadows one of ours" in findings()["packages"][1]
 
 
 def test_command_line(tmp_path: Path) -> None:
@@ -154,7 +154,7 @@ def test_threads_and_kernels_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr("service.daemon.diagnosis.kernels_may_overlap", lambda: False)
     monkeypatch.setattr("service.daemon.diagnosis.is_warm", lambda: True)
     found = findings()
-    assert found["threads"] == (BAD, "no OpenMP: half as fast, one core idle; apt install libgomp1")
+    assert found["threads"] == (BAD, "no OpenMP: half the speed, one core idle; apt install libgomp1")
     assert found["kernels"][0] == GOOD
 
 
@@ -194,7 +194,7 @@ def test_what_a_running_service_holds_is_asked_of_it(tmp_path: Path) -> None:
     finally:
         server.close()
     assert found["mavlink"] == (GOOD, "held by the running service: 1 open, 77 messages heard")
-    assert found["camera"] == (GOOD, "in the running scan: 1234 pictures so far")
+    assert found["camera"] == (GOOD, "in the running scan: 1234 images so far")
     assert found["service"] == (GOOD, "skyrelief 9.9 runs here: scanning")
     assert found["worker"] == (GOOD, "camera: running, 2 of 2 waiting (drop oldest), 0.3 s behind")
     assert worse["mavlink"][0] == NOTE

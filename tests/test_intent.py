@@ -124,7 +124,7 @@ def test_every_stop_ends_the_retries_of_a_scan_that_fails(
 ) -> None:
     with Refused(tmp_path, monkeypatch) as refused:
         assert refused.command(2500, 100) == Result.ACCEPTED
-        until(lambda: refused.opened >= 3)  # it is tried again and again
+        until(lambda: refused.opened >= 3)  # it is retried
         until(lambda: refused.daemon.scanning.phase is Phase.WAITING)
         assert refused.daemon.actions.status().is_recording
         refused.command(number, component, *params)
@@ -218,7 +218,7 @@ def test_a_pause_outlasts_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     [
         (Phase.IDLE, "start a scan first"),
         (Phase.PAUSED, "paused"),
-        (Phase.WAITING, "tried again"),
+        (Phase.WAITING, "being retried"),
         (Phase.FINALISING, "being closed"),
         (Phase.SCANNING, "camera is being opened"),
     ],
@@ -333,13 +333,13 @@ def test_a_scan_by_command_is_closed_after_landing(
     fly(0.0, True)
     fly(600.0, True)
     fly(1.0, False)
-    assert told == ["Landed: the scan closes in 60 s unless you arm"]
+    assert told == ["Landed: scan closes in 60 s unless you arm"]
     fly(30.0, True)  # take-off again
     fly(1.0, False)
     fly(59.0, False)
     assert daemon.scanning.phase is Phase.SCANNING
     fly(1.5, False)
-    assert told[1:] == [told[0], "Landed and not stopped: the scan is closed"]
+    assert told[1:] == [told[0], "Scan closed after landing: no stop command"]
     until(lambda: daemon.scanning.phase is Phase.IDLE)
 
 

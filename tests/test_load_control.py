@@ -82,7 +82,7 @@ def test_record_only_keeps_pictures_that_a_replay_can_read(tmp_path: Path) -> No
     assert list(gate) == []
     assert len(alive) == 100
     assert gate.kept == 50  # five of ten a second
-    assert "50 pictures were only kept in later/" in gate.warnings[0]
+    assert "50 images were only stored in later/" in gate.warnings[0]
     again = open_camera(f"images:{tmp_path / 'later'}")
     frames = list(again)
     assert len(frames) == 50

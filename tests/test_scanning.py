@@ -76,14 +76,14 @@ def test_a_camera_that_fails_is_told(daemon: Daemon, monkeypatch: pytest.MonkeyP
     daemon._tell_of_camera()
     assert told == [
         "Camera: the picture is frozen since 8 s",
-        "No picture for 10 s: nothing is scanned",
-        "Pictures again",
+        "No images for 10 s: nothing is scanned",
+        "Camera images recovered",
     ]
     run.progress_s = time.monotonic() - 60.0
     daemon._tell_of_camera()
     scanning._run = None  # stopped meanwhile
     daemon._tell_of_camera()
-    assert told[3:] == ["No picture for 10 s: nothing is scanned"]
+    assert told[3:] == ["No images for 10 s: nothing is scanned"]
 
 
 @pytest.mark.parametrize(

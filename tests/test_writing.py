@@ -127,7 +127,7 @@ def test_what_went_wrong_beside_another_scan_is_told(slow: Slow, landing: Landin
     landing.write()
     slow.may_end.set()
     until(lambda: landing.work.answer)
-    assert landing.told == ["Scan s is kept, its files are not written: the disk is full"]
+    assert landing.told == ["Scan s is stored, its files are not written: the disk is full"]
     assert landing.work.answer is not None and landing.work.answer.result is Result.FAILED
     assert not landing.is_open
 

@@ -1,1 +1,1 @@
-"""The service that flies: it scans on command, watches itself and its machine."""
+"""The onboard service: scans on command, monitors itself and its machine."""

@@ -1,4 +1,4 @@
-"""What commands ask of the service, and what it answers; each call returns at once."""
+"""Commands of the service and their answers; each call returns at once."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from service.errors import InputError, OutsideError, SkyreliefError
 from service.workers import PROCESS
 
 MIN_FREE_MIB = 500.0
-"""The self-test fails with less than that on the disk."""
+"""The self-test fails with less free disk space."""
 
 
 NO_PHOTO = {
     Phase.IDLE: "start a scan first",
-    Phase.WAITING: "the scan failed and is tried again",
+    Phase.WAITING: "the scan failed and is being retried",
     Phase.PAUSED: "the scan is paused, resume it first",
     Phase.FINALISING: "the scan is being closed",
 }
-"""Why no keyframe can be taken."""
+"""Reasons why no keyframe can be taken."""
 
 
 class ControlActions:
     """The scanning service as commands see it: :class:`mavlink.component.control.ScanControl`."""
 
     def __init__(self, scanning: Scanning, restart: Callable[[], None]) -> None:
-        """``restart`` ends the service, which the init system starts again."""
+        """``restart`` ends the service; the init system restarts it."""
         self.is_ready = False  # still starting
         self._scanning, self._restart = scanning, restart
 
@@ -68,20 +68,20 @@ class ControlActions:
         )
 
     def start_scan(self) -> Answer:
-        """Start a scan; where the last one is being closed, as soon as that allows it."""
+        """Start a scan, once a scan that is being closed permits it."""
         if not self.is_ready:
             return Answer(Result.TEMPORARILY_REJECTED, "still starting")
         is_closing = self._scanning.is_closing
         self._scanning.start()
-        return Answer(text="Scanning once the last scan is closed") if is_closing else ACCEPTED
+        return Answer(text="Scan starts once the last one is closed") if is_closing else ACCEPTED
 
     def stop_scan(self) -> Answer:
-        """Want no scan: close the running one; the files are written after the answer."""
+        """Close the running scan and drop retries; its files are written after the answer."""
         self._scanning.stop()
         return ACCEPTED
 
     def finalise(self) -> Handled:
-        """Stop, and answer when everything is written out."""
+        """Stop, and answer when all files are written."""
         return self._scanning.finalise() or ACCEPTED
 
     def pause(self) -> Handled:
@@ -105,7 +105,7 @@ class ControlActions:
         return ACCEPTED
 
     def clear_map(self) -> Handled:
-        """Forget which surface is known, so that everything counts as new again."""
+        """Clear the map, so that every surface counts as new again."""
         scan = self._scanning.scan
         if scan is None:
             return Answer(Result.DENIED, "no scan is running")
@@ -113,7 +113,7 @@ class ControlActions:
         return ACCEPTED
 
     def self_test(self) -> Handled:
-        """Camera and disk, one after the other, off the protocol's thread."""
+        """Test camera and disk on a separate thread."""
         work = Work()
         PROCESS.start("self-test", lambda _: self._test(work))
         return work
@@ -125,21 +125,21 @@ class ControlActions:
         return work
 
     def power(self, action: Power) -> Handled:
-        """Restart the service; rebooting or shutting down the computer is the system's."""
+        """Restart the service, or reboot or shut down the computer through the init system."""
         if action is Power.RESTART_SERVICE:
             self._restart()
             return ACCEPTED
         return _systemctl("reboot" if action is Power.REBOOT else "poweroff")
 
     def parameter_changed(self, name: str, value: float) -> Answer:
-        """Work by another value of a parameter, or say why not."""
+        """Apply a new value of a parameter, or refuse it with the reason."""
         try:
             self._scanning.follow(with_parameter(self._scanning.config, name, value))
         except InputError as error:
             return Answer(Result.DENIED, str(error))
         return ACCEPTED
 
-    # ---- work of its own thread --------------------------------------------------------------
+    # ---- on worker threads -------------------------------------------------------------------
 
     def _test(self, work: Work) -> None:
         from service.cameras import open_camera
@@ -155,7 +155,7 @@ class ControlActions:
             folder = existing(Path(config.scan.folder))
             free_mib = shutil.disk_usage(folder).free / 2**20
             if free_mib < MIN_FREE_MIB:
-                raise OutsideError(f"{folder} has {free_mib:.0f} MiB left")
+                raise OutsideError(f"{folder} has only {free_mib:.0f} MiB free")
             work.finish(Answer(text="Self-test passed"))
         except SkyreliefError as error:
             work.finish(Answer(Result.FAILED, f"Self-test: {error}"))

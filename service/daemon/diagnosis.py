@@ -1,4 +1,4 @@
-"""One look at everything that a flight needs: what works, what does not, what to do about it."""
+"""Checks everything that a flight needs, and names the remedy for each fault."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ WARM_UP = (
     "/opt/skyrelief/current/bin/skyrelief warm-up"
 )
 
-SOON_DAYS = 30  # a certificate that ends before needs thinking of
+SOON_DAYS = 30  # a certificate that expires sooner gives a note
 
 GOOD, NOTE, BAD = "good", "note", "bad"
 
@@ -54,27 +54,27 @@ BOARDS: dict[str, str] = {
     "orin-agx": r"AGX.*Orin",
     "raspberry-pi-5": r"Raspberry Pi 5|Compute Module 5",
 }
-"""Name of the profile to what the device tree calls the board; as in deploy/install.sh."""
+"""Profile name to the board's name in the device tree; as in deploy/install.sh."""
 
 PLACES = (
     Path(__file__).resolve().parents[2] / "deploy" / "profiles",
     Path(sys.prefix) / "share" / "skyrelief" / "deploy" / "profiles",
 )
 
-WORST = {"ground": NOTE}  # it may just be off
+WORST = {"ground": NOTE}  # it may be switched off
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was looked at."""
+    """Result of one check."""
 
     what: str
-    verdict: str  # GOOD, NOTE (flies, but know it) or BAD
+    verdict: str  # GOOD, NOTE (can fly) or BAD
     text: str
 
 
 def examine(config: Config, listen_s: float) -> Iterator[Finding]:
-    """Every finding, as soon as it is there."""
+    """Every finding, as soon as it is available."""
     running = running_service(config.health.http) if config.health.http else None
     checks: tuple[Callable[[], Iterator[Finding]], ...] = (
         _software,
@@ -106,13 +106,13 @@ def _software() -> Iterator[Finding]:
     else:
         yield Finding("packages", GOOD, ", ".join(found))
     for name, debian in unusable_packages().items():
-        text = f"{name} cannot be loaded, what uses it is missing; apt install {' '.join(debian)}"
+        text = f"{name} cannot be loaded; apt install {' '.join(debian)}"
         yield Finding("libraries", NOTE, text)
     parents = {_parent(name) for name in ("service", "recon", "mavlink")}
     if len(parents) > 1:
         where = ", ".join(sorted(parents))
         yield Finding(
-            "packages", BAD, f"a foreign package hides one of ours ({where}); use a fresh venv"
+            "packages", BAD, f"another package shadows one of ours ({where}); use a fresh venv"
         )
 
 
@@ -132,10 +132,10 @@ def _machine(config: Config) -> Iterator[Finding]:
         yield Finding("memory", BAD if short else GOOD, text + ("; end other services" * short))
     if m.temperature_c is not None:
         hot = m.temperature_c > HOT_C
-        text = f"{m.temperature_c:.0f} degrees" + ("; it will slow down: give it air" * hot)
+        text = f"{m.temperature_c:.0f} degrees" + ("; the CPU will throttle: improve cooling" * hot)
         yield Finding("heat", NOTE if hot else GOOD, text)
     if m.throttled:
-        yield Finding("heat", NOTE, "throttled right now, by heat or a weak supply")
+        yield Finding("heat", NOTE, "throttled now, by heat or a weak power supply")
 
 
 def _board(config: Config, model: str) -> Iterator[Finding]:
@@ -143,34 +143,38 @@ def _board(config: Config, model: str) -> Iterator[Finding]:
     name = board_of(model)
     path = profile_path(name)
     if path is None:
-        yield Finding("board", NOTE, f"no settings are delivered for {model}: the defaults hold")
+        yield Finding("board", NOTE, f"no profile for {model}: the defaults are in force")
         return
     others = other_than_profile(config, path)
     if others:
-        yield Finding("board", NOTE, f"other than {path}: {'; '.join(others)}")
+        yield Finding("board", NOTE, f"differs from {path}: {'; '.join(others)}")
     else:
         yield Finding("board", GOOD, f"the settings of {name} are in force")
 
 
 def _to_fly(config: Config) -> Iterator[Finding]:
-    """What the service does not start without, or a flight is poor without."""
+    """Settings that the service requires, or without which a flight is poor."""
     needed = [n for n in ("source", "model") if not getattr(config.camera, n)]
     if is_simulated(config):
-        yield Finding("to fly", GOOD, "nothing: camera and autopilot are simulated")
+        yield Finding("to fly", GOOD, "nothing required: camera and autopilot are simulated")
         return
     if needed:
         names = " and ".join(f"camera.{n}" for n in needed)
         yield Finding("to fly", BAD, f"set {names}; the service does not start without")
     elif not config.mavlink.links:
-        yield Finding("to fly", NOTE, "set mavlink.links: without it no commands, scale or place")
+        yield Finding(
+            "to fly", NOTE, "set mavlink.links: without it no commands, scale or georeference"
+        )
     else:
-        yield Finding("to fly", GOOD, "all that is needed is set")
+        yield Finding("to fly", GOOD, "all required settings are present")
 
 
 def _clock() -> Iterator[Finding]:
     text = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
     if time.time() < EARLIEST_UNIX_S:
-        hint = "was never set; scans get wrong names and times until the autopilot tells the time"
+        hint = (
+            "was never set; names and times of scans are wrong until the autopilot sends the time"
+        )
         yield Finding("clock", NOTE, f"{text} {hint}")
     else:
         yield Finding("clock", GOOD, text)
@@ -198,13 +202,13 @@ def _compute(config: Config) -> Iterator[Finding]:
     seconds = time.monotonic() - start
     yield Finding("compute", GOOD, f"{backend.name} on {backend.device}, up in {seconds:.1f} s")
     if kernels_may_overlap():
-        yield Finding("threads", GOOD, "OpenMP or TBB: tracking and stereo run side by side")
+        yield Finding("threads", GOOD, "OpenMP or TBB: tracking and stereo run in parallel")
     else:
-        yield Finding("threads", BAD, f"no OpenMP: half as fast, one core idle; {REMEDY}")
+        yield Finding("threads", BAD, f"no OpenMP: half the speed, one core idle; {REMEDY}")
     if is_warm():
         yield Finding("kernels", GOOD, "compiled for this version")
     else:
-        yield Finding("kernels", NOTE, f"the first scan may have to compile; {WARM_UP}")
+        yield Finding("kernels", NOTE, f"the first scan may compile kernels; {WARM_UP}")
 
 
 def _camera(config: Config, running: dict[str, Any] | None) -> Iterator[Finding]:
@@ -223,7 +227,7 @@ def _camera(config: Config, running: dict[str, Any] | None) -> Iterator[Finding]
         yield Finding("camera", NOTE, "camera.source is not set")
         return
     if running is not None and "frames" in running:
-        yield Finding("camera", GOOD, f"in the running scan: {running['frames']} pictures so far")
+        yield Finding("camera", GOOD, f"in the running scan: {running['frames']} images so far")
         return
     try:
         source = open_camera(config.camera.source)
@@ -261,7 +265,7 @@ def _service(running: dict[str, Any] | None) -> Iterator[Finding]:
 
 
 def _worker(worker: dict[str, Any]) -> Finding:
-    """A thread or process of the running service: state, depth and lag."""
+    """A worker of the running service: state, depth and lag."""
     text = f"{worker['name']}: {worker['state']}"
     if worker["bound"] is not None:
         text += f", {worker['waiting']} of {worker['bound']} waiting ({worker['when_full']})"
@@ -289,20 +293,20 @@ def _certificate(config: Config) -> Iterator[Finding]:
         yield Finding("certificate", BAD, text)
     else:
         verdict = GOOD if left_days > SOON_DAYS else NOTE
-        yield Finding("certificate", verdict, f"{path} holds for {left_days:.0f} days more")
+        yield Finding("certificate", verdict, f"{path} is valid for {left_days:.0f} more days")
 
 
 def _datalink(config: Config) -> Iterator[Finding]:
     import socket
 
     if not (config.datalink.connect or config.datalink.listen):
-        yield Finding("datalink", NOTE, "no endpoints: scans stay on board")
+        yield Finding("datalink", NOTE, "no endpoints: scans stay onboard")
     for endpoint in config.datalink.connect:
         host, _, port = endpoint.partition("/")[2].partition("?")[0].rpartition(":")
         try:
             socket.create_connection((host.strip("[]"), int(port)), timeout=3.0).close()
         except (OSError, ValueError) as error:
-            yield Finding("datalink", NOTE, f"{endpoint} does not answer now ({error})")
+            yield Finding("datalink", NOTE, f"{endpoint} does not answer ({error})")
         else:
             yield Finding("datalink", GOOD, f"{endpoint} answers")
 
@@ -335,7 +339,7 @@ def profile_path(name: str) -> Path | None:
 
 
 def other_than_profile(config: Config, path: Path) -> list[str]:
-    """What the profile sets and ``config`` has otherwise: ``compute.threads = 0, not 4``."""
+    """Differences of ``config`` from the profile: ``compute.threads = 0, not 4``."""
     profile, default = load_config(path), Config()
     out = []
     for section, field in keys():
@@ -351,7 +355,7 @@ def other_than_profile(config: Config, path: Path) -> list[str]:
 def examine_links(
     config: Config, listen_s: float, running: dict[str, Any] | None
 ) -> Iterator[Finding]:
-    """What is heard on each link, and what is missing; a running service says it itself."""
+    """What each link receives and lacks, by listening or from the running service."""
     if not config.mavlink.links:
         yield Finding("mavlink", NOTE, "mavlink.links is empty: no telemetry, no commands")
     elif running is not None:
@@ -399,7 +403,7 @@ def _why_silent(link: LinkReport) -> str:
         return f"does not open: {link.last_error}" if link.last_error else "does not open"
     if link.skipped_bytes:
         return "only noise: is SERIALn_BAUD (PX4: SER_TELn_BAUD) the baud rate of mavlink.links?"
-    return "silent: is the autopilot on, its port set to MAVLink 2?"
+    return "silent: is the autopilot on and its port set to MAVLink 2?"
 
 
 def _trouble(what: str, text: str, is_grave: bool) -> Finding:

@@ -1,7 +1,7 @@
-"""Between camera and scan: which frames pass, and which are only kept on the disk.
+"""The gate between camera and scan: passes frames, or only stores them on disk.
 
-Kept images are JPEG files named by their time, a folder that ``skyrelief replay`` takes as it
-is: what was not reconstructed in flight is reconstructed later from it and the scan's .tlog.
+Stored images are JPEG files named by their time, a folder that ``skyrelief replay`` accepts: frames
+not reconstructed in flight can be reconstructed later from it and the scan's .tlog.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from service.daemon.load_shedding import STRIDE, Level
 log = logging.getLogger(__name__)
 
 KEEP_EVERY_NS = 200_000_000
-"""Between two kept images; 2 m of flight at 10 m/s."""
+"""Interval between stored images; 2 m of flight at 10 m/s."""
 
 QUALITY = 90
 MIN_FREE_MIB = 500.0
 
 
 class FrameGate:
-    """A camera of which frames pass as the ladder's level has it."""
+    """Passes the camera's frames as the current load level permits."""
 
     def __init__(
         self,
@@ -37,17 +37,17 @@ class FrameGate:
         alive: Callable[[], None],
         paused: Event,
     ) -> None:
-        """Kept images go to ``folder``; ``zero_unix_ns`` is the unix time of time 0.
+        """Stored images go to ``folder``; ``zero_unix_ns`` is the unix time of time 0.
 
-        ``alive`` is called for every frame that ends here, so that nobody takes the scan for
-        hung. While ``paused`` is set nothing is kept.
+        ``alive`` is called for every frame that ends here, so that the scan does not count as hung.
+        Nothing is stored while ``paused`` is set.
         """
         self._source, self._folder = source, folder
         self._zero_unix_ns, self._alive, self._paused = zero_unix_ns, alive, paused
         self.level = Level.FULL
         self.frames = self.kept = self.lost = 0
-        self.age_s = 0.0  # of the newest frame when it came out of the camera's queue
-        self._taken_s: float | None = None  # when the frame at work was handed on
+        self.age_s = 0.0  # age of the newest frame when it left the camera's queue
+        self._taken_s: float | None = None  # when the current frame was passed on
         self._kept_ns = -KEEP_EVERY_NS
         self._faulty = False
         self.description, self.size_px = source.description, source.size_px
@@ -62,8 +62,8 @@ class FrameGate:
         finally:
             if self.kept:
                 self.warnings.append(
-                    f"{self.kept} pictures were only kept in {self._folder.name}/, "
-                    "for a replay later"
+                    f"{self.kept} images were only stored in {self._folder.name}/, "
+                    "for a later replay"
                 )
 
     def _passing(self) -> Iterator[CameraFrame]:
@@ -82,13 +82,13 @@ class FrameGate:
 
     @property
     def busy_s(self) -> float:
-        """Seconds for which one frame has been worked on; 0 while the camera is waited for."""
+        """Seconds spent on the current frame; 0 while waiting for the camera."""
         taken_s = self._taken_s
         return 0.0 if taken_s is None else time.monotonic() - taken_s
 
     @property
     def late(self) -> int:
-        """Frames that the camera gave and nobody took up in time."""
+        """Camera frames that were dropped because nothing took them in time."""
         return self._source.dropped if isinstance(self._source, Dropping) else 0
 
     def close(self) -> None:
@@ -101,7 +101,7 @@ class FrameGate:
             self.age_s = max(0.0, 1e-9 * (time.monotonic_ns() - shown_ns))
 
     def _keep(self, frame: CameraFrame) -> None:
-        """Write the image, when one is due and there is room."""
+        """Store the image if one is due and the disk has room."""
         if self._paused.is_set() or frame.time_ns - self._kept_ns < KEEP_EVERY_NS:
             return
         self._kept_ns = frame.time_ns
@@ -110,7 +110,7 @@ class FrameGate:
         except OSError as error:
             self.lost += 1
             if not self._faulty:
-                log.error("pictures cannot be kept in %s: %s", self._folder, error.strerror)
+                log.error("images cannot be stored in %s: %s", self._folder, error.strerror)
             self._faulty = True
         else:
             self.kept += 1
@@ -130,7 +130,7 @@ class FrameGate:
 
 
 def image_name(unix_ns: int) -> str:
-    """A file name that tells the time in UTC to the microsecond: 20261121130501123456Z.jpg."""
+    """A file name with the UTC time to the microsecond: 20261121130501123456Z.jpg."""
     seconds, rest_ns = divmod(unix_ns, 1_000_000_000)
     moment = time.strftime("%Y%m%d%H%M%S", time.gmtime(seconds))
     return f"{moment}{rest_ns // 1000:06d}Z.jpg"

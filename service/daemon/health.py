@@ -1,6 +1,6 @@
-"""The state of the service, for whoever asks over HTTP on this machine.
+"""The state of the service over HTTP, for this machine.
 
-No packages: the standard library's HTTP server.
+Uses only the standard library's HTTP server.
 """
 
 from __future__ import annotations
@@ -28,13 +28,12 @@ PREFIX = "skyrelief_"
 class HealthServer:
     """``/healthz`` (200 or 503), ``/status`` (JSON) and ``/metrics`` (Prometheus) over HTTP.
 
-    ``/openapi.json`` describes them (:mod:`service.daemon.health`). ``snapshot`` is called
-    for each request, on a thread of its own; its ``ok`` decides about ``/healthz``, its numbers
-    become metrics.
+    ``/openapi.json`` describes them. ``snapshot`` is called for each request, on its thread; its
+    ``ok`` determines ``/healthz``, its numbers become metrics.
     """
 
     def __init__(self, address: str, snapshot: Snapshot) -> None:
-        """Listen on HOST:PORT; raises OutsideError when that is taken."""
+        """Listen on HOST:PORT; raises OutsideError when it is in use."""
         host, _, port = address.rpartition(":")
         try:
             listener = BoundedListener(host.strip("[]"), int(port), LIMITS)
@@ -55,9 +54,10 @@ class HealthServer:
 
 
 class OwnNames:
-    """The names that a request may call this machine by.
+    """The names that a request may use for this machine.
 
-    A foreign site's name that resolves to this machine would let a browser read for that site.
+    A foreign site's name that resolves to this machine would let a browser read on behalf of that
+    site.
     """
 
     def __init__(self, is_local: bool) -> None:
@@ -65,7 +65,7 @@ class OwnNames:
         self._name = socket.gethostname().partition(".")[0].lower()
 
     def holds(self, header: str | None) -> bool:
-        """Whether a ``Host`` header names this machine; true without one, browsers send one."""
+        """Whether a ``Host`` header names this machine; true without one (browsers send it)."""
         if header is None:
             return True
         name = host_name(header)
@@ -119,7 +119,7 @@ def _handler(snapshot: Snapshot, own_names: OwnNames) -> type[BaseHTTPRequestHan
 
         def do_GET(self) -> None:
             if not own_names.holds(self.headers.get("Host")):
-                self._answer(421, "this is not a name of this machine\n", "text/plain")
+                self._answer(421, "not a name of this machine\n", "text/plain")
                 return
             path = self.path.partition("?")[0]
             if path == "/openapi.json":
@@ -135,7 +135,7 @@ def _handler(snapshot: Snapshot, own_names: OwnNames) -> type[BaseHTTPRequestHan
             elif path == "/metrics":
                 self._answer(200, metrics_text(found), "text/plain; version=0.0.4")
             else:
-                self._answer(404, "there are /healthz, /status and /metrics\n", "text/plain")
+                self._answer(404, "available: /healthz, /status and /metrics\n", "text/plain")
 
         do_HEAD = do_GET
 
@@ -144,7 +144,7 @@ def _handler(snapshot: Snapshot, own_names: OwnNames) -> type[BaseHTTPRequestHan
             self.send_header("Allow", "GET, HEAD")
             self.send_header("Content-Length", "0")
             self.end_headers()
-            self.close_connection = True  # a body may follow, which nobody reads
+            self.close_connection = True  # a body may follow; it is not read
 
         do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = _refuse
 
@@ -170,12 +170,12 @@ HEALTH: dict[str, Any] = {
     "type": "object",
     "required": ["ok", "state", "fault"],
     "properties": {
-        "ok": {"type": "boolean", "description": "false: it needs somebody"},
+        "ok": {"type": "boolean", "description": "false: needs attention"},
         "state": {
             **_TEXT,
-            "description": "starting, idle, waiting (to try again), scanning, paused or finalising",
+            "description": "starting, idle, waiting (to retry), scanning, paused or finalising",
         },
-        "fault": {**_TEXT, "description": "why the last scan ended; empty: no reason"},
+        "fault": {**_TEXT, "description": "why the last scan failed; empty: no fault"},
     },
 }
 
@@ -185,14 +185,14 @@ STATUS: dict[str, Any] = {
     "properties": {
         **HEALTH["properties"],
         "software": _TEXT,
-        "scan": {**_TEXT, "description": "name of the scan that runs; empty: none does"},
+        "scan": {**_TEXT, "description": "name of the running scan; empty: none"},
         "recording_s": _NUMBER,
         "backend": _TEXT,
-        "backend_failure": {**_TEXT, "description": "why the backend gave way to the CPU"},
-        "frames": {**_COUNT, "description": "of the scan that runs, as the next nine"},
+        "backend_failure": {**_TEXT, "description": "why the CPU replaced the backend"},
+        "frames": {**_COUNT, "description": "of the running scan, like the next nine"},
         "map_voxels": {**_COUNT, "description": "of known surface in memory"},
         "map_tiles_on_disk": _COUNT,
-        "loop_views": {**_COUNT, "description": "keyframes remembered for loops"},
+        "loop_views": {**_COUNT, "description": "keyframes kept for loop detection"},
         "graph_keyframes": {**_COUNT, "description": "keyframes in the pose graph"},
         "clouds": _COUNT,
         "points": _COUNT,
@@ -204,7 +204,7 @@ STATUS: dict[str, Any] = {
             "type": "object",
             "required": ["level", "name", "reason"],
             "properties": {
-                "level": {**_COUNT, "description": "steps down the ladder; 0: full quality"},
+                "level": {**_COUNT, "description": "load level; 0: full quality"},
                 "name": _TEXT,
                 "reason": _TEXT,
                 "frame_age_s": _NUMBER,
@@ -218,10 +218,13 @@ STATUS: dict[str, Any] = {
             "type": "object",
             "description": "links, packets, age of the telemetry, what is missing (troubles)",
         },
-        "machine": {"type": "object", "description": "heat, power, memory, disk: what it tells"},
+        "machine": {
+            "type": "object",
+            "description": "temperature, power, memory, disk, if available",
+        },
         "workers": {
             "type": "array",
-            "description": "threads and processes that run or have failed",
+            "description": "running and failed threads and processes",
             "items": {
                 "type": "object",
                 "required": ["name", "state", "waiting", "lag_s", "bound", "when_full", "stop"],
@@ -232,7 +235,7 @@ STATUS: dict[str, Any] = {
                     "restarts": _COUNT,
                     "fault": {**_TEXT, "description": "the last one; empty: none"},
                     "waiting": {**_COUNT, "description": "entries in its queue"},
-                    "lag_s": {**_NUMBER, "description": "age of what it is at, or of the oldest"},
+                    "lag_s": {**_NUMBER, "description": "age of the current or oldest entry"},
                     "bound": {"type": ["integer", "null"], "description": "of the queue"},
                     "when_full": {**_TEXT, "description": "drop oldest, wait or refuse"},
                     "deadline_s": {"type": ["number", "null"], "description": "of progress"},
@@ -261,9 +264,9 @@ DOCUMENT: dict[str, Any] = {
     "paths": {
         "/healthz": _get(
             "Whether all is well.", "application/json", HEALTH,
-            (200, "it is"), (503, "it needs somebody"),
+            (200, "well"), (503, "needs attention"),
         ),
-        "/status": _get("How it goes.", "application/json", STATUS, (200, "everything known")),
+        "/status": _get("State of the service.", "application/json", STATUS, (200, "all values")),
         "/metrics": _get(
             "The same numbers for Prometheus.", "text/plain", _TEXT, (200, "text format 0.0.4")
         ),

@@ -1,9 +1,9 @@
-"""What is wanted of the scan, whatever happens to it: nothing, a scan, or a scan that is paused.
+"""The intended state: no scan, a scan, or a paused scan.
 
 Commands, arming and the configuration change it; retries follow it. So a stop ends every retry,
-and a pause or a fault does not end what was asked for. A small file in the folder of scans says
-that a scan by command runs, so that it goes on after the service or the computer fell over; its
-text names the boot of the computer.
+and a pause or a fault does not cancel a requested scan. A small file in the folder of scans marks
+a running commanded scan, so that it resumes after the service or the computer crashed; its text
+identifies the boot of the computer.
 """
 
 from __future__ import annotations
@@ -24,54 +24,54 @@ BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 
 class Wanted(Enum):
-    """What the operator asked for last."""
+    """The operator's last request."""
 
     NOTHING = "nothing"
     SCAN = "scan"
-    PAUSE = "pause"  # a scan that takes no frames for now
+    PAUSE = "pause"  # a scan that currently takes no frames
 
 
 class Intent:
-    """What is wanted, and when it may be tried next. Its owner guards it against other threads."""
+    """The intended state, and when to try it next. Its owner guards it against other threads."""
 
     def __init__(self) -> None:
         self.wanted = Wanted.NOTHING
-        self.failures = 0  # since the scan was asked for
-        self.paused = threading.Event()  # set exactly while a pause is wanted
+        self.failures = 0  # since the scan was requested
+        self.paused = threading.Event()  # set while a pause is wanted
         self.is_over = False  # the service ends
         self._due_s = 0.0
         self._retry_s = FIRST_RETRY_S
 
     @property
     def wants_scan(self) -> bool:
-        """True from start to stop, through pauses and retries."""
+        """True from start to stop, including pauses and retries."""
         return self.wanted is not Wanted.NOTHING
 
     def scan(self, now_s: float) -> None:
-        """Want a scan, at once; this also ends a pause."""
+        """Request a scan now; also ends a pause."""
         self._due_s, self.failures = now_s, 0
         self._retry_s = FIRST_RETRY_S
         self._want(Wanted.SCAN)
 
     def stop(self) -> None:
-        """Want nothing: no scan, no retry, no pause."""
+        """Request nothing: no scan, no retry, no pause."""
         self._want(Wanted.NOTHING)
 
     def pause(self) -> bool:
-        """Want no frames until :meth:`resume`; False when no scan is wanted."""
+        """Take no frames until :meth:`resume`; False when no scan is wanted."""
         if self.wants_scan:
             self._want(Wanted.PAUSE)
         return self.wants_scan
 
     def resume(self) -> bool:
-        """Want frames again; False unless a pause is wanted."""
+        """Take frames again; False unless a pause is wanted."""
         if self.wanted is not Wanted.PAUSE:
             return False
         self._want(Wanted.SCAN)
         return True
 
     def end(self) -> None:
-        """Want nothing, for good: the service ends."""
+        """Request nothing, permanently: the service ends."""
         self.stop()
         self.is_over = True
 
@@ -89,19 +89,19 @@ class Intent:
         return self.wants_scan and now_s >= self._due_s
 
     def failed(self, now_s: float) -> float:
-        """Note that an attempt failed; return the seconds until the next one."""
+        """Note a failed attempt; return the seconds until the next one."""
         self.failures += 1
         wait_s, self._retry_s = self._retry_s, min(2 * self._retry_s, LAST_RETRY_S)
         self._due_s = now_s + wait_s
         return wait_s
 
     def succeeded(self) -> None:
-        """Note that the attempt produces data, so the next fault is retried soon."""
+        """Note that the attempt produces data, so that the next fault is retried soon."""
         self._retry_s = FIRST_RETRY_S
 
 
 class Left(Enum):
-    """What the last life of the service left undone."""
+    """What the last run of the service left unfinished."""
 
     NOTHING = "nothing"
     BY_SERVICE = "the service ended while scanning"
@@ -109,7 +109,7 @@ class Left(Enum):
 
 
 class Resumption:
-    """What is to be scanned again; known until somebody starts or stops a scan."""
+    """The scan to resume; known until the operator starts or stops a scan."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / MARK
@@ -123,7 +123,7 @@ class Resumption:
         return Left.BY_SERVICE if boot and boot == _boot() else Left.BY_COMPUTER
 
     def note(self) -> None:
-        """A scan runs that must go on after a fall."""
+        """Mark a running scan that must resume after a crash."""
         self.left = Left.NOTHING
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -132,21 +132,21 @@ class Resumption:
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
-            log.warning("%s: a restart in flight will not scan again: %s", self._path, error)
+            log.warning("%s: a restart in flight will not resume the scan: %s", self._path, error)
 
     def forget(self) -> None:
-        """None does any more, or none need go on."""
+        """Remove the mark: no scan runs, or none need resume."""
         self.left = Left.NOTHING
         try:
             self._path.unlink(missing_ok=True)
         except OSError as error:
-            log.warning("%s stays: %s", self._path, error.strerror)
+            log.warning("%s cannot be removed: %s", self._path, error.strerror)
 
     def is_due(self, is_heard: bool, is_armed: bool) -> bool:
-        """True when a scan must be started now; asked until it is, or until nothing is left.
+        """True when a scan must be started now; queried until then, or until none is left.
 
-        After a power cut only an autopilot that is armed says that it was in flight; one that
-        is not (``is_heard``) says that the battery was changed.
+        After a power cut only an armed autopilot proves that it was in flight; a disarmed one
+        (``is_heard``) means that the battery was changed.
         """
         if self.left is Left.BY_COMPUTER and is_heard and not is_armed:
             self.forget()
@@ -154,7 +154,7 @@ class Resumption:
 
 
 def _boot() -> str:
-    """Names this boot of the computer; empty where the system does not tell."""
+    """Id of this boot of the computer; empty where the system has none."""
     try:
         return BOOT.read_text(encoding="ascii").strip()
     except OSError:
@@ -162,15 +162,15 @@ def _boot() -> str:
 
 
 class Landing(Enum):
-    """What to do after a look."""
+    """Action after a check."""
 
     NOTHING = auto()
-    LANDED = auto()  # announce it
+    LANDED = auto()  # announce the landing
     CLOSE = auto()  # close the scan
 
 
 class LandingWatch:
-    """Look at it often: it notices that the motors of a scan's flight stopped for good."""
+    """Detects that the motors of a scan's flight have stopped for good; call :meth:`look` often."""
 
     def __init__(self) -> None:
         self._has_flown = False  # armed while this scan was wanted
@@ -184,10 +184,10 @@ class LandingWatch:
         close_after_s: float,
         now_s: float,
     ) -> Landing:
-        """Return what to do at ``now_s`` of a clock that never goes back.
+        """Return the action at ``now_s`` of a monotonic clock.
 
-        ``is_disarmed`` is what the autopilot says; it is false where none is heard. A
-        ``close_after_s`` of 0 never closes.
+        ``is_disarmed`` is the autopilot's report, False where none is heard. A ``close_after_s`` of
+        0 never closes.
         """
         if is_armed or not wants_scan or close_after_s <= 0.0:
             self._has_flown = wants_scan and (is_armed or self._has_flown)

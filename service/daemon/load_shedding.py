@@ -1,9 +1,9 @@
-"""The ladder that a scan climbs down when the computer is too slow, too hot or short of memory.
+"""Load shedding in steps when the computer is too slow, too hot or short of memory.
 
-:class:`Ladder` turns readings into moves: no clock, no file, no thread. Down goes quickly, one
-step at a time, each given time to help; up goes slowly, and slower still when the last step up
-did not hold. :class:`LoadControl` measures how the running scan keeps up, asks the ladder, acts
-on its moves and reports them.
+:class:`Ladder` turns readings into steps: no clock, no file, no thread. It steps down quickly, one
+step at a time with time to take effect; up slowly, and more slowly when the last step up failed.
+:class:`LoadControl` measures the load of the running scan, queries the ladder, applies its steps
+and reports them.
 """
 
 from __future__ import annotations
@@ -26,57 +26,57 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 STRIDE = 2
-"""From LOWER_RATE on, one of so many frames is tracked."""
+"""From LOWER_RATE on, one of this many frames is tracked."""
 
 NARROWER = 0.7
 
 GRACE_S = 10.0
-"""A scan that has just begun is late by its start alone."""
+"""A scan that has just begun lags because of its start."""
 
 
 class Level(IntEnum):
-    """How much is done with the images; each step keeps what the one before gave up."""
+    """Load level; each includes the reductions of the levels before."""
 
     FULL = 0
     LOWER_RATE = 1  # every second frame, half the stereo pairs
     LOWER_RESOLUTION = 2  # the stereo pair at 0.7 of its width
     NO_UPSAMPLING = 3
-    RECORD_ONLY = 4  # images go to the disk, to be reconstructed later
+    RECORD_ONLY = 4  # images are stored on disk, for later reconstruction
 
     @property
     def label(self) -> str:
-        """As the operator reads it."""
+        """Name for the operator."""
         return self.name.lower().replace("_", " ")
 
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """What was measured since the last look; None where the machine does not tell."""
+    """Measurements since the last check; None where the machine has none."""
 
-    views: int = 0  # that came to be reconstructed
-    late_views: int = 0  # of these, given up because newer ones came faster
-    frames: int = 0  # that the camera gave
-    late_frames: int = 0  # of these, never taken up
-    age_s: float = 0.0  # of the newest frame when it was taken up
+    views: int = 0  # views due for reconstruction
+    late_views: int = 0  # of these, dropped in favour of newer ones
+    frames: int = 0  # frames of the camera
+    late_frames: int = 0  # of these, never processed
+    age_s: float = 0.0  # age of the newest frame when its processing began
     temperature_c: float | None = None
     throttled: bool | None = None
-    memory_free_mib: float | None = None  # to the limit of the service or of the machine
+    memory_free_mib: float | None = None  # below the limit of the service or the machine
 
 
 @dataclass(frozen=True, slots=True)
 class LadderConfig:
-    """When to step, and how patiently."""
+    """Thresholds and times of the steps."""
 
     hottest_c: float = 90.0
-    cooler_c: float = 8.0  # below that before stepping up
-    min_memory_mib: float = 300.0  # half of it: straight to the last step
-    late_views: float = 0.25  # share of the views that may give way
-    late_frames: float = 0.6  # share of the frames that may pass unseen
-    oldest_s: float = 1.5  # age of a frame when it is taken up
-    hopeless: float = 2.5  # so many times these: reason enough to only record
-    patience_s: float = 6.0  # of strain before a step down, and between two
-    heat_patience_s: float = 20.0  # the same: metal cools slowly
-    calm_s: float = 30.0  # without strain before a step up; doubled when that did not hold
+    cooler_c: float = 8.0  # this far below before stepping up
+    min_memory_mib: float = 300.0  # half of it: directly to the last step
+    late_views: float = 0.25  # tolerated share of late views
+    late_frames: float = 0.6  # tolerated share of missed frames
+    oldest_s: float = 1.5  # tolerated age of a frame when its processing begins
+    hopeless: float = 2.5  # at this multiple: only record
+    patience_s: float = 6.0  # of overload before a step down, and between two
+    heat_patience_s: float = 20.0  # the same for heat: cooling is slow
+    calm_s: float = 30.0  # without overload before a step up; doubled when that failed
     longest_calm_s: float = 240.0
 
     def __post_init__(self) -> None:
@@ -89,43 +89,43 @@ class LadderConfig:
 
 @dataclass(frozen=True, slots=True)
 class Strain:
-    """What is too much."""
+    """A cause of overload."""
 
     reason: str
     patience_s: float
-    lowest: Level  # no further down for this reason
-    jump: bool = False  # to ``lowest`` at once
+    lowest: Level  # lowest level for this cause
+    jump: bool = False  # step to ``lowest`` at once
 
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """A step that was taken."""
+    """A step taken."""
 
     level: Level
     reason: str  # of a step down; empty on the way up
 
     @property
     def text(self) -> str:
-        """For the operator."""
+        """Text for the operator."""
         if self.reason:
             return f"Load: {self.level.label} ({self.reason})"
         return f"Load: {self.level.label if self.level else 'full quality'} again"
 
 
 class Ladder:
-    """Where on the ladder the scan stands."""
+    """The current load level and its transitions."""
 
     def __init__(self, config: LadderConfig | None = None) -> None:
         self.config = config or LadderConfig()
         self.level = Level.FULL
-        self.reason = ""  # of the last step down; empty at FULL
-        self._strained_s = self._calm_since_s = math.nan  # since when; NaN: not now
+        self.reason = ""  # cause of the last step down; empty at FULL
+        self._strained_s = self._calm_since_s = math.nan  # start times; NaN: not now
         self._moved_s = -math.inf
         self._went_up = False
         self._calm_s = self.config.calm_s
 
     def update(self, readings: Readings, now_s: float) -> Move | None:
-        """The step to take at ``now_s`` of a clock that never goes back, if any."""
+        """The step to take at ``now_s`` of a monotonic clock, if any."""
         found = strain(readings, self.config)
         if found is not None:
             self._calm_since_s = math.nan
@@ -167,10 +167,10 @@ class Ladder:
 
 
 def strain(readings: Readings, config: LadderConfig) -> Strain | None:
-    """What is too much in ``readings``: memory before heat before lag; None when nothing is."""
+    """The overload in ``readings``: memory before heat before lag; None without any."""
     memory, heat = readings.memory_free_mib, readings.temperature_c
     if memory is not None and memory < config.min_memory_mib:
-        text = f"{memory:.0f} MiB of memory left"
+        text = f"{memory:.0f} MiB memory free"
         short = memory < 0.5 * config.min_memory_mib
         return Strain(text, config.patience_s, Level.RECORD_ONLY, jump=short)
     if heat is not None and heat > config.hottest_c:
@@ -181,12 +181,12 @@ def strain(readings: Readings, config: LadderConfig) -> Strain | None:
 
 
 def _lag(readings: Readings, config: LadderConfig) -> Strain | None:
-    """The worst of what came late, if it is too late."""
+    """The worst lag above its threshold, if any."""
     views, frames = late_shares(readings)
     found = (
         (views / config.late_views, f"{100 * views:.0f} % of the views late"),
-        (readings.age_s / config.oldest_s, f"pictures {readings.age_s:.1f} s late"),
-        (frames / config.late_frames, f"{100 * frames:.0f} % of the pictures missed"),
+        (readings.age_s / config.oldest_s, f"images {readings.age_s:.1f} s late"),
+        (frames / config.late_frames, f"{100 * frames:.0f} % of the images missed"),
     )
     times, reason = max(found)
     if times <= 1.0:
@@ -196,7 +196,7 @@ def _lag(readings: Readings, config: LadderConfig) -> Strain | None:
 
 
 def late_shares(readings: Readings) -> tuple[float, float]:
-    """Shares of views and of frames that came too late, 0 to 1."""
+    """Shares of late views and frames, 0 to 1."""
     return (
         readings.late_views / max(readings.views, 1),
         readings.late_frames / max(readings.frames, 1),
@@ -204,7 +204,7 @@ def late_shares(readings: Readings) -> tuple[float, float]:
 
 
 def is_calm(readings: Readings, config: LadderConfig) -> bool:
-    """True when everything is well below what counts as strain: a step up may be tried."""
+    """True when everything is well below its threshold: a step up may be tried."""
     views, frames = late_shares(readings)
     heat, memory = readings.temperature_c, readings.memory_free_mib
     return (
@@ -218,7 +218,7 @@ def is_calm(readings: Readings, config: LadderConfig) -> bool:
 
 
 def lowered(compute: ComputeConfig, level: Level) -> ComputeConfig:
-    """``compute`` as it is at ``level``."""
+    """``compute`` reduced to ``level``."""
     if level >= Level.LOWER_RATE:
         compute = replace(compute, pairs=max(1, compute.pairs // 2))
     if level >= Level.LOWER_RESOLUTION:
@@ -230,7 +230,7 @@ def lowered(compute: ComputeConfig, level: Level) -> ComputeConfig:
 
 
 class LoadControl:
-    """The ladder tied to a scanning service; ask it to :meth:`look` every few seconds."""
+    """The ladder of a scanning service; call :meth:`look` every few seconds."""
 
     def __init__(self, scanning: Scanning) -> None:
         self._scanning = scanning
@@ -240,7 +240,7 @@ class LoadControl:
         self.readings = Readings()
 
     def look(self, machine: Machine, now_s: float | None = None) -> Move | None:
-        """Take the readings, and the step that they ask for."""
+        """Measure, and take the resulting step."""
         now_s = time.monotonic() if now_s is None else now_s
         compute = self._scanning.config.compute
         self._ladder.config = _ladder_config(compute)
@@ -257,7 +257,7 @@ class LoadControl:
         return move
 
     def to_dict(self) -> dict[str, Any]:
-        """Level, its name and reason, and what was counted in this scan, for the health page."""
+        """Level, its name and reason, and the counts of this scan, for the health page."""
         gate, scan = self._scanning.gate, self._scanning.scan
         figures: dict[str, Any] = {
             "level": int(self._scanning.level),
@@ -282,7 +282,7 @@ class LoadControl:
             self._scanning.set_level(level)
 
     def _measure(self, machine: Machine, now_s: float) -> Readings:
-        """Heat and memory always; lag of a scan that runs, since the last look."""
+        """Measure heat and memory; for a running scan also lag since the last check."""
         fixed = Readings(
             temperature_c=machine.temperature_c,
             throttled=machine.throttled,
@@ -311,7 +311,7 @@ class LoadControl:
         )
 
     def _report_failure(self) -> None:
-        """Say once that the device has failed and the CPU goes on."""
+        """Report once that the device has failed and the CPU has replaced it."""
         failure = self._scanning.backend_failure
         if failure and failure != self._reported_failure:
             self._scanning.vehicle.statustext(f"Compute device failed: {failure}", CRITICAL)

@@ -1,12 +1,11 @@
-"""The machine under us: heat, throttling, power, memory, disk, as far as it tells.
+"""Readings of the machine: heat, throttling, power, memory, disk, as far as available.
 
-Everything comes from the kernel's files, so nothing has to be installed; ``root`` stands in
-for ``/`` in tests.
+All come from the kernel's files, so no package is needed; tests replace ``/`` by ``root``.
 
-The functions at the end keep the process from holding memory that nothing uses: the C library
-gives threads pools of their own, and keeps what was freed in them. Images are taken and freed on
-several threads, so that each pool would grow to the largest need of all; and what is free at the
-end of a pool is given back for the first one only.
+The functions at the end keep unused memory from staying with the process: the C library gives each
+thread its own memory pool and keeps freed memory in it. Images are allocated and freed on several
+threads, so that each pool would grow to the maximum need of all; and only the first pool returns
+free memory at its end.
 """
 
 from __future__ import annotations
@@ -31,15 +30,15 @@ SMALL_BYTES, KEPT_EACH = 1024, 7
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Readings at one moment; None where this machine does not tell."""
+    """Readings at one time; None where not available."""
 
     model: str
     temperature_c: float | None = None  # the hottest sensor
-    throttled: bool | None = None  # right now, for heat or lack of power
-    power_w: float | None = None  # drawn in all
+    throttled: bool | None = None  # now, by heat or low supply voltage
+    power_w: float | None = None  # total
     memory_free_mib: float | None = None  # available without swapping
     memory_total_mib: float | None = None
-    memory_limit_free_mib: float | None = None  # to the limit that the service was given
+    memory_limit_free_mib: float | None = None  # below the service's own limit
     resident_mib: float | None = None  # of this process
     load: float | None = None  # runnable threads per core, 1 minute
     disk_free_mib: float | None = None
@@ -47,25 +46,25 @@ class Machine:
 
     @property
     def memory_left_mib(self) -> float | None:
-        """What this process may still take: of the machine's memory or of its own limit."""
+        """Memory available to this process: of the machine, or below its own limit."""
         known = [m for m in (self.memory_free_mib, self.memory_limit_free_mib) if m is not None]
         return min(known, default=None)
 
     def to_dict(self) -> dict[str, Any]:
-        """The readings that there are."""
+        """The available readings."""
         return {key: value for key, value in asdict(self).items() if value is not None}
 
 
 class CoreLoad:
-    """How busy each core was since the last look, from the kernel's tick counters."""
+    """Load of each core since the last call, from the kernel's tick counters."""
 
     def __init__(self, root: Path = Path("/")) -> None:
-        """Take the first look."""
+        """Take the first reading."""
         self._file = root / "proc/stat"
         self._last = self._read()
 
     def percent(self) -> tuple[int, ...]:
-        """Percent per core since the last call; empty where the kernel does not tell."""
+        """Percent per core since the last call; empty where not available."""
         now = self._read()
         pairs = zip(now, self._last, strict=False)
         self._last = now
@@ -86,7 +85,7 @@ class CoreLoad:
 
 
 def computer_load(machine: Machine, cores: tuple[int, ...], keep_free_mib: float) -> ComputerLoad:
-    """The readings as the operator's ground station gets them over MAVLink."""
+    """The readings in the form sent over MAVLink."""
     from mavlink.component.status import ComputerLoad
 
     def used(free: float | None, total: float | None) -> int | None:
@@ -127,7 +126,7 @@ def read_machine(disk: Path, root: Path = Path("/")) -> Machine:
 
 
 def _limit_free_mib(root: Path) -> float | None:
-    """Room below the tightest memory limit of our control groups (v2); None without a limit."""
+    """Memory below the tightest limit of our control groups (v2); None without a limit."""
     line = _text(root / "proc/self/cgroup")
     if not line.startswith("0::/"):
         return None
@@ -152,7 +151,7 @@ def _hottest(root: Path) -> float | None:
 
 
 def _throttled(root: Path) -> bool | None:
-    """Raspberry Pi's firmware word, else any cooling device of a Jetson that is at work."""
+    """Throttling state of a Raspberry Pi's firmware, or an active cooling device of a Jetson."""
     word = _text(root / "sys/devices/platform/soc/soc:firmware/get_throttled")
     if word:
         return bool(int(word, 16) & THROTTLED_NOW)
@@ -165,7 +164,7 @@ def _throttled(root: Path) -> bool | None:
 
 
 def _power_w(root: Path) -> float | None:
-    """Of the input rail: an INA3221 of a Jetson gives volts and amperes per channel."""
+    """Power of the input rail: an INA3221 of a Jetson gives volts and amperes per channel."""
     for sensor in (root / "sys/class/hwmon").glob("hwmon*"):
         if "ina" not in _text(sensor / "name"):
             continue
@@ -225,10 +224,10 @@ def _text(path: Path) -> str:
 
 
 def one_pool() -> bool:
-    """True when the C library keeps to one pool from now on; threads that run have theirs.
+    """Restrict the C library to one pool; True when it does. Running threads keep theirs.
 
-    Before NumPy is imported: it would ask for huge pages (2 MiB) wherever a large array lay in
-    that pool, for whatever little comes there next.
+    Call it before NumPy is imported, which requests huge pages (2 MiB) for large arrays: any small
+    allocation that later uses such a place in the pool would occupy a whole one.
     """
     os.environ.setdefault("NUMPY_MADVISE_HUGEPAGE", "0")
     libc = _libc("mallopt")
@@ -236,11 +235,11 @@ def one_pool() -> bool:
 
 
 def fill_small_caches() -> None:
-    """Have NumPy take all the small blocks at once that it would take in the course of hours.
+    """Allocate all of NumPy's cached small blocks at once.
 
-    It keeps up to :data:`KEPT_EACH` freed blocks of every size below :data:`SMALL_BYTES`
-    (numpy/_core/src/multiarray/alloc.c): 3.5 MiB. Taken one by one they would lie between
-    images, and each hold a page of memory; taken together they lie together.
+    NumPy keeps up to :data:`KEPT_EACH` freed blocks of every size below :data:`SMALL_BYTES`
+    (numpy/_core/src/multiarray/alloc.c): 3.5 MiB. Allocated one by one they would lie between
+    images and each pin a page of memory; allocated at once they are contiguous.
     """
     import numpy as np
 
@@ -249,10 +248,9 @@ def fill_small_caches() -> None:
 
 
 def give_back(collect: bool = False) -> bool:
-    """True when freed memory went back to the system: a millisecond or two of work.
+    """Return freed memory to the system; True when it did. Takes a millisecond or two.
 
-    With ``collect`` objects that only refer to each other are freed before, as after a scan;
-    that takes longer.
+    With ``collect`` reference cycles are freed first, as after a scan; that takes longer.
     """
     if collect:
         gc.collect()
@@ -261,6 +259,6 @@ def give_back(collect: bool = False) -> bool:
 
 
 def _libc(name: str) -> ctypes.CDLL | None:
-    """The C library if it has that function (glibc has)."""
+    """The C library if it has that function (as glibc does)."""
     libc = ctypes.CDLL(None)
     return libc if hasattr(libc, name) else None

@@ -1,7 +1,7 @@
-"""The daemon's life: heartbeats first, then the heavy imports, then scans; and how it goes.
+"""The life of the onboard service: heartbeats first, then the heavy imports, then scans.
 
-MAVLink starts first and on threads of its own, so that its heartbeat does not wait for the
-heavy imports; the scan runs on one worker thread (:mod:`service.daemon.scanning`).
+MAVLink starts first and on its own threads, so that its heartbeat does not wait for the heavy
+imports; the scan runs on one worker thread (:mod:`service.daemon.scanning`).
 """
 
 from __future__ import annotations
@@ -37,41 +37,41 @@ from service.workers import PROCESS, row_of, running
 log = logging.getLogger(__name__)
 
 STUCK_S = 10.0
-"""A scan without a processed frame for so long is reported as critical."""
+"""A scan without a processed frame for this long is reported as critical."""
 
 HUNG_S = row_of("scan").deadline_s or 20.0
-"""Work on one frame or view for so long is a hang: the watchdog is no longer fed."""
+"""Work on one frame or view for this long is a hang: the watchdog is no longer fed."""
 
 CLOSING_S = 120.0
-"""Closing a scan without a step, a read or a written byte for so long is a hang, too."""
+"""Closing a scan without any progress for this long is a hang, too."""
 
 PROGRESS_S = 1.5
-"""Closing made progress when its last step is not longer ago; looked at every second."""
+"""Closing counts as progressing within this time of its last step; checked every second."""
 
 HOUSEKEEPING_S = 2.0
-"""From one look at the machine, its memory and its disk to the next."""
+"""Interval between two checks of the machine, its memory and its disk."""
 
 COMPILING_S = 180.0
-"""The same before anything was compiled, where nobody ran ``skyrelief warm-up``."""
+"""The same before anything is compiled, where ``skyrelief warm-up`` has not been run."""
 
 REPORT_FAULT_S = 10.0
-"""For so long the operator is told why the service cannot start, before it is started again."""
+"""The operator sees for this long why the service cannot start, before it is restarted."""
 
 
 class Daemon:
-    """The service on the aircraft."""
+    """The onboard service."""
 
     def __init__(
         self, config: Config, first: FirstBeats | None = None, fault: InputError | None = None
     ) -> None:
-        """``first`` speaks on the MAVLink links already. With a ``fault`` of the configuration
-        all that is done is to tell of it."""
-        self._wanted = config  # as it was asked for last; operators may have tuned it since
+        """``first`` sends heartbeats on the MAVLink links already. With a ``fault`` of the
+        configuration, the service only reports it."""
+        self._wanted = config  # as last loaded; operators may have tuned it since
         self._quit = threading.Event()
         self._fault = fault
         self._landing = LandingWatch()
         self._cores = CoreLoad()
-        self._is_silent = False  # no image comes, and that was said
+        self._is_silent = False  # no images arrive, and that was reported
         self.scanning = Scanning(config)
         self.load_control = LoadControl(self.scanning)
         self.actions = ControlActions(self.scanning, self.quit)
@@ -80,18 +80,18 @@ class Daemon:
 
     @property
     def config(self) -> Config:
-        """What is in force."""
+        """The configuration in force."""
         return self.scanning.config
 
     def run(self) -> None:
-        """Serve until :meth:`quit`; raises InputError when the configuration cannot work."""
+        """Serve until :meth:`quit`; raises InputError when the configuration is unusable."""
         notifier = Notifier()
         self.vehicle.set_health(Health.BOOT)
         self.vehicle.start()
         http = self._serve_health()
         try:
             if self.config.scan.start == "on-boot":
-                self.scanning.want()  # a stop that comes before it is ready holds
+                self.scanning.want()  # a stop before it is ready still counts
             self._load(notifier)
             self.actions.is_ready = True
             notifier.ready()
@@ -123,12 +123,12 @@ class Daemon:
                 self.vehicle.set_health(Health.CRITICAL)
                 self.vehicle.statustext(f"Not ready: {error}", CRITICAL)
                 notifier.status(str(error))
-                log.error("%s; started again in %g s", error, REPORT_FAULT_S)
+                log.error("%s; restart in %g s", error, REPORT_FAULT_S)
                 self._quit.wait(REPORT_FAULT_S)
             raise
 
     def _watch(self, notifier: Notifier) -> None:
-        """Keep the operator and the init system told until :meth:`quit`."""
+        """Report to the operator and the init system until :meth:`quit`."""
         scanning, was_armed = self.scanning, False
         while not self._quit.wait(0.25):
             self.vehicle.set_health(self._health())
@@ -141,7 +141,7 @@ class Daemon:
                 notifier.alive(scanning.phase.value)
 
     def _wait_for_closing(self, notifier: Notifier) -> None:
-        """Say once a second that the last scan is being closed, unless that hangs."""
+        """Report once a second that the last scan is being closed, unless that hangs."""
         idle_s = self.scanning.idle_closing_s
         hangs = idle_s > self._max_closing_s
         self.vehicle.set_health(Health.CRITICAL if hangs else Health.ACTIVE)
@@ -151,11 +151,11 @@ class Daemon:
     @property
     def _max_closing_s(self) -> float:
         """Seconds without progress after which the closing of a scan counts as hung."""
-        return CLOSING_S + self.config.datalink.drain_s  # a dead radio is waited for
+        return CLOSING_S + self.config.datalink.drain_s  # includes the wait for a dead radio
 
     @property
     def is_progressing(self) -> bool:
-        """False for a hang that only a restart ends; a camera that gives nothing is none."""
+        """False for a hang that only a restart ends; a silent camera is not one."""
         max_s = HUNG_S if self.scanning.is_warm else COMPILING_S
         return (
             self.scanning.busy_s < max_s
@@ -168,7 +168,7 @@ class Daemon:
         self._quit.set()
 
     def _serve_health(self) -> HealthServer | None:
-        """The server of health.http; a flight goes on without it."""
+        """The server of health.http; without it the flight continues."""
         if not self.config.health.http:
             return None
         try:
@@ -178,7 +178,7 @@ class Daemon:
             return None
 
     def snapshot(self) -> dict[str, Any]:
-        """How it goes, for /status and /metrics."""
+        """The service's state, for /status and /metrics."""
         health, status = self._health(), self.actions.status()
         figures = {"speed_m_s": status.speed_m_s, "distance_m": status.distance_m}
         scan = self.scanning.scan
@@ -206,7 +206,7 @@ class Daemon:
         } | {key: value for key, value in figures.items() if math.isfinite(value)}
 
     def _mavlink(self) -> dict[str, Any]:
-        """How the links to the vehicle do, as far as it is known."""
+        """State of the links to the vehicle, as far as known."""
         report = self.vehicle.report()
         figures = {
             "links_up": sum(link.is_up for link in report.links),
@@ -222,7 +222,7 @@ class Daemon:
         return {key: value for key, value in figures.items() if value is not None}
 
     def reload(self, wanted: Config) -> None:
-        """Take over what of ``wanted`` may change while running; the rest waits for a restart."""
+        """Apply the live keys of ``wanted``; the others wait for a restart."""
         config, taken, waiting = reload(self.config, wanted, self._wanted)
         self._wanted = wanted
         self.scanning.follow(config)
@@ -233,16 +233,16 @@ class Daemon:
             log.warning("configuration: after a restart: %s", ", ".join(waiting))
 
     def _recover(self) -> None:
-        """Close what a crash or a power cut left open; then offer what the ground lacks."""
+        """Close scans that a crash or a power cut left open; then send what the ground lacks."""
         folder = Path(self.config.scan.folder)
         if self.scanning.claim.take(folder):
             close_open_scans(folder, self.scanning.made)
         else:
-            log.warning("%s: another service scans to it; earlier scans are left alone", folder)
+            log.warning("%s: another service uses it; earlier scans are left unchanged", folder)
         self.scanning.offer_backlog()
 
     def _housekeeping(self) -> None:
-        """Watch the machine, do less when it cannot keep up, keep room on the disk."""
+        """Monitor the machine, shed load, and keep free space on the disk."""
         if self._quit.is_set():
             return
         folder, keep_free_mib = Path(self.config.scan.folder), self.config.scan.keep_free_mib
@@ -262,26 +262,26 @@ class Daemon:
         return Health.ACTIVE if self.scanning.phase is not Phase.IDLE else Health.STANDBY
 
     def _report_camera(self) -> None:
-        """Say why the scan does not grow, and when it does again."""
+        """Report why the scan does not grow, and when it does again."""
         for text in self.scanning.camera_news():
             self.vehicle.statustext(f"Camera: {text}", WARNING)
         was_silent, self._is_silent = self._is_silent, self.scanning.silent_s > STUCK_S
         if self._is_silent and not was_silent:
-            self.vehicle.statustext(f"No picture for {STUCK_S:.0f} s: nothing is scanned", CRITICAL)
+            self.vehicle.statustext(f"No images for {STUCK_S:.0f} s: nothing is scanned", CRITICAL)
         elif was_silent and not self._is_silent and self.scanning.phase is Phase.SCANNING:
-            self.vehicle.statustext("Pictures again", NOTICE)
+            self.vehicle.statustext("Camera images recovered", NOTICE)
 
     def _resume(self) -> None:
-        """Go on scanning where a fault of the service, or of its power, ended a flight's scan."""
+        """Resume a flight's scan that a fault of the service or a power cut ended."""
         if self.config.scan.start != "on-command":
             return
         report = self.vehicle.report()
         is_heard = report.autopilot is not None and report.is_certain
         if self.scanning.start_again(is_heard, report.is_armed and report.is_certain):
-            self.vehicle.statustext("Scanning again after a restart", WARNING)
+            self.vehicle.statustext("Scan resumed after a restart", WARNING)
 
     def _follow_arming(self, was_armed: bool) -> bool:
-        """Start and stop a scan with the motors, if so configured; whether they are on."""
+        """Start and stop a scan with arming, if configured; returns whether it is armed."""
         report = self.vehicle.report()
         is_armed = report.is_armed and report.is_certain
         if self.config.scan.start == "on-arm" and is_armed != was_armed:
@@ -291,7 +291,7 @@ class Daemon:
         return is_armed
 
     def _close_after_landing(self) -> None:
-        """Close a scan by command that outlives its flight: the command to stop may be lost."""
+        """Close a commanded scan after landing: the stop command may have been lost."""
         scan, presence = self.config.scan, self.vehicle.presence
         landing = self._landing.look(
             self.scanning.intent.wants_scan and scan.start == "on-command",
@@ -301,8 +301,8 @@ class Daemon:
             time.monotonic(),
         )
         if landing is Landing.LANDED:
-            text = f"Landed: the scan closes in {scan.close_after_landing_s:g} s unless you arm"
+            text = f"Landed: scan closes in {scan.close_after_landing_s:g} s unless you arm"
             self.vehicle.statustext(text, WARNING)
         elif landing is Landing.CLOSE:
-            self.vehicle.statustext("Landed and not stopped: the scan is closed", WARNING)
+            self.vehicle.statustext("Scan closed after landing: no stop command", WARNING)
             self.actions.stop_scan()

@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LATER = "later"
-"""Folder in a scan's for images that are only kept."""
+"""Subfolder of a scan for images that are only stored."""
 
 
 class ScanRun:
     """One attempt at a scan, from opening the camera until its files are written."""
 
     def __init__(self, host: Scanning, is_asked: bool) -> None:
-        """``is_asked``: a command waits for this attempt, it is no retry."""
+        """``is_asked``: a command waits for this attempt; it is no retry."""
         self.stop = threading.Event()
         self.scan: Scan | None = None
         self.gate: FrameGate | None = None
@@ -48,33 +48,33 @@ class ScanRun:
         self._host, self._is_asked = host, is_asked
         self._store: ScanStore | None = None
         self._thread_id = 0
-        self._news_reported = 0  # of the camera's warnings
+        self._news_reported = 0  # camera warnings reported so far
 
     @property
     def is_ending(self) -> bool:
-        """True once it was stopped or the scan is being closed."""
+        """True once the scan was stopped or is being closed."""
         return self.stop.is_set() or self.is_closing
 
     @property
     def busy_s(self) -> float:
-        """Seconds for which one frame or view has been worked on; 0 while the camera is awaited."""
+        """Seconds spent on the current frame or view; 0 while waiting for the camera."""
         scan, gate = self.scan, self.gate
         if scan is None or gate is None or not self.is_feeding:
             return 0.0
         return max(gate.busy_s, scan.pipeline.busy_s)
 
     def close_camera(self) -> None:
-        """Wake up a scan that waits for a dead camera."""
+        """Wake a scan that waits for a dead camera."""
         scan = self.scan
         if scan is not None:
             scan.source.close()
 
     def alive(self) -> None:
-        """Note that a frame was done."""
+        """Note that a frame was processed."""
         self.progress_s = time.monotonic()
 
     def camera_news(self) -> list[str]:
-        """Return what has gone wrong with the camera since the last call."""
+        """Camera warnings since the last call."""
         gate = self.gate
         if gate is None or self.is_ending:
             return []
@@ -83,13 +83,13 @@ class ScanRun:
         return fresh
 
     def closing_marks(self) -> tuple[Any, ...]:
-        """Return what changes when closing makes progress: uses of the store, keyframes."""
+        """Values that change when closing makes progress: uses of the store, keyframes."""
         scan, store = self.scan, self._store
         if scan is None or store is None:
             return (self.is_closing,)
         return (self.is_closing, store.uses(self._thread_id), scan.recorder.keyframes)
 
-    # ---- its thread --------------------------------------------------------------------------
+    # ---- on the scan's thread ----------------------------------------------------------------
 
     def carry_out(self) -> None:
         """Scan until stopped or the recording ends, then close the scan."""
@@ -106,7 +106,7 @@ class ScanRun:
             self.scan = self.gate = self._store = None
 
     def _open_camera(self) -> CameraSource | None:
-        """The camera at its own pace, tried until it answers; None when stopped meanwhile."""
+        """The camera at its own pace, retried until it answers; None when stopped meanwhile."""
         from service.cameras import open_camera
         from service.cameras.source import Paced
 
@@ -116,7 +116,7 @@ class ScanRun:
                 source = open_camera(self._host.config.camera.source)
                 return source if isinstance(source, Paced) else Paced(source)
             except OutsideError as error:
-                log.warning("%s; trying again in %.1f s", error, wait_s)
+                log.warning("%s; retry in %.1f s", error, wait_s)
                 text = f"Camera: {error}"
                 self._host.vehicle.statustext(text, WARNING, is_answer=is_answer)
                 is_answer = False
@@ -152,7 +152,7 @@ class ScanRun:
                 host.write_files(inputs.folder, store)
 
     def _inputs(self, source: CameraSource) -> tuple[ScanInputs, FrameGate]:
-        """What the scan is made from, with its camera behind a gate."""
+        """Inputs of the scan, with its camera behind a gate."""
         from service.cameras.camera_file import check_size
         from service.daemon.frame_gate import FrameGate
         from service.flight.scan import ScanInputs
@@ -187,7 +187,7 @@ class ScanRun:
         return inputs, gate
 
     def _feed(self, scan: Scan) -> None:
-        """Frames into the scan until it is stopped or the recording ends."""
+        """Feed frames into the scan until it is stopped or the recording ends."""
         self.is_feeding = True
         try:
             scan.run(self.stop, self._on_frame, self._host.intent.paused)
@@ -196,7 +196,7 @@ class ScanRun:
         self._host.fulfilled(self)
 
     def _close_scan(self, scan: Scan, store: ScanStore) -> None:
-        """Finish the scan; when the pipeline cannot, what is stored is kept as interrupted."""
+        """Finish the scan; if the pipeline fails, mark the stored part as interrupted."""
         with ExitStack() as on_fault:
             on_fault.callback(store.finish, {"interrupted": True})
             summary = scan.close()
@@ -221,7 +221,7 @@ class ScanRun:
 
 
 def _zero_ns(source: CameraSource) -> int:
-    """Monotonic clock at the source's time 0: its own word if it is live, else now."""
+    """Monotonic clock at the source's time 0: from a live source, otherwise now."""
     start_ns = source.start_monotonic_ns
     return time.monotonic_ns() if start_ns is None else start_ns
 
@@ -229,7 +229,7 @@ def _zero_ns(source: CameraSource) -> int:
 def odometry_reporter(
     config: Config, vehicle: VehicleLink
 ) -> Callable[[Step, VehicleState | None, int], None] | None:
-    """What tells the autopilot how it moves, where that is wanted."""
+    """Reports our motion to the autopilot, if configured."""
     if not config.mavlink.odometry:
         return None
     from service.flight.vehicle_reports import OdometryReport
@@ -238,7 +238,7 @@ def odometry_reporter(
 
 
 def report_keyframe(vehicle: VehicleLink, scan: Scan, keyframe: Keyframe) -> None:
-    """Tell ground stations of a keyframe, at the pose that it has now."""
+    """Report a keyframe to ground stations, at its current pose."""
     from service.flight.vehicle_reports import keyframe_report
 
     inputs = scan.inputs
@@ -250,20 +250,20 @@ def report_keyframe(vehicle: VehicleLink, scan: Scan, keyframe: Keyframe) -> Non
 
 
 def disagreement(offset_ns: int) -> list[str]:
-    """Nothing, or that a scan with this offset (unix time less monotonic clock) goes by another
-    clock than the computer's."""
+    """A warning if a scan with this offset (unix time minus monotonic clock) does not use the
+    computer's clock, else nothing."""
     own_ns = computer_offset_ns()
     if agree(offset_ns, own_ns):
         return []
-    return [f"Companion's clock is {_apart(own_ns - offset_ns)}: the scan takes the autopilot's"]
+    return [f"Companion's clock is {_apart(own_ns - offset_ns)}: using the autopilot's"]
 
 
 def set_since(offset_ns: int, now_ns: int) -> list[str]:
-    """Nothing, or how far the times of a scan with ``offset_ns`` are off by what is known now."""
+    """How far the times of a scan with ``offset_ns`` are off by the current one, else nothing."""
     if agree(offset_ns, now_ns):
         return []
     return [
-        "the clock was set while scanning, or the autopilot told the time only then: the scan's "
+        "the clock was set while scanning, or the autopilot sent the time late: the scan's "
         f"times are {_apart(offset_ns - now_ns)}"
     ]
 

@@ -1,6 +1,6 @@
-"""One scan at a time: what is wanted is carried out, again after a fault, until it is stopped.
+"""One scan at a time: starts the wanted scan, and retries it after a fault until it is stopped.
 
-This is the only place that catches what the outside world throws at a scan.
+Only this module catches errors of the environment during a scan.
 """
 
 from __future__ import annotations
@@ -40,23 +40,23 @@ log = logging.getLogger(__name__)
 
 
 class Scanning:
-    """What is wanted (:attr:`intent`) and what runs (a :class:`ScanRun`, or nothing)."""
+    """Links the intent (:attr:`intent`) to the running scan (a :class:`ScanRun`, or none)."""
 
     vehicle: VehicleLink
-    """Telemetry and the operator; set by who owns both, before the first scan."""
+    """Telemetry and the operator; set by the owner of both, before the first scan."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
         self.intent = Intent()
-        self.fault = ""  # why the last attempt failed; empty once another starts
+        self.fault = ""  # why the last attempt failed; cleared when another starts
         self.level = Level.FULL
-        self.is_warm = is_warm()  # nothing is left to compile
+        self.is_warm = is_warm()  # all kernels are compiled
         self.camera: Camera | None = None  # the model; None before it is loaded
-        self.latency_ms: float | None = None  # of the camera, as the last scan found it
+        self.latency_ms: float | None = None  # camera latency measured by the last scan
         self.link = DaemonLink()
         self.made: set[str] = set()  # names of the scans of this process
         self.resumption = Resumption(Path(config.scan.folder))
-        self.claim = Claim()  # to the folder of scans: whoever has it looks after earlier ones
+        self.claim = Claim()  # to the folder of scans; its holder manages earlier ones
         self._backend: Backend | None = None
         self._lock = threading.RLock()  # guards the intent, the run and the work of closing it
         self._run: ScanRun | None = None
@@ -66,7 +66,7 @@ class Scanning:
         self._watch = ClosingWatch()
 
     def load(self) -> None:
-        """The heavy part of the start: camera model and backend; InputError without them."""
+        """Load camera model and backend, which takes long; InputError if they are unusable."""
         from service.cameras.camera_file import load_camera
         from service.compute.opening import open_backend
 
@@ -74,17 +74,17 @@ class Scanning:
             raise InputError("camera.source is not set; give it in the configuration file")
         if not self.config.camera.model:
             raise InputError(
-                "camera.model is not set; make one with 'skyrelief calibrate' and name it"
+                "camera.model is not set; make one with 'skyrelief calibrate' and set it"
             )
         self.camera = load_camera(Path(self.config.camera.model))
         self._backend = open_backend(self.config.compute, self.camera.size_px)
         fill_small_caches()
         log.info("ready: backend %s", self._backend.name)
 
-    # ---- what is wanted ----------------------------------------------------------------------
+    # ---- intent ------------------------------------------------------------------------------
 
     def want(self) -> None:
-        """Want a scan; :meth:`follow_intent` starts it."""
+        """Request a scan; :meth:`follow_intent` starts it."""
         with self._lock:
             is_new = not self.intent.wants_scan
             self.resume()
@@ -93,13 +93,13 @@ class Scanning:
                 self.resumption.note()  # otherwise it starts by itself anyway
 
     def start(self) -> None:
-        """Want a scan and start it, after the one that is being closed or at once."""
+        """Request a scan and start it, at once or after the one that is being closed."""
         with self._lock:
             self.want()
             self.follow_intent()
 
     def start_again(self, is_heard: bool, is_armed: bool) -> bool:
-        """Start the scan that a fall of the service or the computer ended; False: none is due."""
+        """Resume the scan that a crash or a power cut ended; False when there is none."""
         with self._lock:
             is_due = self.resumption.is_due(is_heard, is_armed)
             if is_due:
@@ -107,7 +107,7 @@ class Scanning:
             return is_due
 
     def stop(self) -> None:
-        """Want no scan: close the one that runs, drop every retry, forget a scan to resume."""
+        """Close the running scan, drop every retry, and forget a scan to resume."""
         with self._lock:
             self.intent.stop()
             self.resumption.forget()
@@ -118,7 +118,7 @@ class Scanning:
             run.close_camera()
 
     def finalise(self) -> Work | None:
-        """Stop, and return what is done when everything is written; None where nothing runs."""
+        """Stop; returns the work of writing everything, or None when nothing runs."""
         with self._lock:
             if self._run is not None:
                 self._closing = self._closing or Work()
@@ -132,7 +132,7 @@ class Scanning:
             return self.intent.pause()
 
     def resume(self) -> bool:
-        """Take frames again after a pause; False when there was none."""
+        """Take frames again after a pause; False without a pause."""
         with self._lock:
             run = self._run
             if run is not None:
@@ -140,7 +140,7 @@ class Scanning:
             return self.intent.resume()
 
     def follow_intent(self) -> None:
-        """Start the scan that is wanted when it is due and none runs; call it often."""
+        """Start the wanted scan when it is due and none runs; call it often."""
         with self._lock:
             if self._run is not None or not self.intent.is_due(time.monotonic()):
                 return
@@ -149,18 +149,18 @@ class Scanning:
             self._worker = PROCESS.start("scan", lambda _: self._carry_out(run), lag_s=self._lag_s)
 
     def fulfilled(self, run: ScanRun) -> None:
-        """Note that the run's recording ended by itself: what was wanted is done."""
+        """Note that the run's recording has ended by itself, which fulfils the request."""
         with self._lock:
             if not run.stop.is_set():
                 run.stop.set()
                 self.intent.stop()
                 self.resumption.forget()
 
-    # ---- what is ----------------------------------------------------------------------------
+    # ---- state ------------------------------------------------------------------------------
 
     @property
     def phase(self) -> Phase:
-        """What happens now."""
+        """The current phase."""
         with self._lock:
             if self._run is None:
                 return Phase.WAITING if self.intent.wants_scan else Phase.IDLE
@@ -180,31 +180,31 @@ class Scanning:
 
     @property
     def scan(self) -> Scan | None:
-        """The scan that runs."""
+        """The running scan."""
         run = self._run
         return None if run is None else run.scan
 
     @property
     def gate(self) -> FrameGate | None:
-        """Between the camera and the scan that runs."""
+        """The gate between the camera and the running scan."""
         run = self._run
         return None if run is None else run.gate
 
     @property
     def scan_id(self) -> str:
-        """Of the scan that runs; else empty."""
+        """Name of the running scan; empty without one."""
         scan = self.scan
         return scan.inputs.scan_id if scan is not None else ""
 
     @property
     def started_s(self) -> float:
-        """Monotonic time at which the run started; now where none runs."""
+        """Monotonic start time of the run; the current time without one."""
         run = self._run
         return time.monotonic() if run is None else run.started_s
 
     @property
     def busy_s(self) -> float:
-        """Seconds for which one frame or view has been worked on; 0 while the camera is awaited."""
+        """Seconds spent on the current frame or view; 0 while waiting for the camera."""
         run = self._run
         return 0.0 if run is None else run.busy_s
 
@@ -213,27 +213,27 @@ class Scanning:
 
     @property
     def progress_s(self) -> float:
-        """Monotonic time at which a frame was done last; now where no scan runs."""
+        """Monotonic time of the last processed frame; the current time without a scan."""
         run = self._run
         return time.monotonic() if run is None else run.progress_s
 
     @property
     def silent_s(self) -> float:
-        """Seconds since a frame was done; 0 while no scan takes frames."""
+        """Seconds since the last processed frame; 0 while no scan takes frames."""
         if self.phase is not Phase.SCANNING:
             return 0.0
         return time.monotonic() - self.progress_s
 
     def camera_news(self) -> list[str]:
-        """Return what has gone wrong with the camera of a running scan since the last call."""
+        """Warnings of a running scan's camera since the last call."""
         run = self._run
         return [] if run is None else run.camera_news()
 
     @property
     def idle_closing_s(self) -> float:
-        """Seconds for which the closing of a scan has made no progress; 0 while none is closed.
+        """Seconds without progress in closing a scan; 0 while none is being closed.
 
-        Ask it often: progress is what has changed since the last call.
+        Call it often: progress is any change since the last call.
         """
         run = self._run
         is_last = self.intent.is_over and len(self._writings) > 0
@@ -245,28 +245,28 @@ class Scanning:
 
     @property
     def in_the_making(self) -> set[str]:
-        """Names of the scans that nobody may delete: the one that runs, and those whose files are
+        """Names of the scans that must not be deleted: the running one, and those whose files are
         being written."""
         return {self.scan_id, *self._writings.names}
 
     @property
     def backend_name(self) -> str:
-        """Of the backend that computes now; empty while starting."""
+        """Name of the backend in use; empty during start-up."""
         return self._backend.name if self._backend is not None else ""
 
     @property
     def backend_failure(self) -> str:
-        """Why the backend that was chosen gave way to the CPU; empty when it did not."""
+        """Why the CPU replaced the chosen backend; empty when it did not."""
         if self._backend is None:
             return ""
         from service.compute.backend_choice import FallbackBackend
 
         return (isinstance(self._backend, FallbackBackend) and self._backend.failure) or ""
 
-    # ---- what may change meanwhile ------------------------------------------------------------
+    # ---- changes in flight --------------------------------------------------------------------
 
     def follow(self, config: Config) -> None:
-        """Work by another configuration: what can change in flight also in the scan that runs."""
+        """Use another configuration; live keys also change in the running scan."""
         self.config = config
         scan = self.scan
         if scan is not None:
@@ -275,7 +275,7 @@ class Scanning:
         self.link.follow(config)
 
     def set_level(self, level: Level) -> None:
-        """Do less with the images, or more again, in this scan and in the next."""
+        """Change the load level, in this scan and in the next."""
         self.level = level
         scan, gate = self.scan, self.gate
         if scan is not None and gate is not None:
@@ -299,7 +299,7 @@ class Scanning:
         self.link.rest()
 
     def offer_backlog(self) -> None:
-        """Send earlier scans that the ground lacks while none is flown."""
+        """Send earlier scans that the ground lacks while no scan runs."""
         if self.claim.is_ours:
             self.link.offer_backlog(
                 self.config, lambda: self.phase is Phase.IDLE and not self.intent.is_over
@@ -315,7 +315,7 @@ class Scanning:
         except SkyreliefError as error:
             fault = str(error)
         except Exception as error:
-            log.exception("the scan ended with a fault of ours")
+            log.exception("the scan ended with an internal fault")
             first, *_ = str(error).strip().splitlines() or [type(error).__name__]
             fault = f"internal fault: {first}"
         give_back(collect=True)
@@ -334,7 +334,7 @@ class Scanning:
         is_first = self.intent.failures == 0
         self.vehicle.statustext(f"Scan failed: {fault}", CRITICAL, is_answer=is_first)
         if self.intent.wants_scan:
-            log.warning("scanning again in %.1f s", self.intent.failed(time.monotonic()))
+            log.warning("next attempt in %.1f s", self.intent.failed(time.monotonic()))
 
     def equipment(self) -> tuple[Camera, Backend]:
         """The camera's model and the backend."""
@@ -342,12 +342,12 @@ class Scanning:
         return self.camera, self._backend
 
     def write_files(self, folder: Path, store: ScanStore) -> None:
-        """Write a scan's files, aside when another scan is wanted meanwhile."""
+        """Write a scan's files, in the background when another scan is wanted meanwhile."""
         land = partial(self.link.land, self.config)
         self._writings.write(folder, store, lambda: self.intent.wants_scan, land, self._hand_over)
 
     def _hand_over(self) -> Work | None:
-        """Finish with a scan whose files are still being written; return what ends with them."""
+        """Release a scan whose files are being written; returns the work that ends with them."""
         self.link.land(self.config, in_haste=True)
         with self._lock:
             work, self._closing = self._closing, None

@@ -1,8 +1,8 @@
 """``camera.source = "sim:"``: a simulated flight in place of a camera and an autopilot.
 
-The flight is rendered once into the state directory, then played again and again by a process
-of its own, ``skyrelief simulate --live --loop``; camera, camera model and MAVLink link of the
-configuration lead to it. ``sim:?size=640x360&fps=10&duration_s=30&seed=1`` are the options.
+The flight is rendered once into the state directory, then played in a loop by a separate process,
+``skyrelief simulate --live --loop``; the configuration's camera, camera model and MAVLink link are
+set to it. Options: ``sim:?size=640x360&fps=10&duration_s=30&seed=1``.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from service.workers import PROCESS, Worker, end_process, open_process
 log = logging.getLogger(__name__)
 
 OPERATOR = "udpout:127.0.0.1:14550"
-"""Where ``skyrelief ctl`` and ground stations listen by default."""
+"""Default endpoint of ``skyrelief ctl`` and ground stations."""
 LOOK_S = 0.5
-REPORT_EVERY = 25  # frames between two lines of progress
+REPORT_EVERY = 25  # frames between two progress lines
 
 
 class SimulatedFlight:
-    """Camera, autopilot and place of one simulated flight."""
+    """Camera, autopilot and folder of one simulated flight."""
 
     def __init__(self, source: str) -> None:
-        """The flight that a source ``sim:`` with its options names, rendered if need be.
+        """The flight of a source ``sim:`` with its options, rendered if necessary.
 
-        InputError for options that cannot be.
+        InputError for invalid options.
         """
         _, rest, options = parse_source(source)
         given = {"size": "640x360", "fps": "10", "duration_s": "30", "seed": "1"}
@@ -54,8 +54,8 @@ class SimulatedFlight:
     def configured(self, config: Config) -> Config:
         """``config`` with this flight as its camera and its autopilot.
 
-        A scan begins at once, unless arming starts it; scans go to the state directory where
-        the default folder cannot be written.
+        A scan starts at once, unless arming starts it; scans go to the state directory if the
+        default folder cannot be written.
         """
         if not is_simulated(config):
             return config
@@ -75,7 +75,7 @@ class SimulatedFlight:
         return dataclasses.replace(config, camera=camera, mavlink=mavlink, scan=scan)
 
     def start(self) -> Worker:
-        """Play the flight until the worker is stopped; it is started again when it fails."""
+        """Play the flight until the worker is stopped; it is restarted when it fails."""
         return PROCESS.start("simulated flight", self._play)
 
     def _play(self, worker: Worker) -> None:
@@ -102,7 +102,7 @@ def is_simulated(config: Config) -> bool:
 
 
 def state_folder() -> Path:
-    """Where the service keeps what it makes: systemd's state directory, or the user's."""
+    """The service's data folder: systemd's state directory, or the user's."""
     if systemd := os.environ.get("STATE_DIRECTORY", "").partition(":")[0]:
         return Path(systemd)
     home = os.environ.get("XDG_STATE_HOME", "")
@@ -110,7 +110,7 @@ def state_folder() -> Path:
 
 
 def free_ports(count: int) -> list[int]:
-    """UDP ports of this machine that nobody uses."""
+    """Unused UDP ports of this machine."""
     with contextlib.ExitStack() as stack:
         probes = []
         for _ in range(count):
@@ -121,7 +121,7 @@ def free_ports(count: int) -> list[int]:
 
 
 def _render(folder: Path, given: dict[str, str]) -> None:
-    """Make the flight; a rendering that is cut off leaves none."""
+    """Render the flight; an interrupted rendering leaves nothing."""
     from service.sim import recording
     from service.sim.flight import FlightPlan
 
@@ -142,7 +142,7 @@ def _render(folder: Path, given: dict[str, str]) -> None:
     def report(done: int, total: int) -> None:
         if done % REPORT_EVERY == 0 or done == total:
             log.info("rendering the simulated flight: frame %d of %d", done, total)
-            notifier.closing()  # systemd waits for it
+            notifier.closing()  # extends systemd's timeout
 
     part = folder.with_name(f"{folder.name}.part")
     try:
@@ -153,7 +153,7 @@ def _render(folder: Path, given: dict[str, str]) -> None:
     except OSError as error:
         raise OutsideError(f"{folder} cannot be written: {error.strerror or error}") from error
     finally:
-        shutil.rmtree(part, ignore_errors=True)  # a full disk gets its room back
+        shutil.rmtree(part, ignore_errors=True)  # frees the space on a full disk
 
 
 def _can_write(folder: Path) -> bool:

@@ -1,4 +1,4 @@
-"""What the vehicle link is given: the [mavlink] section, and the keys that operators tune in flight
+"""Settings of the vehicle link: the [mavlink] section, and the keys that operators tune in flight
 as MAVLink parameters."""
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from service.config import Config, change
 from service.errors import InputError
 
 KEEP_S = 120.0
-"""How long the live history reaches back; frames wait for the pipeline for less than that."""
+"""Length of the live history; frames wait for the pipeline for less than that."""
 
 
 def vehicle_config(config: Config) -> VehicleConfig:
-    """Links, identity, gimbal, signing and memory; InputError when they cannot be."""
+    """Links, identity, gimbal, signing and memory; InputError when they are invalid."""
     mavlink = config.mavlink
     key = Path(mavlink.signing_key) if mavlink.signing_key else None
     try:
@@ -50,22 +50,22 @@ def watch_config(
     wait_s: float = WatchConfig.wait_s,
     ground_wait_s: float = WatchConfig.ground_wait_s,
 ) -> WatchConfig:
-    """What the links must carry for this camera, and how long it is waited for."""
+    """What the links must carry for this camera, and how long to wait for it."""
     gimbal = {"auto": None, "gimbal": True, "fixed": False}[config.camera.mount]
     return WatchConfig(gimbal, wait_s, ground_wait_s)
 
 
 @dataclass(frozen=True, slots=True)
 class Tunable:
-    """A configuration key, and its values as a parameter's."""
+    """A configuration key and its conversion to a parameter's value."""
 
     key: str
     to_key: Callable[[float], object] = float
-    from_key: Callable[[Any], float | None] = float  # None: no parameter can say it
+    from_key: Callable[[Any], float | None] = float  # None: not representable as a parameter
 
 
 def _metres_or_auto(value: object) -> float | None:
-    """The baseline as a parameter: 0 for automatic; frames cannot be said."""
+    """The baseline as a parameter: 0 for automatic; None for frames."""
     if value == "auto":
         return 0.0
     return float(value) if isinstance(value, int | float) else None
@@ -83,17 +83,17 @@ TUNABLES: dict[str, Tunable] = {
         "camera.latency", lambda v: "auto" if v else "fixed", lambda v: float(v == "auto")
     ),
 }
-"""The next parameter is a line here and one in :data:`mavlink.component.parameters.PARAMETERS`."""
+"""A new parameter is a line here and one in :data:`mavlink.component.parameters.PARAMETERS`."""
 
 
 def with_parameter(config: Config, name: str, value: float) -> Config:
-    """``config`` with a parameter's value; InputError when the key does not take it."""
+    """``config`` with a parameter's value; InputError when the key rejects it."""
     tunable = TUNABLES[name]
     return change(config, tunable.key, tunable.to_key(value))
 
 
 def parameters_of(config: Config) -> dict[str, float]:
-    """The parameters as the configuration says; those that it says otherwise are left out."""
+    """The parameters of a configuration; values that are not representable are left out."""
     found = {}
     for name, tunable in TUNABLES.items():
         section, _, field = tunable.key.partition(".")

@@ -1,8 +1,7 @@
-"""A short scan of a made-up ground, so that every compiled kernel lies in numba's cache on disk.
+"""A short scan of synthetic ground, which fills numba's cache on disk with every kernel.
 
-The installer does this once for a version: the first scan of a flight then loads its kernels
-instead of compiling them for minutes on a small board, and a scan that stands still for seconds
-can be taken for hung.
+The installer runs it once per version: the first scan of a flight then loads its kernels instead
+of compiling them for minutes on a small board; a scan that stalls for seconds can count as hung.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ INSTALLED, SERVICE_CACHE = "/opt/skyrelief", "/var/cache/skyrelief"
 
 
 class MadeUpGround:
-    """A camera over flat ground with a slab on it, flown straight on; nothing is random twice."""
+    """A camera on a straight flight over flat ground with a slab; deterministic."""
 
     def __init__(self, frames: int = FRAMES) -> None:
         self.description, self.size_px = "made-up ground", SIZE_PX
@@ -55,7 +54,7 @@ class MadeUpGround:
         for i in range(self._frames):
             x = STEP_PX * i
             image = ground[:, x : x + W].copy()
-            left = W - round(1.1 * x) % (2 * W)  # nearer by a tenth: it passes by faster
+            left = W - round(1.1 * x) % (2 * W)  # nearer by a tenth, so it moves faster
             a, b = max(0, left), min(W, left + 80)
             if a < b:
                 image[60:140, a:b] = ground[150:230, a - left : b - left]
@@ -66,9 +65,9 @@ class MadeUpGround:
 
 
 def warm_up(config: Config) -> tuple[float, int]:
-    """Scan the made-up ground with the configured backend; (seconds, keyframes) of it.
+    """Scan the synthetic ground with the configured backend; returns (seconds, keyframes).
 
-    Leaves the mark that :func:`is_warm` looks for.
+    Writes the marker that :func:`is_warm` checks.
     """
     from recon.backends.cpu import warm_up as warm_up_backend
     from recon.types import Camera
@@ -77,7 +76,7 @@ def warm_up(config: Config) -> tuple[float, int]:
     from service.scans.folder import write_deliverables
 
     start = time.monotonic()
-    warm_up_backend()  # what a device that fails would fall back to
+    warm_up_backend()  # the fallback of a device that fails
     for key in ("scan.assumed_agl_m=60", "scan.keep_debug=false", "scan.baseline=auto"):
         config = change(config, *key.split("="))
     W, H = SIZE_PX
@@ -103,7 +102,7 @@ def warm_up(config: Config) -> tuple[float, int]:
 
 
 def is_warm() -> bool:
-    """True when this version was warmed up with the cache that it uses, or the service does."""
+    """True when this version was warmed up with this cache or that of the installed service."""
     marker = _marker(os.environ.get("NUMBA_CACHE_DIR", "") or _services_cache())
     try:
         return marker is not None and marker.read_text(encoding="utf-8") == software()
@@ -123,13 +122,13 @@ def _mark() -> None:
 
 
 def _services_cache() -> str:
-    """Where an installed service keeps its kernels; empty for any other installation."""
+    """Kernel cache of an installed service; empty for any other installation."""
     return SERVICE_CACHE if Path(sys.prefix).is_relative_to(INSTALLED) else ""
 
 
 def _marker(folder: str) -> Path | None:
-    """Beside the kernels, one for each installation: a version's kernels are its own.
+    """Marker next to the kernels, one per installation: each version has its own kernels.
 
-    None when they lie with the sources, where no version is told apart.
+    None for kernels next to the sources, where versions cannot be distinguished.
     """
     return Path(folder) / f"{MARKER}-{Path(sys.prefix).name}" if folder else None

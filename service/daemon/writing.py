@@ -1,7 +1,7 @@
-"""The files of a scan that has ended, written on a thread of their own.
+"""Writes the files of a finished scan, on a separate thread.
 
-They take half a minute after a flight of five; a flight that begins meanwhile need not wait for
-them. What is stored is safe by then, and the next start writes what this one could not.
+They take half a minute after a flight of five minutes; a flight that begins meanwhile does not wait
+for them. The stored data is safe by then, and the next start writes files that are missing.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ OTHERS = ("scan.db", "link.tlog")
 
 
 class Writing:
-    """Writes a finished scan's files, from its making on."""
+    """Writes a finished scan's files, starting when it is created."""
 
     def __init__(self, folder: Path, store: ScanStore, left: Callable[[Writing], None]) -> None:
-        """Whoever waits for the end closes the ``store``; where nobody does, because of
-        :meth:`leave`, it is closed here and ``left`` is called.
+        """The thread that waits for the end closes the ``store``; after :meth:`leave` none waits,
+        so the store is closed here and ``left`` is called.
         """
         self.name = folder.name
         self.fault = ""  # why the files are not written; empty when they are
-        self.work: Work | None = None  # that ends with the files
+        self.work: Work | None = None  # work that ends with the files
         self._folder, self._store = folder, store
         self._lock, self._done = threading.Lock(), threading.Event()
         self._left, self._is_left = left, False
         self._worker = PROCESS.start("files", lambda _: self._write())
 
     def wait(self, seconds: float) -> bool:
-        """True when it is done, well or not."""
+        """True when it has ended, successfully or not."""
         return self._done.wait(seconds)
 
     def leave(self, hand_over: Callable[[], Work | None]) -> bool:
-        """Wait for it no longer, and take over the work that ``hand_over`` gives. False when it
-        is done already, and nothing of that happens.
+        """Stop waiting, and take over the work that ``hand_over`` returns. False, without any
+        effect, when the files are written already.
         """
         with self._lock:
             if self._done.is_set():
@@ -55,7 +55,7 @@ class Writing:
             return True
 
     def marks(self) -> tuple[Any, ...]:
-        """What changes when it gets on: uses of the store, bytes of files."""
+        """Values that change when it makes progress: uses of the store, bytes of files."""
         return (self._store.uses(self._worker.thread_id), sizes(self._folder))
 
     def _write(self) -> None:
@@ -71,10 +71,10 @@ class Writing:
 
 
 class Writings:
-    """All files that are being written, of the last scan and of those before it."""
+    """All files being written, of the last scan and of those before it."""
 
     def __init__(self, report: Callable[[str], None]) -> None:
-        """``report`` gets what the operator should know of files that no scan waited for."""
+        """``report`` gets messages for the operator about files that no scan waited for."""
         self._report = report
         self._all: list[Writing] = []
 
@@ -83,15 +83,15 @@ class Writings:
 
     @property
     def names(self) -> set[str]:
-        """Of the scans."""
+        """Names of the scans."""
         return {writing.name for writing in tuple(self._all)}
 
     def marks(self) -> tuple[Any, ...]:
-        """What changes when one of them gets on."""
+        """Values that change when one of them makes progress."""
         return tuple(writing.marks() for writing in tuple(self._all))
 
     def wait(self, seconds: float) -> None:
-        """Until the oldest is done, but no longer."""
+        """Wait for the oldest, at most this long."""
         for writing in tuple(self._all)[:1]:
             writing.wait(seconds)
 
@@ -101,9 +101,9 @@ class Writings:
     ) -> None:  # fmt: skip
         """Write a scan's files, then ``land`` its sender and close its store.
 
-        While ``in_haste`` says that another scan is wanted, and kernels may run on two threads at
-        once, no scan waits for the files: ``hand_over`` ends the sender, and the work that it
-        gives is finished with the files. Raises OutsideError when they cannot be written.
+        While ``in_haste`` reports that another scan is wanted, and kernels may run on two threads
+        at once, no scan waits for the files: ``hand_over`` ends the sender, and the work that it
+        returns is finished with the files. Raises OutsideError when they cannot be written.
         """
         writing = Writing(folder, store, self._written)
         self._all.append(writing)
@@ -117,18 +117,20 @@ class Writings:
             raise OutsideError(writing.fault)
 
     def _written(self, writing: Writing) -> None:
-        """The files are there that no scan waited for, or never will be in this life."""
+        """Finish files that no scan waited for, or report that they failed."""
         self._all.remove(writing)
         answer = ACCEPTED
         if writing.fault:
-            self._report(f"Scan {writing.name} is kept, its files are not written: {writing.fault}")
+            self._report(
+                f"Scan {writing.name} is stored, its files are not written: {writing.fault}"
+            )
             answer = Answer(Result.FAILED, writing.fault)
         if writing.work is not None:
             writing.work.finish(answer)
 
 
 class ClosingWatch:
-    """Feed it what :func:`marks` gives, often; it tells for how long that has been the same."""
+    """Measures how long the values of :func:`marks` have not changed; call :meth:`look` often."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -146,7 +148,7 @@ class ClosingWatch:
 def sizes(folder: Path) -> tuple[tuple[str, int], ...]:
     """Name and bytes of each file that closing writes into a scan's folder.
 
-    The store and the link's log are left out: others write them, too.
+    The store and the link's log are left out, because others write them too.
     """
     found = []
     try:

@@ -127,7 +127,7 @@ def test_kill_9_of_a_scan_started_by_command(tmp_path: Path, record: Row) -> Non
         back_s,
     )
     assert not lost
-    assert any("Scanning again after a restart" in text for text in autopilot.texts)
+    assert any("Scan resumed after a restart" in text for text in autopilot.texts)
 
 
 @pytest.mark.parametrize("fault", ["dies", "stalls", "changes size"])
@@ -219,7 +219,7 @@ def test_disk_full_then_room_again(small_disk: Path, tmp_path: Path, record: Row
         service.until(lambda: service.get().get("fault"), "the fault")
         acknowledged = stored(service.scans)
         filler.unlink()
-        back_s = service.until_more_frames("scanning again")
+        back_s = service.until_more_frames("next attempt in")
         service.stop()
     lost = acknowledged - stored(service.scans)
     record(
