@@ -253,8 +253,8 @@ def test_command_reads_a_video(tmp_path: Path) -> None:
         (["{blank}", "--pattern", "9 by 6", "--square-m", "0.025"], "inner corners"),
         (["{blank}", "--pattern", "9x6", "--square-m", "-1"], "squares"),
         (["{blank}", "--pattern", "9x6", "--square-m", "0.025"], "0 of 1"),
-        (["{broken}", "--pattern", "9x6", "--square-m", "0.025"], "no readable picture"),
-        (["{empty}", "--pattern", "9x6", "--square-m", "0.025"], "no pictures"),
+        (["{broken}", "--pattern", "9x6", "--square-m", "0.025"], "no readable image"),
+        (["{empty}", "--pattern", "9x6", "--square-m", "0.025"], "no images"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(arguments: list[str], word: str, tmp_path: Path) -> None:

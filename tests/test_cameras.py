@@ -259,7 +259,7 @@ def test_pipe_refuses_what_cannot_be_piped(monkeypatch: pytest.MonkeyPatch, tmp_
     write_video(str(path), "mp4")
     cases = {
         path.read_bytes(): "cannot be piped",
-        b"": "nothing came",
+        b"": "received nothing",
         b"no video at all " * 400: "not a video stream",
     }
     for data, expected in cases.items():

@@ -137,7 +137,7 @@ def test_names_order_and_space_stills_without_times(tmp_path: Path) -> None:
         ("f10.png", 10**9),
         ("f100.png", 2 * 10**9),
     ]
-    assert any("name no time" in w for w in source.warnings)
+    assert any("have no time" in w for w in source.warnings)
     spaced = open_camera(f"images:{tmp_path}?interval_s=2.5")
     assert [f.time_ns for f in spaced] == [0, 2_500_000_000, 5_000_000_000]
     assert spaced.warnings == []
@@ -205,7 +205,7 @@ def test_odd_ones_are_left_out_and_told(tmp_path: Path) -> None:
 
 
 def test_folders_without_pictures_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no pictures"):
+    with pytest.raises(InputError, match="no images"):
         open_camera(str(tmp_path))
     with pytest.raises(InputError, match="no such folder"):
         open_camera(f"images:{tmp_path / 'none'}")

@@ -152,7 +152,7 @@ def test_one_time_axis_through_losses() -> None:
 
 
 def test_absent_camera_is_told_at_once() -> None:
-    with pytest.raises(OutsideError, match="gives no picture"):
+    with pytest.raises(OutsideError, match="gives no image"):
         LiveSource(opener(OSError("no route")), "test", QUICK)
 
 

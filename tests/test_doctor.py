@@ -154,7 +154,10 @@ def test_threads_and_kernels_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr("service.daemon.diagnosis.kernels_may_overlap", lambda: False)
     monkeypatch.setattr("service.daemon.diagnosis.is_warm", lambda: True)
     found = findings()
-    assert found["threads"] == (BAD, "no OpenMP: half the speed, one core idle; apt install libgomp1")
+    assert found["threads"] == (
+        BAD,
+        "no OpenMP: half the speed, one core idle; apt install libgomp1",
+    )
     assert found["kernels"][0] == GOOD
 
 

@@ -113,7 +113,7 @@ def test_a_decompression_bomb_costs_itself_only(tmp_path: Path) -> None:
     source = open_camera(str(tmp_path))
     assert [frame.name for frame in source] == ["0.png", "1.png", "2.png"]
     said = " ".join(source.warnings)
-    assert "bomb.png is not a picture" in said and "½²bomb3.png" in said
+    assert "bomb.png is not a readable image" in said and "½²bomb3.png" in said
 
 
 def test_flipped_stills_cost_themselves_only(tmp_path: Path) -> None:

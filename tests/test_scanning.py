@@ -40,7 +40,7 @@ def test_pictures_that_the_camera_model_does_not_fit_are_refused(
     scanning.start()
     until(lambda: told and not scanning.is_running)
     assert told == [f"Scan failed: {scanning.fault}"]
-    assert "for 1600x1200 pictures, gimbal has 320x240" in scanning.fault
+    assert "for 1600x1200 images, gimbal has 320x240" in scanning.fault
     assert closed.is_set()
     assert not [path for path in tmp_path.iterdir() if path.is_dir()]
     scanning.stop()
@@ -67,7 +67,7 @@ def test_a_camera_that_fails_is_told(daemon: Daemon, monkeypatch: pytest.MonkeyP
     daemon._tell_of_camera()
     run: Any = ScanRun(scanning, is_asked=True)
     run.gate, run._news_told, scanning._run = gate, 1, run
-    gate.warnings.append("the picture is frozen since 8 s")
+    gate.warnings.append("the image is frozen for 8 s")
     for silent_s in (0.0, 9.0, 11.0, 300.0):
         run.progress_s = time.monotonic() - silent_s
         daemon._tell_of_camera()
@@ -75,7 +75,7 @@ def test_a_camera_that_fails_is_told(daemon: Daemon, monkeypatch: pytest.MonkeyP
     run.progress_s = time.monotonic()
     daemon._tell_of_camera()
     assert told == [
-        "Camera: the picture is frozen since 8 s",
+        "Camera: the image is frozen for 8 s",
         "No images for 10 s: nothing is scanned",
         "Camera images recovered",
     ]

@@ -1,4 +1,4 @@
-"""Cameras behind one table: each line is a word before the colon and who opens what follows it.
+"""Cameras in one table: each line is a word before the colon and the function that opens the rest.
 
 A source is written ``word:rest``, as in ``file:flight.mp4``, ``images:DIR`` or ``pipe:-``. A
 bare path is a file or a folder of images, a bare ``-`` is standard input. Options follow a
@@ -32,7 +32,7 @@ CAMERAS: dict[str, str] = {
 
 
 def open_camera(source: str) -> CameraSource:
-    """The camera that ``source`` names, open and with its first image seen.
+    """The camera that ``source`` names, open and with its first image decoded.
 
     Raises InputError when there is no such source or it holds no images, OutsideError when
     a device or a link does not answer.
@@ -45,9 +45,9 @@ def open_camera(source: str) -> CameraSource:
 
 
 def parse_source(source: str) -> tuple[str, str, dict[str, str]]:
-    """(word of the table, what follows it, options) of a source as a person writes it."""
+    """(word of the table, the rest, options) of a source as written by the user."""
     if not source:
-        raise InputError("no camera source given; name a video, a folder of pictures or '-'")
+        raise InputError("no camera source given; name a video, a folder of images or '-'")
     if source == "-":
         return "pipe", "-", {}
     path = Path(source)
@@ -61,14 +61,14 @@ def parse_source(source: str) -> tuple[str, str, dict[str, str]]:
         return word, rest, dict(parse_qsl(query, keep_blank_values=True))
     if colon and "/" not in word and "." not in word and len(word) > 1:
         near = difflib.get_close_matches(word, CAMERAS, n=1)
-        hint = f"did you mean '{near[0]}:'?" if near else f"there are {', '.join(CAMERAS)}"
+        hint = f"did you mean '{near[0]}:'?" if near else f"available: {', '.join(CAMERAS)}"
         raise InputError(f"no camera source '{word}:'; {hint}")
     raise InputError(f"no such file or folder: {source}")
 
 
 def open_sim(rest: str, options: Mapping[str, str]) -> CameraSource:
-    """Refuse: a simulated flight is more than a camera, and only the daemon plays it."""
-    raise InputError("sim: is a whole flight; 'skyrelief run' plays it, for a video 'simulate'")
+    """Refuse: a simulated flight is more than a camera, and only the service plays it."""
+    raise InputError("sim: is a whole flight; use 'skyrelief run', or 'simulate' for a video")
 
 
 def reject_options(source: str, options: Mapping[str, str], known: tuple[str, ...] = ()) -> None:
@@ -76,4 +76,4 @@ def reject_options(source: str, options: Mapping[str, str], known: tuple[str, ..
     for key in options:
         if key not in known:
             listing = ", ".join(known) if known else "none"
-            raise InputError(f"{source}: no option '{key}'; there are: {listing}")
+            raise InputError(f"{source}: no option '{key}'; available: {listing}")

@@ -23,7 +23,7 @@ MAX_VIEWS = 80
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardSet:
-    """The board in a set of images of one size."""
+    """Detected chessboards in images of one size."""
 
     views: tuple[BoardView, ...]
     missed: tuple[tuple[str, str], ...]  # (name, why the image is not used)
@@ -31,13 +31,13 @@ class BoardSet:
 
 
 def find_boards(sources: Sequence[Path], board: Board) -> BoardSet:
-    """The board in images, folders of images, or videos; InputError when nothing is usable."""
+    """Find the board in images, folders of images, or videos; InputError when none is usable."""
     views: list[BoardView] = []
     missed: list[tuple[str, str]] = []
     size: tuple[int, int] | None = None
     for name, gray in _images(sources):
         if gray is None:
-            missed.append((name, "cannot be read as a picture"))
+            missed.append((name, "cannot be read as an image"))
             continue
         shape = (gray.shape[1], gray.shape[0])
         size = size or shape
@@ -48,16 +48,16 @@ def find_boards(sources: Sequence[Path], board: Board) -> BoardSet:
         if corners is None:
             missed.append((name, f"no board of {board.columns}x{board.rows} inner corners"))
         elif _is_repeat(corners, views, size):
-            missed.append((name, "shows the board where another view has it"))
+            missed.append((name, "shows the board at the same place as another view"))
         elif len(views) < MAX_VIEWS:
             views.append(BoardView(name, corners))
     if size is None:
-        raise InputError(f"no readable picture in {', '.join(str(s) for s in sources)}")
+        raise InputError(f"no readable image in {', '.join(str(s) for s in sources)}")
     return BoardSet(tuple(views), tuple(missed), size)
 
 
 def _is_repeat(corners: F32, views: Sequence[BoardView], size: tuple[int, int]) -> bool:
-    """True when the board has hardly moved since a view that is already there."""
+    """True when the board has hardly moved since an earlier view."""
     limit = 0.004 * float(np.hypot(*size))
     return any(float(np.abs(v.corners_px - corners).max()) < limit for v in views)
 
@@ -68,7 +68,7 @@ def _images(sources: Sequence[Path]) -> Iterator[tuple[str, U8 | None]]:
         if source.is_dir():
             inside = sorted(p for p in source.iterdir() if p.suffix.lower() in STILLS)
             if not inside:
-                raise InputError(f"{source}: no pictures in this folder ({', '.join(STILLS)})")
+                raise InputError(f"{source}: no images in this folder ({', '.join(STILLS)})")
             for path in inside:
                 yield path.name, _still(path)
         elif not source.exists():
@@ -102,9 +102,9 @@ def _video(path: Path) -> Iterator[tuple[str, U8]]:
 
 
 def draw_coverage(calibration: Calibration, views: Sequence[BoardView]) -> U8:
-    """(h, w, 3) BGR image: every corner used, coloured by its view's rms, over the lens' bend.
+    """(h, w, 3) BGR image: all corners used, coloured by their view's rms, over the distortion.
 
-    The lines are a straight grid as the lens bends it, so that the distortion can be seen.
+    The lines are a straight grid as distorted by the lens.
     """
     W, H = calibration.camera.size_px
     scale = 1280.0 / W

@@ -1,4 +1,4 @@
-"""Camera models on disk: the YAML that ROS's ``camera_info_manager`` and ``calibrate`` write.
+"""Camera models on disk: YAML as written by ROS's ``camera_info_manager`` and ``calibrate``.
 
 Keys: ``image_width``, ``image_height``, ``camera_matrix.data`` (9, row by row),
 ``distortion_model: plumb_bob``, ``distortion_coefficients.data`` (k1 k2 p1 p2 k3), and of a
@@ -36,7 +36,7 @@ LONGEST_READOUT_MS = 200.0
 
 
 def load_camera(path: str | Path) -> Camera:
-    """The camera of a camera_info YAML file; InputError, in one line, when it is not usable."""
+    """The camera of a camera_info YAML file; InputError, in one line, when it is unusable."""
     path = Path(path)
     document = _read(path)
     missing = [key for key in REQUIRED if key not in document]
@@ -81,10 +81,10 @@ def with_shutter(camera: Camera, config: CameraConfig) -> Camera:
 
 
 def check_size(camera: Camera, size_px: tuple[int, int], source: str) -> None:
-    """InputError when the images (W, H) of ``source`` are not those of the camera model."""
+    """InputError when the image size (W, H) of ``source`` differs from the camera model's."""
     if camera.size_px != size_px:
         raise InputError(
-            f"the camera model is for {camera.size_px[0]}x{camera.size_px[1]} pictures, "
+            f"the camera model is for {camera.size_px[0]}x{camera.size_px[1]} images, "
             f"{source} has {size_px[0]}x{size_px[1]}; calibrate at that size"
         )
 

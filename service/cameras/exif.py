@@ -1,4 +1,4 @@
-"""When and where a still was taken: EXIF, DJI's XMP block, or its file name.
+"""Time and place of a still: EXIF, DJI's XMP block, or its file name.
 
 EXIF 2.32 (CIPA DC-008-2019) sections 4.6.5 and 4.6.6; XMP names as DJI writes them.
 """
@@ -27,7 +27,7 @@ EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
 @dataclass(frozen=True, slots=True)
 class Tags:
-    """What a still says of itself; times in ns, None where it does not say."""
+    """Tags of a still; times in ns, None where missing."""
 
     size_px: tuple[int, int]
     local_ns: int | None = None  # camera's clock, as if it were UTC
@@ -37,7 +37,7 @@ class Tags:
     sub_second: bool = False  # local_ns is finer than a second
     geotag: GeoTag | None = None
     lens: Lens | None = None
-    turned_deg: int = 0  # clockwise, by which viewers turn the stored pixels
+    turned_deg: int = 0  # clockwise rotation that viewers apply to the stored pixels
 
 
 BROKEN = (
@@ -50,11 +50,11 @@ BROKEN = (
     ValueError,
     struct.error,
 )
-"""What Pillow raises, besides OSError, for files that are no images or hold broken tags."""
+"""Pillow's errors, besides OSError, for invalid images or broken tags."""
 
 
 def read_tags(path: Path) -> Tags:
-    """The tags of the image at ``path``; raises OSError when it is not an image, or one that
+    """The tags of the image at ``path``; raises OSError when it is not an image, or when it
     claims more pixels than any camera has."""
     from PIL import Image
 
@@ -164,7 +164,7 @@ def _gimbal_ypr_deg(xmp: dict[str, str]) -> tuple[float, float, float] | None:
 
 
 def _xmp(path: Path) -> dict[str, str]:
-    """DJI's and Pix4D's values of the XMP block, written as attributes or as elements."""
+    """DJI's and Pix4D's values in the XMP block, as attributes or as elements."""
     with path.open("rb") as stream:
         head = stream.read(XMP_BYTES)
     text = head.decode("latin-1")

@@ -1,4 +1,4 @@
-"""A folder of stills, as mapping drones leave it: times and positions from the images' tags."""
+"""A folder of stills, as mapping drones store them: times and positions from the images' tags."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ log = logging.getLogger(__name__)
 SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"))
 SECOND_NS = 1_000_000_000
 ZOOM = 0.03
-"""Share by which focal lengths of one camera may differ."""
+"""Relative tolerance of the focal lengths of one camera."""
 
 ROLLED_DEG = 45.0
-ZONE_NS = 900 * SECOND_NS  # time zones are whole quarters of an hour
+ZONE_NS = 900 * SECOND_NS  # time zones are multiples of a quarter of an hour
 
 
 class ImagesSource:
-    """The stills of one folder in order of time; unreadable ones are left out, with a warning."""
+    """The stills of one folder in order of time; unreadable ones are skipped with a warning."""
 
     def __init__(self, folder: Path, interval_s: float | None) -> None:
-        """Read the tags of every still; ``interval_s`` spaces stills by name instead of tags."""
+        """Read the tags of every still; ``interval_s`` sets times by name instead of by tags."""
         self.description = str(folder)
         self.is_live = False
         self.start_monotonic_ns: int | None = None
@@ -58,13 +58,13 @@ class ImagesSource:
         for path, tags, time_ns in self._stills:
             image = _load(path, tags.size_px, self.turned_deg)
             if image is None or image.shape[:2] != (self.size_px[1], self.size_px[0]):
-                self._warn(f"{path.name} cannot be decoded; left out")
+                self._warn(f"{path.name} cannot be decoded; skipped")
                 continue
             yield CameraFrame(image, time_ns, seq, tags.geotag, path.name)
             seq += 1
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Nothing is open."""
 
     def _read(self, folder: Path) -> list[tuple[Path, Tags]]:
         paths = sorted(
@@ -77,24 +77,24 @@ class ImagesSource:
                 tagged.append((path, read_tags(path)))
             except OSError as error:
                 why = " ".join(str(error).split())[:120] or type(error).__name__
-                self._warn(f"{path.name} is not a picture that can be read ({why}); left out")
+                self._warn(f"{path.name} is not a readable image ({why}); skipped")
         if not tagged:
-            raise InputError(f"{folder} holds no pictures (jpg, png, tif); name their folder")
+            raise InputError(f"{folder} holds no images (jpg, png, tif); give their folder")
         return tagged
 
     def _same_size(self, tagged: list[tuple[Path, Tags]]) -> list[tuple[Path, Tags]]:
-        """Those of the most frequent size: one camera model fits one size."""
+        """Stills of the most frequent size: a camera model is for one size."""
         size_px, _ = Counter(tags.size_px for _, tags in tagged).most_common(1)[0]
         kept = [(path, tags) for path, tags in tagged if tags.size_px == size_px]
         if len(kept) < len(tagged):
             self._warn(
-                f"{len(tagged) - len(kept)} pictures are not {size_px[0]}x{size_px[1]} like the "
-                "others; left out"
+                f"{len(tagged) - len(kept)} images are not {size_px[0]}x{size_px[1]} like the "
+                "others; skipped"
             )
         return kept
 
     def _same_lens(self, tagged: list[tuple[Path, Tags]]) -> list[tuple[Path, Tags]]:
-        """Those of the most frequent focal length: one camera model fits one zoom."""
+        """Stills of the most frequent focal length: a camera model is for one zoom."""
         focal = [0.0 if tags.lens is None else tags.lens.focal for _, tags in tagged]
         known = [f for f in focal if f]
         if not known:
@@ -104,15 +104,15 @@ class ImagesSource:
         if len(kept) < len(tagged):
             self._warn(
                 f"{len(tagged) - len(kept)} images were not taken with the focal length of the "
-                "others; left out"
+                "others; skipped"
             )
         return kept
 
     def _turn(self, tagged: list[tuple[Path, Tags]]) -> int:
-        """Degrees clockwise that all stills are to be turned by, as their tags say.
+        """Rotation in degrees clockwise for all stills, by their tags.
 
-        A camera that looks down does not know its upper side: where the tags differ, or the
-        gimbal itself was rolled, the images stay as they are stored.
+        A camera that looks down has no defined upper side: where the tags differ, or the gimbal
+        itself was rolled, the images stay as stored.
         """
         turns = {tags.turned_deg for _, tags in tagged}
         rolls = [
@@ -123,7 +123,7 @@ class ImagesSource:
         if rolls and median(rolls) > ROLLED_DEG:
             return 0
         if len(turns) > 1:
-            self._warn("the images' tags name different upper sides: taken as stored")
+            self._warn("the images' tags have different orientations: used as stored")
             return 0
         return turns.pop()
 
@@ -138,13 +138,13 @@ class ImagesSource:
             return _from_first(spread(known, tags)), min(known)
         local = [t.local_ns for t in tags if t.local_ns is not None]
         if interval_s is None and len(local) == len(tags):
-            self._warn("the pictures name no time zone; their absolute time is unknown")
+            self._warn("the images have no time zone; their absolute time is unknown")
             return _from_first(spread(local, tags)), None
         if interval_s is None:
             missing = sum(t.local_ns is None and t.name_unix_ns is None for t in tags)
             self._warn(
-                f"{missing} of {len(tags)} pictures name no time; taken by name, one a second "
-                "(say otherwise with images:DIR?interval_s=2)"
+                f"{missing} of {len(tags)} images have no time; ordered by name, one per second "
+                "(set it with images:DIR?interval_s=2)"
             )
         step_ns = round((interval_s or 1.0) * SECOND_NS)
         return [i * step_ns for i in range(len(tags))], unix[0]
@@ -155,11 +155,11 @@ class ImagesSource:
 
 
 def open_images(rest: str, options: Mapping[str, str]) -> ImagesSource:
-    """The stills in folder ``rest``; option ``interval_s`` sets their spacing by hand."""
+    """The stills in folder ``rest``; option ``interval_s`` sets their interval."""
     reject_options("images", options, ("interval_s",))
     folder = Path(rest)
     if not folder.is_dir():
-        raise InputError(f"no such folder of pictures: {folder}")
+        raise InputError(f"no such folder of images: {folder}")
     interval_s = None
     if "interval_s" in options:
         try:
@@ -178,7 +178,7 @@ def natural_key(path: Path) -> list[tuple[int, int, str]]:
 
 
 def clock_offset_ns(tags: list[Tags]) -> int | None:
-    """Camera's clock minus UTC: as written, else from the GPS times; None when neither is there.
+    """Camera's clock minus UTC: as written, otherwise from GPS times; None without either.
 
     GPS times in EXIF are whole seconds and may lag, so the difference is rounded to a time
     zone (quarter of an hour) unless the camera's clock is off by more than a minute.
@@ -203,7 +203,7 @@ def utc_ns(tags: Tags, offset_ns: int | None) -> int | None:
 
 
 def spread(times_ns: list[int], tags: list[Tags]) -> list[int]:
-    """The same times, with stills of one whole second spread evenly over that second."""
+    """The same times, with stills within one whole second spread evenly over that second."""
     same = Counter(times_ns)
     taken: Counter[int] = Counter()
     out = []
@@ -222,7 +222,7 @@ def _from_first(times_ns: list[int]) -> list[int]:
 def _load(path: Path, stored_px: tuple[int, int], turned_deg: int) -> U8 | None:
     """(H, W, 3) BGR, turned clockwise by ``turned_deg``.
 
-    None when the file does not decode, or is not of ``stored_px`` (W, H) any more.
+    None when the file does not decode, or its size is no longer ``stored_px`` (W, H).
     """
     import cv2
 

@@ -1,4 +1,4 @@
-"""The lens as a still's own tags describe it: the maker's calibration, else the focal length.
+"""The lens from a still's own tags: the maker's calibration, otherwise the focal length.
 
 EXIF 2.32 (CIPA DC-008-2019) sections 4.6.5 (focal plane resolution) and G (35 mm equivalent, by
 the diagonal); XMP names as DJI, Pix4D and Parrot write them.
@@ -20,22 +20,22 @@ from recon.types import Camera
 DIAGONAL_35MM = 43.2666
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 MIN_FOCAL, MAX_FOCAL = 0.2, 20.0
-"""Focal length over the longer side of the image; outside, a tag is wrong."""
+"""Focal length over the longer side of the image; a tag outside this range is wrong."""
 
 SAME_SHAPE = 0.005
-"""Share by which the sides of two images of one shape may differ: sizes are whole pixels."""
+"""Relative tolerance of aspect ratios: sizes are whole pixels."""
 
 AGREEMENT = 0.1
-"""A focal length that differs from the 35 mm equivalent by a larger share is of another size of
-the image: programs that make images smaller keep such tags as they were."""
+"""A focal length that differs more from the 35 mm equivalent belongs to another size of the image:
+programs that shrink images keep such tags unchanged."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """A pinhole with distortion, in shares of the longer side of the image."""
+    """A pinhole camera with distortion, in units of the longer side of the image."""
 
     focal: float
-    principal: tuple[float, float] = (0.0, 0.0)  # off the middle of the image
+    principal: tuple[float, float] = (0.0, 0.0)  # offset from the image centre
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     source: str = ""  # "the maker's calibration", "the focal length in EXIF", ...
 
@@ -49,7 +49,7 @@ class Lens:
 
 
 def turned(camera: Camera, clockwise_deg: int) -> Camera:
-    """The camera of its image turned clockwise by 0, 90, 180 or 270 degrees."""
+    """The camera of its image rotated clockwise by 0, 90, 180 or 270 degrees."""
     for _ in range(clockwise_deg // 90 % 4):
         (W, H), K = camera.size_px, camera.K
         k1, k2, p1, p2, k3 = camera.distortion
@@ -59,10 +59,10 @@ def turned(camera: Camera, clockwise_deg: int) -> Camera:
 
 
 def fitted(camera: Camera, size_px: tuple[int, int], turned_deg: int) -> Camera | None:
-    """The camera model for images of ``size_px`` (W, H); None where its shape is another one.
+    """The camera model for images of ``size_px`` (W, H); None for another aspect ratio.
 
-    The model may be of another size, and of the images as they are stored: those are turned
-    clockwise by ``turned_deg`` before anyone sees them.
+    The model may be for another size, and for the images as stored: those are rotated clockwise by
+    ``turned_deg`` when read.
     """
     for clockwise_deg in dict.fromkeys((turned_deg, 0)):
         model = turned(camera, clockwise_deg)
@@ -77,9 +77,9 @@ def fitted(camera: Camera, size_px: tuple[int, int], turned_deg: int) -> Camera 
 def lens_of(
     photo: Mapping[int, Any], xmp: Mapping[str, str], size_px: tuple[int, int]
 ) -> Lens | None:
-    """The lens by a still's EXIF (``photo``) and XMP; None where they do not tell it.
+    """The lens by a still's EXIF (``photo``) and XMP; None without lens tags.
 
-    ``size_px`` (W, H) is of the still as it is, which may be smaller than it was taken.
+    ``size_px`` (W, H) is the still's current size, which may be smaller than the original.
     """
     found = [_maker(photo, xmp, size_px), _pix4d(photo, xmp, size_px), _focal(photo, size_px)]
     sound = [lens for lens in found if lens is not None and _is_sound(lens, size_px)]
@@ -156,7 +156,7 @@ def _full_frame(photo: Mapping[int, Any], size_px: tuple[int, int]) -> Lens | No
 
 
 def _taken_side(photo: Mapping[int, Any], size_px: tuple[int, int]) -> float:
-    """Longer side in pixels of the image as it was taken."""
+    """Longer side in pixels of the original image."""
     taken = [_number(photo.get(tag)) or 0.0 for tag in (40962, 40963)]
     same_shape = (
         min(taken) > 0 and abs(max(taken) / min(taken) / (max(size_px) / min(size_px)) - 1.0) < 0.02

@@ -1,10 +1,10 @@
-"""A camera that never ends: arrival times smoothed, stalls and frozen images found out.
+"""A live camera: smooths arrival times, detects stalls and frozen images.
 
-The stream is opened again, with growing pauses, when it ends, fails, stalls or repeats one
-image. Images keep one time axis through all of that: ns since the source was opened, on the
-machine's monotonic clock.
+The stream is reopened, with growing pauses, when it ends, fails, stalls or repeats one image.
+Images keep one time axis throughout: ns since the source was opened, on the machine's monotonic
+clock.
 
-``rtsp://…``; ``stream:URL`` for whatever else FFmpeg opens (udp, tcp, srt, http);
+``rtsp://…``; ``stream:URL`` for anything else that FFmpeg opens (udp, tcp, srt, http);
 ``v4l2:/dev/video0?video_size=1280x720&framerate=30&input_format=mjpeg``. GStreamer's pipelines
 are in :mod:`service.cameras.gstreamer`.
 """
@@ -39,15 +39,15 @@ V4L2_OPTIONS = ("video_size", "framerate", "input_format")
 OPEN_S = 10.0
 
 LIVE_OPTIONS = {"fflags": "nobuffer", "flags": "low_delay", "fpsprobesize": "0"}
-"""The last: the stream is opened at once, not when its rate is known some twenty images later."""
+"""The last one: open the stream at once, without waiting some twenty images for its rate."""
 
 
 @dataclass(frozen=True, slots=True)
 class LiveConfig:
-    """When a live camera counts as gone, and how it is called back."""
+    """When a live camera counts as lost, and how it is reopened."""
 
-    stall_s: float = 3.0  # no image for so long: open again
-    frozen_s: float = 8.0  # one and the same image for so long: open again
+    stall_s: float = 3.0  # no image for this long: reopen
+    frozen_s: float = 8.0  # the same image for this long: reopen
     first_retry_s: float = 0.25
     longest_retry_s: float = 5.0
 
@@ -60,16 +60,16 @@ class LiveConfig:
 
 
 class StampFilter:
-    """Arrival times without their jitter: presentation time plus the least delay seen of late.
+    """Arrival times without jitter: presentation time plus the recent minimum of the delay.
 
-    Queues and decoders only ever delay an image, so the lower envelope of arrival minus
-    presentation time is the best estimate of the clocks' offset. It may rise by 200 ppm, which
-    is more than two crystals drift apart. A new connection first hands over what it had
-    gathered, faster than it was taken: those images are older than their arrival tells.
+    Queues and decoders only delay images, so the lower envelope of arrival minus presentation
+    time is the best estimate of the clocks' offset. It may rise by 200 ppm, more than two
+    crystals drift apart. A new connection first delivers its backlog, faster than it was
+    recorded: those images are older than their arrival suggests.
     """
 
     RISE = 200e-6
-    BACKLOG = 0.25  # of the step in presentation time: offset falls faster while catching up
+    BACKLOG = 0.25  # share of the step in presentation time: catching up if the offset falls faster
 
     def __init__(self) -> None:
         """Start with no estimate."""
@@ -87,7 +87,7 @@ class StampFilter:
         self._last_pts_ns = pts_ns
         delay_ns = float(arrival_ns - pts_ns)
         if self._offset_ns is None or not 0 <= step_ns < 10_000_000_000:
-            self._offset_ns = delay_ns  # first image, or a new time line
+            self._offset_ns = delay_ns  # first image, or a new time axis
             return None
         fall_ns = self._offset_ns - delay_ns
         self._offset_ns = min(self._offset_ns + self.RISE * step_ns, delay_ns)
@@ -95,7 +95,7 @@ class StampFilter:
 
 
 class LiveSource:
-    """Images of a stream that is opened again whenever it is lost."""
+    """Images of a stream that is reopened whenever it is lost."""
 
     def __init__(
         self,
@@ -103,9 +103,9 @@ class LiveSource:
         description: str,
         config: LiveConfig | None = None,
     ) -> None:
-        """Open the stream by ``open_container(stall_s)`` and see its first image.
+        """Open the stream by ``open_container(stall_s)`` and decode its first image.
 
-        Raises OutsideError when the camera gives none now; nothing is retried here.
+        Raises OutsideError when the camera gives none now; the constructor does not retry.
         """
         self.description = description
         self.config = config or LiveConfig()
@@ -114,7 +114,7 @@ class LiveSource:
         self.warnings: list[str] = []
         self.losses = 0
         self.misfits = 0  # images of another size, dropped
-        self._fits = True  # the last image did
+        self._fits = True  # whether the last image had the right size
         self.epoch_unix_ns: int | None = time.time_ns()
         self._start_ns = time.monotonic_ns()
         self.start_monotonic_ns: int | None = self._start_ns
@@ -126,13 +126,13 @@ class LiveSource:
         if first is None:
             why = f" ({self.warnings[-1]})" if self.warnings else ""
             raise OutsideError(
-                f"{description}: gives no picture; is the camera on and streaming?{why}"
+                f"{description}: gives no image; is the camera on and streaming?{why}"
             )
         self.size_px = (first[0].shape[1], first[0].shape[0])
         self._first = first
 
     def __iter__(self) -> Iterator[CameraFrame]:
-        """Yield images until :meth:`close`; then, or when dropped, let go of the stream."""
+        """Yield images until :meth:`close`; then, or when dropped, release the stream."""
         self._iterated = True
         try:
             yield from self._frames()
@@ -140,7 +140,7 @@ class LiveSource:
             self._images.close()
 
     def close(self) -> None:
-        """End the iteration at the next image, and the waiting for a lost camera at once."""
+        """End the iteration at the next image; a wait for a lost camera ends at once."""
         self._closed.set()
         if not self._iterated:
             self._images.close()
@@ -175,7 +175,7 @@ class LiveSource:
             self._images = self._connect()
 
     def _connect(self) -> Generator[tuple[U8, int], None, None]:
-        """The (image, time) of one connection; ends, with a log line, when it is lost."""
+        """The (image, time) of one connection; ends, with a log message, when it is lost."""
         import av.error
 
         try:
@@ -188,7 +188,7 @@ class LiveSource:
             if stream is None:
                 self._warn("holds no video stream that can be decoded")
                 return
-            rate = stream.average_rate  # as the camera says; it is not measured
+            rate = stream.average_rate  # nominal, not measured
             self.fps = float(rate) if rate else None
             log.info("%s: connected", self.description)
             yield from self._watch(decoded_frames(container, stream, self._warn, self._damage))
@@ -208,13 +208,13 @@ class LiveSource:
             if fingerprint != print_of_last:
                 print_of_last, changed_ns = fingerprint, arrival_ns
             elif arrival_ns - changed_ns > self.config.frozen_s * 1e9:
-                self._warn(f"the picture is frozen since {self.config.frozen_s:g} s")
+                self._warn(f"the image is frozen for {self.config.frozen_s:g} s")
                 return
             time_ns: int | None = arrival_ns
             if frame.pts is not None and frame.time_base is not None:
                 pts_ns = round(frame.pts * frame.time_base * 1_000_000_000)
                 time_ns = stamps.time_ns(pts_ns, arrival_ns)
-            elif stamps.is_set:  # left in the decoder when the stream broke off, seconds ago
+            elif stamps.is_set:  # left in the decoder from before the interruption
                 time_ns = None
             if time_ns is not None:
                 yield image, time_ns - self._start_ns
@@ -225,7 +225,7 @@ class LiveSource:
     def _warn_misfit(self, image: U8) -> None:
         if self._fits:
             self._warn(
-                f"now gives {image.shape[1]}x{image.shape[0]} pictures instead of "
+                f"now gives {image.shape[1]}x{image.shape[0]} images instead of "
                 f"{self.size_px[0]}x{self.size_px[1]}; they are dropped: the camera model does "
                 "not fit them"
             )
@@ -233,7 +233,7 @@ class LiveSource:
         self.misfits += 1
 
     def _warn(self, text: str) -> None:
-        text = without_credentials(text)  # FFmpeg's errors name the address
+        text = without_credentials(text)  # FFmpeg's errors contain the address
         if not self._closed.is_set():
             if text not in self.warnings:
                 self.warnings.append(text)
@@ -241,13 +241,13 @@ class LiveSource:
 
 
 def open_rtsp(rest: str, options: Mapping[str, str]) -> CameraSource:
-    """The RTSP camera at ``rtsp:`` + ``rest``; over TCP where it serves that, else UDP."""
+    """The RTSP camera at ``rtsp:`` + ``rest``; over TCP if it supports that, otherwise UDP."""
     reject_options("rtsp", options)
     return _live(f"rtsp:{rest}", LIVE_OPTIONS | {"rtsp_flags": "prefer_tcp"})
 
 
 def open_stream(rest: str, options: Mapping[str, str]) -> CameraSource:
-    """The stream at the URL ``rest``, of any protocol that FFmpeg speaks."""
+    """The stream at the URL ``rest``, of any protocol that FFmpeg supports."""
     reject_options("stream", options)
     if "://" not in rest:
         raise InputError(f"stream:{rest} is not like stream:udp://0.0.0.0:5600")
@@ -255,7 +255,7 @@ def open_stream(rest: str, options: Mapping[str, str]) -> CameraSource:
 
 
 def open_v4l2(rest: str, options: Mapping[str, str]) -> CameraSource:
-    """The V4L2 device ``rest``; the kernel's own time stamps are kept."""
+    """The V4L2 device ``rest``; uses the kernel's time stamps."""
     reject_options("v4l2", options, V4L2_OPTIONS)
     device = Path(rest)
     if not device.exists():

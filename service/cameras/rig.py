@@ -1,4 +1,4 @@
-"""How the camera hangs on the vehicle, and what telemetry therefore says of its pose."""
+"""The camera's mount on the vehicle, and the prior of its pose from telemetry."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from service.config import CameraConfig, FusionConfig, ScanConfig
 from service.georeference import LocalFrame
 
 ASSUMED_AGL_M = 50.0
-"""Height above ground that gives a scan its scale when nothing else does (stated in it)."""
+"""Assumed height above ground without any other scale; the scan states it."""
 
 ABOVE_HOME_SHARE = 0.25
-"""Sigma of a height above the take-off point as a height above ground, as a share of it."""
+"""Relative sigma of a height above the take-off point, used as a height above ground."""
 
 MOUNT_TILT_SIGMA_RAD = math.radians(6.0)
-"""How far a camera may lean from its nominal mount when no attitude is known."""
+"""Sigma of the camera's tilt from its nominal mount without a known attitude."""
 
 AT_REST_M_S, ON_GROUND_M = 0.3, 2.0
-"""A vehicle slower and lower than these stands on the ground."""
+"""Below these a vehicle stands on the ground."""
 
 MIN_SIGMA_M, MAX_ALTITUDE_M = 0.005, 1e5
-"""No receiver is better, and nothing with a camera flies higher; a tag may claim both."""
+"""Limits of plausible accuracies and heights in tags."""
 
 NO_YAW_RAD = 3.0
-"""Sigma of a heading that is not known."""
+"""Sigma of an unknown heading."""
 
 
 class HeightSource(Enum):
-    """Where a height above ground comes from."""
+    """Origin of a height above ground."""
 
-    MEASURED = "measured"  # by a rangefinder or over known terrain, or set by the operator
+    MEASURED = "measured"  # by rangefinder, terrain model, or the operator
     ABOVE_HOME = "above home"  # the site may lie higher or lower than the take-off point
     ASSUMED = "assumed"
 
@@ -55,9 +55,9 @@ class Fix:
 
 
 class Rig:
-    """Turns vehicle states and picture tags into priors on the camera's pose.
+    """Turns vehicle states and image tags into priors on the camera's pose.
 
-    The scan's origin is the first position heard; until then positions are left out.
+    The scan's origin is the first known position; before it there are no positions.
     """
 
     def __init__(self, camera: CameraConfig, scan: ScanConfig, fusion: FusionConfig) -> None:
@@ -77,10 +77,10 @@ class Rig:
         )
 
     def prior(self, state: VehicleState | None, tag: GeoTag | None) -> PosePrior:
-        """The prior of one frame from telemetry, else from the picture's own tag.
+        """The prior of one frame from telemetry, otherwise from the image's own tag.
 
-        Without an attitude the nominal mount of a level vehicle heading north is given, with
-        a sigma that says so; without a height the configured or assumed one, likewise.
+        Without an attitude it is the nominal mount of a level vehicle heading north, with a large
+        sigma; without a height the configured or assumed one, likewise.
         """
         R, tilt, yaw = self._rotation(state, tag)
         fix = self._fix(state, tag)
@@ -98,7 +98,7 @@ class Rig:
         if position is not None and state is not None and state.receiver is not None:
             above = state.receiver
             prior = replace(prior, above_m=above.above_m, above_fixes=1, above_ns=above.time_ns)
-        # With a position the altitude is part of it.
+        # A position includes the altitude.
         if position is None and state is not None and self._fusion.altitude:
             altitude = state.alt_amsl_m
             prior = replace(prior, altitude_m=None if altitude is None else altitude + lever[2])
@@ -154,7 +154,7 @@ class Rig:
         return None
 
     def _position(self, fix: Fix | None) -> tuple[F64 | None, F64 | None]:
-        """(3,) ENU metres about the origin and their sigmas."""
+        """(3,) ENU metres from the origin, and their sigmas."""
         if fix is None:
             return None, None
         altitude = fix.alt_amsl_m
@@ -171,7 +171,7 @@ class Rig:
     def _agl(
         self, state: VehicleState | None, tag: GeoTag | None
     ) -> tuple[float, float, HeightSource]:
-        """Height above ground, its sigma in metres, and where it comes from."""
+        """Height above ground, its sigma in metres, and its origin."""
         if self._scan.assumed_agl_m is not None:
             agl = self._scan.assumed_agl_m
             return agl, 0.1 * agl, HeightSource.MEASURED
@@ -189,16 +189,16 @@ class Rig:
         return ASSUMED_AGL_M, 0.5 * ASSUMED_AGL_M, HeightSource.ASSUMED
 
     def height_known(self, state: VehicleState | None, tag: GeoTag | None) -> bool:
-        """False when the scan's scale rests on :data:`ASSUMED_AGL_M`."""
+        """False when the scan's scale depends on :data:`ASSUMED_AGL_M`."""
         return self._agl(state, tag)[2] is not HeightSource.ASSUMED
 
     def attitude_known(self, state: VehicleState | None, tag: GeoTag | None) -> bool:
-        """False when the view direction is the nominal mount's."""
+        """False when the view direction is that of the nominal mount."""
         return self._rotation(state, tag)[1] < MOUNT_TILT_SIGMA_RAD
 
 
 def _is_at_rest(state: VehicleState) -> bool:
-    """True where telemetry says that the vehicle stands on the ground."""
+    """True where telemetry shows the vehicle standing on the ground."""
     if state.v_ned_m_s is None or state.alt_agl_m is None:
         return False
     speed_m_s = float(np.linalg.norm(state.v_ned_m_s))

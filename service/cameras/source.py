@@ -1,5 +1,5 @@
-"""What every camera hands over, whatever it is: images with a time and what is known of them;
-and readers that take them from the camera on a thread of their own."""
+"""The interface of all cameras: images with a time and their tags; and readers that fetch them on
+a separate thread."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from service.workers import PROCESS, Worker
 
 @dataclass(frozen=True, slots=True)
 class GeoTag:
-    """Where an image was taken, as the camera itself wrote it (EXIF, XMP)."""
+    """Position of an image, as written by the camera (EXIF, XMP)."""
 
     lat_deg: float
     lon_deg: float
     alt_amsl_m: float | None = None  # as written; consumer cameras drift by tens of metres
-    sigma_h_m: float = 5.0  # 1 sigma, horizontal; the default when the tag does not say
+    sigma_h_m: float = 5.0  # 1 sigma, horizontal; the default for tags without accuracy
     ypr_deg: tuple[float, float, float] | None = None
     """Yaw from true north, pitch, roll of the gimbal head (FRD in NED); pitch -90 looks down."""
     relative_alt_m: float | None = None  # above the take-off point
@@ -29,11 +29,11 @@ class GeoTag:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraFrame:
-    """One image as the source gave it."""
+    """One image of a source."""
 
     image: U8  # (H, W, 3) BGR
     time_ns: int  # presentation time, ns since the start of the stream
-    seq: int  # 0, 1, 2 … of the images that came out
+    seq: int  # 0, 1, 2 … of the delivered images
     geotag: GeoTag | None
     name: str  # file name of a still, else "frame <seq>"
 
@@ -44,10 +44,10 @@ class CameraSource(Protocol):
 
     description: str  # for a log line and scan.json
     size_px: tuple[int, int]  # (W, H)
-    epoch_unix_ns: int | None  # UTC of time_ns = 0, when the source tells
+    epoch_unix_ns: int | None  # UTC of time_ns = 0, if known
     start_monotonic_ns: int | None  # this machine's monotonic clock at time_ns = 0, if live
-    fps: float | None  # mean images per second, when the source tells
-    is_live: bool  # True: images that are not fetched in time are lost
+    fps: float | None  # mean images per second, if known
+    is_live: bool  # images that are not fetched in time are lost
     warnings: list[str]  # one line each; grows while images are fetched
 
     def __iter__(self) -> Iterator[CameraFrame]:
@@ -55,19 +55,19 @@ class CameraSource(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the file or device; safe to call twice."""
+        """Release the file or device; safe to call twice."""
         ...
 
 
 @runtime_checkable
 class Dropping(Protocol):
-    """A source that drops images which are not fetched in time."""
+    """A source that drops images that are not fetched in time."""
 
     dropped: int
 
 
 def ahead(source: CameraSource, kept: int = 4) -> Generator[CameraFrame, None, None]:
-    """Every image of ``source`` in order, at most ``kept`` of them decoded in advance.
+    """Every image of ``source`` in order, with at most ``kept`` of them decoded in advance.
 
     Raises what the source raises. A reader whose images are no longer fetched ends soon;
     close the iterator before the source.
@@ -87,7 +87,7 @@ def _read(
     frames: Iterable[CameraFrame],
     at_end: Callable[[], None] = lambda: None,
 ) -> Worker:
-    """Fill ``queue`` with ``frames`` on a thread of its own."""
+    """Fill ``queue`` with ``frames`` on a separate thread."""
 
     def read(_: Worker) -> None:
         try:
@@ -99,10 +99,10 @@ def _read(
 
 
 class Paced:
-    """A source that gives each image when its presentation time has come, as a camera does.
+    """A source that delivers each image at its presentation time, as a camera does.
 
-    A live source is not held back: it is only emptied, so that its newest images are used.
-    At most ``kept`` images wait; :attr:`dropped` counts those that were too late.
+    A live source is not delayed: it is drained, so that its newest images are used.
+    At most ``kept`` images wait; :attr:`dropped` counts those that were not fetched in time.
     """
 
     def __init__(self, source: CameraSource, kept: int = 2) -> None:
@@ -118,7 +118,7 @@ class Paced:
 
     @property
     def dropped(self) -> int:
-        """Images that nobody took up in time."""
+        """Images that were not fetched in time."""
         return self._queue.dropped
 
     def __iter__(self) -> Iterator[CameraFrame]:
@@ -131,12 +131,12 @@ class Paced:
         self._reader = _read("camera", self._queue, due, end)
         yield from self._queue
         if self.dropped:
-            self.warnings.append(f"{self.dropped} frames came faster than they could be used")
+            self.warnings.append(f"{self.dropped} frames arrived faster than they could be used")
 
     def close(self) -> None:
         """End the iteration at once, from any thread, and close the source.
 
-        A recording is closed by the thread that reads it, not under its hands.
+        A recording is closed by the thread that reads it.
         """
         self._closed.set()
         self._queue.close()
@@ -144,7 +144,7 @@ class Paced:
             self._source.close()
 
     def _due(self) -> Generator[CameraFrame, None, None]:
-        """The images, each when its time has come."""
+        """The images, each at its presentation time."""
         start = time.monotonic_ns()
         for frame in self._source:
             early_s = 1e-9 * (frame.time_ns - (time.monotonic_ns() - start))

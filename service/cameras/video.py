@@ -1,9 +1,8 @@
 """Recorded video through PyAV, with the container's own presentation times.
 
-``file:flight.mp4``: mp4, mov, mkv, MPEG-TS, whatever FFmpeg reads. ``pipe:-`` or a named pipe:
-``ffmpeg -i flight.mp4 -c copy -f mpegts - | skyrelief replay -``. Matroska, MPEG-TS, fragmented
-mp4 and y4m describe themselves; raw frames need their shape in the options:
-``pipe:-?format=rawvideo&video_size=1280x720&pixel_format=bgr24&framerate=30`` (FFmpeg's names).
+``file:flight.mp4``: mp4, mov, mkv, MPEG-TS, or any other format of FFmpeg. ``pipe:-`` or a named
+pipe: ``ffmpeg -i flight.mp4 -c copy -f mpegts - | skyrelief replay -``. Matroska, MPEG-TS,
+fragmented mp4 and y4m describe themselves; raw frames need options:
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_PIXELS = 1 << 27
-"""Of an image; the decoder refuses larger ones before it makes room for them."""
+"""Maximum pixels of an image; the decoder refuses larger ones before allocating memory."""
 
 EARLIEST_UNIX_S = 946_684_800  # 2000-01-01: cameras without a clock write 1904 or 1970
 
@@ -49,9 +48,9 @@ class VideoSource:
         description: str,
         follows_turn: bool = False,
     ) -> None:
-        """Take over ``container``; raises InputError when it shows no image.
+        """Take over ``container``; raises InputError when it has no image.
 
-        ``follows_turn`` turns the images as the container asks players to.
+        ``follows_turn`` rotates the images as the container requests.
         """
         self.description = description
         self.turned_deg = 0
@@ -75,10 +74,10 @@ class VideoSource:
         self._first = next(self._decoded, None)
         if self._first is None:
             self.close()
-            raise InputError(f"{description}: no picture could be decoded; is it cut off or empty?")
+            raise InputError(f"{description}: no image could be decoded; is it cut off or empty?")
         stored = int(self._first.width), int(self._first.height)
         self._stored_px = stored
-        if follows_turn:  # counterclockwise there
+        if follows_turn:  # counterclockwise in PyAV
             self.turned_deg = round(-getattr(self._first, "rotation", 0) / 90) * 90 % 360
         self.size_px = stored[::-1] if self.turned_deg % 180 else stored
         self._start_s = _start_s(self._stream, self._first)
@@ -87,7 +86,7 @@ class VideoSource:
         self.fps = float(rate) if rate else None
 
     def __iter__(self) -> Iterator[CameraFrame]:
-        """Yield the images whose time goes forward; says at the end what was left out."""
+        """Yield the images whose time increases; warns at the end about skipped ones."""
         first, self._first = self._first, None
         if first is None:
             return
@@ -103,8 +102,8 @@ class VideoSource:
             size_px = (int(frame.width), int(frame.height))
             if size_px != self._stored_px:
                 self._warn(
-                    f"picture size changed from {_by(self._stored_px)} to {_by(size_px)} at "
-                    f"{time_ns / 1e9:.2f} s; what follows is left out"
+                    f"image size changed from {_by(self._stored_px)} to {_by(size_px)} at "
+                    f"{time_ns / 1e9:.2f} s; the rest is skipped"
                 )
                 break
             image = np.rot90(frame_bgr(frame), -(self.turned_deg // 90))
@@ -123,10 +122,10 @@ class VideoSource:
 
     def _damage(self, error: Exception) -> None:
         self._damaged += 1
-        log.debug("%s: picture dropped: %s", self.description, error)
+        log.debug("%s: image dropped: %s", self.description, error)
 
     def _time_ns(self, frame: av.VideoFrame, last_ns: int) -> int:
-        """Presentation time; an image without one follows the last by the mean interval."""
+        """Presentation time; an image without one follows the last one at the mean interval."""
         if frame.pts is None or frame.time_base is None:
             step = 1e9 / self.fps if self.fps else 1e9 / 30.0
             return last_ns + int(step) if last_ns >= 0 else 0
@@ -135,12 +134,12 @@ class VideoSource:
 
     def _warn_losses(self, decoded: int) -> None:
         if self._damaged:
-            self._warn(f"{self._damaged} damaged pictures were left out")
+            self._warn(f"{self._damaged} damaged images were skipped")
         if self._unordered:
-            self._warn(f"{self._unordered} pictures whose time does not go forward were left out")
+            self._warn(f"{self._unordered} images with non-increasing time were skipped")
         if self._expected > decoded:
             self._warn(
-                f"{decoded} of the {self._expected} pictures that the index names could be "
+                f"{decoded} of the {self._expected} images in the index could be "
                 "decoded; the recording is cut off or damaged"
             )
 
@@ -150,7 +149,7 @@ class VideoSource:
 
 
 def video_stream(container: av.container.InputContainer) -> av.VideoStream | None:
-    """The first video stream, ready to decode; None when there is none that can be decoded."""
+    """The first video stream, ready to decode; None without a decodable one."""
     stream = container.streams.video[0] if container.streams.video else None
     if stream is None or stream.codec_context is None:
         return None
@@ -165,10 +164,10 @@ def decoded_frames(
     broke_off: Callable[[str], None],
     damaged: Callable[[Exception], None],
 ) -> Iterator[av.VideoFrame]:
-    """Every whole image of ``stream``, packet by packet: a damaged one costs itself only.
+    """Every complete image of ``stream``, packet by packet: a damaged one affects no other.
 
-    ``broke_off`` is told when the container ends with an error, ``damaged`` of each image
-    that does not decode or that the decoder pieced together from others.
+    ``broke_off`` is called when the container ends with an error, ``damaged`` for each image
+    that does not decode or that the decoder concealed.
     """
     import av.error
 
@@ -177,7 +176,7 @@ def decoded_frames(
         try:
             packet = next(packets, None)
         except (av.error.FFmpegError, OSError) as error:
-            broke_off(f"the recording breaks off: {error}")
+            broke_off(f"the recording is cut off: {error}")
             packet = None
         try:
             frames = stream.codec_context.decode(None) if packet is None else packet.decode()
@@ -206,7 +205,7 @@ def creation_unix_ns(container: Any, stream: Any) -> int | None:
 
 
 def parse_time_unix_ns(text: str) -> int | None:
-    """Unix ns of an ISO 8601 time, UTC when it names no zone; None when unusable."""
+    """Unix ns of an ISO 8601 time, UTC when it has no zone; None when invalid."""
     try:
         moment = datetime.fromisoformat(text.strip().replace("Z", "+00:00"))
     except ValueError:
@@ -221,7 +220,7 @@ def parse_time_unix_ns(text: str) -> int | None:
 def _start_s(stream: av.VideoStream, first: av.VideoFrame) -> Fraction:
     """Presentation time of the stream's start as an exact fraction of seconds.
 
-    The first image that decodes may come later than the start (a stream joined midway).
+    The first decodable image may be later than the start (a stream joined midway).
     """
     if stream.start_time is not None and stream.time_base is not None:
         start = stream.start_time * stream.time_base
@@ -242,7 +241,7 @@ def _by(size_px: tuple[int, int]) -> str:
 
 
 def open_file(rest: str, options: Mapping[str, str]) -> VideoSource:
-    """The video at path ``rest``; raises InputError naming what is wrong with it."""
+    """The video at path ``rest``; raises InputError that names the fault."""
     import av
     import av.error
 
@@ -251,7 +250,7 @@ def open_file(rest: str, options: Mapping[str, str]) -> VideoSource:
     if not path.exists():
         raise InputError(f"no such file: {path}")
     if path.is_dir():
-        raise InputError(f"{path} is a folder; for a folder of pictures write images:{path}")
+        raise InputError(f"{path} is a folder; for a folder of images write images:{path}")
     if not path.is_file():
         raise InputError(f"{path} is not a regular file; for a named pipe write pipe:{path}")
     if path.stat().st_size == 0:
@@ -261,7 +260,7 @@ def open_file(rest: str, options: Mapping[str, str]) -> VideoSource:
     except av.error.InvalidDataError as error:
         raise InputError(_not_video(path)) from error
     except av.error.EOFError as error:
-        raise InputError(f"{path} ends before its first picture; it was cut off") from error
+        raise InputError(f"{path} ends before its first image; it is cut off") from error
     except (av.error.FFmpegError, OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         raise InputError(f"{path} cannot be read: {why}") from error
@@ -280,7 +279,7 @@ def _not_video(path: Path) -> str:
 
 
 class PipeReader:
-    """A read-only byte stream whose first bytes can be looked at before they are consumed."""
+    """A read-only byte stream whose first bytes can be peeked."""
 
     def __init__(self, stream: BinaryIO) -> None:
         """Wrap ``stream``; nothing is read yet."""
@@ -306,7 +305,7 @@ class PipeReader:
 
 
 def open_pipe(rest: str, options: Mapping[str, str]) -> VideoSource:
-    """The video that comes out of ``-`` (standard input) or the named pipe at ``rest``."""
+    """The video from ``-`` (standard input) or the named pipe at ``rest``."""
     import av
     import av.error
 
@@ -315,7 +314,7 @@ def open_pipe(rest: str, options: Mapping[str, str]) -> VideoSource:
     reader = PipeReader(_stream(rest))
     head = reader.peek(HEAD_BYTES)
     if not head:
-        raise InputError(f"{name}: nothing came; pipe a video into it")
+        raise InputError(f"{name}: received nothing; pipe a video into it")
     if index_at_end(head):
         raise InputError(
             f"{name}: an mp4 with its index at the end cannot be piped; give the file itself, or "

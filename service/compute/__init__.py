@@ -1,1 +1,1 @@
-"""What computes: the backend that is chosen, and how threads share the cores."""
+"""Choice of the backend, and sharing of cores between threads."""

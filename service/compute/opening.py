@@ -1,7 +1,7 @@
-"""The backend that a configuration asks for, or the learned model that it declares.
+"""Opens the configured backend, or the learned model of a declaration.
 
-A model is an ONNX file and a TOML beside it, which names the file (``model = "net.onnx"``,
-relative to itself) and gives the fields of
+A model is an ONNX file and a TOML file next to it, which names the ONNX file
+(``model = "net.onnx"``, relative to itself) and sets the fields of
 :class:`recon.backends.learned_stereo.LearnedStereoConfig` that differ from their defaults.
 """
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 
 def open_backend(config: ComputeConfig, image_px: tuple[int, int] | None = None) -> Backend:
-    """The backend named by ``compute.backend``, ready to run; "auto" is the fastest that works.
+    """The backend of ``compute.backend``, ready to run; "auto" is the fastest that works.
 
-    With ``compute.model`` it is the learned model declared there, by ONNX Runtime; with the
-    size of the camera's pictures (W, H) its size is checked before anything flies. A backend
-    that is named and cannot run stops the start: InputError for an unknown name or a model that
-    does not fit, OutsideError with the reason otherwise.
+    With ``compute.model`` it is that learned model on ONNX Runtime; ``image_px`` (W, H) of the
+    camera checks its input size before the flight. A named backend that cannot run stops the start:
+    InputError for an unknown name or a model that does not fit, OutsideError with the reason
+    otherwise.
     """
     from service.compute.backend_choice import FallbackBackend, choose_backend
 
@@ -53,7 +53,7 @@ def open_backend(config: ComputeConfig, image_px: tuple[int, int] | None = None)
 def load_learned_model(declaration: Path) -> LearnedStereoBackend:
     """The model declared in a TOML file, checked and ready to run.
 
-    TensorRT's engine of it, where there is TensorRT, is kept between starts.
+    TensorRT's engine, if available, is cached between starts.
 
     Raises InputError, with what was expected and what was found, when declaration and model
     do not fit, and OutsideError when ONNX Runtime is missing.

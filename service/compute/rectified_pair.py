@@ -1,4 +1,4 @@
-"""A rectified pair from files, and how it is matched when it is all there is."""
+"""A rectified image pair from files, and the matching settings for a single pair."""
 
 from __future__ import annotations
 

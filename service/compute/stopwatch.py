@@ -1,4 +1,4 @@
-"""How long each stage takes."""
+"""Time spent per stage."""
 
 from __future__ import annotations
 

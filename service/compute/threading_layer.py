@@ -1,7 +1,7 @@
-"""Whether compiled kernels may run on two threads of ours at once.
+"""Whether compiled kernels may run on two threads at once.
 
-Numba shares its loops among cores by TBB, OpenMP or a work queue of its own. The work queue ends
-the process when two threads call it at once, and it is what is left on a bare system without
+Numba distributes its loops over cores by TBB, OpenMP or its own work queue. The work queue aborts
+the process when two threads call it at once, and it is the only one on a bare system without
 ``libgomp.so.1`` (numba's documentation, "The Threading Layers").
 """
 
@@ -21,10 +21,10 @@ REMEDY = "apt install libgomp1"
 
 
 def share_cores(threads: int) -> Callable[[], None]:
-    """Give compiled kernels of this thread half of ``threads`` (0: one per core) from now on.
+    """Limit compiled kernels of this thread to half of ``threads`` (0: one per core).
 
-    Returns what gives the other half to the thread that calls it: two that each want all the
-    cores only wait for one another.
+    Returns a function that gives the other half to its calling thread: two threads that each use
+    all cores only wait for each other.
     """
     import numba
 
@@ -36,7 +36,7 @@ def share_cores(threads: int) -> Callable[[], None]:
 
 @functools.cache
 def kernels_may_overlap() -> bool:
-    """True when TBB or OpenMP is there; said once in the log when neither is."""
+    """True with TBB or OpenMP; logs once when neither is available."""
     import numba
 
     if numba.config.THREADING_LAYER != "workqueue" and (

@@ -219,7 +219,7 @@ def test_disk_full_then_room_again(small_disk: Path, tmp_path: Path, record: Row
         service.until(lambda: service.get().get("fault"), "the fault")
         acknowledged = stored(service.scans)
         filler.unlink()
-        back_s = service.until_more_frames("next attempt in")
+        back_s = service.until_more_frames("scanning again")
         service.stop()
     lost = acknowledged - stored(service.scans)
     record(
