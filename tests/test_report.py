@@ -85,7 +85,7 @@ def test_residuals_loops_drift_and_points_are_told() -> None:
     cells = re.findall(r"<td>(.*?)</td>", page)
     assert "1.10 (5)" in cells and "0.90 (4)" in cells
     assert "2 used, 1 waiting" in cells and "1 used, 1 refused" in cells and "0-3" in cells
-    assert "1.50 m (most 2.00 m, 2.00 % of the way)" in cells and "-0.20 %" in cells
+    assert "1.50 m (max 2.00 m, 2.00 % of the distance)" in cells and "-0.20 %" in cells
     assert "0.17 m, 0.17 m, 0.17 m" in cells and "1 sigma 0.40 %" in cells
     assert "+1.000  +2.000  +3.000" in cells and "2 m off" in cells
     assert "0.020 m, 0.030 m" in cells
@@ -97,7 +97,7 @@ def test_a_scan_with_a_refinement_shows_it(tmp_path: Path, house: HouseFlight) -
         store.finish(SUMMARY["run"])
         write_deliverables(tmp_path, store, {})
     page = (tmp_path / "report.html").read_text()
-    assert "How it fits together" in page and "GNSS position" in page
+    assert "Consistency" in page and "GNSS position" in page
     assert "Surveyed points" not in page and "<script" not in page
 
 

@@ -198,7 +198,7 @@ def test_the_report_says_what_was_flown_and_nothing_runs_in_it(
     assert page.count("<svg") == 5  # the map; no height above ground was recorded
     assert "http" not in page  # nothing is fetched
     rows = dict(re.findall(r"<tr><td>(.*?)</td><td>(.*?)</td></tr>", page))
-    assert rows["lasted"] == "4 s"
+    assert rows["duration"] == "4 s"
     assert rows["speed, median"] == "5.0 m/s"
 
 

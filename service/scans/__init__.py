@@ -1,1 +1,1 @@
-"""The files of a scan, made from its store alone: cloud, previews, coverage, report."""
+"""The files of a scan, made from its store: cloud, previews, coverage, report."""

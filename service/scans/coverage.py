@@ -1,7 +1,7 @@
-"""The coverage layer of a scan: kept up to date from its store, as picture, figures and GeoTIFF.
+"""The coverage layer of a scan, updated from its store, as image, figures and GeoTIFF.
 
-Drone and ground make the same layer, because both read the same store. In flight
-:class:`LiveCoverage` reads only keyframes that are new or were moved.
+Drone and ground compute the same layer, because both read the same store. In flight
+:class:`LiveCoverage` reads only keyframes that are new or have moved.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ log = logging.getLogger(__name__)
 
 IMAGE, FIGURES = "coverage.png", "coverage.json"
 MIN_VIEWS = 3
-"""Pictures of a place below which it counts as weak: two alone can agree on what is wrong."""
+"""Images of a place below which it is weak: two alone can agree on an error."""
 
 MAX_SIGMAS = 3.0
 """A surface is weak where its sigma is this many times the scan's median."""
@@ -51,19 +51,19 @@ MAX_SIGMAS = 3.0
 GAP, SELDOM, UNSURE = (70, 60, 220), (60, 160, 245), (90, 220, 245)  # BGR
 BEST, USUAL = (110, 190, 60), (190, 220, 160)
 LEGEND = {
-    "gap": "inside what was flown, no surface measured",
-    "seldom": "covered by too few pictures",
+    "gap": "inside the flown area, no surface measured",
+    "seldom": "covered by too few images",
     "unsure": "sigma too large",
-    "good": "measured; the darker, the surer",
+    "good": "measured; darker is more certain",
 }
 LARGEST_PX = 1600
 WRITE_EVERY_S = 15.0
-"""In flight the layer is written beside the scan this often."""
+"""Interval at which the layer is written in flight."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What counts as weak."""
+    """Thresholds of a weak surface."""
 
     min_views: int
     max_sigma_m: float
@@ -71,21 +71,21 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """The layer of a scan at one moment, in the scan's ENU metres."""
+    """The layer of a scan at one time, in the scan's ENU metres."""
 
     layer: CoverageGrid
     frame: LocalFrame | None
-    places: Rows  # of PLACE, of the keyframes, in order of their number
+    places: Rows  # rows of PLACE per keyframe, in order of their number
     limits: Limits
 
     @cached_property
     def footprints(self) -> tuple[Footprint, ...]:
-        """Of the keyframes, in order of their number."""
+        """Footprints of the keyframes, in order of their number."""
         return tuple(footprint_of(place) for place in self.places)
 
     @cached_property
     def weak(self) -> Array:
-        """(rows, cols) bool: cells worth flying over again."""
+        """(rows, cols) bool: cells worth another flight."""
         return self.layer.weak(self.limits.min_views, self.limits.max_sigma_m)
 
     @property
@@ -94,7 +94,7 @@ class Coverage:
         return self.layer.grid.bounds
 
     def corners_lat_lon(self) -> list[tuple[float, float]] | None:
-        """(latitude, longitude) of the picture's NW, NE, SE and SW corners, if it has a place."""
+        """(latitude, longitude) of the image's NW, NE, SE and SW corners, if georeferenced."""
         if self.frame is None:
             return None
         west, south, east, north = self.bounds_m
@@ -103,7 +103,7 @@ class Coverage:
         return [(round(float(r[0]), 8), round(float(r[1]), 8)) for r in rows]
 
     def figures(self) -> dict[str, Any]:
-        """What the layer says in numbers, fit for JSON."""
+        """Figures of the layer, for JSON."""
         layer, area = self.layer, self.layer.grid.cell_m**2
         known, inside = layer.known, layer.inside
         sigma, views = layer.sigma_m[known], layer.views[inside]
@@ -126,7 +126,7 @@ class Coverage:
         }
 
     def image(self) -> U8:
-        """(rows, cols, 4) BGRA, north up: what is weak and why; clear where nobody flew."""
+        """(rows, cols, 4) BGRA, north up: weak cells by cause; clear outside the flown area."""
         layer, limits = self.layer, self.limits
         out = np.zeros((*layer.grid.shape, 4), np.uint8)
         known, inside = layer.known, layer.inside
@@ -145,7 +145,7 @@ class Coverage:
         return out
 
     def png_bytes(self) -> bytes:
-        """The picture as PNG with its alpha, a pixel per cell (fewer where it is very large)."""
+        """The image as PNG with alpha, a pixel per cell (fewer where it is very large)."""
         image = self.image()
         step = -(-max(image.shape[:2]) // LARGEST_PX)
         return cv2.imencode(".png", np.ascontiguousarray(image[::step, ::step]))[1].tobytes()
@@ -156,22 +156,22 @@ class Coverage:
 
 
 class LiveCoverage:
-    """The layer of an open store, brought up to date by :meth:`refresh`."""
+    """The layer of an open store; :meth:`refresh` updates it."""
 
     def __init__(
         self, store: ScanStore, cell_m: float | None = None, ledger: Ledger | None = None
     ) -> None:
-        """``ledger`` takes rows of :data:`recon.surface.coverage.PLACE`; memory when left out."""
+        """``ledger`` stores rows of :data:`recon.surface.coverage.PLACE`; in memory by default."""
         self._store = store
         self._cell_m, self._ledger = cell_m, ledger
         self._map: CoverageMap | None = None
-        self._seqs = array("q")  # keyframes taken in, in order; and of each
-        self._fine = array("b")  # whether its fine layer was there
-        self._revisions = array("q")  # of its pose
-        self._reposes = RangeSet()  # re-poses in force then
+        self._seqs = array("q")  # processed keyframes, in order; and for each:
+        self._fine = array("b")  # whether its fine layer was available
+        self._revisions = array("q")  # revision of its pose
+        self._reposes = RangeSet()  # re-poses in force at that time
 
     def refresh(self) -> Coverage | None:
-        """The layer as the store has it now; None while it holds no surface."""
+        """The layer of the store's current content; None while it holds no surface."""
 
         numbers = self._store.numbers()
         fine, reposes = (numbers.get(kind, RangeSet()) for kind in ("k1", "repose"))
@@ -222,7 +222,7 @@ class LiveCoverage:
 
 
 def coverage_of(store: ScanStore, cell_m: float | None = None) -> Coverage | None:
-    """The layer of all that ``store`` holds; None without any surface.
+    """The layer of everything in ``store``; None without any surface.
 
     Cells of ``cell_m``; by default about four pixels of the first keyframe's depth image.
     """
@@ -230,7 +230,7 @@ def coverage_of(store: ScanStore, cell_m: float | None = None) -> Coverage | Non
 
 
 def write_coverage_files(folder: Path, store: ScanStore) -> Coverage | None:
-    """Write coverage.png and coverage.json beside the scan; the layer, None without surface."""
+    """Write coverage.png and coverage.json into the scan's folder; None without surface."""
     found = coverage_of(store)
     if found is not None:
         _write(folder, found)
@@ -245,9 +245,9 @@ def _write(folder: Path, found: Coverage) -> None:
 
 
 class CoverageWriter:
-    """Writes coverage.png and coverage.json beside a growing scan, on a thread of its own.
+    """Writes coverage.png and coverage.json of a growing scan, on a separate thread.
 
-    For a ``with`` about the flight; failures of the disk are logged and tried again.
+    Use it in a ``with`` around the flight; disk failures are logged and retried.
     """
 
     def __init__(self, store: ScanStore, every_s: float = WRITE_EVERY_S) -> None:
@@ -304,13 +304,13 @@ class LiveCoverages:
             return found
 
     def forget(self, folder: Path) -> None:
-        """Close what is held of a folder, such as before it is deleted."""
+        """Close the store of a folder, for example before it is deleted."""
         with self._lock:
             held = self._kept.pop(folder, None)
             if held is not None:
                 held[1].close()
 
     def close(self) -> None:
-        """Close all that is held."""
+        """Close all stores."""
         for folder in list(self._kept):
             self.forget(folder)

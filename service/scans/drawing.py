@@ -1,6 +1,6 @@
-"""Pictures of a scan: from above, and every stage of one keyframe (the paper's Figure 2).
+"""Images of a scan: from above, and every stage of one keyframe (the paper's Figure 2).
 
-From above there are two panels, colour and height over shaded relief, both north-up at the same
+The view from above has two panels, colour and height over shaded relief, both north-up at the same
 scale, with the track, a scale bar, a north arrow and the key figures in a line below.
 """
 
@@ -35,10 +35,10 @@ def draw_preview(
     largest_px: int = 1400,
     height_of_zero_m: float = 0.0,
 ) -> U8:
-    """(h, w, 3) BGR picture of ``raster`` with the (N, 2 or 3) track in the raster's frame.
+    """(h, w, 3) BGR image of ``raster`` with the (N, 2 or 3) track in the raster's frame.
 
     Each panel's longer side is at most ``largest_px``; ``lines`` are the key figures.
-    ``height_of_zero_m`` is added to the heights written.
+    ``height_of_zero_m`` is added to the labelled heights.
     """
     shown = fill_holes(raster)
     shade = _relief(shown)
@@ -58,7 +58,7 @@ def draw_preview(
 
 
 def blank_preview(lines: Sequence[str]) -> U8:
-    """The picture of a scan without any surface: only its key figures."""
+    """The image of a scan without any surface: only its key figures."""
     return _with_lines(np.full((120, 640, 3), BACKGROUND, np.uint8), lines)
 
 
@@ -70,7 +70,7 @@ def _relief(raster: Raster) -> F32:
 
 
 def _colour_panel(raster: Raster, shade: F32) -> U8:
-    """Colour times shading, softened so that the picture stays readable."""
+    """Colour times shading, softened so that the image stays readable."""
     light = np.clip(0.6 + 0.4 * np.nan_to_num(shade, nan=1.0), 0.0, 1.25)
     bright = float(np.percentile(raster.rgb[raster.known], 98)) if raster.known.any() else 255.0
     gain = float(np.clip(230.0 / max(bright, 1.0), 1.0, 2.0))
@@ -104,7 +104,7 @@ def _on_background(bgr: F64 | F32, known: Bool) -> U8:
 
 
 def _fit(panel: U8, largest_px: int) -> U8:
-    """The panel at a size good to look at: enlarged in whole steps, or reduced by area."""
+    """The panel at display size: enlarged in whole steps, or reduced by area."""
     h, w = panel.shape[:2]
     scale = _scale((h, w), largest_px)
     if scale >= 1.0:
@@ -114,13 +114,13 @@ def _fit(panel: U8, largest_px: int) -> U8:
 
 
 def _scale(shape: tuple[int, int], largest_px: int) -> float:
-    """Picture pixels per cell: a whole number up to 8, or less than one."""
+    """Image pixels per cell: a whole number up to 8, or less than one."""
     scale = largest_px / max(shape)
     return float(min(int(scale), 8)) if scale >= 1.0 else scale
 
 
 def _padded_to(panel: U8, smallest_px: int = 160) -> U8:
-    """The panel with background to its right and below, so that the labels have room."""
+    """The panel with background added to its right and bottom, to make room for labels."""
     h, w = panel.shape[:2]
     if min(h, w) >= smallest_px:
         return panel
@@ -130,7 +130,7 @@ def _padded_to(panel: U8, smallest_px: int = 160) -> U8:
 
 
 def _draw_track(panel: U8, grid: Grid, track_m: F64, scale: float) -> None:
-    """The way flown, with a ring where it began."""
+    """The flight path, with a ring at its start."""
     if not len(track_m):
         return
     px = (grid.pixels(track_m[:, :2]) + 0.5) * scale
@@ -171,7 +171,7 @@ def _draw_height_legend(panel: U8, raster: Raster, height_of_zero_m: float) -> N
 
 
 def _text(image: U8, text: str, at: tuple[int, int], size: float) -> None:
-    """Dark letters on a light label, readable on any ground."""
+    """Dark text on a light label, readable on any ground."""
     (w, h), below = cv2.getTextSize(text, FONT, size, 1)
     x, y = at
     cv2.rectangle(image, (x - 2, y - h - 2), (x + w + 1, y + below), BACKGROUND, cv2.FILLED)
@@ -206,24 +206,24 @@ DEBUG_KEYS = {
     "sigma_m": 2,
     "bgr": 3,
 }
-"""What ``debug/keyframe_NNNNNN.npz`` holds, and how many dimensions each array has."""
+"""Contents of ``debug/keyframe_NNNNNN.npz``, and the number of dimensions of each array."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Panel:
-    """One picture with its title."""
+    """One image with its title."""
 
     title: str
     image: U8  # (h, w, 3) BGR
 
 
 def debug_path(folder: Path, seq: int) -> Path:
-    """Where the stages of keyframe ``seq`` are kept when ``scan.keep_debug`` is on."""
+    """Path of the stages of keyframe ``seq`` when ``scan.keep_debug`` is on."""
     return folder / "debug" / f"keyframe_{seq:06d}.npz"
 
 
 def save_debug(folder: Path, seq: int, arrays: dict[str, Array]) -> Path:
-    """Keep the stages of a keyframe for ``skyrelief inspect``; those of DEBUG_KEYS are read."""
+    """Save the stages of a keyframe for ``skyrelief inspect``, which reads those of DEBUG_KEYS."""
     path = debug_path(folder, seq)
     path.parent.mkdir(parents=True, exist_ok=True)
     kept: dict[str, Any] = {name: arrays[name] for name in DEBUG_KEYS if name in arrays}
@@ -234,7 +234,7 @@ def save_debug(folder: Path, seq: int, arrays: dict[str, Array]) -> Path:
 def load_debug(path: Path) -> dict[str, Array] | None:
     """The arrays of DEBUG_KEYS in ``path``; None when there is no such file.
 
-    Raises InputError when the file is not what ``save_debug`` writes.
+    Raises InputError when the file was not written by ``save_debug``.
     """
     if not path.is_file():
         return None
@@ -257,21 +257,21 @@ def load_debug(path: Path) -> dict[str, Array] | None:
 
 
 def middle_keyframe(folder: Path, seqs: Sequence[int]) -> int | None:
-    """Number of a keyframe in the middle, of those with every stage kept if there are any."""
+    """Number of a keyframe in the middle, preferably one with every stage saved."""
     kept = [seq for seq in seqs if debug_path(folder, seq).is_file()]
     some = kept or list(seqs)
     return some[len(some) // 2] if some else None
 
 
 def stages(folder: Path, scan_id: str, keyframe: Keyframe) -> tuple[U8, bool]:
-    """One picture of a keyframe's stages (the paper's Figure 2), and whether all were kept."""
+    """One image of a keyframe's stages (the paper's Figure 2), and whether all were saved."""
     arrays = load_debug(debug_path(folder, keyframe.seq))
     panels = keyframe_panels(keyframe) if arrays is None else debug_panels(arrays)
     return sheet(panels, f"{scan_id}: keyframe {keyframe.seq}"), arrays is not None
 
 
 def debug_panels(arrays: dict[str, Array]) -> list[Panel]:
-    """The stages in the order of the paper's figure; a stage that was not kept is left out."""
+    """The stages in the order of the paper's figure; stages that were not saved are left out."""
     out = []
     for name, title in (("raw_left", "raw, left"), ("raw_right", "raw, right")):
         if name in arrays:
@@ -297,7 +297,7 @@ def debug_panels(arrays: dict[str, Array]) -> list[Panel]:
 
 
 def keyframe_panels(keyframe: Keyframe) -> list[Panel]:
-    """What the store holds of a keyframe: colour, depth, sigma and views."""
+    """Images of a keyframe in the store: colour, depth, sigma and views."""
     depth = keyframe.depth
     views = np.where(np.isfinite(depth.depth_m), depth.views.astype(np.float32), np.nan)
     return [
@@ -319,7 +319,7 @@ def coloured(title: str, values: Array, unit: str, colours: int = cv2.COLORMAP_T
     known = np.isfinite(values)
     if not known.any():
         blank = np.full((*values.shape, 3), BACKGROUND, np.uint8)
-        return Panel(f"{title}: nothing known", blank)
+        return Panel(f"{title}: no data", blank)
     low, high = (float(p) for p in np.percentile(values[known], [1, 99]))
     span = max(high - low, 1e-9)
     tone = np.clip((np.where(known, values, low) - low) / span * 255, 0, 255).astype(np.uint8)

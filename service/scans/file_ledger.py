@@ -1,4 +1,4 @@
-"""A ledger on the disk, in a file without a name that is gone with the process."""
+"""A ledger on disk, in an unnamed file that disappears with the process."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class FileLedger:
         return self._count
 
     def append(self, rows: Rows) -> None:
-        """Put rows after the last one."""
+        """Append rows."""
         self.amend(self._count, rows)
         self._count += len(rows)
 
@@ -36,15 +36,15 @@ class FileLedger:
         return np.array(np.frombuffer(data, self._kind))
 
     def amend(self, first: int, rows: Rows) -> None:
-        """Write over rows from ``first`` on."""
+        """Overwrite rows from ``first`` on."""
         data = rows.astype(self._kind, copy=False).tobytes()
         try:
             written = os.pwrite(self._file.fileno(), data, first * self._kind.itemsize)
         except OSError as error:
-            raise OutsideError(f"poses cannot be kept beside the scan: {error.strerror}") from error
+            raise OutsideError(f"poses cannot be stored with the scan: {error.strerror}") from error
         if written < len(data):
-            raise OutsideError("poses cannot be kept beside the scan: the disk is full")
+            raise OutsideError("poses cannot be stored with the scan: the disk is full")
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._file.close()

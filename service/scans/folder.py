@@ -1,9 +1,9 @@
-"""The files of a finished (or still growing) scan, made from its store alone.
+"""The files of a finished or growing scan, made from its store alone.
 
 Drone and ground hold the same store, so both make the same files: ``cloud.laz``,
 ``trajectory.tum``, ``trajectory.csv``, ``scan.json``, ``preview.jpg``, ``coverage.png``,
 ``coverage.json`` and ``report.html``.
-Each is written beside its place and then renamed, so a reader never sees half a file.
+Each is written to a temporary file and then renamed, so a reader never sees a partial file.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ SUMMARY, PREVIEW, REPORT = "scan.json", "preview.jpg", "report.html"
 PREVIEW_CELLS = 6e6
 LONGEST_REASON = 500
 MIN_VOXEL_M, MAX_VOXEL_M = 0.01, 100.0
-"""What a scan's own configuration may ask for."""
+"""Permitted voxel sizes in a scan's own configuration."""
 NOTHING = FusedCloud(
     PointCloud(
         np.zeros((0, 3), np.float32),
@@ -54,7 +54,7 @@ NOTHING = FusedCloud(
     0,
     0,
 )
-"""Stands for a cloud that could not be fused."""
+"""Replaces a cloud that could not be fused."""
 NO_GEOREFERENCE = (
     "no georeference: coordinates are metres east, north and up of the scan's own origin"
 )
@@ -63,15 +63,15 @@ NO_GEOREFERENCE = (
 def write_deliverables(
     folder: Path, store: ScanStore, extra: dict[str, Any], voxel_m: float | None = None
 ) -> dict[str, Any]:
-    """Write the scan folder's files from ``store``; returns what scan.json holds.
+    """Write the scan folder's files from ``store``; returns the content of scan.json.
 
     Args:
-        extra: more figures of the run, kept with those of the store under ``run`` in
-            scan.json; nothing here where the files shall be the same at both ends.
+        extra: more figures of the run, added under ``run`` in scan.json; empty where the files
+        shall be identical at both ends.
         voxel_m: size of the fused voxels; by default ``scan.resolution_m`` of the scan's own
             configuration, else the ground sample distance.
 
-    A file that cannot be made is named under ``failed``, with the reason, and logged; the others
+    A file that cannot be made is listed under ``failed``, with the reason, and logged; the others
     are written. Raises OutsideError, at the end, when the folder cannot be written.
     """
     header = store.header
@@ -113,19 +113,19 @@ def write_deliverables(
 
 
 class Failures:
-    """The files of a scan that could not be made, and why. Each costs itself only."""
+    """The files of a scan that could not be made, and why. A failure affects one file only."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self.why: dict[str, str] = {}
-        self.of_the_disk: OutsideError | None = None  # the first; worth another attempt
+        self.of_the_disk: OutsideError | None = None  # the first one; it justifies another attempt
 
     @contextmanager
     def noted(self, name: str) -> Iterator[None]:
-        """A part of the work that makes the file ``name``; what it raises is noted."""
+        """Run the block that makes the file ``name``; note its exception."""
         try:
             yield
-        except Exception as error:  # whatever a stranger's scan holds, it must not stop the rest
+        except Exception as error:  # a corrupt scan must not stop the other files
             if isinstance(error, OutsideError) and self.of_the_disk is None:
                 self.of_the_disk = error
             first, *_ = str(error).strip().splitlines() or [""]
@@ -136,9 +136,9 @@ class Failures:
 
 
 def files_due(folder: Path) -> bool:
-    """Whether the files of a finished scan are yet to be written, or to be tried again.
+    """Whether the files of a finished scan must still be written, or retried.
 
-    scan.json is the last of them; it says when the disk took another one not.
+    scan.json is written last; it records whether the disk refused another file.
     """
     try:
         document = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
@@ -158,7 +158,7 @@ def _stages(folder: Path, store: ScanStore) -> bytes | None:
 
 
 def _resolution_m(header: ScanHeader) -> float | None:
-    """``scan.resolution_m`` of the scan's configuration; None when it leaves that open."""
+    """``scan.resolution_m`` of the scan's configuration; None when it is automatic."""
     section = header.configuration.get("scan", {})
     value = section.get("resolution_m") if isinstance(section, dict) else None
     if not isinstance(value, int | float) or not MIN_VOXEL_M <= value <= MAX_VOXEL_M:
@@ -190,7 +190,7 @@ def _summary(
     extra: dict[str, Any],
     finished: bool,
 ) -> dict[str, Any]:
-    """What scan.json holds."""
+    """The content of scan.json."""
     notes = list(header.notes) + list(fused.notes)
     if frame is None:
         notes.append(NO_GEOREFERENCE)
@@ -236,7 +236,7 @@ def _summary(
 def _quality(
     fused: FusedCloud, raster: Raster | None, poses: Sequence[PoseRecord]
 ) -> dict[str, Any]:
-    """Figures of the cloud and the track; None where there is nothing to measure."""
+    """Figures of the cloud and the track; None where there is no data."""
     cloud = fused.cloud
     none = not len(cloud)
     return {
@@ -272,7 +272,7 @@ def _preview(raster: Raster | None, poses: Sequence[PoseRecord], summary: dict[s
 
 
 def _key_figures(summary: dict[str, Any]) -> list[str]:
-    """Two or three lines of text for the preview (ASCII: OpenCV's letters have no more)."""
+    """Two or three lines of text for the preview (ASCII: OpenCV's fonts have no more)."""
     counts, quality, origin = summary["counts"], summary["quality"], summary["origin"]
     place = "no georeference"
     if origin is not None:

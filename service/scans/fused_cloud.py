@@ -1,4 +1,4 @@
-"""The fused cloud of a scan, from the keyframes in its store, and as LAS and LAZ files.
+"""The fused cloud of a scan, from the keyframes in its store; LAS and LAZ output.
 
 Files are LAS 1.4, point format 7, with sigma_m and views per point.
 """
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     import laspy
 
 STRIP_POINTS = 4_000_000
-"""Points fused at a time; the sums of a strip take some hundred bytes each."""
+"""Points fused at once; the sums of a strip take some hundred bytes each."""
 
 LARGEST_POINTS = 60_000_000
-"""Points before fusion at most; a scan with more gets larger voxels, and a note."""
+"""Maximum points before fusion; a scan with more gets larger voxels, and a note."""
 
 SMALLEST_VOXEL_M = 1e-3
 DEFAULT_VOXEL_M = 0.25
@@ -36,7 +36,7 @@ DEFAULT_VOXEL_M = 0.25
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FusedCloud:
-    """A scan's fused cloud in its own ENU metres, and what it was made of."""
+    """A scan's fused cloud in its own ENU metres, and its statistics."""
 
     cloud: PointCloud
     voxel_m: float
@@ -48,7 +48,7 @@ class FusedCloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Extent:
-    """What one keyframe covers."""
+    """The extent of one keyframe."""
 
     seq: int
     points: int
@@ -60,8 +60,8 @@ class _Extent:
 def fused_cloud(store: ScanStore, voxel_m: float | None = None) -> FusedCloud:
     """All keyframes of ``store`` fused; voxels of the ground sample distance by default.
 
-    Points that other keyframes see through are left out. The store is read several times,
-    so that memory holds the fused points, and the sums of one strip of the site at a time.
+    Points that other keyframes see through are removed. The store is read several times, so that
+    memory holds only the fused points and the sums of one strip of the site at a time.
     """
     extents = _extents(store)
     points = sum(e.points for e in extents)
@@ -82,7 +82,7 @@ def fused_cloud(store: ScanStore, voxel_m: float | None = None) -> FusedCloud:
 
 
 def _extents(store: ScanStore) -> list[_Extent]:
-    """The keyframes that hold points."""
+    """The keyframes with points."""
     out = []
     apart = _apart(store.summary or {})
     for keyframe in store.keyframes():
@@ -97,7 +97,7 @@ def _extents(store: ScanStore) -> list[_Extent]:
 
 
 def _apart(summary: dict[str, Any]) -> list[tuple[int, int]]:
-    """First and last keyframe of each stretch that hangs on nothing, by the scan's summary."""
+    """First and last keyframe of each unconnected segment, by the scan's summary."""
     rows = summary.get("apart")
     if not isinstance(rows, list):
         return []
@@ -106,9 +106,9 @@ def _apart(summary: dict[str, Any]) -> list[tuple[int, int]]:
 
 
 def strip_edges(extents: Iterable[_Extent], max_points: int) -> list[float]:
-    """Edges in x, from -inf to inf, between which lie about ``max_points`` at most.
+    """Edges in x, from -inf to inf, of strips with at most about ``max_points`` each.
 
-    A keyframe's points are taken as evenly spread over its width.
+    A keyframe's points are assumed to be evenly spread over its width.
     """
     ends = [(e.west_m, e.points / max(e.east_m - e.west_m, 1e-3)) for e in extents]
     ends += [(e.east_m, -e.points / max(e.east_m - e.west_m, 1e-3)) for e in extents]
@@ -125,8 +125,8 @@ def strip_edges(extents: Iterable[_Extent], max_points: int) -> list[float]:
 def _strip(
     store: ScanStore, extents: list[_Extent], low_m: float, high_m: float
 ) -> Callable[[], Iterator[PointCloud]]:
-    """The clouds of the keyframes that reach into a strip, read when asked for."""
-    margin = 1.0  # the edges are moved by up to a voxel
+    """The clouds of the keyframes that overlap a strip, read on demand."""
+    margin = 1.0  # edges are moved by up to a voxel
     seqs = [e.seq for e in extents if e.east_m >= low_m - margin and e.west_m <= high_m + margin]
 
     def clouds() -> Iterator[PointCloud]:
@@ -143,13 +143,13 @@ CHUNK_POINTS = 1_000_000
 
 
 def placed(cloud: PointCloud, frame: LocalFrame | None) -> F64:
-    """(N, 3) UTM metres with AMSL height of the cloud's ENU metres; those without a frame."""
+    """(N, 3) UTM metres with AMSL height of the cloud's ENU metres; unchanged without a frame."""
     enu = cloud.xyz_m.astype(np.float64)
     return enu if frame is None or not len(enu) else frame.to_utm(enu)
 
 
 def las_header(xyz_m: F64, frame: LocalFrame | None, started_unix_ns: int) -> laspy.LasHeader:
-    """The header for points about ``xyz_m``; its dates come from the scan, not from the clock."""
+    """The header for points near ``xyz_m``; its dates come from the scan, not from the clock."""
     import laspy
     from pyproj import CRS
 
@@ -166,7 +166,7 @@ def las_header(xyz_m: F64, frame: LocalFrame | None, started_unix_ns: int) -> la
     header.system_identifier = "camera stereo"
     when = dt.datetime.fromtimestamp(started_unix_ns / 1e9, dt.timezone.utc)
     header.creation_date = when.date()
-    header.global_encoding.wkt = True  # LAS 1.4 asks for it with this format, also without a CRS
+    header.global_encoding.wkt = True  # LAS 1.4 requires it with this format, even without a CRS
     if frame is not None:
         header.add_crs(CRS.from_epsg(frame.epsg))
     return header
@@ -177,7 +177,7 @@ def write_laz(
 ) -> None:
     """Write ``cloud`` (ENU metres) to ``path``, in UTM with AMSL heights when there is a frame.
 
-    RGB are 16 bits as the format wants them (8-bit value times 257).
+    RGB are 16 bits as the format requires (8-bit value times 257).
     """
     import laspy
 

@@ -1,6 +1,6 @@
-"""``report.html``: what was flown, coverage, accuracy, speeds and faults, in one file.
+"""``report.html``: flight, coverage, accuracy, speeds and faults, in one file.
 
-Pictures and curves are inside the file, and nothing in it is fetched or run.
+Images and curves are embedded; the file loads and runs nothing.
 """
 
 from __future__ import annotations
@@ -89,15 +89,15 @@ def _flown(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[tuple[s
     if poses:
         seconds = times["last_pose_unix_s"] - times["first_pose_unix_s"]
         rows += [
-            ("lasted", f"{seconds:.0f} s"),
-            ("flown", f"{summary['quality']['distance_m']:.0f} m"),
+            ("duration", f"{seconds:.0f} s"),
+            ("distance", f"{summary['quality']['distance_m']:.0f} m"),
             ("speed, median", f"{np.median([p.speed_m_s for p in poses]):.1f} m/s"),
         ]
         heights = [p.agl_m for p in poses if p.agl_m is not None]
         if heights:
             rows.append(("height above ground, median", f"{np.median(heights):.1f} m"))
     if origin is None:
-        rows.append(("place", "no georeference: metres about the scan's own origin"))
+        rows.append(("position", "no georeference: metres about the scan's own origin"))
     else:
         rows.append(("origin", f"{origin['lat_deg']:.7f}, {origin['lon_deg']:.7f}"))
         rows.append(("coordinates", f"EPSG:{summary['epsg']}, {summary['heights']}"))
@@ -129,13 +129,13 @@ def _accuracy(summary: dict[str, Any], raster: Raster | None) -> list[tuple[str,
 
 
 def sensor_constants(graph: dict[str, Any]) -> list[tuple[str, str]]:
-    """What the sensors were found to be constantly off by."""
+    """Constant sensor errors found by the pose graph."""
     rows = []
     boresight, datum = graph.get("boresight"), graph.get("altitude_datum")
     if boresight is not None:
         offsets = ("{:+.2f} +- {:.2f}".format(*pair) for pair in
                 zip(boresight["deg"], boresight["sigma_deg"], strict=True))  # fmt: skip
-        verdict = "taken out" if boresight["sure"] else "not sure, left alone"
+        verdict = "corrected" if boresight["sure"] else "uncertain, not applied"
         name = "boresight about right, down, ahead"
         rows.append((name, f"{', '.join(offsets)} degrees: {verdict}"))
     if datum is not None and datum["shift_m"]:
@@ -148,15 +148,15 @@ def _covered(coverage: Coverage | None) -> list[tuple[str, str]]:
         return []
     f = coverage.figures()
     return [
-        ("flown over", f"{f['flown_m2']:.0f} m2"),
-        ("of that without a surface", f"{f['gaps_m2']:.0f} m2"),
-        ("of that weak (skyrelief refly plans a flight over it)", f"{f['weak_m2']:.0f} m2"),
-        ("pictures of a place, median", f"{f['views_median']:.0f}"),
+        ("area flown", f"{f['flown_m2']:.0f} m2"),
+        ("of it without a surface", f"{f['gaps_m2']:.0f} m2"),
+        ("of it weak (skyrelief refly plans a flight over it)", f"{f['weak_m2']:.0f} m2"),
+        ("images per place, median", f"{f['views_median']:.0f}"),
     ]
 
 
 def _maps(cloud: PointCloud, raster: Raster | None) -> list[str]:
-    """How often and how well each place was seen."""
+    """Maps of the number of views and of sigma per cell."""
     if raster is None:
         return ["<p>There is no surface.</p>"]
     cell = raster.grid.cell_m
@@ -165,8 +165,8 @@ def _maps(cloud: PointCloud, raster: Raster | None) -> list[str]:
     views, sigma = _per_cell(cloud, cell)
     out = []
     for title, values, unit, colours in (
-        ("Stereo pairs that agree, most per cell:", views, "", cv2.COLORMAP_VIRIDIS),
-        ("Sigma, least per cell:", sigma, "m", cv2.COLORMAP_MAGMA),
+        ("Stereo pairs that agree, maximum per cell:", views, "", cv2.COLORMAP_VIRIDIS),
+        ("Sigma, minimum per cell:", sigma, "m", cv2.COLORMAP_MAGMA),
     ):
         panel = coloured(title, values, unit, colours)
         caption = panel.title.rpartition(",")[0] or panel.title
@@ -175,7 +175,7 @@ def _maps(cloud: PointCloud, raster: Raster | None) -> list[str]:
 
 
 def _per_cell(cloud: PointCloud, cell_m: float) -> tuple[F32, F32]:
-    """Most views and least sigma of the points in each cell, NaN where there are none."""
+    """Maximum views and minimum sigma of the points in each cell, NaN where there are none."""
     xy = cloud.xyz_m[:, :2].astype(np.float64)
     grid = grid_over(xy, cell_m)
     col, row = np.rint(grid.pixels(xy)).astype(np.int64).T
@@ -227,7 +227,7 @@ def _rows(values: dict[str, Any], names: Sequence[str]) -> list[tuple[str, str]]
 
 
 def _counted(title: str, values: Any) -> str:
-    """A table of names and numbers; nothing when there are none."""
+    """A table of names and numbers; empty without numbers."""
     if not isinstance(values, dict) or not values:
         return ""
     return f"<h3>{escape(title)}</h3>" + _table([(str(k), str(v)) for k, v in values.items()])
@@ -261,7 +261,7 @@ KINDS = {
     "height": "height above ground",
     "scale": "change of scale",
     "loop": "loops",
-    "placing": "the flight's own placing",
+    "placing": "placement in flight",
     "prior": "start",
     "survey": "survey of control points",
     "control": "marks of control points",
@@ -276,7 +276,7 @@ def consistency(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[st
     out = []
     residuals = _residuals(flown.get("residuals") or {}, refined.get("residuals") or {})
     if residuals:
-        out += ["<h2>How it fits together</h2>", residuals]
+        out += ["<h2>Consistency</h2>", residuals]
     drift = _drift(summary, poses)
     if drift:
         out += ["<h3>Drift</h3>", rows_table((), drift)]
@@ -310,38 +310,38 @@ def _residuals(flown: dict[str, Any], refined: dict[str, Any]) -> str:
             rows.append(cells if refined else cells[:2])
     if not rows:
         return ""
-    header = ["residuals over their sigmas, rms (number)", "in flight", "refined"]
+    header = ["residuals divided by sigma, rms (number)", "in flight", "refined"]
     note = (
-        "<p>1 is as large as the sigmas claim. Telemetry's are smaller: its sigmas are widened, "
-        "because its errors wander slowly and many readings are no better than a few.</p>"
+        "<p>1 agrees with sigma. Values of telemetry are smaller: its sigmas are enlarged, "
+        "because its errors drift slowly and are correlated.</p>"
     )
     return rows_table(header if refined else header[:2], rows) + note
 
 
 def _drift(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[tuple[str, str]]:
-    """How far off the track may be, and was found to be."""
+    """Estimated and observed drift of the track."""
     out = []
     if len(poses) >= 2:
         sigma = [float(np.sqrt(np.trace(position_covariance(p)))) for p in poses]
         words = ", ".join(f"{sigma[k]:.2f} m" for k in (0, len(sigma) // 2, -1))
-        out.append(("sigma of the place at the start, the middle and the end", words))
+        out.append(("sigma of the position at start, middle and end", words))
     scale = summary.get("run", {}).get("scale")
     if isinstance(scale, dict) and scale.get("sigma") is not None:
         out.append(("scale by " + str(scale.get("from")), f"1 sigma {100 * scale['sigma']:.2f} %"))
     refined = summary.get("refinement")
     if refined:
         moved, length = refined["moved_m"], summary["quality"]["distance_m"]
-        share = f", {100 * moved['most'] / length:.2f} % of the way" if length else ""
+        share = f", {100 * moved['most'] / length:.2f} % of the distance" if length else ""
         out.append(
-            ("refinement moved keyframes by", f"{moved['median']:.2f} m (most {moved['most']:.2f} m"
+            ("refinement moved keyframes by", f"{moved['median']:.2f} m (max {moved['most']:.2f} m"
              f"{share})")
         )  # fmt: skip
-        out.append(("and changed the scale by", f"{100 * (refined['scale'] - 1):+.2f} %"))
+        out.append(("refinement changed the scale by", f"{100 * (refined['scale'] - 1):+.2f} %"))
     return out
 
 
 def _loops(summary: dict[str, Any], flown: dict[str, Any], refined: dict[str, Any]) -> list[str]:
-    """Loops by what became of them, and their ends."""
+    """Loops by status, and their keyframes."""
     rows = []
     for name, found in (("in flight", flown.get("loops")), ("refined", refined.get("loops"))):
         if found:
@@ -357,7 +357,7 @@ def _loops(summary: dict[str, Any], flown: dict[str, Any], refined: dict[str, An
 
 
 def _survey(refined: dict[str, Any]) -> str:
-    """Each point's offset in the map, before and after, and the sums."""
+    """Each point's offset in the map, before and after, and rms values."""
     rows = []
     for p in refined["points"]:
         offsets = [_offset(p["before_m"]), _offset(p["after_m"])]
@@ -367,7 +367,7 @@ def _survey(refined: dict[str, Any]) -> str:
         if s:
             sums = [_rms(s[f"rms_h_{w}_m"], s[f"rms_v_{w}_m"]) for w in ("before", "after")]
             rows.append([f"rms of {s['count']}", role, "", *sums, "horizontal, vertical"])
-    header = ("point", "role", "marks", "map less survey before: east, north, up, m", "after", "")
+    header = ("point", "role", "marks", "map minus survey before: east, north, up, m", "after", "")
     return rows_table(header, rows)
 
 

@@ -1,4 +1,4 @@
-"""The report's map: coverage, the way flown with error ellipses, loops and surveyed points."""
+"""The report's map: coverage, flight path with error ellipses, loops and surveyed points."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def map_figure(
 
 
 def position_covariance(pose: PoseRecord) -> F64:
-    """(3, 3) of the camera's place, from the covariance of its pose."""
+    """(3, 3) covariance of the camera's position, from that of its pose."""
     lever = np.hstack([-se3.hat(pose.T_world_camera[:3, 3]), np.eye(3)])
     return np.asarray(lever @ pose.covariance @ lever.T)
 
@@ -98,7 +98,7 @@ def _polyline(px: F64, colour: str) -> str:
 
 
 def _ellipses(poses: Sequence[PoseRecord], view: _View) -> tuple[list[str], int]:
-    """Ellipses of the horizontal place at some keyframes, and how many times enlarged."""
+    """Ellipses of the horizontal position at some keyframes, and their enlargement."""
     keys = [p for p in poses if p.keyframe_seq is not None] or list(poses)
     keys = keys[:: max(1, -(-len(keys) // MAX_ELLIPSES))]
     shapes = [np.linalg.eigh(position_covariance(p)[:2, :2]) for p in keys]
@@ -122,7 +122,7 @@ def _ellipses(poses: Sequence[PoseRecord], view: _View) -> tuple[list[str], int]
 
 
 def _loops(summary: dict[str, Any], poses: Sequence[PoseRecord], view: _View) -> list[str]:
-    """Lines between the ends of loops; broken ones did not count."""
+    """Lines between the ends of loops; dashed where unused."""
     where = {p.keyframe_seq: p.T_world_camera[:2, 3] for p in poses if p.keyframe_seq is not None}
     out = []
     for a, b, used in loop_pairs(summary):
@@ -179,21 +179,21 @@ def _scale_bar(view: _View) -> str:
 
 
 def _caption(coverage: Coverage | None, summary: dict[str, Any], grown: int) -> str:
-    """What the signs mean."""
+    """Legend of the map."""
     times = "" if grown == 1 else f", {grown} times enlarged"
-    out = [f"The way flown with error ellipses of {SIGMAS:g} sigma{times}."]
+    out = [f"Flight path with error ellipses of {SIGMAS:g} sigma{times}."]
     if coverage is not None:
         f = coverage.figures()
         marks = (
             (BEST, "measured"),
             (UNSURE, f"sigma over {f['most_sigma_m']:.2f} m"),
-            (SELDOM, f"in fewer than {f['least_views']} pictures"),
+            (SELDOM, f"in fewer than {f['least_views']} images"),
             (GAP, "no surface"),
         )
         out += [f'<span style="color:rgb({b[2]},{b[1]},{b[0]})">&#9632;</span> {t}.'
                 for b, t in marks]  # fmt: skip
     if loop_pairs(summary):
-        out.append("Blue lines: loops; broken lines: loops that did not count.")
+        out.append("Blue lines: loops; dashed lines: unused loops.")
     if (summary.get("refinement") or {}).get("points"):
         out.append("Triangles: control points; circles: check points; red: refused.")
     return " ".join(out)

@@ -1,4 +1,4 @@
-"""Scans on the disk: who makes them, which were left open by a crash, and which make room."""
+"""Scans on disk: who makes them, which a crash left open, and which are deleted for space."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ log = logging.getLogger(__name__)
 MIB = 2**20
 
 PAGES = "map-pages"
-"""Folder of the map inside a scan's folder; gone when the scan is closed."""
+"""Folder of the map inside a scan's folder; removed when the scan is closed."""
 
 
 def close_open_scans(folder: Path, ours: Container[str]) -> list[str]:
-    """Finish the scans in ``folder`` that a crash or a power cut left open; their names.
+    """Finish the scans in ``folder`` that a crash or a power cut left open; returns their names.
 
-    Those called as in ``ours`` are left alone: they are being made. No clock is asked, which a
-    power cut may have set back. What the scans hold is kept and their files are written, with
-    ``interrupted`` in the summary. One that cannot be read is left as it is, with a warning.
+    Scans named in ``ours`` are in progress and left unchanged. The clock is not used, because a
+    power cut may have reset it. The stored data is kept and the files are written, with ``interrupted``
+    in the summary. An unreadable scan stays as it is, with a warning.
     """
     from service.scans.folder import files_due, write_deliverables
     from service.stream.store import ScanStore
@@ -46,20 +46,20 @@ def close_open_scans(folder: Path, ours: Container[str]) -> list[str]:
             log.warning("%s cannot be closed: %s", path.parent, error)
             continue
         closed.append(path.parent.name)
-        log.info("%s was left open; it is closed and kept", path.parent)
+        log.info("%s was left open; it is now closed", path.parent)
     return closed
 
 
 def make_room(folder: Path, keep_free_mib: float, keep: Container[str] = ()) -> list[str]:
-    """Delete the oldest finished scans until ``keep_free_mib`` are free; names of the deleted.
+    """Delete the oldest finished scans until ``keep_free_mib`` are free; returns their names.
 
-    Those called as in ``keep`` and those that are still open stay.
+    Scans in ``keep`` and open ones stay.
     """
     deleted: list[str] = []
     if keep_free_mib <= 0 or not folder.is_dir():
         return deleted
     candidates = [path.parent for path in folder.glob("*/scan.db") if path.parent.name not in keep]
-    for scan in sorted(candidates, key=lambda p: p.name):  # names are times
+    for scan in sorted(candidates, key=lambda p: p.name):  # sorted by name, which is a time
         if shutil.disk_usage(folder).free >= keep_free_mib * MIB:
             break
         if not _finished(scan):
@@ -82,7 +82,7 @@ def _finished(scan: Path) -> bool:
 
 
 class Claim:
-    """That this process, and no other, makes scans in a folder; ends with it, however it ends."""
+    """The exclusive right of this process to make scans in a folder; ends with the process."""
 
     def __init__(self) -> None:
         self.is_ours = False
@@ -91,12 +91,12 @@ class Claim:
     def take(self, folder: Path) -> bool:
         """Make the folder and claim it; False when another process has it.
 
-        Where folders cannot be locked, nobody has.
+        Where folders cannot be locked, every claim succeeds.
         """
         try:
             folder.mkdir(parents=True, exist_ok=True)
             held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-        except OSError as error:  # told when a scan is to be made in it
+        except OSError as error:  # reported when a scan is made in it
             log.debug("%s cannot be claimed: %s", folder, error.strerror)
             self.is_ours = True
             return True
@@ -111,7 +111,7 @@ class Claim:
         return True
 
     def give_up(self) -> None:
-        """Let others have it."""
+        """Release it."""
         if self._held is not None:
             os.close(self._held)
         self._held, self.is_ours = None, False

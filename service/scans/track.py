@@ -1,4 +1,4 @@
-"""Where a stored scan lies, and the way it was flown, also as tables."""
+"""Georeference and trajectory of a stored scan, also as tables."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CSV_COLUMNS = (
 
 
 def local_frame(header: ScanHeader) -> LocalFrame | None:
-    """The scan's place on the globe, or None when it has none."""
+    """The scan's georeference, or None when it has none."""
     lat, lon, alt = header.origin_lat_deg, header.origin_lon_deg, header.origin_alt_amsl_m
     if lat is None or lon is None:
         return None
@@ -37,7 +37,7 @@ def local_frame(header: ScanHeader) -> LocalFrame | None:
 
 
 def latest(poses: Iterator[PoseRecord]) -> list[PoseRecord]:
-    """The poses in order of time; where a time was written again, only its last record."""
+    """The poses in order of time; of several at one time only the last record."""
     return sorted({p.time_unix_ns: p for p in poses}.values(), key=lambda p: p.time_unix_ns)
 
 
@@ -57,7 +57,7 @@ def _seconds(time_unix_ns: int) -> str:
 
 
 def csv_table(poses: Sequence[PoseRecord]) -> str:
-    """The trajectory as a table; a value that is not known is empty."""
+    """The trajectory as a table; unknown values are empty."""
     out = io.StringIO()
     table = csv.writer(out, lineterminator="\n")
     table.writerow(CSV_COLUMNS)

@@ -11,20 +11,20 @@ import numpy as np
 from recon.types import Array
 
 MAX_SCALE_SIGMA = 0.05
-"""A scale less certain than this is not a measurement."""
+"""A less certain scale is not a measurement."""
 
 MAX_SLOPE_DEG = 30.0
-"""A site that leans by more, where the view direction is assumed, was not seen from above."""
+"""Above this slope, with an assumed view direction, the site was not seen from above."""
 
 MIN_PLACED_SHARE = 0.5
-"""Of the frames: below it vision was lost for most of the flight."""
+"""Share of the frames; below it vision was lost for most of the flight."""
 
 
 class Trust(Enum):
-    """From the most to the least that may be measured in a scan."""
+    """What may be measured in a scan, from the most to the least."""
 
     GEOREFERENCED = "georeferenced"  # positions and distances
-    SCALED = "scaled"  # distances, at no known place
+    SCALED = "scaled"  # distances, without georeference
     RELATIVE = "relative"  # shapes, of unknown size
     DOUBTFUL = "doubtful"  # not even the shape is certain
 
@@ -33,8 +33,8 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     """The level as ``level`` and what limits it as ``reasons``, both for scan.json.
 
     Args:
-        run: what the scan's run noted: ``assumed``, ``scale``, ``frames``,
-            ``frames_tracked``. What it lacks, or holds in another form, limits nothing.
+        run: figures of the scan's run: ``assumed``, ``scale``, ``frames``,
+            ``frames_tracked``. Missing or malformed ones limit nothing.
         georeference: of the scan's header; "none" without.
         slope_deg: of the plane through the cloud.
     """
@@ -46,7 +46,7 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         doubts.append("the lens is assumed: shapes bend; calibrate the camera")
     if "view" in assumed and slope_deg > MAX_SLOPE_DEG:
         doubts.append(
-            f"the view direction is assumed, and the site leans by {slope_deg:.0f} degrees"
+            f"the view direction is assumed, and the site slopes by {slope_deg:.0f} degrees"
         )
     frames, tracked = _number(run, "frames"), _number(run, "frames_tracked")
     if frames and tracked is not None and tracked < MIN_PLACED_SHARE * (frames - 1):
@@ -54,9 +54,9 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     if doubts:
         return _said(Trust.DOUBTFUL, doubts)
     if "height" in assumed:
-        return _said(Trust.RELATIVE, ["the size follows from an assumed height above ground"])
+        return _said(Trust.RELATIVE, ["the scale comes from an assumed height above ground"])
     if scale_sigma is not None and scale_sigma > MAX_SCALE_SIGMA:
-        return _said(Trust.RELATIVE, [f"the scale is known to {scale_sigma:.0%} only"])
+        return _said(Trust.RELATIVE, [f"the scale is uncertain by {scale_sigma:.0%}"])
     if georeference == "none":
         return _said(Trust.SCALED, ["no positions: the scan has its own origin and heading"])
     return _said(Trust.GEOREFERENCED, [])
@@ -74,7 +74,7 @@ def _number(document: Any, key: str) -> float | None:
 def slope_deg(xyz_m: Array) -> float:
     """The angle in degrees between the plane through points (N, 3) and the horizontal.
 
-    The normal is the direction of least spread; 0 for fewer than three points.
+    The normal is the direction of minimum spread; 0 for fewer than three points.
     """
     if len(xyz_m) < 3:
         return 0.0

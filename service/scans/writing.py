@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Files that appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from service.errors import OutsideError
 
 @contextmanager
 def writing(path: Path) -> Iterator[Path]:
-    """A path beside ``path`` to write to; renamed onto it when all went well, else removed.
+    """A temporary path for ``path``; renamed onto it on success, otherwise removed.
 
-    A failure of the disk becomes an OutsideError.
+    A disk failure becomes an OutsideError.
     """
     part = path.with_name(f".{path.name}.part")
     try:
@@ -28,5 +28,5 @@ def writing(path: Path) -> Iterator[Path]:
             f"cannot write {path} ({error.strerror or error}); check the disk and its rights"
         ) from error
     finally:
-        with suppress(OSError):  # the disk that cannot be written cannot be cleaned either
+        with suppress(OSError):  # a disk that cannot be written cannot be cleaned either
             part.unlink(missing_ok=True)
