@@ -24,8 +24,8 @@ def close_open_scans(folder: Path, ours: Container[str]) -> list[str]:
     """Finish the scans in ``folder`` that a crash or a power cut left open; returns their names.
 
     Scans named in ``ours`` are in progress and left unchanged. The clock is not used, because a
-    power cut may have reset it. The stored data is kept and the files are written, with ``interrupted``
-    in the summary. An unreadable scan stays as it is, with a warning.
+    power cut may have reset it. The stored data is kept and the files are written, with
+    ``interrupted`` in the summary. An unreadable scan stays as it is, with a warning.
     """
     from service.scans.folder import files_due, write_deliverables
     from service.stream.store import ScanStore
