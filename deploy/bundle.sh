@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Prepares a folder from which deploy/install.sh installs without a network:
 #   deploy/bundle.sh [--platform x86_64|aarch64] [--extras logs] [--out dist/bundle]
-# Run it with the Python version of the machine that will fly it (JetPack 6: 3.10), for instance
+# Run it with the Python version of the target machine (JetPack 6: 3.10), for instance
 #   PYTHON=python3.10 deploy/bundle.sh --platform aarch64
 set -euo pipefail
 
@@ -27,7 +27,7 @@ rm -rf "$out"
 mkdir -p "$out/wheels"
 cp -r "$here/deploy" "$here/systemd" "$here/pyproject.toml" "$here/README.md" "$here/LICENSE" "$out/"
 
-# Our own wheel is built in an environment that holds the pinned builders and nothing else.
+# Our own wheel is built in an environment with the pinned build tools only.
 builder=$(mktemp -d)
 trap 'rm -rf "$builder"' EXIT
 "$python" -m venv "$builder"
@@ -52,7 +52,7 @@ for extra in ${extras//,/ }; do
   [[ -r $here/deploy/locked/$extra.txt ]] || { printf 'bundle.sh: no extra %s\n' "$extra" >&2; exit 1; }
   locked+=(-r "$here/deploy/locked/$extra.txt")
 done
-# Only wheels, each with the hash that deploy/locked says: nothing that is downloaded runs here.
+# Only wheels, each with its hash in deploy/locked: no downloaded code runs here.
 pinned download -d "$out/wheels" --implementation cp --python-version "$version" "${tags[@]}" \
   "${locked[@]}"
 "$python" "$here/deploy/inventory.py" "$out"

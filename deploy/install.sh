@@ -62,7 +62,7 @@ check_python() {
   "$python" -c 'import ensurepip' 2>/dev/null || die "no venv module; apt install python3-venv"
 }
 
-# Without OpenMP numba cannot let tracking and stereo run side by side.
+# Without OpenMP numba cannot run tracking and stereo in parallel.
 check_openmp() {
   [[ -z $root ]] || return 0
   "$python" -c 'import ctypes; ctypes.CDLL("libgomp.so.1")' 2>/dev/null && return 0
@@ -87,7 +87,7 @@ check_libraries() {
 }
 
 # NVIDIA's own builds of torch and onnxruntime live in the system's Python on a Jetson; a
-# virtual environment that sees them keeps them, PyPI's would lack the GPU.
+# virtual environment with system packages uses them; PyPI's builds lack the GPU.
 site_packages() {
   if "$python" - <<'PY' 2>/dev/null
 import importlib.util, sys
@@ -112,7 +112,7 @@ wanted_extras() {
 
 system_has() { "$python" -c "import importlib.util as u, sys; sys.exit(u.find_spec('$1') is None)"; }
 
-# Makes $versions/$1 from this clone or the bundle; an unfinished one is thrown away.
+# Makes $versions/$1 from this clone or the bundle; an unfinished one is deleted.
 build_version() {
   local target=$versions/$1 part=$versions/$1.part from=$bundle site
   rm -rf "$part"
@@ -150,7 +150,7 @@ switch_to() {
   if live; then systemctl daemon-reload; fi
 }
 
-# Makes $1 (versions/NAME) the version before; none when it is empty.
+# Makes $1 (versions/NAME) the previous version; none when it is empty.
 remember() {
   rm -f "$home/previous"
   [[ -z $1 ]] || ln -s "$1" "$home/previous"
@@ -202,7 +202,7 @@ prepare_machine() {
   udevadm control --reload 2>/dev/null || true
 }
 
-# Compiles the kernels of version $1 as the service's user, so that no flight waits for that.
+# Compiles the kernels of version $1 as the service's user, before the first flight.
 warm_up() {
   live && [[ $unit == skyrelief ]] || return 0
   say "warming up: the kernels are compiled, some minutes on a small board"
@@ -224,7 +224,7 @@ healthy() {
   systemctl is-active --quiet "$unit.service"
 }
 
-# True when the configuration names what the service cannot start without.
+# True when the configuration has the settings that the service requires.
 is_configured() {
   [[ $unit == skyrelief ]] || return 0
   "$current/bin/python" - "$etc/skyrelief.toml" <<'PY' 2>/dev/null
@@ -262,7 +262,7 @@ start_or_roll_back() {
   fi
 }
 
-# Keeps the version in use, the one before, and the newest others: $keep in all.
+# Keeps the current version, the previous one, and the newest others: $keep in all.
 prune() {
   find "$versions" -mindepth 1 -maxdepth 1 -type d -printf '%T@ %f\n' | sort -rn |
     awk -v now="$(version_now)" -v kept="$((keep - 1))" '$2 != now && n++ >= kept { print $2 }' |

@@ -1,4 +1,4 @@
-"""What a bundle holds: ``requirements.txt`` with hashes, an SBOM and ``THIRD_PARTY_NOTICES``.
+"""Writes the contents of a bundle: ``requirements.txt`` with hashes, an SBOM and ``THIRD_PARTY_NOTICES``.
 
     python3 deploy/inventory.py BUNDLE
 
@@ -22,8 +22,8 @@ from pathlib import Path
 GPL_LIBRARIES = ("x264", "x265")
 COPYLEFT = re.compile(r"\b[AL]?GPL|GNU |Lesser|\bMPL|Mozilla", re.IGNORECASE)
 DUTIES = """\
-skyrelief itself is Apache-2.0. Whoever passes this bundle on to others, on a medium or inside a
-product, also passes on the packages below, and must keep to their licences:
+skyrelief itself is Apache-2.0. Distributing this bundle, on a medium or inside a product, also
+distributes the packages below; their licences apply:
 
 - keep this file and the licence texts inside the wheels with every copy;
 - for GPL, LGPL and MPL parts, provide or offer the source code of exactly the versions listed
