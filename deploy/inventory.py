@@ -60,7 +60,7 @@ class Part:
 
 
 def read_wheel(path: Path) -> Part:
-    """What a wheel says of itself."""
+    """Read the metadata of a wheel."""
     with zipfile.ZipFile(path) as wheel:
         names = wheel.namelist()
         (about,) = (n for n in names if re.fullmatch(r"[^/]+\.dist-info/METADATA", n))

@@ -74,7 +74,7 @@ def test_writes_disparity_in_pixels(
     ("change", "words"),
     [
         ({"--labels": "1"}, "2 to 1024"), ({"--iterations": "0"}, "iterations"),
-        ({"--backend": "abacus"}, "there are auto, cpu"), ({"--out": "d.txt"}, ".npy"),
+        ({"--backend": "abacus"}, "available: auto, cpu"), ({"--out": "d.txt"}, ".npy"),
         ({"--out": "nowhere/d.npy"}, "no folder"), ({"--model": "none.toml"}, "none.toml"),
     ],
 )  # fmt: skip
@@ -143,7 +143,7 @@ def test_a_lost_device_falls_back_to_the_cpu(caplog: pytest.LogCaptureFixture) -
     assert np.nanmedian(found.px) == pytest.approx(0, abs=0.1)
     assert backend.name == backend.device == "cpu"
     assert backend.failure == "CUDA out of memory"
-    assert "the CPU goes on" in caplog.text
+    assert "the CPU takes over" in caplog.text
 
 
 def test_auto_takes_the_fastest_that_works(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -171,7 +171,7 @@ def test_named_backend_that_cannot_run_stops(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(backend_choice, "load_backend", refuse)
     with pytest.raises(OutsideError, match="torch cannot run here: No module named"):
         choose_backend("torch")
-    with pytest.raises(InputError, match="there are auto"):
+    with pytest.raises(InputError, match="available: auto"):
         choose_backend("vulkan")
 
 

@@ -1,4 +1,4 @@
-"""Which backend does the heavy operations: the operator's, or the fastest that works."""
+"""Chooses the backend of the heavy operations: the configured one, or the fastest that works."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ TRIAL_ROUNDS = 5
 
 
 class FallbackBackend:
-    """A backend on a device, and the CPU for the day that the device fails.
+    """A backend on a device, with the CPU as fallback.
 
-    After the first RuntimeError (out of memory, device lost) the operation is done again on
-    the CPU, and so is everything after it; ``failure`` then says why.
+    After the first RuntimeError (out of memory, device lost) the CPU repeats the operation and does
+    all further ones; ``failure`` then gives the reason.
     """
 
     def __init__(self, backend: Backend) -> None:
@@ -50,12 +50,12 @@ class FallbackBackend:
 
     @property
     def name(self) -> str:
-        """Of the backend that works."""
+        """Name of the backend in use."""
         return self._backend.name
 
     @property
     def device(self) -> str:
-        """Of the backend that works."""
+        """Device of the backend in use."""
         return self._backend.device
 
     def belief_propagation(
@@ -82,7 +82,7 @@ class FallbackBackend:
         T_world_camera: F64,
         stages: DenseStages,
     ) -> DepthMap | None:
-        """See :class:`recon.backends.PathBackend`; None also when the CPU goes on."""
+        """See :class:`recon.backends.PathBackend`; None also after the fallback."""
         return self._run(
             lambda b: (
                 b.fused_depth(pairs, K, size_px, T_world_camera, stages)
@@ -92,10 +92,10 @@ class FallbackBackend:
         )
 
     def fail(self, error: Exception) -> None:
-        """Compute on the processor from now on, because of this error."""
+        """Use the CPU from now on, because of this error."""
         self.failure = str(error).splitlines()[0] if str(error) else type(error).__name__
         log.error(
-            "backend %s on %s failed (%s): the CPU goes on", self.name, self.device, self.failure
+            "backend %s on %s failed (%s): the CPU takes over", self.name, self.device, self.failure
         )
         self._backend = load_backend("cpu")
 
@@ -122,23 +122,23 @@ def choose_backend(name: str = "auto") -> Backend:
 
 
 def engine_folder() -> str | None:
-    """Where compiled engines of GPU providers are kept between starts; None: nowhere."""
+    """Cache folder for compiled engines of GPU providers; None without one."""
     given = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]  # as systemd sets it
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(given or Path(home) / "skyrelief") / "engines"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        log.info("compiled engines are not kept: %s", error)
+        log.info("compiled engines are not cached: %s", error)
         return None
     return str(folder)
 
 
 def fastest_backend() -> Backend:
-    """The fastest of those that work, in a short measured trial.
+    """The fastest working backend in a short measured trial.
 
-    A torch without a device is left out: on a processor it has less than half of the speed of
-    the compiled backend.
+    torch without a device is left out: on a CPU it has less than half the speed of the compiled
+    backend.
     """
     working: list[Backend] = []
     for candidate in BACKENDS:
@@ -152,7 +152,7 @@ def fastest_backend() -> Backend:
             log.info("backend %s: cannot run here, %s", candidate, error)
             continue
         if candidate != "cpu" and backend.device == "cpu":
-            log.info("backend %s: not tried, it found no device but the processor", candidate)
+            log.info("backend %s: not tried, it found no device but the CPU", candidate)
             continue
         working.append(backend)
     if len(working) == 1:
@@ -169,34 +169,34 @@ def fastest_backend() -> Backend:
     seconds, chosen = min(timed, key=lambda entry: entry[0])
     figures = ", ".join(f"{b.name} {1e3 * s:.1f} ms" for s, b in timed)
     log.info(
-        "backend %s on %s: %.1f ms a trial, the least of %s",
+        "backend %s on %s: %.1f ms a trial, the fastest of %s",
         chosen.name, chosen.device, 1e3 * seconds, figures,
     )  # fmt: skip
     return chosen
 
 
 def named_backend(name: str) -> Backend:
-    """The backend called ``name``.
+    """The backend called ``name``, ready to run.
 
     Raises InputError when there is none of that name, OutsideError when it cannot run here.
     """
     if name not in BACKENDS:
-        raise InputError(f"backend {name}: there are auto, {', '.join(BACKENDS)}")
+        raise InputError(f"backend {name}: available: auto, {', '.join(BACKENDS)}")
     try:
         backend = load_backend(name, engine_folder())
     except (ImportError, RuntimeError, ValueError) as error:
         raise OutsideError(f"backend {name} cannot run here: {error}") from error
-    log.info("backend %s on %s, as named", backend.name, backend.device)
+    log.info("backend %s on %s, as configured", backend.name, backend.device)
     return backend
 
 
 def pointless(name: str) -> str | None:
-    """Why ``auto`` need not try this backend, or None; costs no heavy import."""
+    """Why ``auto`` skips this backend, or None; imports nothing heavy."""
     if name == "torch":
         if find_spec("torch") is None:
             return "torch is not installed"
         if ctypes.util.find_library("cuda") is None:
-            return "there is no CUDA driver, and on a processor the cpu backend is faster"
+            return "there is no CUDA driver, and on a CPU the cpu backend is faster"
     if name == "onnx":
         if find_spec("onnxruntime") is None or find_spec("onnx") is None:
             return "onnx and onnxruntime are not installed"
@@ -204,12 +204,12 @@ def pointless(name: str) -> str | None:
 
         providers = set(onnxruntime.get_available_providers())
         if not providers & {"TensorrtExecutionProvider", "CUDAExecutionProvider"}:
-            return "ONNX Runtime has no GPU provider, and on a processor cpu is faster"
+            return "ONNX Runtime has no GPU provider, and on a CPU the cpu backend is faster"
     return None
 
 
 def trial(backend: Backend) -> float:
-    """Least seconds of a pair from images to upsampled disparity, after a warm-up round."""
+    """Minimum seconds from an image pair to upsampled disparity, after a warm-up round."""
     rng = np.random.default_rng(0)
     height, width = TRIAL_SIZE
     guide = rng.integers(0, 256, (2 * height, 2 * width, 3), np.uint8)
