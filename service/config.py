@@ -46,12 +46,12 @@ class CameraConfig:
     mount_pitch_deg: float = key(-90.0, "fixed mount: -90 looks straight down, 0 looks ahead")
     mount_yaw_deg: float = key(0.0, "fixed mount: 0 points the image's top to the nose")
     lever_forward_m: float = key(0.0, "camera ahead of the autopilot's position, body frame")
-    lever_right_m: float = key(0.0, "the same to the right")
-    lever_down_m: float = key(0.0, "the same downwards")
+    lever_right_m: float = key(0.0, "camera to the right of it, body frame")
+    lever_down_m: float = key(0.0, "camera below it, body frame")
     latency_ms: float = key(0.0, "from mid-exposure to the image's time stamp", live=True)
     latency: Literal["fixed", "auto"] = key(
         "fixed",
-        "fixed: latency_ms; auto: measured from image rotation",
+        "fixed: latency_ms; auto: measured in flight, latency_ms until then",
         live=True,
     )
     readout_ms: float | Literal["model"] = key(
@@ -103,7 +103,7 @@ class ScanConfig:
 
     folder: str = key("/var/lib/skyrelief/scans", "parent folder of the scans")
     drone: str = key("", "name of this aircraft in scans and on the datalink; empty: host name")
-    start: Literal["on-command", "on-boot", "on-arm"] = key("on-command", "start of a scan")
+    start: Literal["on-command", "on-boot", "on-arm"] = key("on-command", "what starts a scan")
     close_after_landing_s: float = key(
         60.0,
         "a commanded scan is closed this long after disarming; 0: never",
@@ -114,10 +114,12 @@ class ScanConfig:
     )
     base_to_height: float = key(0.1, "auto baseline: metres of baseline per metre above ground")
     assumed_agl_m: float | None = key(
-        None, "height above ground when telemetry has none; gives the scan its scale"
+        None, "height above ground if telemetry has none; determines the scan's scale"
     )
     keep_free_mib: float = key(
-        2048.0, "free disk space; the oldest finished scans are deleted to keep it; 0: never", True
+        2048.0,
+        "disk space to keep free; the oldest finished scans are deleted for it; 0: never",
+        True,
     )
     resolution_m: float = key(
         0.0, "voxel size of the map, from the next scan on; 0: by image resolution", live=True
@@ -160,7 +162,7 @@ class ComputeConfig:
     iterations: int = key(5, "iterations of belief propagation per level; the paper's is 5")
     guide_width: int = key(1280, "width of the image that guides the upsampling")
     upsample: bool = key(True, "joint bilateral upsampling; without it depth is coarser and faster")
-    pairs: int = key(4, "stereo pairs fused into a keyframe, at most")
+    pairs: int = key(4, "maximum number of stereo pairs fused into a keyframe")
     relief: bool = key(
         True,
         "shed load when too slow, too hot or short of memory: lower rate, lower resolution, no "
