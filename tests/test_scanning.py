@@ -64,25 +64,25 @@ def test_a_camera_that_fails_is_told(daemon: Daemon, monkeypatch: pytest.MonkeyP
     told, gate = [], SimpleNamespace(warnings=["told when it was opened"])
     scanning: Any = daemon.scanning
     monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, _: told.append(text))
-    daemon._tell_of_camera()
+    daemon._report_camera()
     run: Any = ScanRun(scanning, is_asked=True)
-    run.gate, run._news_told, scanning._run = gate, 1, run
+    run.gate, run._news_reported, scanning._run = gate, 1, run
     gate.warnings.append("the image is frozen for 8 s")
     for silent_s in (0.0, 9.0, 11.0, 300.0):
         run.progress_s = time.monotonic() - silent_s
-        daemon._tell_of_camera()
-        daemon._tell_of_camera()
+        daemon._report_camera()
+        daemon._report_camera()
     run.progress_s = time.monotonic()
-    daemon._tell_of_camera()
+    daemon._report_camera()
     assert told == [
         "Camera: the image is frozen for 8 s",
         "No images for 10 s: nothing is scanned",
         "Camera images recovered",
     ]
     run.progress_s = time.monotonic() - 60.0
-    daemon._tell_of_camera()
+    daemon._report_camera()
     scanning._run = None  # stopped meanwhile
-    daemon._tell_of_camera()
+    daemon._report_camera()
     assert told[3:] == ["No images for 10 s: nothing is scanned"]
 
 
