@@ -1,4 +1,4 @@
-"""Writes the contents of a bundle: ``requirements.txt`` with hashes, an SBOM and ``THIRD_PARTY_NOTICES``.
+"""Write the requirements with hashes, the SBOM and ``THIRD_PARTY_NOTICES`` of a bundle.
 
     python3 deploy/inventory.py BUNDLE
 
