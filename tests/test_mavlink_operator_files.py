@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 from mavlink.component.commands import (
@@ -49,3 +50,28 @@ def test_the_operators_page_names_every_action_of_ctl() -> None:
     page = (ROOT / "docs" / "operators.md").read_text()
     assert all(action in page for action in ACTIONS)
     assert set(ORDERS) | {"status", "watch"} == set(ACTIONS)
+
+
+def test_the_messages_of_the_operators_pages_are_those_of_the_service() -> None:
+    """The longest fixed part of each listed text occurs in the code (steps as names of an enum)."""
+    code = "".join(
+        path.read_text(encoding="utf-8")
+        for package in ("service", "mavlink")
+        for path in (ROOT / package).rglob("*.py")
+    )
+    operators = (ROOT / "docs" / "operators.md").read_text(encoding="utf-8")
+    card = (ROOT / "docs" / "card.md").read_text(encoding="utf-8")
+    tables = [
+        operators.partition("## Missing on the links")[2].partition("\n## ")[0],
+        operators.partition("## Status texts")[2].partition("\n## ")[0],
+        card.partition("| message | do |")[2].partition("\n\n")[0],
+    ]
+    cells = [
+        line.split("|")[1] for table in tables for line in table.splitlines() if line[:3] == "| `"
+    ]
+    texts = [text for cell in cells for text in re.findall(r"`([^`]+)`", cell)]
+    fixed = {text: max(re.split(r"\d+|…|[():,]", text), key=len).strip() for text in texts}
+    assert len(fixed) > 20
+    assert [
+        text for text, part in fixed.items() if part.lower() not in code.lower().replace("_", " ")
+    ] == []
