@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
 from recon.mapping.plausibility import plausible
 from recon.types import F64, U8, DepthMap, PosePrior
+from service.flight.stages import Plausible
+from service.flight.viewpoints import StereoCandidate
 
 K = np.array([[100.0, 0, 59.5], [0, 100.0, 39.5], [0, 0, 1]])
 SHAPE = (80, 120)
@@ -48,3 +54,17 @@ def test_what_may_lie_below_the_horizon_is_kept() -> None:
 def test_nothing_left_is_no_depth() -> None:
     assert plausible(surface(np.zeros(SHAPE, np.uint8)), PosePrior()) is None
     assert plausible(surface(np.ones(SHAPE, np.uint8)), PosePrior(looking(60.0), 0.0)) is None
+
+
+def test_a_stretch_that_was_refuted_needs_more_views_that_agree() -> None:
+    """Two views of a false motion contradict themselves; a third that does not stays out."""
+    rejected: Counter[str] = Counter()
+    stage = Plausible(rejected)
+    false, good = surface(np.zeros(SHAPE, np.uint8)), surface(np.full(SHAPE, 2, np.uint8))
+    first, second = (
+        cast(StereoCandidate, SimpleNamespace(prior=PosePrior(), segment=n)) for n in range(2)
+    )
+    assert [stage(first, d) for d in (false, false, good, good)] == [None] * 4
+    assert stage(first, good) is good
+    assert stage(second, None) is None and stage(second, good) is good
+    assert sum(rejected.values()) == 4

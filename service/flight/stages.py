@@ -252,17 +252,26 @@ def by_stages(pairs: Sequence[RectifiedPair], grid: Grid) -> None:
 
 
 class Plausible:
-    """Drops the depth that a view cannot have seen."""
+    """Drops the depth that a view cannot have seen.
+
+    The views of a stretch share one motion: where as many were refuted as not, it is false.
+    """
 
     def __init__(self, rejected: Counter[str]) -> None:
         self._rejected = rejected
+        self._balance: Counter[int] = Counter()  # views kept less those refuted, by segment
 
     def __call__(self, view: StereoCandidate, depth: DepthMap | None) -> DepthMap | None:
         """What is left of ``depth``; None where there is nothing."""
-        kept = None if depth is None else plausible(depth, view.prior)
-        if depth is not None and kept is None:
-            self._rejected["pairs contradict each other"] += 1
-        return kept
+        if depth is None:
+            return None
+        kept = plausible(depth, view.prior)
+        self._balance[view.segment] += -1 if kept is None else 1
+        if kept is not None and self._balance[view.segment] > 0:
+            return kept
+        contradicted = "pairs contradict each other"
+        self._rejected[contradicted if kept is None else f"{contradicted} in earlier views"] += 1
+        return None
 
 
 class Register:
