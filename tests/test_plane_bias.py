@@ -1,0 +1,62 @@
+"""Stereo of a plane that is known exactly lies neither above nor below it, at any width."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from painted_ground import CAMERA, HEIGHT_M, SIZE, K, pose, still
+
+from recon import se3
+from recon.camera_model import rays, scaled_K
+from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
+from recon.stereo.reprojection import reproject
+from recon.stereo.upsampling import UpsamplingConfig, upsample
+from recon.stereo.virtual_stereo import StereoPair, View, VirtualStereoConfig, drop_unseen, rectify
+from recon.types import F64
+
+LARGEST_BIAS = 2e-4
+"""Of the height."""
+
+
+def heights(width_px: int, upsampled: bool, east_m: float) -> F64:
+    """Heights above the plane of a tilted view paired with one ``east_m`` further on."""
+    views = []
+    for T in (pose(0.0, 10.0, seed=1), pose(east_m, 10.0, seed=2)):
+        T[:3, :3] = se3.so3_exp(np.array([0.1, 0.15, 0.0])) @ T[:3, :3]
+        image = still(T)
+        views.append(View(np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)), image, K, T))
+    left, right = views
+    w, h = width_px, round(width_px * SIZE[1] / SIZE[0])
+    K_grid = scaled_K(CAMERA.K, w / SIZE[0], h / SIZE[1])
+    config = VirtualStereoConfig(width_px=w, guide_width_px=max(w, SIZE[0]), guided=upsampled)
+    pair = rectify(left, right, on_plane(K_grid, (w, h), left.T_odom_camera)[::97], config)
+    assert isinstance(pair, StereoPair)
+    labels = belief_propagation(pair.left, pair.right, pair.labels, BeliefPropagationConfig())
+    labels = drop_unseen(labels, pair)
+    if pair.guide is not None:
+        labels = upsample(labels, pair.guide, UpsamplingConfig())
+    depth = reproject(labels, pair, K_grid, (w, h)).depth_m
+    truth = on_plane(K_grid, (w, h), left.T_odom_camera)[:, 2].reshape(h, w)
+    off = HEIGHT_M * (1.0 - depth / truth)
+    assert np.isfinite(off).mean() > 0.5
+    return np.asarray(off[np.isfinite(off)], np.float64)
+
+
+def on_plane(K_grid: F64, size: tuple[int, int], T_world_camera: F64) -> F64:
+    """(w h, 3) where the pixels' rays meet the plane, in the camera's frame."""
+    u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    ray = rays(K_grid, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
+    return np.asarray(ray * (HEIGHT_M / -(ray @ T_world_camera[2, :3]))[:, None])
+
+
+@pytest.mark.parametrize("east_m", [4.0, -4.0])
+@pytest.mark.parametrize(("width_px", "upsampled"), [(240, False), (240, True), (480, False)])
+def test_a_known_plane_is_found_without_bias(
+    width_px: int, upsampled: bool, east_m: float
+) -> None:
+    assert abs(np.median(heights(width_px, upsampled, east_m))) < LARGEST_BIAS * HEIGHT_M
+
+
+def test_a_grid_finer_than_the_image_has_no_bias_either() -> None:
+    assert abs(np.median(heights(960, False, 4.0))) < LARGEST_BIAS * HEIGHT_M
