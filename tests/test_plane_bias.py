@@ -52,9 +52,7 @@ def on_plane(K_grid: F64, size: tuple[int, int], T_world_camera: F64) -> F64:
 
 @pytest.mark.parametrize("east_m", [4.0, -4.0])
 @pytest.mark.parametrize(("width_px", "upsampled"), [(240, False), (240, True), (480, False)])
-def test_a_known_plane_is_found_without_bias(
-    width_px: int, upsampled: bool, east_m: float
-) -> None:
+def test_a_known_plane_is_found_without_bias(width_px: int, upsampled: bool, east_m: float) -> None:
     assert abs(np.median(heights(width_px, upsampled, east_m))) < LARGEST_BIAS * HEIGHT_M
 
 

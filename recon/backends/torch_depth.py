@@ -275,7 +275,7 @@ def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Te
     """Depth, sigma and number of views (h, w) float32 of pairs (P, h, w); no view: NaN.
 
     As :func:`recon.stereo.reprojection.fuse`: inverse depth of the largest group that agrees,
-    nothing where several pairs read and no two agree.
+    nothing where several pairs read and none comes near another.
     """
     z, e = depth.double(), sigma.double()
     usable = (z > 0) & (e < config.most_sigma_share * z)
@@ -286,7 +286,8 @@ def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Te
     member = usable & ((inverse - centre).abs() <= limit)
     weight = torch.where(member, 1 / s**2, 0.0)
     views = member.sum(0)
-    contradicted = (views == 1) & (usable.sum(0) > 1)
+    near = usable & ((inverse - centre).abs() <= config.most_sigma_share * centre)
+    contradicted = (views == 1) & (usable.sum(0) > 1) & (near.sum(0) == 1)
     refuted = contradicted.sum() > (views >= 2).sum()
     seen = (views > 0) & ~contradicted & ~refuted
     total = torch.where(seen, weight.sum(0), 1.0)

@@ -133,9 +133,10 @@ def fuse(pairs: Sequence[PairDepth], K: F64, T_world_camera: F64, config: Fusion
 
     The mean is over inverse depth (whose error is nearly Gaussian) with weights 1/sigma^2;
     the sigma is the larger of the propagated one and the spread inside the group. ``views``
-    counts the group. Where several pairs read and no two agree nothing is known; where that is
-    so at more pixels than those at which two agree, what they see is no rigid surface, or their
-    motion is false, and the whole map is unknown. Raises ValueError without any pair.
+    counts the group. Where several pairs read and none comes within ``most_sigma_share`` of
+    another nothing is known. Where that is so at more pixels than those at which two agree, what
+    they see is no rigid surface, or their motion is false, and the whole map is unknown. Raises
+    ValueError without any pair.
     """
     if not pairs:
         raise ValueError("no stereo pair to fuse")
@@ -215,7 +216,11 @@ def _fuse(
                     views += 1
             out_views[v, u] = views
             if views == 1 and count > 1:
-                continue
+                near = 0
+                for p in range(count):
+                    near += abs(w[p] - w[centre]) <= most_share * w[centre]
+                if near == 1:
+                    continue
             mean /= total
             spread = 0.0
             for p in range(count):
