@@ -12,8 +12,8 @@ from recon.camera_model import rays, scaled_K
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.reprojection import reproject
 from recon.stereo.upsampling import UpsamplingConfig, upsample
-from recon.stereo.virtual_stereo import StereoPair, View, VirtualStereoConfig, drop_unseen, rectify
-from recon.types import F64
+from recon.stereo.virtual_stereo import View, VirtualStereoConfig, drop_unseen, rectify
+from recon.types import F64, StereoPair
 
 LARGEST_BIAS = 2e-4
 """Of the height."""
