@@ -10,7 +10,6 @@ they take any other: partners lie on one row, and the labels lie about the plane
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +27,9 @@ if TYPE_CHECKING:
 
 SEAM_GAP_RAD = 0.3
 """A gap between the directions of the pixels that is wider is no part of the image."""
+
+OUTSIDE_PX = 1e4
+"""Further out than any image."""
 
 MIN_DETAIL = 1.5
 """Gray levels of standard deviation in 5x5 pixels: less is sky, water or plain paint."""
@@ -213,22 +215,13 @@ def rectify_polar(
         return "relief too large for the baseline"
     lowest = 0.5 * (low + high) - 0.5 * (labels - 1)
 
-    def left_rays(finer: float) -> F32:
-        away, about = sector.angles(finer)
-        return directions(away[None], about[:, None]).astype(np.float32)
-
-    def right_rays(finer: float) -> F32:
-        away, about = sector.angles(finer)
-        away = np.maximum(away + lowest / f, 0.0)[None]
-        seen = seen_from_right(away, about[:, None], plane, baseline)
-        return directions(seen, about[:, None]).astype(np.float32)
-
-    left_gray, left_seen = _stereo_view(left, R_left, left_rays, f)
-    right_gray, right_seen = _stereo_view(right, R_right, right_rays, f)
+    left_view = _PolarView(left, R_left, sector, np.zeros(3), 0.0)
+    right_view = _PolarView(right, R_right, sector, baseline * plane, lowest / f)
+    left_gray, left_seen = left_view.for_stereo()
+    right_gray, right_seen = right_view.for_stereo()
     guide = None
     if config.guided and left.bgr is not None:
-        finer = max(1.0, config.guide_width_px / config.width_px)
-        guide = _warp(left.bgr, left, R_left, left_rays(finer), f * finer)
+        guide = left_view.warped(left.bgr, max(1.0, config.guide_width_px / config.width_px))
     return PolarPair(
         left=left_gray,
         right=right_gray,
@@ -256,45 +249,59 @@ def _rays(view: View) -> F64:
     return np.asarray(pixels @ np.linalg.inv(view.K).T)
 
 
-def _maps(view: View, R_polar_view: F64, rays: F32) -> tuple[F32, F32]:
-    """Columns and rows (h, w) of the view's pixels on ``rays`` (h, w, 3); far off behind it."""
-    P = rays @ (view.K @ R_polar_view.T).T.astype(np.float32)
-    z = P[..., 2]
-    behind = z < 1e-3
-    z = np.where(behind, np.float32(1.0), z)
-    x, y = (np.where(behind, np.float32(-1e4), P[..., k] / z) for k in range(2))
-    return np.clip(x, -1e4, 3e4), np.clip(y, -1e4, 3e4)
+@dataclass(frozen=True, slots=True, eq=False)
+class _PolarView:
+    """A view on the grid of a pair; the right one as it sees what lies at the plane."""
 
+    view: View
+    R_polar_view: F64
+    sampling: Sampling
+    nearness: F64  # (3,) plane times baseline: the step towards it; zeros for the left view
+    shift_rad: float  # away from the axis: that of label 0
 
-def _warp(image: U8, view: View, R_polar_view: F64, rays: F32, px_per_rad: float) -> U8:
-    """The view's ``image`` along ``rays``; halved first until no pixel is skipped."""
-    x, y = _maps(view, R_polar_view, rays)
-    ratio = float(view.K[0, 0]) / px_per_rad
-    while ratio > 1.9:
-        H, W = image.shape[:2]
-        half = (W // 2, H // 2)
-        x, y = (
-            (m + 0.5) * np.float32(b / a) - 0.5 for m, a, b in ((x, W, half[0]), (y, H, half[1]))
+    def maps(self, finer: float) -> tuple[F32, F32]:
+        """Columns and rows (h, w) of the view's pixels; far outside for rays behind it."""
+        away, about = self.sampling.angles(finer)
+        away = np.maximum(away + self.shift_rad, 0.0)
+        s, c = np.sin(away).astype(np.float32), np.cos(away).astype(np.float32)
+        turn = np.stack([np.cos(about), np.sin(about)], axis=1).astype(np.float32)
+        n, M = self.nearness.astype(np.float32), self.view.K @ self.R_polar_view.T
+        ahead = c - np.maximum(np.outer(turn @ n[:2], s) + n[2] * c, 0.0)
+        x, y, z = (np.outer(turn @ m[:2], s) + m[2] * ahead for m in M.astype(np.float32))
+        behind = z < 1e-3
+        z[behind] = 1.0
+        for axis in (x, y):
+            axis /= z
+            axis[behind] = -OUTSIDE_PX
+            np.clip(axis, -OUTSIDE_PX, OUTSIDE_PX, out=axis)
+        return x, y
+
+    def warped(self, image: U8, finer: float) -> U8:
+        """``image`` of the view on a grid ``finer`` times as fine; halved until none is skipped."""
+        x, y = self.maps(finer)
+        ratio = float(self.view.K[0, 0]) / (self.sampling.px_per_rad * finer)
+        while ratio > 1.9:
+            H, W = image.shape[:2]
+            image = np.asarray(cv2.resize(image, (W // 2, H // 2), interpolation=cv2.INTER_AREA))
+            x = (x + 0.5) * np.float32(image.shape[1] / W) - 0.5
+            y = (y + 0.5) * np.float32(image.shape[0] / H) - 0.5
+            ratio /= 2
+        out = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(out, np.uint8)
+
+    def for_stereo(self) -> tuple[U8, Bool]:
+        """Gray (h, w), averaged down from twice its size, and where it shows something."""
+        H, W = self.view.gray.shape
+        rim = int(np.ceil(1.0 + self.view.K[0, 0] / self.sampling.px_per_rad))
+        inside = np.zeros((H, W), np.uint8)
+        inside[rim:-rim, rim:-rim] = (
+            1 if self.view.seen is None else self.view.seen[rim:-rim, rim:-rim]
         )
-        image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
-        ratio /= 2
-    out = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(out, np.uint8)
-
-
-def _stereo_view(
-    view: View, R_polar_view: F64, rays: Callable[[float], F32], px_per_rad: float
-) -> tuple[U8, Bool]:
-    """Gray view (h, w) in polar coordinates, from twice its size, and where it is seen."""
-    H, W = view.gray.shape
-    rim = int(np.ceil(1.0 + view.K[0, 0] / px_per_rad))
-    inside = np.zeros((H, W), np.uint8)
-    inside[rim:-rim, rim:-rim] = 1 if view.seen is None else view.seen[rim:-rim, rim:-rim]
-    seen = cv2.remap(inside, *_maps(view, R_polar_view, rays(1.0)), cv2.INTER_NEAREST) > 0
-    double = _warp(view.gray, view, R_polar_view, rays(2.0), 2.0 * px_per_rad)
-    size = (seen.shape[1], seen.shape[0])
-    gray = np.asarray(cv2.resize(double, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return stretch(gray, seen), seen & _has_detail(gray)
+        seen = cv2.remap(inside, *self.maps(1.0), cv2.INTER_NEAREST) > 0
+        double = self.warped(self.view.gray, 2.0)
+        size = self.sampling.size
+        gray = np.asarray(cv2.resize(double, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return stretch(gray, seen), seen & _has_detail(gray)
 
 
 def _has_detail(gray: U8) -> Bool:
