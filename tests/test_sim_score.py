@@ -101,12 +101,25 @@ def test_perfect_scan_scores_perfectly(flight: Path, tmp_path: Path) -> None:
     assert report["surface"]["raw"]["rms_m"] < 0.003
     assert report["surface"]["rigid"]["rms_m"] < 0.003
     assert report["completeness"]["share"] > 0.97
+    assert report["completeness"]["share_near_track"] > 0.97
     assert report["trajectory"]["raw"]["max_m"] < 0.001
     assert report["trajectory"]["raw"]["median_deg"] < 0.01
     assert report["altitude_m"] == pytest.approx(40.0, abs=3.0)
     dsm = report["dsm"]["raw"]
     assert dsm["cells"] > 1000 and dsm["within_30cm"] > 0.9
     assert dsm["rms_away_from_steps_m"] < 0.15 and abs(dsm["median_m"]) < 0.02
+
+
+def test_ground_near_the_track_counts_apart(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cloud with a gap below the flight is complete elsewhere."""
+    monkeypatch.setattr("service.sim.scoring.NEAR_TRACK_M", 5.0)
+    points, track = true_cloud(flight), np.loadtxt(flight / "truth" / "trajectory.tum")[:, 1:3]
+    beside = np.linalg.norm(points[:, None, :2] - track[None], axis=2).min(axis=1) > 6.0
+    scan = write_scan(tmp_path / "scan", flight, points[beside], True, np.eye(3), np.zeros(3), 0.01)
+    complete = score(scan, flight)["completeness"]
+    assert complete["share_near_track"] < 0.15 < 0.5 < complete["share"]
 
 
 def test_known_displacement_and_noise_are_told_apart(flight: Path, tmp_path: Path) -> None:
@@ -127,6 +140,7 @@ def test_known_displacement_and_noise_are_told_apart(flight: Path, tmp_path: Pat
     assert rigid["median_percent_of_altitude"] == pytest.approx(
         100 * rigid["median_m"] / report["altitude_m"]
     )
+    assert rigid["median_percent_of_distance"] == pytest.approx(100 * 0.0674 / 42.0, rel=0.2)
     assert report["dsm"]["raw"]["median_m"] == pytest.approx(raw["bias_m"], abs=0.35)
     assert abs(report["dsm"]["rigid"]["median_m"]) < 0.1
     assert report["trajectory"]["raw"]["rms_m"] > 0.5

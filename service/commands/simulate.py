@@ -220,13 +220,14 @@ def _text(report: dict[str, Any]) -> str:
         f"compared, flown {report['altitude_m']:.1f} m above the ground"
         + ("" if report["georeferenced"] else "; the scan has no georeference"),
         "",
-        "surface              median      rms      p90     bias   <0.25 m   <0.5 m   of altitude",
+        "surface              median      rms      p90     bias   <0.25 m   <0.5 m"
+        "   of altitude  distance",
     ]
     for name, s in report["surface"].items():
         lines.append(
             f"  {_label(name):<16} {s['median_m']:7.3f} m {s['rms_m']:6.3f} m {s['p90_m']:6.3f} m "
             f"{s['bias_m']:+6.3f} m  {s['share_25cm']:7.1%}  {s['share_50cm']:7.1%} "
-            f"  {s['median_percent_of_altitude']:8.2f} %"
+            f"  {s['median_percent_of_altitude']:8.2f} %  {s['median_percent_of_distance']:8.2f} %"
         )
     for name, s in report["surface"].items():
         if s.get("honesty") and name == report["judged_after"]:
@@ -248,7 +249,8 @@ def _text(report: dict[str, Any]) -> str:
         "",
         f"completeness: {c['share']:.1%} of {c['seen_m2']:.0f} m2 seen lies within "
         f"{c['within_m']:g} m of a point ({c['share_flat']:.1%} of ground and roofs, "
-        f"{c['share_steep']:.1%} of walls)",
+        f"{c['share_steep']:.1%} of walls, {c['share_near_track']:.1%} within "
+        f"{c['near_track_m']:g} m of the track)",
         "",
         "trajectory              rms   median      max     turn    drift",
     ]

@@ -32,6 +32,7 @@ log = logging.getLogger(__name__)
 
 REACH_M = 5.0
 COMPLETE_WITHIN_M = 0.5
+NEAR_TRACK_M = 40.0
 DSM_CELL_M = 0.25
 MAX_POINTS = 300_000
 
@@ -85,7 +86,7 @@ def score(scan_folder: Path, truth_folder: Path, deliverables: bool = False) -> 
         if name in ("raw", best)
     }
     seen = seen_surface(truth)
-    report["completeness"] = _completeness(scan, seen, fits["surface"][best])
+    report["completeness"] = _completeness(scan, truth, seen, fits["surface"][best])
     for name, fit in fits["surface"].items():
         report["surface"][name]["fit"] = _fit_size(fit, scan.points)
     if deliverables:
@@ -122,6 +123,8 @@ def _surface_part(scan: ScanResult, truth: Truth, fit: Fit) -> dict[str, Any]:
     out: dict[str, Any] = asdict(metrics.surface_errors(distance, signed, REACH_M))
     out["median_percent_of_altitude"] = 100.0 * out["median_m"] / truth.agl_m
     out["rms_percent_of_altitude"] = 100.0 * out["rms_m"] / truth.agl_m
+    away = _distance_to(truth.poses[:, :3, 3], points)
+    out["median_percent_of_distance"] = 100.0 * float(np.nanmedian(distance / away))
     if scan.sigma_m is not None:
         claim = metrics.honesty(distance, scan.sigma_m[::step] * np.float32(fit.scale))
         out["honesty"] = None if claim is None else asdict(claim)
@@ -183,15 +186,28 @@ def _fit_size(fit: Fit, points: F64) -> dict[str, float]:
     }
 
 
-def _completeness(scan: ScanResult, seen: SeenSurface, fit: Fit) -> dict[str, float]:
-    """Share of the surface that the flight saw and the cloud has, in all and by steepness."""
+def _distance_to(track: F64, points: F64) -> F64:
+    """(N,) distance of each of ``points`` to the nearest place of ``track``."""
+    from scipy.spatial import cKDTree
+
+    return np.asarray(cKDTree(track).query(points)[0])
+
+
+def _completeness(scan: ScanResult, truth: Truth, seen: SeenSurface, fit: Fit) -> dict[str, float]:
+    """Share of the surface that the flight saw and the cloud has: in all, by steepness, and near.
+
+    Near is what lies within NEAR_TRACK_M of the ground track.
+    """
     covered = metrics.share_covered(seen.places, fit.points(scan.points), COMPLETE_WITHIN_M)
     flat = np.abs(seen.normals[:, 2]) > 0.5
+    near = _distance_to(truth.poses[:, :2, 3], seen.places[:, :2]) < NEAR_TRACK_M
     return {
         "share": float(covered.mean()),
         "share_flat": float(covered[flat].mean()) if flat.any() else float("nan"),
         "share_steep": float(covered[~flat].mean()) if (~flat).any() else float("nan"),
         "steep_part": float((~flat).mean()),
+        "share_near_track": float(covered[near].mean()) if near.any() else float("nan"),
+        "near_track_m": NEAR_TRACK_M,
         "seen_m2": seen.area_m2,
         "within_m": COMPLETE_WITHIN_M,
     }
