@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import logging
 import sys
 import threading
@@ -14,10 +15,11 @@ import typer
 import typer.core
 import typer.main
 
-from service.errors import SkyreliefError
+from service.errors import InputError, SkyreliefError
 from service.journal import log_handler
 from service.packages import needing
 from service.redaction import without_credentials
+from service.version import software
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": (
@@ -75,6 +77,11 @@ class LazyCommands(typer.core.TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """(name, command, its arguments) of a command line."""
+        wanted = args[0] if args else ""
+        if wanted not in COMMANDS and wanted[:1] != "-" and not ctx.resilient_parsing:
+            near = difflib.get_close_matches(wanted, COMMANDS, 3)
+            hint = f"did you mean {' or '.join(near)}?" if near else "see skyrelief --help"
+            raise InputError(f"no command {wanted!r}; {hint}")
         name, _, rest = super().resolve_command(ctx, args)
         return name, load_command(str(name)), rest
 
@@ -90,14 +97,22 @@ def load_command(name: str) -> Any:
 app = typer.Typer(
     cls=LazyCommands,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(software())
+        raise typer.Exit
 
 
 @app.callback()
 def _root(
     context: typer.Context,
+    version: bool = typer.Option(
+        False, "--version", callback=_print_version, is_eager=True, help="Print the version."
+    ),
     verbose: bool = typer.Option(False, "--verbose", "-v", help="Log details of every stage."),
 ) -> None:
     """Terrain and buildings in 3D, in real time, from the camera of a drone."""

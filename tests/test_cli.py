@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import json
+import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from typer.testing import CliRunner
 
 import service.cli
 from service.cli import COMMANDS, app, load_command
+from service.commands.ground import _show_news
 from service.errors import InputError, OutsideError, SkyreliefError
+from service.offline.exports.model import MeshOptions
+from service.offline.exports.view import ExportOptions, ScanView
+from service.stream.session import SessionConfig, open_session
+from service.version import software
+
+if TYPE_CHECKING:
+    from conftest import HouseFlight
 
 HEAVY = ("cv2", "numba", "torch", "open3d", "scipy", "zenoh", "onnxruntime", "av", "pymavlink")
 """Packages that no command may import before it is called: start-up time on the aircraft."""
@@ -71,6 +82,70 @@ def test_overview_imports_no_command() -> None:
 def test_wrong_usage_is_exit_2() -> None:
     for arguments in (["nonsense"], ["config"], ["config", "check", "--nope"]):
         assert run_cli(*arguments).returncode == 2
+
+
+def test_a_mistyped_command_is_answered_with_the_near_ones() -> None:
+    done = run_cli("mehs", "folder")
+    assert done.returncode == 2
+    assert done.stderr == "skyrelief: no command 'mehs'; did you mean mesh?\n"
+
+
+def test_the_version_is_printed() -> None:
+    assert run_cli("--version").stdout == f"{software()}\n"
+
+
+def test_a_shell_completes_commands_and_their_options() -> None:
+    for typed, wanted in (("skyrelief exp", "export-model"), ("skyrelief mesh --vi", "--video")):
+        words = {"COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
+        code = "from service.cli import app; app(prog_name='skyrelief')"
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env=os.environ | words | {"_SKYRELIEF_COMPLETE": "complete_bash"},
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert wanted in done.stdout.split(), done.stderr
+
+
+def test_a_mesh_without_its_package_or_video_fails_before_the_work(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from service.offline.exports import model
+
+    house.flown(tmp_path / "scan").close()
+    monkeypatch.setattr(model, "footprints", lambda _: pytest.fail("the work has begun"))
+    missing = MeshOptions(video=tmp_path / "none.mp4")
+    with ScanView(tmp_path / "scan") as scan:
+        with pytest.raises(InputError, match=r"none\.mp4: no such file or folder"):
+            model.write_mesh(scan, tmp_path / "mesh.glb", missing, ExportOptions())
+        monkeypatch.setitem(sys.modules, "trimesh", None)
+        with pytest.raises(OutsideError, match="a mesh file needs the package trimesh; pip"):
+            model.write_mesh(scan, tmp_path / "mesh.glb", MeshOptions(), ExportOptions())
+
+
+def test_ground_prints_a_line_only_when_it_has_changed(capsys: pytest.CaptureFixture[str]) -> None:
+    entry: dict[str, Any] = {
+        "drone": "d", "scan": "s", "folder": "/d/s", "held": {"k0": 1, "pose": 2},
+        "missing": {}, "complete": False, "received_bytes": 1_000_000,
+    }  # fmt: skip
+    shown: dict[str, str] = {}
+    for keyframes in (1, 1, 2, 2, 2):
+        entry["held"]["k0"] = keyframes
+        _show_news([entry], shown)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split()[1] for line in lines] == ["1", "2"]
+
+
+def test_a_port_that_is_taken_is_said_in_plain_words() -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        config = SessionConfig("router", listen=(f"tcp/127.0.0.1:{port}",))
+        with pytest.raises(OutsideError, match="another program has this port"):
+            open_session(config)
 
 
 def test_input_errors_are_one_line_and_exit_2(tmp_path: Path) -> None:

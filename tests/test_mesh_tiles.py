@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -17,10 +18,11 @@ from typer.testing import CliRunner
 pytest.importorskip("open3d", exc_type=ImportError)
 
 from recon.surface import triangle_grid
+from recon.surface.meshing import Mesh
 from service.cameras import CameraFrame
 from service.cli import app
 from service.errors import InputError, OutsideError
-from service.offline.exports import mesh_tiles, pictures
+from service.offline.exports import mesh_tiles, model, pictures
 from service.offline.exports.mesh_tiles import (
     Footprint,
     TileJob,
@@ -29,6 +31,7 @@ from service.offline.exports.mesh_tiles import (
     run_tiles,
     tile_boxes,
 )
+from service.offline.exports.view import ExportOptions, ScanView
 from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
@@ -203,6 +206,25 @@ def test_pictures_come_from_the_video_at_the_keyframes_times(
         pictures.video_pictures(keyframes, header, tmp_path, None)
     with pytest.raises(InputError, match="no camera model"):
         pictures.video_pictures(keyframes, replace(header, camera={}), tmp_path, None)
+
+
+def test_the_file_names_no_path_of_this_machine(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("trimesh")
+    house.flown(tmp_path / "scan").close()
+    corner = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
+    mesh = Mesh(corner, np.array([[0, 1, 2]], np.int32), rgb=np.full((3, 3), 90, np.uint8))
+    figures = {"faces": 1, "vertices": 3, "seen": 1.0, "texture_px": [1, 1]}
+    part = SimpleNamespace(mesh=mesh, picture=None, figures=figures)
+    monkeypatch.setattr(model, "run_tiles", lambda *_: [part])
+    monkeypatch.setattr(model, "check_video", lambda *_: None)
+    how = model.MeshOptions(video=tmp_path / "flight.mp4")
+    with ScanView(tmp_path / "scan") as scan:
+        said = model.write_mesh(scan, tmp_path / "mesh.glb", how, ExportOptions())
+    written = (tmp_path / "mesh.glb").read_bytes()
+    assert said["pictures"] == str(tmp_path / "flight.mp4")
+    assert b'"pictures":"video"' in written and str(tmp_path).encode() not in written
 
 
 def test_an_empty_scan_is_refused(tmp_path: Path) -> None:

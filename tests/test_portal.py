@@ -7,6 +7,7 @@ import struct
 import threading
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from loopback import until
-from portal_client import TOKEN, Client, FakeOperator, client, store
+from portal_client import TOKEN, Client, FakeOperator, client, flown_store, serving, store
 
 from recon import se3
 from service.errors import InputError, OutsideError
@@ -216,6 +217,22 @@ def test_a_keyframes_picture_is_shown(client: Client, house: HouseFlight) -> Non
     assert image is not None
     error = np.abs(image.astype(float) - house.keyframe(2, 10.0).bgr)
     assert np.median(error) < 6.0
+
+
+def test_a_keyframe_that_brought_little_new_is_completed_from_those_before_it(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    flown_store(tmp_path, house)
+    one = house.keyframe(9, 11.0)
+    with ScanStore.open(tmp_path / "drone-1/test-1/scan.db") as scan:
+        fresh = np.zeros_like(one.fresh)
+        fresh[:, 150:] = True  # only the border is new
+        scan.add_keyframe(9, encode(replace(one, fresh=fresh), one.time_ns))
+    with serving(tmp_path) as client:
+        _, data, _ = client.ask("/api/scans/drone-1/test-1/keyframes/9.jpg")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    error = np.abs(np.asarray(image, np.float64) - one.bgr).max(axis=2)
+    assert np.median(error) < 10.0 and (error < 40.0).mean() > 0.9
 
 
 def test_a_picture_closes_gaps_and_leaves_the_rest_dark() -> None:

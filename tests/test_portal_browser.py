@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 import pytest
 from loopback import free_port
@@ -72,6 +74,8 @@ def test_rename_download_delete_and_bring_back(browser: Browser, portal: Portal)
 def test_the_cloud_grows_and_moves_while_one_looks(
     browser: Browser, portal: Portal, scans: Path, house: HouseFlight
 ) -> None:
+    browser.open("about:blank")  # the page before this one asks its own portal no more
+    browser.wait("location.href === 'about:blank'")
     browser.requests.clear()
     browser.open(f"{base(portal)}/#/view/drone-1/test-1")
     before = browser.wait("Number(document.body.dataset.points) || 0")
@@ -97,6 +101,17 @@ def test_the_mesh_is_made_and_shown(browser: Browser, portal: Portal) -> None:
     browser.wait("document.body.dataset.mesh === 'shown'", 60)
 
 
+def roof_red(browser: Browser) -> float:
+    """How bright the red roof is drawn, 0 to 255: (40, 40, 200) in the scan."""
+    script = "document.querySelector('.stage canvas').toDataURL('image/png').split(',')[1]"
+    data = np.frombuffer(base64.b64decode(browser.run(script)), np.uint8)
+    image = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.int64)
+    red = image[image[..., 2] > 2 * image[..., 1]]
+    assert len(red) > 100
+    assert np.median(red[:, 1]) < 70
+    return float(np.median(red[:, 2]))
+
+
 def test_the_tiles_are_loaded_where_the_cloud_was(
     browser: Browser, portal: Portal, scans: Path
 ) -> None:
@@ -107,8 +122,14 @@ def test_the_tiles_are_loaded_where_the_cloud_was(
     browser.wait("document.querySelectorAll('article').length === 1")
     browser.open(f"{base(portal)}/#/view/drone-1/test-1")
     browser.wait("Number(document.body.dataset.points) || 0")
+    browser.click("Whole site")
+    browser.wait("document.body.dataset.still === 'yes'")
+    red = roof_red(browser)
     browser.click("Tiles")
     browser.wait("Number(document.body.dataset.tiles) > 0", 60)
+    browser.run("new Promise(r => setTimeout(r, 500))")
+    browser.wait("document.body.dataset.still === 'yes'")
+    assert abs(roof_red(browser) - red) < 25  # the same colours, not washed out
     off = json.loads(browser.wait("document.body.dataset.tilesMiddle"))
     assert np.abs(off[:2]).max() < 15.0 and abs(off[2]) < 5.0  # about the scan's own origin
 

@@ -23,6 +23,7 @@ pytestmark = NEEDS
 __all__ = ["browser"]  # the fixture
 
 GRID = [(x, y) for x in range(350, 951, 75) for y in (362, 384, 500, 530, 560)]
+GRID += [(x, 374) for x in (580, 610, 640, 670, 695)]
 """Places on the screen that the cloud covers: no wall of the house, which has no points."""
 
 
@@ -162,7 +163,7 @@ def test_the_volume_of_the_house_its_profile_and_the_way_out(
     x, y = found[:, 0], found[:, 1]
     plan_m2 = abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2.0
     assert abs(ruler.number("Area") - plan_m2) < 0.2
-    assert abs(ruler.number("Volume above") / (12.0 * 8.0 * 6.0) - 1.0) < 0.01
+    assert abs(ruler.number("Volume above") / (12.0 * 8.0 * 6.0) - 1.0) < 0.02
     assert ruler.number("Volume below") < 3.0
 
     folder = tmp_path / "downloads"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import shutil
 import time
 from collections.abc import Iterator
@@ -60,7 +61,8 @@ def test_the_state_says_when_the_drone_was_heard(browser: Browser, scans: Path) 
         browser.open(f"{base}/#/view/drone-1/test-1")
         kind(browser, "silent")
         said = browser.run(STATE)
-        assert said.startswith("silent · last heard 2") and said.endswith(" s ago · backlog 3")
+        found = re.fullmatch(r"silent · last heard (\d+) s ago · backlog 3", said)
+        assert found is not None and 25 <= int(found.group(1)) < 100
         entry["heard_unix_s"] = time.time() + 60.0  # it is back, for a while
         browser.wait("document.querySelector('.state').textContent.includes('0 B/s')", 30)
         entry["received_bytes"] = 500_000
@@ -79,7 +81,9 @@ def test_the_report_is_linked_when_the_scan_has_finished(
         browser.open(f"{base}/#/view/drone-1/test-1")
         browser.wait("document.body.dataset.points === '72000'")
         kind(browser, "silent")
-        report = "[...document.querySelectorAll('nav a')].find(a => a.textContent === 'Report')"
+        report = (
+            "[...document.querySelectorAll('.view header a')].find(a => a.textContent === 'Report')"
+        )
         assert browser.run(f"{report}.hidden") and " days ago" in browser.run(STATE)
         with ScanStore.open(folder / "scan.db") as store:
             one = house.keyframe(5, 30.0)

@@ -27,6 +27,7 @@ DEFAULT_PORT = 7447
 RADIO_REFRESH_S = 15.0
 MAV_TYPE_GCS = 6
 NOTIFY_S = 1.0
+SHOW_S = 2.0
 CLOSING_S = 900.0
 """Writing deliverables at the end may take so long; then the init system ends it."""
 
@@ -240,7 +241,8 @@ def _watch(
     idle_exit_s: float | None,
 ) -> None:
     """Return on a signal, or when what the options name has come about."""
-    shown = beat_at = 0.0
+    shown: dict[str, str] = {}
+    shown_at = beat_at = 0.0
     while not stop.wait(0.2):
         entries = receiver.progress()
         if time.monotonic() >= beat_at:
@@ -253,10 +255,18 @@ def _watch(
             return
         if idle_exit_s is not None and time.monotonic() - receiver.last_news_at > idle_exit_s:
             return
-        if sys.stderr.isatty() and time.monotonic() - shown > 2.0:
-            shown = time.monotonic()
-            for entry in entries:
-                print(_line(entry), file=sys.stderr)
+        if sys.stderr.isatty() and time.monotonic() - shown_at > SHOW_S:
+            shown_at = time.monotonic()
+            _show_news(entries, shown)
+
+
+def _show_news(entries: list[dict[str, Any]], shown: dict[str, str]) -> None:
+    """Print the scans whose line is not the one in ``shown``, by folder, and keep it there."""
+    for entry in entries:
+        line = _line(entry)
+        if shown.get(entry["folder"]) != line:
+            shown[entry["folder"]] = line
+            print(line, file=sys.stderr, flush=True)
 
 
 def _report(

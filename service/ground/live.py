@@ -6,7 +6,8 @@ A message is either JSON text or a binary chunk (little-endian):
 bytes   content
 ======  =======================================================================
 4       length J of the JSON
-J       JSON: ``seq``, ``layer``, ``points`` N, ``unit_m``, ``T`` (16, column by column)
+J       JSON: ``seq``, ``layer``, ``points`` N, ``unit_m``, ``apart`` (of neighbouring
+        points at depth 1), ``T`` (16, column by column)
 pad     zeros up to a multiple of 4
 6 N     int16 x, y, z of the camera frame, in ``unit_m``
 3 N     uint8 red, green, blue (sRGB)
@@ -69,6 +70,7 @@ def chunk_message(keyframe: Keyframe, layer: int, max_points: int | None = None)
             "layer": layer,
             "points": len(rows),
             "unit_m": unit,
+            "apart": 1.0 / float(depth.K[0, 0]),
             "time_unix_s": keyframe.time_ns / 1e9,
             "T": columns(depth.T_world_camera),
         }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 
 import cv2
 import numpy as np
@@ -10,7 +11,8 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
-from recon.types import U8, Bool
+from recon.mapping.cloud_fusion import cloud_of
+from recon.types import U8, Bool, Keyframe
 from service.errors import InputError
 from service.ground.state import names_of, state_of
 from service.ground.storage import is_regular
@@ -23,6 +25,9 @@ DEEPEST_TILE = 8
 SEQ = re.compile(r"[0-9]{1,9}")
 
 JPEG_QUALITY = 82
+EARLIER_KEYFRAMES = 12
+"""Keyframes that complete the image of one, where it brought nothing new."""
+
 DARK = (45, 38, 32)
 SANDBOX = {
     "content-security-policy": "sandbox; default-src 'none'; style-src 'unsafe-inline';"
@@ -63,19 +68,52 @@ def _tile(request: Request) -> Response:
 
 
 def _picture(request: Request) -> Response:
-    """The colours of a keyframe as JPEG; small gaps are closed, the rest is dark."""
+    """What a keyframe's camera saw, as JPEG: its own colours, the rest from keyframes before it."""
     folder = state_of(request).library.folder(*names_of(request))
     if not SEQ.fullmatch(request.path_params["seq"]):
         raise InputError("no such keyframe")
+    seq = int(request.path_params["seq"])
     with ScanStore.open(folder / "scan.db") as store:
-        keyframe = store.keyframe(int(request.path_params["seq"]))
-    if keyframe is None:
-        raise InputError("no such keyframe")
-    bgr = _closed(keyframe.bgr, keyframe.fresh)
-    ok, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        keyframe = store.keyframe(seq)
+        if keyframe is None:
+            raise InputError("no such keyframe")
+        earlier = [s for s in store.seqs() if s < seq][-EARLIER_KEYFRAMES:]
+        bgr, known = _completed(keyframe, filter(None, map(store.keyframe, reversed(earlier))))
+    ok, data = cv2.imencode(".jpg", _closed(bgr, known), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not ok:
         raise InputError("no picture in this keyframe")
     return Response(data.tobytes(), media_type="image/jpeg")
+
+
+def _completed(keyframe: Keyframe, earlier: Iterable[Keyframe]) -> tuple[U8, Bool]:
+    """(H, W, 3) colours of a keyframe and (H, W) which are known.
+
+    A chunk has no colours where nothing is new. What is old there was in a keyframe before it:
+    those points are projected into this camera, the newest first, the nearest point to each pixel.
+    """
+    bgr, known = keyframe.bgr.copy(), keyframe.fresh.copy()
+    K, T_camera_world = keyframe.depth.K, np.linalg.inv(keyframe.depth.T_world_camera)
+    h, w = known.shape
+    for other in earlier:
+        if known.all():
+            break
+        cloud = cloud_of(other.depth, other.bgr, other.fresh)
+        xyz = cloud.xyz_m @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+        front = np.flatnonzero(xyz[:, 2] > 1e-3)
+        front = front[np.argsort(-xyz[front, 2], kind="stable")]  # the nearest is written last
+        with np.errstate(over="ignore"):
+            u, v = (
+                np.rint(K[i, i] * xyz[front, i] / xyz[front, 2] + K[i, 2]).clip(-1, 1e6)
+                for i in (0, 1)
+            )
+        inside = (u >= 0) & (u < w) & (v >= 0) & (v < h)
+        cols, rows = u[inside].astype(np.int64), v[inside].astype(np.int64)
+        seen, colours = np.zeros((h, w), np.bool_), np.zeros_like(bgr)
+        seen[rows, cols] = True
+        colours[rows, cols] = cloud.rgb[front[inside], ::-1]
+        new = seen & ~known
+        bgr[new], known[new] = colours[new], True
+    return bgr, known
 
 
 def _closed(bgr: U8, known: Bool) -> U8:

@@ -108,6 +108,8 @@ class Vehicle:
             try:
                 operator = self._connect(self.endpoint)
             except (InputError, OutsideError) as error:
+                if self._trouble != str(error):
+                    log.warning("%s; looking on", error)
                 self._trouble = str(error)
                 worker.stop.wait(1.0)
                 continue

@@ -31,7 +31,8 @@ CURVE_PX = (820, 150)
 STYLE = (
     "body{font:15px/1.5 system-ui,sans-serif;color:#20252b;max-width:960px;margin:24px auto;"
     "padding:0 16px}h1{font-size:24px}h2{font-size:18px;margin-top:30px}table{border-collapse:"
-    "collapse}td,th{padding:3px 14px 3px 0;text-align:left;border-bottom:1px solid #e3e7eb}"
+    "collapse;display:block;overflow-x:auto}svg{max-width:100%}td,th{overflow-wrap:anywhere;"
+    "padding:3px 14px 3px 0;text-align:left;border-bottom:1px solid #e3e7eb}"
     "td+td{font-variant-numeric:tabular-nums}img{max-width:100%;border:1px solid #e3e7eb}"
     "figure{margin:14px 0}figcaption{color:#56606a;font-size:13.5px}"
 )
@@ -72,7 +73,11 @@ def report_html(
         *(f"<p>Note: {escape(str(note))}</p>" for note in summary["notes"]),
         f"<p>{escape(summary['software'])}</p>",
     ]
-    head = f"<!doctype html><html lang=en><meta charset=utf-8><title>{escape(summary['id'])}"
+    head = (
+        "<!doctype html><html lang=en><meta charset=utf-8>"
+        "<meta name=viewport content='width=device-width, initial-scale=1'>"
+        f"<title>{escape(summary['id'])}"
+    )
     return f"{head}</title><style>{STYLE}</style><body>{''.join(parts)}</body></html>\n"
 
 

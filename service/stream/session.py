@@ -84,6 +84,8 @@ def open_session(config: SessionConfig) -> zenoh.Session:
     except zenoh.ZError as error:
         reason = str(error).split(" at ", 1)[0][:200]
         where = ", ".join((*config.listen, *config.connect))
+        if "Address already in use" in str(error) or "os error 98" in str(error):
+            reason = "another program has this port, such as a second ground station"
         raise OutsideError(f"datalink does not open at {where}: {reason}") from error
 
 

@@ -14,7 +14,7 @@ from recon.surface.meshing import Mesh
 from recon.types import U8
 from service.errors import InputError
 from service.offline.exports.mesh_tiles import TileJob, footprints, run_tiles, tile_boxes
-from service.offline.exports.pictures import recording_of
+from service.offline.exports.pictures import check_video, recording_of
 from service.offline.exports.view import ExportOptions, ScanView
 from service.packages import needing
 from service.scans.writing import writing
@@ -50,10 +50,15 @@ def write_mesh(
 
     ``height`` is one sheet over the ground; ``poisson`` a surface through all points; ``auto``
     takes ``height`` unless many keyframes look sideways. Raises InputError when there is too
-    little surface, OutsideError when a cluster was named and does not answer.
+    little surface or the video does not fit, OutsideError when a cluster was named and does not
+    answer.
     """
     if how.method not in METHODS:
         raise InputError(f"mesh by {how.method!r}: there are {', '.join(METHODS)}")
+    with needing("a mesh file"):
+        import trimesh  # noqa: F401  # before the long work, not after it
+    if how.video is not None:
+        check_video(scan.store.header, how.video)
     method = how.method
     if method == "auto":
         method = "poisson" if scan.oblique else "height"
@@ -99,7 +104,8 @@ def write_mesh(
     }
     options.progress(f"writing {figures['faces']} triangles")
     with writing(out) as part:
-        part.write_bytes(glb([(p.mesh, p.picture) for p in parts], _extras(scan) | figures))
+        extras = _extras(scan) | figures | {"pictures": "store" if video is None else "video"}
+        part.write_bytes(glb([(p.mesh, p.picture) for p in parts], extras))
     return figures
 
 

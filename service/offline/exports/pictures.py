@@ -14,6 +14,7 @@ from recon.camera_model import Undistorter, scaled_K
 from recon.surface.texture_views import TextureView
 from recon.types import U8, Camera, Keyframe
 from service.cameras import open_camera
+from service.cameras.source import CameraSource
 from service.errors import InputError, SkyreliefError
 from service.scans.folder import SUMMARY
 from service.stream.records import ScanHeader
@@ -71,6 +72,25 @@ def recording_of(folder: Path, header: ScanHeader) -> Recording:
     return Recording(found, f"textures from {found}, which the scan was made from")
 
 
+def check_video(header: ScanHeader, video: Path) -> None:
+    """Raise InputError or OutsideError when ``video`` cannot be that of the scan."""
+    _opened(header, video).close()
+
+
+def _opened(header: ScanHeader, video: Path) -> CameraSource:
+    """The open video; InputError when it is missing or its images have another size."""
+    if not video.exists():
+        raise InputError(f"{video}: no such file or folder; give the flight's video")
+    camera, source = _camera(header), open_camera(str(video))
+    if source.size_px != camera.size_px:
+        source.close()
+        raise InputError(
+            f"{video}: {source.size_px[0]}x{source.size_px[1]} pictures, but the scan's camera "
+            f"is {camera.size_px[0]}x{camera.size_px[1]}; give the video that was flown"
+        )
+    return source
+
+
 def video_pictures(
     keyframes: Sequence[Keyframe], header: ScanHeader, video: Path, epoch_ns: int | None
 ) -> list[TextureView]:
@@ -80,14 +100,7 @@ def video_pictures(
     the scan's start. Keyframes without a frame keep their stored picture. Raises InputError
     when the video is of another size, or none of its frames is a keyframe.
     """
-    camera = _camera(header)
-    source = open_camera(str(video))
-    if source.size_px != camera.size_px:
-        source.close()
-        raise InputError(
-            f"{video}: {source.size_px[0]}x{source.size_px[1]} pictures, but the scan's camera "
-            f"is {camera.size_px[0]}x{camera.size_px[1]}; give the video that was flown"
-        )
+    camera, source = _camera(header), _opened(header, video)
     start = header.started_unix_ns if epoch_ns is None else epoch_ns
     undistort = Undistorter(camera)
     shrink = min(1.0, (MAX_BYTES / (4.0 * np.prod(camera.size_px) * len(keyframes))) ** 0.5)

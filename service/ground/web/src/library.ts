@@ -16,6 +16,7 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
   const search = el("input", { type: "search", placeholder: "find by name, tag or drone" });
   search.setAttribute("aria-label", "find");
   const bin = el("section", { className: "bin" });
+  bin.setAttribute("aria-label", "bin");
   const again = (): void => void load().catch(tell);
   root.replaceChildren(
     el("header", {}, el("h1", { textContent: "skyrelief" }), search, vehicleStrip(), importForm(again)),
@@ -105,7 +106,7 @@ function importForm(again: () => void): HTMLElement {
 function card(s: api.Scan, again: () => void): HTMLElement {
   const open = `#/view/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`;
   const picture = s.preview
-    ? el("img", { src: api.file(s, "preview.jpg"), alt: "", loading: "lazy" })
+    ? el("img", { src: api.file(s, "preview.jpg"), alt: `preview of ${s.title}`, loading: "lazy" })
     : el("div", { className: "blank", textContent: "no preview yet" });
   return el(
     "article",
@@ -135,13 +136,16 @@ function card(s: api.Scan, again: () => void): HTMLElement {
 function facts(s: api.Scan): HTMLElement {
   const rows: [string, string][] = [["Drone", s.drone], ["Flown", date(s.started_unix_s)]];
   if (s.origin) rows.push(["Place", `${s.origin.lat_deg.toFixed(5)}, ${s.origin.lon_deg.toFixed(5)}`]);
-  const { area_m2, sigma_median_m } = s.quality ?? {};
+  const { area_m2, sigma_median_m, position_sigma_median_m } = s.quality ?? {};
   const size: string[] = [];
   if (s.counts?.points !== undefined) size.push(`${count(s.counts.points)} points`);
   else if (s.counts?.keyframes !== undefined) size.push(`${s.counts.keyframes} keyframes`);
   if (area_m2) size.push(`${count(area_m2)} m²`);
   if (size.length) rows.push(["Size", size.join(", ")]);
-  if (sigma_median_m) rows.push(["Sigma", `${sigma_median_m.toFixed(2)} m (median)`]);
+  const sigma: string[] = [];
+  if (sigma_median_m) sigma.push(`${sigma_median_m.toFixed(2)} m relative`);
+  if (s.origin && position_sigma_median_m) sigma.push(`${position_sigma_median_m.toFixed(2)} m absolute`);
+  if (sigma.length) rows.push(["Sigma", sigma.join(", ")]);
   return el(
     "dl",
     { className: "facts" },
@@ -211,5 +215,5 @@ function binRows(names: string[], again: () => void): HTMLElement[] {
       }),
     ),
   );
-  return [el("h3", { textContent: "Bin" }), el("ul", {}, ...rows)];
+  return [el("h2", { textContent: "Bin" }), el("ul", {}, ...rows)];
 }

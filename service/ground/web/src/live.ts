@@ -5,6 +5,8 @@ export interface Chunk {
   layer: number;
   points: number;
   unit_m: number;
+  /** Distance of neighbouring points at depth 1. */
+  apart: number;
   time_unix_s: number;
   T: number[];
   xyz: Int16Array;

@@ -2,13 +2,14 @@
 // no picture takes long and the page stays usable however many points there are.
 
 import * as THREE from "three";
+import { Dome } from "./dome";
 
 /** A part of the scene of which any share can be drawn. */
 export interface Gradual {
   /** How many points there are to draw. */
   readonly wanted: number;
-  /** Draws the points between two shares, 0 to 1. */
-  range(from: number, to: number): void;
+  /** Draws the points between two shares, 0 to 1; `whole` when the others follow. */
+  range(from: number, to: number, whole: boolean): void;
 }
 
 /** What lays effects over the plain picture; it draws the whole picture at once. */
@@ -22,6 +23,7 @@ const MOVING_MS = 70;
 const SLICE_MS = 90;
 const FIRST_POINTS = 100_000;
 const LEAST_POINTS = 20_000;
+const SHOWN_FROM = 0.5; // of the points; until then the last, thinned picture with large points stays
 const EFFECTS_TIMES = 3; // of the points drawn while moving, once the view stands still
 
 /** Work given to the graphics card, until it has done it. */
@@ -39,6 +41,7 @@ export class Painter {
   /** Share of the points that the picture shows so far. */
   shown = 0;
   gradual: Gradual | null = null;
+  readonly dome = new Dome();
   /** Objects drawn with every slice; all others are in the first picture only. */
   readonly again = new Set<THREE.Object3D>();
   private moving = FIRST_POINTS;
@@ -49,7 +52,7 @@ export class Painter {
   constructor(
     private readonly renderer: THREE.WebGLRenderer,
     private readonly scene: THREE.Scene,
-    private readonly camera: THREE.Camera,
+    private readonly camera: THREE.PerspectiveCamera,
     private readonly world: THREE.Group,
   ) {}
 
@@ -73,18 +76,20 @@ export class Painter {
     }
     this.settled = !lively;
     for (const call of before) call();
-    this.whole(!lively && this.effects !== null);
+    this.whole(!lively);
     this.give("whole", now);
   }
 
-  /** Draws the picture anew; with effects, the last one has no slices to follow. */
-  private whole(last: boolean): void {
+  /** Draws the picture again; when the view stands still, slices follow unless effects lie over it. */
+  private whole(still: boolean): void {
     const wanted = Math.max(1, this.gradual?.wanted ?? 0);
+    const last = still && this.effects !== null;
     const points = last ? EFFECTS_TIMES * this.moving : this.moving;
     const share = this.fullDetail ? 1 : Math.min(1, points / wanted);
-    this.gradual?.range(0, share);
-    if (this.effects && !this.renderer.xr.isPresenting) this.effects.render();
-    else this.renderer.render(this.scene, this.camera);
+    this.gradual?.range(0, share, still && !last);
+    if (this.renderer.xr.isPresenting) this.renderer.render(this.scene, this.camera);
+    else if (this.effects) this.effects.render();
+    else this.dome.render(this.renderer, this.scene, this.camera, true, !still || share > SHOWN_FROM);
     this.shown = last || !this.gradual?.wanted ? 1 : share;
   }
 
@@ -93,17 +98,15 @@ export class Painter {
     const gradual = this.gradual;
     if (!gradual) return;
     const next = Math.min(1, this.shown + this.slice / Math.max(1, gradual.wanted));
-    gradual.range(this.shown, next);
+    gradual.range(this.shown, next, true);
     const hidden = this.world.children.filter((c) => c.visible && !this.again.has(c));
     const background = this.scene.background;
     for (const object of hidden) object.visible = false;
     this.scene.background = null;
-    this.renderer.autoClear = false;
-    this.renderer.render(this.scene, this.camera);
-    this.renderer.autoClear = true;
+    this.dome.render(this.renderer, this.scene, this.camera, false, next > SHOWN_FROM);
     this.scene.background = background;
     for (const object of hidden) object.visible = true;
-    gradual.range(0, next); // what the picture shows, for those who measure in it
+    gradual.range(0, next, true); // for the figures
     this.shown = next;
     this.give("slice", now);
   }

@@ -11,7 +11,10 @@ const VERTEX = /* glsl */ `
   attribute vec3 rgb;
   attribute float sigma;
   attribute float views;
-  uniform float size;
+  uniform float size;    // of a point, in distances to its neighbour
+  uniform float apart;   // of neighbours, in depths of the camera that took them
+  uniform float thin;    // as 1, for the points left out of the picture
+  uniform float height_px;
   uniform float mode;
   uniform vec2 range;
   uniform float age;
@@ -29,7 +32,8 @@ const VERTEX = /* glsl */ `
     vec4 world = modelMatrix * vec4(position, 1.0);
     vec4 seen = viewMatrix * world;
     gl_Position = projectionMatrix * seen;
-    gl_PointSize = clamp(size / max(-seen.z, 0.01), 1.0, 24.0);
+    float gap = size * thin * apart * position.z * length(modelMatrix[2].xyz);
+    gl_PointSize = clamp(gap * projectionMatrix[1][1] * height_px / max(-seen.z, 0.01), 1.5, 40.0);
     vec3 s = rgb;
     if (mode > 0.5) s = ramp((world.z - range.x) / max(range.y - range.x, 0.01));
     if (mode > 1.5) s = ramp(sigma * 5.1 / 1.0);
@@ -64,7 +68,9 @@ export class Cloud implements Gradual {
   datum_m = 0;
   private readonly chunks = new Map<number, Held>();
   private readonly shared = {
-    size: { value: 300 },
+    size: { value: 1.3 },
+    thin: { value: 1 },
+    height_px: { value: 400 },
     mode: { value: 0 },
     range: { value: new THREE.Vector2(0, 1) },
   };
@@ -90,7 +96,7 @@ export class Cloud implements Gradual {
     const material = new THREE.ShaderMaterial({
       vertexShader: VERTEX,
       fragmentShader: FRAGMENT,
-      uniforms: { ...this.shared, age: { value: 0 } },
+      uniforms: { ...this.shared, age: { value: 0 }, apart: { value: chunk.apart } },
     });
     const object = new THREE.Points(geometry, material);
     object.matrixAutoUpdate = false;
@@ -125,8 +131,14 @@ export class Cloud implements Gradual {
     return words[COLOURS[this.shared.mode.value]!];
   }
 
-  pointSize(pixelsAtOneMetre: number): void {
-    this.shared.size.value = pixelsAtOneMetre;
+  /** Diameter of a point in distances to its neighbour; 1 closes the surface just so. */
+  pointSize(distances: number): void {
+    this.shared.size.value = distances;
+  }
+
+  /** Half the height of what is drawn into, pixels of the screen. */
+  screen(half_px: number): void {
+    this.shared.height_px.value = half_px;
   }
 
   /** Points to draw: all, or the budget; none while they are hidden. */
@@ -136,10 +148,11 @@ export class Cloud implements Gradual {
 
   /**
    * Draws the points between two shares of what is wanted. Each chunk's points are shuffled, so
-   * any part of them is an even sample.
+   * any part of them is an even sample; drawn alone, a part has larger points.
    */
-  range(from: number, to: number): void {
+  range(from: number, to: number, whole: boolean): void {
     const share = Math.min(1, this.budget / Math.max(1, this.total));
+    this.shared.thin.value = 1 / Math.sqrt(Math.max(1e-6, share * (whole ? 1 : to)));
     this.drawn = 0;
     for (const { object, points } of this.chunks.values()) {
       const [start, end] = [Math.ceil(points * share * from), Math.ceil(points * share * to)];

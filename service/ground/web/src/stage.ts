@@ -22,9 +22,8 @@ export function canDraw(): boolean {
 
 export class Stage {
   readonly renderer = new THREE.WebGLRenderer({
-    antialias: true,
     powerPreference: "high-performance",
-    preserveDrawingBuffer: true, // the painter adds to the last picture
+    preserveDrawingBuffer: true, // nothing is drawn while nothing changes
   });
   readonly scene = new THREE.Scene();
   readonly camera = new THREE.PerspectiveCamera(60, 1, 0.1, 20000);
@@ -89,6 +88,7 @@ export class Stage {
     this.renderer.setAnimationLoop(null);
     this.watcher.disconnect();
     this.controls.dispose();
+    this.painter.dome.close();
     this.renderer.dispose();
   }
 

@@ -6,6 +6,12 @@ import type { Origin } from "./api";
 import { eastNorthUp } from "./globe";
 import type { Stage } from "./stage";
 
+/** Their colours are sRGB, while three.js takes them as linear: too bright. */
+function linearColours(shader: { vertexShader: string }): void {
+  const linear = "vColor.rgb = mix(vColor.rgb / 12.92, pow((vColor.rgb + 0.055) / 1.055, vec3(2.4)), step(0.04045, vColor.rgb));";
+  shader.vertexShader = shader.vertexShader.replace("#include <color_vertex>", `#include <color_vertex>\n${linear}`);
+}
+
 /** Puts the tiles at `address` into the stage, on the scan's own axes; returns what removes them. */
 export function showTiles(stage: Stage, address: string, origin: Origin, pointSize: () => number): () => void {
   const tiles = new TilesRenderer(address);
@@ -16,6 +22,7 @@ export function showTiles(stage: Stage, address: string, origin: Origin, pointSi
     stage.touch();
     scene.traverse((node) => {
       if (!(node instanceof THREE.Points)) return;
+      node.material.onBeforeCompile = linearColours;
       node.material.size = pointSize();
       node.material.sizeAttenuation = false;
       document.body.dataset["tiles"] = String(Number(document.body.dataset["tiles"] ?? 0) + 1);

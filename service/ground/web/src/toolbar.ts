@@ -188,7 +188,8 @@ function settings({ stage, cloud }: Parts): HTMLElement {
     };
     panel.append(el("label", {}, el("span", { textContent: text }), input, shown));
   };
-  slide("Point size", 50, 1500, 10, 300, (v) => cloud.pointSize(v), (v) => `${(v / 300).toFixed(1)} x`);
+  slide("Point size", 0.3, 5, 0.1, 1.3, (v) => cloud.pointSize(v), (v) => `${v.toFixed(1)} x`);
+  slide("Shading", 0, 3, 0.1, 1, (v) => (stage.painter.dome.strength = v), (v) => v.toFixed(1));
   slide("Points drawn", 5, 8, 0.1, 6.5, (v) => (cloud.budget = 10 ** v), (v) => `${(10 ** (v - 6)).toFixed(1)} M`);
   slide("Field of view", 20, 100, 1, 60, (v) => stage.fieldOfView(v), (v) => `${v}°`);
   slide("Exposure", -2, 2, 0.1, 0, (v) => (stage.renderer.toneMappingExposure = 2 ** v), (v) => `${v > 0 ? "+" : ""}${v.toFixed(1)} EV`);
@@ -201,7 +202,7 @@ function settings({ stage, cloud }: Parts): HTMLElement {
   ];
   for (const [name, value] of tones) tone.append(el("option", { textContent: name, value: String(value) }));
   tone.onchange = () => (stage.renderer.toneMapping = Number(tone.value) as THREE.ToneMapping);
-  panel.append(el("label", {}, el("span", { textContent: "Tone (mesh)" }), tone));
+  panel.append(el("label", {}, el("span", { textContent: "Tone" }), tone));
   const bloom = el("input", { type: "checkbox" });
   const blur = el("input", { type: "checkbox" });
   bloom.onchange = blur.onchange = () => void looks(stage, bloom.checked, blur.checked).catch(tell);

@@ -14,7 +14,8 @@ export function vehicleStrip(): HTMLElement {
   const refresh = async (): Promise<void> => {
     const now = await api.vehicle().catch(() => ({ connected: null }) as api.Vehicle);
     strip.hidden = now.connected === null;
-    figures.textContent = now.connected ? words(now) : (now.trouble ?? "");
+    figures.textContent = now.connected ? words(now) : `no vehicle: ${now.trouble ?? "looking"}`;
+    for (const button of strip.querySelectorAll("button")) button.disabled = !now.connected;
     const wait = now.connected === null ? 10000 : 1000;
     setTimeout(() => strip.isConnected && void refresh(), wait);
   };

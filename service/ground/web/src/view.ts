@@ -43,16 +43,20 @@ function view(root: HTMLElement, scan: api.Scan): () => void {
   const link = new LinkState();
   const title = el("h1", {});
   const report = el("a", { href: api.file(id, "report.html"), textContent: "Report" });
-  const bar = el("nav", {}, el("a", { href: "#/", textContent: "‹ Scans" }), title, link.element, vehicleStrip(), report);
-  const host = el("div", { className: "stage" });
+  const bar = el("header", {}, el("a", { href: "#/", textContent: "‹ Scans" }), title, link.element, vehicleStrip(), report);
+  const host = el("main", { className: "stage" });
   const legend = el("div", { className: "panel legend", hidden: true });
   const coverage = el("div", { className: "panel coverage", hidden: true });
   const latest = el("figure", { className: "panel latest", hidden: true });
-  const page = el("main", { className: "view" }, bar, host, figures, legend, coverage, latest);
+  const side = el("aside", { className: "side", tabIndex: 0 }, figures, legend, coverage, latest);
+  side.setAttribute("aria-label", "figures");
+  const page = el("div", { className: "view" }, bar, host, side);
   root.replaceChildren(page);
   const cloud = new Cloud();
   cloud.datum_m = scan.origin?.alt_amsl_m ?? 0;
+  let fused: number | undefined;
   const learn = (now: api.Scan): void => {
+    fused = now.counts?.points;
     title.textContent = now.title;
     report.hidden = !now.files.some((f) => f.name === "report.html");
   };
@@ -74,8 +78,8 @@ function view(root: HTMLElement, scan: api.Scan): () => void {
     origin: scan.origin,
   });
   host.append(ruler.overlay, ruler.cursor);
-  page.append(ruler.panel);
-  stage.before.push(ruler.draw);
+  side.prepend(ruler.panel);
+  stage.before.push(ruler.draw, () => cloud.screen(stage.renderer.domElement.height / 2));
   stage.drawGradually(cloud);
   stage.add(cameras.group);
   stage.addAgain(cloud.group);
@@ -127,7 +131,7 @@ function view(root: HTMLElement, scan: api.Scan): () => void {
   const clock = setInterval(() => {
     link.draw();
     if (cameras.refresh()) stage.touch();
-    figures.replaceChildren(...rows(cloud, stage, last));
+    figures.replaceChildren(...rows(cloud, stage, last, fused));
     document.body.dataset["points"] = String(cloud.total);
     document.body.dataset["drawn"] = String(cloud.drawn);
     document.body.dataset["fps"] = stage.painter.frames_per_s.toFixed(1);
@@ -156,12 +160,12 @@ function keepLatest(
     if (seq === shown) return;
     shown = seq;
     const image = new Image();
-    image.alt = `keyframe ${seq}`;
+    image.alt = `keyframe ${seq}, seen from the aircraft`;
     image.onload = () => {
       cameras.show(seq, image);
       stage.touch();
       place.hidden = false;
-      place.replaceChildren(image, el("figcaption", { textContent: `latest picture, keyframe ${seq}` }));
+      place.replaceChildren(image, el("figcaption", { textContent: `latest keyframe, ${seq}` }));
       document.body.dataset["picture"] = String(seq);
     };
     image.src = `${api.scanAddress(id)}/keyframes/${seq}.jpg`;
@@ -169,9 +173,10 @@ function keepLatest(
   return () => clearInterval(timer);
 }
 
-function rows(cloud: Cloud, stage: Stage, last: LastPose | undefined): HTMLElement[] {
+function rows(cloud: Cloud, stage: Stage, last: LastPose | undefined, fused: number | undefined): HTMLElement[] {
   const facts: [string, string][] = [
-    ["Points", count(cloud.total)],
+    ...(fused === undefined ? [] : [["Points", count(fused)] as [string, string]]),
+    ["Samples", count(cloud.total)],
     ["Drawn", count(cloud.drawn)],
     ["Keyframes", String(cloud.keyframes)],
   ];
@@ -181,11 +186,11 @@ function rows(cloud: Cloud, stage: Stage, last: LastPose | undefined): HTMLEleme
     if (last.alt_amsl_m !== null) facts.push(["AMSL", `${last.alt_amsl_m.toFixed(1)} m`]);
     facts.push(["Flown", `${last.distance_m.toFixed(0)} m`]);
     facts.push(["Camera", `${last.roll_deg}° ${last.pitch_deg}° ${last.yaw_deg}°`]);
-    facts.push(["Pose σ", `${last.sigma_m.toFixed(2)} m`]);
+    facts.push(["Absolute σ", `${last.sigma_m.toFixed(2)} m`]);
     facts.push(["From", last.sources.join(", ")]);
     if (last.lat_deg !== null && last.lon_deg !== null)
       facts.push(["At", `${last.lat_deg.toFixed(6)}, ${last.lon_deg.toFixed(6)}`]);
   }
-  facts.push(["Pictures", `${stage.painter.frames_per_s.toFixed(stage.painter.frames_per_s < 3 ? 1 : 0)} /s`]);
+  facts.push(["Drawing", `${stage.painter.frames_per_s.toFixed(stage.painter.frames_per_s < 3 ? 1 : 0)} /s`]);
   return facts.map(([k, v]) => el("div", {}, el("dt", { textContent: k }), el("dd", { textContent: v })));
 }

@@ -1,0 +1,88 @@
+// Eye-dome lighting: the scene is drawn into a target with its depth, and what stands behind its
+// neighbours is shaded (Boucheny 2009). So a cloud without normals looks like a surface.
+
+import * as THREE from "three";
+
+const FRAGMENT = /* glsl */ `
+  uniform sampler2D colour;
+  uniform highp sampler2D depth;
+  uniform vec2 pixel;
+  uniform vec2 planes;
+  uniform float strength;
+  varying vec2 place;
+
+  float far(vec2 at) {
+    float d = texture2D(depth, at).x;
+    return log2(planes.x * planes.y / (planes.y - d * (planes.y - planes.x)));
+  }
+  void main() {
+    vec3 seen = texture2D(colour, place).rgb;
+    if (strength > 0.0 && texture2D(depth, place).x < 1.0) {
+      float here = far(place);
+      float sum = max(0.0, here - far(place + vec2(pixel.x, 0.0)))
+        + max(0.0, here - far(place - vec2(pixel.x, 0.0)))
+        + max(0.0, here - far(place + vec2(0.0, pixel.y)))
+        + max(0.0, here - far(place - vec2(0.0, pixel.y)));
+      seen *= max(0.35, exp(-strength * sum));
+    }
+    gl_FragColor = vec4(seen, 1.0);
+    #include <tonemapping_fragment>
+    #include <colorspace_fragment>
+  }
+`;
+const RADIUS_PX = 1.5;
+const STRENGTH = 12;
+
+export class Dome {
+  /** 1 is usual, 0 switches it off. */
+  strength = 1;
+  private readonly target = new THREE.WebGLRenderTarget(1, 1, {
+    type: THREE.HalfFloatType,
+    depthTexture: new THREE.DepthTexture(1, 1, THREE.UnsignedIntType),
+  });
+  private readonly uniforms = {
+    colour: { value: this.target.texture },
+    depth: { value: this.target.depthTexture },
+    pixel: { value: new THREE.Vector2() },
+    planes: { value: new THREE.Vector2() },
+    strength: { value: 0 },
+  };
+  private readonly sheet = new THREE.Mesh(
+    new THREE.PlaneGeometry(2, 2),
+    new THREE.ShaderMaterial({
+      vertexShader: "varying vec2 place; void main() { place = uv; gl_Position = vec4(position.xy, 0.0, 1.0); }",
+      fragmentShader: FRAGMENT,
+      uniforms: this.uniforms,
+      depthTest: false,
+      depthWrite: false,
+    }),
+  );
+  private readonly flat = new THREE.OrthographicCamera(-1, 1, 1, -1, 0, 1);
+
+  constructor() {
+    this.sheet.frustumCulled = false;
+  }
+
+  /** Draws the scene into the target, over what it holds unless `clear`; shows it when `show`. */
+  render(renderer: THREE.WebGLRenderer, scene: THREE.Scene, camera: THREE.PerspectiveCamera, clear: boolean, show: boolean): void {
+    const size = renderer.getDrawingBufferSize(new THREE.Vector2());
+    if (size.x !== this.target.width || size.y !== this.target.height) this.target.setSize(size.x, size.y);
+    renderer.setRenderTarget(this.target);
+    renderer.autoClear = clear;
+    renderer.render(scene, camera);
+    renderer.setRenderTarget(null);
+    renderer.autoClear = true;
+    if (!show) return;
+    const radius = RADIUS_PX * renderer.getPixelRatio();
+    this.uniforms.pixel.value.set(radius / size.x, radius / size.y);
+    this.uniforms.planes.value.set(camera.near, camera.far);
+    this.uniforms.strength.value = this.strength * STRENGTH;
+    renderer.render(this.sheet, this.flat);
+  }
+
+  close(): void {
+    this.target.dispose();
+    this.sheet.geometry.dispose();
+    this.sheet.material.dispose();
+  }
+}
