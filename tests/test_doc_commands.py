@@ -94,7 +94,7 @@ def _commands(words: list[str]) -> Iterator[list[str]]:
         end = next((k for k, word in enumerate(words) if set(word) <= set(";|&")), len(words))
         command, words = words[:end], words[end + 1 :]
         if command[:1] == ["sudo"]:
-            command = command[3:] if command[1] == "-u" else command[1:]
+            command = command[3:] if command[1:2] == ["-u"] else command[1:]
         if command and Path(command[0]).name == "skyrelief":
             yield command[1:]
 
