@@ -183,7 +183,7 @@ class _Bundle:
         K = np.array([[model[0], 0.0, model[3]], [0.0, model[1], model[4]], [0.0, 0.0, 1.0]])
         distortion = self._given.distortion.copy()
         distortion[:4] = model[5:9]
-        return Camera(K, distortion, self._given.size_px)
+        return replace(self._given, K=K, distortion=distortion)
 
     def _errors_px(self, values: Any) -> F64:
         """(M,) what each sighting is off by, of one coordinate; under a robust loss."""
