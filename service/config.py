@@ -59,7 +59,7 @@ class CameraConfig:
         "rolling shutter, first to last row; 0: global shutter; model: as the camera model says",
     )
     readout_direction: Literal["down", "up", "right", "left"] = key(
-        "down", "way of the rolling shutter over the picture, with a readout_ms in numbers"
+        "down", "readout order of the rows or columns, used if readout_ms is a number"
     )
 
     def __post_init__(self) -> None:
