@@ -17,8 +17,9 @@ from typing import Any
 
 import msgspec
 import pytest
+import typer.main
 
-from service.cli import COMMANDS, load_command
+from service.cli import COMMANDS, app, load_command
 from service.config import keys, load_config
 from service.errors import InputError
 
@@ -138,6 +139,7 @@ def test_complete_commands_parse(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_mentioned_commands_and_options_exist(page: Path) -> None:
     every = {option for name in COMMANDS for option in options(name)}
+    every |= {option for p in typer.main.get_command(app).params for option in p.opts}
     others = [*(ROOT / "deploy").glob("*.sh"), ROOT / "tests" / "conftest.py", ROOT / "Makefile"]
     foreign = "".join(map(text_of, others))
     wrong = []
