@@ -166,3 +166,20 @@ def test_a_height_set_by_the_operator_is_known_whatever_it_is() -> None:
     assert fifty.height_known(None, None)
     assert fifty.prior(None, None).is_agl_measured
     assert not rig().height_known(None, None)
+
+
+def test_the_turn_of_the_camera_is_in_its_own_frame() -> None:
+    """Looking down with the nose above: yaw turns about the view, roll about the nose."""
+    level = VehicleState(0, q_ned_body_wxyz=q(0, 0, 0), sigma_yaw_rad=0.1)
+    for after, axis in ((q(0, 0, 2), [0, 0, 1]), (q(2, 0, 0), [0, -1, 0]), (q(0, 2, 0), [1, 0, 0])):
+        later = replace(level, time_ns=40_000_000, q_ned_body_wxyz=after)
+        found = rig().turn(level, later)
+        assert found is not None
+        np.testing.assert_allclose(found, math.radians(50.0) * np.array(axis), atol=1e-9)
+
+
+def test_without_attitude_or_time_the_turn_is_unknown() -> None:
+    state = VehicleState(0, q_ned_body_wxyz=q(0, 0, 0), sigma_yaw_rad=0.1)
+    assert rig().turn(state, state) is None
+    assert rig().turn(None, state) is None
+    assert rig().turn(state, VehicleState(1_000_000)) is None
