@@ -352,6 +352,32 @@ def test_points_without_heights_place_a_scan_horizontally(tmp_path: Path, placed
     assert "vertically" not in json.loads((flight.scan / "scan.json").read_text())["notes"][-1]
 
 
+def test_the_command_prints_points_without_heights(flight: Flight) -> None:
+    gcp = write_csv(flight.folder / "flat.csv", flight.survey(SPOTS, alt_amsl_m=""))
+    answer = CliRunner().invoke(app, ["refine", str(flight.scan), "--gcp", str(gcp)])
+    assert answer.exit_code == 0, answer.output
+    assert "left out" in answer.stdout and "vertical" not in answer.stdout
+
+
+def test_each_control_point_is_told_from_the_others(flight: Flight) -> None:
+    """A point that is off by decimetres shows where it is left out, not where it takes part."""
+    rows = flight.survey(SPOTS)
+    figures = refine(flight.scan, RefineOptions(write_csv(flight.folder / "a.csv", rows)))
+    sound = {p["name"]: p["left_out_m"] for p in figures["points"]}
+    assert sound["C1"] is None  # a check point
+    assert all(np.abs(sound[name]).max() < 0.2 for name in "ABDEF")
+    for row in rows:
+        if row["name"] == "F":
+            row["alt_amsl_m"] += 0.6
+    figures = refine(flight.scan, RefineOptions(write_csv(flight.folder / "b.csv", rows)))
+    off = {p["name"]: p for p in figures["points"]}["F"]
+    assert off["left_out_m"][2] == pytest.approx(-0.6, abs=0.2)
+    assert abs(off["left_out_m"][2]) > abs(off["after_m"][2])
+    few = [row for row in rows if row["name"] in ("A", "B", "D")]
+    figures = refine(flight.scan, RefineOptions(write_csv(flight.folder / "c.csv", few)))
+    assert all(p["left_out_m"] is None for p in figures["points"])
+
+
 def test_one_column_less_is_no_fault_and_points_with_heights_still_lift(flight: Flight) -> None:
     rows = [
         {k: v for k, v in row.items() if k != "sigma_v_m"} | ({"alt_amsl_m": ""} if flat else {})

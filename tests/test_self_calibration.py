@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.calibration.flight import Sightings, self_calibrate, without_k3
+from recon.calibration.flight import self_calibrate
+from recon.calibration.global_bundle import Sightings
 from recon.types import F64, Camera
 
 SIZE = (1280, 720)
@@ -149,16 +150,6 @@ def test_a_camera_beyond_belief_and_wild_sightings() -> None:
     assert not found.why_not and abs(found.camera.K[0, 0] / 960.0 - 1.0) < 0.005
     far = Camera(TRUE.K * [[1.25, 1, 1], [1, 1.25, 1], [1, 1, 1]], np.zeros(5), SIZE)
     assert "chessboard" in self_calibrate(far, start, near, seen, fixes, sigma).why_not
-
-
-def test_the_third_radial_term_is_taken_out_of_the_pixels() -> None:
-    full = Camera(TRUE.K, np.array([-0.12, 0.03, 0.001, -0.002, 0.02]), SIZE)
-    fewer = Camera(TRUE.K, np.array([-0.12, 0.03, 0.001, -0.002, 0.0]), SIZE)
-    rng = np.random.default_rng(0)
-    points = np.column_stack([rng.uniform(-0.5, 0.5, 40), rng.uniform(-0.3, 0.3, 40), np.ones(40)])
-    shown = [_shown(points, c) for c in (full, fewer)]
-    np.testing.assert_allclose(without_k3(full, shown[0]), shown[1], atol=0.02)
-    assert without_k3(fewer, shown[1]) is shown[1]
 
 
 def test_wrong_calls_are_refused() -> None:

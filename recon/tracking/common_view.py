@@ -91,17 +91,17 @@ class CommonView:
         return replace(by_plane, uv=self.carry(uv_px))
 
 
-def features(gray: U8, width_px: int = WIDTH_PX) -> Features:
-    """The features of ``gray`` (H, W) uint8, looked for at ``width_px``; none where it shows
-    nothing."""
+def features(gray: U8, width_px: int = WIDTH_PX, most: int = MOST) -> Features:
+    """The ``most`` strongest features of ``gray`` (H, W) uint8, looked for at ``width_px``; none
+    where it shows nothing."""
     H, W = gray.shape
     size = (min(width_px, W), max(16, round(min(width_px, W) * H / W)))
     small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     level = cv2.createCLAHE(4.0, (8, 8)).apply(small)
-    found, descriptors = cv2.SIFT.create(MOST, contrastThreshold=0.01).detectAndCompute(level, None)
+    found, descriptors = cv2.SIFT.create(most, contrastThreshold=0.01).detectAndCompute(level, None)
     if descriptors is None or len(found) == 0:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), W)
-    order = np.argsort([-point.response for point in found], kind="stable")[:MOST]
+    order = np.argsort([-point.response for point in found], kind="stable")[:most]
     uv = np.array([found[i].pt for i in order], np.float64)
     total = np.maximum(descriptors[order].sum(1, keepdims=True), 1e-9)
     root = np.sqrt(descriptors[order] / total)
@@ -111,7 +111,7 @@ def features(gray: U8, width_px: int = WIDTH_PX) -> Features:
 
 def common_view(a: Features, b: Features) -> CommonView | None:
     """What images ``a`` and ``b`` share, or None when they do not surely share anything."""
-    rows_a, rows_b = _mutual(a.descriptors, b.descriptors)
+    rows_a, rows_b = mutual(a.descriptors, b.descriptors)
     if len(rows_a) < MIN_MATCHES:
         return None
     uv_a, uv_b = a.uv_px[rows_a], b.uv_px[rows_b]
@@ -126,17 +126,20 @@ def common_view(a: Features, b: Features) -> CommonView | None:
     return CommonView(H, uv_a[good], uv_b[good], a.width_px)
 
 
-def _mutual(a: F32, b: F32) -> tuple[np.ndarray, np.ndarray]:
+def mutual(a: F32, b: F32) -> tuple[np.ndarray, np.ndarray]:
     """Rows of ``a`` and ``b`` that are each other's best match, and clearly so."""
     none = np.zeros(0, np.int64)
     if min(len(a), len(b)) < MIN_MATCHES:
         return none, none
     likeness = a @ b.T
     best, back = likeness.argmax(axis=1), likeness.argmax(axis=0)
-    top = np.partition(likeness, -2, axis=1)[:, -2:]
-    distance = np.sqrt(np.maximum(2.0 - 2.0 * top, 0.0))
     rows = np.arange(len(a))
-    good = (back[best] == rows) & (distance[:, 1] < RATIO * distance[:, 0])
+    top = likeness[rows, best]
+    likeness[rows, best] = -1.0
+    closest, next_one = (
+        np.sqrt(np.maximum(2.0 - 2.0 * one, 0.0)) for one in (top, likeness.max(axis=1))
+    )
+    good = (back[best] == rows) & (closest < RATIO * next_one)
     return rows[good], best[good]
 
 
@@ -151,9 +154,7 @@ def _is_sound(H: F64, uv: F64) -> bool:
 
 def alike(a: U8, b: U8) -> int:
     """How many features two signatures (N, 128) have in common, each surely the other's."""
-    rows, _ = _mutual(
-        a.astype(np.float32) / SIGNATURE_STEPS, b.astype(np.float32) / SIGNATURE_STEPS
-    )
+    rows, _ = mutual(a.astype(np.float32) / SIGNATURE_STEPS, b.astype(np.float32) / SIGNATURE_STEPS)
     return len(rows)
 
 

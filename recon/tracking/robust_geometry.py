@@ -120,6 +120,18 @@ def relative_pose(
     return np.asarray(R, np.float64), np.asarray(t, np.float64).ravel(), int(count)
 
 
+def on_epipolar_lines(uv_a: F64, uv_b: F64, K: F64, threshold_px: float) -> Bool | None:
+    """(N,) matches that agree with one essential matrix; None where there is none."""
+    if len(uv_a) < 6 or not span_a_plane(uv_a, uv_b):
+        return None
+    found = attempt(
+        lambda: cv2.findEssentialMat(uv_a, uv_b, K, cv2.USAC_MAGSAC, 0.9999, threshold_px)
+    )
+    if found is None or found[0] is None or found[0].shape != (3, 3):
+        return None
+    return np.asarray(found[1]).ravel().astype(bool)
+
+
 def homography(uv_a: F64, uv_b: F64, threshold_px: float) -> tuple[F64, Bool] | None:
     """((3, 3) H with uv_b ~ H uv_a, (N,) inliers) of (N, 2) matched pixels; H is invertible."""
     if len(uv_a) < 4 or not span_a_plane(uv_a, uv_b):

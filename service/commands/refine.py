@@ -22,11 +22,11 @@ def refine(
     ] = None,
     loops: Annotated[bool, typer.Option(help="search for places seen twice")] = True,
     intrinsics: Annotated[
-        bool, typer.Option("--intrinsics", help="find the camera's model; takes --video")
+        bool, typer.Option("--intrinsics", help="find the camera's model only; takes --video")
     ] = False,
     video: Annotated[
         Path | None,
-        typer.Option(help="the flight's recording or folder of stills, for --intrinsics"),
+        typer.Option(help="the flight's recording or folder of stills: match its images again"),
     ] = None,
     undo: Annotated[
         bool, typer.Option("--undo", help="bring back the scan as it was flown")
@@ -44,20 +44,20 @@ def refine(
     from service.offline.refine.refinement import refine as run
     from service.offline.refine.refinement import undo as run_undo
 
-    if intrinsics != (video is not None):
-        raise InputError("--intrinsics and --video FILE go together")
-    if video is not None:
+    if intrinsics and video is None:
+        raise InputError("--intrinsics takes --video FILE")
+    if intrinsics and video is not None:
         if gcp or undo:
             raise InputError("--intrinsics takes --video, --telemetry and --out only")
         figures = run_intrinsics(scan_dir, video, telemetry, out)
         print(json.dumps(figures) if as_json else "\n".join(_camera_lines(figures)))
         return
     if undo:
-        if gcp or telemetry or out:
+        if gcp or telemetry or out or video:
             raise InputError("--undo takes nothing else")
         figures = run_undo(scan_dir)
     else:
-        figures = run(scan_dir, RefineOptions(gcp, telemetry, out, loops))
+        figures = run(scan_dir, RefineOptions(gcp, telemetry, out, loops, video))
     print(json.dumps(figures) if as_json else "\n".join(_lines(figures)))
 
 
@@ -86,6 +86,12 @@ def _lines(figures: dict[str, Any]) -> list[str]:
         f"(most {moved['most']:.2f} m), scale {figures['scale']:.4f}; "
         f"loops: {found['used']} used of {found['verified']} verified"
     ]
+    if images := figures.get("images"):
+        before, after = images["focal_px"]
+        out.append(
+            f"{images['views']} images tied by {images['sightings']} sightings of "
+            f"{images['places']} places; focal length {before:.1f} -> {after:.1f} px"
+        )
     if not figures["changed"]:
         out[0] += "; nothing new since the last refinement"
     step = found["step_m"]
@@ -97,18 +103,21 @@ def _lines(figures: dict[str, Any]) -> list[str]:
         )
     for p in figures["points"]:
         line = f"  {p['role']:<8}{p['name']:<12}{p['marks']:>3} marks"
-        for name in ("before_m", "after_m"):
+        for name in ("before_m", "after_m", "left_out_m"):
             if p[name] is not None and not p["refused"]:
-                line += "  " + name[:-2] + " " + " ".join(f"{v:+.2f}" for v in p[name])
+                known = (f"{v:+.2f}" for v in p[name] if v is not None)
+                line += f"  {name[:-2].replace('_', ' ')} {' '.join(known)}"
         out.append(line + (f"  REFUSED: {p['refused']}" if p["refused"] else ""))
     for role in ("control", "check"):
         s = figures[role]
         if s:
-            out.append(
+            line = (
                 f"{role} points ({s['count']}), rms: horizontal {s['rms_h_before_m']:.2f} -> "
-                f"{s['rms_h_after_m']:.2f} m, vertical {s['rms_v_before_m']:.2f} -> "
-                f"{s['rms_v_after_m']:.2f} m"
+                f"{s['rms_h_after_m']:.2f} m"
             )
+            if s["rms_v_after_m"] is not None:
+                line += f", vertical {s['rms_v_before_m']:.2f} -> {s['rms_v_after_m']:.2f} m"
+            out.append(line)
     return out + [f"note: {note}" for note in figures["notes"]]
 
 

@@ -1,8 +1,8 @@
 """The camera's model from the flight's own video: ``refine --intrinsics --video FILE``.
 
-Corners of each keyframe's picture are found again in its neighbours' and in those of other legs
-that show the same ground (undistorted by the model given, ZSSD), and
-:mod:`recon.calibration.flight` adjusts poses, landmarks and the camera at once.
+Features of each keyframe's picture are found again in its neighbours' and in those of other legs
+that show the same ground, and :mod:`recon.calibration.flight` adjusts poses, landmarks and the
+camera at once.
 What comes out is a camera file to replay the flight with: depth images that were made with
 another focal length cannot be bent to this one. The scan and its own model stay as they are.
 """
@@ -11,6 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
+from functools import lru_cache
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +21,23 @@ import cv2
 import numpy as np
 
 from recon import se3
-from recon.calibration.flight import SelfCalibrated, Sightings, self_calibrate
+from recon.calibration.flight import (
+    SelfCalibrated,
+    SelfCalibrationConfig,
+    camera_information,
+    first_held,
+    network,
+    self_calibrate,
+)
+from recon.calibration.global_bundle import Knowledge, Sightings
+from recon.calibration.tracks import (
+    are_alike,
+    crossings,
+    extended,
+    image_of,
+    joined,
+    sharpened,
+)
 from recon.camera_model import Undistorter, project, rays
 from recon.tracking import matching
 from recon.types import F64, U8, Camera
@@ -33,7 +52,7 @@ WITHIN_S = 0.02
 """A picture belongs to a keyframe when their times differ by no more."""
 
 REACH = 3
-"""A keyframe's corners are looked for in so many before and after it."""
+"""A keyframe is compared with so many before and after it."""
 
 ACROSS = 8
 """And in so many others that show the same ground, those that are turned most to it."""
@@ -41,13 +60,13 @@ ACROSS = 8
 MIN_SHOWN = 0.3
 """Of a picture's ground, that such another picture shows."""
 
-SEARCH_SHARE = 0.05
-"""Of the picture's width about the predicted place."""
+START = SelfCalibrationConfig()
+
+EXHAUSTIVE = 60
+"""Of so many pictures all are compared, wherever they are said to look."""
 
 MIN_SHARE = 0.5
 """Of the keyframes, whose pictures the video must hold."""
-
-CORNERS = matching.MatchingConfig(grid=16)
 
 
 def camera_of(header: ScanHeader) -> Camera:
@@ -82,36 +101,43 @@ def pictures_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dic
 
 def sightings(
     pictures: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float
-) -> tuple[F64, Sightings]:
-    """(P, 3) landmarks and where they are seen in the distorted pictures.
+) -> tuple[F64, Sightings, F64]:
+    """(P, 3) landmarks, where they are seen in the distorted pictures, and (N, 4, 4) poses that
+    agree with them.
 
     ``pictures`` by view, with ``poses`` (N, 4, 4) of all views; the ground lies about
-    ``ground_m`` up in the world.
+    ``ground_m`` up in the world. Pictures whose ground overlaps are compared, and of few
+    pictures all that look alike. Raises InputError when nothing ties them together.
     """
-    flat, W = Undistorter(camera), camera.size_px[0]
-    views = sorted(pictures)
-    stacks = {k: matching.Pyramid.build(flat.image(pictures[k])) for k in views}
-    landmarks: list[F64] = []
-    rows: list[tuple[int, int, F64]] = []
+    images = {k: image_of(gray, camera) for k, gray in pictures.items()}
+    views = sorted(images)
     overlap = _overlapping(views, camera, poses, ground_m)
-    for k in views:
-        uv = matching.harris_grid(stacks[k].levels[0], CORNERS, flat.valid).uv_px.astype(np.float64)
-        points = _on_ground(poses[k], rays(camera.K, uv), ground_m)
-        near = np.isfinite(points[:, 2])
-        uv, points = uv[near], points[near]
-        first = len(landmarks)
-        seen = np.zeros(len(uv), bool)
-        for other in overlap[k]:
-            at, ok = _matched(stacks, camera, poses, (k, other), uv, points, SEARCH_SHARE * W)
-            rows += [(other, first + int(i), at[i]) for i in np.flatnonzero(ok)]
-            seen |= ok
-        rows += [(k, first + int(i), uv[i]) for i in np.flatnonzero(seen)]
-        landmarks += list(points)
-    if not rows:
-        raise InputError("no corner was found again in a neighbour's picture; is this the video?")
-    at = _distorted(camera, np.array([row[2] for row in rows]))
-    seen_in = np.array([row[0] for row in rows], np.int64)
-    return np.array(landmarks), Sightings(seen_in, np.array([row[1] for row in rows]), at)
+    pairs = {(min(a, b), max(a, b)) for a, others in overlap.items() for b in others}
+    if len(views) <= EXHAUSTIVE:
+        some = [pair for pair in combinations(views, 2) if pair not in pairs]
+        pairs |= {(a, b) for a, b in some if are_alike(images[a], images[b])}
+    seen = joined(images, sorted(pairs), camera)
+    if len(seen.view) == 0:
+        raise InputError("no place was found again in another picture; is this the video?")
+    flat = Undistorter(camera)
+    stack = lru_cache(maxsize=64)(lambda k: matching.Pyramid.build(flat.image(pictures[k])))
+    seen = sharpened(stack, camera, seen)
+    span = float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
+    known = replace(
+        Knowledge.none(len(poses), int(seen.landmark.max()) + 1),
+        fixes=poses[:, :3, 3], sigma_fixes=np.full((len(poses), 3), 0.1 * span),
+        placed=poses, placing=first_held(poses),
+    )  # fmt: skip
+    try:
+        found = network(camera, poses, seen, known, camera_information(camera, START))
+    except ValueError as error:
+        raise InputError(f"{error}; is this the video?") from error
+    poses, points = found.solution.poses, found.solution.points
+    own = found.solution.camera
+    points = crossings(poses, own, found.seen, len(points))
+    overlap = _overlapping(views, own, poses, float(np.nanmedian(points[:, 2])))
+    seen = extended(stack, camera, own, poses, points, found.seen, overlap)
+    return np.nan_to_num(points), seen, poses
 
 
 def _overlapping(
@@ -148,44 +174,17 @@ def _on_ground(T: F64, ways: F64, ground_m: float) -> F64:
     return np.asarray(T[:3, 3] + there * far[:, None])
 
 
-def _matched(
-    stacks: Mapping[int, matching.Pyramid], camera: Camera, poses: F64, pair: tuple[int, int],
-    uv: F64, points: F64, radius: float,
-) -> tuple[F64, np.ndarray[Any, np.dtype[np.bool_]]]:  # fmt: skip
-    """Where the corners of the first view lie in the second, and which were found."""
-    k, other = pair
-    T = se3.inverse(poses[other])
-    predicted = project(camera.K, se3.transform(T, points))
-    beside = []
-    for axis in range(2):  # what a step in the first picture is in the second, on the ground
-        ways = rays(camera.K, uv + 8.0 * np.eye(2)[axis]) @ poses[k][:3, :3].T
-        far = (points[:, 2] - poses[k][2, 3]) / np.where(ways[:, 2] < -0.1, ways[:, 2], np.nan)
-        there = se3.transform(T, poses[k][:3, 3] + ways * far[:, None])
-        beside.append((project(camera.K, there) - predicted) / 8.0)
-    warp = np.stack(beside, axis=2)
-    found = matching.match(stacks[k], uv, stacks[other], predicted, radius, warp, CORNERS)
-    return found.uv_px.astype(np.float64), np.asarray(found.ok)
-
-
-def _distorted(camera: Camera, uv: F64) -> F64:
-    """(M, 2) pixels of the camera's own pictures, from those without distortion."""
-    ahead = rays(camera.K, uv)
-    zero = np.zeros(3)
-    out, _ = cv2.projectPoints(ahead[:, None], zero, zero, camera.K, camera.distortion)
-    return np.asarray(out.reshape(-1, 2), np.float64)
-
-
 def found_camera(
     pictures: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float, fixes: F64,
     sigma_fixes: F64,
 ) -> SelfCalibrated:  # fmt: skip
     """The camera as the flight tells it; InputError, in one line, when it does not."""
-    landmarks, seen = sightings(pictures, camera, poses, ground_m)
+    landmarks, seen, poses = sightings(pictures, camera, poses, ground_m)
     try:
         found = self_calibrate(camera, poses, landmarks, seen, fixes, sigma_fixes)
     except ValueError as error:
         raise InputError(f"--intrinsics: {error}") from error
-    except RuntimeError as error:  # GTSAM's of an ill-posed problem
+    except (RuntimeError, np.linalg.LinAlgError) as error:  # an ill-posed problem
         raise InputError(
             "--intrinsics: too few corners tie the pictures together; nothing was changed"
         ) from error

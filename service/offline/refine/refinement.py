@@ -23,6 +23,7 @@ from recon.posegraph.ground_control import (
     Adjusted,
     BatchConfig,
     Closure,
+    Mark,
     Point,
     Track,
     adjust,
@@ -32,11 +33,21 @@ from recon.posegraph.ground_control import (
 from recon.posegraph.sensor_offsets import constants
 from recon.posegraph.submap_loops import SubmapLoopConfig
 from recon.types import F64, Camera, Keyframe, PosePrior
+from service.cameras.camera_file import save_camera
 from service.cameras.rig import Rig
 from service.config import CameraConfig, FusionConfig, ScanConfig
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.refine import own_camera
+from service.offline.refine.by_images import (
+    ImageNetwork,
+    adjusted,
+    as_seen,
+    carried_marks,
+    crossing_marks,
+    marked_frames,
+    network_of,
+)
 from service.offline.refine.control_points import (
     Candidate,
     Pictures,
@@ -45,10 +56,10 @@ from service.offline.refine.control_points import (
     place_by_survey,
     screen,
 )
-from service.offline.refine.refinement_figures import in_words, told
+from service.offline.refine.refinement_figures import in_words, off_by, told
 from service.offline.refine.revisions import Revisions, copy_store, grown, moved_frames
 from service.offline.refine.stored_loops import StoredLoops, loose
-from service.offline.refine.survey_file import read_survey
+from service.offline.refine.survey_file import SurveyPoint, read_survey
 from service.scans.folder import write_deliverables
 from service.scans.track import local_frame
 from service.stream.records import (
@@ -66,6 +77,9 @@ LINK_LOG = "link.tlog"
 
 MIN_SIGMA_SCALE = 0.003
 BY_SURVEY = "control points"
+MIN_OTHERS = 3
+"""Control points that hold a scan without one of them."""
+
 MAX_REFUSALS = 0.4
 """Of the control points; when more contradict the rest, nobody knows which half is right."""
 
@@ -78,6 +92,7 @@ class RefineOptions:
     telemetry: Path | None = None
     out: Path | None = None
     loops: bool = True
+    video: Path | None = None
 
 
 def refine(folder: Path, options: RefineOptions) -> dict[str, Any]:
@@ -170,12 +185,19 @@ class _Refinement:
         self.keyframe = lru_cache(maxsize=64)(revisions.keyframe)
         self.notes: list[str] = []
         self.grown = 1.0  # metres of the survey per metre of the flight's own scale
+        self.images: ImageNetwork | None = None
 
     def run(self) -> dict[str, Any]:
         """Adjust and append; the figures."""
         survey = read_survey(self.options.gcp) if self.options.gcp is not None else []
+        places_m = np.array([s.T_world_camera[:3, 3] for s in self.states])
+        if self.options.video is not None:
+            self._match_again(self.options.video, survey)
         pictures = Pictures(self.states, self.frames, self.header.camera, self.keyframe, self.frame)
         candidates = candidates_of(survey, pictures, str(self.options.gcp))
+        if self.images is not None:
+            for one in candidates:
+                crossing_marks(one, pictures.poses)
         if self.frame is None and candidates:
             self._place(candidates)
         if self.frame is not None:
@@ -184,16 +206,21 @@ class _Refinement:
         elif self.options.telemetry is not None:
             raise InputError(f"{self.folder} has no georeference; replay it with its telemetry")
         track = self._track()
-        flown = self._flown_loops() if self.options.loops else []
-        closures = self._closures(track) if self.options.loops else []
-        kept = [c for c in supported([*flown, *closures], track.poses) if c not in flown]
-        track = replace(track, loops=[*flown, *kept])
+        verified = 0
+        if self.options.loops and self.images is None:
+            track, verified = self._with_loops(track)
         found = self._adjusted(track, candidates)
         told_clustered = clustered(candidates, track.poses[:, :3, 3])
         self.notes += [told_clustered] if told_clustered else []
         seqs = [s.seq for s in self.states]
-        verified = len(flown) + len(closures)
-        figures = told(seqs, track, found, candidates, verified, self._ahead_m())
+        if self.images is None or self.grown != 1.0:
+            places_m = track.poses[:, :3, 3]
+        figures = told(seqs, track, found, candidates, verified, self._ahead_m(), places_m)
+        if self.images is not None:
+            figures["images"] = self.images.figures(self.header.camera["K"][0])
+        alone = self._left_out(track, candidates)
+        for point in figures["points"]:
+            point["left_out_m"] = alone.get(point["name"])
         figures["notes"] = self.notes
         header = replace(self.header, notes=(*self.header.notes, in_words(figures)))
         frames = moved_frames(self.frames, self.states, found, self.frame)
@@ -212,6 +239,28 @@ class _Refinement:
         return found, given
 
     # ---- what goes in ------------------------------------------------------------------------
+
+    def _match_again(self, video: Path, survey: Sequence[SurveyPoint]) -> None:
+        """Tie the keyframes by their images, and take them as the images have them."""
+        marked = marked_frames(survey, self.frames, self.states)
+        images = network_of(video, self.header, self.states, marked, self._ahead_m())
+        self.states, self.frames = as_seen(images, self.states, self.frames, marked, self.keyframe)
+        self.images = images
+        if images.doubt:
+            self.notes.append(f"the camera given holds: {images.doubt}")
+            return
+        path = (self.options.out or self.folder) / own_camera.FILE
+        save_camera(path, images.camera)
+        self.notes.append(
+            f"the camera as the images have it: {path.name}; surfaces keep the one that they were "
+            "made with: replay the flight with --camera-model and that file"
+        )
+
+    def _with_loops(self, track: Track) -> tuple[Track, int]:
+        """The track with its loops, and how many of them were verified."""
+        flown, closures = self._flown_loops(), self._closures(track)
+        kept = [c for c in supported([*flown, *closures], track.poses) if c not in flown]
+        return replace(track, loops=[*flown, *kept]), len(flown) + len(closures)
 
     def _place(self, candidates: Sequence[Candidate]) -> None:
         """Give a scan without a place, and without a sure scale, those of the survey."""
@@ -246,6 +295,8 @@ class _Refinement:
                 R @ f.T_world_camera[:3, :3], scale * R @ f.T_world_camera[:3, 3] + t))
             for f in self.frames
         ]  # fmt: skip
+        if self.images is not None:
+            self.images = placed(self.images, scale, R, t)
         f = self.frame
         self.header = replace(
             self.header, origin_lat_deg=f.lat_deg, origin_lon_deg=f.lon_deg,
@@ -340,16 +391,13 @@ class _Refinement:
 
     def _adjusted(self, track: Track, candidates: Sequence[Candidate]) -> Adjusted:
         """The adjustment; control points that stay off are left out one by one, and named."""
-        points = [
-            Point(np.zeros(3) if c.surveyed_m is None else c.surveyed_m, c.sigma_m)
-            for c in candidates
-        ]
+        points = _points(candidates)
         most = int(MAX_REFUSALS * sum(not c.point.is_check for c in candidates))
         while True:
             used = [c for c in candidates if c.usable and not c.point.is_check]
             marks = [m for c in used for m in c.marks]
             try:
-                found = adjust(track, points, marks, self._config())
+                found = self._solved(track, points, marks, candidates)
             except RuntimeError as error:  # so the solver says that the system is ill-posed
                 raise InputError(
                     "the poses of this scan contradict each other too far to be adjusted"
@@ -368,6 +416,43 @@ class _Refinement:
                 return found
             worst.why_not = f"stays {far:.2f} m off after the adjustment"
 
+    def _solved(
+        self, track: Track, points: Sequence[Point], marks: Sequence[Mark],
+        candidates: Sequence[Candidate],
+    ) -> Adjusted:  # fmt: skip
+        if self.images is None:
+            return adjust(track, points, marks, self._config())
+        before = self.images
+        found, self.images = adjusted(before, track, points, marks, self.states, self.keyframe)
+        for one in candidates:
+            one.marks = carried_marks(one, before, self.images)
+        return found
+
+    def _left_out(
+        self, track: Track, candidates: Sequence[Candidate]
+    ) -> dict[str, list[float | None]]:
+        """How far each control point is off where the others alone put it, by name.
+
+        Empty for fewer than four control points: three are needed without it.
+        """
+        used = [c for c in candidates if c.usable and not c.point.is_check]
+        if len(used) <= MIN_OTHERS:
+            return {}
+        points, out = _points(candidates), {}
+        for one in used:
+            marks = [m for c in used if c is not one for m in c.marks]
+            mine = one.marks
+            if self.images is None:
+                found = adjust(track, points, marks, self._config())
+            else:
+                args = track, points, marks, self.states, self.keyframe
+                found, after = adjusted(self.images, *args)
+                mine = carried_marks(one, self.images, after)
+            place = map_position(found.poses, found.scales, mine)
+            if place is not None:
+                out[one.point.name] = off_by(one, place[0])
+        return out
+
     def _reposes(self, found: Adjusted) -> list[Repose]:
         return [
             Repose(s.seq, 0, T, s.scale * float(scale), spread)
@@ -375,6 +460,13 @@ class _Refinement:
                 self.states, found.poses, found.scales, found.covariances, strict=True
             )
         ]
+
+
+def _points(candidates: Sequence[Candidate]) -> list[Point]:
+    """The surveyed points of ``candidates``, numbered alike."""
+    return [
+        Point(np.zeros(3) if c.surveyed_m is None else c.surveyed_m, c.sigma_m) for c in candidates
+    ]
 
 
 Section = TypeVar("Section")

@@ -19,14 +19,15 @@ def told(
     found: Adjusted,
     candidates: Sequence[Candidate],
     verified: int,
-    ahead_m: float = 0.0,
+    ahead_m: float,
+    places_m: F64,
 ) -> dict[str, Any]:
-    """What the adjustment of the keyframes ``seqs`` did, fit for JSON.
+    """What the adjustment of the keyframes ``seqs``, at ``places_m`` (N, 3) before, did.
 
     ``verified``: loops of the flight and loops that matching confirmed; of these the track
     has those with support. ``ahead_m`` is the usual distance of the ground.
     """
-    shift = np.linalg.norm((found.poses - track.poses)[:, :3, 3], axis=1)
+    shift = np.linalg.norm(found.poses[:, :3, 3] - places_m, axis=1)
     points = [_told_point(c, found) for c in candidates]
     return {
         "keyframes": len(track.poses),
@@ -71,22 +72,23 @@ def _steps(track: Track, found: Adjusted, ahead_m: float) -> dict[str, Any] | No
 
 def _told_point(one: Candidate, found: Adjusted) -> dict[str, Any]:
     after = map_position(found.poses, found.scales, one.marks)
-
-    def off(place: F64 | None) -> list[float | None] | None:
-        if place is None or one.surveyed_m is None:
-            return None
-        east, north, up = (_round(v) for v in one.off_m(place))
-        return [east, north, up if one.has_height else None]
-
     return {
         "name": one.point.name,
         "role": "check" if one.point.is_check else "control",
         "marks": len(one.marks),
         "refused": one.why_not or None,
         "place_m": None if one.surveyed_m is None else [_round(v) for v in one.surveyed_m],
-        "before_m": off(one.before_m),
-        "after_m": off(None if after is None else after[0]),
+        "before_m": off_by(one, one.before_m),
+        "after_m": off_by(one, None if after is None else after[0]),
     }
+
+
+def off_by(one: Candidate, place: F64 | None) -> list[float | None] | None:
+    """East, north and, where it was surveyed, up from a point's survey to ``place`` (3,)."""
+    if place is None or one.surveyed_m is None:
+        return None
+    east, north, up = (_round(v) for v in one.off_m(place))
+    return [east, north, up if one.has_height else None]
 
 
 def _summed(points: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
@@ -109,7 +111,7 @@ def _round(value: Any, digits: int = 4) -> float:
 
 def in_words(figures: dict[str, Any]) -> str:
     """One line for the scan's notes."""
-    parts = [f"{figures['loops']['used']} loops"]
+    parts = ["its own images" if "images" in figures else f"{figures['loops']['used']} loops"]
     if figures["telemetry"]:
         parts.append("the flight's telemetry")
     control, check = figures["control"], figures["check"]

@@ -1,0 +1,456 @@
+"""All poses, points and the one camera of a flight, adjusted at once from their pixels.
+
+Levenberg-Marquardt with the Schur complement on the points (Triggs et al., Bundle Adjustment - A
+Modern Synthesis, 2000, doi:10.1007/3-540-44480-7_21). The reduced system of the poses is sparse:
+two of them meet only where they see a common point. The camera is a dense border of eight columns.
+Poses err by left perturbations of T_camera_world, rotation first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from recon import se3
+from recon.types import F64, Camera
+
+I64 = npt.NDArray[np.int64]
+
+CAMERA = 8
+"""fx, fy, cx, cy, k1, k2, p1, p2; k3 stays."""
+
+MOST_COVARIANCES = 100
+"""Poses whose covariance is computed; the others take that of the nearest of them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """Landmarks seen in distorted images of full size; one row of each array per sighting."""
+
+    view: I64  # (M,) which pose
+    landmark: I64  # (M,) which landmark
+    uv_px: F64  # (M, 2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Knowledge:
+    """What is known of N poses and P points beside their pixels; NaN where nothing is."""
+
+    fixes: F64  # (N, 3) measured places of the cameras, m, world
+    sigma_fixes: F64  # (N, 3)
+    attitudes: F64  # (N, 3, 3) R_world_camera
+    sigma_attitudes: F64  # (N, 3) about the world's axes, rad
+    surveyed: F64  # (P, 3) places of points, m, world
+    sigma_surveyed: F64  # (P, 3)
+    placed: F64  # (N, 4, 4) T_world_camera, with the
+    placing: F64  # (N, 6, 6) information of a left perturbation of T_camera_world
+
+    @classmethod
+    def none(cls, poses: int, points: int) -> Knowledge:
+        """Nothing is known."""
+
+        def unknown(*shape: int) -> F64:
+            return np.full(shape, np.nan)
+
+        return cls(
+            fixes=unknown(poses, 3), sigma_fixes=unknown(poses, 3),
+            attitudes=unknown(poses, 3, 3), sigma_attitudes=unknown(poses, 3),
+            surveyed=unknown(points, 3), sigma_surveyed=unknown(points, 3),
+            placed=np.tile(np.eye(4), (poses, 1, 1)), placing=np.zeros((poses, 6, 6)),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """The adjusted flight."""
+
+    poses: F64  # (N, 4, 4) T_world_camera
+    points: F64  # (P, 3) world, m
+    camera: Camera
+    errors_px: F64  # (M,) lengths, infinite behind the camera
+    covariances: F64  # (N, 6, 6) left perturbation of T_world_camera; empty when not asked for
+    camera_covariance: F64  # (8, 8) of CAMERA's parameters
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """Sightings with a start; ``camera_information`` (8, 8) holds the camera to ``given``."""
+
+    camera: Camera
+    given: Camera
+    poses: F64  # (N, 4, 4) T_world_camera
+    points: F64  # (P, 3) world, m
+    seen: Sightings
+    sigma_px: F64  # (M,) of a coordinate
+    known: Knowledge
+    camera_information: F64
+    huber_sigmas: float = 1.5
+    cauchy_sigmas: float = 2.0  # of a fix
+
+
+@njit(cache=True, nogil=True)
+def _pixel(P: F64, X: F64, k: F64, k3: float, out: F64) -> bool:
+    """Fill ``out`` with u, v, a, b, z, r2, radial; False behind the camera."""
+    z = P[2, 0] * X[0] + P[2, 1] * X[1] + P[2, 2] * X[2] + P[2, 3]
+    if z < 1e-6:
+        return False
+    a = (P[0, 0] * X[0] + P[0, 1] * X[1] + P[0, 2] * X[2] + P[0, 3]) / z
+    b = (P[1, 0] * X[0] + P[1, 1] * X[1] + P[1, 2] * X[2] + P[1, 3]) / z
+    r2 = a * a + b * b
+    radial = 1.0 + r2 * (k[4] + r2 * (k[5] + r2 * k3))
+    out[0] = k[0] * (a * radial + 2.0 * k[6] * a * b + k[7] * (r2 + 2.0 * a * a)) + k[2]
+    out[1] = k[1] * (b * radial + k[6] * (r2 + 2.0 * b * b) + 2.0 * k[7] * a * b) + k[3]
+    out[2], out[3], out[4], out[5], out[6] = a, b, z, r2, radial
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _errors(T: F64, X: F64, k: F64, k3: float, view: I64, point: I64, uv: F64, out: F64) -> None:
+    """``out`` (M,) receives the lengths of the errors in pixels."""
+    at = np.zeros(7)
+    for m in range(view.size):
+        if _pixel(T[view[m]], X[point[m]], k, k3, at):
+            out[m] = np.sqrt((at[0] - uv[m, 0]) ** 2 + (at[1] - uv[m, 1]) ** 2)
+        else:
+            out[m] = np.inf
+
+
+@njit(cache=True, nogil=True)
+def _linearise(P: F64, X: F64, k: F64, k3: float, at: F64, Jc: F64, Jp: F64, Jk: F64) -> None:
+    """Fill the Jacobians (2, 6), (2, 3), (2, 8) of a pixel that :func:`_pixel` gave ``at``."""
+    a, b, z, r2, radial = at[2], at[3], at[4], at[5], at[6]
+    grows = k[4] + r2 * (2.0 * k[5] + 3.0 * r2 * k3)  # of radial, with r2
+    cross = 2.0 * a * b * grows + 2.0 * k[6] * a + 2.0 * k[7] * b
+    along = radial + 2.0 * a * a * grows + 2.0 * k[6] * b + 6.0 * k[7] * a
+    across = radial + 2.0 * b * b * grows + 6.0 * k[6] * b + 2.0 * k[7] * a
+    for i in range(2):
+        f = k[i]
+        da, db = (f * along, f * cross) if i == 0 else (f * cross, f * across)
+        jx, jy, jz = da / z, db / z, -(da * a + db * b) / z
+        Jc[i, 3], Jc[i, 4], Jc[i, 5] = jx, jy, jz
+        Jc[i, 0], Jc[i, 1], Jc[i, 2] = (jz * b - jy) * z, (jx - jz * a) * z, (jy * a - jx * b) * z
+        for j in range(3):
+            Jp[i, j] = jx * P[0, j] + jy * P[1, j] + jz * P[2, j]
+        s, t = (a, b) if i == 0 else (b, a)
+        Jk[i, :] = 0.0
+        Jk[i, i] = (at[i] - k[2 + i]) / f
+        Jk[i, 2 + i] = 1.0
+        Jk[i, 4], Jk[i, 5] = f * s * r2, f * s * r2 * r2
+        Jk[i, 6 + i], Jk[i, 7 - i] = f * 2.0 * s * t, f * (r2 + 2.0 * s * s)
+
+
+@njit(cache=True, nogil=True)
+def _reduce(
+    T: F64, X: F64, k: F64, k3: float, view: I64, start: I64, uv: F64, sigma: F64, huber: float,
+    Hp: F64, bp: F64, damping: float, pair: I64, S: F64, g: F64, B: F64, Hk: F64, gk: F64,
+    W: F64, Wk: F64,
+) -> None:  # fmt: skip
+    """Eliminate the points.
+
+    ``Hp`` (P, 3, 3) and ``bp`` (P, 3) hold what is known of the points and receive the inverses
+    and right-hand sides. ``S`` (Q, 6, 6) are the blocks of the poses numbered by ``pair`` (N, N),
+    the upper half only; ``B`` (N, 6, 8) and ``Hk`` (8, 8) the border.
+    """
+    at, Jc, Jp, Jk = np.zeros(7), np.zeros((2, 6)), np.zeros((2, 3)), np.zeros((2, 8))
+    r = np.zeros(2)
+    for p in range(X.shape[0]):
+        for m in range(start[p], start[p + 1]):
+            v = view[m]
+            W[m] = 0.0
+            if not _pixel(T[v], X[p], k, k3, at):
+                continue
+            _linearise(T[v], X[p], k, k3, at, Jc, Jp, Jk)
+            r[0], r[1] = uv[m, 0] - at[0], uv[m, 1] - at[1]
+            length = np.sqrt(r[0] * r[0] + r[1] * r[1]) / sigma[m]
+            w = min(1.0, huber / max(length, 1e-12)) / sigma[m] ** 2
+            q = pair[v, v]
+            for i in range(2):
+                for a in range(6):
+                    wa = w * Jc[i, a]
+                    g[v, a] += wa * r[i]
+                    for c in range(6):
+                        S[q, a, c] += wa * Jc[i, c]
+                    for c in range(8):
+                        B[v, a, c] += wa * Jk[i, c]
+                    for c in range(3):
+                        W[m, a, c] += wa * Jp[i, c]
+                for a in range(8):
+                    wa = w * Jk[i, a]
+                    gk[a] += wa * r[i]
+                    for c in range(8):
+                        Hk[a, c] += wa * Jk[i, c]
+                    for c in range(3):
+                        Wk[p, a, c] += wa * Jp[i, c]
+                for a in range(3):
+                    wa = w * Jp[i, a]
+                    bp[p, a] += wa * r[i]
+                    for c in range(3):
+                        Hp[p, a, c] += wa * Jp[i, c]
+        ridge = 1e-9 * (Hp[p, 0, 0] + Hp[p, 1, 1] + Hp[p, 2, 2]) + 1e-12
+        for a in range(3):
+            Hp[p, a, a] += damping * Hp[p, a, a] + ridge
+        Hp[p] = np.linalg.inv(Hp[p])
+        Ak = Wk[p] @ Hp[p]
+        gk -= Ak @ bp[p]
+        Hk -= Ak @ Wk[p].T
+        for m in range(start[p], start[p + 1]):
+            v = view[m]
+            A = W[m] @ Hp[p]
+            g[v] -= A @ bp[p]
+            B[v] -= A @ Wk[p].T
+            for n in range(m, start[p + 1]):  # views of a point are in order
+                q = pair[v, view[n]]
+                for a in range(6):
+                    for c in range(6):
+                        S[q, a, c] -= (
+                            A[a, 0] * W[n, c, 0] + A[a, 1] * W[n, c, 1] + A[a, 2] * W[n, c, 2]
+                        )
+
+
+@njit(cache=True, nogil=True)
+def _mark_pairs(view: I64, start: I64, met: npt.NDArray[np.bool_]) -> None:
+    """Set ``met`` (N, N), upper half, for views that share a point."""
+    for p in range(start.size - 1):
+        for m in range(start[p], start[p + 1]):
+            for n in range(m, start[p + 1]):
+                met[view[m], view[n]] = True
+
+
+def errors_px(camera: Camera, poses: F64, points: F64, seen: Sightings) -> F64:
+    """(M,) lengths of the errors of sightings; infinite behind the camera."""
+    out = np.zeros(len(seen.view))
+    T = np.array([se3.inverse(one) for one in poses])
+    k, k3 = _vector(camera), float(camera.distortion[4])
+    _errors(T, np.ascontiguousarray(points), k, k3, seen.view, seen.landmark, seen.uv_px, out)
+    return out
+
+
+def solve(problem: Problem, iterations: int = 40, covariances: bool = False) -> Solution:
+    """Adjust until a step lowers the cost by less than a millionth.
+
+    Raises ValueError for shapes that do not fit or a landmark seen twice in one view.
+    """
+    M = len(problem.seen.view)
+    if problem.seen.uv_px.shape != (M, 2) or problem.sigma_px.shape != (M,):
+        raise ValueError(f"{M} sightings need uv_px (M, 2) and sigma_px (M,)")
+    bundle = _Bundle(problem)
+    state = bundle.start
+    cost, damping = bundle.cost(state), 1e-4
+    for _ in range(iterations):
+        new = bundle.stepped(state, damping)
+        new_cost = bundle.cost(new)
+        if new_cost < cost:
+            gain, state, cost = (cost - new_cost) / cost, new, new_cost
+            damping = max(damping * 0.2, 1e-9)
+            if gain < 1e-6:
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e6:
+                break
+    return bundle.solution(state, covariances)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    T: F64  # (N, 4, 4) T_camera_world
+    X: F64  # (P, 3)
+    k: F64  # (8,)
+
+
+@dataclass(slots=True, eq=False)
+class _Equations:
+    """The reduced system of the poses, factored, with its border."""
+
+    solved: Any  # solves for columns (6 N, n)
+    B: F64  # (6 N, 8)
+    Hk: F64  # (8, 8), reduced by the points and the poses
+    g: F64  # (6 N,)
+    gk: F64  # (8,)
+    Z: F64  # (6 N, 8) solved(B)
+    Hp_inverse: F64  # (P, 3, 3)
+    bp: F64  # (P, 3)
+    W: F64  # (M, 6, 3)
+    Wk: F64  # (P, 8, 3)
+
+
+class _Bundle:
+    """The arrays of one adjustment, sorted by landmark and view."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._of = problem
+        seen, P = problem.seen, len(problem.points)
+        self._order = np.lexsort((seen.view, seen.landmark))
+        self._view = np.ascontiguousarray(seen.view[self._order], np.int64)
+        self._point = np.ascontiguousarray(seen.landmark[self._order], np.int64)
+        twice = (np.diff(self._point) == 0) & (np.diff(self._view) == 0)
+        if twice.any():
+            raise ValueError(f"landmark {self._point[1:][twice][0]} is seen twice in one view")
+        self._uv = np.ascontiguousarray(seen.uv_px[self._order], np.float64)
+        self._sigma = np.ascontiguousarray(problem.sigma_px[self._order], np.float64)
+        self._start_of = np.searchsorted(self._point, np.arange(P + 1)).astype(np.int64)
+        T = np.array([se3.inverse(one) for one in problem.poses])
+        self.start = _State(T, np.array(problem.points, np.float64), _vector(problem.camera))
+        self._k3 = float(problem.camera.distortion[4])
+        met = np.eye(len(T), dtype=np.bool_)
+        _mark_pairs(self._view, self._start_of, met)
+        self._rows, self._columns = np.nonzero(met)
+        self._pair = np.full(met.shape, -1, np.int64)
+        self._pair[self._rows, self._columns] = np.arange(len(self._rows))
+
+    # ---- cost -------------------------------------------------------------------------------
+
+    def _lengths(self, s: _State) -> F64:
+        out = np.zeros(len(self._view))
+        _errors(s.T, s.X, s.k, self._k3, self._view, self._point, self._uv, out)
+        return out
+
+    def cost(self, s: _State) -> float:
+        """Half the sum of squares, robust losses applied."""
+        huber, c = self._of.huber_sigmas, self._of.cauchy_sigmas
+        e = np.minimum(self._lengths(s) / self._sigma, 1e4)
+        pixels = np.where(e <= huber, 0.5 * e**2, huber * (e - 0.5 * huber)).sum()
+        fixes, attitude, placing, points = self._known_errors(s)
+        loss = 0.5 * c**2 * np.log1p(np.sum(fixes**2, axis=1) / c**2).sum()
+        bent = s.k - _vector(self._of.given)
+        return float(
+            pixels + loss + 0.5 * np.sum(attitude**2) + 0.5 * np.sum(points**2)
+            + 0.5 * np.einsum("ni,nij,nj->", placing, self._of.known.placing, placing)
+            + 0.5 * bent @ self._of.camera_information @ bent
+        )  # fmt: skip
+
+    def _known_errors(self, s: _State) -> tuple[F64, F64, F64, F64]:
+        """Whitened errors of fixes (N, 3), attitudes (N, 3) and points (P, 3), 0 where nothing is
+        known, and of the placing (N, 6), not whitened."""
+        known = self._of.known
+        centre = -np.einsum("nji,nj->ni", s.T[:, :3, :3], s.T[:, :3, 3])
+        fixes = np.nan_to_num((centre - known.fixes) / known.sigma_fixes)
+        points = np.nan_to_num((s.X - known.surveyed) / known.sigma_surveyed)
+        attitude, placing = np.zeros((len(s.T), 3)), np.zeros((len(s.T), 6))
+        for n in np.flatnonzero(np.isfinite(known.attitudes[:, 0, 0])):
+            turned = known.attitudes[n] @ s.T[n, :3, :3]  # in the world
+            attitude[n] = se3.so3_log(turned) / known.sigma_attitudes[n]
+        for n in np.flatnonzero(known.placing.any(axis=(1, 2))):
+            placing[n] = se3.log(s.T[n] @ known.placed[n])
+        return fixes, attitude, placing, points
+
+    # ---- steps ------------------------------------------------------------------------------
+
+    def stepped(self, s: _State, damping: float) -> _State:
+        """The state after one step."""
+        eq = self._equations(s, damping)
+        dk = np.linalg.solve(eq.Hk, eq.gk)
+        dc = (eq.solved(eq.g) - eq.Z @ dk).reshape(-1, 6)
+        bp = eq.bp - np.einsum("pkc,k->pc", eq.Wk, dk)
+        carried = np.einsum("mac,ma->mc", eq.W, dc[self._view])
+        np.subtract.at(bp, self._point, carried)
+        T = np.array([se3.exp(d) @ one for d, one in zip(dc, s.T, strict=True)])
+        return _State(T, s.X + np.einsum("pij,pj->pi", eq.Hp_inverse, bp), s.k + dk)
+
+    def _equations(self, s: _State, damping: float) -> _Equations:
+        N, P, M = len(s.T), len(s.X), len(self._view)
+        S, g, B = np.zeros((len(self._rows), 6, 6)), np.zeros((N, 6)), np.zeros((N, 6, CAMERA))
+        Hk, gk = self._of.camera_information.copy(), np.zeros(CAMERA)
+        gk += self._of.camera_information @ (_vector(self._of.given) - s.k)
+        Hp, bp = np.zeros((P, 3, 3)), np.zeros((P, 3))
+        self._add_known(s, S, g, Hp, bp)
+        W, Wk = np.zeros((M, 6, 3)), np.zeros((P, CAMERA, 3))
+        _reduce(
+            s.T, s.X, s.k, self._k3, self._view, self._start_of, self._uv, self._sigma,
+            self._of.huber_sigmas, Hp, bp, damping, self._pair, S, g, B, Hk, gk, W, Wk,
+        )  # fmt: skip
+        own = self._pair[np.arange(N), np.arange(N)]
+        for i in range(6):
+            S[own, i, i] += damping * np.abs(S[own, i, i]) + 1e-9
+        Hk[np.diag_indices(CAMERA)] *= 1.0 + damping
+        solved, border = self._factored(S, N), B.reshape(6 * N, CAMERA)
+        Z = solved(border)
+        reduced, right = Hk - border.T @ Z, gk - Z.T @ g.ravel()
+        return _Equations(solved, border, reduced, g.ravel(), right, Z, Hp, bp, W, Wk)
+
+    def _factored(self, S: F64, N: int) -> Any:
+        """Solves with the symmetric matrix of the blocks ``S``."""
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.linalg import splu
+
+        six = np.arange(6)
+        shape = S.shape
+        rows = np.broadcast_to(6 * self._rows[:, None, None] + six[:, None], shape).ravel()
+        columns = np.broadcast_to(6 * self._columns[:, None, None] + six, shape).ravel()
+        off = np.repeat(self._rows != self._columns, 36)
+        data = S.ravel()
+        both = coo_matrix(
+            (
+                np.concatenate([data, data[off]]),
+                (np.concatenate([rows, columns[off]]), np.concatenate([columns, rows[off]])),
+            ),
+            (6 * N, 6 * N),
+        )
+        options = {"SymmetricMode": True}
+        return splu(
+            both.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
+        ).solve
+
+    def _add_known(self, s: _State, S: F64, g: F64, Hp: F64, bp: F64) -> None:
+        """What fixes, attitudes, the placing and surveyed points add."""
+        known, c = self._of.known, self._of.cauchy_sigmas
+        fixes, attitude, placing, points = self._known_errors(s)
+        R = s.T[:, :3, :3]
+        weight = 1.0 / (1.0 + np.sum(fixes**2, axis=1) / c**2)
+        J = -np.transpose(R, (0, 2, 1)) / known.sigma_fixes[:, :, None]  # of the translation
+        J = np.nan_to_num(J)
+        own = self._pair[np.arange(len(s.T)), np.arange(len(s.T))]
+        S[own, 3:, 3:] += weight[:, None, None] * np.einsum("nij,nik->njk", J, J)
+        g[:, 3:] -= weight[:, None] * np.einsum("nij,ni->nj", J, fixes)
+        turn = np.nan_to_num(known.attitudes / known.sigma_attitudes[:, :, None])
+        S[own, :3, :3] += np.einsum("nij,nik->njk", turn, turn)
+        g[:, :3] -= np.einsum("nij,ni->nj", turn, attitude)
+        S[own] += known.placing
+        g -= np.einsum("nij,nj->ni", known.placing, placing)
+        sure = np.nan_to_num(1.0 / known.sigma_surveyed)
+        for i in range(3):
+            Hp[:, i, i] += sure[:, i] ** 2
+        bp -= sure * points
+
+    # ---- result -----------------------------------------------------------------------------
+
+    def solution(self, s: _State, covariances: bool) -> Solution:
+        """The result at ``s``."""
+        eq = self._equations(s, 0.0)
+        spread = np.linalg.inv(eq.Hk)
+        errors = np.empty(len(self._view))
+        errors[self._order] = self._lengths(s)
+        poses = np.array([se3.inverse(one) for one in s.T])
+        known = self._covariances(eq, spread, poses) if covariances else np.zeros((0, 6, 6))
+        return Solution(poses, s.X, _camera(self._of.camera, s.k), errors, known, spread)
+
+    def _covariances(self, eq: _Equations, spread: F64, poses: F64) -> F64:
+        """(N, 6, 6) of a left perturbation of T_world_camera, the camera's own included."""
+        N = len(poses)
+        some = np.unique(np.linspace(0, N - 1, min(N, MOST_COVARIANCES)).astype(int))
+        out = []
+        for n, T in zip(some, poses[some], strict=True):
+            unit = np.zeros((6 * N, 6))
+            unit[6 * n : 6 * n + 6] = np.eye(6)
+            rows = slice(6 * n, 6 * n + 6)
+            own = eq.solved(unit)[rows] + eq.Z[rows] @ spread @ eq.Z[rows].T
+            A = se3.adjoint(T)
+            out.append(0.5 * A @ (own + own.T) @ A.T)
+        nearest = np.abs(np.arange(N)[:, None] - some).argmin(axis=1)
+        return np.asarray(np.array(out)[nearest])
+
+
+def _vector(camera: Camera) -> F64:
+    K = camera.K
+    return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *camera.distortion[:4]])
+
+
+def _camera(given: Camera, k: F64) -> Camera:
+    K = np.array([[k[0], 0.0, k[2]], [0.0, k[1], k[3]], [0.0, 0.0, 1.0]])
+    distortion = given.distortion.copy()
+    distortion[:4] = k[4:]
+    return replace(given, K=K, distortion=distortion)

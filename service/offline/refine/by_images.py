@@ -1,0 +1,286 @@
+"""A finished scan adjusted by its own images: ``refine --video FLIGHT``.
+
+The keyframes' images, and those that hold marks of surveyed points, are matched again at full
+size. One adjustment has their poses, the places seen, the camera where the flight tells it, what
+telemetry knows and the surveyed points in it. Depth images stay as they are; each is scaled to
+the places that it shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recon import se3
+from recon.calibration.flight import (
+    Network,
+    SelfCalibrationConfig,
+    camera_information,
+    doubt,
+    first_held,
+    network,
+)
+from recon.calibration.global_bundle import Knowledge, Sightings
+from recon.calibration.tracks import with_distortion, without_distortion
+from recon.camera_model import project, rays
+from recon.posegraph.ground_control import (
+    ATTITUDE_S,
+    FIX_S,
+    Adjusted,
+    Mark,
+    Point,
+    Track,
+    map_position,
+)
+from recon.types import F64, Camera, Keyframe
+from service.errors import InputError
+from service.offline.refine import own_camera
+from service.offline.refine.control_points import MARK_PX, Candidate
+from service.offline.refine.revisions import KeyframeState, moved_frames
+from service.offline.refine.survey_file import SurveyPoint
+from service.stream.records import PoseRecord, ScanHeader
+
+FREE = SelfCalibrationConfig()
+HELD = replace(
+    FREE, sigma_focal=1e-5, sigma_aspect=1e-5, sigma_centre=1e-6, sigma_k=1e-6, sigma_p=1e-7
+)
+
+MIN_DEPTHS = 8
+"""Places that a depth image has to show before it is scaled to them."""
+
+Surfaces = Callable[[KeyframeState], Keyframe | None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageNetwork:
+    """What the images tell of a scan."""
+
+    keyframes: int
+    given: Camera
+    camera: Camera  # found, or the one given
+    held: F64  # (8, 8) information of the one given
+    poses: F64  # (V, 4, 4) T_world_camera: those of the keyframes, then of other marked frames
+    points: F64  # (P, 3)
+    seen: Sightings
+    sigma_focal: float
+    doubt: str  # why the camera is held; empty when it is found
+
+    def figures(self, given_focal_px: float) -> dict[str, Any]:
+        """What is reported of the network."""
+        return {
+            "sightings": len(self.seen.view),
+            "places": len(np.unique(self.seen.landmark)),
+            "views": len(self.poses),
+            "focal_px": [round(given_focal_px, 2), round(float(self.camera.K[0, 0]), 2)],
+            "centre_px": [round(float(v), 1) for v in self.camera.K[:2, 2]],
+            "distortion": [round(float(v), 5) for v in self.camera.distortion],
+        }
+
+
+def network_of(
+    video: Path, header: ScanHeader, states: Sequence[KeyframeState],
+    marked: Sequence[PoseRecord], ahead_m: float,
+) -> ImageNetwork:  # fmt: skip
+    """The images of the keyframes, and of the frames ``marked``, tied together.
+
+    Raises InputError when ``video`` is not the scan's.
+    """
+    given = own_camera.camera_of(header)
+    times = [s.time_ns for s in states] + [f.time_unix_ns for f in marked]
+    poses = np.array([one.T_world_camera for one in (*states, *marked)])
+    pictures = own_camera.pictures_at(video, header.started_unix_ns, times)
+    ground_m = float(np.median((poses[:, :3, 3] + ahead_m * poses[:, :3, 2])[:, 2]))
+    _, seen, start = own_camera.sightings(pictures, given, poses, ground_m)
+    span = float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
+    known = replace(
+        Knowledge.none(len(poses), int(seen.landmark.max()) + 1),
+        fixes=poses[:, :3, 3], sigma_fixes=np.full((len(poses), 3), 0.1 * span),
+        placed=poses, placing=first_held(poses),
+    )  # fmt: skip
+    held = camera_information(given, FREE)
+    found = network(given, start, seen, known, held)
+    sigmas = np.sqrt(np.abs(np.diag(found.solution.camera_covariance)))
+    focal = float(sigmas[:2].max() / found.solution.camera.K[0, 0])
+    why = doubt(found.solution.camera, given, focal, FREE)
+    if why:
+        held = camera_information(given, HELD)
+        found = network(given, start, seen, known, held)
+    s = found.solution
+    return ImageNetwork(
+        len(states), given, s.camera, held, s.poses, s.points, found.seen, focal, why
+    )
+
+
+def marked_frames(
+    survey: Sequence[SurveyPoint], frames: Sequence[PoseRecord], states: Sequence[KeyframeState]
+) -> list[PoseRecord]:
+    """Frames beside the keyframes in which surveyed points are marked."""
+    keys = np.array([s.time_ns for s in states])
+    wanted = {
+        round(seen.time_unix_s * 1e9)
+        for point in survey
+        for seen in point.sightings
+        if seen.time_unix_s is not None
+    }
+    out = {}
+    for time_ns in wanted:
+        near = min(frames, key=lambda f: abs(f.time_unix_ns - time_ns), default=None)
+        if near is not None and np.abs(keys - time_ns).min() >= 2_000_000:
+            out[near.time_unix_ns] = near
+    return [out[t] for t in sorted(out)]
+
+
+def as_seen(
+    found: ImageNetwork, states: Sequence[KeyframeState], frames: Sequence[PoseRecord],
+    marked: Sequence[PoseRecord], surface: Surfaces,
+) -> tuple[list[KeyframeState], list[PoseRecord]]:  # fmt: skip
+    """Keyframes and frames as the images have them."""
+    n = len(states)
+    scales = depth_scales(found, found.poses, found.points, found.seen, states, surface)
+    spread = np.array([s.covariance for s in states])
+    moved = moved_frames(frames, states, Adjusted(found.poses[:n], spread, scales, {}, ()), None)
+    own = {f.time_unix_ns: T for f, T in zip(marked, found.poses[n:], strict=True)}
+    moved = [replace(f, T_world_camera=own.get(f.time_unix_ns, f.T_world_camera)) for f in moved]
+    poses = [
+        replace(s, T_world_camera=T, scale=s.scale * float(scale))
+        for s, T, scale in zip(states, found.poses[:n], scales, strict=True)
+    ]
+    return poses, moved
+
+
+def placed(images: ImageNetwork, scale: float, R: F64, t: F64) -> ImageNetwork:
+    """The network in the world that a similarity takes it to."""
+    poses = np.array([se3.compose(R @ T[:3, :3], scale * R @ T[:3, 3] + t) for T in images.poses])
+    return replace(images, poses=poses, points=scale * images.points @ R.T + t)
+
+
+def depth_scales(
+    found: ImageNetwork, poses: F64, points: F64, seen: Sightings,
+    states: Sequence[KeyframeState], surface: Surfaces,
+) -> F64:  # fmt: skip
+    """(N,) what the depth of each keyframe is multiplied by to meet the places that it shows."""
+    flat = rays(found.given.K, without_distortion(found.given, seen.uv_px))
+    out = np.full(len(states), np.nan)
+    for k, state in enumerate(states):
+        keyframe = surface(state)
+        rows = np.flatnonzero(seen.view == k)
+        if keyframe is None or len(rows) < MIN_DEPTHS:
+            continue
+        depth = keyframe.depth
+        h, w = depth.depth_m.shape
+        u, v = np.rint(project(depth.K, flat[rows])).astype(int).T
+        inside = (u >= 0) & (u < w) & (v >= 0) & (v < h)
+        there = se3.transform(se3.inverse(poses[k]), points[seen.landmark[rows[inside]]])[:, 2]
+        ratio = there / depth.depth_m[v[inside], u[inside]]
+        ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
+        if len(ratio) >= MIN_DEPTHS:
+            out[k] = np.median(ratio)
+    usual = float(np.nanmedian(out)) if np.isfinite(out).any() else 1.0
+    return np.where(np.isfinite(out), out, usual)
+
+
+def adjusted(
+    images: ImageNetwork, track: Track, points: Sequence[Point], marks: Sequence[Mark],
+    states: Sequence[KeyframeState], surface: Surfaces,
+) -> tuple[Adjusted, ImageNetwork]:  # fmt: skip
+    """The adjustment with telemetry and surveyed points, and the network after it.
+
+    ``images`` is in the world of ``track``.
+    """
+    n, first = len(track.poses), len(images.points)
+    known = _known(images, track, points, {m.point for m in marks})
+    rows = [
+        (_view_of(images, mark), first + mark.point, project(images.given.K, mark.ray[None]))
+        for mark in marks
+    ]
+    seen = None
+    if rows:
+        at_px = with_distortion(images.given, np.concatenate([row[2] for row in rows]))
+        seen = Sightings(np.array([r[0] for r in rows]), np.array([r[1] for r in rows]), at_px)
+    try:
+        found = network(
+            images.given, images.poses, images.seen, known, images.held, seen, MARK_PX, True
+        )
+    except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
+        raise InputError(f"the images do not tie the scan together ({error})") from error
+    s = found.solution
+    scales = depth_scales(images, s.poses, s.points, found.seen, states, surface)
+    after = replace(images, camera=s.camera, poses=s.poses, seen=found.seen)
+    return Adjusted(s.poses[:n], s.covariances[:n], scales, _residuals(found, known), ()), after
+
+
+def _view_of(images: ImageNetwork, mark: Mark) -> int:
+    """Which view a mark is in: a keyframe, or the marked frame at its pose."""
+    if np.array_equal(mark.T_key_camera, np.eye(4)):
+        return mark.keyframe
+    T, n = images.poses[mark.keyframe] @ mark.T_key_camera, images.keyframes
+    return n + int(np.argmin(np.linalg.norm(images.poses[n:, :3, 3] - T[:3, 3], axis=1)))
+
+
+def _known(
+    images: ImageNetwork, track: Track, points: Sequence[Point], used: set[int]
+) -> Knowledge:
+    """What telemetry, or the placing that the flight ended with, and the survey tell."""
+    n, first = len(track.poses), len(images.points)
+    out = Knowledge.none(len(images.poses), first + len(points))
+    for k in used:
+        out.surveyed[first + k] = points[k].position_m
+        out.sigma_surveyed[first + k] = np.maximum(points[k].sigma_m, 1e-3)
+    out.placed[:n] = track.poses
+    if not track.priors:
+        floor = np.diag([1e-8] * 3 + [1e-6] * 3)
+        for k, (T, spread) in enumerate(zip(track.poses, track.covariances, strict=True)):
+            A = se3.adjoint(se3.inverse(T))
+            out.placing[k] = np.linalg.inv(n * A @ (spread + floor) @ A.T)
+        return out
+    out.placing[0] = first_held(track.poses)[0] * 1e-4
+    gap_s = max(float(np.median(np.diff(track.times_s))), 1e-3)
+    for k, prior in enumerate(track.priors):
+        if prior.position_m is not None and prior.sigma_position_m is not None:
+            out.fixes[k] = prior.position_m
+            sigma = np.maximum(prior.sigma_position_m, 0.005)
+            out.sigma_fixes[k] = sigma * np.sqrt(max(1.0, 2.0 * FIX_S / gap_s))
+        if prior.R_world_camera is not None:
+            yaw = prior.sigma_yaw_rad if prior.sigma_yaw_rad < 1.0 else 10.0
+            sigma = np.array([prior.sigma_tilt_rad, prior.sigma_tilt_rad, yaw])
+            out.attitudes[k] = prior.R_world_camera
+            out.sigma_attitudes[k] = sigma * np.sqrt(max(1.0, 2.0 * ATTITUDE_S / gap_s))
+    return out
+
+
+def _residuals(found: Network, known: Knowledge) -> dict[str, F64]:
+    """Whitened, by kind."""
+    s = found.solution
+    errors = s.errors_px[: len(found.seen.view)] / found.sigma_px / np.sqrt(2.0)
+    out = {
+        "pixels": errors[np.isfinite(errors), None],
+        "position": (s.poses[:, :3, 3] - known.fixes) / known.sigma_fixes,
+        "survey": (s.points - known.surveyed) / known.sigma_surveyed,
+    }
+    return {kind: rows[np.isfinite(rows).all(axis=1)] for kind, rows in out.items()}
+
+
+def crossing_marks(candidate: Candidate, poses: F64) -> None:
+    """Let the rays of its marks tell where the map has a point, if they cross."""
+    bare = [replace(m, depth_m=None) for m in candidate.marks]
+    crossing = map_position(poses, np.ones(len(poses)), bare)
+    if crossing is not None:
+        candidate.marks = bare
+        candidate.before_m, candidate.sigma_before_m = crossing
+        candidate.why_not = ""
+
+
+def carried_marks(candidate: Candidate, before: ImageNetwork, after: ImageNetwork) -> list[Mark]:
+    """A point's marks with the poses that its frames have after the adjustment."""
+    out = []
+    for mark in candidate.marks:
+        view = _view_of(before, mark)
+        if view >= before.keyframes:
+            T = se3.inverse(after.poses[mark.keyframe]) @ after.poses[view]
+            mark = replace(mark, T_key_camera=T)
+        out.append(mark)
+    return out
