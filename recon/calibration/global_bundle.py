@@ -421,7 +421,7 @@ class _Bundle:
     def solution(self, s: _State, covariances: bool) -> Solution:
         """The result at ``s``."""
         eq = self._equations(s, 0.0)
-        spread = np.linalg.inv(eq.Hk)
+        spread = np.asarray(np.linalg.inv(eq.Hk), np.float64)
         errors = np.empty(len(self._view))
         errors[self._order] = self._lengths(s)
         poses = np.array([se3.inverse(one) for one in s.T])
