@@ -170,6 +170,7 @@ def network(
             covariances=covariances and gate < 15.0,
         )
         poses, camera = solution.poses, solution.camera
+    assert solution is not None
     return Network(solution, kept, sigma)
 
 
