@@ -45,7 +45,7 @@ def depth_of(T: F64) -> F64:
     return np.asarray(-T[2, 3] / (ways @ T[:3, :3].T)[..., 2])
 
 
-def made(folder: Path, truth: F64) -> Path:
+def made(folder: Path, truth: F64, placed: bool = True) -> Path:
     """A scan whose poses err one by one and whose surfaces are 4 % too deep, and its stills."""
     rng = np.random.default_rng(4)
     camera = {"width": SIZE[0], "height": SIZE[1], "K": K.ravel().tolist(), "distortion": [0.0] * 5}
@@ -54,6 +54,8 @@ def made(folder: Path, truth: F64) -> Path:
         origin_lon_deg=FRAME.lon_deg, origin_alt_amsl_m=FRAME.alt_amsl_m, epsg=FRAME.epsg,
         georeference="gnss",
     )  # fmt: skip
+    if not placed:
+        header = ScanHeader("test-1", "drone-1", START_NS, camera=camera)
     spread = np.diag([0.02**2] * 3 + [1.0] * 3)
     (folder / "stills").mkdir()
     with ScanStore.create(folder / "scan" / "scan.db", header) as store:
@@ -117,6 +119,16 @@ def test_images_and_control_points_bring_a_bent_scan_to_the_truth(tmp_path: Path
             assert np.sqrt(np.diag(found.pose.covariance)[3:]).max() < 1.0
     back = CliRunner().invoke(app, ["refine", str(scan), "--undo"])
     assert back.exit_code == 0, back.output
+
+
+def test_a_scan_without_a_place_takes_its_images_along(tmp_path: Path) -> None:
+    truth = flown()
+    scan, points = made(tmp_path, truth, placed=False), survey(tmp_path / "points.csv", truth)
+    command = ["refine", str(scan), "--video", str(tmp_path / "stills"), "--gcp", str(points)]
+    answer = CliRunner().invoke(app, [*command, "--json"])
+    assert answer.exit_code == 0, answer.output
+    figures = json.loads(answer.stdout.splitlines()[-1])
+    assert figures["check"]["rms_h_after_m"] < 0.05 and figures["check"]["rms_v_after_m"] < 0.1
 
 
 def test_a_video_of_something_else_changes_nothing(tmp_path: Path) -> None:

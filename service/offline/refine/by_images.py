@@ -152,7 +152,7 @@ def as_seen(
     return poses, moved
 
 
-def placed(images: ImageNetwork, scale: float, R: F64, t: F64) -> ImageNetwork:
+def in_world(images: ImageNetwork, scale: float, R: F64, t: F64) -> ImageNetwork:
     """The network in the world that a similarity takes it to."""
     poses = np.array([se3.compose(R @ T[:3, :3], scale * R @ T[:3, 3] + t) for T in images.poses])
     return replace(images, poses=poses, points=scale * images.points @ R.T + t)

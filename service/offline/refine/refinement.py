@@ -45,6 +45,7 @@ from service.offline.refine.by_images import (
     as_seen,
     carried_marks,
     crossing_marks,
+    in_world,
     marked_frames,
     network_of,
 )
@@ -296,7 +297,7 @@ class _Refinement:
             for f in self.frames
         ]  # fmt: skip
         if self.images is not None:
-            self.images = placed(self.images, scale, R, t)
+            self.images = in_world(self.images, scale, R, t)
         f = self.frame
         self.header = replace(
             self.header, origin_lat_deg=f.lat_deg, origin_lon_deg=f.lon_deg,
@@ -430,7 +431,7 @@ class _Refinement:
 
     def _left_out(
         self, track: Track, candidates: Sequence[Candidate]
-    ) -> dict[str, list[float | None]]:
+    ) -> dict[str, list[float | None] | None]:
         """How far each control point is off where the others alone put it, by name.
 
         Empty for fewer than four control points: three are needed without it.
@@ -438,7 +439,8 @@ class _Refinement:
         used = [c for c in candidates if c.usable and not c.point.is_check]
         if len(used) <= MIN_OTHERS:
             return {}
-        points, out = _points(candidates), {}
+        points = _points(candidates)
+        out: dict[str, list[float | None] | None] = {}
         for one in used:
             marks = [m for c in used if c is not one for m in c.marks]
             mine = one.marks
