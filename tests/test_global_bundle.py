@@ -144,7 +144,7 @@ def test_fixes_attitudes_and_a_placing_hold_what_pixels_leave_open() -> None:
         replace(none, placed=there, placing=np.tile(100.0 * np.eye(6), (len(T), 1, 1))),
     ):  # fmt: skip
         start = se3.transform(shift, points)
-        near = np.array([se3.compose(np.eye(3), [3.0, -2.0, 1.0]) @ one for one in there])
+        near = np.array([se3.compose(np.eye(3), np.array([3.0, -2.0, 1.0])) @ one for one in there])
         problem = Problem(TRUE, TRUE, near, start, seen, sigmas, known, held)
         found = solve(problem, 80)
         assert np.abs(found.poses[:, :3, 3] - there[:, :3, 3]).max() < 0.01

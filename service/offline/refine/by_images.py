@@ -91,7 +91,7 @@ def network_of(
     """
     given = own_camera.camera_of(header)
     times = [s.time_ns for s in states] + [f.time_unix_ns for f in marked]
-    poses = np.array([one.T_world_camera for one in (*states, *marked)])
+    poses = np.array([s.T_world_camera for s in states] + [f.T_world_camera for f in marked])
     pictures = own_camera.pictures_at(video, header.started_unix_ns, times)
     ground_m = float(np.median((poses[:, :3, 3] + ahead_m * poses[:, :3, 2])[:, 2]))
     _, seen, start = own_camera.sightings(pictures, given, poses, ground_m)
