@@ -21,6 +21,8 @@ EPOCH = 1777629600  # of the simulated video; a transport stream does not carry 
 
 Run = subprocess.CompletedProcess[str]
 
+SPARSE = ("--set", "compute.stereo_width=320")
+
 
 def skyrelief(*arguments: str | Path, stdin: Any = subprocess.DEVNULL) -> Run:
     command = [sys.executable, "-m", "service.cli", *map(str, arguments)]
@@ -42,7 +44,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def replay_of(flight: Path, out: Path, *more: str | Path) -> Run:
     return skyrelief(
         "replay", flight / "flight.mp4", "--telemetry", flight / "flight.tlog",
-        "--camera-model", flight / "camera.yaml", "--out", out, "--json", *more,
+        "--camera-model", flight / "camera.yaml", "--out", out, "--json", *SPARSE, *more,
     )  # fmt: skip
 
 
@@ -116,7 +118,7 @@ def test_a_pipe_gives_the_same_cloud_as_the_file(
     done = skyrelief(
         "replay", "-", "--telemetry", flight / "flight.tlog", "--camera-model",
         flight / "camera.yaml", "--out", tmp_path / "scan", "--json",
-        "--video-epoch", str(EPOCH), stdin=muxed.stdout,
+        "--video-epoch", str(EPOCH), *SPARSE, stdin=muxed.stdout,
     )  # fmt: skip
     muxed.wait(timeout=20)
     assert done.returncode == 0, done.stderr
