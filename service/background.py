@@ -100,10 +100,12 @@ class BackgroundWorker(Generic[In, Out]):
         work: Callable[[In], Out],
         bound: int,
         live: bool = False,
-        prepare: Callable[[], object] = lambda: None,
+        prepare: Callable[[], object] | None = None,
     ) -> None:
-        """``prepare`` is called once on the thread, before any work."""
+        """``prepare`` is called once on the thread, with the first work; what it raises counts as
+        raised by that work, and it is called again with the next."""
         self._work, self._bound, self._live = work, bound, live
+        self._prepare = prepare if row is not None else None
         self._offered: dict[Future[Out], In] = {}  # in order; dropped items leave at once
         self.dropped = 0
         self._began_s: list[float] = []  # start of the current work, if any
@@ -112,7 +114,7 @@ class BackgroundWorker(Generic[In, Out]):
         if row is not None:
             todo, began_s = self._todo, self._began_s
             self._worker = PROCESS.start(
-                row, lambda _: _run(todo, prepare), todo.qsize, lambda: _since(began_s)
+                row, lambda _: _run(todo), todo.qsize, lambda: _since(began_s)
             )
             weakref.finalize(self, todo.put, None)  # also when it is never closed
 
@@ -139,13 +141,17 @@ class BackgroundWorker(Generic[In, Out]):
             self.dropped += 1
 
     def finished(self, everything: bool = False) -> list[tuple[In, Out]]:
-        """Finished work, in order; ``everything`` waits for the rest. Raises what work raised."""
-        out = []
+        """Finished work, in order; ``everything`` waits for the rest.
+
+        Raises what work raised, but first returns what was done before it.
+        """
+        out: list[tuple[In, Out]] = []
         while self._offered:
             future = next(iter(self._offered))
             if not everything and not future.done():
                 break
-            future.exception()  # waits
+            if future.exception() is not None and out:  # waits
+                break
             out.append((self._offered.pop(future), future.result()))
         return out
 
@@ -163,6 +169,9 @@ class BackgroundWorker(Generic[In, Out]):
             return
         self._began_s.append(time.monotonic())
         try:
+            if self._prepare is not None:
+                self._prepare()
+                self._prepare = None
             result = self._work(self._offered[future])
         except Exception as error:  # raised where the result is taken
             self._began_s.clear()
@@ -172,8 +181,7 @@ class BackgroundWorker(Generic[In, Out]):
             future.set_result(result)
 
 
-def _run(todo: SimpleQueue[Callable[[], None] | None], prepare: Callable[[], object]) -> None:
-    prepare()
+def _run(todo: SimpleQueue[Callable[[], None] | None]) -> None:
     while (job := todo.get()) is not None:
         job()
         del job  # releases the owner, whose finaliser ends this thread

@@ -9,7 +9,7 @@ line with its equation. The stages are built from the configuration by
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from recon.posegraph.trajectory import Placed
 from recon.tracking.odometry import Tracked
@@ -82,19 +82,23 @@ class Pipeline:
         sigma_m, fresh = s.map(view, depth, s.chain.map_pose(view.seq))  # map: what is new
         return s.keyframe(view, depth, sigma_m, fresh, placed)
 
-    def finish(self) -> Step:
-        """The views still waiting for partners, and the last corrections."""
+    def drain(self) -> Step:
+        """The views still waiting for partners, up to one whose work failed."""
         s = self.stages
         s.views.end_stretch()
         for view in s.views.ready(everything=True):
             self._beside.offer(view)
+        tracked = Tracked("lost", s.track.segment, reason="end of the recording")
+        return Step(tracked, keyframes=self._finished(everything=True))
+
+    def finish(self) -> Step:
+        """What :meth:`drain` has left, and the last corrections. Raises what work raised."""
         try:
-            keyframes = self._finished(everything=True)
+            step = self.drain()
         finally:
             self._beside.close()
-        s.map.clear()
-        tracked = Tracked("lost", s.track.segment, reason="end of the recording")
-        return Step(tracked, keyframes=keyframes, moved=s.chain.corrections(final=True))
+        self.stages.map.clear()
+        return replace(step, moved=self.stages.chain.corrections(final=True))
 
     def _finished(self, everything: bool = False) -> tuple[Keyframe, ...]:
         """Keyframes that are done, in order."""

@@ -65,7 +65,10 @@ class Recorder:
 
     def flush(self) -> None:
         """Write what the pipeline still holds and correct the trajectory; call it once."""
-        self._write_keyframes(self.pipeline.finish())
+        try:
+            self._write_keyframes(self.pipeline.drain())
+        finally:
+            self._write_keyframes(self.pipeline.finish())
         self._correct_trajectory()
         self._told.close()
 
