@@ -12,8 +12,11 @@ from recon.types import F64
 
 
 def hat(w: F64) -> F64:
-    """(3, 3) cross-product matrix of (3,) ``w``."""
-    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+    """(..., 3, 3) cross-product matrices of (..., 3) ``w``."""
+    out = np.zeros((*w.shape, 3))
+    out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
+    out[..., 1, 2], out[..., 2, 0], out[..., 0, 1] = -w[..., 0], -w[..., 1], -w[..., 2]
+    return out
 
 
 def so3_exp(w: F64) -> F64:

@@ -10,7 +10,7 @@ import pytest
 from flown_track import SPREAD, landed, sensed, tell
 
 from recon import se3
-from recon.posegraph.interpolated import KEYFRAME, Carrier, left
+from recon.posegraph.interpolated import KEYFRAME, left
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.records import Loop, Node
 from recon.posegraph.thinning import moved_loops, over_gaps, surplus, thinned
@@ -135,7 +135,7 @@ def test_of_what_was_never_told_the_node_before_tells() -> None:
     rows, poses = np.zeros(2, KEYFRAME), np.array([se3.exp(rng.normal(size=6)) for _ in range(2)])
     rows["pose"], rows["scale"], rows["published"] = poses[:, :3], 3.0, [2, 0]
     node = se3.exp(rng.normal(size=6))
-    T, scales = left(rows, Carrier(0, np.eye(4), node, 2.0))
+    T, scales = left(rows, node, np.array(2.0))
     np.testing.assert_array_equal(T, [poses[0], node])
     assert scales.tolist() == [3.0, 2.0]
 

@@ -1,4 +1,4 @@
-"""Factors of the pose graph that GTSAM does not bring, and conversions to its conventions.
+"""Factors of the adjustment that GTSAM does not bring, and conversions to its conventions.
 
 GTSAM perturbs poses on the right; this package on the left. Both put the rotation first.
 """
@@ -16,20 +16,9 @@ MOST_LOG = 20.0
 """Of a scale that a step of the solver may ask about."""
 
 
-def reversed_motion(T: F64, covariance: F64) -> tuple[F64, F64]:
-    """T_b_a and its (6, 6) covariance in b's frame, from T_a_b and that in a's frame."""
-    return se3.inverse(T), right_covariance(T, covariance)
-
-
 def right_covariance(T: F64, covariance: F64) -> F64:
     """(6, 6) covariance of the right perturbation of ``T`` from that of the left."""
     A = se3.adjoint(se3.inverse(T))
-    return np.asarray(A @ covariance @ A.T)
-
-
-def left_covariance(T: F64, covariance: F64) -> F64:
-    """(6, 6) covariance of the left perturbation of ``T`` from that of the right."""
-    A = se3.adjoint(T)
     return np.asarray(A @ covariance @ A.T)
 
 

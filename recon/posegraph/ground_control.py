@@ -19,6 +19,7 @@ from recon import se3
 from recon.posegraph import factors as graph_factors
 from recon.posegraph.factors import matrix, pose3
 from recon.posegraph.records import loops_agree
+from recon.posegraph.smoother import left_covariance
 from recon.types import F64, Bool, PosePrior
 
 CHI2_LIMIT = 22.5
@@ -280,7 +281,7 @@ class _Batch:
         marginals = self._gtsam.Marginals(self._graph, self._values)
         poses = np.array([matrix(self._values.atPose3(key)) for key in range(n)])
         spread = [
-            graph_factors.left_covariance(T, np.asarray(marginals.marginalCovariance(key)))
+            left_covariance(T, np.asarray(marginals.marginalCovariance(key)))
             for key, T in enumerate(poses)
         ]
         logs = [float(self._values.atVector(self._scale_key(key))[0]) for key in range(n)]

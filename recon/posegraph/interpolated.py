@@ -11,10 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from recon import se3
 from recon.posegraph.ledger import Rows
-from recon.types import F64
+from recon.types import F64, Bool
+
+I64 = npt.NDArray[np.int64]
 
 KEYFRAME = np.dtype(
     [
@@ -32,35 +35,57 @@ KEYFRAME = np.dtype(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Carrier:
-    """A node that others hang on."""
+class Spans:
+    """Stretches between two neighbouring nodes that others hang on."""
 
-    row: int  # in the ledger
-    T_odom_camera: F64  # (4, 4)
-    T_world_camera: F64  # (4, 4)
-    scale: float  # metres per unit of the odometry
-
-
-def interpolated(rows: Rows, first: int, before: Carrier, after: Carrier) -> tuple[F64, F64]:
-    """(N, 4, 4) poses and (N,) scales of the ledger's rows from ``first`` on, between two nodes."""
-    inverse = se3.inverse(before.T_odom_camera)
-    motions = inverse @ whole(rows["odom"])
-    motions[:, :3, 3] *= before.scale
-    poses = before.T_world_camera @ motions
-    last = inverse @ after.T_odom_camera
-    last[:3, 3] *= before.scale
-    miss = se3.log(after.T_world_camera @ se3.inverse(before.T_world_camera @ last))
-    share = (first - before.row + np.arange(len(rows))) / (after.row - before.row)
-    mended = np.array([se3.exp(s * miss) for s in share]).reshape(-1, 4, 4)
-    return mended @ poses, before.scale * (after.scale / before.scale) ** share
+    rows: I64  # (G, 2) of the nodes in the ledger
+    T_odom_camera: F64  # (G, 2, 4, 4)
+    T_world_camera: F64  # (G, 2, 4, 4)
+    scale: F64  # (G, 2) metres per unit of the odometry
+    is_seen: Bool  # (G,) both nodes are of one segment
 
 
-def left(rows: Rows, before: Carrier) -> tuple[F64, F64]:
+def interpolated(rows: Rows, number: I64, span: I64, spans: Spans) -> tuple[F64, F64]:
+    """(N, 4, 4) poses and (N,) scales of the ledger's rows ``number`` (N,), each in its span."""
+    inverse = np.linalg.inv(spans.T_odom_camera[:, 0])
+    scale, T = spans.scale[:, 0], spans.T_world_camera[:, 0]
+    motions = inverse[span] @ whole(rows["odom"])
+    motions[:, :3, 3] *= scale[span, None]
+    last = inverse @ spans.T_odom_camera[:, 1]
+    last[:, :3, 3] *= scale[:, None]
+    miss = spans.T_world_camera[:, 1] @ np.linalg.inv(T @ last)
+    twists = np.array([se3.log(one) for one in miss])
+    share = (number - spans.rows[span, 0]) / np.diff(spans.rows, axis=1)[span, 0]
+    poses = screws(twists[span], share) @ T[span] @ motions
+    scales = scale[span] * (spans.scale[:, 1] / scale)[span] ** share
+    is_left = ~spans.is_seen[span]
+    if is_left.any():
+        poses[is_left], scales[is_left] = left(
+            rows[is_left], T[span][is_left], scale[span][is_left]
+        )
+    return poses, scales
+
+
+def screws(twists: F64, shares: F64) -> F64:
+    """(N, 4, 4) motions by shares (N,) of twists (N, 6)."""
+    angle = np.maximum(np.linalg.norm(twists[:, :3], axis=1, keepdims=True), 1e-12)
+    axis, turned = se3.hat(twists[:, :3] / angle), shares[:, None] * angle
+    across = np.einsum("nij,nj->ni", axis, twists[:, 3:])
+    along = np.einsum("nij,nj->ni", axis, across)
+    sine, rest = np.sin(turned), 1.0 - np.cos(turned)
+    out = np.tile(np.eye(4), (len(shares), 1, 1))
+    out[:, :3, :3] += sine[..., None] * axis + rest[..., None] * (axis @ axis)
+    out[:, :3, 3] = shares[:, None] * twists[:, 3:] + rest / angle * across
+    out[:, :3, 3] += (turned - sine) / angle * along
+    return out
+
+
+def left(rows: Rows, T_before: F64, scale_before: F64) -> tuple[F64, F64]:
     """(N, 4, 4) poses and (N,) scales of the ledger's rows that no node carries: as published,
-    and in the place of the node ``before`` them if they never were."""
+    and in the place of the node before them, (N, 4, 4) and (N,), if they never were."""
     told = rows["published"] > 0
-    poses = np.where(told[:, None, None], whole(rows["pose"]), before.T_world_camera)
-    return poses, np.where(told, rows["scale"], before.scale)
+    poses = np.where(told[:, None, None], whole(rows["pose"]), T_before)
+    return poses, np.where(told, rows["scale"], scale_before)
 
 
 def whole(parts: F64) -> F64:

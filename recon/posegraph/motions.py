@@ -10,13 +10,11 @@ from collections import Counter
 import numpy as np
 
 from recon import se3
-from recon.posegraph import factors as graph_factors
 from recon.posegraph.between_keyframes import carried
-from recon.posegraph.factors import pose3
 from recon.posegraph.readings import BLOCK
 from recon.posegraph.records import Node, PoseGraphConfig
 from recon.posegraph.segment_frames import SegmentFrames
-from recon.posegraph.smoother import SCALAR, Smoother
+from recon.posegraph.smoother import NO_SCALE, Smoother, left_covariance
 from recon.types import F64
 
 VELOCITY_S = 1.0
@@ -34,14 +32,11 @@ class Motions:
         counts: Counter[str],
     ) -> None:
         """``counts`` takes in the stretches without vision."""
-        import gtsam
-
-        self._gtsam = gtsam
         self._config, self._smoother = config, smoother
         self._segments, self._counts = segments, counts
-        self.scale_of: list[int] = []  # key of each keyframe's scale; 0 while it has none
-        self._blocks: dict[int, tuple[list[int], int, int]] = {}
-        # keys of scales, keyframe of the last, and how many keyframes that block stands for
+        self.scale_of: list[int] = []  # key of each keyframe's scale, or NO_SCALE
+        self._blocks: dict[int, tuple[int, int, int]] = {}
+        # by segment, its last scale, that scale's first node, and how many keyframes it stands for
 
     def first(self, node: Node) -> tuple[F64, F64]:
         """Pose and covariance of the first keyframe: loose where readings will tell.
@@ -55,9 +50,9 @@ class Motions:
             known = float(np.sqrt(np.linalg.eigvalsh(frame.covariance[:3, :3])[-1]))
             sigma_t, sigma_r = 50.0, max(sigma_r, min(known, 1.0))
         sigma = np.array([sigma_r] * 3 + [sigma_t] * 3)
-        noise = self._gtsam.noiseModel.Diagonal.Sigmas(sigma)
-        self._smoother.add(self._gtsam.PriorFactorPose3(node.key, pose3(T), noise), "prior")
-        return T, graph_factors.left_covariance(T, np.diag(sigma**2))
+        self._smoother.add_turn("prior", node.key, T[:3, :3], sigma[:3])
+        self._smoother.add_place("prior place", node.key, T[:3, 3], sigma[3:])
+        return T, left_covariance(T, np.diag(sigma**2))
 
     def add(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
         """T_last_node in metres and its (6, 6) covariance, left, in last's frame; now a factor."""
@@ -74,42 +69,26 @@ class Motions:
         Blocks keep the smoother incremental: one variable for the whole flight would tie every
         keyframe to the newest reading.
         """
-        gtsam = self._gtsam
-        keys, since, held = self._blocks.get(node.segment, ([], 0, 0))
-        if keys and node.key - since < BLOCK:
-            if self.scale_of[node.key] != keys[-1]:
-                self._blocks[node.segment] = (keys, since, held + node.weight)
-            self.scale_of[node.key] = keys[-1]
-            return keys[-1]
-        key = int(gtsam.symbol(SCALAR, len(keys) + 1_000_000 * node.segment))
-        one = gtsam.noiseModel.Isotropic
-        if keys:
-            value = self._smoother.scalar(keys[-1])
-            walk = self._config.sigma_scale_walk * float(np.sqrt(max(1.0, held / BLOCK)))
-            hold = gtsam.BetweenFactorVector(keys[-1], key, np.zeros(1), one.Sigma(1, walk))
-        else:
-            value, sigma = 0.0, self._config.sigma_scale
-            hold = gtsam.PriorFactorVector(key, np.zeros(1), one.Sigma(1, sigma))
-        self._smoother.add(hold, "scale")
-        self._smoother.add_scalar(key, value)
-        self._blocks[node.segment] = ([*keys, key], node.key, node.weight)
+        key, since, held = self._blocks.get(node.segment, (NO_SCALE, 0, 0))
+        if key == NO_SCALE or node.key - since >= BLOCK:
+            before, since = key, node.key
+            log = float(self._smoother.logs()[before])
+            sigma = self._config.sigma_scale
+            if before != NO_SCALE:
+                sigma = self._config.sigma_scale_walk * float(np.sqrt(max(1.0, held / BLOCK)))
+            key, held = self._smoother.append_scale(log), 0
+            self._smoother.add_scale("scale", (before, key), 0.0, sigma)
+        if self.scale_of[node.key] != key:
+            self._blocks[node.segment] = (key, since, held + node.weight)
         self.scale_of[node.key] = key
         return key
 
     def _connect(self, node: Node, last: Node, motion: F64, covariance: F64) -> None:
         """The motion between two keyframes; of an aligned segment, with its scale left open."""
-        gtsam = self._gtsam
-        noise = gtsam.noiseModel.Gaussian.Covariance(
-            graph_factors.right_covariance(motion, covariance)
-        )
-        if node.segment != last.segment or self._segments.known(node.segment) is None:
-            kind = "vision" if node.segment == last.segment else "link"
-            factor = gtsam.BetweenFactorPose3(last.key, node.key, pose3(motion), noise)
-            self._smoother.add(factor, kind)
-            return
-        keys = [last.key, node.key, self.scale_key(node)]
-        error = graph_factors.scaled_motion_error(motion)
-        self._smoother.add(gtsam.CustomFactor(noise, keys, error), "vision")
+        kind, scale = "vision" if node.segment == last.segment else "link", NO_SCALE
+        if kind == "vision" and self._segments.known(node.segment) is not None:
+            scale = self.scale_key(node)
+        self._smoother.add_motion(kind, (last.key, node.key), motion, covariance, scale)
 
     def _seen(self, node: Node, last: Node) -> tuple[F64, F64]:
         """Vision's motion."""
@@ -139,7 +118,7 @@ class Motions:
         motion = se3.inverse(T_last) @ T
         # Where it went and how it turned are told apart: the one does not swing by the other.
         apart = np.diag(np.square([sigma_r] * 3 + [sigma_m] * 3))
-        return motion, graph_factors.left_covariance(motion, apart)
+        return motion, left_covariance(motion, apart)
 
     def _velocity(self, last: Node, T_last: F64) -> F64 | None:
         """(3,) m/s at a segment's keyframe, over a second or more; None at its start, and where

@@ -16,16 +16,14 @@ from dataclasses import replace
 import numpy as np
 
 from recon import se3
-from recon.posegraph import factors as graph_factors
 from recon.posegraph.alignment import Scale, Similarity
-from recon.posegraph.factors import pose3
 from recon.posegraph.loop_book import Edge, LoopBook
 from recon.posegraph.motions import Motions
-from recon.posegraph.readings import Readings, is_frozen
+from recon.posegraph.readings import Readings, is_frozen, sound
 from recon.posegraph.records import Loop, Node, PoseGraphConfig
 from recon.posegraph.segment_frames import SegmentFrames
 from recon.posegraph.sensor_offsets import Constants
-from recon.posegraph.smoother import ROUNDS, Smoother, moved_covariance
+from recon.posegraph.smoother import MANY_STEPS, STEPS, Smoother, moved_covariance, reversed_motion
 from recon.posegraph.thinning import GONE_SHARE, thin
 from recon.types import F64, Pose, PosePrior
 
@@ -90,7 +88,7 @@ class PoseGraph:
         above, lean = height if height is not None else (None, 0.0)
         node = Node(
             seq, len(self._nodes), time_ns, segment, np.array(T_odom_camera, np.float64),
-            np.array(covariance, np.float64), self._fresh(prior), above, lean,
+            np.array(covariance, np.float64), self._fresh(sound(prior)), above, lean,
         )  # fmt: skip
         last = self._newest() if self._nodes else None
         self._keep(node)
@@ -100,11 +98,8 @@ class PoseGraph:
         elif is_refitted:
             self.rebuild()
         else:
-            try:
-                self._insert(node, last)
-                self._smoother.update()
-            except RuntimeError:
-                self.rebuild()
+            self._insert(node, last)
+            self._solve()
         return self.pose(seq)
 
     def add_loop(self, a: int, b: int, T_a_b: F64, covariance: F64, growth: float = 1.0) -> bool:
@@ -119,7 +114,7 @@ class PoseGraph:
             raise ValueError(f"keyframes {a} and {b} are not two of the graph")
         if a > b:
             a, b, growth = b, a, 1.0 / growth
-            T_a_b, covariance = graph_factors.reversed_motion(T_a_b, covariance)
+            T_a_b, covariance = reversed_motion(T_a_b, covariance)
         scale = self.scale(a)
         ratio = growth * self.scale(b) / scale
         loop = Loop(a, b, T_a_b, covariance, ratio).scaled(1.0 / scale)
@@ -129,12 +124,9 @@ class PoseGraph:
         if self._tie(loop):
             self.rebuild()
             return True
-        try:
-            for item in fresh:
-                self._add_loop_factor(item)
-            self._smoother.update(now=True, rounds=ROUNDS)
-        except RuntimeError:
-            self.rebuild()
+        for item in fresh:
+            self._add_loop_factor(item)
+        self._solve(now=True, steps=MANY_STEPS)
         return True
 
     def solve(self) -> None:
@@ -212,10 +204,8 @@ class PoseGraph:
     def scale(self, seq: int) -> float:
         """Metres per unit of the odometry at keyframe ``seq``."""
         node = self._nodes[seq]
-        key = self._motions.scale_of[node.key]
-        return self._segments.frame(node.segment).scale * float(
-            np.exp(self._smoother.scalar(key) if key else 0.0)
-        )
+        log = self._smoother.logs()[self._motions.scale_of[node.key]]
+        return self._segments.frame(node.segment).scale * float(np.exp(log))
 
     def poses(self) -> dict[int, F64]:
         """(4, 4) T_world_camera of every node."""
@@ -237,18 +227,17 @@ class PoseGraph:
 
     def scales(self) -> F64:
         """(N,) metres per unit of the odometry, in the order of the keyframes."""
-        blocks, block = np.unique(np.array(self._motions.scale_of, np.int64), return_inverse=True)
-        drift = np.array([self._smoother.scalar(int(key)) if key else 0.0 for key in blocks])
         frames = [
             np.full(len(nodes), self._segments.frame(segment).scale)
             for segment, nodes in self._segments.nodes.items()
         ]
-        return np.asarray(np.concatenate(frames) * np.exp(drift[block]))
+        logs = self._smoother.logs()[self._motions.scale_of]
+        return np.asarray(np.concatenate(frames) * np.exp(logs))
 
     def residuals(self) -> dict[str, F64]:
         """Whitened residuals by kind of factor: "vision", "attitude", "position", "altitude",
         "height", "loop", "link" and "prior"; (n, dimension) each."""
-        self._smoother.update(now=True)
+        self._solve(now=True)
         return self._smoother.residuals()
 
     def newest_scales(self) -> tuple[Scale | None, Scale | None]:
@@ -257,12 +246,9 @@ class PoseGraph:
 
     # ---- building ------------------------------------------------------------------------------
 
-    def _start(self, careful: bool = False) -> None:
-        import gtsam
-
-        self._gtsam = gtsam
+    def _start(self) -> None:
         self._built += 1
-        self._smoother = Smoother(careful)
+        self._smoother = Smoother()
         self._left_out: Counter[str] = Counter()
         times = [n.time_ns for n in self._nodes.values()]
         span_s = (times[-1] - times[0]) * 1e-9 if times else 0.0
@@ -275,37 +261,23 @@ class PoseGraph:
         self._path: list[float] = []  # m flown up to each keyframe
 
     def rebuild(self) -> None:
-        """Make the whole graph anew from all readings and the segments' present frames.
-
-        Where full steps lead nowhere it is made once more with careful ones. Where those find no
-        solution either, poses are as vision predicts them until it is made again.
-        """
-        try:
-            self._make()
-            if self._smoother.is_sound():
-                return
-            why = "its scales went astray"
-        except RuntimeError as error:  # GTSAM: an indeterminate system, by steps gone wild
-            why = " ".join(str(error).split()[:9])
-        log.warning("the pose graph is solved again, carefully: %s", why)
-        self._kept_counts["solved again"] += 1
-        try:
-            self._make(careful=True)
-            is_sound = self._smoother.is_sound()
-        except RuntimeError as error:
-            log.error("the pose graph has no solution: %s", " ".join(str(error).split()[:9]))
-            is_sound = False
-        self._kept_counts["solved badly"] += not is_sound
-
-    def _make(self, careful: bool = False) -> None:
-        self._start(careful)
+        """Make the whole graph anew from all readings and the segments' present frames."""
+        self._start()
         last: Node | None = None
         for node in self._nodes.values():
             self._insert(node, last)
             last = node
         for loop in self._book.taken:
             self._add_loop_factor(loop)
-        self._smoother.update(now=True, rounds=ROUNDS)
+        self._solve(now=True, steps=MANY_STEPS)
+
+    def _solve(self, now: bool = False, steps: int = STEPS) -> None:
+        """Solve what waits, when it is due; without a solution it stays as vision predicts it."""
+        try:
+            self._smoother.update(now, steps)
+        except RuntimeError as error:
+            log.error("the pose graph has no solution: %s", error)
+            self._kept_counts["solved badly"] += 1
 
     def _thin(self) -> None:
         """Let some of the older keyframes ride on their neighbours, and build anew."""
@@ -348,7 +320,7 @@ class PoseGraph:
             T = se3.project_to_so3(T_last @ motion)
             self._path[-1] += float(np.linalg.norm(motion[:3, 3]))
             spread = moved_covariance(spread_last, T_last, covariance)
-        self._smoother.add_pose(node.key, T, spread)
+        self._smoother.append_pose(T, spread)
         frame = self._segments.known(node.segment)
         drift_m = None if frame is None else self.config.frame_drift * self._path[node.key]
         node = self._segments.freed(node)
@@ -384,13 +356,9 @@ class PoseGraph:
     def _add_loop_factor(self, loop: Loop) -> None:
         a, b = self._nodes[loop.a].key, self._nodes[loop.b].key
         loop = loop.scaled(self.scale(loop.a))
-        noise = self._gtsam.noiseModel.Gaussian.Covariance(
-            graph_factors.right_covariance(loop.T_a_b, loop.covariance)
-        )
         self._sources[b].add("loop")
         # Not robust: two loops agreed, and what closes late would lose its weight by its size.
-        factor = self._gtsam.BetweenFactorPose3(a, b, pose3(loop.T_a_b), noise)
-        self._smoother.add(factor, "loop")
+        self._smoother.add_motion("loop", (a, b), loop.T_a_b, loop.covariance)
 
     def _newest(self) -> Node:
         return next(reversed(self._nodes.values()))

@@ -8,7 +8,7 @@ T count as 1 + T / (2 tau) of them; each gets the sigma that makes it so.
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,11 +16,14 @@ from recon import se3
 from recon.posegraph.alignment import MIN_FIX_M, Anchor, ReadingNoise, height_ratio
 from recon.posegraph.records import Node, PoseGraphConfig
 from recon.posegraph.sensor_noise import PRECISE_M
-from recon.posegraph.smoother import Smoother
+from recon.posegraph.smoother import NO_SCALE, Smoother
 from recon.types import F64, PosePrior
 
 HEIGHT_GATE = 0.05
 """Share of a height by which one exactly below may be off, once its constant is out."""
+
+MIN_TURN_RAD = 1e-4
+"""Sigma that no attitude is better than."""
 
 FRAME_SIGMA_RAD = (0.05, 0.05, 0.15)
 """What a placed segment's tilt and heading are known to, at least."""
@@ -43,10 +46,8 @@ class Readings:
     ) -> None:
         """``keyframes`` are known so far over ``span_s``; ``altitude_offset_m`` is altitude less
         world z, by default that of the first reading."""
-        import gtsam
-
-        self._gtsam = gtsam
         self._config, self._smoother, self._counts = config, smoother, counts
+        self._huber = config.huber_sigmas
         self._keyframes, self._span_s = max(keyframes, 1), max(span_s, 1.0)
         self._offset_m = altitude_offset_m
 
@@ -81,10 +82,10 @@ class Readings:
             self._counts["height off"] += 1  # a tree or a roof under the one sensor alone
             return False
         sigma = ratio[1] * float(np.sqrt(BLOCK * self._config.blocks_per_height))
-        noise = self._gtsam.noiseModel.Isotropic.Sigma(1, sigma)
-        measured = np.array([ratio[0] - np.log(scale)])
-        factor = self._gtsam.PriorFactorVector(scale_key, measured, self._robust(noise))
-        self._smoother.add(factor, "height", noise)
+        measured = ratio[0] - float(np.log(scale))
+        self._smoother.add_scale(
+            "height", (NO_SCALE, scale_key), measured, sigma, self._config.huber_sigmas
+        )
         return True
 
     def _attitude(self, node: Node, T: F64, spread: F64, is_placed: bool) -> bool:
@@ -105,10 +106,7 @@ class Readings:
             return False
         R = se3.so3_exp(turn) @ T[:3, :3]
         sigma = sigma * self._inflated(self._config.attitude_s)
-        covariance = R.T @ np.diag(sigma**2) @ R
-        noise = self._gtsam.noiseModel.Gaussian.Covariance(covariance)
-        factor = self._gtsam.PoseRotationPrior3D(node.key, self._gtsam.Rot3(R), self._robust(noise))
-        self._smoother.add(factor, "attitude", noise)
+        self._smoother.add_turn("attitude", node.key, R, sigma, self._huber)
         return True
 
     def _position(
@@ -132,9 +130,9 @@ class Readings:
             precise = float(sigma[0]) < PRECISE_M
             seconds = self._config.precise_fix_s if precise else self._config.fix_s
             sigma = sigma * self._inflated(seconds)
-        noise = self._gtsam.noiseModel.Diagonal.Sigmas(sigma)
-        factor = self._gtsam.GPSFactor(node.key, prior.position_m, self._robust(noise))
-        self._smoother.add(factor, "position", noise)
+        self._smoother.add_place(
+            "position", node.key, prior.position_m, sigma, self._config.huber_sigmas
+        )
         return True
 
     def _altitude(self, node: Node, T: F64) -> bool:
@@ -149,12 +147,9 @@ class Readings:
             self._counts["altitude off"] += 1
             self._offset_m = prior.altitude_m - T[2, 3]
             return False
-        loose = 1e4  # m: says nothing of east and north
-        sigma = np.array([loose, loose, one * self._inflated(self._config.altitude_s)])
-        noise = self._gtsam.noiseModel.Diagonal.Sigmas(sigma)
-        place = np.array([T[0, 3], T[1, 3], z])
-        factor = self._gtsam.GPSFactor(node.key, place, self._robust(noise))
-        self._smoother.add(factor, "altitude", noise)
+        sigma = np.array([np.inf, np.inf, one * self._inflated(self._config.altitude_s)])
+        place = np.array([0.0, 0.0, z])
+        self._smoother.add_place("altitude", node.key, place, sigma, self._huber)
         return True
 
     def _inflated(self, seconds: float) -> float:
@@ -164,9 +159,31 @@ class Readings:
         independent = 1.0 + self._span_s / (2.0 * seconds)
         return float(np.sqrt(max(1.0, self._keyframes / independent)))
 
-    def _robust(self, noise: Any) -> Any:
-        model = self._gtsam.noiseModel
-        return model.Robust.Create(model.mEstimator.Huber.Create(self._config.huber_sigmas), noise)
+
+def sound(prior: PosePrior) -> PosePrior:
+    """The prior without readings that are not finite, and no sigma below what a sensor reaches."""
+    R, position, sigma = prior.R_world_camera, prior.position_m, prior.sigma_position_m
+    has_turn = _are_finite(R, prior.sigma_tilt_rad, prior.sigma_yaw_rad)
+    has_agl = _are_finite(prior.agl_m, prior.sigma_agl_m) and (prior.agl_m or 0.0) > 0.0
+    has_altitude = _are_finite(prior.altitude_m, prior.sigma_altitude_m)
+    has_fix = _are_finite(position, sigma)
+    return replace(
+        prior,
+        R_world_camera=R if has_turn else None,
+        sigma_tilt_rad=max(prior.sigma_tilt_rad, MIN_TURN_RAD),
+        sigma_yaw_rad=max(prior.sigma_yaw_rad, MIN_TURN_RAD),
+        position_m=position if has_fix or sigma is None else None,
+        sigma_position_m=np.maximum(sigma, MIN_FIX_M) if has_fix and sigma is not None else None,
+        agl_m=prior.agl_m if has_agl else None,
+        sigma_agl_m=max(prior.sigma_agl_m, MIN_FIX_M),
+        altitude_m=prior.altitude_m if has_altitude else None,
+        sigma_altitude_m=max(prior.sigma_altitude_m, MIN_FIX_M),
+        above_m=prior.above_m if _are_finite(prior.above_m) else None,
+    )
+
+
+def _are_finite(*parts: F64 | float | None) -> bool:
+    return all(part is not None and bool(np.isfinite(part).all()) for part in parts)
 
 
 def is_frozen(prior: PosePrior, before: PosePrior) -> bool:

@@ -1,185 +1,350 @@
-"""Poses and drifting scalars held by iSAM2, fed in batches that grow with it.
+"""Poses and drifting scales that fit all factors best: sparse Gauss-Newton over arrays.
 
-Kaess et al. 2012, doi:10.1177/0278364911430419, by GTSAM. One update costs a little more with
-every pose held, so updates become rarer at the same rate: the mean cost stays flat. Poses not
-yet in the smoother are predictions with their own covariance.
+All factors of one kind are rows of one array, so a step is a few array operations and one sparse
+factorisation (SuperLU), during which other threads run. A step that does not lower the cost is
+damped (Marquardt 1963, doi:10.1137/0111030). Nothing is incremental: what waits is predicted, and
+more may wait the more is held, so that the mean cost of a pose stays flat. Huber's loss weighs
+factors again at each step.
+
+A pose is perturbed by a rotation about its own camera and a shift, both in world axes.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
 
 from recon import se3
-from recon.posegraph import factors as graph_factors
-from recon.posegraph.factors import matrix, pose3
+from recon.posegraph.ledger import MemoryLedger, Rows
 from recon.types import F64
 
-LEAST_WAIT, POSES_PER_WAIT = 2, 400
+I64 = npt.NDArray[np.int64]
+
+MIN_WAIT, POSES_PER_WAIT = 2, 100
 """So many poses wait between two updates, and one more for each so many that are held."""
 
-WILDFIRE = 1e-3
-"""rad and m; corrections smaller than this are not passed on."""
+STEPS, MANY_STEPS = 1, 10
+"""Of an update, at most, and where many poses may move far."""
 
-RELINEARISE_POSE, RELINEARISE_SCALAR = (0.02, 0.02, 0.02, 1.0, 1.0, 1.0), 0.02
-"""rad and m; what moved further is linearised again, at every tenth update. Motions between
-poses bend with the angle and hardly with the place."""
+SMALL_STEP = 1e-3
+"""rad, m and log scale; none follows a step that is smaller."""
 
-SCALAR = "s"
-"""First letter of a scalar's key (``gtsam.symbol``); poses have plain numbers."""
+SHARES = 0.5 ** np.arange(8)
+"""Of a step, from the whole one on, until the cost falls."""
 
-SOUND = 1.0
-"""What no scalar reaches: they are logarithms of scales, close to nought by their priors."""
+NO_SCALE = 0
+"""Key of a scale that is held at 1."""
 
-ROUNDS = 3
-"""Updates after a change that moves many poses; each linearises again what moved."""
+MOTION = np.dtype(
+    [("a", int), ("b", int), ("scale", int), ("R", float, (3, 3)), ("t", float, (3,)),
+     ("weight", float, (6, 6))]
+)  # fmt: skip
+TURN = np.dtype([("key", int), ("R", float, (3, 3)), ("weight", float, (3,))])
+PLACE = np.dtype([("key", int), ("t", float, (3,)), ("weight", float, (3,))])
+SCALE = np.dtype([("a", int), ("b", int), ("log", float), ("weight", float)])
+
+
+class State(NamedTuple):
+    """Poses and logarithms of scales."""
+
+    R: F64  # (N, 3, 3)
+    t: F64  # (N, 3) m
+    logs: F64  # (M,)
+
+    def moved(self, step: F64) -> State:
+        """The state after a step (6 N + M,)."""
+        poses = step[: 6 * len(self.R)].reshape(-1, 6)
+        return State(
+            Rotation.from_rotvec(poses[:, :3]).as_matrix() @ self.R,
+            self.t + poses[:, 3:],
+            self.logs + step[6 * len(self.R) :],
+        )
+
+
+class Linear(NamedTuple):
+    """Factors of one kind about a state."""
+
+    error: F64  # (n, d) whitened
+    J: F64  # (n, d, k)
+    columns: I64  # (n, k) unknowns that the Jacobian is of
+
+
+def _of_motions(rows: Rows, at: State) -> Linear:
+    """log of T_a_b over the motion, whose lengths grow with a scale; left in the frame of a."""
+    a, b, scale = rows["a"], rows["b"], rows["scale"]
+    R_a_world = at.R[a].transpose(0, 2, 1)
+    turned = at.R[b] @ rows["R"].transpose(0, 2, 1)
+    expected = np.einsum("nij,nj->ni", turned, rows["t"] * np.exp(at.logs[scale])[:, None])
+    apart = at.t[b] - at.t[a] - expected  # m, in the world
+    error = np.hstack([_log(R_a_world @ turned), np.einsum("nij,nj->ni", R_a_world, apart)])
+    J = np.zeros((len(rows), 6, 13))
+    J[:, :3, 0:3] = J[:, 3:, 3:6] = -R_a_world
+    J[:, :3, 6:9] = J[:, 3:, 9:12] = R_a_world
+    J[:, 3:, 0:3] = R_a_world @ se3.hat(apart)
+    J[:, 3:, 6:9] = R_a_world @ se3.hat(expected)
+    J[:, 3:, 12] = -np.einsum("nij,nj->ni", R_a_world, expected)
+    J[scale == NO_SCALE, :, 12] = 0.0
+    columns = np.hstack([_unknowns(a, 0, 6), _unknowns(b, 0, 6), _logs(at, scale)])
+    error = np.einsum("nij,nj->ni", rows["weight"], error)
+    return Linear(error, rows["weight"] @ J, columns)
+
+
+def _of_turns(rows: Rows, at: State) -> Linear:
+    """Rotation from the measured one, in world axes."""
+    error = _log(at.R[rows["key"]] @ rows["R"].transpose(0, 2, 1)) * rows["weight"]
+    return Linear(error, np.eye(3) * rows["weight"][:, :, None], _unknowns(rows["key"], 0, 3))
+
+
+def _of_places(rows: Rows, at: State) -> Linear:
+    error = (at.t[rows["key"]] - rows["t"]) * rows["weight"]
+    return Linear(error, np.eye(3) * rows["weight"][:, :, None], _unknowns(rows["key"], 3, 6))
+
+
+def _of_scales(rows: Rows, at: State) -> Linear:
+    """Log of b's scale over a's, less the measured one."""
+    weight = rows["weight"][:, None]
+    error = (at.logs[rows["b"]] - at.logs[rows["a"]] - rows["log"])[:, None] * weight
+    J = np.stack([np.where(rows["a"][:, None] == NO_SCALE, 0.0, -weight), weight], axis=2)
+    return Linear(error, J, np.hstack([_logs(at, rows["a"]), _logs(at, rows["b"])]))
+
+
+def _log(R: F64) -> F64:
+    """(N, 3) rotation vectors of (N, 3, 3)."""
+    axis = 0.5 * (R - R.transpose(0, 2, 1))[:, [2, 0, 1], [1, 2, 0]]
+    sine, cosine = np.linalg.norm(axis, axis=1), 0.5 * (np.trace(R, axis1=1, axis2=2) - 1.0)
+    grown = np.where(sine > 1e-9, np.arctan2(sine, cosine) / np.maximum(sine, 1e-9), 1.0)
+    out = axis * grown[:, None]
+    for i in np.flatnonzero((sine < 1e-6) & (cosine < 0.0)):  # half a turn hides its axis
+        out[i] = se3.so3_log(R[i])
+    return np.asarray(out)
+
+
+def _unknowns(keys: I64, first: int, end: int) -> I64:
+    """(n, end - first) columns of poses."""
+    return np.asarray(6 * keys[:, None] + np.arange(first, end))
+
+
+def _logs(at: State, keys: I64) -> I64:
+    """(n, 1) columns of scales."""
+    return np.asarray(6 * len(at.R) + keys[:, None])
+
+
+class Factors:
+    """The factors of one kind."""
+
+    def __init__(
+        self, form: Callable[[Rows, State], Linear], dtype: np.dtype[Any], huber: float
+    ) -> None:
+        """Whitened errors longer than ``huber`` lose weight."""
+        self.form, self.huber = form, huber
+        self.rows = MemoryLedger(dtype)
+
+    def about(self, at: State) -> Linear:
+        """All of them about a state."""
+        return self.form(self.rows.read(0, len(self.rows)), at)
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """The normal equations about a state."""
+
+    at: State
+    H: Any  # sparse (U, U) information
+    g: F64  # (U,)
+    cost: float
+
+    @staticmethod
+    def of(factors: list[Factors], at: State) -> System:
+        """That of all factors."""
+        count, first_log = 6 * len(at.R) + len(at.logs), 6 * len(at.R)
+        held = np.array([first_log + NO_SCALE])
+        values, rows, columns, g, cost = [np.ones(1)], [held], [held], np.zeros(count), 0.0
+        for one in factors:
+            error, J, unknowns = one.about(at)
+            length = np.linalg.norm(error, axis=1)
+            weight = np.minimum(1.0, one.huber / np.maximum(length, 1e-12))
+            cost += float(np.sum(weight * length * (length - 0.5 * weight * length)))
+            JW, width = J.transpose(0, 2, 1) * weight[:, None, None], unknowns.shape[1]
+            g += np.bincount(unknowns.ravel(), (JW @ error[:, :, None]).ravel(), count)
+            values.append((JW @ J).ravel())
+            rows.append(np.repeat(unknowns, width, axis=1).ravel())
+            columns.append(np.tile(unknowns, (1, width)).ravel())
+        where = np.concatenate(rows), np.concatenate(columns)
+        H = sparse.csc_matrix((np.concatenate(values), where), shape=(count, count))
+        return System(at, H, g, cost)
+
+    @cached_property
+    def factors(self) -> Any:
+        """The information, factorised. Raises RuntimeError where it is singular."""
+        return splu(
+            self.H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )  # fmt: skip
+
+    def covariance(self, key: int) -> F64:
+        """(6, 6) of a pose, as a left perturbation in the world."""
+        unit = np.zeros((len(self.g), 6))
+        unit[6 * key : 6 * key + 6] = np.eye(6)
+        own = self.factors.solve(unit)[6 * key : 6 * key + 6]
+        lever = np.eye(6)
+        lever[3:, :3] = se3.hat(self.at.t[key])
+        return np.asarray(lever @ (0.5 * (own + own.T)) @ lever.T)
+
+
+def solved(factors: list[Factors], start: State, steps: int) -> System:
+    """The system about the state with the lowest cost that is found in so many steps.
+
+    Raises RuntimeError when there is none.
+    """
+    system = System.of(factors, start)
+    for _ in range(steps):
+        step = -system.factors.solve(system.g)
+        tried = (System.of(factors, system.at.moved(share * step)) for share in SHARES)
+        lower = next((one for one in tried if one.cost <= system.cost), None)
+        if lower is None:
+            break
+        system = lower
+        if np.abs(step).max() < SMALL_STEP:
+            break
+    if not np.isfinite(system.cost):
+        raise RuntimeError("factors are not finite")
+    return system
 
 
 class Smoother:
-    """Poses by key 0, 1, 2 …; scalars by symbols of the letter :data:`SCALAR`."""
+    """Poses by key 0, 1, 2 ...; scales by key from 1 on, :data:`NO_SCALE` before them."""
 
-    def __init__(self, careful: bool = False) -> None:
-        """``careful`` steps (Powell's dog leg, in a region of trust) are shorter and slower."""
-        import gtsam
-
-        self._gtsam = gtsam
-        parameters = gtsam.ISAM2Params()
-        solver = gtsam.ISAM2DoglegParams() if careful else gtsam.ISAM2GaussNewtonParams()
-        solver.setWildfireThreshold(WILDFIRE)
-        parameters.setOptimizationParams(solver)
-        thresholds = gtsam.ISAM2ThresholdMap()
-        thresholds.insert((chr(0), np.array(RELINEARISE_POSE)))
-        thresholds.insert((SCALAR, np.array([RELINEARISE_SCALAR])))
-        parameters.setRelinearizeThreshold(thresholds)
-        parameters.relinearizeSkip = 10
-        parameters.setFactorization("QR")  # loose starts beside tight motions are ill-conditioned
-        self._isam: Any = gtsam.ISAM2(parameters)
-        self._graph: Any = gtsam.NonlinearFactorGraph()
-        self._values: Any = gtsam.Values()
-        self._kinds: list[str] = []
-        self._noises: list[Any] = []
-        self._waiting: dict[int, tuple[F64, F64]] = {}  # pose and its left covariance
-        self._held = 0
-        self.has_failed = False  # nothing can be solved any more: poses stay as predicted
+    def __init__(self) -> None:
+        self._factors: dict[str, Factors] = {}
+        self._held = System.of([], State(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(1)))
+        self._waiting: list[tuple[F64, F64]] = []  # pose and its left covariance
+        self._fresh_logs: list[float] = []
+        self._covariances: dict[int, F64] = {}  # asked for since the last update
         self.updates = 0
-        self._states: dict[int, tuple[F64, F64]] = {}  # asked for since the last update
 
     def __len__(self) -> int:
-        return self._held + len(self._waiting)
+        return len(self._held.at.R) + len(self._waiting)
 
     # ---- what goes in --------------------------------------------------------------------------
 
-    def add(self, factor: Any, kind: str, noise: Any = None) -> None:
-        """Take a factor; its residuals are reported under ``kind``.
+    def add_motion(
+        self, kind: str, keys: tuple[int, int], T_a_b: F64, covariance: F64, scale: int = NO_SCALE
+    ) -> None:
+        """A motion (4, 4) between poses a and b, whose lengths grow with a scale; its covariance
+        (6, 6) is of the left perturbation in a's frame."""
+        weight = np.linalg.inv(np.linalg.cholesky(covariance))
+        self._add(_of_motions, MOTION, kind, (*keys, scale, T_a_b[:3, :3], T_a_b[:3, 3], weight))
 
-        ``noise`` is its noise model without a robust loss, when it has one.
+    def add_turn(self, kind: str, key: int, R: F64, sigma: F64, huber: float = np.inf) -> None:
+        """A rotation (3, 3) of a pose; sigma (3,) in rad about the world's axes."""
+        self._add(_of_turns, TURN, kind, (key, R, 1.0 / sigma), huber)
+
+    def add_place(self, kind: str, key: int, place: F64, sigma: F64, huber: float = np.inf) -> None:
+        """A place (3,) of a pose, with sigma (3,) m; infinite where nothing is known."""
+        self._add(_of_places, PLACE, kind, (key, place, 1.0 / sigma), huber)
+
+    def add_scale(
+        self, kind: str, keys: tuple[int, int], log: float, sigma: float, huber: float = np.inf
+    ) -> None:
+        """The log of scale b over scale a."""
+        self._add(_of_scales, SCALE, kind, (*keys, log, 1.0 / sigma), huber)
+
+    def _add(
+        self, form: Callable[[Rows, State], Linear], dtype: np.dtype[Any], kind: str,
+        row: tuple[Any, ...], huber: float = np.inf,
+    ) -> None:  # fmt: skip
+        factors = self._factors.setdefault(kind, Factors(form, dtype, huber))
+        factors.rows.append(np.array([row], dtype))
+
+    def append_pose(self, T: F64, covariance: F64) -> None:
+        """The next pose (4, 4) with its predicted left covariance (6, 6)."""
+        self._waiting.append((T, covariance))
+
+    def append_scale(self, log: float) -> int:
+        """The key of a new scale that begins with this logarithm."""
+        self._fresh_logs.append(log)
+        return len(self._held.at.logs) + len(self._fresh_logs) - 1
+
+    def update(self, now: bool = False, steps: int = STEPS) -> bool:
+        """True when what waits was solved: enough of it waits, or ``now``.
+
+        Raises RuntimeError when there is no solution; all stays as predicted then.
         """
-        self._graph.add(factor)
-        self._kinds.append(kind)
-        self._noises.append(noise or factor.noiseModel())
-
-    def add_pose(self, key: int, T: F64, covariance: F64) -> None:
-        """A new pose (4, 4) with its predicted left covariance (6, 6); keys follow each other."""
-        if key != len(self):
-            raise ValueError(f"the next pose has key {len(self)}, got {key}")
-        self._values.insert(key, pose3(T))
-        self._waiting[key] = (T, covariance)
-
-    def add_scalar(self, key: int, value: float) -> None:
-        """A new scalar with its first value."""
-        self._values.insert(key, np.array([value]))
-
-    def update(self, now: bool = False, rounds: int = 0) -> bool:
-        """True when what waits went into the smoother: enough of it waits, or ``now``.
-
-        Raises RuntimeError when there is no solution; after that nothing goes in any more.
-        """
-        is_due = now or len(self._waiting) > LEAST_WAIT + self._held // POSES_PER_WAIT
-        if self.has_failed or not is_due:
+        held = self._held.at
+        if not now and len(self._waiting) <= MIN_WAIT + len(held.R) // POSES_PER_WAIT:
             return False
-        try:
-            self._solve(rounds)
-        except RuntimeError:
-            self.has_failed = True
-            raise
-        self._graph.resize(0)
-        self._values.clear()
-        self._held += len(self._waiting)
-        self._waiting.clear()
-        self._states.clear()
+        T = np.array([T for T, _ in self._waiting]).reshape(-1, 4, 4)
+        start = State(
+            np.concatenate([held.R, T[:, :3, :3]]),
+            np.concatenate([held.t, T[:, :3, 3]]),
+            np.concatenate([held.logs, self._fresh_logs]),
+        )
+        self._held = solved(list(self._factors.values()), start, steps)
+        self._waiting, self._fresh_logs = [], []
+        self._covariances.clear()
         self.updates += 1
         return True
-
-    def _solve(self, rounds: int) -> None:
-        self._isam.update(self._graph, self._values)
-        g = self._gtsam
-        nothing: list[Any] = [g.NonlinearFactorGraph(), g.Values(), [], g.KeyGroupMap()]
-        nothing += [g.KeyList(), g.KeyList()]
-        for _ in range(rounds):
-            self._isam.update(*nothing, True)  # relinearise; no new factors, removals or groups
-        if len(self):
-            self._isam.calculateEstimatePose3(len(self) - 1)  # by QR, faults show only here
 
     # ---- what comes out ------------------------------------------------------------------------
 
     def pose(self, key: int) -> F64:
         """(4, 4) best estimate of a pose."""
-        if key in self._waiting:
-            return self._waiting[key][0]
-        return matrix(self._isam.calculateEstimatePose3(key))
+        held = self._held.at
+        if key >= len(held.R):
+            return self._waiting[key - len(held.R)][0]
+        return se3.compose(held.R[key], held.t[key])
 
     def state(self, key: int) -> tuple[F64, F64]:
         """A pose and its (6, 6) left covariance."""
-        if key in self._waiting:
-            return self._waiting[key]
-        if key not in self._states:
-            T = self.pose(key)
-            right = np.asarray(self._isam.marginalCovariance(key), np.float64)
-            self._states[key] = (T, graph_factors.left_covariance(T, right))
-        return self._states[key]
+        if key >= len(self._held.at.R):
+            return self._waiting[key - len(self._held.at.R)]
+        if key not in self._covariances:
+            self._covariances[key] = self._held.covariance(key)
+        return self.pose(key), self._covariances[key]
 
-    def scalar(self, key: int) -> float:
-        """Best estimate of a scalar."""
-        if self._values.exists(key):
-            return float(self._values.atVector(key)[0])
-        return float(self._isam.calculateEstimateVector(key)[0])
-
-    def is_sound(self) -> bool:
-        """False when a scalar has left :data:`SOUND`, as after steps that led nowhere."""
-        held = self._gtsam.utilities.extractVectors(self._isam.calculateEstimate(), SCALAR)
-        return bool(np.all(np.abs(np.asarray(held, np.float64)) < SOUND))
+    def logs(self) -> F64:
+        """(M,) logarithms of all scales, by their keys."""
+        return np.concatenate([self._held.at.logs, self._fresh_logs])
 
     def poses(self) -> F64:
         """(N, 4, 4) of all poses in the order of their keys."""
+        held = self._held.at
         out = np.tile(np.eye(4), (len(self), 1, 1))
-        if self._held:
-            rows = np.asarray(
-                self._gtsam.utilities.extractPose3(self._isam.calculateEstimate()), np.float64
-            )
-            out[: self._held, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
-            out[: self._held, :3, 3] = rows[:, 9:]
-        for key, (T, _) in self._waiting.items():
+        out[: len(held.R), :3, :3], out[: len(held.R), :3, 3] = held.R, held.t
+        for key, (T, _) in enumerate(self._waiting, len(held.R)):
             out[key] = T
         return out
 
     def residuals(self) -> dict[str, F64]:
-        """Whitened residuals of all factors in the smoother by kind, one row per factor.
+        """Whitened errors of all factors by kind, one row per factor, without their losses.
 
-        Robust losses are left out: a residual is the error over its sigma. Empty where there is
-        no solution.
+        Empty while something waits.
         """
-        if self.has_failed:
+        if self._waiting:
             return {}
-        values, factors = self._isam.calculateEstimate(), self._isam.getFactorsUnsafe()
-        out: dict[str, list[F64]] = {}
-        for i, kind in enumerate(self._kinds[: factors.size()]):
-            error = graph_factors.whitened(factors.at(i), self._noises[i], values)
-            out.setdefault(kind, []).append(error)
-        return {kind: np.array(rows) for kind, rows in out.items()}
+        return {kind: one.about(self._held.at).error for kind, one in self._factors.items()}
+
+
+def left_covariance(T: F64, covariance: F64) -> F64:
+    """(6, 6) covariance of the left perturbation of ``T`` from that of the right."""
+    A = se3.adjoint(T)
+    return np.asarray(A @ covariance @ A.T)
+
+
+def reversed_motion(T: F64, covariance: F64) -> tuple[F64, F64]:
+    """T_b_a and its (6, 6) covariance in b's frame, from T_a_b and that in a's frame."""
+    back = se3.inverse(T)
+    return back, left_covariance(back, covariance)
 
 
 def moved_covariance(spread: F64, T: F64, covariance: F64) -> F64:
     """(6, 6) left covariance after a motion with left ``covariance`` in the frame of ``T``."""
-    A = se3.adjoint(T)
-    return np.asarray(spread + A @ covariance @ A.T)
+    return spread + left_covariance(T, covariance)

@@ -21,8 +21,8 @@ from itertools import groupby, pairwise
 import numpy as np
 
 from recon import se3
-from recon.posegraph.factors import reversed_motion
 from recon.posegraph.records import Loop, Node
+from recon.posegraph.smoother import reversed_motion
 from recon.types import F64, PosePrior
 
 NEWEST_SHARE = 0.25

@@ -7,6 +7,7 @@ frame.
 
 from __future__ import annotations
 
+from array import array
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
@@ -19,10 +20,9 @@ from recon import se3
 from recon.posegraph.alignment import Similarity
 from recon.posegraph.interpolated import (
     KEYFRAME,
-    Carrier,
+    Spans,
     change,
     interpolated,
-    left,
     moved_m,
     whole,
 )
@@ -31,7 +31,8 @@ from recon.posegraph.pose_graph import PoseGraph
 from recon.types import F64, PosePrior
 
 AT_ONCE = 200
-"""Carried keyframes told in flight with one correction, about; the rest comes with the next."""
+"""Interpolated keyframes looked at with one correction in flight, about; the rest comes with the
+next."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +136,7 @@ class Trajectory:
         self.graph = PoseGraph() if graph is None else graph
         self._ledger: Ledger = MemoryLedger(KEYFRAME) if ledger is None else ledger
         self._published = _Published()
-        self._row: dict[int, int] = {}  # of the nodes, in the ledger
+        self._seqs = array("q")  # numbers of all keyframes, as in the ledger
         self._nodes: list[int] = []  # their numbers, in order
         self._generation = 0  # of the graph
         self._owed: deque[int] = deque()  # nodes after which others may have moved
@@ -160,13 +161,14 @@ class Trajectory:
         row = np.zeros(1, KEYFRAME)
         row["seq"], row["segment"], row["odom"] = seq, segment, T_map_camera[:3]
         row["height"] = height[0] if height is not None and height[0] else 1.0
-        self._row[seq] = len(self._ledger)
+        self._seqs.append(seq)
         self._nodes.append(seq)
         self._ledger.append(row)
         self._follow()
 
     def __contains__(self, seq: int) -> bool:
-        return seq in self.graph or self._find(seq) is not None
+        row = bisect_left(self._seqs, seq)
+        return row < len(self._seqs) and self._seqs[row] == seq
 
     def similarity(self, segment: int) -> Similarity | None:
         """The segment's way to the world; None while it stands where telemetry first put it."""
@@ -176,13 +178,16 @@ class Trajectory:
         """(4, 4) T_map_camera of a keyframe in its segment's chain."""
         if seq in self.graph:
             return self.graph.node(seq).T_odom_camera
-        return np.asarray(whole(self._rows_of(seq)[1]["odom"])[0])
+        return np.asarray(whole(self._read(self._row(seq))["odom"])[0])
 
     def place(self, seq: int) -> Placed:
         """The keyframe in the world, as known now. Raises KeyError for an unknown keyframe."""
         if seq not in self.graph:
-            row, rows = self._rows_of(seq)
-            return self._carried(row, rows, *self._beside(seq))[0]
+            row, ends = self._row(seq), self._beside(seq)
+            at = np.array([row]), np.array([0])
+            T, scales = interpolated(self._read(row), *at, self._spans([ends]))
+            node = self.place(ends[0])
+            return replace(node, seq=seq, T_world_camera=T[0], scale=float(scales[0]))
         pose = self.graph.pose(seq)
         known = self.graph.similarity(self.graph.node(seq).segment) is not None
         covariance = pose.covariance if known else np.eye(6)
@@ -214,7 +219,7 @@ class Trajectory:
             if not self._same_segment(before, after):
                 return False  # no node carries it
             T = self.step_between(before, a)
-            node, rows = self.graph.node(after), self._row[after] - self._row[before]
+            node, rows = self.graph.node(after), self._row(after) - self._row(before)
             units = np.array([1.0] * 3 + [self.graph.scale(before)] * 3)
             step = node.covariance * np.outer(units, units) * (rows / node.weight)
             A = se3.adjoint(T)
@@ -270,24 +275,46 @@ class Trajectory:
 
     def _moved_interpolated(self, final: bool) -> list[Placed]:
         out: list[Placed] = []
-        while self._owed and (final or len(out) < AT_ONCE):
-            before = self._owed.popleft()
-            after = self._nodes[bisect_left(self._nodes, before) + 1]
-            first, end = self._row[before] + 1, self._row[after]
-            if first == end:
-                continue
-            rows = self._ledger.read(first, end)
-            known = self._published.of(before)
-            least = self.config.repose_m
-            if known is not None:
-                least = max(least, self.config.repose_sigmas * known.sigma_m)
-            placed = self._carried(first, rows, before, after)
-            T = np.array([p.T_world_camera for p in placed])
-            scales = np.array([p.scale for p in placed])
-            told = np.flatnonzero(rows["published"] > 0)
-            far = moved_m(rows[told], T[told], scales[told]) > (1e-6 if final else least)
-            out += [placed[i] for i in told[far]]
+        while self._owed:
+            spans, count = [], 0
+            while self._owed and count < AT_ONCE:
+                before = self._owed.popleft()
+                after = self._nodes[bisect_left(self._nodes, before) + 1]
+                held = self._row(after) - self._row(before) - 1
+                spans += [(before, after)] if held else []
+                count += held
+            out += self._moved_within(spans, final) if spans else []
+            if not final:
+                break
         return out
+
+    def _moved_within(self, spans: list[tuple[int, int]], final: bool) -> list[Placed]:
+        """Published keyframes between these pairs of nodes that have moved."""
+        firsts = [self._row(before) + 1 for before, _ in spans]
+        parts = [
+            self._ledger.read(first, self._row(after))
+            for first, (_, after) in zip(firsts, spans, strict=True)
+        ]
+        span = np.repeat(np.arange(len(spans)), [len(part) for part in parts])
+        number = np.concatenate(
+            [first + np.arange(len(p)) for first, p in zip(firsts, parts, strict=True)]
+        )
+        rows = np.concatenate(parts)
+        told = rows["published"] > 0
+        rows, number, span = rows[told], number[told], span[told]
+        T, scales = interpolated(rows, number, span, self._spans(spans))
+        known = [
+            self.place(before) if final else self._published.of(before) or self.place(before)
+            for before, _ in spans
+        ]
+        sigma = np.array([one.sigma_m for one in known])[span]
+        least = np.maximum(self.config.repose_m, self.config.repose_sigmas * sigma)
+        far = moved_m(rows, T, scales) > (1e-6 if final else least)
+        return [
+            replace(known[span[i]], seq=int(rows["seq"][i]), T_world_camera=T[i],
+                    scale=float(scales[i]))
+            for i in np.flatnonzero(far)
+        ]  # fmt: skip
 
     def publish(self, placed: Placed) -> tuple[int, float]:
         """Remember that this pose of the keyframe was published.
@@ -297,7 +324,8 @@ class Trajectory:
         if placed.seq in self.graph:
             node = self.graph.node(placed.seq)
             self._published.put(placed, node.key, node.height or 1.0)
-        row, rows = self._rows_of(placed.seq)
+        row = self._row(placed.seq)
+        rows = self._read(row)
         rows["published"] += 1
         rows["pose"], rows["scale"] = placed.T_world_camera[:3], placed.scale
         if rows["published"][0] == 1:
@@ -313,9 +341,8 @@ class Trajectory:
             return
         self._generation = self.graph.generation
         self._nodes = list(self.graph.seqs)
-        self._row = {seq: self._row[seq] for seq in self._nodes}
         self._published.thin({seq: key for key, seq in enumerate(self._nodes)})
-        self._owed = deque(seq for seq in self._owed if seq in self._row)
+        self._owed = deque(seq for seq in self._owed if seq in self.graph)
 
     def _same_segment(self, a: int, b: int) -> bool:
         return self.graph.node(a).segment == self.graph.node(b).segment
@@ -327,38 +354,22 @@ class Trajectory:
             raise KeyError(seq)
         return self._nodes[i - 1], self._nodes[i]
 
-    def _find(self, seq: int) -> tuple[int, Rows] | None:
-        """Place and row of a keyframe in the ledger."""
-        row = self._row.get(seq)
-        if row is not None:
-            return row, self._ledger.read(row, row + 1)
-        i = bisect_left(self._nodes, seq)
-        if not 0 < i < len(self._nodes):
-            return None
-        first = self._row[self._nodes[i - 1]] + 1
-        rows = self._ledger.read(first, self._row[self._nodes[i]])
-        k = int(np.searchsorted(rows["seq"], seq))
-        return (first + k, rows[k : k + 1]) if k < len(rows) and rows["seq"][k] == seq else None
-
-    def _rows_of(self, seq: int) -> tuple[int, Rows]:
-        found = self._find(seq)
-        if found is None:
+    def _row(self, seq: int) -> int:
+        """Place of a keyframe in the ledger. Raises KeyError for an unknown one."""
+        if seq not in self:
             raise KeyError(seq)
-        return found
+        return bisect_left(self._seqs, seq)
 
-    def _carried(self, first: int, rows: Rows, before: int, after: int) -> list[Placed]:
-        """Keyframes between two nodes, the ledger's rows from ``first`` on."""
-        held = self.place(before)
-        ends = [
-            Carrier(self._row[p.seq], self.graph.node(p.seq).T_odom_camera, p.T_world_camera,
-                    p.scale)
-            for p in (held, self.place(after))
-        ]  # fmt: skip
-        if self._same_segment(before, after):
-            T, scales = interpolated(rows, first, *ends)
-        else:
-            T, scales = left(rows, ends[0])
-        return [
-            Placed(int(row["seq"]), T[i], float(scales[i]), held.covariance, held.sources)
-            for i, row in enumerate(rows)
-        ]
+    def _read(self, row: int) -> Rows:
+        return self._ledger.read(row, row + 1)
+
+    def _spans(self, ends: list[tuple[int, int]]) -> Spans:
+        """What lies between these pairs of nodes, as known now."""
+        nodes = [[self.graph.node(seq) for seq in pair] for pair in ends]
+        return Spans(
+            np.array([[self._row(seq) for seq in pair] for pair in ends]),
+            np.array([[node.T_odom_camera for node in pair] for pair in nodes]),
+            np.array([[self.graph.place(seq) for seq in pair] for pair in ends]),
+            np.array([[self.graph.scale(seq) for seq in pair] for pair in ends]),
+            np.array([a.segment == b.segment for a, b in nodes]),
+        )
