@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from flown_track import SPREAD, landed, sensed, tell
 
 from recon import se3
-from recon.posegraph.interpolated import KEYFRAME
+from recon.posegraph.interpolated import KEYFRAME, screws
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.records import Loop, Node
 from recon.posegraph.thinning import moved_loop, surplus, thinned
@@ -170,3 +172,13 @@ def test_ends_of_segments_stay() -> None:
         for segment in {n.segment for n in nodes}:
             seqs = [n.seq for n in nodes if n.segment == segment]
             assert (seqs[0], seqs[-1]) == (7 * segment, 7 * segment + 6)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 9999), st.sampled_from([0.0, 1e-12, 1e-9, 1e-6, 1e-3, 1.0, 3.0]))
+def test_screws_are_exponentials(seed: int, turn: float) -> None:
+    rng = np.random.default_rng(seed)
+    twists, shares = rng.normal(size=(5, 6)), rng.uniform(-1.0, 2.0, 5)
+    twists[:, :3] *= turn / np.linalg.norm(twists[:, :3], axis=1, keepdims=True)
+    expected = [se3.exp(share * twist) for share, twist in zip(shares, twists, strict=True)]
+    np.testing.assert_allclose(screws(twists, shares), expected, atol=1e-12)

@@ -64,11 +64,7 @@ class Motions:
         return motion, covariance
 
     def scale_key(self, node: Node) -> int:
-        """Key of the node's scale, a new one every twenty keyframes; made when missing.
-
-        Blocks keep the smoother incremental: one variable for the whole flight would tie every
-        keyframe to the newest reading.
-        """
+        """Key of the node's scale, a new one every twenty keyframes; made when missing."""
         key, since, held = self._blocks.get(node.segment, (NO_SCALE, 0, 0))
         if key == NO_SCALE or node.key - since >= BLOCK:
             before, since = key, node.key

@@ -236,7 +236,7 @@ class PoseGraph:
 
     def residuals(self) -> dict[str, F64]:
         """Whitened residuals by kind of factor: "vision", "attitude", "position", "altitude",
-        "height", "loop", "link" and "prior"; (n, dimension) each."""
+        "height", "loop", "link", "scale", "prior" and "prior place"; (n, dimension) each."""
         self._solve(now=True)
         return self._smoother.residuals()
 

@@ -205,6 +205,8 @@ def solved(factors: list[Factors], start: State, steps: int) -> System:
     Raises RuntimeError when there is none.
     """
     system = System.of(factors, start)
+    if not np.isfinite(system.cost):
+        raise RuntimeError("factors are not finite")
     for _ in range(steps):
         step = -system.factors.solve(system.g)
         tried = (System.of(factors, system.at.moved(share * step)) for share in SHARES)
@@ -214,8 +216,6 @@ def solved(factors: list[Factors], start: State, steps: int) -> System:
         system = lower
         if np.abs(step).max() < SMALL_STEP:
             break
-    if not np.isfinite(system.cost):
-        raise RuntimeError("factors are not finite")
     return system
 
 
@@ -261,8 +261,9 @@ class Smoother:
         self, form: Callable[[Rows, State], Linear], dtype: np.dtype[Any], kind: str,
         row: tuple[Any, ...], huber: float = np.inf,
     ) -> None:  # fmt: skip
-        factors = self._factors.setdefault(kind, Factors(form, dtype, huber))
-        factors.rows.append(np.array([row], dtype))
+        if kind not in self._factors:
+            self._factors[kind] = Factors(form, dtype, huber)
+        self._factors[kind].rows.append(np.array([row], dtype))
 
     def append_pose(self, T: F64, covariance: F64) -> None:
         """The next pose (4, 4) with its predicted left covariance (6, 6)."""

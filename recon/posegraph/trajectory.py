@@ -276,7 +276,8 @@ class Trajectory:
     def _moved_interpolated(self, final: bool) -> list[Placed]:
         out: list[Placed] = []
         while self._owed:
-            spans, count = [], 0
+            spans: list[tuple[int, int]] = []
+            count = 0
             while self._owed and count < AT_ONCE:
                 before = self._owed.popleft()
                 after = self._nodes[bisect_left(self._nodes, before) + 1]
@@ -290,16 +291,10 @@ class Trajectory:
 
     def _moved_within(self, spans: list[tuple[int, int]], final: bool) -> list[Placed]:
         """Published keyframes between these pairs of nodes that have moved."""
-        firsts = [self._row(before) + 1 for before, _ in spans]
-        parts = [
-            self._ledger.read(first, self._row(after))
-            for first, (_, after) in zip(firsts, spans, strict=True)
-        ]
-        span = np.repeat(np.arange(len(spans)), [len(part) for part in parts])
-        number = np.concatenate(
-            [first + np.arange(len(p)) for first, p in zip(firsts, parts, strict=True)]
-        )
-        rows = np.concatenate(parts)
+        numbers = [np.arange(self._row(a) + 1, self._row(b)) for a, b in spans]
+        span = np.repeat(np.arange(len(spans)), [len(held) for held in numbers])
+        rows = np.concatenate([self._ledger.read(held[0], held[-1] + 1) for held in numbers])
+        number = np.concatenate(numbers)
         told = rows["published"] > 0
         rows, number, span = rows[told], number[told], span[told]
         T, scales = interpolated(rows, number, span, self._spans(spans))
