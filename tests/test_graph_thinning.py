@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from flown_track import SPREAD, landed, sensed, tell
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from flown_track import SPREAD, landed, sensed, tell
 
 from recon import se3
 from recon.posegraph.interpolated import KEYFRAME, screws

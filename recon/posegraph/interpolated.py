@@ -72,7 +72,7 @@ def screws(twists: F64, shares: F64) -> F64:
     axis, turned = se3.hat(twists[:, :3] / angle), shares[:, None] * angle
     across = np.einsum("nij,nj->ni", axis, twists[:, 3:])
     along = np.einsum("nij,nj->ni", axis, across)
-    sine, rest = np.sin(turned), 1.0 - np.cos(turned)
+    sine, rest = np.sin(turned), 2.0 * np.sin(0.5 * turned) ** 2
     out = np.tile(np.eye(4), (len(shares), 1, 1))
     out[:, :3, :3] += sine[..., None] * axis + rest[..., None] * (axis @ axis)
     out[:, :3, 3] = shares[:, None] * twists[:, 3:] + rest / angle * across
