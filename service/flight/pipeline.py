@@ -88,8 +88,9 @@ class Pipeline:
         s.views.end_stretch()
         for view in s.views.ready(everything=True):
             self._beside.offer(view)
+        keyframes = self._finished(everything=True)
         tracked = Tracked("lost", s.track.segment, reason="end of the recording")
-        return Step(tracked, keyframes=self._finished(everything=True))
+        return Step(tracked, keyframes=keyframes)
 
     def finish(self) -> Step:
         """What :meth:`drain` has left, and the last corrections. Raises what work raised."""
