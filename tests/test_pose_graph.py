@@ -539,7 +539,7 @@ def test_readings_that_cannot_be_are_left_out(fault: dict[str, Any]) -> None:
     for i, (T, prior) in enumerate(zip(f.odom, f.priors, strict=True)):
         prior = replace(prior, **fault) if i % 5 == 0 else prior
         graph.add_keyframe(i, i * 10**9, 0, T, f.covariance, prior, (60.0 / 1.3, 0.0))
-        assert i < 3 or np.linalg.norm((graph.place(i) - f.truth[i])[:3, 3]) < 3.0
+        assert i < 3 or np.linalg.norm((graph.place(i) - f.truth[i])[:3, 3]) < 5.0
     assert not graph.counts["solved badly"]
     graph.solve()
     assert rms_m(graph, f) < 1.5
