@@ -54,6 +54,9 @@ def test_ground_holds_what_was_made_onboard(tmp_path: Path) -> None:
     done = skyrelief("demo", "--flight", str(flight), "--out", str(out), "--json", *CPU)
     assert done.returncode == 0, done.stderr + (out / "ground.log").read_text()
     report = json.loads(done.stdout.splitlines()[-1])
+    assert "[1/3] open this page and see the map grow: http://127.0.0.1:" in done.stderr
+    assert "[2/3] flight: 5 images" in done.stderr
+    assert "INFO" not in done.stderr
     assert report["points"] > 10_000
     assert report["points"] == report["ground_points"]
     onboard, ground = Path(report["scan_folder"]), Path(report["ground_folder"])
