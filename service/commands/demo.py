@@ -159,7 +159,6 @@ def _replay(flight: Path, out: Path, endpoint: str, overrides: list[str]) -> Non
     settings = [
         f'datalink.connect=["{endpoint}"]',
         "datalink.budget_kbit_s=20000",
-        "compute.stereo_width=640",
         *overrides,
     ]
     command = _skyrelief(
