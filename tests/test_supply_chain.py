@@ -7,6 +7,7 @@ import importlib.util
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -182,6 +183,24 @@ def test_npm_runs_no_scripts_and_nothing_as_root(
     uid, *called = (page / "web" / "node_modules" / "called").read_text().split()
     assert called[:2] == ["ci", "--ignore-scripts"]
     assert uid != "0" and (page / "web" / "dist" / "index.html").read_text().split()[0] != "0"
+
+
+def test_a_changed_page_is_built_again(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the packages that are there; their own dist folders are part of them."""
+    monkeypatch.setenv("PATH", f"{page / 'bin'}{os.pathsep}{os.environ['PATH']}")
+    made, web = hook(), page / "web"
+    package = web / "node_modules" / "vite" / "dist" / "cli.js"
+    package.parent.mkdir(parents=True)
+    package.touch()
+    (web / "package-lock.json").touch()
+    (web / "node_modules" / ".package-lock.json").touch()
+    assert made._is_current(web)
+    copy = page / "copy"
+    shutil.copytree(web, copy, ignore=made._built(web))
+    assert (copy / "node_modules" / "vite" / "dist" / "cli.js").is_file()
+    assert made._is_current(copy)
+    os.utime(web / "package-lock.json", (2e9, 2e9))
+    assert not made._is_current(web)
 
 
 def test_the_bundle_and_the_installer_check_hashes() -> None:
