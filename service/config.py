@@ -156,7 +156,7 @@ class ComputeConfig:
     stereo_width: int = key(
         320,
         "width of the stereo pair in pixels; the paper's is 320. If unset, an offline replay uses "
-        "640 where the recording is at least that wide",
+        "up to 640, at most half of the recording's width",
     )
     labels: int = key(16, "minimum number of disparity labels; the paper's is 16")
     iterations: int = key(5, "iterations of belief propagation per level; the paper's is 5")

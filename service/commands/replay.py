@@ -67,11 +67,15 @@ def replay(
 
 
 def denser(config: Config, source: CameraSource) -> Config:
-    """The stereo width that the recording and the guide carry, up to 640."""
+    """Half of the recording's width up to 640, and no more than the guide's.
+
+    Stereo on the recording's own pixels matches their noise and compression as well: on 640
+    pixels a width of 640 gives more points than 320, but worse ones.
+    """
     from service.config import change
 
     compute = config.compute
-    width = min(STEREO_WIDTH_PX, source.size_px[0], compute.guide_width)
+    width = min(STEREO_WIDTH_PX, source.size_px[0] // 2, compute.guide_width)
     return change(config, WIDTH, max(width, compute.stereo_width))
 
 
