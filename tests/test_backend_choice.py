@@ -54,7 +54,7 @@ def test_auto_never_takes_torch_on_the_processor(
     chosen = choose_backend("auto")
     assert "torch" not in asked
     assert chosen.name != "torch"
-    assert "backend torch: not tried, it found no device but the processor" in caplog.text
+    assert "backend torch: not tried, it found no device but the CPU" in caplog.text
 
 
 def test_auto_says_what_it_took_and_why(
@@ -87,7 +87,7 @@ def test_auto_says_what_it_took_and_why(
     monkeypatch.setattr(backend_choice, "trial", trial)
     assert backend_choice.fastest_backend().name == "onnx"
     assert "backend torch: failed its trial, CUDA out of memory" in caplog.text
-    assert "onnx on cuda: 4.0 ms a trial, the least of cpu 20.0 ms, onnx 4.0 ms" in caplog.text
+    assert "onnx on cuda: 4.0 ms a trial, the fastest of cpu 20.0 ms, onnx 4.0 ms" in caplog.text
 
 
 def test_doctor_explains_a_named_backend_that_cannot_run(monkeypatch: pytest.MonkeyPatch) -> None:

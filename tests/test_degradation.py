@@ -109,12 +109,12 @@ def test_throttling_never_ends_the_reconstruction() -> None:
     ("readings", "word"),
     [
         (replace(CALM, age_s=2.0), "2.0 s late"),
-        (replace(CALM, late_frames=50), "83 % of the pictures"),
+        (replace(CALM, late_frames=50), "83 % of the images"),
         (replace(CALM, temperature_c=95.0, memory_free_mib=10.0), "memory"),
         (Readings(), ""),
     ],
 )
-def test_the_reason_is_told(readings: Readings, word: str) -> None:
+def test_the_reason_is_reported(readings: Readings, word: str) -> None:
     found = strain(readings, LadderConfig())
     assert (found.reason if found else "") == "" if not word else found and word in found.reason
 

@@ -215,7 +215,7 @@ def test_doctor_tells_how_long_a_certificate_holds(tmp_path: Path) -> None:
         (finding,) = _certificate(config)
         return finding.verdict, finding.text
 
-    assert found(90.5)[0] == GOOD and "holds for 90 days" in found(90.5)[1]
+    assert found(90.5)[0] == GOOD and "is valid for 90 more days" in found(90.5)[1]
     assert found(5.5)[0] == NOTE
     assert found(-5.5)[0] == BAD and "expired" in found(-5.5)[1]
     assert found(90.0, "key.pem")[0] == BAD
