@@ -68,7 +68,7 @@ def rooms() -> list[str]:
 
 
 def drawing() -> str:
-    """The picture as SVG text."""
+    """The image as SVG text."""
     if missing := set(rooms()) ^ set(BOXES):
         raise SystemExit(f"table of rooms and boxes differ: {sorted(missing)}")
     parts = [

@@ -80,7 +80,7 @@ def inverse_depth_plane(P: F64) -> F64:
 
 
 class Undistorter:
-    """Takes pictures of a distorted camera to the same camera without distortion.
+    """Takes images of a distorted camera to the same camera without distortion.
 
     The undistorted camera keeps K and the size of the original; pixels that the original
     does not see come out black and are zero in :attr:`valid`.
@@ -101,7 +101,7 @@ class Undistorter:
             self.valid = np.where(seen == 255, 255, 0).astype(np.uint8)
 
     def image(self, image: U8) -> U8:
-        """(H, W, 3) or (H, W) picture without distortion."""
+        """(H, W, 3) or (H, W) image without distortion."""
         if image.shape[:2] != (self.camera.size_px[1], self.camera.size_px[0]):
             raise ValueError(f"image {image.shape} is not of size (W, H) {self.camera.size_px}")
         if self._maps is None:

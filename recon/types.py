@@ -116,8 +116,8 @@ class StereoPair:
     slope: float  # d(disparity) / d(label)
     R_left_keyframe: F64  # (3, 3) keyframe camera to rectified left camera
     guide: U8 | None = None  # (H, W, 3) rectified left in colour, at guidance resolution
-    left_seen: Bool | None = None  # (h, w) False where the left picture has nothing
-    right_seen: Bool | None = None  # (h, w) the same of the shifted right picture
+    left_seen: Bool | None = None  # (h, w) False where the left image has nothing
+    right_seen: Bool | None = None  # (h, w) the same of the shifted right image
 
 
 @dataclass(frozen=True, slots=True, eq=False)

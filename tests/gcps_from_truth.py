@@ -57,7 +57,7 @@ def flat_points(truth: Truth, poses: F64, rng: np.random.Generator, count: int) 
 def marks_of(
     truth: Truth, spot: F64, seqs: list[int], poses: F64, distortion: F64, rng: np.random.Generator
 ) -> list[tuple[int, float, float]]:
-    """(keyframe, u, v) in the distorted picture wherever ``spot`` is seen, the best first."""
+    """(keyframe, u, v) in the distorted image wherever ``spot`` is seen, the best first."""
     W, H = truth.size_px
     found = []
     for seq, T in zip(seqs, poses, strict=True):

@@ -1,4 +1,4 @@
-"""Spoiled pictures in the middle of a flight: no crash, no invented surface, a reason counted.
+"""Spoiled images in the middle of a flight: no crash, no invented surface, a reason counted.
 
 The flight is exact: a camera 60 m above a level, textured plane, with attitude and height.
 """
@@ -45,7 +45,7 @@ def ploughed() -> U8:
 
 
 def photograph(ground: U8, i: int) -> U8:
-    """(H, W, 3) picture number ``i`` of the flight east."""
+    """(H, W, 3) image number ``i`` of the flight east."""
     rng = np.random.default_rng(i)
     R = se3.so3_exp(rng.normal(0, 0.01, 3)) @ DOWN
     t = np.array([STEP_M * i + 60.0, 60.0, HEIGHT_M])
@@ -151,7 +151,7 @@ def test_water_that_never_looks_the_same_gives_nothing() -> None:
 
 
 def test_telemetry_goes_on_where_vision_was_lost(clean: list[U8]) -> None:
-    """Fixes that are 3 m off when the pictures end do not throw the camera there."""
+    """Fixes that are 3 m off when the images end do not throw the camera there."""
     config = load_config(None, ["compute.upsample=false"])
     pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu")))
     rig = Rig(config.camera, config.scan, config.fusion)

@@ -23,7 +23,7 @@ STAGES = (
 def test_every_stage_is_measured_beside_its_floor(
     monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
-    """Small pictures here; the figures are those of ``skyrelief bench gpu``."""
+    """Small images here; the figures are those of ``skyrelief bench gpu``."""
     from service.bench import gpu_stages
 
     for module in (bench_gpu, gpu_stages, gpu):

@@ -54,7 +54,7 @@ def sample_rays() -> F64:
 
 
 def rendered(turn: F64, shift: F64) -> U8:
-    """A picture of the board, the mean of nine samples per pixel, with a little noise."""
+    """An image of the board, the mean of nine samples per pixel, with a little noise."""
     rays = sample_rays()
     R = cv2.Rodrigues(turn)[0]
     depth = (R[:, 2] @ shift) / (rays @ R[:, 2])

@@ -17,7 +17,7 @@ CAMERA = Camera(K, DISTORTION, (640, 480))
 
 
 def chart() -> U8:
-    """(480, 640) picture of dots and gradients."""
+    """(480, 640) image of dots and gradients."""
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 255, (480, 640)).astype(np.uint8)
     return np.asarray(cv2.GaussianBlur(noise, (0, 0), 3), np.uint8)

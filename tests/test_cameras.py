@@ -1,4 +1,4 @@
-"""Recorded cameras: every picture and its time come out, and bad input is told in one line."""
+"""Recorded cameras: every image and its time come out, and bad input is told in one line."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 def picture(i: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """Flat BGR colour that tells picture ``i`` from the others after lossy coding."""
+    """Flat BGR colour that tells image ``i`` from the others after lossy coding."""
     image = np.zeros((SIZE_PX[1], SIZE_PX[0], 3), np.uint8)
     image[:, :, 0] = 20 + 25 * i
     image[:, :, 2] = 230 - 25 * i
     noise = np.random.default_rng(i).integers(0, 256, (SIZE_PX[1], 32, 3), np.uint8)
-    image[:, -32:] = noise  # every picture costs bytes, so that a cut file loses some
+    image[:, -32:] = noise  # every image costs bytes, so that a cut file loses some
     return image
 
 
@@ -43,7 +43,7 @@ def write_video(
     creation_time: str | None = None,
     codec: str = "libx264",
 ) -> None:
-    """Code the pictures at ``TIMES_MS`` into ``target`` (path or stream)."""
+    """Code the images at ``TIMES_MS`` into ``target`` (path or stream)."""
     with av.open(target, "w", format=container_format, options=options or {}) as out:
         if creation_time:
             out.metadata["creation_time"] = creation_time
@@ -61,7 +61,7 @@ def write_video(
 
 
 def check_pictures(frames: list[CameraFrame]) -> None:
-    """Assert that ``frames`` are the pictures of :func:`write_video`, in order, in colour."""
+    """Assert that ``frames`` are the images of :func:`write_video`, in order, in colour."""
     assert [f.seq for f in frames] == list(range(len(TIMES_MS)))
     for i, frame in enumerate(frames):
         assert frame.image.shape == (SIZE_PX[1], SIZE_PX[0], 3)

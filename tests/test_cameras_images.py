@@ -31,7 +31,7 @@ def write_still(
     xmp: str = "",
     orientation: int | None = None,
 ) -> None:
-    """A grey JPEG with the given tags."""
+    """A gray JPEG with the given tags."""
     image = Image.fromarray(np.full((size_px[1], size_px[0], 3), 90, np.uint8))
     exif = Image.Exif()
     photo = exif.get_ifd(0x8769)

@@ -1,4 +1,4 @@
-"""Live cameras: one time axis through every loss; stalls, frozen pictures and misfits found."""
+"""Live cameras: one time axis through every loss; stalls, frozen images and misfits found."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ QUICK = LiveConfig(stall_s=1.0, frozen_s=0.3, first_retry_s=0.01, longest_retry_
 
 
 def clip(n: int, size_px: tuple[int, int] = (64, 48), moving: bool = True) -> bytes:
-    """``n`` Matroska pictures of noise, 20 ms apart; all the same unless ``moving``."""
+    """``n`` Matroska images of noise, 20 ms apart; all the same unless ``moving``."""
     data = io.BytesIO()
     with av.open(data, "w", format="matroska") as out:
         stream: Any = out.add_stream("ffv1", rate=50)
@@ -105,7 +105,7 @@ def test_stamps_shed_jitter_and_follow_drift() -> None:
 
 
 def test_what_a_new_connection_had_gathered_is_not_stamped() -> None:
-    """Two seconds of pictures come at once, then the rest as they are taken."""
+    """Two seconds of images come at once, then the rest as they are taken."""
     pts = [i * 40_000_000 for i in range(100)]
     arrival = [max(p, 2_000_000_000 + i * 1_000_000) for i, p in enumerate(pts)]
     stamps = StampFilter()
@@ -124,7 +124,7 @@ def test_stamps_begin_again_on_a_new_time_line() -> None:
 
 
 def test_a_picture_that_lost_its_time_is_dropped_where_others_have_one() -> None:
-    """A decoder gives up its last pictures when the stream has broken off, seconds late."""
+    """A decoder gives up its last images when the stream has broken off, seconds late."""
     source = LiveSource(opener(clip(50)), "test", QUICK)
 
     def pictures(*stamps: int | None) -> Iterator[Any]:
@@ -173,7 +173,7 @@ def test_frozen_picture_is_found_out() -> None:
 
 
 def test_live_pictures_are_not_held_back() -> None:
-    """A live source that was opened an hour before it is read gives its pictures at once."""
+    """A live source that was opened an hour before it is read gives its images at once."""
     source = LiveSource(opener(clip(5)), "test", QUICK)
     source._first = (source._first[0], 3600 * 10**9)
     paces = Paced(source)
@@ -221,7 +221,7 @@ def no_collector() -> Iterator[None]:
 
 
 def test_a_paced_recording_can_be_ended(tmp_path: Path) -> None:
-    """Its pictures are hours apart; closing does not wait for the next one."""
+    """Its images are hours apart; closing does not wait for the next one."""
     data = clip(3)
     path = tmp_path / "v.mkv"
     path.write_bytes(data)
@@ -259,7 +259,7 @@ def free_udp_port() -> int:
 
 
 def send_udp(port: int) -> subprocess.Popen[bytes]:
-    """A moving test picture in H.264 over MPEG-TS, 20 a second, for ever."""
+    """A moving test image in H.264 over MPEG-TS, 20 a second, for ever."""
     return subprocess.Popen(
         shlex.split(
             "ffmpeg -v error -re -f lavfi -i testsrc2=size=160x120:rate=20 -c:v libx264 "
@@ -338,7 +338,7 @@ def has_gstreamer(*elements: str) -> bool:
     not has_gstreamer("qtdemux", "h264parse", "avdec_h264"), reason="needs GStreamer's decoders"
 )
 def test_a_gstreamer_decoder_with_padded_pictures_is_read(tmp_path: Path) -> None:
-    """A height that is no multiple of sixteen: the decoder's buffers are larger than pictures."""
+    """A height that is no multiple of sixteen: the decoder's buffers are larger than images."""
     clip, made = tmp_path / "clip.mp4", "testsrc2=size=80x70:rate=20:duration=2"
     command = f"ffmpeg -v error -f lavfi -i {made} -pix_fmt yuv420p -c:v libx264 {clip}"
     subprocess.run(shlex.split(command), check=True)
@@ -351,7 +351,7 @@ def test_a_gstreamer_decoder_with_padded_pictures_is_read(tmp_path: Path) -> Non
         truth = next(container.decode(video=0)).to_ndarray(format="bgr24")
     assert shown[0].shape == (70, 80, 3)
     apart = [np.abs(image.astype(int) - truth).mean() for image in shown]
-    assert min(apart) < 12.0  # chroma apart; another stride would shear the picture
+    assert min(apart) < 12.0  # chroma apart; another stride would shear the image
 
 
 @pytest.mark.skipif(not has_gstreamer(), reason="needs GStreamer")

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from conftest import HouseFlight
 
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
-"""A camera that looks straight down, the top of its picture to the north."""
+"""A camera that looks straight down, the top of its image to the north."""
 
 SIZE = (48, 80)
 
@@ -163,7 +163,7 @@ def test_a_gap_between_two_lines_is_inside_and_the_border_is_not() -> None:
     gap = found.gaps
     col, row = np.rint(found.grid.pixels(np.array([[55.0, 40.0]]))[0]).astype(int)
     assert gap[row, col]
-    width = gap[:, col].sum()  # between the pictures: 80 m less a picture's height of 32 m
+    width = gap[:, col].sum()  # between the images: 80 m less an image's height of 32 m
     assert abs(width - (80 - SIZE[0] / 60 * 40)) <= 2
     assert not found.weak(1, 10.0)[0].any() and not found.weak(1, 10.0)[:, 0].any()
 

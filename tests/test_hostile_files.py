@@ -41,7 +41,7 @@ def mp4(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 def frames(path: Path) -> int:
-    """How many pictures come out; -1 when the file is refused in one line."""
+    """How many images come out; -1 when the file is refused in one line."""
     try:
         source = open_camera(str(path))
     except InputError as error:

@@ -1,4 +1,4 @@
-"""The picture of a keyframe's stages, from kept arrays and from the store alone."""
+"""The image of a keyframe's stages, from kept arrays and from the store alone."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ START_NS = 1_790_000_000_123_456_000
 
 
 class Film:
-    """A camera of a hundred numbered pictures, ten a second."""
+    """A camera of a hundred numbered images, ten a second."""
 
     def __init__(self, count: int = 100) -> None:
         self.description, self.size_px = "film", (64, 48)

@@ -46,7 +46,7 @@ def camera(x: float, y: float, z: float, yaw: float) -> F64:
 
 
 def view(T: F64, seed: int = 0, ground: int = 1, sigma_m: float = 0.08) -> LoopView:
-    """A picture with noise and a depth map at half its size with noise."""
+    """An image with noise and a depth map at half its size with noise."""
     rng = np.random.default_rng(seed)
     v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]].astype(np.float64)
     directions = rays(K, np.column_stack([u.ravel(), v.ravel()])) @ T[:3, :3].T
@@ -101,7 +101,7 @@ def oblique(x: float, y: float, yaw: float) -> F64:
 
 @pytest.mark.parametrize("across_m", [0.0, 12.0])
 def test_oblique_views_from_opposite_sides_are_one_place(across_m: float) -> None:
-    """50 degrees between the rays, pictures turned by half a circle."""
+    """50 degrees between the rays, images turned by half a circle."""
     near = 40.0 * np.tan(np.radians(25.0))
     A, B = oblique(0.0, -near, 0.0), oblique(across_m, near, np.pi)
     assert np.allclose((A[:3, 3] + A[:3, 2] * 40.0 / -A[2, 2])[:2], [0, 0], atol=0.1)
@@ -149,7 +149,7 @@ def test_another_place_is_no_loop() -> None:
 
 
 def test_the_same_picture_over_another_relief_is_no_loop() -> None:
-    """Perfect matches whose depths contradict: the ground moved, or a picture repeats."""
+    """Perfect matches whose depths contradict: the ground moved, or an image repeats."""
     B = camera(3.0, 2.0, 40.0, 0.2)
     a, b = view(A, 1), view(B, 2)
     v, u = np.mgrid[0:180, 0:320]

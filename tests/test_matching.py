@@ -52,7 +52,7 @@ def view(du: float, dv: float, height: int = 360, width: int = 480) -> F64:
 
 
 def inside(uv: npt.ArrayLike, size: tuple[int, ...], margin: float) -> Bool:
-    """(N,) which pixels lie inside a picture of (height, width) ``size``."""
+    """(N,) which pixels lie inside an image of (height, width) ``size``."""
     points = np.asarray(uv)
     upper = np.array([size[1], size[0]]) - margin
     return np.asarray(np.all((points > margin) & (points < upper), axis=1))
@@ -62,7 +62,7 @@ def inside(uv: npt.ArrayLike, size: tuple[int, ...], margin: float) -> Bool:
 
 
 def naive_response(image: U8, k: float) -> F64:
-    """Eq. 5 by SciPy: Sobel slopes in grey levels per pixel, binomial 5x5 window."""
+    """Eq. 5 by SciPy: Sobel slopes in gray levels per pixel, binomial 5x5 window."""
     I = image.astype(np.float64)
     gx, gy = ndi.sobel(I, 1) / 8, ndi.sobel(I, 0) / 8
     w = np.outer([1, 4, 6, 4, 1], [1, 4, 6, 4, 1]) / 256
@@ -151,7 +151,7 @@ def test_noise_and_a_change_of_exposure_cost_a_tenth_of_a_pixel(gain: float, off
 
 
 def turned(angle_deg: float, scale: float, shift: tuple[float, float]) -> tuple[U8, U8, F64, F64]:
-    """Two (450, 600) pictures and the (2, 2), (2,) map of pixels from the first to the second."""
+    """Two (450, 600) images and the (2, 2), (2,) map of pixels from the first to the second."""
     scene = ground(1100, 1300, seed=3)
     angle = np.radians(angle_deg)
     A = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

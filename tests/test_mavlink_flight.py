@@ -36,7 +36,7 @@ LAT, LON = 47.3, 8.5
 
 
 def draw_flight(folder: Path) -> None:
-    """Nadir pictures of flat ground, flown east with the picture's top to the north."""
+    """Nadir images of flat ground, flown east with the image's top to the north."""
     rng = np.random.default_rng(3)
     ground = np.zeros((SIZE[1] + 8, SIZE[0] + 3 * IMAGES, 3), np.float32)
     for size in (3, 9, 31):

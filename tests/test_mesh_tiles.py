@@ -158,7 +158,7 @@ def test_the_command_cuts_a_large_site(tmp_path: Path, house: HouseFlight) -> No
 
 
 class FakeVideo:
-    """Pictures twice as fine as the keyframes', one of them at each keyframe's second."""
+    """Images twice as fine as the keyframes', one of them at each keyframe's second."""
 
     def __init__(self, house: HouseFlight, size_px: tuple[int, int] = (320, 180)) -> None:
         self.size_px, self.closed = size_px, False

@@ -1,4 +1,4 @@
-"""The odometry over a flat, textured ground whose pictures are exact homographies."""
+"""The odometry over a flat, textured ground whose images are exact homographies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The camera found from rendered pictures of a flight, and what the command refuses."""
+"""The camera found from rendered images of a flight, and what the command refuses."""
 
 from __future__ import annotations
 

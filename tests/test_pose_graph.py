@@ -324,7 +324,7 @@ def test_a_stretch_without_vision_is_bridged_and_said() -> None:
 
 @pytest.mark.parametrize("burst_ns", [0, 996_000_000])
 def test_without_fixes_a_gap_is_bridged_at_the_last_velocity(burst_ns: int) -> None:
-    """Also when the last pictures before it came in a burst, milliseconds apart."""
+    """Also when the last images before it came in a burst, milliseconds apart."""
     f = flight(40, scale=1.0, turn_every=100)
     graph = PoseGraph()
     for i in range(20):

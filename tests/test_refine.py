@@ -216,7 +216,7 @@ def test_marks_by_time_and_points_of_the_cloud_count_too(flight: Flight) -> None
         lat, lon, alt = FRAME.to_geodetic(spot[None])[0]
         row: dict[str, Any] = dict.fromkeys(("time", "u_px", "v_px", "x", "y", "z"), "")
         row |= {"name": name, "lat": lat, "lon": lon, "alt_amsl_m": alt}
-        if name in "ABD":  # two pictures between keyframes
+        if name in "ABD":  # two images between keyframes
             for k in [k for k in range(15) if flight.pixel(k, spot)]:
                 half = np.array(flight.truth[k])
                 half[:3, 3] = (flight.truth[k] + flight.truth[k + 1])[:3, 3] / 2

@@ -31,13 +31,13 @@ HEIGHT_M = 40.0
 
 
 def looking_down(x: float, y: float, forward: float = 0.0) -> DepthMap:
-    """Level ground 40 m below; the picture is 64 m across and 32 m along a flight east.
+    """Level ground 40 m below; the image is 64 m across and 32 m along a flight east.
 
     ``forward``: rad by which the camera looks ahead, to the east.
     """
     w, h = 60, 30
     K = np.array([[37.5, 0.0, (w - 1) / 2], [0.0, 37.5, (h - 1) / 2], [0.0, 0.0, 1.0]])
-    # The picture's width lies across the flight: camera x to the south, y to the west.
+    # The image's width lies across the flight: camera x to the south, y to the west.
     R = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     c, s = np.cos(forward), np.sin(forward)
     R = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]]) @ R

@@ -1,4 +1,4 @@
-"""Vehicle states and picture tags as priors on the camera's pose."""
+"""Vehicle states and image tags as priors on the camera's pose."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def q(roll: float, pitch: float, yaw: float) -> F64:
 
 
 def up_and_right(R_world_camera: F64 | None) -> tuple[F64, F64, F64]:
-    """Where the picture's right, its top, and the view point to, in ENU."""
+    """Where the image's right, its top, and the view point to, in ENU."""
     assert R_world_camera is not None
     return R_world_camera[:, 0], -R_world_camera[:, 1], R_world_camera[:, 2]
 
 
 def test_a_nadir_camera_of_a_vehicle_heading_east() -> None:
-    """The picture's top points where the nose does, the view straight down."""
+    """The image's top points where the nose does, the view straight down."""
     prior = rig().prior(VehicleState(0, q_ned_body_wxyz=q(0, 0, 90), sigma_yaw_rad=0.1), None)
     right, top, view = up_and_right(prior.R_world_camera)
     np.testing.assert_allclose(view, [0, 0, -1], atol=1e-9)

@@ -1,4 +1,4 @@
-"""Blurred pictures are told from sharp ones of the same scene."""
+"""Blurred images are told from sharp ones of the same scene."""
 
 from __future__ import annotations
 

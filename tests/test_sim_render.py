@@ -70,7 +70,7 @@ def test_depth_agrees_with_brute_force() -> None:
 
 
 def test_frames_depth_and_poses_belong_together() -> None:
-    """One frame, taken to another by true depth and pose, shows the same picture."""
+    """One frame, taken to another by true depth and pose, shows the same image."""
     T_a, T_b = (
         looking_down(0.0, 0.0, 40.0),
         looking_down(4.0, 2.0, 41.0, np.array([0.05, 0.03, 0.1])),

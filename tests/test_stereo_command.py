@@ -36,7 +36,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
 
 @pytest.fixture
 def pair(tmp_path: Path) -> tuple[Path, Path]:
-    """Two pictures of a textured wall at a disparity of 9.5 px."""
+    """Two images of a textured wall at a disparity of 9.5 px."""
     canvas = np.random.default_rng(0).normal(128, 90, (80, 300)).astype(np.float32)
     canvas = np.asarray(cv2.GaussianBlur(canvas, (0, 0), 1.3))
     v, u = np.mgrid[0:80, 0:160].astype(np.float32)

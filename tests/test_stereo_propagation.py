@@ -211,7 +211,7 @@ def test_no_label_whose_partner_lies_outside_the_right_image() -> None:
 
 
 def rng_image(seed: int, level: float) -> U8:
-    """Independent noise about grey 128."""
+    """Independent noise about gray 128."""
     return grey(np.random.default_rng(seed).normal(128, level, (120, 200)))
 
 

@@ -43,7 +43,7 @@ def _oblique(along: float, across: float, back: bool) -> F64:
 
 
 def _keyframe(seq: int, T: F64, texture: F64 = GROUND) -> Keyframe:
-    """A view of the ground with noise in grey and depth."""
+    """A view of the ground with noise in gray and depth."""
     rng = np.random.default_rng(seq)
     w, h = SIZE
     v, u = np.mgrid[0:h, 0:w].astype(np.float64)

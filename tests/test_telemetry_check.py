@@ -1,4 +1,4 @@
-"""What the pictures say of the telemetry, from tracked frames to the operator's words."""
+"""What the images say of the telemetry, from tracked frames to the operator's words."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ def test_room_around_a_pair_changes_nothing(
 def test_belief_on_the_device_equals_the_compiled_one(
     device: str, seed: int, tolerance: float
 ) -> None:
-    """Contrast, visibility, speckles of every size, and what either picture does not see."""
+    """Contrast, visibility, speckles of every size, and what either image does not see."""
     from recon.backends.torch_stereo import believe, drop_unseen
 
     config = BeliefPropagationConfig(occlusion_tolerance=tolerance)

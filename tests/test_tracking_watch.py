@@ -1,4 +1,4 @@
-"""The operator hears that nothing is reconstructed while pictures come."""
+"""The operator hears that nothing is reconstructed while images come."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_a_long_loss_is_told_once_with_its_reason_and_its_end() -> None:
     once = ["keyframe", *["lost"] * 30, "tracked", "tracked"]
     assert flown(*once) == [lost, "Vision has its way again"]
     assert flown(*once, *once) == 2 * [lost, "Vision has its way again"]
-    assert flown(*["lost"] * 30) == [lost]  # nothing to see from the first picture on
+    assert flown(*["lost"] * 30) == [lost]  # nothing to see from the first image on
     assert len(flown("keyframe", *(["lost"] * 12 + ["started", "waiting"]) * 9)) == 1
 
 

@@ -65,7 +65,7 @@ def test_a_frame_at_work_is_timed_and_a_silent_camera_is_not(tmp_path: Path) -> 
     gate: FrameGate
 
     class Silent(MadeUpGround):
-        """Gives one picture, then nothing for a while."""
+        """Gives one image, then nothing for a while."""
 
         def __iter__(self) -> Iterator[CameraFrame]:
             for frame in super().__iter__():

@@ -62,7 +62,7 @@ class DenseStages:
 
 @runtime_checkable
 class PathBackend(Protocol):
-    """A backend that keeps the stages between pictures and fused depth on its device."""
+    """A backend that keeps the stages between images and fused depth on its device."""
 
     def fused_depth(
         self,

@@ -81,7 +81,7 @@ class LearnedStereoBackend(OnnxBackend):
         """The model's disparity less ``config.min_disparity``, NaN outside the labels.
 
         A pair larger than the model's images is averaged down to fit (rectified pairs of a
-        turning camera are larger than its pictures); its disparities grow back with it.
+        turning camera are larger than its images); its disparities grow back with it.
         """
         check_pair(left, right, labels)
         h, w = left.shape

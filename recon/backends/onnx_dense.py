@@ -300,7 +300,7 @@ def upsampling_model(
 
     Inputs ``px`` and ``confidence`` (h, w) float32, ``taps`` (h, w, 3) and ``guide`` (H, W, 3)
     uint8; results ``fine_px`` and ``fine_confidence`` (H, W). Unless ``fixed`` the taps of each
-    row and column are inputs as well, see :func:`tap_windows`, and pictures may be smaller.
+    row and column are inputs as well, see :func:`tap_windows`, and images may be smaller.
     """
     graph = Graph()
     px = graph.input("px", TensorProto.FLOAT, coarse)

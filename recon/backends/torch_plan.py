@@ -57,7 +57,7 @@ class Plan:
         self._outputs: tuple[Tensor, ...] = ()
 
     def upload(self, arrays: Sequence[Array], slot: int = 0) -> None:
-        """Write the inputs; a smaller picture is continued by its last row and column."""
+        """Write the inputs; a smaller image is continued by its last row and column."""
         if slot not in self._staging:
             host = torch.zeros(self.upload_bytes, dtype=torch.uint8, pin_memory=self._on_cuda)
             self._staging[slot] = host, [view.numpy() for view in self._views(host)]

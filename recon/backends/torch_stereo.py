@@ -376,7 +376,7 @@ def _of_neighbours(own: Tensor, across: Tensor, down: Tensor, none: int, best: o
 def drop_unseen(
     px: Tensor, confidence: Tensor, left_seen: Tensor, right_seen: Tensor, true: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The labels without those that rest on nothing in either picture; masks are 0 or 1."""
+    """The labels without those that rest on nothing in either image; masks are 0 or 1."""
     w = px.shape[1]
     known = px == px
     column = torch.arange(w, device=px.device)[None, :]

@@ -46,7 +46,7 @@ def build(depth: Tensor, sigma: Tensor, intrinsics: Tensor, edge_share: float) -
 def rays(
     size: tuple[int, int], intrinsics: Tensor, stride: int, first: int
 ) -> tuple[Tensor, Tensor]:
-    """x and y at z = 1 of every ``stride``-th pixel (h', w') of a picture of ``size`` (h, w)."""
+    """x and y at z = 1 of every ``stride``-th pixel (h', w') of an image of ``size`` (h, w)."""
     v = torch.arange(first, size[0], stride, dtype=DOUBLE, device=intrinsics.device)[:, None]
     u = torch.arange(first, size[1], stride, dtype=DOUBLE, device=intrinsics.device)[None, :]
     fx, fy, cx, cy = intrinsics

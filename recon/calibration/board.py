@@ -1,4 +1,4 @@
-"""Intrinsics and lens distortion from pictures of a chessboard.
+"""Intrinsics and lens distortion from images of a chessboard.
 
 The corners come from OpenCV's detectors; the model is fitted by its bundle adjustment after
 Zhang (2000, DOI 10.1109/34.888718). Radial distortion only,
@@ -43,7 +43,7 @@ class Board:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardView:
-    """The corners of the board in one picture."""
+    """The corners of the board in one image."""
 
     name: str
     corners_px: F32  # (N, 2), in the board's order
@@ -77,7 +77,7 @@ class Calibration:
 
 
 def find_board(gray: U8, board: Board) -> F32 | None:
-    """(N, 2) corners of the board in a gray picture, sub-pixel, or None when it is not there.
+    """(N, 2) corners of the board in a gray image, sub-pixel, or None when it is not there.
 
     The classic detector finds more real boards; the sector-based one (Duda and Frese 2018)
     is asked where it finds none. Both are refined to the saddle points.

@@ -60,7 +60,7 @@ class Tiles:
         return len(self.first) - 1
 
     def in_view(self, depth: DepthMap, slack_m: float = 0.0, up_m: float = 0.0) -> I64:
-        """(M,) undecided tiles that may hold a place in the picture, no more than ``slack_m``
+        """(M,) undecided tiles that may hold a place in the image, no more than ``slack_m``
         behind the farthest surface in it; or one that is raised by up to ``up_m``.
         """
         planes = _planes(depth, slack_m)
@@ -141,7 +141,7 @@ def seen_through(cloud: PointCloud, views: Iterable[DepthMap]) -> Bool:
 
     A keyframe counts with the number of pairs that agree at its pixel. Points that no
     keyframe sees at all are kept. The first MOST_VIEWS keyframes with a point's place in the
-    picture decide; where there may be more of them, give the views as :func:`spread` orders them.
+    image decide; where there may be more of them, give the views as :func:`spread` orders them.
     """
     tiles = Tiles(cloud.xyz_m)
     sigma = np.ascontiguousarray(cloud.sigma_m[tiles.order], np.float32)

@@ -31,7 +31,7 @@ HUBER = 2.5
 """Whitened residuals beyond this lose weight."""
 
 WILD = 5.0
-"""Median of the whitened residuals beyond which attitudes and pictures do not belong together."""
+"""Median of the whitened residuals beyond which attitudes and images do not belong together."""
 
 SURE = 9.0
 """Squared sigmas by which a boresight must differ from none before attitudes are corrected."""

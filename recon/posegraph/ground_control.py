@@ -2,7 +2,7 @@
 
 One batch over poses and the scale of each stretch (Levenberg-Marquardt of GTSAM): the motions
 between keyframes as vision had them, loops, telemetry or the placing it once gave, and ground
-control points. A control point is seen in pictures: each mark gives a direction and, where the
+control points. A control point is seen in images: each mark gives a direction and, where the
 keyframe has a surface there, a distance. The point itself is unknown within its survey's
 sigma. Check points take no part; :func:`map_position` says where the map has them.
 """
@@ -46,15 +46,15 @@ class BatchConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mark:
-    """A point as one picture sees it."""
+    """A point as one image sees it."""
 
     point: int  # which, of the list of points
     keyframe: int  # which, of the list of keyframes
-    ray: F64  # (3,) in the picture's camera, z = 1
+    ray: F64  # (3,) in the image's camera, z = 1
     sigma: float  # of the direction, rad
     depth_m: float | None = None  # along z, of the keyframe's surface there
     sigma_depth_m: float = 1.0
-    T_key_camera: F64 = field(default_factory=lambda: np.eye(4))  # for pictures between keyframes
+    T_key_camera: F64 = field(default_factory=lambda: np.eye(4))  # for images between keyframes
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,7 +1,7 @@
 """Places seen before: candidates by overlap of the views, each verified before it is believed.
 
 Verification is independent of the pose graph: corners of one keyframe with their depths are
-matched in the other's picture (ZSSD), give a pose by EPnP, and the two depth maps must then
+matched in the other's image (ZSSD), give a pose by EPnP, and the two depth maps must then
 agree by ICP. Whether a loop that passes may bend the map is for
 :meth:`recon.posegraph.pose_graph.PoseGraph.add_loop` to say.
 """
@@ -45,7 +45,7 @@ class LoopConfig:
 
     least_gap: int = 10  # keyframes between the two ends of a loop
     least_overlap: float = 0.35  # of the later view in the earlier one
-    search_share: float = 0.12  # of the picture's width, about the predicted places
+    search_share: float = 0.12  # of the image's width, about the predicted places
     min_matches: int = 40
     max_disagreement: float = 4.0  # chi-square per degree of freedom between EPnP and ICP
     matching: matching.MatchingConfig = field(default_factory=matching.MatchingConfig)
@@ -69,7 +69,7 @@ class LoopView:
     """A keyframe as the search for loops needs it."""
 
     gray: U8  # (H, W) without distortion
-    K: F64  # (3, 3) px of the picture
+    K: F64  # (3, 3) px of the image
     depth: DepthMap  # metres; of the same camera at any size
 
 
@@ -85,7 +85,7 @@ class LoopClosure:
 
 
 def ground_seen(depth: DepthMap) -> F64:
-    """(N, 3) what a camera sees, in its frame: a grid over the whole picture.
+    """(N, 3) what a camera sees, in its frame: a grid over the whole image.
 
     Where nothing was measured lies the plane through what was.
     """

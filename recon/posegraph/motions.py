@@ -118,7 +118,7 @@ class Motions:
 
     def _velocity(self, last: Node, T_last: F64) -> F64 | None:
         """(3,) m/s at a segment's keyframe, over a second or more; None at its start, and where
-        no aircraft is so fast: a camera about to fail stamps pictures anyhow."""
+        no aircraft is so fast: a camera about to fail stamps images anyhow."""
         for node in reversed(self._segments.nodes[last.segment]):
             passed_s = (last.time_ns - node.time_ns) * 1e-9
             if node.key < last.key and passed_s >= VELOCITY_S:

@@ -1,8 +1,8 @@
 """Loops between keyframes of a finished flight, whose surfaces are known on both sides.
 
-Corners of one are found in the other's picture (ZSSD), and their places on both surfaces give
+Corners of one are found in the other's image (ZSSD), and their places on both surfaces give
 the motion by a robust fit of points to points. That needs fewer matches than a pose from
-pixels, so it holds where little of two pictures is alike: oblique views from opposite sides.
+pixels, so it holds where little of two images is alike: oblique views from opposite sides.
 A kept keyframe holds only what was new when it was flown, so its view is first filled with the
 surface that its neighbours measured, brought over by the track between them.
 Arun et al. 1987, doi:10.1109/TPAMI.1987.4767965, with weights.
@@ -31,7 +31,7 @@ class SubmapLoopConfig:
 
     least_gap: int = 10  # keyframes between the two ends
     least_overlap: float = 0.2  # of the later view in the earlier one
-    search_shares: tuple[float, ...] = (0.03, 0.1)  # of the picture's width, tried in turn
+    search_shares: tuple[float, ...] = (0.03, 0.1)  # of the image's width, tried in turn
     min_matches: int = 14
     min_inlier_share: float = 0.6
     gate_sigmas: float = 3.0
@@ -99,7 +99,7 @@ def _fitted(
 
 
 def _on_surface(view: LoopView, uv: F64) -> tuple[F64, Bool]:
-    """(N, 3) surface points at pixels (N, 2) of the picture, and where there is one."""
+    """(N, 3) surface points at pixels (N, 2) of the image, and where there is one."""
     h, w = view.depth.depth_m.shape
     H, W = view.gray.shape
     at = np.rint((uv + 0.5) * [w / W, h / H] - 0.5)

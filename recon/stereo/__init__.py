@@ -1,1 +1,1 @@
-"""Two frames as the pictures of a virtual stereo camera, to a depth map with its sigma."""
+"""Two frames as the images of a virtual stereo camera, to a depth map with its sigma."""

@@ -46,11 +46,11 @@ class BeliefPropagationConfig:
     levels: int = 5  # of the pyramid; fewer when the image is small
     smoothness_truncation: float = 2.5  # labels; a larger jump costs no more
     edge_floor: float = 0.4  # share of the smoothness that is left across strong edges
-    edge_contrast: int = 32  # grey levels between neighbours that make a strong edge
+    edge_contrast: int = 32  # gray levels between neighbours that make a strong edge
     min_disparity: int = 0  # px, disparity of label 0
     cost: MatchingCostConfig = field(default_factory=MatchingCostConfig)
     min_evidence: float = 0.2  # how much better than the mean label, 0 to 1; 0: believe all
-    min_contrast: float = 0.5  # grey levels of standard deviation in 9x9; 0: believe all
+    min_contrast: float = 0.5  # gray levels of standard deviation in 9x9; 0: believe all
     occlusion_tolerance: float = 1.0  # labels; a surface seen behind another one; < 0: no check
     fill_occluded: bool = False  # with the farther neighbour of the row, at low confidence
     speckle_px: int = 24  # smaller islands are dropped; 0: none
@@ -84,7 +84,7 @@ def belief_propagation(
 ) -> DisparityMap:
     """Real-valued labels (0 to labels - 1) of the left view, (h, w), NaN where not trusted.
 
-    ``left`` and ``right`` are rectified grey images (h, w) uint8; left pixel (u, v) at label
+    ``left`` and ``right`` are rectified gray images (h, w) uint8; left pixel (u, v) at label
     ``l`` matches ``right[v, u - l - config.min_disparity]``. Raises ValueError for bad input.
     """
     check_pair(left, right, labels)
@@ -120,7 +120,7 @@ def believe(left: U8, px: F32, confidence: F32, config: BeliefPropagationConfig)
 
 
 def _contrast(image: U8) -> F32:
-    """Standard deviation of the grey levels in 9x9, (h, w)."""
+    """Standard deviation of the gray levels in 9x9, (h, w)."""
     mean = cv2.boxFilter(image, cv2.CV_32F, (9, 9), borderType=cv2.BORDER_REPLICATE)
     square = cv2.sqrBoxFilter(image, cv2.CV_32F, (9, 9), borderType=cv2.BORDER_REPLICATE)
     return np.asarray(np.sqrt(np.maximum(square - mean * mean, 0)), np.float32)

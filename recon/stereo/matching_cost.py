@@ -33,14 +33,14 @@ _WINDOW = 2 * CENSUS_RADIUS + 1
 class MatchingCostConfig:
     """Weights of the data term, in units of one label of smoothness.
 
-    A census bit adds ``census_weight``, a grey level of difference ``difference_weight``;
+    A census bit adds ``census_weight``, a gray level of difference ``difference_weight``;
     each part stops growing at its truncation.
     """
 
     census_weight: float = 0.08
     census_truncation: int = 24  # bits
     difference_weight: float = 0.04
-    difference_truncation: int = 30  # grey levels
+    difference_truncation: int = 30  # gray levels
     unseen: float = 1.0  # of a label whose partner is outside the image, above the best one
 
     def __post_init__(self) -> None:
@@ -106,7 +106,7 @@ def plain(array: Any) -> Any:
 
 
 def check_pair(left: U8, right: U8, labels: int) -> None:
-    """Raises ValueError when the two are not grey 8-bit images of one size."""
+    """Raises ValueError when the two are not gray 8-bit images of one size."""
     for image in (left, right):
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f"a grey 8-bit image is needed, not {image.dtype} {image.shape}")

@@ -151,7 +151,7 @@ class Smoothness:
     """What a step between neighbouring labels costs, in integer units.
 
     ``slope`` per label, ``truncation`` at most; both fall, with the contrast of the two
-    pixels, to ``floor`` of that at ``full_contrast`` grey levels and above.
+    pixels, to ``floor`` of that at ``full_contrast`` gray levels and above.
     """
 
     slope: int

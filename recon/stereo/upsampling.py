@@ -48,13 +48,13 @@ class UpsamplingConfig:
     """The paper's "filter 15, diameter 10", mapped so that any guide size gives one look.
 
     The spatial sigma is ``filter_px`` pixels of the paper's 2704 px frame, which are
-    15 / 8.45 = 1.78 coarse pixels; the range sigma is ``range_sigma`` grey levels of the
+    15 / 8.45 = 1.78 coarse pixels; the range sigma is ``range_sigma`` gray levels of the
     Euclidean distance of the colours; the window is the nearest ``diameter_px`` x
     ``diameter_px`` coarse pixels.
     """
 
     filter_px: float = 15.0
-    range_sigma: float = 15.0  # grey levels
+    range_sigma: float = 15.0  # gray levels
     diameter_px: int = 10  # coarse pixels
     min_support: float = 0.5  # share of the weight that must fall on known taps
 

@@ -42,9 +42,9 @@ class VirtualStereoConfig:
     min_base_to_height: float = 0.03
     max_base_to_height: float = 0.45
     min_overlap: float = 0.4  # share of the left view that the right one sees
-    width_px: int = 320  # of the stereo views, along the picture's width
-    guide_width_px: int = 1280  # of the picture that guides the upsampling
-    guided: bool = True  # make the picture that guides the upsampling
+    width_px: int = 320  # of the stereo views, along the image's width
+    guide_width_px: int = 1280  # of the image that guides the upsampling
+    guided: bool = True  # make the image that guides the upsampling
     labels: int = 16  # the fewest; relief may widen it
     max_labels: int = 96
     margin_labels: float = 3.0  # on either side of the relief that the landmarks show
@@ -64,13 +64,13 @@ class VirtualStereoConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A posed picture without distortion that may become a left or right view."""
+    """A posed image without distortion that may become a left or right view."""
 
     bgr: U8 | None  # (H, W, 3); only a left view that guides the upsampling needs it
     gray: U8  # (H, W) the same
-    K: F64  # (3, 3) px of that picture
+    K: F64  # (3, 3) px of that image
     T_odom_camera: F64  # (4, 4)
-    seen: U8 | None = None  # (H, W) zero where the picture has nothing; None: all of it
+    seen: U8 | None = None  # (H, W) zero where the image has nothing; None: all of it
     rows: Rows | None = None  # how the camera moved while it read the image; None: not at all
     scene: F64 | None = None  # (3,) inverse depth of the ground, times a ray with z = 1; with rows
 
@@ -117,7 +117,7 @@ def is_along_the_view(left: View, right: View, config: VirtualStereoConfig) -> b
 
 
 def _overlap(T_left_right: F64, K: F64, size: tuple[int, int], depth_m: float) -> float:
-    """Share of the left picture that the right one sees, for ground at one depth."""
+    """Share of the left image that the right one sees, for ground at one depth."""
     W, H = size
     u, v = np.meshgrid(np.linspace(0, W - 1, 12), np.linspace(0, H - 1, 8))
     ray = np.stack(
@@ -232,7 +232,7 @@ def _row_baseline(
 
 
 def drop_unseen(labels: DisparityMap, pair: RectifiedPair) -> DisparityMap:
-    """``labels`` (h, w) of the pair without those that rest on nothing in either picture."""
+    """``labels`` (h, w) of the pair without those that rest on nothing in either image."""
     h, w = labels.px.shape
     if pair.left_seen is None or pair.right_seen is None:
         return labels
@@ -259,7 +259,7 @@ def _rectifying_rotation(T_left_right: F64) -> F64:
 def _rectified_intrinsics(
     left: View, R_rect_left: F64, width_px: int
 ) -> tuple[F64, tuple[int, int]]:
-    """Intrinsics and (w, h) of a rectified picture that holds the whole left view."""
+    """Intrinsics and (w, h) of a rectified image that holds the whole left view."""
     H, W = left.gray.shape
     s = width_px / W
     corners = np.array([[0, 0, 1], [W - 1, 0, 1], [0, H - 1, 1], [W - 1, H - 1, 1.0]])
@@ -317,7 +317,7 @@ def _fit_plane(u: F64, v: F64, d: F64) -> tuple[F64, F64]:
 
 
 def _homography(view: View, R_rect_view: F64, K: F64, oversample: float, plane: F64 | None) -> F64:
-    """(3, 3) from a pixel of the rectified picture (``oversample`` finer) to one of the view.
+    """(3, 3) from a pixel of the rectified image (``oversample`` finer) to one of the view.
 
     The shift by the disparity plane is affine along the rows, so it is part of it.
     """
@@ -337,7 +337,7 @@ def _homography(view: View, R_rect_view: F64, K: F64, oversample: float, plane: 
 def _seen(
     view: View, R_rect_view: F64, K: F64, size: tuple[int, int], plane: F64 | None = None
 ) -> Bool:
-    """(h, w) True where the rectified picture shows something, a pixel inside the border."""
+    """(h, w) True where the rectified image shows something, a pixel inside the border."""
     H, W = view.gray.shape
     rim = int(np.ceil(1.0 + view.K[0, 0] / K[0, 0]))
     inside = np.zeros((H, W), np.uint8)
@@ -357,7 +357,7 @@ def _warp(
 ) -> U8:
     """The view's ``picture`` as the rectified camera sees it, shifted by the disparity plane.
 
-    It is halved first until no pixel is skipped. Beyond the picture its edge is repeated: a
+    It is halved first until no pixel is skipped. Beyond the image its edge is repeated: a
     black rim would be matched with the other view's.
     """
     M = _homography(view, R_rect_view, K, oversample, plane)

@@ -1,7 +1,7 @@
 """How well each piece of ground was seen, kept up to date keyframe by keyframe.
 
 The ground is cut into square cells, held in tiles that exist only where something was seen,
-so memory follows the area. Per cell: in how many keyframes' pictures it lies, the best sigma
+so memory follows the area. Per cell: in how many keyframes' images it lies, the best sigma
 and the mean height of the surface measured there, and when that was. A keyframe that is
 moved takes its share of the views along; the surface of the tiles it touched is summed up
 again from the keyframes that touch them.
@@ -38,7 +38,7 @@ MAX_CELLS = 25_000_000
 """Of the rectangle about all tiles (500 MB); of a larger one only its middle is shown."""
 
 LONGEST_CELLS = 1 << 15
-"""Of a footprint along either axis: a picture is some hundred cells across."""
+"""Of a footprint along either axis: an image is some hundred cells across."""
 
 SMALLEST_CELL_M, LARGEST_CELL_M = 1e-3, 1e3
 
@@ -68,12 +68,12 @@ class CoverageGrid:
     """The layer on one north-up grid; NaN where no surface was measured."""
 
     grid: Grid
-    views: Array  # (rows, cols) uint16: keyframes whose picture covers the cell
+    views: Array  # (rows, cols) uint16: keyframes whose image covers the cell
     sigma_m: F32  # (rows, cols) best 1 sigma of a point in the cell
     height_m: F32  # (rows, cols) mean by the inverse of the variance
     seen_s: F32  # (rows, cols) when a surface was last measured, seconds from the first keyframe
-    inside: Bool  # (rows, cols) within what was flown: the hull of the pictures' middles, and
-    # a quarter of a picture about it
+    inside: Bool  # (rows, cols) within what was flown: the hull of the images' middles, and
+    # a quarter of an image about it
     core: Bool  # (rows, cols) within that hull itself
 
     @property
@@ -87,7 +87,7 @@ class CoverageGrid:
         return self.inside & ~self.known
 
     def seldom(self, least_views: int) -> Bool:
-        """(rows, cols) cells of the core that too few pictures cover; ends of lines are not."""
+        """(rows, cols) cells of the core that too few images cover; ends of lines are not."""
         return np.asarray(self.core & (self.views < least_views))
 
     def unsure(self, most_sigma_m: float) -> Bool:
@@ -411,7 +411,7 @@ def _merge(
 
 
 FARTHEST = 3.0
-"""Pictures count as seeing the ground out to this many times their median depth."""
+"""Images count as seeing the ground out to this many times their median depth."""
 
 PLACE = np.dtype(
     [
@@ -429,15 +429,15 @@ PLACE = np.dtype(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Footprint:
-    """What a keyframe's picture covers on level ground at its median height."""
+    """What a keyframe's image covers on level ground at its median height."""
 
-    corners_m: F64  # (4, 2) east and north, around the picture
-    centre_m: F64  # (2,) where the middle of the picture looks
+    corners_m: F64  # (4, 2) east and north, around the image
+    centre_m: F64  # (2,) where the middle of the image looks
     camera_m: F64  # (3,)
 
 
 def footprint(depth: DepthMap) -> Footprint | None:
-    """Where a keyframe's picture meets level ground; None without any depth."""
+    """Where a keyframe's image meets level ground; None without any depth."""
     known = np.isfinite(depth.depth_m)
     if not known.any():
         return None

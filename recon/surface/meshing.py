@@ -22,7 +22,7 @@ class Mesh:
 
     vertices_m: F64  # (V, 3)
     faces: I32  # (F, 3)
-    uv: F32 | None = None  # (V, 2) texture coordinates from the picture's upper left corner
+    uv: F32 | None = None  # (V, 2) texture coordinates from the image's upper left corner
     rgb: U8 | None = None  # (V, 3)
 
 

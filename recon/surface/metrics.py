@@ -288,7 +288,7 @@ BROAD_PX = 8.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchShifts:
-    """Where patches of a picture lie, against the same patches of the other."""
+    """Where patches of an image lie, against the same patches of the other."""
 
     middle_px: F64  # (N, 2) column and row
     shift_px: F64  # (N, 2) column and row: where the content is, less where it should be
@@ -339,7 +339,7 @@ def patch_shifts(found: F32, truth: F32, known: Bool, reach_px: int) -> PatchShi
 
 
 def _fine(picture: F32, known: Bool) -> F32:
-    """The picture without its broad shading; zero where it is not known."""
+    """The image without its broad shading; zero where it is not known."""
     weight = known.astype(np.float32)
     values = np.where(known, picture, 0.0).astype(np.float32)
     share = np.maximum(cv2.GaussianBlur(weight, (0, 0), BROAD_PX), 1e-3)

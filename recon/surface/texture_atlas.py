@@ -1,4 +1,4 @@
-"""Charts of one view each, packed into one picture and painted from the views."""
+"""Charts of one view each, packed into one image and painted from the views."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Layout:
     uv_px: F64  # (F, 3, 2) texels from the upper left corner; a texel's centre is at .5
     chart: I32  # (F,)
     size_px: tuple[int, int]  # (w, h)
-    scale: float  # texels per pixel of the pictures
+    scale: float  # texels per pixel of the images
 
 
 def lay_out(
@@ -96,7 +96,7 @@ def _charts(label: I32, neighbours: I32) -> I32:
 
 
 def _seen_uv(mesh: Mesh, views: Sequence[TextureView], label: I32) -> F64:
-    """(F, 3, 2) corners in the picture of each triangle's view, in pixels from its corner."""
+    """(F, 3, 2) corners in the image of each triangle's view, in pixels from its corner."""
     out = np.zeros((len(label), 3, 2))
     for number in np.unique(label[label >= 0]):
         view, faces = views[number], np.flatnonzero(label == number)
@@ -165,7 +165,7 @@ def paint(mesh: Mesh, layout: Layout, found: Sightings, label: I32, palette: Pal
 
 
 def _flat(views: Sequence[TextureView]) -> tuple[U8, I64, I64]:
-    """All pictures in one array, where each begins, and their (h, w)."""
+    """All images in one array, where each begins, and their (h, w)."""
     sides = np.array([v.bgra.shape[:2] for v in views], np.int64).reshape(-1, 2)
     start = np.concatenate([[0], np.cumsum(4 * sides[:, 0] * sides[:, 1])]).astype(np.int64)
     pixels = np.empty(int(start[-1]), np.uint8)

@@ -1,4 +1,4 @@
-"""Which pictures see which triangles of a mesh, how finely, and in what colour.
+"""Which images see which triangles of a mesh, how finely, and in what colour.
 
 The first two steps of texturing: visibility by ray casting, and the data term, after
 Waechter, Moehrle and Goesele 2014 (doi:10.1007/978-3-319-10602-1_54, sections 3.1 and 4.1).
@@ -43,10 +43,10 @@ OUTLIER_SPREADS = 4.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TextureView:
-    """One picture of the surface, without distortion; ``alpha`` 0 where it holds nothing."""
+    """One image of the surface, without distortion; ``alpha`` 0 where it holds nothing."""
 
     bgra: U8  # (h, w, 4)
-    K: F64  # (3, 3) px of this picture
+    K: F64  # (3, 3) px of this image
     T_world_camera: F64  # (4, 4)
 
 
@@ -164,7 +164,7 @@ def _projected(view: TextureView, xyz: F64) -> tuple[F64, F64]:
 
 
 def _inside(px: F64, depth: F64, view: TextureView) -> Bool:
-    """(N,) places that fall into the picture, a pixel away from its border."""
+    """(N,) places that fall into the image, a pixel away from its border."""
     h, w = view.bgra.shape[:2]
     with np.errstate(invalid="ignore"):
         u = (px[:, 0] >= EDGE_PX) & (px[:, 0] <= w - 1 - EDGE_PX)

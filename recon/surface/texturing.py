@@ -1,4 +1,4 @@
-"""A mesh textured from posed pictures: the finest view of each triangle, in one atlas.
+"""A mesh textured from posed images: the finest view of each triangle, in one atlas.
 
 The steps of Waechter, Moehrle and Goesele 2014, "Let There Be Color!"
 (doi:10.1007/978-3-319-10602-1_54): visibility, photo-consistency, a Markov random field for
@@ -28,7 +28,7 @@ LARGEST_ATLAS_PX = 8192
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Textured:
-    """A mesh with its picture, and what the picture is made of."""
+    """A mesh with its image, and what the image is made of."""
 
     mesh: Mesh  # uv set; vertices doubled where charts meet
     picture: U8  # (h, w, 3) RGB

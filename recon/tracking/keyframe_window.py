@@ -101,7 +101,7 @@ class TrackingFrame:
     time_ns: int
     prior: PosePrior
     moving: FrameRows
-    mask: U8 | None  # (H, W) non-zero where the picture is valid
+    mask: U8 | None  # (H, W) non-zero where the image is valid
     blurred: bool
 
 

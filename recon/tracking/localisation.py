@@ -34,7 +34,7 @@ class OdometryConfig:
     min_track_share: float = 0.25  # of the corners that should be visible
     tracked_landmarks: int = 300  # enough for a pose; keyframes match all their corners
     max_tilt_error_rad: float = 0.35  # vision against attitude: more is a false solution
-    loose_px: float = 6.0  # gate of a second try: a rolling shutter bends pictures that much
+    loose_px: float = 6.0  # gate of a second try: a rolling shutter bends images that much
     lost_after: int = 8  # frames in a row without a pose before a new segment starts
     still_gap_s: float = 0.7  # frames further apart are stills: no motion model holds
     matching: matching.MatchingConfig = field(default_factory=matching.MatchingConfig)
@@ -258,7 +258,7 @@ class Localiser:
         """EPnP pose of the frame from one keyframe's landmarks, or why there is none.
 
         ``least`` matches it takes; with ``most`` only about so many landmarks are searched and
-        no corner that has none, spread over the picture.
+        no corner that has none, spread over the image.
         """
         radius_px = share * self.camera.size_px[0]
         guess, visible = prediction.on_landmarks(
@@ -369,7 +369,7 @@ class FirstViews:
     ) -> tuple[F64, Bool]:
         """(N, 2) pixels and (N,) success of the first frame's corners in a new frame.
 
-        ``R_b_a`` (3, 3) is the turn by telemetry; ``still`` pictures are far apart in time.
+        ``R_b_a`` (3, 3) is the turn by telemetry; ``still`` images are far apart in time.
         """
         best: tuple[F64, Bool] | None = None
         for guess in self._guesses(new, first, R_b_a, still):

@@ -1,4 +1,4 @@
-"""Corners and their partners in another picture (paper section 2.3, Eq. 4-5).
+"""Corners and their partners in another image (paper section 2.3, Eq. 4-5).
 
 Harris corners, the best of each cell of a 30x30 grid; zero-mean SSD of patches, coarse to
 fine through an image pyramid, all corners in one compiled call; sub-pixel at the end. Pixel
@@ -141,11 +141,11 @@ class MatchingConfig:
 
     grid: int = 30  # cells along each side; one corner per cell (paper: 30 x 30)
     harris_k: float = 0.04  # k of Eq. 5
-    min_response: float = 4.0  # threshold of R, grey levels to the fourth
+    min_response: float = 4.0  # threshold of R, gray levels to the fourth
     patch_radius_px: int = 5  # the patch is (2 r + 1) squared
     search_levels: int = 5  # pyramid levels that a search may use, at most
     coarse_reach_px: int = 8  # search radius that decides on the level to start at
-    min_contrast: float = 2.0  # standard deviation of a patch, grey levels
+    min_contrast: float = 2.0  # standard deviation of a patch, gray levels
     max_zssd: float = 0.4  # of patches made unit: 2 (1 - correlation)
     ambiguity: float = 0.8  # best zssd over that of the next separate peak, at most
     max_return_px: float = 0.5  # forward and backward match may differ by this
@@ -167,7 +167,7 @@ class MatchingConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Corners:
-    """Corners of one picture, in no particular order."""
+    """Corners of one image, in no particular order."""
 
     uv_px: F32  # (N, 2)
     response: F32  # (N,) R of Eq. 5
@@ -187,7 +187,7 @@ class Matches:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pyramid:
-    """A grey picture and its halvings, each (ceil(H / 2^l), ceil(W / 2^l)) uint8."""
+    """A gray image and its halvings, each (ceil(H / 2^l), ceil(W / 2^l)) uint8."""
 
     levels: tuple[U8, ...]
 
@@ -209,7 +209,7 @@ def _check_gray(gray: U8) -> None:
 def harris_grid(gray: U8, config: MatchingConfig, mask: U8 | None = None) -> Corners:
     """The strongest Harris corner of each grid cell of ``gray`` (H, W), Eq. 4-5.
 
-    ``mask`` (H, W) is zero where the picture holds nothing; patches stay clear of it.
+    ``mask`` (H, W) is zero where the image holds nothing; patches stay clear of it.
     """
     _check_gray(gray)
     margin = config.patch_radius_px + 3
@@ -265,7 +265,7 @@ class _Found:
     uv: F64  # (N, 2) full-size px
     score: F64  # (N,) correlation, NO_SCORE where nothing could be compared
     second: F64  # (N,) correlation of the next separate peak
-    contrast: F64  # (N,) of the patch of a, grey levels
+    contrast: F64  # (N,) of the patch of a, gray levels
 
     def distinct(self, ratio: float) -> Bool:
         """(N,) True where the best place is that much better than any other."""
@@ -278,7 +278,7 @@ class _Refined:
 
     uv: F64  # (N, 2) px
     score: F64  # (N,) correlation, NO_SCORE where there is none
-    contrast_a: F64  # (N,) grey levels, of the patch in a
+    contrast_a: F64  # (N,) gray levels, of the patch in a
     contrast_b: F64  # (N,) and where it was found
 
 
@@ -352,7 +352,7 @@ def match(
     Each is searched within ``radius_px`` of ``uv_b_predicted`` (N, 2). ``warp`` ((2, 2) or
     (N, 2, 2)) takes an offset in a to the offset in b: rotation, scale, a linearised
     homography. Not ok: nothing alike, a second place as good, no texture, a backward match
-    that ends elsewhere, a patch outside the picture. A change of brightness or contrast does
+    that ends elsewhere, a patch outside the image. A change of brightness or contrast does
     no harm. On a coarse level, points without an answer of their own follow the trend of the
     others. Points that are not finite are not ok. Raises ValueError on wrong shapes.
     """

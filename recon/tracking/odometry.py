@@ -97,9 +97,9 @@ class Odometry:
         """Pose of a new frame, or why there is none.
 
         Args:
-            gray: (H, W) undistorted picture.
+            gray: (H, W) undistorted image.
             prior: telemetry's word on this frame; parts may be missing.
-            mask: (H, W) non-zero where the picture is valid.
+            mask: (H, W) non-zero where the image is valid.
             blurred: a later frame makes a better keyframe, if it comes soon.
         """
         pyramid = Pyramid.build(gray, self.config.matching.search_levels)
@@ -322,7 +322,7 @@ class Odometry:
             self._unsettled = None
 
     def _forget(self) -> None:
-        """Let go of what left the window: pictures, corners, and landmarks nobody sees."""
+        """Let go of what left the window: images, corners, and landmarks nobody sees."""
         window = self.keyframes[-self.config.window - 2 :]
         for old in self.keyframes[: -len(window)]:
             old.pyramid = matching.Pyramid(())

@@ -50,7 +50,7 @@ def _sample(image: Any, u: float, v: float, w: Any, radius: int, patch: Any) -> 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _normalise(patch: Any, n: int) -> float:
-    """Contrast (standard deviation, grey levels) of the n x n ``patch``, made zero-mean, unit."""
+    """Contrast (standard deviation, gray levels) of the n x n ``patch``, made zero-mean, unit."""
     mean = 0.0
     for y in range(n):
         for x in range(n):

@@ -65,7 +65,7 @@ def solve(
 ) -> PnpResult | None:
     """The pose that projects ``points_m`` (N, 3) to ``uv_px`` (N, 2), or None without trust.
 
-    ``K`` (3, 3) is of the undistorted picture. ``prior_T_camera_points`` (4, 4) competes with
+    ``K`` (3, 3) is of the undistorted image. ``prior_T_camera_points`` (4, 4) competes with
     EPnP's answer as a start, and a result that turns far away from it must explain most of
     the points. Points or pixels that are not finite are outliers. None: too few inliers, too
     loose a fit, or points so placed that the position stays open. Raises ValueError on wrong

@@ -3,7 +3,7 @@
 The floor is the larger of the bytes that a stage cannot but move over the bandwidth of a copy,
 and its operations over the rate of a matrix product, both measured in the same run. Figures
 "on the device" have their inputs there and leave their results there; figures "with uploads"
-start from pictures of the host and end with results on it. On a machine without a GPU all of
+start from images of the host and end with results on it. On a machine without a GPU all of
 it runs on the processor: the figures then show why ``auto`` leaves torch and ONNX Runtime
 alone there, and nothing about a GPU.
 """
@@ -82,7 +82,7 @@ def against_floor(stage: Stage, floor: Floor, options: BenchOptions) -> BenchRes
 def calls(
     backend: Backend, compiled: Backend, guide_px: tuple[int, int], options: BenchOptions
 ) -> list[BenchResult]:
-    """The backend's three calls, pictures up and results down, beside the compiled ones."""
+    """The backend's three calls, images up and results down, beside the compiled ones."""
     left, right = scene(*SIZE, LABELS)
     matching, upsampling = BeliefPropagationConfig(), UpsamplingConfig()
     coarse = compiled.belief_propagation(left, right, LABELS, matching)

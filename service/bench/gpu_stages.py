@@ -89,7 +89,7 @@ def icp_stage(device: str) -> Stage:
 
 
 def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
-    """From two rectified pictures to fused depth, one after the other."""
+    """From two rectified images to fused depth, one after the other."""
     w, h = SIZE
     matching, upsampling = BeliefPropagationConfig(), UpsamplingConfig()
     assert pair.guide is not None and pair.left_seen is not None
@@ -148,7 +148,7 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
 
 
 def whole_path(device: str, pair: StereoPair) -> list[Stage]:
-    """A cloud of one pair: inputs on the device, then pictures up and depth down, and four."""
+    """A cloud of one pair: inputs on the device, then images up and depth down, and four."""
     assert pair.guide is not None
     path = DensePath(device, BeliefPropagationConfig(), UpsamplingConfig(), FusionConfig())
     path.depth([pair], pair.K, SIZE, np.eye(4))

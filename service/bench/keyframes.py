@@ -15,7 +15,7 @@ OVERLAP = 0.8
 
 
 def natural(h: int, w: int, slope: float, seed: int) -> F64:
-    """(h, w) picture of unit variance whose amplitude falls with frequency to ``-slope``."""
+    """(h, w) image of unit variance whose amplitude falls with frequency to ``-slope``."""
     rng = np.random.default_rng(seed)
     fy = np.fft.fftfreq(h)[:, None] * h
     fx = np.fft.rfftfreq(w)[None, :] * w
@@ -30,7 +30,7 @@ def make_keyframe(
 ) -> Keyframe:
     """A nadir keyframe with depths from about 50 to 95 m; noise 2 cm white, 8 cm correlated.
 
-    At 320x180 the picture makes about 14 KB of JPEG at quality 80, as aerial photographs do.
+    At 320x180 the image makes about 14 KB of JPEG at quality 80, as aerial photographs do.
     """
     w, h = size_px
     rng = np.random.default_rng(seed + 1000 * seq)

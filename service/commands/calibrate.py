@@ -1,4 +1,4 @@
-"""``skyrelief calibrate``: a camera model from pictures of a chessboard."""
+"""``skyrelief calibrate``: a camera model from images of a chessboard."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def calibrate(
 ) -> None:
     """Intrinsics and radial distortion from a chessboard, as ROS camera_info YAML.
 
-    Writes a picture of where the corners were beside the model.
+    Writes an image of where the corners were beside the model.
     """
     from recon.calibration.board import FEWEST_VIEWS, CalibrationConfig
     from recon.calibration.board import calibrate as fit

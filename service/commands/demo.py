@@ -83,7 +83,7 @@ def _are_kernels_compiled() -> bool:
 
 
 def _flight(flight: Path | None) -> Path:
-    """The folder with the pictures and the camera model."""
+    """The folder with the images and the camera model."""
     folder = flight or Path(__file__).resolve().parents[2] / FLIGHT
     if not (folder / "frames").is_dir() or not (folder / "camera.yaml").is_file():
         raise InputError(

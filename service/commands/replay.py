@@ -46,7 +46,7 @@ def replay(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
 ) -> None:
-    """Recorded video, a folder of pictures or a pipe through the onboard path into a scan."""
+    """Recorded video, a folder of images or a pipe through the onboard path into a scan."""
     from service.cameras import open_camera
     from service.config import is_given, load_config
 

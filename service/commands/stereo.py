@@ -88,7 +88,7 @@ def check_output(path: Path, suffix: str) -> None:
 
 
 def write(out: Path, picture: Path | None, px: F32, labels: int, min_disparity: int) -> None:
-    """The disparity as an array and, when asked, as a picture (black = unknown)."""
+    """The disparity as an array and, when asked, as an image (black = unknown)."""
     import cv2
     import numpy as np
 

@@ -1,7 +1,7 @@
 """Where frames hang on the odometry's keyframes, in little memory for as long as a scan lasts.
 
 A keyframe of the odometry is refined while it is in the window that is adjusted together, and
-holds pictures and corners meanwhile. Afterwards its pose is all that is wanted of it.
+holds images and corners meanwhile. Afterwards its pose is all that is wanted of it.
 """
 
 from __future__ import annotations

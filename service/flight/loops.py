@@ -23,7 +23,7 @@ from recon.tracking.common_view import Signatures, alike
 from recon.types import F64, U8, DepthMap
 
 WIDTH_PX = 640
-"""Of the pictures kept; loops need no finer ones."""
+"""Of the images kept; loops need no finer ones."""
 
 LEAST_DEPTH_PX = 120
 """A depth image at least twice as wide is kept at half its size."""
@@ -48,8 +48,8 @@ class _Kept:
     seq: int
     ordinal: int  # among all keyframes
     segment: int
-    picture: U8  # JPEG, grey
-    K: F64  # (3, 3) px of that picture
+    picture: U8  # JPEG, gray
+    K: F64  # (3, 3) px of that image
     depth: npt.NDArray[np.uint16]  # (h, w) share of ``far``, 0 unknown
     far: float  # odometry units
     sigma: npt.NDArray[np.float16]  # (h, w) odometry units

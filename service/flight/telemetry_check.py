@@ -1,4 +1,4 @@
-"""What the pictures say of the telemetry: the camera's latency, the gimbal's frame.
+"""What the images say of the telemetry: the camera's latency, the gimbal's frame.
 
 The operator is told once; the latency found is applied when ``camera.latency`` is "auto",
 the gimbal's frame when ``mavlink.gimbal_yaw_frame`` is "auto".
@@ -77,7 +77,7 @@ class TelemetryCheck:
         self.applied_ms += max(-SLEW * passed_ms, min(SLEW * passed_ms, change))
         return stamp_ns - round(self.applied_ms * 1e6)
 
-    # ---- what the pictures say -------------------------------------------------------------
+    # ---- what the images say -------------------------------------------------------------
 
     def add(self, stamp_ns: int, tracked: Tracked) -> None:
         """Take in a frame's pose by vision, at its stamp, and look at all of them now and then."""
@@ -133,7 +133,7 @@ class TelemetryCheck:
             self._once("latency", f"{text}, {self.applied_ms:.0f} ms is set")
 
     def _judge_frame(self, history: VehicleHistory) -> None:
-        """Correct what the gimbal claims when the pictures refute it."""
+        """Correct what the gimbal claims when the images refute it."""
         verdict, used = self.frame, history.gimbal_frame()
         if verdict is None or not verdict.decided or used not in verdict.refuted:
             return

@@ -9,7 +9,7 @@ from recon.tracking.odometry import Tracked
 
 LOST_S = 10.0
 FOUND = ("tracked", "keyframe")
-"""States with a pose that rests on more than the segment's first picture."""
+"""States with a pose that rests on more than the segment's first image."""
 
 
 class TrackingWatch:

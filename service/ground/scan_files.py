@@ -1,4 +1,4 @@
-"""What can be fetched of a scan: deliverables, 3D Tiles, keyframes' pictures, coverage."""
+"""What can be fetched of a scan: deliverables, 3D Tiles, keyframes' images, coverage."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def _completed(keyframe: Keyframe, earlier: Iterable[Keyframe]) -> tuple[U8, Boo
 
 
 def _closed(bgr: U8, known: Bool) -> U8:
-    """The picture with gaps filled from around, as far as a twentieth of its width."""
+    """The image with gaps filled from around, as far as a twentieth of its width."""
     out = np.where(known[..., None], bgr, 0).astype(np.float32)
     weight = known.astype(np.float32)
     side = max(3, bgr.shape[1] // 80)

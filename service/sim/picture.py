@@ -1,6 +1,6 @@
-"""The scene's colours: a picture from above for ground and roofs, solid colours for the rest.
+"""The scene's colours: an image from above for ground and roofs, solid colours for the rest.
 
-The picture from above is made once per flight, at a texel a little finer than the camera's
+The image from above is made once per flight, at a texel a little finer than the camera's
 pixel on the ground, with sun and shadows in it, and reduced to a pyramid so that rendering
 does not flicker.
 """
@@ -64,7 +64,7 @@ def sun_direction() -> F64:
 
 
 def make(scene: Scene, texel_m: float, mosaic: U8 | None = None) -> Picture:
-    """The picture of ``scene``; ``mosaic`` (H, W, 3), of any size, replaces the drawn ground."""
+    """The image of ``scene``; ``mosaic`` (H, W, 3), of any size, replaces the drawn ground."""
     sun = sun_direction()
     size = tuple(max(4, int(np.ceil(s / texel_m))) for s in scene.area.size_m)
     cover = _cover(scene, size, texel_m)
@@ -371,7 +371,7 @@ FEATHER = 0.08  # of a photograph's side that fades into its neighbour
 
 
 def patchwork(folder: Path, size: tuple[int, int], seed: int) -> U8:
-    """(H, W, 3) picture of ``size`` (W, H): photographs side by side at their own resolution.
+    """(H, W, 3) image of ``size`` (W, H): photographs side by side at their own resolution.
 
     They are shuffled, flipped and brought to the same mean brightness, and fade into each
     other. InputError when the folder holds no readable photograph.

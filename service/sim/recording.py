@@ -47,7 +47,7 @@ REPEATABLE = "bframes=0:mbtree=0:scenecut=0"
 class Faults:
     """What goes wrong on purpose."""
 
-    blank: tuple[tuple[int, int], ...] = ()  # (first frame, count) black pictures
+    blank: tuple[tuple[int, int], ...] = ()  # (first frame, count) black images
     exposure: tuple[tuple[float, float], ...] = ()  # (from second, gain)
 
 

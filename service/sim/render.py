@@ -116,7 +116,7 @@ class Renderer:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _texel(bgr, levels, level, x0, y0, texel_m, x, y):  # type: ignore[no-untyped-def]
-    """(b, g, r) of one level of the picture from above, bilinear."""
+    """(b, g, r) of one level of the image from above, bilinear."""
     offset, rows, cols = levels[level, 0], levels[level, 1], levels[level, 2]
     size = texel_m * (1 << level)
     u = min(max((x - x0) / size - 0.5, 0.0), cols - 1.001)

@@ -13,7 +13,7 @@ from service.sim.noise import value3
 I32 = npt.NDArray[np.int32]
 
 GROUND, TOP, WALL, CROWN = 0, 1, 2, 3
-"""Materials of triangles: GROUND and TOP show the picture from above, the others are solid."""
+"""Materials of triangles: GROUND and TOP show the image from above, the others are solid."""
 
 # Columns of the block table, one row per block.
 KIND, X, Y, COS, SIN, HALF_L, HALF_W, BASE, EAVE, RIDGE = range(10)

@@ -135,7 +135,7 @@ def test_a_camera_is_there_again_after_landing_under_load(tmp_path: Path, record
 
 
 def test_memory_short_is_relieved(tmp_path: Path, record: Row) -> None:
-    """Relief by the ladder, live: nothing reconstructed, pictures kept, and back."""
+    """Relief by the ladder, live: nothing reconstructed, images kept, and back."""
     short = '[compute]\nbackend = "cpu"\nguide_width = 320\n'
     with Service(tmp_path) as service:
         service.until(lambda: service.frames > 0, "frames")

@@ -70,7 +70,7 @@ def aircraft(
 ) -> Iterator[tuple[Service, Autopilot, subprocess.Popen[bytes]]]:  # fmt: skip
     """The service, an autopilot that only beats and arms, and the camera: FFmpeg.
 
-    ``streamed`` is the pictures' size and source, as :func:`trial_rig.stream_to` takes them.
+    ``streamed`` is the images' size and source, as :func:`trial_rig.stream_to` takes them.
     """
     port, link = free_port(), free_port()
     autopilot = Autopilot(link, attitude=False)

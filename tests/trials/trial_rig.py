@@ -248,14 +248,14 @@ def burn(processes: int) -> list[subprocess.Popen[bytes]]:
 
 
 def small_model(folder: Path, width: int = 320) -> Path:
-    """The demo's camera model for pictures of ``width`` pixels."""
+    """The demo's camera model for images of ``width`` pixels."""
     path = folder / "camera.yaml"
     save_camera(path, scaled(load_camera(DEMO / "camera.yaml"), (width, width * 3 // 4)))
     return path
 
 
 def stream_to(port: int, size: str = "320:240", source: str = "") -> subprocess.Popen[bytes]:
-    """FFmpeg sending the demo's pictures, or a video, in a loop by UDP."""
+    """FFmpeg sending the demo's images, or a video, in a loop by UDP."""
     given = source or f"-framerate 2 -pattern_type glob -i {DEMO}/frames/*.jpg"
     command = (
         f"ffmpeg -v error -re -stream_loop -1 {given} -vf scale={size} -c:v libx264 "

@@ -3,7 +3,7 @@
     python docs/reports/benchmarks/sensors.py FLIGHT OUT [ROW ...]
 
 ``FLIGHT`` is made by ``skyrelief simulate``. The flight's other logs are made as it was, with
-the sensors' noise of their row and without pictures. Prints a row of the table for each, or
+the sensors' noise of their row and without images. Prints a row of the table for each, or
 only for the rows named; scans that lie in ``OUT`` already are not made again.
 """
 

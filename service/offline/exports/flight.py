@@ -92,7 +92,7 @@ def write_kml(scan: ScanView, out: Path, options: ExportOptions) -> None:
 def write_colmap(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """A folder: ``images/`` and ``sparse/0/`` with cameras, images and points as text.
 
-    World coordinates are the scan's ENU metres. Pictures are the keyframes as stored,
+    World coordinates are the scan's ENU metres. Images are the keyframes as stored,
     without distortion; the points are the fused cloud.
     """
     with writing_folder(out) as part:
@@ -131,7 +131,7 @@ def _name(one: Keyframe) -> str:
 
 
 def _image_lines(one: Keyframe, camera: int) -> str:
-    """The two lines of a picture: world to camera, then no 2D points."""
+    """The two lines of an image: world to camera, then no 2D points."""
     T = se3.inverse(one.depth.T_world_camera)
     q = se3.quaternion_from_rotation(T[:3, :3])
     numbers = " ".join(f"{v:.9f}" for v in (*q, *T[:3, 3]))

@@ -55,7 +55,7 @@ class TileJob:
     largest_texture_px: int
     video: str | None = None
     video_epoch_ns: int | None = None
-    video_named: bool = True  # False: found by itself; without it the stored pictures do
+    video_named: bool = True  # False: found by itself; without it the stored images do
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""The pictures that a mesh is textured from: the stored keyframes', or the video's own."""
+"""The images that a mesh is textured from: the stored keyframes', or the video's own."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from service.scans.folder import SUMMARY
 from service.stream.records import ScanHeader
 
 MAX_BYTES = 1_500_000_000
-"""All pictures of one tile together; more are made smaller."""
+"""All images of one tile together; more are made smaller."""
 
 SAME_TIME_NS = 5_000_000
 
@@ -39,7 +39,7 @@ def stored_pictures(keyframes: Sequence[Keyframe]) -> list[TextureView]:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """Where the pictures of a mesh come from; without a path from the scan's own store."""
+    """Where the images of a mesh come from; without a path from the scan's own store."""
 
     path: Path | None
     words: str  # for the operator
@@ -97,7 +97,7 @@ def video_pictures(
     """A view per keyframe from the frame of ``video`` (file or folder) taken at its time.
 
     The camera is the scan's own. ``epoch_ns`` is unix time of the video's start; by default
-    the scan's start. Keyframes without a frame keep their stored picture. Raises InputError
+    the scan's start. Keyframes without a frame keep their stored image. Raises InputError
     when the video is of another size, or none of its frames is a keyframe.
     """
     camera, source = _camera(header), _opened(header, video)

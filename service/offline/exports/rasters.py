@@ -44,7 +44,7 @@ def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
     Unknown is also what cannot be placed beside a step
     (:func:`recon.surface.raster.surface_model`), and ground above which something may stand that
-    no picture shows.
+    no image shows.
     """
     cloud = scan.fused.cloud
     raster = surface_model(scan.xyz_m, cloud.rgb, cloud.sigma_m, scan.grid(options.cell_m))

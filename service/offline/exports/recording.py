@@ -149,7 +149,7 @@ class _Recording:
         self._write(self._fix, fix, time_ns)
 
     def log_keyframe(self, keyframe: Keyframe) -> None:
-        """The keyframe's points, picture and camera."""
+        """The keyframe's points, image and camera."""
         import cv2
         from foxglove import messages
 

@@ -22,7 +22,7 @@ from service.offline.refine.survey_file import Sighting, SurveyPoint
 from service.stream.records import PoseRecord
 
 MARK_PX = 1.5
-"""How well a point is marked in a picture, 1 sigma, with what remains of lens and pose."""
+"""How well a point is marked in an image, 1 sigma, with what remains of lens and pose."""
 
 FAR_M = 50.0
 """A point farther from its place in the map is a mistake, whatever the receiver claims."""
@@ -124,7 +124,7 @@ def candidates_of(survey: Sequence[SurveyPoint], scan: Pictures, path: str) -> l
 
 
 def _in_picture(seen: Sighting, number: int, scan: Pictures, where: str) -> Mark:
-    """A mark from pixels of the camera's own, distorted picture."""
+    """A mark from pixels of the camera's own, distorted image."""
     assert seen.uv_px is not None
     camera = scan.camera
     if not {"K", "width", "height"} <= set(camera):
@@ -150,7 +150,7 @@ def _in_picture(seen: Sighting, number: int, scan: Pictures, where: str) -> Mark
 
 
 def _picture(seen: Sighting, scan: Pictures, where: str) -> tuple[int, F64]:
-    """Which keyframe a mark hangs on, and the picture's pose in its camera."""
+    """Which keyframe a mark hangs on, and the image's pose in its camera."""
     seqs = [s.seq for s in scan.states]
     if seen.keyframe_seq is not None:
         if seen.keyframe_seq not in seqs:

@@ -1,6 +1,6 @@
 """The camera's model from the flight's own video: ``refine --intrinsics --video FILE``.
 
-Features of each keyframe's picture are found again in its neighbours' and in those of other legs
+Features of each keyframe's image are found again in its neighbours' and in those of other legs
 that show the same ground, and :mod:`recon.calibration.flight` adjusts poses, landmarks and the
 camera at once.
 What comes out is a camera file to replay the flight with: depth images that were made with
@@ -49,7 +49,7 @@ from service.stream.records import ScanHeader
 
 FILE = "camera.refined.yaml"
 WITHIN_S = 0.02
-"""A picture belongs to a keyframe when their times differ by no more."""
+"""An image belongs to a keyframe when their times differ by no more."""
 
 REACH = 3
 """A keyframe is compared with so many before and after it."""
@@ -58,15 +58,15 @@ ACROSS = 8
 """And in so many others that show the same ground, those that are turned most to it."""
 
 MIN_SHOWN = 0.3
-"""Of a picture's ground, that such another picture shows."""
+"""Of an image's ground, that such another image shows."""
 
 START = SelfCalibrationConfig()
 
 EXHAUSTIVE = 60
-"""Of so many pictures all are compared, wherever they are said to look."""
+"""Of so many images all are compared, wherever they are said to look."""
 
 MIN_SHARE = 0.5
-"""Of the keyframes, whose pictures the video must hold."""
+"""Of the keyframes, whose images the video must hold."""
 
 
 def camera_of(header: ScanHeader) -> Camera:
@@ -78,7 +78,7 @@ def camera_of(header: ScanHeader) -> Camera:
 
 
 def pictures_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dict[int, U8]:
-    """Gray pictures by the position of the moment in ``times_ns`` they show.
+    """Gray images by the position of the moment in ``times_ns`` they show.
 
     ``video`` is a recording or a folder of stills.
     """
@@ -102,12 +102,12 @@ def pictures_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dic
 def sightings(
     pictures: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float
 ) -> tuple[F64, Sightings, F64]:
-    """(P, 3) landmarks, where they are seen in the distorted pictures, and (N, 4, 4) poses that
+    """(P, 3) landmarks, where they are seen in the distorted images, and (N, 4, 4) poses that
     agree with them.
 
     ``pictures`` by view, with ``poses`` (N, 4, 4) of all views; the ground lies about
-    ``ground_m`` up in the world. Pictures whose ground overlaps are compared, and of few
-    pictures all that look alike. Raises InputError when nothing ties them together.
+    ``ground_m`` up in the world. Images whose ground overlaps are compared, and of few
+    images all that look alike. Raises InputError when nothing ties them together.
     """
     images = {k: image_of(gray, camera) for k, gray in pictures.items()}
     views = sorted(images)

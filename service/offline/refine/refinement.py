@@ -229,7 +229,7 @@ class _Refinement:
         return figures | {"changed": changed}
 
     def own_camera(self, video: Path) -> tuple[SelfCalibrated, Camera]:
-        """The camera by the flight's own pictures, and the one that it was flown with."""
+        """The camera by the flight's own images, and the one that it was flown with."""
         track, given = self._track(), own_camera.camera_of(self.header)
         times = [s.time_ns for s in self.states]
         pictures = own_camera.pictures_at(video, self.header.started_unix_ns, times)
@@ -348,7 +348,7 @@ class _Refinement:
     # ---- loops -------------------------------------------------------------------------------
 
     def _flown_loops(self) -> list[Closure]:
-        """The loops that the flight accepted, with whole pictures at hand."""
+        """The loops that the flight accepted, with whole images at hand."""
         graph = (self.store.summary or {}).get("graph") or {}
         at = {s.seq: k for k, s in enumerate(self.states)}
         out = []

@@ -1,7 +1,7 @@
 """A second flight over what the first saw too little of, as a mission for ground stations.
 
 Lines run over the weak cells of the coverage layer at the height flown, as far apart as the
-camera's picture and the wanted overlap allow. The camera starts before the first line and
+camera's image and the wanted overlap allow. The camera starts before the first line and
 stops after the last, so that the second flight is one scan.
 """
 
@@ -28,7 +28,7 @@ TAKEOFF, WAYPOINT, RETURN, SPEED = 22, 16, 20, 178
 VIDEO_START, VIDEO_STOP, PHOTO_START, PHOTO_STOP = 2500, 2501, 2000, 2001
 AMSL, MISSION, RELATIVE = 0, 2, 3  # MAV_FRAME
 SMALLEST_SHARE = 0.005
-"""Weak patches smaller than this share of a picture are left to chance."""
+"""Weak patches smaller than this share of an image are left to chance."""
 
 FORWARD_OVERLAP = 0.8
 """Of two photographs one after the other, when photographs are taken."""
@@ -49,11 +49,11 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Swath:
-    """How the camera flew: its picture on the ground and where it looks."""
+    """How the camera flew: its image on the ground and where it looks."""
 
     across_m: float
     along_m: float
-    ahead_m: float  # from below the camera to the middle of its picture, along the flight
+    ahead_m: float  # from below the camera to the middle of its image, along the flight
     heading_rad: float  # most flown, from east to north
     altitude_amsl_m: float
     speed_m_s: float
@@ -94,7 +94,7 @@ class Refly:
 def flown_swath(
     places: Sequence[Footprint], frame: LocalFrame, speed_m_s: float, height_m: float | None
 ) -> Swath:
-    """What the keyframes' pictures say of camera and flight. Raises InputError for one alone."""
+    """What the keyframes' images say of camera and flight. Raises InputError for one alone."""
     if len(places) < 2:
         raise InputError("the scan holds a single keyframe: no line was flown to go by")
     cameras = np.array([p.camera_m for p in places])
@@ -188,7 +188,7 @@ def _parallel(cells_m: F64, angle: float, swath: Swath, overlap: float) -> list[
         here = np.abs(t - (low + (k + 0.5) * step)) <= 0.5 * step + 1e-6
         if not here.any():
             continue
-        # Half a picture before and after, so that the ends are seen as often as the middle.
+        # Half an image before and after, so that the ends are seen as often as the middle.
         first, last = s[here].min() - 0.5 * swath.along_m, s[here].max() + 0.5 * swath.along_m
         middle = (low + (k + 0.5) * step) * side
         ends = [first * way + middle, last * way + middle]
@@ -230,7 +230,7 @@ def suggest(
 ) -> Refly | None:
     """A flight over the weak areas; None when nothing is weak.
 
-    ``overlap`` is that of neighbouring lines' pictures. Altitudes are AMSL as flown, or
+    ``overlap`` is that of neighbouring lines' images. Altitudes are AMSL as flown, or
     ``relative`` to home by the height above ground flown.
 
     Raises InputError when the scan has no place on the globe, holds too few keyframes, or the
@@ -265,7 +265,7 @@ def suggest(
 
 
 def _behind(line: Line, swath: Swath) -> Line:
-    """Where to fly so that the picture's middle follows ``line``."""
+    """Where to fly so that the image's middle follows ``line``."""
     way = (line.end_m - line.start_m) / max(line.length_m, 1e-6)
     return Line(line.start_m - swath.ahead_m * way, line.end_m - swath.ahead_m * way)
 

@@ -1,9 +1,9 @@
-"""Surveyed points of a CSV: where they are on the globe, and where pictures or the map have them.
+"""Surveyed points of a CSV: where they are on the globe, and where images or the map have them.
 
 A row without ``alt_amsl_m`` is of a point surveyed horizontally only.
 
 One row is one sighting: ``keyframe_seq`` or ``time`` with ``u_px,v_px`` in the camera's own
-picture, or ``x,y,z`` in the delivered cloud's coordinates. Rows of one name are one point.
+image, or ``x,y,z`` in the delivered cloud's coordinates. Rows of one name are one point.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LARGEST_BYTES = 10_000_000
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """One row: a mark in a picture, or a point of the cloud."""
+    """One row: a mark in an image, or a point of the cloud."""
 
     line: int
     keyframe_seq: int | None = None
