@@ -10,7 +10,7 @@ import numpy as np
 from recon.types import U8, Bool
 
 WANTED_SPREAD = 45.0
-"""Standard deviation in gray levels that a image of a well-lit scene has."""
+"""Standard deviation in gray levels that an image of a well-lit scene has."""
 
 MAX_GAIN = 8.0
 """Beyond it noise is all that grows."""
@@ -19,7 +19,7 @@ MAX_GAIN = 8.0
 def stretch(gray: U8, seen: Bool | None = None) -> U8:
     """The image (H, W) with its contrast raised to that of a well-lit scene.
 
-    One gain for the whole image, so that places are not moved; a image with contrast
+    One gain for the whole image, so that places are not moved; an image with contrast
     enough comes back as it is. ``seen`` (H, W) says which pixels count.
     """
     sample = gray[::4, ::4] if seen is None else gray[::4, ::4][seen[::4, ::4]]

@@ -202,7 +202,7 @@ def encode_colour(planes: Planes, quality: int) -> bytes:
         [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1],
     )
     if not ok:
-        raise ValueError(f"JPEG refused a image of shape {image.shape}")
+        raise ValueError(f"JPEG refused an image of shape {image.shape}")
     return data.tobytes()
 
 
