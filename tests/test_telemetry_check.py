@@ -83,7 +83,7 @@ def test_the_latency_is_shown_and_not_applied_unless_asked(gimbal: str) -> None:
     assert latency["applied_ms"] == 0.0
     assert latency["estimate_ms"] == pytest.approx(70.0, abs=10.0)
     assert abs(latency["estimate_ms"] - 70.0) < 3.0 * latency["sigma_ms"]
-    assert len(told) == 1 and told[0].endswith("by the pictures, 0 ms is set")
+    assert len(told) == 1 and told[0].endswith("by the images, 0 ms is set")
 
 
 def test_auto_applies_what_was_found_and_keeps_the_frames_in_order() -> None:

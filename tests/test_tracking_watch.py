@@ -19,11 +19,11 @@ def flown(*states: str) -> list[str]:
 
 
 def test_a_long_loss_is_told_once_with_its_reason_and_its_end() -> None:
-    lost = "Vision is lost for 10 s (too little texture): nothing is scanned"
+    lost = "Tracking lost for 10 s (too little texture): nothing is scanned"
     assert flown("started", "keyframe", *["lost"] * 300) == [lost]
     once = ["keyframe", *["lost"] * 30, "tracked", "tracked"]
-    assert flown(*once) == [lost, "Vision has its way again"]
-    assert flown(*once, *once) == 2 * [lost, "Vision has its way again"]
+    assert flown(*once) == [lost, "Tracking recovered"]
+    assert flown(*once, *once) == 2 * [lost, "Tracking recovered"]
     assert flown(*["lost"] * 30) == [lost]  # nothing to see from the first image on
     assert len(flown("keyframe", *(["lost"] * 12 + ["started", "waiting"]) * 9)) == 1
 

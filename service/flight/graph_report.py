@@ -28,7 +28,7 @@ LEFT_OUT = {
     "position off": "positions far from the track were left out: does GNSS jump?",
     "position frozen": "positions only repeated the one before: is GNSS frozen?",
     "heading off": "headings contradict the track and were left out: check the compass",
-    "tilt off": "attitudes contradict the pictures and were left out: check the gimbal's frame",
+    "tilt off": "attitudes contradict the images and were left out: check the gimbal's frame",
     "altitude off": "altitudes stepped and were left out: check the barometer",
 }
 

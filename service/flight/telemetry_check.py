@@ -125,7 +125,7 @@ class TelemetryCheck:
             self._judge_frame(history)
 
     def _tell_latency(self, found: LatencyEstimate) -> None:
-        text = f"Camera latency {found.latency_ms:.0f} ms by the pictures"
+        text = f"Camera latency {found.latency_ms:.0f} ms by the images"
         off_ms = abs(found.latency_ms - self.applied_ms)
         if self._camera.latency == "auto":
             self._once("latency", f"{text}: applied")
@@ -137,7 +137,7 @@ class TelemetryCheck:
         verdict, used = self.frame, history.gimbal_frame()
         if verdict is None or not verdict.decided or used not in verdict.refuted:
             return
-        seen = f"Gimbal angles refer to {_WORDS[verdict.frame]} by the pictures"
+        seen = f"Gimbal angles refer to {_WORDS[verdict.frame]} by the images"
         if history.config.gimbal.yaw_frame == "auto":
             history.trust_images(verdict.frame)
             self._once("frame", f"{seen}: applied")

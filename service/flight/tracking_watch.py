@@ -25,7 +25,7 @@ class TrackingWatch:
         """Take what a frame gave; times never go back. A camera that stands still is not lost."""
         if tracked.state in FOUND:
             if self._is_told:
-                self._tell("Vision has its way again")
+                self._tell("Tracking recovered")
             self._since_ns, self._frames, self._is_told = None, 0, False
             self._reasons.clear()
             return
@@ -36,5 +36,5 @@ class TrackingWatch:
         is_lost = 2 * self._reasons.total() > self._frames
         if for_s >= LOST_S and is_lost and not self._is_told:
             ((reason, _),) = self._reasons.most_common(1)
-            self._tell(f"Vision is lost for {for_s:.0f} s ({reason}): nothing is scanned")
+            self._tell(f"Tracking lost for {for_s:.0f} s ({reason}): nothing is scanned")
             self._is_told = True
