@@ -16,6 +16,15 @@ MAX_GAIN = 8.0
 """Beyond it noise is all that grows."""
 
 
+def halved(image: U8, ratio: float) -> U8:
+    """``image`` halved until ``ratio`` of its pixels to those wanted is at most 1.9."""
+    while ratio > 1.9:
+        half = (image.shape[1] // 2, image.shape[0] // 2)
+        image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
+        ratio /= 2
+    return image
+
+
 def stretch(gray: U8, seen: Bool | None = None) -> U8:
     """The image (H, W) with its contrast raised to that of a well-lit scene.
 

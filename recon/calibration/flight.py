@@ -188,6 +188,16 @@ def joint(a: Sightings, b: Sightings) -> Sightings:
     )  # fmt: skip
 
 
+def loosely_placed(poses: F64, seen: Sightings) -> Knowledge:
+    """The flight is about where ``poses`` (N, 4, 4) have it, within a tenth of its extent."""
+    span = float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
+    return replace(
+        Knowledge.none(len(poses), int(seen.landmark.max()) + 1),
+        fixes=poses[:, :3, 3], sigma_fixes=np.full((len(poses), 3), 0.1 * span),
+        placed=poses, placing=first_held(poses),
+    )  # fmt: skip
+
+
 def first_held(poses: F64) -> F64:
     """(N, 6, 6) information that loosely holds the first pose, as fixes in a line hold no roll."""
     out = np.zeros((len(poses), 6, 6))

@@ -15,7 +15,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import rays, scaled_K
-from recon.image_quality import stretch
+from recon.image_quality import halved, stretch
 from recon.rolling_shutter import Rows
 from recon.stereo.polar import rectify_polar
 from recon.types import (
@@ -73,6 +73,13 @@ class View:
     seen: U8 | None = None  # (H, W) zero where the image has nothing; None: all of it
     rows: Rows | None = None  # how the camera moved while it read the image; None: not at all
     scene: F64 | None = None  # (3,) inverse depth of the ground, times a ray with z = 1; with rows
+
+    def inside(self, focal_px: float) -> U8:
+        """(H, W) 1 where the image shows something, a pixel of that focal length from its rim."""
+        rim = int(np.ceil(1.0 + self.K[0, 0] / focal_px))
+        inside = np.zeros(self.gray.shape, np.uint8)
+        inside[rim:-rim, rim:-rim] = 1 if self.seen is None else self.seen[rim:-rim, rim:-rim]
+        return inside
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -338,16 +345,12 @@ def _seen(
     view: View, R_rect_view: F64, K: F64, size: tuple[int, int], plane: F64 | None = None
 ) -> Bool:
     """(h, w) True where the rectified image shows something, a pixel inside the border."""
-    H, W = view.gray.shape
-    rim = int(np.ceil(1.0 + view.K[0, 0] / K[0, 0]))
-    inside = np.zeros((H, W), np.uint8)
-    inside[rim:-rim, rim:-rim] = 1 if view.seen is None else view.seen[rim:-rim, rim:-rim]
     M = _homography(view, R_rect_view, K, 1.0, plane)
-    return _sampled(inside, view, M, size, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT) > 0
+    return _sampled(view.inside(K[0, 0]), view, M, size, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT) > 0
 
 
 def _warp(
-    picture: U8,
+    image: U8,
     view: View,
     R_rect_view: F64,
     K: F64,
@@ -355,20 +358,15 @@ def _warp(
     oversample: float,
     plane: F64 | None = None,
 ) -> U8:
-    """The view's ``picture`` as the rectified camera sees it, shifted by the disparity plane.
+    """The view's ``image`` as the rectified camera sees it, shifted by the disparity plane.
 
     It is halved first until no pixel is skipped. Beyond the image its edge is repeated: a
     black rim would be matched with the other view's.
     """
     M = _homography(view, R_rect_view, K, oversample, plane)
     ratio = float(view.K[0, 0]) / (K[0, 0] * oversample)
-    while ratio > 1.9:
-        H, W = picture.shape[:2]
-        half = (W // 2, H // 2)
-        picture = np.asarray(cv2.resize(picture, half, interpolation=cv2.INTER_AREA), np.uint8)
-        ratio /= 2
     fine = (int(size[0] * oversample), int(size[1] * oversample))
-    return _sampled(picture, view, M, fine, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+    return _sampled(halved(image, ratio), view, M, fine, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
 
 
 def _sampled(image: U8, view: View, M: F64, size: tuple[int, int], flags: int, border: int) -> U8:

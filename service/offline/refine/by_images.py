@@ -22,6 +22,7 @@ from recon.calibration.flight import (
     camera_information,
     doubt,
     first_held,
+    loosely_placed,
     network,
 )
 from recon.calibration.global_bundle import Knowledge, Sightings
@@ -95,12 +96,7 @@ def network_of(
     pictures = own_camera.pictures_at(video, header.started_unix_ns, times)
     ground_m = float(np.median((poses[:, :3, 3] + ahead_m * poses[:, :3, 2])[:, 2]))
     _, seen, start = own_camera.sightings(pictures, given, poses, ground_m)
-    span = float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
-    known = replace(
-        Knowledge.none(len(poses), int(seen.landmark.max()) + 1),
-        fixes=poses[:, :3, 3], sigma_fixes=np.full((len(poses), 3), 0.1 * span),
-        placed=poses, placing=first_held(poses),
-    )  # fmt: skip
+    known = loosely_placed(poses, seen)
     held = camera_information(given, FREE)
     found = network(given, start, seen, known, held)
     sigmas = np.sqrt(np.abs(np.diag(found.solution.camera_covariance)))

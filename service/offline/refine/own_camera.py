@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import replace
 from functools import lru_cache
 from itertools import combinations
 from pathlib import Path
@@ -25,11 +24,11 @@ from recon.calibration.flight import (
     SelfCalibrated,
     SelfCalibrationConfig,
     camera_information,
-    first_held,
+    loosely_placed,
     network,
     self_calibrate,
 )
-from recon.calibration.global_bundle import Knowledge, Sightings
+from recon.calibration.global_bundle import Sightings
 from recon.calibration.tracks import (
     are_alike,
     crossings,
@@ -122,12 +121,7 @@ def sightings(
     flat = Undistorter(camera)
     stack = lru_cache(maxsize=64)(lambda k: matching.Pyramid.build(flat.image(pictures[k])))
     seen = sharpened(stack, camera, seen)
-    span = float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
-    known = replace(
-        Knowledge.none(len(poses), int(seen.landmark.max()) + 1),
-        fixes=poses[:, :3, 3], sigma_fixes=np.full((len(poses), 3), 0.1 * span),
-        placed=poses, placing=first_held(poses),
-    )  # fmt: skip
+    known = loosely_placed(poses, seen)
     try:
         found = network(camera, poses, seen, known, camera_information(camera, START))
     except ValueError as error:
