@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit, prange
 
 from recon import se3
-from recon.image_quality import stretch
+from recon.image_quality import halved, stretch
 from recon.stereo.reprojection import LABEL_SIGMA_PX, MIN_CONFIDENCE, PairDepth, label_at
 from recon.types import F32, F64, U8, Bool, DisparityMap, PolarPair
 
@@ -279,24 +279,17 @@ class _PolarView:
     def warped(self, image: U8, finer: float) -> U8:
         """``image`` of the view on a grid ``finer`` times as fine; halved until none is skipped."""
         x, y = self.maps(finer)
-        ratio = float(self.view.K[0, 0]) / (self.sampling.px_per_rad * finer)
-        while ratio > 1.9:
-            H, W = image.shape[:2]
-            image = np.asarray(cv2.resize(image, (W // 2, H // 2), interpolation=cv2.INTER_AREA))
+        H, W = image.shape[:2]
+        image = halved(image, float(self.view.K[0, 0]) / (self.sampling.px_per_rad * finer))
+        if image.shape[:2] != (H, W):
             x = (x + 0.5) * np.float32(image.shape[1] / W) - 0.5
             y = (y + 0.5) * np.float32(image.shape[0] / H) - 0.5
-            ratio /= 2
         out = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(out, np.uint8)
 
     def for_stereo(self) -> tuple[U8, Bool]:
         """Gray (h, w), averaged down from twice its size, and where it shows something."""
-        H, W = self.view.gray.shape
-        rim = int(np.ceil(1.0 + self.view.K[0, 0] / self.sampling.px_per_rad))
-        inside = np.zeros((H, W), np.uint8)
-        inside[rim:-rim, rim:-rim] = (
-            1 if self.view.seen is None else self.view.seen[rim:-rim, rim:-rim]
-        )
+        inside = self.view.inside(self.sampling.px_per_rad)
         seen = cv2.remap(inside, *self.maps(1.0), cv2.INTER_NEAREST) > 0
         double = self.warped(self.view.gray, 2.0)
         size = self.sampling.size
