@@ -1,4 +1,4 @@
-"""Draw docs/pictures/architecture.svg: rooms of the code and the data between them.
+"""Draw docs/images/architecture.svg: rooms of the code and the data between them.
 
     python docs/architecture.py
 

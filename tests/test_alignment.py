@@ -118,7 +118,7 @@ def test_covariance_of_the_scale_covers_its_error() -> None:
     assert max(ratios) < 4.0
 
 
-def test_height_is_that_of_the_ground_most_nearly_below() -> None:
+def test_height_is_that_of_the_ground_max_nearly_below() -> None:
     """A camera leaning forward over ground that rises ahead: the height is that of its foot."""
     rng = np.random.default_rng(0)
     xy = rng.uniform([-30, 5], [30, 90], (600, 2))
@@ -193,8 +193,8 @@ def test_the_height_exactly_below_is_read_from_the_depth_map() -> None:
     image = depth.reshape(180, 320).astype(np.float32)
     ones = np.ones_like(image)
 
-    def below(picture: F32) -> float | None:
-        seen = DepthMap(picture, 0.1 * ones, 3 * ones.astype(np.uint8), K, T)
+    def below(depth_m: F32) -> float | None:
+        seen = DepthMap(depth_m, 0.1 * ones, 3 * ones.astype(np.uint8), K, T)
         return height_below(seen, T[2, :3])
 
     assert below(image) == pytest.approx(50.0, abs=0.3)

@@ -164,9 +164,9 @@ def test_a_learned_model_serves_the_whole_path(tmp_path: Path) -> None:
 )
 def test_a_learned_model_that_does_not_fit_is_refused(
     tmp_path: Path, text: str, backend: str, width: int,
-    picture: tuple[int, int] | None, said: str,
+    image: tuple[int, int] | None, said: str,
 ) -> None:  # fmt: skip
     """Before anything flies, with what was expected and what was found."""
     model = str(declared(tmp_path, text))
     with pytest.raises(InputError, match=said):
-        open_backend(ComputeConfig(backend=backend, model=model, stereo_width=width), picture)
+        open_backend(ComputeConfig(backend=backend, model=model, stereo_width=width), image)

@@ -81,7 +81,7 @@ def test_corners_of_a_rendered_board_are_sub_pixel() -> None:
         assert gap < 0.08
 
 
-def test_known_camera_is_found_from_pictures() -> None:
+def test_known_camera_is_found_from_images() -> None:
     views = []
     for k, (turn, shift) in enumerate(board_poses(12)):
         corners = find_board(rendered(turn, shift), BOARD)
@@ -198,8 +198,8 @@ def test_command_on_real_photographs(tmp_path: Path) -> None:
     assert camera.size_px == (640, 480)
     assert camera.K[0, 0] == pytest.approx(533.0, rel=0.02)  # all 13 photographs give 533
     assert yaml.safe_load(out.read_text())["calibration"]["rms_px"] == report["rms_px"]
-    picture = cv2.imread(str(tmp_path / "cam_coverage.png"))
-    assert picture is not None and picture.std() > 10
+    image = cv2.imread(str(tmp_path / "cam_coverage.png"))
+    assert image is not None and image.std() > 10
 
 
 @pytest.mark.parametrize(

@@ -34,11 +34,11 @@ class Recording:
     def close(self) -> None: ...
 
 
-def test_every_picture_comes_in_order() -> None:
+def test_every_image_comes_in_order() -> None:
     assert [f.seq for f in ahead(Recording(50))] == list(range(50))
 
 
-def test_a_fault_of_the_source_reaches_the_reader_after_the_pictures_before_it() -> None:
+def test_a_fault_of_the_source_reaches_the_reader_after_the_images_before_it() -> None:
     seen = []
     with pytest.raises(OSError, match="disk is gone"):
         for frame in ahead(Recording(50, fault_at=7)):

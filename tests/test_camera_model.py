@@ -86,8 +86,8 @@ def test_straight_lines_come_out_straight() -> None:
     y, x = np.mgrid[0:480, 0:640]
     for (u, v), (bu, bv) in zip(truth, bent[:, 0], strict=True):
         dot = 255 * np.exp(-((x - bu) ** 2 + (y - bv) ** 2) / (2 * 2.0**2))
-        picture = undistorter.image(np.asarray(np.round(dot), np.uint8)).astype(np.float64)
-        mass = np.array([(picture * x).sum(), (picture * y).sum()]) / picture.sum()
+        image = undistorter.image(np.asarray(np.round(dot), np.uint8)).astype(np.float64)
+        mass = np.array([(image * x).sum(), (image * y).sum()]) / image.sum()
         np.testing.assert_allclose(mass, [u, v], atol=0.15)
 
 
@@ -101,7 +101,7 @@ def test_pixels_that_the_lens_never_saw_are_marked() -> None:
     assert barrel.valid.all()
 
 
-def test_without_distortion_the_picture_is_untouched() -> None:
+def test_without_distortion_the_image_is_untouched() -> None:
     undistorter = cm.Undistorter(Camera(K, np.zeros(5), (640, 480)))
     image = chart()
     assert undistorter.image(image) is image

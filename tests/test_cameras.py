@@ -26,7 +26,7 @@ needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
-def picture(i: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
+def image(i: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """Flat BGR colour that tells image ``i`` from the others after lossy coding."""
     image = np.zeros((SIZE_PX[1], SIZE_PX[0], 3), np.uint8)
     image[:, :, 0] = 20 + 25 * i
@@ -54,26 +54,26 @@ def write_video(
         if codec == "libx264":
             stream.options = {"bf": "0", "crf": "12"}
         for i, ms in enumerate(TIMES_MS):
-            frame = av.VideoFrame.from_ndarray(picture(i), format="bgr24")
+            frame = av.VideoFrame.from_ndarray(image(i), format="bgr24")
             frame.pts, frame.time_base = ms, Fraction(1, 1000)
             out.mux(stream.encode(frame))
         out.mux(stream.encode(None))
 
 
-def check_pictures(frames: list[CameraFrame]) -> None:
+def check_images(frames: list[CameraFrame]) -> None:
     """Assert that ``frames`` are the images of :func:`write_video`, in order, in colour."""
     assert [f.seq for f in frames] == list(range(len(TIMES_MS)))
     for i, frame in enumerate(frames):
         assert frame.image.shape == (SIZE_PX[1], SIZE_PX[0], 3)
         assert frame.image.dtype == np.uint8
         middle = frame.image[20:70, 20:120].reshape(-1, 3).mean(axis=0)
-        np.testing.assert_allclose(middle, picture(i)[0, 0], atol=8)
+        np.testing.assert_allclose(middle, image(i)[0, 0], atol=8)
 
 
 @pytest.mark.parametrize(
     ("name", "container_format"), [("v.mp4", "mp4"), ("v.mkv", "matroska"), ("v.ts", "mpegts")]
 )
-def test_file_keeps_pictures_and_times(tmp_path: Path, name: str, container_format: str) -> None:
+def test_file_keeps_images_and_times(tmp_path: Path, name: str, container_format: str) -> None:
     path = tmp_path / name
     write_video(str(path), container_format)
     source = open_camera(str(path))
@@ -81,7 +81,7 @@ def test_file_keeps_pictures_and_times(tmp_path: Path, name: str, container_form
     assert source.size_px == SIZE_PX
     assert not source.is_live
     frames = list(source)
-    check_pictures(frames)
+    check_images(frames)
     tolerance_ns = 12_000 if container_format == "mpegts" else 0  # its clock ticks at 90 kHz
     for frame, ms in zip(frames, TIMES_MS, strict=True):
         assert abs(frame.time_ns - ms * 1_000_000) <= tolerance_ns
@@ -192,7 +192,7 @@ def test_bad_files_are_told_in_one_line(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
 
-def test_header_without_pictures_is_refused(tmp_path: Path) -> None:
+def test_header_without_images_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "v.mkv"
     write_video(str(path), "matroska")
     data = path.read_bytes()
@@ -236,22 +236,22 @@ def test_pipe_of_every_streamable_container(monkeypatch: pytest.MonkeyPatch) -> 
             "service.cameras.video._stream", lambda rest, d=data: io.BytesIO(d.getvalue())
         )
         frames = list(open_camera("-"))
-        check_pictures(frames)
+        check_images(frames)
         for frame, ms in zip(frames, TIMES_MS, strict=True):
             assert abs(frame.time_ns - ms * 1_000_000) <= 12_000, container_format
 
 
-def test_pipe_of_raw_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    data = b"".join(picture(i).tobytes() for i in range(len(TIMES_MS)))
+def test_pipe_of_raw_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = b"".join(image(i).tobytes() for i in range(len(TIMES_MS)))
     monkeypatch.setattr("service.cameras.video._stream", lambda rest: io.BytesIO(data))
     source = open_camera(
         f"pipe:-?format=rawvideo&video_size={SIZE_PX[0]}x{SIZE_PX[1]}"
         "&pixel_format=bgr24&framerate=25"
     )
     frames = list(source)
-    check_pictures(frames)
+    check_images(frames)
     assert [f.time_ns for f in frames] == [i * 40_000_000 for i in range(len(TIMES_MS))]
-    assert all(np.array_equal(f.image, picture(i)) for i, f in enumerate(frames))
+    assert all(np.array_equal(f.image, image(i)) for i, f in enumerate(frames))
 
 
 def test_pipe_refuses_what_cannot_be_piped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -293,9 +293,7 @@ def test_pipe_reader_loses_no_byte() -> None:
         ["-f", "yuv4mpegpipe", "-fps_mode", "passthrough"],
     ],
 )
-def test_ffmpeg_pipe_gives_the_pictures_of_the_file(
-    tmp_path: Path, ffmpeg_output: list[str]
-) -> None:
+def test_ffmpeg_pipe_gives_the_images_of_the_file(tmp_path: Path, ffmpeg_output: list[str]) -> None:
     path = tmp_path / "v.mp4"
     write_video(str(path), "mp4")
     code = (
@@ -317,7 +315,7 @@ def test_ffmpeg_pipe_gives_the_pictures_of_the_file(
     assert len(rows) == len(TIMES_MS)
     y4m = "yuv4mpegpipe" in ffmpeg_output  # y4m has a rate and no times
     for (seq, time_ns, blue), ms in zip(rows, TIMES_MS, strict=True):
-        assert abs(blue - int(picture(seq)[0, 0, 0])) <= 10
+        assert abs(blue - int(image(seq)[0, 0, 0])) <= 10
         assert y4m or abs(time_ns - ms * 1_000_000) <= 12_000
 
 

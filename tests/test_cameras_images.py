@@ -204,7 +204,7 @@ def test_odd_ones_are_left_out_and_told(tmp_path: Path) -> None:
         assert name in told
 
 
-def test_folders_without_pictures_are_refused(tmp_path: Path) -> None:
+def test_folders_without_images_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no images"):
         open_camera(str(tmp_path))
     with pytest.raises(InputError, match="no such folder"):

@@ -123,19 +123,19 @@ def test_stamps_begin_again_on_a_new_time_line() -> None:
     assert stamps.time_ns(10**15, 950_000_000) is None  # or jumped far ahead
 
 
-def test_a_picture_that_lost_its_time_is_dropped_where_others_have_one() -> None:
+def test_a_image_that_lost_its_time_is_dropped_where_others_have_one() -> None:
     """A decoder gives up its last images when the stream has broken off, seconds late."""
     source = LiveSource(opener(clip(50)), "test", QUICK)
 
-    def pictures(*stamps: int | None) -> Iterator[Any]:
+    def images(*stamps: int | None) -> Iterator[Any]:
         for pts in stamps:
             frame = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="bgr24")
             frame.pts, frame.time_base = pts, Fraction(1, 50)
             time.sleep(0.02)
             yield frame
 
-    assert len(list(source._watch(pictures(0, 1, 2, None, None)))) == 2  # the first sets the clock
-    assert len(list(source._watch(pictures(*[None] * 5)))) == 5
+    assert len(list(source._watch(images(0, 1, 2, None, None)))) == 2  # the first sets the clock
+    assert len(list(source._watch(images(*[None] * 5)))) == 5
     source.close()
 
 
@@ -156,7 +156,7 @@ def test_absent_camera_is_told_at_once() -> None:
         LiveSource(opener(OSError("no route")), "test", QUICK)
 
 
-def test_pictures_of_another_size_are_dropped() -> None:
+def test_images_of_another_size_are_dropped() -> None:
     source = LiveSource(opener(clip(3), clip(5, (96, 64)), clip(50)), "test", QUICK)
     frames = take(source, 6)
     assert all(f.image.shape == (48, 64, 3) for f in frames)
@@ -164,7 +164,7 @@ def test_pictures_of_another_size_are_dropped() -> None:
     assert any("96x64" in w for w in source.warnings)
 
 
-def test_frozen_picture_is_found_out() -> None:
+def test_frozen_image_is_found_out() -> None:
     source = LiveSource(opener(clip(200, moving=False), clip(200)), "test", QUICK)
     frames = take(source, 40)
     assert source.losses == 1
@@ -172,7 +172,7 @@ def test_frozen_picture_is_found_out() -> None:
     assert len({f.image.tobytes() for f in frames}) > 10
 
 
-def test_live_pictures_are_not_held_back() -> None:
+def test_live_images_are_not_held_back() -> None:
     """A live source that was opened an hour before it is read gives its images at once."""
     source = LiveSource(opener(clip(5)), "test", QUICK)
     source._first = (source._first[0], 3600 * 10**9)
@@ -337,7 +337,7 @@ def has_gstreamer(*elements: str) -> bool:
 @pytest.mark.skipif(
     not has_gstreamer("qtdemux", "h264parse", "avdec_h264"), reason="needs GStreamer's decoders"
 )
-def test_a_gstreamer_decoder_with_padded_pictures_is_read(tmp_path: Path) -> None:
+def test_a_gstreamer_decoder_with_padded_images_is_read(tmp_path: Path) -> None:
     """A height that is no multiple of sixteen: the decoder's buffers are larger than images."""
     clip, made = tmp_path / "clip.mp4", "testsrc2=size=80x70:rate=20:duration=2"
     command = f"ffmpeg -v error -f lavfi -i {made} -pix_fmt yuv420p -c:v libx264 {clip}"
@@ -437,15 +437,15 @@ class RtspServer:
     def _play(self, client: socket.socket) -> None:
         seq, stamp = 0, 0
         for unit in self._units:
-            picture = unit[0] & 31 in (1, 5)
+            image = unit[0] & 31 in (1, 5)
             pieces = [unit] if len(unit) < 1200 else self._fragments(unit)
             for i, piece in enumerate(pieces):
-                marker = 0x80 if picture and i == len(pieces) - 1 else 0
+                marker = 0x80 if image and i == len(pieces) - 1 else 0
                 packet = bytes((0x80, 96 | marker)) + seq.to_bytes(2, "big")
                 packet += stamp.to_bytes(4, "big") + b"\0\0\0\1" + piece
                 client.sendall(b"$\0" + len(packet).to_bytes(2, "big") + packet)
                 seq += 1
-            if picture:
+            if image:
                 stamp += 3600
                 if self._ended.wait(0.04):
                     return

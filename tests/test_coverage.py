@@ -109,7 +109,7 @@ def test_best_sigma_per_cell_is_that_of_brute_force() -> None:
     assert found == pytest.approx(expected, rel=1e-5)
 
 
-def test_views_count_the_pictures_that_cover_a_cell() -> None:
+def test_views_count_the_images_that_cover_a_cell() -> None:
     depths = [looking_down(8.0 * k, 0.0, yaw=0.4 * k) for k in range(5)]
     found = filled(depths, 1.0).grid()
     assert found is not None
@@ -255,26 +255,26 @@ def test_a_fine_layer_that_comes_later_is_taken_in(tmp_path: Path, house: HouseF
     assert late.figures() == fresh.figures()
 
 
-def test_picture_figures_and_geotiff(tmp_path: Path, house: HouseFlight) -> None:
+def test_image_figures_and_geotiff(tmp_path: Path, house: HouseFlight) -> None:
     rasterio = pytest.importorskip("rasterio", exc_type=ImportError)
     with house.flown(tmp_path) as store:
         write_deliverables(tmp_path, store, {})
         found = coverage_of(store)
     assert found is not None
-    picture = cv2.imread(str(tmp_path / IMAGE), cv2.IMREAD_UNCHANGED)
-    assert picture is not None and picture.shape == (*found.layer.grid.shape, 4)
-    assert np.array_equal(picture[..., 3] > 0, found.layer.known | found.layer.inside)
+    image = cv2.imread(str(tmp_path / IMAGE), cv2.IMREAD_UNCHANGED)
+    assert image is not None and image.shape == (*found.layer.grid.shape, 4)
+    assert np.array_equal(image[..., 3] > 0, found.layer.known | found.layer.inside)
     said = json.loads((tmp_path / FIGURES).read_text())
     assert said["keyframes"] == 5 and len(said["corners_lat_lon"]) == 4
     assert json.loads((tmp_path / "scan.json").read_text())["coverage"] == said
     with ScanView(tmp_path) as scan:
         path = export(scan, "coverage", None, ExportOptions())
     frame = LocalFrame(*house.origin)
-    with rasterio.open(path) as image:
-        assert image.crs.to_epsg() == frame.epsg
-        assert image.descriptions == ("views", "sigma, m", "height, m")
+    with rasterio.open(path) as raster:
+        assert raster.crs.to_epsg() == frame.epsg
+        assert raster.descriptions == ("views", "sigma, m", "height, m")
         east, north, _ = frame.to_utm(np.array([[10.5, 2.5, 0.0]]))[0]
-        views, sigma, height = next(image.sample([(east, north)]))
+        views, sigma, height = next(raster.sample([(east, north)]))
     assert height == pytest.approx(house.origin[2] + 6.0, abs=0.1)
     assert views == 5 and 0.03 < sigma < 0.08
 

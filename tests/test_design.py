@@ -32,7 +32,7 @@ def test_every_path_in_it_exists() -> None:
     assert [path for path in paths if not (ROOT / path).exists()] == []
 
 
-def test_the_picture_of_the_architecture_is_up_to_date() -> None:
+def test_the_image_of_the_architecture_is_up_to_date() -> None:
     spec = importlib.util.spec_from_file_location("architecture", ROOT / "docs/architecture.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)

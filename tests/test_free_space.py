@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recon.mapping.cloud_fusion import cloud_of
-from recon.mapping.free_space import MOST_VIEWS, Tiles, open_above, seen_through, spread
+from recon.mapping.free_space import MAX_VIEWS, Tiles, open_above, seen_through, spread
 from recon.types import F64, DepthMap, PointCloud
 
 if TYPE_CHECKING:
@@ -82,9 +82,9 @@ def test_the_first_keyframes_asked_decide(house: HouseFlight) -> None:
                 asked[0] += 1
                 yield view
 
-    assert seen_through(blob, views(MOST_VIEWS, 3 * MOST_VIEWS)).all()
-    assert asked == [4 * MOST_VIEWS]
-    assert not seen_through(blob, views(MOST_VIEWS // 2 - 1, MOST_VIEWS)).any()
+    assert seen_through(blob, views(MAX_VIEWS, 3 * MAX_VIEWS)).all()
+    assert asked == [4 * MAX_VIEWS]
+    assert not seen_through(blob, views(MAX_VIEWS // 2 - 1, MAX_VIEWS)).any()
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 1000])
@@ -156,7 +156,7 @@ def test_tiles_keep_every_place_once_and_neighbours_together() -> None:
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 35.0, 60.0])
 @pytest.mark.parametrize("up_m", [0.0, 8.0])
-def test_every_place_in_the_picture_lies_in_a_tile_in_view(
+def test_every_place_in_the_image_lies_in_a_tile_in_view(
     house: HouseFlight, tilt_deg: float, up_m: float
 ) -> None:
     """Against the projection of each place by itself."""

@@ -45,7 +45,7 @@ def flown(hard: Hard) -> tuple[list[F64], Trajectory]:
     units = np.array([1.0] * 3 + [1.0 / hard.scale] * 3)
     truth = legs(rng, COUNT, hard.leg, hard.step_m)
     odom, priors = sensed(rng, truth, SPREAD, hard.scale)
-    trajectory = Trajectory(graph=PoseGraph(PoseGraphConfig(most_nodes=hard.nodes)))
+    trajectory = Trajectory(graph=PoseGraph(PoseGraphConfig(max_nodes=hard.nodes)))
     segment, start, time_ns = 0, 0, 0
     for i, prior in enumerate(heard(hard, rng, truth, priors)):
         if i and rng.random() < 1.0 / hard.segment:
@@ -98,11 +98,11 @@ FLIGHTS = {
 
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_the_track_keeps_to_the_truth(name: str) -> None:
-    hard, most_m = FLIGHTS[name]
+    hard, max_m = FLIGHTS[name]
     truth, trajectory = flown(hard)
     poses = landed(trajectory, COUNT)
     apart = np.linalg.norm((poses - np.array(truth))[:, :3, 3], axis=1)
-    assert np.median(apart) < most_m
+    assert np.median(apart) < max_m
     assert apart.max() < 1000.0
     R = poses[:, :3, :3]
     np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (COUNT, 1, 1)),

@@ -46,7 +46,7 @@ def fly(trajectory: Trajectory, first: int = 0, count: int = COUNT, fixes: bool 
 
 
 def bounded() -> PoseGraph:
-    return PoseGraph(PoseGraphConfig(most_nodes=MOST))
+    return PoseGraph(PoseGraphConfig(max_nodes=MOST))
 
 
 def test_many_short_segments_keep_to_the_bound_and_near_the_truth() -> None:

@@ -37,7 +37,7 @@ def flight() -> tuple[list[F64], list[F64], list[PosePrior]]:
 
 
 def bounded(most: int = MOST) -> PoseGraph:
-    return PoseGraph(PoseGraphConfig(most_nodes=most))
+    return PoseGraph(PoseGraphConfig(max_nodes=most))
 
 
 def fly(trajectory: Trajectory, count: int = COUNT, first: int = 0) -> None:

@@ -311,7 +311,7 @@ def test_many_drones_share_the_station_and_one_more_is_refused(
         assert not list((tmp_path / "ground").glob("invented-*"))
 
 
-def test_a_silent_drone_that_brought_least_makes_way_for_another(
+def test_a_silent_drone_that_brought_min_makes_way_for_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Invented drones with a scan each fill the table; who comes later is received all the same."""

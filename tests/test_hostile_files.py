@@ -83,7 +83,7 @@ def test_a_recording_with_an_odd_index(tmp_path: Path, mp4: bytes, old: bytes, n
     assert frames(path) in (-1, 8)
 
 
-def test_a_picture_of_more_pixels_than_allowed_is_not_decoded(
+def test_a_image_of_more_pixels_than_allowed_is_not_decoded(
     tmp_path: Path, mp4: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "v.mp4").write_bytes(mp4)

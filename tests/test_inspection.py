@@ -63,8 +63,8 @@ def test_kept_stages_come_back_and_each_has_its_panel(tmp_path: Path) -> None:
         "sigma",
         "colour",
     ]
-    picture = sheet(panels, "heading")
-    assert picture.shape[1] == 3 * 480 + 40
+    image = sheet(panels, "heading")
+    assert image.shape[1] == 3 * 480 + 40
     assert load_debug(debug_path(tmp_path, 8)) is None
 
 

@@ -77,7 +77,7 @@ def test_lower_rate_passes_every_second_frame(level: Level, tmp_path: Path) -> N
     assert not (tmp_path / "later").exists()
 
 
-def test_record_only_keeps_pictures_that_a_replay_can_read(tmp_path: Path) -> None:
+def test_record_only_keeps_images_that_a_replay_can_read(tmp_path: Path) -> None:
     gate, alive = gate_over(Film(), tmp_path, Level.RECORD_ONLY)
     assert list(gate) == []
     assert len(alive) == 100
@@ -116,7 +116,7 @@ def test_nothing_is_kept_while_paused_or_without_room(
     assert (full.kept, full.lost, len(alive)) == (0, 50, 100)
 
 
-def test_names_of_pictures_are_times() -> None:
+def test_names_of_images_are_times() -> None:
     assert image_name(1_533_459_888_480_000_000) == "20180805090448480000Z.jpg"
 
 
@@ -188,8 +188,8 @@ def test_a_device_that_fails_is_told_once_and_the_cpu_goes_on(
     operator = Operator(daemon, monkeypatch)
     backend = FallbackBackend(Dying())
     daemon.scanning._backend = backend
-    grey = np.zeros((48, 64), np.uint8)
-    arguments: tuple[Any, ...] = (grey, grey, 4, BeliefPropagationConfig())
+    gray = np.zeros((48, 64), np.uint8)
+    arguments: tuple[Any, ...] = (gray, gray, 4, BeliefPropagationConfig())
     truth = load_backend("cpu").belief_propagation(*arguments).px
     for i in range(4):
         found = backend.belief_propagation(*arguments).px
@@ -217,10 +217,10 @@ def test_onnx_runtime_out_of_memory_falls_back_too(monkeypatch: pytest.MonkeyPat
     def refuse(*_: object) -> None:
         raise ValueError("ONNX Runtime cannot use the model: out of memory")
 
-    grey = np.zeros((48, 64), np.uint8)
+    gray = np.zeros((48, 64), np.uint8)
     for opener in (lambda *_: Full(), refuse):
         monkeypatch.setattr(onnx_backend, "open_session", opener)
         backend = FallbackBackend(load_backend("onnx"))
-        backend.belief_propagation(grey, grey, 4, BeliefPropagationConfig())
+        backend.belief_propagation(gray, gray, 4, BeliefPropagationConfig())
         assert backend.name == "cpu"
         assert backend.failure is not None and "out of memory" in backend.failure

@@ -73,7 +73,7 @@ def view(T: F64, seed: int = 0, ground: int = 1, sigma_m: float = 0.08) -> LoopV
 
 
 A = camera(0.0, 0.0, 40.0, 0.0)
-ADJACENT = LoopConfig(least_gap=1)
+ADJACENT = LoopConfig(min_gap=1)
 LEVEL = np.array([[x, y, 40.0] for x in np.linspace(-28, 28, 9) for y in np.linspace(-15, 15, 7)])
 
 
@@ -131,7 +131,7 @@ def test_what_is_seen_goes_on_where_nothing_was_measured() -> None:
     assert len(ground_seen(none)) == 0
 
 
-def test_a_guess_far_off_is_helped_by_the_pictures() -> None:
+def test_a_guess_far_off_is_helped_by_the_images() -> None:
     B = camera(4.0, 2.0, 40.0, 0.8)
     truth = se3.inverse(A) @ B
     guess = se3.exp(np.array([0.0, 0.0, 1.0, 14.0, -9.0, 0.0])) @ truth
@@ -148,7 +148,7 @@ def test_another_place_is_no_loop() -> None:
     assert verify(view(A, 1), view(camera(60.0, 55.0, 40.0, 0.2), 2), guess) is None
 
 
-def test_the_same_picture_over_another_relief_is_no_loop() -> None:
+def test_the_same_image_over_another_relief_is_no_loop() -> None:
     """Perfect matches whose depths contradict: the ground moved, or an image repeats."""
     B = camera(3.0, 2.0, 40.0, 0.2)
     a, b = view(A, 1), view(B, 2)
@@ -224,7 +224,7 @@ def test_two_verified_loops_close_the_map() -> None:
 def search_along(poses: list[F64], chain: list[F64], segment: list[int]) -> LoopSearch:
     """The search fed as the reconstruction feeds it, without telemetry."""
     trajectory = Trajectory()
-    search = LoopSearch(trajectory, LoopConfig(least_gap=5))
+    search = LoopSearch(trajectory, LoopConfig(min_gap=5))
     covariance = np.diag([4e-3**2] * 3 + [0.1**2] * 3)
     for i, (T, odom) in enumerate(zip(poses, chain, strict=True)):
         trajectory.add(i, segment[i], odom, PosePrior(), None, i * 10**9, covariance)
@@ -256,7 +256,7 @@ def test_the_search_closes_two_legs_of_a_drifting_chain() -> None:
     assert apart_m(search, poses, 1, 8) < 0.5 * before
 
 
-def test_a_lost_stretch_is_found_again_from_the_pictures() -> None:
+def test_a_lost_stretch_is_found_again_from_the_images() -> None:
     """Over the same ground after a gap, in a frame of another origin, heading and scale."""
     poses = [camera(6.0 * i, 0.0, 40.0, 0.0) for i in range(4)]
     poses += [camera(6.0 * i + 3.0, 4.0, 40.0, 0.3) for i in range(4)]
@@ -281,7 +281,7 @@ def test_a_lost_stretch_is_found_by_its_look_among_many() -> None:
 def test_the_search_keeps_a_bounded_number_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = view(A, 1)
     trajectory = Trajectory()
-    search = LoopSearch(trajectory, most_views=6)
+    search = LoopSearch(trajectory, max_views=6)
     rng = np.random.default_rng(4)
     for i in range(20):
         T = camera(300.0 * i, 0.0, 40.0, 0.0)
@@ -292,7 +292,7 @@ def test_the_search_keeps_a_bounded_number_of_views(monkeypatch: pytest.MonkeyPa
 
 
 def test_wrong_parameters_are_named() -> None:
-    with pytest.raises(ValueError, match="least_gap"):
-        LoopConfig(least_gap=0)
-    with pytest.raises(ValueError, match="least_overlap"):
-        LoopConfig(least_overlap=0.0)
+    with pytest.raises(ValueError, match="min_gap"):
+        LoopConfig(min_gap=0)
+    with pytest.raises(ValueError, match="min_overlap"):
+        LoopConfig(min_overlap=0.0)

@@ -33,8 +33,8 @@ def ground(height: int, width: int, seed: int = 0) -> F64:
     return np.asarray(128 + 55 * (total - total.mean()) / total.std(), np.float64)
 
 
-def grey(picture: F64) -> U8:
-    return np.asarray(np.clip(np.round(picture), 0, 255), np.uint8)
+def gray(image: F64) -> U8:
+    return np.asarray(np.clip(np.round(image), 0, 255), np.uint8)
 
 
 WIDE = ground(600, 820)
@@ -71,7 +71,7 @@ def naive_response(image: U8, k: float) -> F64:
 
 
 def test_corners_are_the_best_of_their_cells() -> None:
-    image = grey(view(0, 0))
+    image = gray(view(0, 0))
     corners = harris_grid(image, CONFIG)
     R = naive_response(image, CONFIG.harris_k)
     u, v = corners.uv_px.astype(int).T
@@ -92,7 +92,7 @@ def test_corners_are_the_best_of_their_cells() -> None:
 
 
 def test_corners_stay_clear_of_the_mask_and_the_border() -> None:
-    image = grey(view(0, 0))
+    image = gray(view(0, 0))
     mask = np.full(image.shape, 255, np.uint8)
     mask[:, :200] = 0
     corners = harris_grid(image, CONFIG, mask)
@@ -103,9 +103,9 @@ def test_corners_stay_clear_of_the_mask_and_the_border() -> None:
 
 
 @pytest.mark.parametrize("level", [0, 128, 255])
-def test_a_blank_picture_has_no_corners(level: int) -> None:
+def test_a_blank_image_has_no_corners(level: int) -> None:
     rng = np.random.default_rng(0)
-    noisy = grey(level + rng.normal(0, 1.0, (200, 300)))
+    noisy = gray(level + rng.normal(0, 1.0, (200, 300)))
     assert len(harris_grid(np.full((200, 300), level, np.uint8), CONFIG)) == 0
     assert len(harris_grid(noisy, CONFIG)) == 0
 
@@ -122,7 +122,7 @@ def test_a_straight_edge_is_no_corner() -> None:
 @settings(max_examples=12, deadline=None)
 @given(st.floats(-45, 45), st.floats(-45, 45))
 def test_shifts_are_found_to_a_twentieth_of_a_pixel(du: float, dv: float) -> None:
-    a, b = grey(view(0, 0)), grey(view(du, dv))
+    a, b = gray(view(0, 0)), gray(view(du, dv))
     corners = harris_grid(a, CONFIG).uv_px
     truth = corners - np.array([du, dv])
     radius = max(abs(du), abs(dv)) + 5
@@ -139,8 +139,8 @@ def test_shifts_are_found_to_a_twentieth_of_a_pixel(du: float, dv: float) -> Non
 def test_noise_and_a_change_of_exposure_cost_a_tenth_of_a_pixel(gain: float, offset: float) -> None:
     rng = np.random.default_rng(1)
     shift = np.array([11.3, -7.6])
-    a = grey(view(0, 0) + rng.normal(0, 2.5, (360, 480)))
-    b = grey(gain * view(*shift) + offset + rng.normal(0, 2.5 * gain, (360, 480)))
+    a = gray(view(0, 0) + rng.normal(0, 2.5, (360, 480)))
+    b = gray(gain * view(*shift) + offset + rng.normal(0, 2.5 * gain, (360, 480)))
     corners = harris_grid(a, CONFIG).uv_px
     found = match(Pyramid.build(a), corners, Pyramid.build(b), corners, 20.0, None, CONFIG)
     truth = corners - shift
@@ -161,7 +161,7 @@ def turned(angle_deg: float, scale: float, shift: tuple[float, float]) -> tuple[
     # cv2.warpAffine maps scene pixels p to A (p - corner) + t.
     M = np.column_stack([A, t - A @ corner])
     b = cv2.warpAffine(scene, M, (600, 450), flags=cv2.INTER_LANCZOS4)
-    return grey(a), grey(np.asarray(b, np.float64)), A, t
+    return gray(a), gray(np.asarray(b, np.float64)), A, t
 
 
 @pytest.mark.parametrize(
@@ -190,8 +190,8 @@ def test_a_known_turn_and_a_large_shift(
 
 def test_the_score_is_opencvs_normalised_correlation() -> None:
     rng = np.random.default_rng(5)
-    a = grey(view(0, 0))
-    b = grey(view(4.0, -3.0) * 0.7 + 20 + rng.normal(0, 6, (360, 480)))
+    a = gray(view(0, 0))
+    b = gray(view(4.0, -3.0) * 0.7 + 20 + rng.normal(0, 6, (360, 480)))
     corners = harris_grid(a, CONFIG).uv_px[200:260].astype(int)
     found = match(Pyramid.build(a, 1), corners, Pyramid.build(b, 1), corners, 6.0, None, CONFIG)
     assert found.ok.sum() > 30
@@ -211,16 +211,16 @@ def test_texture_that_repeats_is_refused() -> None:
     v, u = np.mgrid[0:360, 0:480]
     field = 128 + 50 * np.sin(2 * np.pi * u / 14) + 40 * np.sin(2 * np.pi * v / 14)
     rng = np.random.default_rng(2)
-    a, b = (grey(field + rng.normal(0, 3, field.shape)) for _ in range(2))
+    a, b = (gray(field + rng.normal(0, 3, field.shape)) for _ in range(2))
     corners = harris_grid(a, CONFIG).uv_px
     assert len(corners) > 200
     found = match(Pyramid.build(a), corners, Pyramid.build(b), corners, 40.0, None, CONFIG)
     assert found.ok.mean() < 0.05
 
 
-def test_what_is_hidden_in_the_second_picture_is_not_found() -> None:
-    a, b = grey(view(0, 0)), grey(view(6.0, 2.0))
-    b[:, 240:] = grey(ground(360, 240, seed=9))
+def test_what_is_hidden_in_the_second_image_is_not_found() -> None:
+    a, b = gray(view(0, 0)), gray(view(6.0, 2.0))
+    b[:, 240:] = gray(ground(360, 240, seed=9))
     corners = harris_grid(a, CONFIG).uv_px
     found = match(Pyramid.build(a), corners, Pyramid.build(b), corners, 25.0, None, CONFIG)
     hidden = corners[:, 0] - 6.0 > 250
@@ -229,7 +229,7 @@ def test_what_is_hidden_in_the_second_picture_is_not_found() -> None:
 
 
 def test_hopeless_points_are_not_ok_and_keep_their_prediction() -> None:
-    a = grey(view(0, 0))
+    a = gray(view(0, 0))
     pyramid = Pyramid.build(a)
     corners = np.array([[240.0, 180.0], [np.nan, 10.0], [-50.0, 3.0], [5e8, 1.0], [100.0, 100.0]])
     predicted = corners.copy()
@@ -243,15 +243,15 @@ def test_hopeless_points_are_not_ok_and_keep_their_prediction() -> None:
 
 
 @pytest.mark.parametrize("fill", [0, 255])
-def test_a_blank_second_picture_gives_no_match(fill: int) -> None:
-    a = grey(view(0, 0))
+def test_a_blank_second_image_gives_no_match(fill: int) -> None:
+    a = gray(view(0, 0))
     corners = harris_grid(a, CONFIG).uv_px
     blank = Pyramid.build(np.full(a.shape, fill, np.uint8))
     assert not match(Pyramid.build(a), corners, blank, corners, 30.0, None, CONFIG).ok.any()
 
 
 def test_the_same_call_gives_the_same_answer() -> None:
-    a, b = grey(view(0, 0)), grey(view(9.0, 4.0))
+    a, b = gray(view(0, 0)), gray(view(9.0, 4.0))
     corners = harris_grid(a, CONFIG).uv_px
     first, second = (
         match(Pyramid.build(a), corners, Pyramid.build(b), corners, 20.0, None, CONFIG)
@@ -260,9 +260,9 @@ def test_the_same_call_gives_the_same_answer() -> None:
     np.testing.assert_array_equal(first.uv_px, second.uv_px)
 
 
-def test_pictures_of_different_size_and_odd_levels() -> None:
-    a = grey(view(0, 0, 351, 477))
-    b = grey(view(3.25, 2.5, 300, 401))
+def test_images_of_different_size_and_odd_levels() -> None:
+    a = gray(view(0, 0, 351, 477))
+    b = gray(view(3.25, 2.5, 300, 401))
     corners = harris_grid(a, CONFIG).uv_px
     found = match(Pyramid.build(a), corners, Pyramid.build(b), corners, 30.0, None, CONFIG)
     truth = corners - np.array([3.25, 2.5])
@@ -271,7 +271,7 @@ def test_pictures_of_different_size_and_odd_levels() -> None:
 
 
 def test_wrong_shapes_are_named() -> None:
-    a = grey(view(0, 0))
+    a = gray(view(0, 0))
     pyramid = Pyramid.build(a)
     with pytest.raises(ValueError, match=r"\(3, 3\)"):
         match(pyramid, np.zeros((3, 3)), pyramid, np.zeros((3, 2)), 5.0)
@@ -321,7 +321,7 @@ def test_a_common_view_is_a_start_for_matching() -> None:
 
 
 def test_strangers_share_nothing() -> None:
-    images = [features(grey(ground(300, 400, seed=i))) for i in range(8)]
+    images = [features(gray(ground(300, 400, seed=i))) for i in range(8)]
     assert all(common_view(a, b) is None for a, b in itertools.combinations(images, 2))
     blank = features(np.full((300, 400), 90, np.uint8))
     assert len(blank.uv_px) == 0 and common_view(blank, images[0]) is None

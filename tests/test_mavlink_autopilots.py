@@ -103,7 +103,7 @@ def test_the_nearer_of_two_that_answer_is_ours() -> None:
     assert net.presence.autopilot == (7, 1)
 
 
-def test_the_one_that_says_most_is_ours_where_nobody_answers() -> None:
+def test_the_one_that_says_max_is_ours_where_nobody_answers() -> None:
     net = Net(Vehicle(2), Vehicle(7, chatter=5))
     net.wait(7.0)
     assert net.presence.autopilot == (7, 1)

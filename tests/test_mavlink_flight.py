@@ -47,8 +47,8 @@ def draw_flight(folder: Path) -> None:
     for k in range(IMAGES):
         shift = SPEED_M_S * INTERVAL_S * k * FOCAL_PX / AGL_M
         move = np.array([[1.0, 0.0, -shift], [0.0, 1.0, 0.0]])
-        picture = cv2.warpAffine(ground, move, SIZE, flags=cv2.INTER_CUBIC)
-        cv2.imwrite(str(folder / f"{k:03}.png"), np.clip(picture, 0, 255).astype(np.uint8))
+        image = cv2.warpAffine(ground, move, SIZE, flags=cv2.INTER_CUBIC)
+        cv2.imwrite(str(folder / f"{k:03}.png"), np.clip(image, 0, 255).astype(np.uint8))
     K = np.array([[FOCAL_PX, 0.0, 159.5], [0.0, FOCAL_PX, 119.5], [0.0, 0.0, 1.0]])
     save_camera(folder / "camera.yaml", Camera(K, np.zeros(5), SIZE))
 
@@ -121,7 +121,7 @@ def test_a_flight_by_mavlink(tmp_path: Path, autopilot: Autopilot) -> None:
     draw_flight(tmp_path / "pictures")
     settings = {
         "scan.folder": tmp_path / "scans",
-        "camera.source": f"images:{tmp_path / 'pictures'}?interval_s={INTERVAL_S}",
+        "camera.source": f"images:{tmp_path / 'images'}?interval_s={INTERVAL_S}",
         "camera.model": tmp_path / "pictures" / "camera.yaml",
         "mavlink.links": f"udpout:127.0.0.1:{autopilot.port}",
         "mavlink.odometry": "true",

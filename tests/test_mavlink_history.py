@@ -394,7 +394,7 @@ def test_a_fixed_mount_stands_in_when_no_gimbal_speaks() -> None:
     assert "mount" in state.sources
 
 
-def test_the_pictures_decide_between_frames() -> None:
+def test_the_images_decide_between_frames() -> None:
     rng = np.random.default_rng(5)
     bodies = [
         Rotation.from_euler("ZYX", [0.02 * k, 0.1 * math.sin(k), 0.1 * math.cos(2 * k)])

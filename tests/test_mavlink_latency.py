@@ -120,7 +120,7 @@ def test_a_steady_swing_has_two_answers_and_gets_none() -> None:
     assert watch.estimate([(round(k / 50 * S), swing(k / 50)) for k in range(2200)]) is None
 
 
-def test_pictures_that_do_not_fit_the_flight_say_nothing() -> None:
+def test_images_that_do_not_fit_the_flight_say_nothing() -> None:
     rng = np.random.default_rng(1)
     watch = LatencyWatch()
     for k in range(600):

@@ -22,7 +22,7 @@ from recon.surface.meshing import Mesh
 from service.cameras import CameraFrame
 from service.cli import app
 from service.errors import InputError, OutsideError
-from service.offline.exports import mesh_tiles, model, pictures
+from service.offline.exports import images, mesh_tiles, model
 from service.offline.exports.mesh_tiles import (
     Footprint,
     TileJob,
@@ -52,7 +52,7 @@ def same(a: list[TilePart], b: list[TilePart]) -> None:
         np.testing.assert_array_equal(one.mesh.vertices_m, other.mesh.vertices_m)
         np.testing.assert_array_equal(one.mesh.faces, other.mesh.faces)
         np.testing.assert_array_equal(one.mesh.uv, other.mesh.uv)
-        np.testing.assert_array_equal(one.picture, other.picture)
+        np.testing.assert_array_equal(one.image, other.image)
 
 
 def test_boxes_cover_the_site_once_and_hold_no_more_than_asked() -> None:
@@ -177,7 +177,7 @@ class FakeVideo:
         self.closed = True
 
 
-def test_pictures_come_from_the_video_at_the_keyframes_times(
+def test_images_come_from_the_video_at_the_keyframes_times(
     tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with house.flown(tmp_path) as store:
@@ -186,26 +186,26 @@ def test_pictures_come_from_the_video_at_the_keyframes_times(
         camera = {"K": K.ravel().tolist(), "distortion": [0.0] * 5, "width": 320, "height": 180}
         header = replace(store.header, camera=camera)
     video = FakeVideo(house)
-    monkeypatch.setattr(pictures, "open_camera", lambda _: video)
-    views = pictures.video_pictures(keyframes, header, tmp_path, None)
+    monkeypatch.setattr(images, "open_camera", lambda _: video)
+    views = images.video_images(keyframes, header, tmp_path, None)
     assert len(views) == 5 and video.closed
     for view, keyframe in zip(views, keyframes, strict=True):
         assert view.bgra.shape == (180, 320, 4) and (view.bgra[..., 3] == 255).all()
         np.testing.assert_array_equal(view.T_world_camera, keyframe.depth.T_world_camera)
         np.testing.assert_allclose(view.K, K)
-    late = pictures.video_pictures(keyframes, header, tmp_path, header.started_unix_ns + 3 * 10**9)
+    late = images.video_images(keyframes, header, tmp_path, header.started_unix_ns + 3 * 10**9)
     assert [v.bgra.shape[0] for v in late] == [90, 90, 90, 180, 180]  # the rest from the store
-    monkeypatch.setattr(pictures, "MAX_BYTES", 5 * 4 * 160 * 90)
-    small = pictures.video_pictures(keyframes, header, tmp_path, None)
+    monkeypatch.setattr(images, "MAX_BYTES", 5 * 4 * 160 * 90)
+    small = images.video_images(keyframes, header, tmp_path, None)
     assert {v.bgra.shape[:2] for v in small} == {(90, 160)}
     np.testing.assert_allclose(small[0].K[0, 0], 140.0)
     with pytest.raises(InputError, match="--video-epoch"):
-        pictures.video_pictures(keyframes, header, tmp_path, 0)
-    monkeypatch.setattr(pictures, "open_camera", lambda _: FakeVideo(house, (640, 360)))
+        images.video_images(keyframes, header, tmp_path, 0)
+    monkeypatch.setattr(images, "open_camera", lambda _: FakeVideo(house, (640, 360)))
     with pytest.raises(InputError, match="640x360"):
-        pictures.video_pictures(keyframes, header, tmp_path, None)
+        images.video_images(keyframes, header, tmp_path, None)
     with pytest.raises(InputError, match="no camera model"):
-        pictures.video_pictures(keyframes, replace(header, camera={}), tmp_path, None)
+        images.video_images(keyframes, replace(header, camera={}), tmp_path, None)
 
 
 def test_the_file_names_no_path_of_this_machine(
@@ -216,7 +216,7 @@ def test_the_file_names_no_path_of_this_machine(
     corner = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
     mesh = Mesh(corner, np.array([[0, 1, 2]], np.int32), rgb=np.full((3, 3), 90, np.uint8))
     figures = {"faces": 1, "vertices": 3, "seen": 1.0, "texture_px": [1, 1]}
-    part = SimpleNamespace(mesh=mesh, picture=None, figures=figures)
+    part = SimpleNamespace(mesh=mesh, image=None, figures=figures)
     monkeypatch.setattr(model, "run_tiles", lambda *_: [part])
     monkeypatch.setattr(model, "check_video", lambda *_: None)
     how = model.MeshOptions(video=tmp_path / "flight.mp4")
@@ -242,12 +242,12 @@ def test_the_recording_that_a_scan_names_is_found(
     with house.flown(folder) as store:
         camera = {"K": [1.0] * 9, "distortion": [0.0] * 5, "width": 320, "height": 180}
         header = replace(store.header, camera=camera)
-    monkeypatch.setattr(pictures, "open_camera", lambda _: FakeVideo(house))
-    assert pictures.recording_of(folder, header).path is None  # no scan.json yet
+    monkeypatch.setattr(images, "open_camera", lambda _: FakeVideo(house))
+    assert images.recording_of(folder, header).path is None  # no scan.json yet
 
-    def name(source: object) -> pictures.Recording:
+    def name(source: object) -> images.Recording:
         (folder / "scan.json").write_text(json.dumps({"run": {"source": source}}))
-        return pictures.recording_of(folder, header)
+        return images.recording_of(folder, header)
 
     assert name("flight.mp4").path is None and "is not there" in name("flight.mp4").words
     video = tmp_path / "flight.mp4"
@@ -256,10 +256,10 @@ def test_the_recording_that_a_scan_names_is_found(
     assert name(str(video)).path == video
     for unfit in (None, 7, ["x"]):
         assert "does not name" in name(unfit).words
-    monkeypatch.setattr(pictures, "open_camera", lambda _: FakeVideo(house, (640, 360)))
+    monkeypatch.setattr(images, "open_camera", lambda _: FakeVideo(house, (640, 360)))
     assert name("flight.mp4").path is None and "another recording" in name("flight.mp4").words
     bare = replace(header, camera={})
-    assert pictures.recording_of(folder, bare).path is None
+    assert images.recording_of(folder, bare).path is None
 
 
 def test_a_recording_found_by_itself_that_does_not_fit_is_left(

@@ -54,16 +54,16 @@ def prior_of(T: F64, rng: np.random.Generator) -> PosePrior:
 
 
 def fly(
-    ground: U8, track: list[F64], telemetry: bool, pictures: dict[int, U8] | None = None
+    ground: U8, track: list[F64], telemetry: bool, images: dict[int, U8] | None = None
 ) -> tuple[Odometry, list[Tracked]]:
-    """Run the odometry at 5 Hz; ``pictures`` replaces some of the frames."""
+    """Run the odometry at 5 Hz; ``images`` replaces some of the frames."""
     rng = np.random.default_rng(2)
     odometry, out = Odometry(CAMERA, OdometryConfig()), []
     for i, T in enumerate(track):
-        picture = photograph(ground, T)
-        picture = (pictures or {}).get(i, picture)
+        image = photograph(ground, T)
+        image = (images or {}).get(i, image)
         prior = prior_of(T, rng) if telemetry else PosePrior(DOWN, 0.1, 3.0, agl_m=60.0)
-        out.append(odometry.track(picture, i, i * 200_000_000, prior))
+        out.append(odometry.track(image, i, i * 200_000_000, prior))
     return odometry, out
 
 

@@ -16,7 +16,7 @@ from recon.camera_model import rays
 from recon.types import F64, U8, Camera
 from service.cli import app
 from service.errors import InputError
-from service.offline.refine.own_camera import FILE, found_camera, pictures_at, sightings, write
+from service.offline.refine.own_camera import FILE, found_camera, images_at, sightings, write
 
 SIZE = (480, 270)
 TRUE = Camera(
@@ -39,7 +39,7 @@ def _height(x: F64, y: F64) -> F64:
     return np.asarray(2.0 * np.sin(x / 9.0) * np.cos(y / 11.0))
 
 
-def _picture(T: F64, seed: int) -> U8:
+def _image(T: F64, seed: int) -> U8:
     """The ground through the true camera, with noise."""
     w, h = SIZE
     v, u = np.mgrid[0:h, 0:w].astype(np.float64)
@@ -49,9 +49,9 @@ def _picture(T: F64, seed: int) -> U8:
         p = T[:3, 3] + ways * z[:, None]
         z += (p[:, 2] - _height(p[:, 0], p[:, 1])) / -ways[:, 2]
     p = (T[:3, 3] + ways * z[:, None])[:, :2] / TEXEL_M + 550
-    grey = ndi.map_coordinates(TEXTURE, p.T, order=1, mode="reflect").reshape(h, w)
-    noise = np.random.default_rng(seed).normal(size=grey.shape)
-    return np.asarray(np.clip(grey + noise, 0, 255), np.uint8)
+    gray = ndi.map_coordinates(TEXTURE, p.T, order=1, mode="reflect").reshape(h, w)
+    noise = np.random.default_rng(seed).normal(size=gray.shape)
+    return np.asarray(np.clip(gray + noise, 0, 255), np.uint8)
 
 
 def _pose(x: float, y: float, yaw: float, ahead_deg: float) -> F64:
@@ -78,11 +78,11 @@ def _off(poses: F64) -> F64:
     return np.array([se3.exp(rng.normal(size=6) * ([3e-3] * 3 + [0.15] * 3)) @ T for T in poses])
 
 
-def test_the_pictures_of_an_oblique_turn_tell_the_focal_length(tmp_path: Path) -> None:
+def test_the_images_of_an_oblique_turn_tell_the_focal_length(tmp_path: Path) -> None:
     poses = _flight(38.0)
-    pictures = {k: _picture(T, k) for k, T in enumerate(poses)}
+    images = {k: _image(T, k) for k, T in enumerate(poses)}
     fixes, sigma = poses[:, :3, 3], np.full((len(poses), 3), 0.5)
-    found = found_camera(pictures, WRONG, _off(poses), 0.0, fixes, sigma)
+    found = found_camera(images, WRONG, _off(poses), 0.0, fixes, sigma)
     assert abs(found.camera.K[0, 0] / 360.0 - 1.0) < 0.003
     assert found.rms_after_px < 0.3 * found.rms_before_px
     figures = write(found, WRONG, tmp_path)
@@ -91,13 +91,13 @@ def test_the_pictures_of_an_oblique_turn_tell_the_focal_length(tmp_path: Path) -
     assert figures["focal_px"] == [367.2, pytest.approx(360.0, abs=1.1)]
 
 
-def test_a_leg_flown_back_ties_its_pictures_to_those_of_the_first() -> None:
+def test_a_leg_flown_back_ties_its_images_to_those_of_the_first() -> None:
     """Only views turned to each other show a lens off its axis."""
     out = [_pose(0.0, 9.0 * k, 0.0, 0.0) for k in range(5)]
     back = [_pose(10.0, 36.0 - 9.0 * k, np.pi, 0.0) for k in range(5)]
     poses = np.array([*out, *back])
-    pictures = {k: _picture(T, k) for k, T in enumerate(poses)}
-    landmarks, seen, own = sightings(pictures, TRUE, poses, 0.0)
+    images = {k: _image(T, k) for k, T in enumerate(poses)}
+    landmarks, seen, own = sightings(images, TRUE, poses, 0.0)
     of = [set(seen.landmark[seen.view == k]) for k in range(10)]
     assert len(of[0] & of[9]) > 20 and len(of[1] & of[7]) > 20
     shared = np.isin(seen.landmark, list(of[0] & of[9])) & (seen.view == 9)
@@ -112,20 +112,20 @@ def test_a_folder_of_stills_is_a_recording_too(tmp_path: Path) -> None:
     for k in range(4):
         assert cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((60, 80, 3), 40 * k, np.uint8))
     times = [int(2e18) + k * 10**9 for k in range(4)]
-    found = pictures_at(tmp_path, times[0], times)
+    found = images_at(tmp_path, times[0], times)
     assert [int(found[k].mean()) for k in range(4)] == [0, 40, 80, 120]
 
 
 def test_a_straight_line_looking_down_is_refused_in_one_line() -> None:
     poses = _flight(0.0)
-    pictures = {k: _picture(T, k) for k, T in enumerate(poses)}
+    images = {k: _image(T, k) for k, T in enumerate(poses)}
     fixes, sigma = poses[:, :3, 3], np.full((len(poses), 3), 1.0)
     with pytest.raises(InputError, match="cannot tell the focal length") as refused:
-        found_camera(pictures, WRONG, _off(poses), 0.0, fixes, sigma)
+        found_camera(images, WRONG, _off(poses), 0.0, fixes, sigma)
     assert "\n" not in str(refused.value) and "nothing was changed" in str(refused.value)
 
 
-def test_pictures_of_something_else_are_refused() -> None:
+def test_images_of_something_else_are_refused() -> None:
     poses = _flight(0.0)
     blank = {k: np.full((SIZE[1], SIZE[0]), 100, np.uint8) for k in range(len(poses))}
     with pytest.raises(InputError, match="is this the video"):

@@ -23,7 +23,7 @@ from service.ground.library import Library
 from service.ground.live import SIGMA_STEP_M, LiveFeed, StoreIndex
 from service.ground.portal import Portal, PortalConfig, open_portal, parse_address
 from service.ground.scan_files import DARK
-from service.ground.scan_files import _closed as closed_picture
+from service.ground.scan_files import _closed as closed_image
 from service.ground.vehicle import Vehicle
 from service.stream.codec import encode
 from service.stream.records import Repose, ScanHeader
@@ -210,7 +210,7 @@ def test_the_tiles_of_a_scan_are_served(client: Client, store: Path) -> None:
         assert client.ask(f"{one}/{bad}")[0] == 404
 
 
-def test_a_keyframes_picture_is_shown(client: Client, house: HouseFlight) -> None:
+def test_a_keyframes_image_is_shown(client: Client, house: HouseFlight) -> None:
     status, data, headers = client.ask("/api/scans/drone-1/test-1/keyframes/2.jpg")
     assert status == 200 and headers["content-type"] == "image/jpeg"
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
@@ -235,12 +235,12 @@ def test_a_keyframe_that_brought_little_new_is_completed_from_those_before_it(
     assert np.median(error) < 10.0 and (error < 40.0).mean() > 0.9
 
 
-def test_a_picture_closes_gaps_and_leaves_the_rest_dark() -> None:
+def test_a_image_closes_gaps_and_leaves_the_rest_dark() -> None:
     known = np.ones((90, 160), np.bool_)
     known[40:44, 50:54] = False
     known[:, 100:] = False
     bgr = np.where(known[..., None], 200, 0).repeat(3, axis=2).astype(np.uint8)
-    closed = closed_picture(bgr, known)
+    closed = closed_image(bgr, known)
     assert (closed[40:44, 50:54] == 200).all()
     assert (closed[:, 120:] == DARK).all()
 

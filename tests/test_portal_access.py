@@ -43,7 +43,7 @@ def show(browser: Browser, address: str, size: tuple[int, int]) -> None:
     browser.wait("!!document.querySelector('h1')")
     if address.endswith("/test-1"):
         browser.wait("document.body.dataset.points === '72000'")
-        browser.wait("document.body.dataset.picture === '4'")
+        browser.wait("document.body.dataset.image === '4'")
 
 
 def box(browser: Browser, selector: str) -> dict[str, float]:
@@ -103,4 +103,4 @@ def test_axe_finds_nothing_serious(
             browser.run("document.querySelector('details.group').open = true")
         browser.run(AXE.read_text() + ";0")
         assert browser.run(SERIOUS) == [], page
-        browser.picture(tmp_path / f"{page}.png")  # to look at
+        browser.image(tmp_path / f"{page}.png")  # to look at

@@ -186,7 +186,7 @@ def test_the_session_cookie_is_secure_under_tls(store: Path, scheme: str, secure
     assert [e["action"] for e in lines_of(store)] == ["login"]
 
 
-def test_pictures_are_for_this_site_only(client: Client) -> None:
+def test_images_are_for_this_site_only(client: Client) -> None:
     paths = (f"{ONE}/files/preview.jpg", f"{ONE}/keyframes/2.jpg", "/api/scans", "/nothing")
     for path in paths:
         assert client.ask(path)[2]["cross-origin-resource-policy"] == "same-origin"

@@ -134,11 +134,11 @@ def test_the_tiles_are_loaded_where_the_cloud_was(
     assert np.abs(off[:2]).max() < 15.0 and abs(off[2]) < 5.0  # about the scan's own origin
 
 
-def test_the_latest_picture_is_shown(browser: Browser, portal: Portal) -> None:
+def test_the_latest_image_is_shown(browser: Browser, portal: Portal) -> None:
     browser.open(portal.url)
     browser.wait("document.querySelectorAll('article').length === 1")
     browser.open(f"{base(portal)}/#/view/drone-1/test-1")
-    browser.wait("document.body.dataset.picture === '4'")
+    browser.wait("document.body.dataset.image === '4'")
     assert browser.run("document.querySelector('.latest img').naturalWidth") == 160
 
 

@@ -195,4 +195,4 @@ def test_the_volume_of_the_house_its_profile_and_the_way_out(
     datum = house.origin[2]
     assert abs(low - datum) < 0.05 and abs(high - datum - 6.0) < 0.05
     assert abs(length - 24.0) < 0.6
-    ruler.page.picture(tmp_path / "profile.png")  # to look at
+    ruler.page.image(tmp_path / "profile.png")  # to look at

@@ -66,7 +66,7 @@ Object.defineProperty(navigator, 'xr', { configurable: true, value: {
 } });
 """
 TOLD = " field.dispatchEvent(new Event('input', { bubbles: true }))"
-PICTURE = "document.querySelector('.stage canvas').toDataURL('image/png').split(',')[1]"
+IMAGE = "document.querySelector('.stage canvas').toDataURL('image/png').split(',')[1]"
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def open_scan(page: Page, portal: Portal) -> None:
     page.wait("document.querySelectorAll('article').length === 1")
     page.open(f"{portal.url.split('/?')[0]}/#/view/drone-1/test-1")
     page.wait("Number(document.body.dataset.points) > 1000")
-    page.wait("document.body.dataset.picture === '4'")
+    page.wait("document.body.dataset.image === '4'")
     page.wait("document.body.dataset.drawn === document.body.dataset.points")
     page.wait("document.body.dataset.still === 'yes'")
 
@@ -102,7 +102,7 @@ def drawn(page: Page) -> U8:
     """What the stage shows, once it stands still."""
     page.run("new Promise(r => setTimeout(r, 100))")
     page.wait("document.body.dataset.still === 'yes'")
-    data = np.frombuffer(base64.b64decode(page.run(PICTURE)), np.uint8)
+    data = np.frombuffer(base64.b64decode(page.run(IMAGE)), np.uint8)
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
 
 
@@ -120,7 +120,7 @@ def difference(a: U8, b: U8) -> float:
     return float((cv2.absdiff(a, b).max(axis=2) > 4).mean())
 
 
-def test_settings_change_the_picture_and_go_back(browser: Browser, portal: Portal) -> None:
+def test_settings_change_the_image_and_go_back(browser: Browser, portal: Portal) -> None:
     open_scan(browser, portal)
     plain = drawn(browser)
     sky = np.full_like(plain, plain[0, 0])

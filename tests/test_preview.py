@@ -20,9 +20,9 @@ def raster(rows: int, cols: int, cell_m: float = 1.0) -> Raster:
 
 def test_colour_stands_in_its_corner_and_the_track_on_its_way() -> None:
     track = np.array([[100.0, 190.0, 50.0], [140.0, 190.0, 50.0]])
-    picture = draw_preview(raster(40, 40), track, ["a line"], largest_px=400)
+    image = draw_preview(raster(40, 40), track, ["a line"], largest_px=400)
     scale = 8  # at most eight pixels a cell
-    panel = picture[MARGIN : MARGIN + 40 * scale, MARGIN : MARGIN + 40 * scale].astype(int)
+    panel = image[MARGIN : MARGIN + 40 * scale, MARGIN : MARGIN + 40 * scale].astype(int)
     assert panel[15, 15, 2] > 150 > panel[15, 15, 1]  # red in the north-west
     assert panel[200, 200, 1] > 120 > panel[200, 200, 2]
     row = 10 * scale  # 190 m north is ten cells below the top
@@ -32,24 +32,24 @@ def test_colour_stands_in_its_corner_and_the_track_on_its_way() -> None:
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 300), (300, 2), (40, 41)])
 def test_any_shape_is_drawn(shape: tuple[int, int]) -> None:
-    picture = draw_preview(raster(*shape), np.zeros((0, 3)), ["x" * 50], largest_px=300)
-    assert picture.dtype == np.uint8
-    assert picture.ndim == 3
+    image = draw_preview(raster(*shape), np.zeros((0, 3)), ["x" * 50], largest_px=300)
+    assert image.dtype == np.uint8
+    assert image.ndim == 3
 
 
 def test_large_rasters_are_reduced() -> None:
-    picture = draw_preview(raster(900, 1100, 0.1), np.zeros((0, 3)), [], largest_px=500)
-    assert max(picture.shape) < 1100
+    image = draw_preview(raster(900, 1100, 0.1), np.zeros((0, 3)), [], largest_px=500)
+    assert max(image.shape) < 1100
 
 
 def test_unknown_ground_is_left_blank_and_far_tracks_do_no_harm() -> None:
     one = raster(40, 40)
     one.height_m[:, 20:] = np.nan
     track = np.array([[1e12, -1e12, 0.0], [0.0, 0.0, 0.0]])
-    picture = draw_preview(one, track, [], largest_px=40)
-    assert (picture[MARGIN + 20, MARGIN + 30] == BACKGROUND).all()
+    image = draw_preview(one, track, [], largest_px=40)
+    assert (image[MARGIN + 20, MARGIN + 30] == BACKGROUND).all()
 
 
 def test_a_scan_without_surface_shows_its_figures() -> None:
-    picture = blank_preview(["nothing seen"])
-    assert (picture < 100).any()
+    image = blank_preview(["nothing seen"])
+    assert (image < 100).any()

@@ -21,11 +21,11 @@ from recon.surface.raster import (
 from recon.types import F32, F64, PointCloud
 
 
-def cloud(xyz: F64, sigma_m: float = 0.05, grey: int = 100) -> PointCloud:
+def cloud(xyz: F64, sigma_m: float = 0.05, gray: int = 100) -> PointCloud:
     n = len(xyz)
     return PointCloud(
         np.asarray(xyz, np.float32),
-        np.full((n, 3), grey, np.uint8),
+        np.full((n, 3), gray, np.uint8),
         np.full(n, sigma_m, np.float32),
         np.ones(n, np.uint8),
     )

@@ -556,11 +556,11 @@ GOOD = "name,keyframe_seq,u_px,v_px,lat,lon,alt_amsl_m\n"
         (GOOD + "A,1.5,10,10,47.39,8.54,408\n", "not a whole number"),
         (GOOD + "A,0,1,1,47.39,8.54,408\nA,1,1,1,47.38,8.54,408\n", "differs from line 2"),
         (GOOD + "A,3,10,10,47.39,8.54,408\n", "no keyframe 3; the nearest is 0"),
-        (GOOD + "A,0,999,10,47.39,8.54,408\n", "outside the camera's picture of 160x90"),
+        (GOOD + "A,0,999,10,47.39,8.54,408\n", "outside the camera's image of 160x90"),
         ("name,x,y,z,lat,lon,alt_amsl_m\nA,1,2,3,47.39,8.54,408\n", "no surface at x,y,z"),
         (
             "name,time,u_px,v_px,lat,lon,alt_amsl_m\nA,5,10,10,47.39,8.54,408\n",
-            "no picture within 20 ms",
+            "no image within 20 ms",
         ),
         (
             "name,x,y,z,u_px,v_px,lat,lon,alt_amsl_m\nA,1,2,3,4,5,47.39,8.54,408\n",

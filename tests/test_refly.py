@@ -89,7 +89,7 @@ def weak_spots(coverage: Coverage, flight: Refly) -> F64:
 
 
 @pytest.mark.parametrize("apart_m", [100.0, 130.0, 260.0])
-def test_every_weak_cell_comes_into_the_picture(apart_m: float) -> None:
+def test_every_weak_cell_comes_into_the_image(apart_m: float) -> None:
     coverage = covered(two_lines(apart_m))
     flight = suggest(coverage, 5.0, HEIGHT_M)
     assert flight is not None
@@ -98,7 +98,7 @@ def test_every_weak_cell_comes_into_the_picture(apart_m: float) -> None:
     assert all(is_seen(flight, spot) for spot in spots[::7])
 
 
-def test_the_swath_is_the_picture_flown() -> None:
+def test_the_swath_is_the_image_flown() -> None:
     flight = suggest(covered(two_lines()), 5.0, HEIGHT_M)
     assert flight is not None
     swath = flight.swath

@@ -100,7 +100,7 @@ def test_the_camera_hangs_beside_the_vehicles_position() -> None:
     assert blind.altitude_m == pytest.approx(499.9)
 
 
-def test_a_picture_tag_serves_when_there_is_no_telemetry() -> None:
+def test_a_image_tag_serves_when_there_is_no_telemetry() -> None:
     some = rig()
     tag = GeoTag(30.0, -98.0, 300.0, ypr_deg=(90.0, -90.0, 0.0), relative_alt_m=80.0)
     prior = some.prior(None, tag)

@@ -27,7 +27,7 @@ def daemon(tmp_path: Path) -> Daemon:
     return Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
 
 
-def test_pictures_that_the_camera_model_does_not_fit_are_refused(
+def test_images_that_the_camera_model_does_not_fit_are_refused(
     daemon: Daemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     closed, told, scanning = threading.Event(), [], daemon.scanning

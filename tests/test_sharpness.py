@@ -19,9 +19,9 @@ def scene(seed: int = 0) -> U8:
     return np.asarray(np.clip(120 + 25 * out, 0, 255), np.uint8)
 
 
-def motion_blur(picture: U8, length: int) -> U8:
+def motion_blur(image: U8, length: int) -> U8:
     kernel = np.full((1, length), 1.0 / length)
-    return np.asarray(cv2.filter2D(picture, -1, kernel), np.uint8)
+    return np.asarray(cv2.filter2D(image, -1, kernel), np.uint8)
 
 
 def test_blur_lowers_sharpness_but_contrast_and_brightness_do_not() -> None:
@@ -38,8 +38,8 @@ def test_a_blurred_frame_among_sharp_ones_is_told() -> None:
     watch = BlurWatch()
     told = []
     for i in range(30):
-        picture = scene(i)
-        told.append(watch.blurred(motion_blur(picture, 15) if i in (12, 20) else picture))
+        image = scene(i)
+        told.append(watch.blurred(motion_blur(image, 15) if i in (12, 20) else image))
     assert [i for i, blurred in enumerate(told) if blurred] == [12, 20]
 
 

@@ -21,7 +21,7 @@ from recon.types import F64, Shutter
 from service.cameras.camera_file import load_camera
 from service.cli import app
 from service.errors import InputError
-from service.sim.picture import patchwork
+from service.sim.ground_texture import patchwork
 from service.sim.truth import read_surface, write_surface
 
 SMALL = [

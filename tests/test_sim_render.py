@@ -12,7 +12,7 @@ import pytest
 from recon import se3
 from recon.rolling_shutter import row_times_s
 from recon.types import F64, Camera, Shutter
-from service.sim import picture, scene, shapes
+from service.sim import ground_texture, scene, shapes
 from service.sim.noise import fractal2, hash01, normal
 from service.sim.render import Look, Renderer, camera_rays
 from service.sim.scene import Area
@@ -32,7 +32,7 @@ def place() -> scene.Scene:
 
 @cache
 def renderer() -> Renderer:
-    return Renderer(place(), picture.make(place(), 0.12), CAMERA)
+    return Renderer(place(), ground_texture.make(place(), 0.12), CAMERA)
 
 
 def looking_down(x: float, y: float, z: float, tilt: F64 | None = None) -> F64:
@@ -132,9 +132,9 @@ def test_shadows_fall_away_from_the_sun() -> None:
     """Ground just north-west of a house is darker than just south-east of it."""
     blocks = place().blocks
     houses = blocks[np.isin(blocks[:, shapes.KIND], [shapes.FLAT, shapes.GABLED])]
-    sun = picture.sun_direction()
+    sun = ground_texture.sun_direction()
     drop = []
-    pyramid = picture.make(place(), 0.25)
+    pyramid = ground_texture.make(place(), 0.25)
     _, rows, cols = pyramid.levels[0]
     image = pyramid.bgr[: rows * cols].reshape(rows, cols, 3).mean(axis=2)
     for house in houses:
@@ -221,7 +221,7 @@ def test_each_row_is_rendered_at_its_own_pose(direction: str) -> None:
     poses = np.array(
         [looking_down(3.0 + 20 * t, 1.0, 40.0, np.array([2 * t, t, 0])) for t in times]
     )
-    rolling = Renderer(place(), picture.make(place(), 0.12), camera).frame(poses, 0, QUIET)
+    rolling = Renderer(place(), ground_texture.make(place(), 0.12), camera).frame(poses, 0, QUIET)
     for k in (0, n // 3, n - 1):
         whole = renderer().frame(poses[k], 0, QUIET)
         ours, row = (rolling[:, k], whole[:, k]) if sideways else (rolling[k], whole[k])

@@ -52,10 +52,10 @@ def test_writes_disparity_in_pixels(
     pair: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str], first: int, labels: int,
 ) -> None:  # fmt: skip
-    out, picture = tmp_path / "d.npy", tmp_path / "d.png"
+    out, image = tmp_path / "d.npy", tmp_path / "d.png"
     code = run(
         monkeypatch, "stereo", *pair, "--labels", labels, "--min-disparity", first,
-        "--out", out, "--picture", picture, "--backend", "cpu", "--json",
+        "--out", out, "--picture", image, "--backend", "cpu", "--json",
     )  # fmt: skip
     assert code == 0
     report = json.loads(capsys.readouterr().out.splitlines()[-1])
@@ -65,7 +65,7 @@ def test_writes_disparity_in_pixels(
     assert report["known_share"] == pytest.approx(np.isfinite(px).mean())
     assert abs(np.nanmedian(px[:, 20:]) - 9.5) < 0.1
     assert np.isfinite(px[:, 24:]).mean() > 0.98
-    drawn = cv2.imread(str(picture))
+    drawn = cv2.imread(str(image))
     assert drawn is not None
     assert drawn.shape == (80, 160, 3)
 

@@ -27,7 +27,7 @@ def texture(height: int, width: int, seed: int = 0, blur: float = 1.2) -> F64:
     return np.asarray(128 + 40 * noise / noise.std())
 
 
-def grey(image: Array) -> U8:
+def gray(image: Array) -> U8:
     """Rounded to 8 bits."""
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
@@ -40,7 +40,7 @@ def shifted_pair(disparity: F64, seed: int = 0, blur: float = 1.2) -> tuple[U8, 
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     x = (u - disparity + margin).astype(np.float32)
     left = cv2.remap(canvas, x, v, cv2.INTER_LANCZOS4)
-    return grey(left), grey(canvas[:, margin : margin + width])
+    return gray(left), gray(canvas[:, margin : margin + width])
 
 
 def beliefs_of(data: Array, messages: Array, width: int) -> Array:
@@ -127,10 +127,10 @@ def test_matching_cost_against_its_definition(min_disparity: int) -> None:
                 x = u - label - min_disparity
                 if 0 <= x < 22:
                     bits = bin(int(words_left[v, u]) ^ int(words_right[v, x])).count("1")
-                    grey_step = abs(int(left[v, u]) - int(right[v, x]))
+                    gray_step = abs(int(left[v, u]) - int(right[v, x]))
                     seen[label] = (
                         min(bits, config.census_truncation) * weights[0]
-                        + min(grey_step, config.difference_truncation) * weights[1]
+                        + min(gray_step, config.difference_truncation) * weights[1]
                     )
             unseen = min(seen.values()) + round(config.unseen * COST_UNIT) if seen else 0
             want = [seen.get(label, unseen) for label in range(6)]
@@ -181,7 +181,7 @@ def box_scene() -> tuple[F64, U8, U8]:
     left = np.where(on_box, near[v, u - 14 + 80], far[v, u - 4 + 80])
     box_right = np.roll(on_box, -14, axis=1)
     right = np.where(box_right, near[v, u + 80], far[v, u + 80])
-    return truth, grey(left), grey(right)
+    return truth, gray(left), gray(right)
 
 
 def test_occluded_strip_is_unknown_and_edges_stay_sharp() -> None:
@@ -212,7 +212,7 @@ def test_no_label_whose_partner_lies_outside_the_right_image() -> None:
 
 def rng_image(seed: int, level: float) -> U8:
     """Independent noise about gray 128."""
-    return grey(np.random.default_rng(seed).normal(128, level, (120, 200)))
+    return gray(np.random.default_rng(seed).normal(128, level, (120, 200)))
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def rng_image(seed: int, level: float) -> U8:
         (np.zeros((120, 200), np.uint8), rng_image(1, 40)),
         (rng_image(2, 40), rng_image(3, 40)),
         (rng_image(4, 2), rng_image(5, 2)),
-        (grey(texture(120, 200, 6)), grey(texture(120, 200, 7))),
+        (gray(texture(120, 200, 6)), gray(texture(120, 200, 7))),
     ],
     ids=["blank", "white", "half blank", "noise", "sensor noise", "unrelated"],
 )
@@ -235,7 +235,7 @@ def test_nothing_is_invented_without_evidence(left: U8, right: U8) -> None:
 def test_confidence_tells_right_from_wrong() -> None:
     truth = np.tile(np.linspace(3, 12, 200), (120, 1))
     left, right = shifted_pair(truth)
-    patch = grey(texture(120, 200, 9))
+    patch = gray(texture(120, 200, 9))
     left = left.copy()
     left[30:80, 80:150] = patch[30:80, 80:150]  # moved between the exposures
     found = belief_propagation(left, right, 16, BELIEVE_ALL)
@@ -249,7 +249,7 @@ def test_confidence_tells_right_from_wrong() -> None:
 def test_exposure_change_is_survived() -> None:
     truth = np.tile(np.linspace(3, 12, 200), (100, 1))
     left, right = shifted_pair(truth)
-    brighter = grey(right * 0.8 + 45)
+    brighter = gray(right * 0.8 + 45)
     px = belief_propagation(left, brighter, 16, BeliefPropagationConfig()).px[:, 20:]
     assert np.isfinite(px).mean() > 0.85
     assert np.nanmean(np.abs(px - truth[:, 20:]) < 0.5) > 0.97
@@ -330,7 +330,7 @@ def test_bad_input_is_named() -> None:
         belief_propagation(image, image[:, :-1], 16, BELIEVE_ALL)
     with pytest.raises(ValueError, match="labels"):
         belief_propagation(image, image, 1, BELIEVE_ALL)
-    with pytest.raises(ValueError, match="grey"):
+    with pytest.raises(ValueError, match="gray"):
         belief_propagation(image.astype(np.float32), image, 16, BELIEVE_ALL)
     for wrong in (
         {"iterations": 0}, {"levels": 0}, {"smoothness_truncation": 0.0},

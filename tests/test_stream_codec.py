@@ -195,7 +195,7 @@ def test_damage_behind_a_valid_checksum_never_raises(
         assert back.depth.depth_m.size <= codec.MAX_PIXELS
 
 
-def test_an_embedded_picture_that_lies_about_its_size_is_not_opened() -> None:
+def test_an_embedded_image_that_lies_about_its_size_is_not_opened() -> None:
     colour = planes.encode_colour(
         planes.Planes(
             np.ones((8, 8), np.float32),

@@ -64,12 +64,12 @@ def keyframe(seq: int, x_m: float, fresh_from_px: int = 0) -> Keyframe:
         x = x_m + (u - 159.5) / F * z
         y = 20.0 - (v - 89.5) / F * z
         z = 60.0 - ground_m(x, y)
-    grey = (128 + 60 * np.sin(x / 3)).astype(np.uint8)
+    gray = (128 + 60 * np.sin(x / 3)).astype(np.uint8)
     depth = DepthMap(
         z.astype(np.float32), np.full((h, w), 0.2, np.float32), np.full((h, w), 3, np.uint8), K, T
     )
     fresh = np.broadcast_to(u >= fresh_from_px, (h, w)).copy()
-    bgr = np.stack([grey, grey, grey // 2], axis=-1)
+    bgr = np.stack([gray, gray, gray // 2], axis=-1)
     return Keyframe(seq, 5, depth, bgr, Pose(T, np.eye(6) * 1e-4), fresh)
 
 

@@ -110,8 +110,8 @@ def read_layer(data: bytes) -> dict[str, Any]:
     if method == 2:
         codes = read_predicted(sections[1], mask)
     else:
-        picture = imagecodecs.jpegls_decode(sections[1])
-        codes = {(v, u): int(picture[v, u]) for v in range(h) for u in range(w) if mask[v][u]}
+        image = imagecodecs.jpegls_decode(sections[1])
+        codes = {(v, u): int(image[v, u]) for v in range(h) for u in range(w) if mask[v][u]}
     sigma = imagecodecs.jpegls_decode(sections[2])
     views = imagecodecs.jpegls_decode(sections[3]) if sections[3] else np.ones((h, w), int)
     colour = np.asarray(Image.open(io.BytesIO(sections[4])))

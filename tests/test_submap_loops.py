@@ -17,7 +17,7 @@ from service.offline.refine.stored_loops import StoredLoops, steps_m
 SIZE = (320, 180)
 K = np.array([[240.0, 0.0, 159.5], [0.0, 240.0, 89.5], [0.0, 0.0, 1.0]])
 HEIGHT_M, SIGMA_M, METRES = 60.0, 0.06, 0.22
-LOOPS = SubmapLoopConfig(least_gap=5)
+LOOPS = SubmapLoopConfig(min_gap=5)
 
 
 def _texture(seed: int) -> F64:
@@ -53,14 +53,14 @@ def _keyframe(seq: int, T: F64, texture: F64 = GROUND) -> Keyframe:
         p = T[:3, 3] + ways * z[:, None]
         z += (p[:, 2] - _height(p[:, 0], p[:, 1])) / -ways[:, 2]
     p = (T[:3, 3] + ways * z[:, None])[:, :2] / METRES + 450
-    grey = ndi.map_coordinates(texture, p.T, order=1, mode="reflect").reshape(h, w)
-    grey = np.clip(grey + rng.normal(size=grey.shape) * 2, 0, 255).astype(np.uint8)
+    gray = ndi.map_coordinates(texture, p.T, order=1, mode="reflect").reshape(h, w)
+    gray = np.clip(gray + rng.normal(size=gray.shape) * 2, 0, 255).astype(np.uint8)
     depth = z.reshape(h, w) + ndi.gaussian_filter(rng.normal(size=(h, w)), 1.5) * 4 * SIGMA_M
     known = np.full((h, w), 3, np.uint8)
     return Keyframe(
         seq, seq * 10**9,
         DepthMap(depth.astype(np.float32), np.full((h, w), SIGMA_M, np.float32), known, K, T),
-        np.repeat(grey[..., None], 3, axis=2),
+        np.repeat(gray[..., None], 3, axis=2),
         Pose(T, np.eye(6) * 1e-4, ("vision",)), np.ones((h, w), np.bool_),
     )  # fmt: skip
 
@@ -176,7 +176,7 @@ def test_stored_keyframes_alone_bring_two_oblique_legs_together() -> None:
 
 
 def test_wrong_parameters_are_named() -> None:
-    with pytest.raises(ValueError, match="least_gap"):
-        SubmapLoopConfig(least_gap=0)
-    with pytest.raises(ValueError, match="least_overlap"):
+    with pytest.raises(ValueError, match="min_gap"):
+        SubmapLoopConfig(min_gap=0)
+    with pytest.raises(ValueError, match="min_overlap"):
         SubmapLoopConfig(search_shares=(0.9,))

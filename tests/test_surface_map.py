@@ -10,7 +10,7 @@ import pytest
 from recon import se3
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
 from recon.types import F64, DepthMap
-from service.flight.surface_map import MOST_OVER, PagedMap
+from service.flight.surface_map import MAX_OVER, PagedMap
 
 K: F64 = np.array([[60.0, 0.0, 39.5], [0.0, 60.0, 29.5], [0.0, 0.0, 1.0]])
 NADIR: F64 = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
@@ -36,22 +36,22 @@ def survey() -> list[DepthMap]:
 
 
 def test_pages_change_no_answer(tmp_path: Path) -> None:
-    whole, paged = VoxelMap(CONFIG), PagedMap(CONFIG, tmp_path / "pages", most_voxels=20_000)
-    most_on_disk = largest = 0
+    whole, paged = VoxelMap(CONFIG), PagedMap(CONFIG, tmp_path / "pages", max_voxels=20_000)
+    max_on_disk = largest = 0
     for depth in survey():
         expected = whole.fresh(depth)
         np.testing.assert_array_equal(paged.fresh(depth), expected)
         assert paged.insert(depth, expected) == whole.insert(depth, expected)
-        most_on_disk = max(most_on_disk, paged.tiles_on_disk)
+        max_on_disk = max(max_on_disk, paged.tiles_on_disk)
         largest = max(largest, len(paged))
-    assert len(whole) > 60_000 and most_on_disk > 5
+    assert len(whole) > 60_000 and max_on_disk > 5
     assert largest < 20_000 + 2 * depth.depth_m.size
     paged.close()
     assert not (tmp_path / "pages").exists()
 
 
 def test_a_damaged_page_makes_its_ground_new_and_nothing_else(tmp_path: Path) -> None:
-    paged = PagedMap(CONFIG, tmp_path, most_voxels=20_000)
+    paged = PagedMap(CONFIG, tmp_path, max_voxels=20_000)
     for depth in survey()[:40]:
         paged.insert(depth)
     assert paged.tiles_on_disk > 0
@@ -64,7 +64,7 @@ def test_a_damaged_page_makes_its_ground_new_and_nothing_else(tmp_path: Path) ->
 def test_a_disk_that_takes_no_pages_keeps_the_map_in_memory(tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
-    paged = PagedMap(CONFIG, blocked / "pages", most_voxels=20_000)
+    paged = PagedMap(CONFIG, blocked / "pages", max_voxels=20_000)
     for depth in survey()[:40]:
         paged.insert(depth)
     assert paged.tiles_on_disk == 0 and not paged.fresh(view(0.0)).any()
@@ -72,14 +72,14 @@ def test_a_disk_that_takes_no_pages_keeps_the_map_in_memory(tmp_path: Path) -> N
 
 def test_more_and_more_surface_under_one_view_is_bounded(tmp_path: Path) -> None:
     """A map that drifts lays surface over surface where the drone hovers."""
-    paged = PagedMap(CONFIG, tmp_path, most_voxels=2_000)
+    paged = PagedMap(CONFIG, tmp_path, max_voxels=2_000)
     held = []
     for n in range(40):
         depth = view(0.0)
         depth.depth_m[:] += 2.0 * n
         paged.insert(depth)
         held.append(len(paged))
-    assert max(held) < MOST_OVER * 2_000 + depth.depth_m.size
+    assert max(held) < MAX_OVER * 2_000 + depth.depth_m.size
     assert held[-1] > 0 and not paged.fresh(depth).any()
 
 
@@ -97,5 +97,5 @@ def test_tiles_under_a_view_hold_all_of_its_voxels() -> None:
 
 
 def test_nonsense_limits_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="most_voxels"):
-        PagedMap(CONFIG, tmp_path, most_voxels=10)
+    with pytest.raises(ValueError, match="max_voxels"):
+        PagedMap(CONFIG, tmp_path, max_voxels=10)

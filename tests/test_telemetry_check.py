@@ -137,7 +137,7 @@ def test_a_gimbal_that_claims_the_wrong_frame_is_corrected_and_told_once() -> No
     assert (truth.inv() * Rotation.from_quat([x, y, z, w])).magnitude() < 0.01
 
 
-def test_a_frame_that_was_configured_stands_against_the_pictures() -> None:
+def test_a_frame_that_was_configured_stands_against_the_images() -> None:
     told: list[str] = []
     history = history_of("wrong", 1.0, GimbalConfig(yaw_frame="earth"))
     fly(TelemetryCheck(CameraConfig(), history, told.append))

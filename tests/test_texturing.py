@@ -37,7 +37,7 @@ def pattern(x: Array, y: Array) -> Array:
     return 128.0 + 60.0 * np.stack(waves, axis=-1)
 
 
-def picture(eye: F64, gain: float = 1.0, offset: float = 0.0) -> TextureView:
+def image(eye: F64, gain: float = 1.0, offset: float = 0.0) -> TextureView:
     """A nadir view of the pattern on level ground at height 0."""
     v, u = np.mgrid[0:240, 0:320].astype(float)
     x = eye[0] + (u - K[0, 2]) / K[0, 0] * eye[2]
@@ -70,7 +70,7 @@ def test_without_open3d_the_same_views_see_the_same_triangles(
 ) -> None:
     pytest.importorskip("open3d", exc_type=ImportError)
     mesh = sheet(step_m=10.0)
-    views = [picture(np.array([x, 0.0, 30.0])) for x in (6.0, -6.0)]
+    views = [image(np.array([x, 0.0, 30.0])) for x in (6.0, -6.0)]
     exact = look(mesh, views)
     monkeypatch.setitem(sys.modules, "open3d", None)
     own = look(mesh, views)
@@ -83,10 +83,10 @@ def test_a_texture_without_open3d_shows_the_ground_where_it_is(no_open3d: None) 
 
 def test_the_texture_shows_the_ground_where_it_is() -> None:
     mesh = sheet()
-    views = [picture(np.array([x, y, 14.0])) for x in (-5.0, 5.0) for y in (-5.0, 5.0)]
+    views = [image(np.array([x, y, 14.0])) for x in (-5.0, 5.0) for y in (-5.0, 5.0)]
     done = texture(mesh, views)
     assert done.seen_share > 0.99 and done.views_used == 4
-    middle, colour = shown(done.mesh, done.picture)
+    middle, colour = shown(done.mesh, done.image)
     inner = np.abs(middle[:, :2]).max(axis=1) < 9.0
     error = np.abs(colour - pattern(middle[:, 0], middle[:, 1]))[inner]
     assert np.median(error) < 2.0
@@ -102,9 +102,9 @@ def edges(mesh: Mesh) -> tuple[F64, F64]:
 
 def test_differently_exposed_views_leave_no_step_at_their_seam() -> None:
     mesh = sheet()
-    views = [picture(np.array([-4.0, 0, 14.0])), picture(np.array([4.0, 0, 14.0]), 0.7, 12.0)]
+    views = [image(np.array([-4.0, 0, 14.0])), image(np.array([4.0, 0, 14.0]), 0.7, 12.0)]
     done = texture(mesh, views)
-    middle, colour = shown(done.mesh, done.picture)
+    middle, colour = shown(done.mesh, done.image)
     inner = np.abs(middle[:, :2]).max(axis=1) < 8.0
     truth = pattern(middle[inner, 0], middle[inner, 1])
     for channel in range(3):  # one gain and offset fit all of it: no step is left inside
@@ -115,7 +115,7 @@ def test_differently_exposed_views_leave_no_step_at_their_seam() -> None:
 def test_visibility_is_that_of_exact_rays() -> None:
     pytest.importorskip("open3d", exc_type=ImportError)  # without it the truth would be itself
     mesh = sheet(step_m=10.0)
-    view = picture(np.array([6.0, 0.0, 30.0]))  # the step hides ground to its west
+    view = image(np.array([6.0, 0.0, 30.0]))  # the step hides ground to its west
     found = look(mesh, [view])
     grid = triangle_grid.build(mesh.vertices_m, mesh.faces)
     middle = mesh.vertices_m[mesh.faces].mean(axis=1)
@@ -134,7 +134,7 @@ def test_visibility_is_that_of_exact_rays() -> None:
 
 
 def test_resolution_falls_with_distance_and_slant() -> None:
-    found = look(sheet(), [picture(np.array([0.0, 0.0, h])) for h in (28.0, 14.0)])
+    found = look(sheet(), [image(np.array([0.0, 0.0, h])) for h in (28.0, 14.0)])
     row = int(np.argmin(np.abs(sheet().vertices_m[sheet().faces].mean(axis=1)).sum(axis=1)))
     assert found.view[row, :2].tolist() == [1, 0]  # the nearer first
     np.testing.assert_allclose(found.px_per_m[row, :2], [200 / 14, 200 / 28], rtol=0.02)
@@ -166,7 +166,7 @@ def energy(found: Sightings, neighbours: Array, slot: Array) -> float:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_labels_reach_the_least_energy_found_by_trying_all(seed: int) -> None:
+def test_labels_reach_the_min_energy_found_by_trying_all(seed: int) -> None:
     rng = np.random.default_rng(seed)
     strip = np.array([[k, k + 1, k + 2] for k in range(8)], np.int32)
     neighbours = face_neighbours(strip)
@@ -204,8 +204,8 @@ def test_gains_and_offsets_are_found() -> None:
         found.bgr[:, k] = true * gain[view[:, k], None] + offset[view[:, k], None]
     found.bgr[:: count // 40, 0] += 60.0  # something moved
     fixed = levels(found, 3)
-    grey = np.linspace(50, 180, 5)
-    seen = grey[None] * gain[:, None] + offset[:, None]
+    gray = np.linspace(50, 180, 5)
+    seen = gray[None] * gain[:, None] + offset[:, None]
     for channel in range(3):
         flat = fixed[:, channel, :1] * seen + fixed[:, channel, 1:]
         assert np.ptp(flat, axis=0).max() < 3.0
@@ -243,7 +243,7 @@ def test_charts_do_not_overlap_and_fit() -> None:
     assert used.max() == 1
     assert used.mean() > 0.7
     mesh = sheet()
-    view = picture(np.array([0.0, 0.0, 14.0]))
+    view = image(np.array([0.0, 0.0, 14.0]))
     label = np.where(np.arange(len(mesh.faces)) % 7 == 0, -1, 0).astype(np.int32)
     layout = lay_out(mesh, [view], label, face_neighbours(mesh.faces), 128)
     assert max(layout.size_px) <= 128 and layout.scale < 1.0
@@ -255,7 +255,7 @@ def test_what_no_view_sees_keeps_the_colours_of_the_vertices() -> None:
     pytest.importorskip("open3d", exc_type=ImportError)
     done = texture(sheet(cells=6), [])
     assert done.seen_share == 0.0
-    assert (shown(done.mesh, done.picture)[1] == 9).all()
+    assert (shown(done.mesh, done.image)[1] == 9).all()
     with pytest.raises(ValueError, match="colours at its vertices"):
         texture(Mesh(sheet().vertices_m, sheet().faces), [])
 

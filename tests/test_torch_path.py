@@ -113,7 +113,7 @@ def test_belief_on_the_device_equals_the_compiled_one(
     device: str, seed: int, tolerance: float
 ) -> None:
     """Contrast, visibility, speckles of every size, and what either image does not see."""
-    from recon.backends.torch_stereo import believe, drop_unseen
+    from recon.backends.torch_stereo import drop_unreliable, drop_unseen
 
     config = BeliefPropagationConfig(occlusion_tolerance=tolerance)
     pair = stereo_pair(60, 100, 16, seed)
@@ -126,10 +126,10 @@ def test_belief_on_the_device_equals_the_compiled_one(
     assert isinstance(pair.left_seen, np.ndarray) and isinstance(pair.right_seen, np.ndarray)
     true = torch.tensor([60, 100], device=device)
     left, labels, sure = on(device, pair.left, px, confidence)
-    got_px, got_confidence = believe(left, labels, sure, true, config)
+    got_px, got_confidence = drop_unreliable(left, labels, sure, true, config)
     here, there = on(device, pair.left_seen.view(np.uint8), pair.right_seen.view(np.uint8))
     seen_px, seen_confidence = drop_unseen(got_px, got_confidence, here, there, true)
-    want = compiled.believe(pair.left, px.copy(), confidence.copy(), config)
+    want = compiled.drop_unreliable(pair.left, px.copy(), confidence.copy(), config)
     np.testing.assert_array_equal(got_px.cpu().numpy(), want.px)
     np.testing.assert_array_equal(got_confidence.cpu().numpy(), want.confidence)
     assert 0.05 < np.isnan(want.px).mean() < 0.95

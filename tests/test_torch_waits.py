@@ -109,7 +109,7 @@ def texture(height: int, width: int) -> U8:
 K = np.array([[100.0, 0, 47.5], [0, 100.0, 26.5], [0, 0, 1]])
 
 
-def test_a_keyframe_from_pictures_to_fused_depth(device: str, reads: list[int]) -> None:
+def test_a_keyframe_from_images_to_fused_depth(device: str, reads: list[int]) -> None:
     """Two pairs, one read of depth, sigma and views."""
     from recon.backends import DenseStages
     from recon.backends.torch_backend import TorchBackend

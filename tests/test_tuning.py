@@ -171,10 +171,10 @@ def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> N
 
     from recon.backends.cpu import CpuBackend
 
-    pictures = tmp_path / "pictures"
-    pictures.mkdir()
-    cv2.imwrite(str(pictures / "20260101000000000Z.png"), np.zeros((90, 160, 3), np.uint8))
-    source = open_images(str(pictures), {})
+    images = tmp_path / "pictures"
+    images.mkdir()
+    cv2.imwrite(str(images / "20260101000000000Z.png"), np.zeros((90, 160, 3), np.uint8))
+    source = open_images(str(images), {})
     K = np.array([[140.0, 0.0, 79.5], [0.0, 140.0, 44.5], [0.0, 0.0, 1.0]])
     camera = Camera(K, np.zeros(5), (160, 90))
     operator.set("SR_RESOLUTION_M", 0.5)

@@ -211,7 +211,7 @@ def flat(K: F64, depth_m: float, T: F64, size: tuple[int, int] = (48, 64)) -> De
     return DepthMap(depth, np.full(size, 0.05, np.float32), views, K, T)
 
 
-def test_a_picture_of_half_the_world_does_not_inflate_the_coverage_map() -> None:
+def test_a_image_of_half_the_world_does_not_inflate_the_coverage_map() -> None:
     K = np.array([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]])
     down = se3.compose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 40.0]))
     layer_map = CoverageMap(0.1)

@@ -22,9 +22,9 @@ def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> View
         seq, seq, segment, se3.inverse(T), np.eye(6), PosePrior(), Pyramid(()),
         np.zeros((0, 2)), np.zeros(0, np.int64), Landmarks(), FrameRows(seq, PosePrior(), T),
     )  # fmt: skip
-    picture = np.zeros((32, 32, 3), np.uint8)
+    image = np.zeros((32, 32, 3), np.uint8)
     anchor = Anchorage(seq, key, np.eye(4))
-    return Viewpoint(seq, seq, PosePrior(), picture, picture[..., 0], key, anchor, blurred)
+    return Viewpoint(seq, seq, PosePrior(), image, image[..., 0], key, anchor, blurred)
 
 
 def offer(

@@ -27,8 +27,8 @@ CONFIG = VirtualStereoConfig(width_px=160, guide_width_px=320)
 def view(seq: int, centre: tuple[float, float, float], turn: tuple[float, float, float]) -> View:
     R = se3.so3_exp(np.array(turn)) @ np.diag([1.0, -1, -1])
     rng = np.random.default_rng(seq)
-    picture: U8 = rng.integers(0, 255, (H, W, 3), dtype=np.uint8)
-    return View(picture, picture[..., 0].copy(), K, se3.compose(R, np.array(centre)))
+    image: U8 = rng.integers(0, 255, (H, W, 3), dtype=np.uint8)
+    return View(image, image[..., 0].copy(), K, se3.compose(R, np.array(centre)))
 
 
 def ground(rng: np.random.Generator, n: int = 500, relief: float = 6.0) -> F64:

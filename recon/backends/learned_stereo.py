@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from recon.backends.onnx_backend import ORT_ERRORS, OnnxBackend, open_session
-from recon.stereo.belief_propagation import BeliefPropagationConfig, believe
+from recon.stereo.belief_propagation import BeliefPropagationConfig, drop_unreliable
 from recon.stereo.matching_cost import check_pair
 from recon.types import F32, U8, DisparityMap
 
@@ -99,7 +99,9 @@ class LearnedStereoBackend(OnnxBackend):
         partner = np.arange(w)[None, :] - px - config.min_disparity
         sound = (px >= 0) & (px <= labels - 1) & (partner > -0.5) & (partner < w - 0.5)
         confidence = np.where(sound, self.config.confidence, 0).astype(np.float32)
-        return believe(left, np.where(sound, px, np.nan).astype(np.float32), confidence, config)
+        return drop_unreliable(
+            left, np.where(sound, px, np.nan).astype(np.float32), confidence, config
+        )
 
     def _disparity(self, left: U8, right: U8) -> F32:
         """(h, w) pixels, of images that fit the model."""

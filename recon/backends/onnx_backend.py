@@ -13,7 +13,7 @@ from onnxruntime.capi import onnxruntime_pybind11_state  # type: ignore[import-u
 from recon.backends.cpu import CpuBackend
 from recon.backends.onnx_dense import stereo_model, tap_windows, upsampling_model
 from recon.backends.room import kept, place, pyramid_levels, room
-from recon.stereo.belief_propagation import BeliefPropagationConfig, believe
+from recon.stereo.belief_propagation import BeliefPropagationConfig, drop_unreliable
 from recon.stereo.matching_cost import check_pair
 from recon.stereo.upsampling import UpsamplingConfig, check_guide, guide_at_taps
 from recon.types import U8, Array, DisparityMap
@@ -73,7 +73,7 @@ class OnnxBackend(CpuBackend):
         place(given["left"], left)
         place(given["right"], right)
         px, confidence = _run(session, {**given, "true": np.array([h, w, labels])})
-        return believe(left, px[:h, :w].copy(), confidence[:h, :w].copy(), config)
+        return drop_unreliable(left, px[:h, :w].copy(), confidence[:h, :w].copy(), config)
 
     def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
         """``coarse`` (h, w) at the size of ``guide`` (H, W, 3), values unscaled; Eq. 2."""

@@ -55,7 +55,7 @@ def stereo_model(
     Iterations and levels are written out. With ``levels`` of the pyramid given the model serves
     every pair up to its size: ``true`` (3,) int64 is height, width and labels of the pair,
     whose last row and column are repeated beyond. The results are those before
-    :func:`recon.stereo.belief_propagation.believe`.
+    :func:`recon.stereo.belief_propagation.drop_unreliable`.
     """
     graph = Graph()
     left = graph.input("left", TensorProto.UINT8, size).numbers()

@@ -14,7 +14,7 @@ from recon.backends.room import kept, pyramid_levels, room
 from recon.backends.torch_depth import DensePath, JointBilateral
 from recon.backends.torch_plan import Part, Plan, part, read
 from recon.backends.torch_stereo import DenseStereo
-from recon.stereo.belief_propagation import BeliefPropagationConfig, believe
+from recon.stereo.belief_propagation import BeliefPropagationConfig, drop_unreliable
 from recon.stereo.matching_cost import check_pair
 from recon.stereo.upsampling import UpsamplingConfig, check_guide, guide_at_taps
 from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration, StereoPair
@@ -64,7 +64,7 @@ class TorchBackend:
             (left, right, true),
         )
         px, confidence = px[:h, :w].copy(), confidence[:h, :w].copy()
-        return believe(left, px, confidence, config)
+        return drop_unreliable(left, px, confidence, config)
 
     def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
         """``coarse`` (h, w) at the size of ``guide`` (H, W, 3), values unscaled; Eq. 2."""

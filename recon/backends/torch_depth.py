@@ -17,7 +17,7 @@ from torch import Tensor
 
 from recon.backends.room import kept, pyramid_levels, room
 from recon.backends.torch_plan import Plan, part, read
-from recon.backends.torch_stereo import DenseStereo, believe, drop_unseen
+from recon.backends.torch_stereo import DenseStereo, drop_unreliable, drop_unseen
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.reprojection import LABEL_SIGMA_PX, FusionConfig
 from recon.stereo.reprojection import MIN_CONFIDENCE as MIN_REPROJECTED
@@ -108,7 +108,7 @@ class PairDepthStage(torch.nn.Module):
         """``true`` (5,) is h, w of the pair, H, W of the guide and the number of labels."""
         own = torch.stack([true[0], true[1], true[4]])
         px, confidence = self.stereo(left, right, own)
-        px, confidence = believe(left, px, confidence, own, self.matching)
+        px, confidence = drop_unreliable(left, px, confidence, own, self.matching)
         px, confidence = drop_unseen(px, confidence, left_seen, right_seen, own)
         sizes = true[:4]
         if guide.shape[0] > 0:
@@ -278,7 +278,7 @@ def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Te
     nothing where several pairs read and none comes near another.
     """
     z, e = depth.double(), sigma.double()
-    usable = (z > 0) & (e < config.most_sigma_share * z)
+    usable = (z > 0) & (e < config.max_sigma_share * z)
     inverse = torch.where(usable, 1 / z, 0.0)
     s = torch.where(usable, e / z**2, math.inf)
     centre, spread = _largest_group(inverse, s, usable, config.agree_sigmas)
@@ -286,7 +286,7 @@ def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Te
     member = usable & ((inverse - centre).abs() <= limit)
     weight = torch.where(member, 1 / s**2, 0.0)
     views = member.sum(0)
-    near = usable & ((inverse - centre).abs() <= config.most_sigma_share * centre)
+    near = usable & ((inverse - centre).abs() <= config.max_sigma_share * centre)
     contradicted = (views == 1) & (usable.sum(0) > 1) & (near.sum(0) == 1)
     refuted = contradicted.sum() > (views >= 2).sum()
     seen = (views > 0) & ~contradicted & ~refuted
@@ -296,7 +296,7 @@ def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Te
     variance = 1 / total + scatter / total / (views - 1).clamp(min=1)
     fused = 1 / torch.where(seen, mean, 1.0)
     alone = torch.where(views == 1, config.single_view_sigma, 1.0)
-    error = (variance.sqrt() * fused**2 * alone).maximum(config.least_sigma_share * fused)
+    error = (variance.sqrt() * fused**2 * alone).maximum(config.min_sigma_share * fused)
     nan = math.nan
     return (
         torch.where(seen, fused, nan).float(),

@@ -289,7 +289,7 @@ CONTRAST_PX = 9
 UNKNOWN = -2048 * SPECKLE_STEP
 
 
-def believe(
+def drop_unreliable(
     left: Tensor, px: Tensor, confidence: Tensor, true: Tensor, config: BeliefPropagationConfig
 ) -> tuple[Tensor, Tensor]:
     """Labels (h, w), NaN where nothing speaks for them, and their confidence.

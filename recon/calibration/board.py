@@ -17,7 +17,7 @@ import numpy as np
 from recon.tracking.robust_geometry import attempt
 from recon.types import F32, F64, U8, Camera
 
-FEWEST_VIEWS = 4
+MIN_VIEWS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ def find_board(gray: U8, board: Board) -> F32 | None:
     is asked where it finds none. Both are refined to the saddle points.
     """
     if gray.ndim != 2:
-        raise ValueError(f"the picture must be gray (H, W), got {gray.shape}")
+        raise ValueError(f"the image must be gray (H, W), got {gray.shape}")
     pattern = (board.columns, board.rows)
     classic = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     found, corners = cv2.findChessboardCorners(gray, pattern, flags=classic)
@@ -117,8 +117,8 @@ def calibrate(
     Raises ValueError for fewer than four views or corners of another number than the board's.
     """
     config = config or CalibrationConfig()
-    if len(views) < FEWEST_VIEWS:
-        raise ValueError(f"{len(views)} views of the board are too few; at least {FEWEST_VIEWS}")
+    if len(views) < MIN_VIEWS:
+        raise ValueError(f"{len(views)} views of the board are too few; at least {MIN_VIEWS}")
     for view in views:
         if view.corners_px.shape != (board.columns * board.rows, 2):
             raise ValueError(f"{view.name}: corners {view.corners_px.shape} do not fit the board")
@@ -132,7 +132,7 @@ def calibrate(
         usual = float(np.median(per_view))
         worst = int(np.argmax(per_view))
         limit = max(config.outlier_ratio * usual, config.outlier_floor_px)
-        if per_view[worst] <= limit or len(kept) <= FEWEST_VIEWS:
+        if per_view[worst] <= limit or len(kept) <= MIN_VIEWS:
             break
         reason = f"rms {per_view[worst]:.2f} px where the median view has {usual:.2f} px"
         rejected.append((kept.pop(worst).name, reason))

@@ -41,17 +41,17 @@ class SelfCalibrationConfig:
     sigma_centre: float = 0.015  # of the centre, as a share of the width
     sigma_k: float = 0.1  # of k1 and of k2
     sigma_p: float = 0.005  # of p1 and of p2
-    most_sigma_focal: float = 0.003  # a focal length less sure than this is not told
-    most_sigmas: float = 3.0  # from the model given; a camera further off is not believed
+    max_sigma_focal: float = 0.003  # a focal length less sure than this is not told
+    max_sigmas: float = 3.0  # from the model given; a camera further off is not believed
     pixel_sigma: float = 0.5
     huber_sigmas: float = 1.5
     gate_sigmas: float = 6.0  # sightings further off after the first round are left out
-    least_sightings: int = 200
+    min_sightings: int = 200
     iterations: int = 40
 
     def __post_init__(self) -> None:
         """Raise ValueError when a parameter makes no sense."""
-        positive = ("sigma_focal", "sigma_centre", "sigma_k", "sigma_p", "most_sigma_focal")
+        positive = ("sigma_focal", "sigma_centre", "sigma_k", "sigma_p", "max_sigma_focal")
         for name in (*positive, "pixel_sigma"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
@@ -89,8 +89,8 @@ def self_calibrate(
     config = config or SelfCalibrationConfig()
     if len(poses) < 3 or poses.shape[1:] != (4, 4) or fixes.shape != (len(poses), 3):
         raise ValueError(f"expected three poses (N, 4, 4) or more with fixes, got {poses.shape}")
-    if len(seen.view) < config.least_sightings:
-        raise ValueError(f"{len(seen.view)} sightings are too few; {config.least_sightings} needed")
+    if len(seen.view) < config.min_sightings:
+        raise ValueError(f"{len(seen.view)} sightings are too few; {config.min_sightings} needed")
     if not np.isfinite(fixes).all(axis=1).any():  # the scale has to be held by something
         span = float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
         fixes, sigma_fixes = poses[:, :3, 3], np.full((len(poses), 3), 0.05 * span)
@@ -214,10 +214,10 @@ def shared(seen: Sightings, kept: Bool) -> Sightings:
 
 def doubt(found: Camera, given: Camera, sigma_focal: float, c: SelfCalibrationConfig) -> str:
     """Why a camera is not to be believed; empty when it is."""
-    if sigma_focal > c.most_sigma_focal:
+    if sigma_focal > c.max_sigma_focal:
         return (
             f"the flight cannot tell the focal length (to {100 * sigma_focal:.1f} %, asked "
-            f"{100 * c.most_sigma_focal:.1f} %): seen straight down from one height it looks "
+            f"{100 * c.max_sigma_focal:.1f} %): seen straight down from one height it looks "
             "like another height; fly two heights or an oblique turn"
         )
     off = abs(found.K[0, 0] / given.K[0, 0] - 1.0) / c.sigma_focal
@@ -225,7 +225,7 @@ def doubt(found: Camera, given: Camera, sigma_focal: float, c: SelfCalibrationCo
     off = max(off, float(shift) / (c.sigma_centre * given.size_px[0]))
     bent = np.abs(found.distortion[:4] - given.distortion[:4])
     off = max(off, float((bent / [c.sigma_k, c.sigma_k, c.sigma_p, c.sigma_p]).max()))
-    if off > c.most_sigmas:
+    if off > c.max_sigmas:
         return "the camera found is too far from the model given; calibrate with a chessboard"
     return ""
 

@@ -23,7 +23,7 @@ I64 = npt.NDArray[np.int64]
 CAMERA = 8
 """fx, fy, cx, cy, k1, k2, p1, p2; k3 stays."""
 
-MOST_COVARIANCES = 100
+MAX_COVARIANCES = 100
 """Poses whose covariance is computed; the others take that of the nearest of them."""
 
 
@@ -431,7 +431,7 @@ class _Bundle:
     def _covariances(self, eq: _Equations, spread: F64, poses: F64) -> F64:
         """(N, 6, 6) of a left perturbation of T_world_camera, the camera's own included."""
         N = len(poses)
-        some = np.unique(np.linspace(0, N - 1, min(N, MOST_COVARIANCES)).astype(int))
+        some = np.unique(np.linspace(0, N - 1, min(N, MAX_COVARIANCES)).astype(int))
         out = []
         for n, T in zip(some, poses[some], strict=True):
             unit = np.zeros((6 * N, 6))

@@ -119,7 +119,7 @@ WINDOW_PX = 2
 
 KNOWN_SHARE = 0.5
 
-MOST_VIEWS = 100
+MAX_VIEWS = 100
 """Keyframes asked about a point at most: a camera that stays over one place has thousands.
 Their pairs, 255 at most each, are counted in 16 bits."""
 
@@ -140,7 +140,7 @@ def seen_through(cloud: PointCloud, views: Iterable[DepthMap]) -> Bool:
     """(N,) points that more stereo pairs see through than see.
 
     A keyframe counts with the number of pairs that agree at its pixel. Points that no
-    keyframe sees at all are kept. The first MOST_VIEWS keyframes with a point's place in the
+    keyframe sees at all are kept. The first MAX_VIEWS keyframes with a point's place in the
     image decide; where there may be more of them, give the views as :func:`spread` orders them.
     """
     tiles = Tiles(cloud.xyz_m)
@@ -268,7 +268,7 @@ def _vote(
     for tile in tiles:
         left = 0
         for p in range(first[tile], first[tile + 1]):
-            if asked[p] == MOST_VIEWS:
+            if asked[p] == MAX_VIEWS:
                 continue
             left += 1
             x, y, z = float(xyz[p, 0]), float(xyz[p, 1]), float(xyz[p, 2])

@@ -36,10 +36,10 @@ EXACT_HEIGHTS = 16.0
 LEANING_SHARE = 2.0
 """Sigma of a height, as a share of it, per unit of (1 - cosine) off the vertical."""
 
-LEAST_EXACT = 4
+MIN_EXACT = 4
 """Heights exactly below from which on no others count."""
 
-LEAST_SPREAD = 0.005
+MIN_SPREAD = 0.005
 """Share of a height by which readings of one flight may always differ."""
 
 EDGE_SHARE = 0.03
@@ -180,12 +180,12 @@ def height_ratios(anchors: Sequence[Anchor]) -> tuple[list[tuple[float, float]],
     if not measured:
         return [h for h, _ in known], UNMEASURED_HEIGHTS
     exact = [h for h, a in measured if a.lean == 0.0]
-    if len(exact) < LEAST_EXACT:
+    if len(exact) < MIN_EXACT:
         return [h for h, _ in measured], INDEPENDENT_HEIGHTS
     # A rangefinder meets a tree where the image sees through it: single ones are far off.
     ratio = np.array([h[0] for h in exact])
     apart = np.abs(ratio - np.median(ratio))
-    limit = max(3.0 * 1.48 * float(np.median(apart)), LEAST_SPREAD)
+    limit = max(3.0 * 1.48 * float(np.median(apart)), MIN_SPREAD)
     return [h for h, off in zip(exact, apart, strict=True) if off <= limit], EXACT_HEIGHTS
 
 

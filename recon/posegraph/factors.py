@@ -12,7 +12,7 @@ import numpy as np
 from recon import se3
 from recon.types import F64
 
-MOST_LOG = 20.0
+MAX_LOG = 20.0
 """Of a scale that a step of the solver may ask about."""
 
 
@@ -57,7 +57,7 @@ def scaled_motion_error(T_a_b: F64) -> Any:
         import gtsam
 
         a_key, b_key, scale_key = factor.keys()
-        stretched = t * float(np.exp(np.clip(values.atVector(scale_key)[0], -MOST_LOG, MOST_LOG)))
+        stretched = t * float(np.exp(np.clip(values.atVector(scale_key)[0], -MAX_LOG, MAX_LOG)))
         motion = values.atPose3(a_key).between(values.atPose3(b_key))
         expected = gtsam.Pose3(gtsam.Rot3(R), stretched)
         if jacobians is not None:

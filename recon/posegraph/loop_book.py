@@ -17,7 +17,7 @@ from recon.types import F64
 CHI2_LIMIT = 22.5
 """99.9 % of chi-square with six degrees of freedom."""
 
-MOST_PENDING = 50
+MAX_PENDING = 50
 """Loops that wait for one that agrees; older ones are forgotten."""
 
 
@@ -66,7 +66,7 @@ class LoopBook:
             return []
         support = [other for other in self.pending + self.taken if self._agree(loop, other)]
         if not support:
-            self.pending = [*self.pending, loop][-MOST_PENDING:]
+            self.pending = [*self.pending, loop][-MAX_PENDING:]
             self.counts["loop waits"] += 1
             return []
         fresh = [loop, *(other for other in support if other in self.pending)]

@@ -23,7 +23,7 @@ from recon.types import F32, F64, U8, Bool, DepthMap
 FEATURE_SHARE = 0.03
 """Search radius around places that features predict, as a share of the width."""
 
-LEAST_RAD, LEAST_SHARE = 2e-4, 0.1
+MIN_RAD, MIN_SHARE = 2e-4, 0.1
 """A loop's sigmas are no less than this, and than this share of its depths' sigma: what the
 points of one depth map have in common does not average out."""
 
@@ -43,8 +43,8 @@ __all__ = [
 class LoopConfig:
     """Parameters of the search for loops."""
 
-    least_gap: int = 10  # keyframes between the two ends of a loop
-    least_overlap: float = 0.35  # of the later view in the earlier one
+    min_gap: int = 10  # keyframes between the two ends of a loop
+    min_overlap: float = 0.35  # of the later view in the earlier one
     search_share: float = 0.12  # of the image's width, about the predicted places
     min_matches: int = 40
     max_disagreement: float = 4.0  # chi-square per degree of freedom between EPnP and ICP
@@ -54,14 +54,14 @@ class LoopConfig:
 
     def without_gap(self) -> LoopConfig:
         """The same for keyframes that are known not to be neighbours."""
-        return replace(self, least_gap=1)
+        return replace(self, min_gap=1)
 
     def __post_init__(self) -> None:
         """Raise ValueError when a parameter makes no sense."""
-        if self.least_gap < 1 or self.min_matches < 6:
-            raise ValueError("least_gap must be at least 1, min_matches at least 6")
-        if not (0 < self.least_overlap <= 1 and 0 < self.search_share <= 0.5):
-            raise ValueError("least_overlap must be in (0, 1], search_share in (0, 0.5]")
+        if self.min_gap < 1 or self.min_matches < 6:
+            raise ValueError("min_gap must be at least 1, min_matches at least 6")
+        if not (0 < self.min_overlap <= 1 and 0 < self.search_share <= 0.5):
+            raise ValueError("min_overlap must be in (0, 1], search_share in (0, 0.5]")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,13 +143,13 @@ def candidates(
     order = list(poses)
     position = order.index(newest)
     found = []
-    for seq in order[: max(position - config.least_gap + 1, 0)]:
+    for seq in order[: max(position - config.min_gap + 1, 0)]:
         there = se3.transform(se3.inverse(poses[seq]), ground)
         seen = project(K, there)
         inside = (seen >= 0).all(axis=1) & (seen <= [W - 1, H - 1]).all(axis=1)
         inside &= there[:, 2] > 0
         share = float(np.mean(inside))
-        if share >= config.least_overlap:
+        if share >= config.min_overlap:
             found.append((seq, share))
     here = poses[newest][:3, 3]
     return sorted(
@@ -268,7 +268,7 @@ def _with_icp(
     if float(difference @ np.linalg.solve(spread, difference)) / 6.0 > config.max_disagreement:
         return None
     T, covariance = se3.average(T_a_b, covariance, aligned.T_target_source, aligned.covariance)
-    covariance = covariance + np.diag([LEAST_RAD**2] * 3 + [(LEAST_SHARE * sigma) ** 2] * 3)
+    covariance = covariance + np.diag([MIN_RAD**2] * 3 + [(MIN_SHARE * sigma) ** 2] * 3)
     return LoopClosure(T, covariance, count, ("epnp", "icp"), growth)
 
 

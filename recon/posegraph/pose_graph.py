@@ -45,11 +45,11 @@ class PoseGraph:
         self.config = config or PoseGraphConfig()
         self._kept_counts: Counter[str] = Counter()  # of what happens once, whatever is rebuilt
         self._nodes: dict[int, Node] = {}  # by keyframe number, in order of time
-        self._thin_at = self.config.most_nodes
+        self._thin_at = self.config.max_nodes
         self.entered = 0  # keyframes, whether they are nodes or not
         self.generation = 0  # how often nodes were thinned out
         self._segments = SegmentFrames(
-            self.config.least_anchors, self.config.fix_s, self.config.attitude_s
+            self.config.min_anchors, self.config.fix_s, self.config.attitude_s
         )
         self._book = LoopBook(self.config, self)
         self._built = 0
@@ -69,7 +69,7 @@ class PoseGraph:
     ) -> Pose:
         """The new keyframe's pose after all that is known.
 
-        Of more than ``most_nodes`` some older ones stop being nodes: their motions are those of
+        Of more than ``max_nodes`` some older ones stop being nodes: their motions are those of
         the nodes beside them (:mod:`recon.posegraph.thinning`), and all is built anew.
 
         Args:
@@ -288,7 +288,7 @@ class PoseGraph:
         self._nodes = {node.seq: node for node in nodes}
         self._segments.thin(nodes)
         self._book.thin(done.marginalised, done.let_go, len(nodes))
-        self._thin_at = max(self.config.most_nodes, int(len(nodes) * (1.0 + GONE_SHARE)))
+        self._thin_at = max(self.config.max_nodes, int(len(nodes) * (1.0 + GONE_SHARE)))
         self.generation += 1
         self.rebuild()
 

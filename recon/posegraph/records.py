@@ -11,7 +11,7 @@ from recon import se3
 from recon.posegraph.sensor_noise import PRECISE_TAU_S
 from recon.types import F64, PosePrior
 
-LEAST_NODES = 50
+MIN_NODES = 50
 """Of a pose graph's keyframes, what its bound may not go below."""
 
 
@@ -22,7 +22,7 @@ class PoseGraphConfig:
     sigma_scale: float = 0.1  # of a segment's scale after its alignment, before the readings
     sigma_scale_walk: float = 0.003  # change of the scale per twenty keyframes
     sigma_step: float = 0.002  # of one vision motion, as a share of its length
-    least_anchors: int = 3  # keyframes of a segment before telemetry places it
+    min_anchors: int = 3  # keyframes of a segment before telemetry places it
     fix_s: float = 60.0  # a receiver's error wanders with this time constant
     precise_fix_s: float = PRECISE_TAU_S  # and that of an RTK fix, under 0.3 m, with this one
     attitude_s: float = 40.0  # an attitude's
@@ -38,7 +38,7 @@ class PoseGraphConfig:
     loop_slack_m: float = 2.0  # and this
     loop_turn_rad: float = 0.5
     loop_window: int = 15  # keyframes within which two loops support each other
-    most_nodes: int = 100_000  # keyframes in the graph; of more, some ride on their neighbours
+    max_nodes: int = 100_000  # keyframes in the graph; of more, some ride on their neighbours
 
     def __post_init__(self) -> None:
         """Raise ValueError when a parameter makes no sense."""
@@ -48,10 +48,10 @@ class PoseGraphConfig:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         if min(self.fix_s, self.precise_fix_s, self.attitude_s, self.altitude_s) < 0:
             raise ValueError("time constants must not be negative")
-        if self.most_nodes < LEAST_NODES:
-            raise ValueError(f"most_nodes must be at least {LEAST_NODES}, got {self.most_nodes}")
-        if self.loop_window < 1 or self.least_anchors < 2:
-            raise ValueError("loop_window must be at least 1, least_anchors at least 2")
+        if self.max_nodes < MIN_NODES:
+            raise ValueError(f"max_nodes must be at least {MIN_NODES}, got {self.max_nodes}")
+        if self.loop_window < 1 or self.min_anchors < 2:
+            raise ValueError("loop_window must be at least 1, min_anchors at least 2")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

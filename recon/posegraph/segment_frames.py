@@ -27,13 +27,13 @@ SETTLED = 100
 class SegmentFrames:
     """Keyframes by segment, and each segment's similarity once telemetry or a loop tells it."""
 
-    def __init__(self, least_anchors: int, fix_s: float = 60.0, attitude_s: float = 40.0) -> None:
-        """``least_anchors`` keyframes must be there before telemetry places a segment.
+    def __init__(self, min_anchors: int, fix_s: float = 60.0, attitude_s: float = 40.0) -> None:
+        """``min_anchors`` keyframes must be there before telemetry places a segment.
 
         Fixes and attitudes wander with the time constants ``fix_s`` and ``attitude_s``.
         """
         self.nodes: dict[int, list[Node]] = {}
-        self._least, self._wander_s = least_anchors, (fix_s, attitude_s)
+        self._least, self._wander_s = min_anchors, (fix_s, attitude_s)
         self._constants: dict[int, Constants] = {}  # that the frame was fitted with
         self._frames: dict[int, Similarity] = {}
         self._offsets: dict[int, Offsets] = {}

@@ -21,7 +21,7 @@ from recon.posegraph.loop_closure import LoopClosure, LoopView, landmarks, warps
 from recon.tracking import matching
 from recon.types import F32, F64, Bool, DepthMap, Keyframe
 
-LEAST_RAD, LEAST_SHARE = 2e-4, 0.1
+MIN_RAD, MIN_SHARE = 2e-4, 0.1
 """A loop's sigmas are no less than this, and than this share of its depths' sigma."""
 
 
@@ -29,14 +29,14 @@ LEAST_RAD, LEAST_SHARE = 2e-4, 0.1
 class SubmapLoopConfig:
     """Parameters of the search; the track is near the truth already."""
 
-    least_gap: int = 10  # keyframes between the two ends
-    least_overlap: float = 0.2  # of the later view in the earlier one
+    min_gap: int = 10  # keyframes between the two ends
+    min_overlap: float = 0.2  # of the later view in the earlier one
     search_shares: tuple[float, ...] = (0.03, 0.1)  # of the image's width, tried in turn
     min_matches: int = 14
     min_inlier_share: float = 0.6
     gate_sigmas: float = 3.0
     pixel_sigma: float = 0.4  # of a match
-    least_spread: float = 0.02  # of the matches across their narrow side, of their distance
+    min_spread: float = 0.02  # of the matches across their narrow side, of their distance
     matching: matching.MatchingConfig = field(
         default_factory=lambda: matching.MatchingConfig(
             grid=50, ambiguity=0.9, max_zssd=0.6, max_return_px=0.7
@@ -45,10 +45,10 @@ class SubmapLoopConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError when a parameter makes no sense."""
-        if self.least_gap < 1 or self.min_matches < 6:
-            raise ValueError("least_gap must be at least 1, min_matches at least 6")
-        if not 0 < self.least_overlap <= 1 or not all(0 < s <= 0.5 for s in self.search_shares):
-            raise ValueError("least_overlap must be in (0, 1], search_shares in (0, 0.5]")
+        if self.min_gap < 1 or self.min_matches < 6:
+            raise ValueError("min_gap must be at least 1, min_matches at least 6")
+        if not 0 < self.min_overlap <= 1 or not all(0 < s <= 0.5 for s in self.search_shares):
+            raise ValueError("min_overlap must be in (0, 1], search_shares in (0, 0.5]")
 
 
 def verify_surfaces(
@@ -93,7 +93,7 @@ def _fitted(
     if count < config.min_matches or count < config.min_inlier_share * len(here):
         return None
     spread = np.linalg.svd(here[inside] - here[inside].mean(axis=0), compute_uv=False)
-    if spread[1] < config.least_spread * float(np.median(here[:, 2])) * np.sqrt(count):
+    if spread[1] < config.min_spread * float(np.median(here[:, 2])) * np.sqrt(count):
         return None
     return LoopClosure(T, _covariance(T, here, there, sigma, inside), count, ("points",))
 
@@ -145,12 +145,12 @@ def _covariance(T: F64, here: F64, there: F64, sigma: F64, inside: Bool) -> F64:
         H += J.T @ J
     off = (here[inside] - moved) / sigma[inside, None]
     variance = max(float(np.sum(off**2)) / max(3 * len(moved) - 6, 1), 0.3)
-    least = LEAST_SHARE * float(np.median(sigma))
-    floor = np.diag([LEAST_RAD**2] * 3 + [least**2] * 3)
+    least = MIN_SHARE * float(np.median(sigma))
+    floor = np.diag([MIN_RAD**2] * 3 + [least**2] * 3)
     return np.asarray(variance * np.linalg.inv(H) + floor)
 
 
-LEAST_NEIGHBOURS = 5
+MIN_NEIGHBOURS = 5
 """Of a pixel's eight, that must be known for it to be filled."""
 
 
@@ -205,7 +205,7 @@ def _closed(layers: F32) -> F32:
     around = np.array(
         [padded[v + dv, u + du] for dv in range(3) for du in range(3) if (dv, du) != (1, 1)]
     )
-    enough = np.count_nonzero(np.isfinite(around[..., 0]), axis=0) >= LEAST_NEIGHBOURS
+    enough = np.count_nonzero(np.isfinite(around[..., 0]), axis=0) >= MIN_NEIGHBOURS
     out: F32 = layers.copy()
     if enough.any():
         out[v[enough], u[enough]] = np.nanmedian(around[:, enough], axis=0)

@@ -31,7 +31,7 @@ NEWEST_SHARE = 0.25
 GONE_SHARE = 0.25
 """Of the nodes, how many go at once, so that building anew is seldom due."""
 
-MOST_WORSE = 2.0
+MAX_WORSE = 2.0
 """A fix whose sigma is so many times that of another spoils their mean."""
 
 
@@ -209,7 +209,7 @@ def _with_fix(node: Node, left: Node) -> PosePrior:
     if position_m is None or one.sigma_position_m is None:
         one = replace(one, sigma_position_m=other.sigma_position_m, above_m=None, above_fixes=0)
         share, position_m = 1.0, other.position_m
-    elif np.any(other.sigma_position_m > MOST_WORSE * one.sigma_position_m):
+    elif np.any(other.sigma_position_m > MAX_WORSE * one.sigma_position_m):
         return one
     places = [_place_of_fix(n) for n in (node, left)]
     place = places[0] + share * (places[1] - places[0])

@@ -97,11 +97,13 @@ def belief_propagation(
     px, confidence = select(
         data, messages, cost, config.min_disparity, config.truncation, config.min_evidence
     )
-    return believe(left, px, confidence, config)
+    return drop_unreliable(left, px, confidence, config)
 
 
-def believe(left: U8, px: F32, confidence: F32, config: BeliefPropagationConfig) -> DisparityMap:
-    """The labels that contrast, visibility and size of their surface speak for.
+def drop_unreliable(
+    left: U8, px: F32, confidence: F32, config: BeliefPropagationConfig
+) -> DisparityMap:
+    """Return the labels that pass the checks of contrast, visibility and surface size.
 
     ``px`` and ``confidence`` are changed in place. Every backend ends with this.
     """

@@ -109,7 +109,7 @@ def check_pair(left: U8, right: U8, labels: int) -> None:
     """Raises ValueError when the two are not gray 8-bit images of one size."""
     for image in (left, right):
         if image.ndim != 2 or image.dtype != np.uint8:
-            raise ValueError(f"a grey 8-bit image is needed, not {image.dtype} {image.shape}")
+            raise ValueError(f"a gray 8-bit image is needed, not {image.dtype} {image.shape}")
     if left.shape != right.shape or min(left.shape) < 1:
         raise ValueError(f"left {left.shape} and right {right.shape} must be of one size")
     if not 2 <= labels <= 1024:
@@ -183,8 +183,8 @@ def _cost_volume(
             low = best[first:last]
             for i in range(count):
                 bits = min(np.int32(_popcount(ca[i] ^ cb[i])), np.int32(census_truncation))
-                grey = min(abs(np.int32(a[i]) - np.int32(b[i])), np.int32(difference_truncation))
-                value = np.int16(bits * census_weight + grey * difference_weight)
+                gray = min(abs(np.int32(a[i]) - np.int32(b[i])), np.int32(difference_truncation))
+                value = np.int16(bits * census_weight + gray * difference_weight)
                 row[i] = value
                 low[i] = min(low[i], value)
         for u in range(width):

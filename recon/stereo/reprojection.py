@@ -124,8 +124,8 @@ class FusionConfig:
 
     agree_sigmas: float = 2.5  # pairs agree within that many combined sigmas
     single_view_sigma: float = 1.5  # factor on the sigma of a point that one pair saw alone
-    most_sigma_share: float = 0.04  # of the depth; a worse reading says nothing
-    least_sigma_share: float = 0.0005  # of the depth; no pair is better than this
+    max_sigma_share: float = 0.04  # of the depth; a worse reading says nothing
+    min_sigma_share: float = 0.0005  # of the depth; no pair is better than this
 
 
 def fuse(pairs: Sequence[PairDepth], K: F64, T_world_camera: F64, config: FusionConfig) -> DepthMap:
@@ -133,7 +133,7 @@ def fuse(pairs: Sequence[PairDepth], K: F64, T_world_camera: F64, config: Fusion
 
     The mean is over inverse depth (whose error is nearly Gaussian) with weights 1/sigma^2;
     the sigma is the larger of the propagated one and the spread inside the group. ``views``
-    counts the group. Where several pairs read and none comes within ``most_sigma_share`` of
+    counts the group. Where several pairs read and none comes within ``max_sigma_share`` of
     another nothing is known. Where that is so at more pixels than those at which two agree, what
     they see is no rigid surface, or their motion is false, and the whole map is unknown. Raises
     ValueError without any pair.
@@ -148,8 +148,8 @@ def fuse(pairs: Sequence[PairDepth], K: F64, T_world_camera: F64, config: Fusion
         T_world_camera,
     )  # fmt: skip
     _fuse(
-        depth, sigma, config.agree_sigmas, config.single_view_sigma, config.most_sigma_share,
-        config.least_sigma_share, out.depth_m, out.sigma_m, out.views,
+        depth, sigma, config.agree_sigmas, config.single_view_sigma, config.max_sigma_share,
+        config.min_sigma_share, out.depth_m, out.sigma_m, out.views,
     )  # fmt: skip
     contradicted = np.isnan(out.depth_m) & (out.views > 0)
     refuted = np.count_nonzero(contradicted) > np.count_nonzero(out.views >= 2)
@@ -182,8 +182,8 @@ def _fuse(
     sigma: Any,
     agree_sigmas: float,
     single_view: float,
-    most_share: float,
-    least_share: float,
+    max_share: float,
+    min_share: float,
     out_depth: Any,
     out_sigma: Any,
     out_views: Any,
@@ -198,7 +198,7 @@ def _fuse(
             count = 0
             for p in range(P):
                 z, e = float(depth[p, v, u]), float(sigma[p, v, u])
-                if z > 0 and e < most_share * z:
+                if z > 0 and e < max_share * z:
                     w[count] = 1.0 / z
                     s[count] = e / (z * z)
                     count += 1
@@ -218,7 +218,7 @@ def _fuse(
             if views == 1 and count > 1:
                 near = 0
                 for p in range(count):
-                    near += abs(w[p] - w[centre]) <= most_share * w[centre]
+                    near += abs(w[p] - w[centre]) <= max_share * w[centre]
                 if near == 1:
                     continue
             mean /= total
@@ -231,4 +231,4 @@ def _fuse(
             z = 1.0 / mean
             e = np.sqrt(variance) * z * z * (single_view if views == 1 else 1.0)
             out_depth[v, u] = z
-            out_sigma[v, u] = max(e, least_share * z)
+            out_sigma[v, u] = max(e, min_share * z)

@@ -86,18 +86,18 @@ class CoverageGrid:
         """(rows, cols) cells within the hull where no surface was measured."""
         return self.inside & ~self.known
 
-    def seldom(self, least_views: int) -> Bool:
+    def seldom(self, min_views: int) -> Bool:
         """(rows, cols) cells of the core that too few images cover; ends of lines are not."""
-        return np.asarray(self.core & (self.views < least_views))
+        return np.asarray(self.core & (self.views < min_views))
 
-    def unsure(self, most_sigma_m: float) -> Bool:
+    def unsure(self, max_sigma_m: float) -> Bool:
         """(rows, cols) cells of what was flown whose surface is less sure than that."""
         with np.errstate(invalid="ignore"):
-            return np.asarray(self.inside & (self.sigma_m > most_sigma_m))
+            return np.asarray(self.inside & (self.sigma_m > max_sigma_m))
 
-    def weak(self, least_views: int, most_sigma_m: float) -> Bool:
+    def weak(self, min_views: int, max_sigma_m: float) -> Bool:
         """(rows, cols) cells worth another flight: gaps, seldom seen or unsure."""
-        return np.asarray(self.gaps | self.seldom(least_views) | self.unsure(most_sigma_m))
+        return np.asarray(self.gaps | self.seldom(min_views) | self.unsure(max_sigma_m))
 
 
 def usual_cell_m(depth: DepthMap) -> float | None:

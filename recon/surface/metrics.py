@@ -311,7 +311,7 @@ def patch_shifts(found: F32, truth: F32, known: Bool, reach_px: int) -> PatchShi
     """
     if found.shape != truth.shape or found.shape != known.shape or found.ndim != 2:
         raise ValueError(f"sizes differ: {found.shape}, {truth.shape}, {known.shape}")
-    a, b = (_fine(picture, known) for picture in (found, truth))
+    a, b = (_fine(image, known) for image in (found, truth))
     rows, cols = known.shape
     middles, shifts, likenesses, tried = [], [], [], 0
     for top in range(reach_px, rows - PATCH_PX - reach_px + 1, PATCH_PX // 2):
@@ -338,10 +338,10 @@ def patch_shifts(found: F32, truth: F32, known: Bool, reach_px: int) -> PatchShi
     )
 
 
-def _fine(picture: F32, known: Bool) -> F32:
+def _fine(image: F32, known: Bool) -> F32:
     """The image without its broad shading; zero where it is not known."""
     weight = known.astype(np.float32)
-    values = np.where(known, picture, 0.0).astype(np.float32)
+    values = np.where(known, image, 0.0).astype(np.float32)
     share = np.maximum(cv2.GaussianBlur(weight, (0, 0), BROAD_PX), 1e-3)
     mean = cv2.GaussianBlur(values, (0, 0), BROAD_PX) / share
     return np.asarray(np.where(known, values - mean, 0.0), np.float32)

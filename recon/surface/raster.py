@@ -31,7 +31,7 @@ SPARSE_SHARE = 0.5
 
 LARGEST_CELLS = 200_000_000
 
-CELLS_PER_POINT, FEWEST_CELLS = 1000, 10_000_000
+CELLS_PER_POINT, MIN_CELLS = 1000, 10_000_000
 """A rectangle with more cells than the larger of the two is empty but for strays: points that lie
 anywhere must not choose how much memory is asked for."""
 
@@ -99,7 +99,7 @@ def grid_over(xy_m: F64, cell_m: float, margin_cells: int = 0) -> Grid:
         low = np.floor(xy.min(axis=0) / cell_m) - margin_cells
         high = np.floor(xy.max(axis=0) / cell_m) + 1 + margin_cells
         cells = float(np.prod(high - low))
-    if not cells <= min(LARGEST_CELLS, max(FEWEST_CELLS, CELLS_PER_POINT * len(xy))):
+    if not cells <= min(LARGEST_CELLS, max(MIN_CELLS, CELLS_PER_POINT * len(xy))):
         raise ValueError(_too_large(high[1] - low[1], high[0] - low[0]))
     cols, rows = (high - low).astype(int)
     return Grid(float(low[0] * cell_m), float(high[1] * cell_m), cell_m, (int(rows), int(cols)))

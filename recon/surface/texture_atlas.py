@@ -148,7 +148,7 @@ class Palette:
 def paint(mesh: Mesh, layout: Layout, found: Sightings, label: I32, palette: Palette) -> U8:
     """(h, w, 3) RGB atlas: each texel the mix of the views that fade there."""
     w, h = layout.size_px
-    picture = np.zeros((h, w, 3), np.uint8)
+    image = np.zeros((h, w, 3), np.uint8)
     done = np.zeros((h, w), np.bool_)
     views = palette.views
     pixels, start, sides = _flat(views)
@@ -159,9 +159,9 @@ def paint(mesh: Mesh, layout: Layout, found: Sightings, label: I32, palette: Pal
         np.array([v.K for v in views]) if views else empty,
         np.array([np.linalg.inv(v.T_world_camera)[:3] for v in views]) if views
         else np.zeros((0, 3, 4)),
-        palette.levels, picture, done,
+        palette.levels, image, done,
     )  # fmt: skip
-    return _bordered(picture, done)
+    return _bordered(image, done)
 
 
 def _flat(views: Sequence[TextureView]) -> tuple[U8, I64, I64]:
@@ -174,10 +174,10 @@ def _flat(views: Sequence[TextureView]) -> tuple[U8, I64, I64]:
     return pixels, start, sides
 
 
-def _bordered(picture: U8, done: Bool) -> U8:
+def _bordered(image: U8, done: Bool) -> U8:
     """The charts' colours carried a few texels past their edges."""
     reached = done.copy()
-    out = picture.astype(np.float32)
+    out = image.astype(np.float32)
     for _ in range(BORDER_PX + 1):
         weight = reached.astype(np.float32)
         total = cv2.boxFilter(weight, -1, (3, 3), normalize=False)
@@ -272,7 +272,7 @@ def _texel(
 @njit(cache=True, nogil=True)
 def _paint(
     vertices: F64, faces: I32, uv: F64, label: I32, seen: I32, fade_view: I32, fade_share: F32,
-    rgb: U8, pixels: U8, start: I64, sides: I64, K: F64, T: F64, levels: F32, picture: U8,
+    rgb: U8, pixels: U8, start: I64, sides: I64, K: F64, T: F64, levels: F32, image: U8,
     done: Bool,
 ) -> None:  # fmt: skip  # pragma: no cover - compiled
     """Fill the texels whose centres lie in a triangle; of a smaller one, its middle's texel."""
@@ -315,7 +315,7 @@ def _paint(
                 _texel(
                     f, a / whole, b / whole, c / whole, vertices, faces, seen, fade_share, rgb,
                     pixels, start, sides, K, T, levels, ids, shares, colour, mixed,
-                    picture[row, col],
+                    image[row, col],
                 )  # fmt: skip
                 done[row, col] = filled = True
         row, col = int((ay + by + cy) / 3.0), int((ax + bx + cx) / 3.0)
@@ -323,6 +323,6 @@ def _paint(
             third = 1.0 / 3.0
             _texel(
                 f, third, third, third, vertices, faces, seen, fade_share, rgb, pixels, start,
-                sides, K, T, levels, ids, shares, colour, mixed, picture[row, col],
+                sides, K, T, levels, ids, shares, colour, mixed, image[row, col],
             )  # fmt: skip
             done[row, col] = True

@@ -31,7 +31,7 @@ class Textured:
     """A mesh with its image, and what the image is made of."""
 
     mesh: Mesh  # uv set; vertices doubled where charts meet
-    picture: U8  # (h, w, 3) RGB
+    image: U8  # (h, w, 3) RGB
     seen_share: float  # of the triangles
     views_used: int
     charts: int
@@ -69,11 +69,11 @@ def texture(
     layout = lay_out(mesh, views, label, neighbours, largest_px)
     progress("painting {} x {} texels".format(*layout.size_px))
     palette = Palette(views, gains, fade_view, fade_share, mesh.rgb)
-    picture = paint(mesh, layout, found, label, palette)
+    image = paint(mesh, layout, found, label, palette)
     used = np.unique(label[label >= 0])
     charts = len(np.unique(layout.chart[label >= 0]))
     return Textured(
-        _split(mesh, layout), picture, float((label >= 0).mean()), len(used), charts, layout.scale
+        _split(mesh, layout), image, float((label >= 0).mean()), len(used), charts, layout.scale
     )
 
 

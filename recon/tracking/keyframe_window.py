@@ -120,7 +120,7 @@ def triangulate(
     uv: F64,
     ok: Bool,
     K: F64,
-    least_parallax_rad: float,
+    min_parallax_rad: float,
     loose_px: float,
 ) -> None:
     """Landmarks for the keyframe's corners that were matched (``ok``) at ``uv`` and have none.
@@ -141,7 +141,7 @@ def triangulate(
         two_view.reprojection_error(T_camera_odom, points, K, uv_b),
     )
     gate_px = max(1.5, 2.0 * float(np.median(error)))
-    good = (error < min(gate_px, loose_px)) & (angle > least_parallax_rad)
+    good = (error < min(gate_px, loose_px)) & (angle > min_parallax_rad)
     key.landmark[rows[good]] = key.map.add(points[good])
     ok[rows[error >= gate_px]] = False
 

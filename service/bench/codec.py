@@ -203,7 +203,7 @@ def _jpeg_ls(frame: Keyframe) -> CodecFigures:
 
     depth, colour = encode()
     codes = imagecodecs.jpegls_decode(depth)
-    picture = cv2.imdecode(np.frombuffer(colour, np.uint8), cv2.IMREAD_COLOR)
+    image = cv2.imdecode(np.frombuffer(colour, np.uint8), cv2.IMREAD_COLOR)
     bits = (len(depth) + len(colour)) * 8 / codes.size
     rms = _rms_at_60(frame, (1.0 / (low + step * codes)).astype(np.float32))
     return CodecFigures(
@@ -211,7 +211,7 @@ def _jpeg_ls(frame: Keyframe) -> CodecFigures:
         bits,
         _median_ms(encode),
         rms,
-        _psnr(np.asarray(picture, np.uint8), frame),
+        _psnr(np.asarray(image, np.uint8), frame),
     )
 
 

@@ -14,7 +14,7 @@ from recon.backends.room import pyramid_levels
 from recon.backends.torch_depth import DensePath, JointBilateral, averaged, fuse, reproject
 from recon.backends.torch_icp import DeviceIcp
 from recon.backends.torch_plan import Plan, part
-from recon.backends.torch_stereo import DenseStereo, believe, drop_unseen
+from recon.backends.torch_stereo import DenseStereo, drop_unreliable, drop_unseen
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.reprojection import FusionConfig
@@ -112,7 +112,7 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
     trusted = planned(
         device,
         lambda left, p, s, a, b, true: drop_unseen(
-            *believe(left, p, s, true, matching), a, b, true
+            *drop_unreliable(left, p, s, true, matching), a, b, true
         ),
         pair.left, px, sure, seen, seen, own,
     )  # fmt: skip
@@ -137,7 +137,7 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
     return [
         *found,
         staged(f"what is believed, {w}x{h}, on the device", device, trusted,
-              20.0 * pixels, 60.0 * pixels, "contrast, visibility, speckles, both pictures"),
+              20.0 * pixels, 60.0 * pixels, "contrast, visibility, speckles, both images"),
         staged(f"upsampling to {W}x{H}, exact, on the device", device, finer,
               11.0 * W * H, 20.0 * taps * W * H, f"{taps} taps"),
         staged(f"reprojection to {w}x{h}, on the device", device, depth,

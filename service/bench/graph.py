@@ -76,7 +76,7 @@ class _Flown:
     """The trajectory as the reconstruction keeps it, and how long that took."""
 
     def __init__(self) -> None:
-        nodes = PoseGraphConfig(most_nodes=FusionConfig().graph_keyframes)
+        nodes = PoseGraphConfig(max_nodes=FusionConfig().graph_keyframes)
         self.trajectory = Trajectory(graph=PoseGraph(nodes))
         self.newest: Placed | None = None  # what tracking reads
         self.taken: list[float] = []  # ms of each keyframe: entered, placed, loops, corrections

@@ -21,8 +21,8 @@ def natural(h: int, w: int, slope: float, seed: int) -> F64:
     fx = np.fft.rfftfreq(w)[None, :] * w
     amplitude = 1.0 / np.maximum(np.hypot(fx, fy), 1.0) ** slope
     spectrum = np.fft.rfft2(rng.normal(size=(h, w))) * amplitude
-    picture = np.fft.irfft2(spectrum, (h, w))
-    return np.asarray((picture - picture.mean()) / picture.std())
+    image = np.fft.irfft2(spectrum, (h, w))
+    return np.asarray((image - image.mean()) / image.std())
 
 
 def make_keyframe(

@@ -65,8 +65,8 @@ def make_video(path: Path, frames: int) -> None:
             tilt = 0.98 * tilt + rng.normal(0, 0.001, 3)
             centre = np.array([60.0 + SPEED_M_S * i / FPS, 50.0, HEIGHT_M])
             R = se3.so3_exp(tilt) @ np.diag([1.0, -1, -1])
-            picture = _photograph(ground, se3.compose(R, centre))
-            frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
+            image = _photograph(ground, se3.compose(R, centre))
+            frame = av.VideoFrame.from_ndarray(image, format="bgr24")
             for packet in stream.encode(frame):
                 container.mux(packet)
         for packet in stream.encode(None):

@@ -135,7 +135,7 @@ class Page:
             mobile=mobile,
         )
 
-    def picture(self, path: Path) -> None:
+    def image(self, path: Path) -> None:
         """Write what the page shows as PNG."""
         data = self.call("Page.captureScreenshot", format="png")["data"]
         path.write_bytes(base64.b64decode(data))

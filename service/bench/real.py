@@ -29,7 +29,7 @@ from recon.types import F64, DepthMap
 from service.bench import BenchOptions, BenchResult
 from service.cameras import open_camera
 from service.errors import InputError, OutsideError
-from service.offline.refine.control_points import Pictures, candidates_of
+from service.offline.refine.control_points import ScanImages, candidates_of
 from service.offline.refine.revisions import Revisions
 from service.offline.refine.survey_file import Sighting, SurveyPoint
 from service.scans.track import latest, local_frame
@@ -256,7 +256,7 @@ def targets(flight: Flight) -> Iterator[tuple[str, float, str]]:
     with ScanStore.open(flight.scan / "scan.db") as store, Revisions(store) as revisions:
         states = [s for seq in store.seqs() if (s := revisions.keyframe_state(seq)) is not None]
         start = store.header.started_unix_ns
-        scan = Pictures(states, revisions.frames(), store.header.camera, revisions.keyframe, None)
+        scan = ScanImages(states, revisions.frames(), store.header.camera, revisions.keyframe, None)
         times = {image.name: image.time_ns for image in open_camera(flight.source)}
         placed = {_tick(frame.time_unix_ns - start) for frame in scan.frames}
         surveyed = _surveyed(flight.data / "gcp_list_1600px.txt", times, placed, start)

@@ -27,7 +27,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
     The peers are OpenCV's corner detector and its pyramidal Lucas-Kanade tracker run forward
     and backward, with windows and levels that reach as far.
     """
-    a, b = pictures()
+    a, b = images()
     config = MatchingConfig()
     corners = harris_grid(a, config)
     points = corners.uv_px[:, None]
@@ -54,7 +54,7 @@ def shared(a: U8, b: U8) -> CommonView | None:
     return common_view(features(a), features(b))
 
 
-def pictures() -> tuple[U8, U8]:
+def images() -> tuple[U8, U8]:
     """Two noisy views of one texture with detail at every scale, shifted by SHIFT_PX."""
     rng = np.random.default_rng(0)
     h, w = SIZE[0] + 128, SIZE[1] + 128
@@ -185,7 +185,7 @@ def position_error() -> BenchResult:
 
 def frame(options: BenchOptions) -> BenchResult:
     """Milliseconds of what every frame costs: pyramid, matches of 900 landmarks, pose."""
-    a, b = pictures()
+    a, b = images()
     config = MatchingConfig()
     key, uv = Pyramid.build(a), harris_grid(a, config).uv_px.astype(np.float64)
     landmarks = rays(K, uv) * 60.0  # flat ground: the shift is a motion along it

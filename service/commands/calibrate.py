@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    sources: Annotated[list[Path], typer.Argument(help="Pictures, folders of them, or a video.")],
+    sources: Annotated[list[Path], typer.Argument(help="Images, folders of them, or a video.")],
     pattern: Annotated[str, typer.Option(help="Inner corners of the board: 9x6.")],
     square_m: Annotated[float, typer.Option(help="Side of a square in metres.")],
     out: Annotated[Path, typer.Option(help="Camera model to write (YAML).")],
@@ -29,17 +29,17 @@ def calibrate(
 
     Writes an image of where the corners were beside the model.
     """
-    from recon.calibration.board import FEWEST_VIEWS, CalibrationConfig
+    from recon.calibration.board import MIN_VIEWS, CalibrationConfig
     from recon.calibration.board import calibrate as fit
     from service.cameras.board_images import draw_coverage, find_boards, write_image
     from service.cameras.camera_file import save_camera
 
     board = _board(pattern, square_m)
     boards = find_boards(sources, board)
-    if len(boards.views) < FEWEST_VIEWS:
+    if len(boards.views) < MIN_VIEWS:
         raise InputError(
             f"the board was found in {len(boards.views)} of "
-            f"{len(boards.views) + len(boards.missed)} pictures, {FEWEST_VIEWS} are needed; "
+            f"{len(boards.views) + len(boards.missed)} images, {MIN_VIEWS} are needed; "
             f"is --pattern {pattern} the number of inner corners?"
         )
     result = fit(boards.views, board, boards.size_px, CalibrationConfig(tangential))
@@ -49,11 +49,11 @@ def calibrate(
         save_camera(out, result.camera, name, {"calibration": _record(result, boards, board)})
     except ValueError as error:
         raise InputError(f"the views give no usable camera ({error}); take more views") from error
-    picture = out.with_name(f"{out.stem}_coverage.png")
-    write_image(picture, draw_coverage(result, boards.views))
+    image = out.with_name(f"{out.stem}_coverage.png")
+    write_image(image, draw_coverage(result, boards.views))
     report = _record(result, boards, board) | {
         "out": str(out),
-        "coverage_picture": str(picture),
+        "coverage_picture": str(image),
         "K": result.camera.K.tolist(),
         "distortion": result.camera.distortion.tolist(),
     }
@@ -103,6 +103,6 @@ def _text(report: dict[str, Any]) -> str:
         *(f"  not used   {view}: {reason}" for view, reason in report["not_used"].items()),
         *(f"warning: {warning}" for warning in report["warnings"]),
         "",
-        f"wrote {report['out']} and {report['coverage_picture']}",
+        f"wrote {report['out']} and {report['coverage_image']}",
     ]
     return "\n".join(lines)

@@ -63,10 +63,10 @@ def mesh(
     ] = None,
     video: Annotated[
         Path | None,
-        typer.Option(help="the flight's video or folder of pictures; default: as scan.json names"),
+        typer.Option(help="the flight's video or folder of images; default: as scan.json names"),
     ] = None,
     stored: Annotated[
-        bool, typer.Option("--stored", help="texture from the scan's own small pictures")
+        bool, typer.Option("--stored", help="texture from the scan's own small images")
     ] = False,
     video_epoch: Annotated[
         float | None, typer.Option(help="unix seconds of its start; default: the scan's start")
@@ -107,7 +107,7 @@ def mesh(
     else:
         print(
             f"{path}: {figures['faces']} triangles in {figures['tiles']} tile(s), "
-            f"{figures['method']}, {figures['seen']:.0%} seen by a picture, "
+            f"{figures['method']}, {figures['seen']:.0%} seen by an image, "
             f"{figures['seconds']} s"
         )
 
@@ -142,9 +142,9 @@ def inspect(
         found = scan.store.keyframe(seq) if seq in seqs else None
         if found is None:
             raise InputError(f"{scan_dir}: no keyframe {seq}; there are {seqs[0]} to {seqs[-1]}")
-    picture, complete = stages(scan_dir, scan.store.header.scan_id, found)
+    image, complete = stages(scan_dir, scan.store.header.scan_id, found)
     path = out or scan_dir / f"keyframe_{seq:06d}.png"
-    ok, data = cv2.imencode(".png", picture)
+    ok, data = cv2.imencode(".png", image)
     if not ok:
         raise InputError(f"{path}: OpenCV cannot write PNG on this machine")
     with writing(path) as part:

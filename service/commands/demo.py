@@ -229,7 +229,7 @@ Received at ground:   {ground}
   {report["distance_m"]:.0f} m flown, median sigma {report["sigma_median_m"]:.2f} m, \
 {report["seconds"]:.0f} s in all; the ground holds {report["ground_points"]:,} points
 Look at it:
-  {onboard}/preview.jpg   colour and relief from above; any picture viewer
+  {onboard}/preview.jpg   colour and relief from above; any image viewer
   {onboard}/cloud.laz     coloured points, EPSG:{report["epsg"]}, metres above sea level;
                           CloudCompare, QGIS, Potree
   {onboard}/trajectory.csv and scan.json: where the camera was, what was used, how good it is

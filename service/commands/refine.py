@@ -127,9 +127,9 @@ def refly(
         Path | None,
         typer.Option(help=".plan (QGroundControl) or .waypoints; default: refly.plan in the scan"),
     ] = None,
-    overlap: Annotated[float, typer.Option(help="of neighbouring lines' pictures, 0 to 0.9")] = 0.6,
+    overlap: Annotated[float, typer.Option(help="of neighbouring lines' images, 0 to 0.9")] = 0.6,
     views: Annotated[
-        int | None, typer.Option(help="pictures below which a place is weak; default 3")
+        int | None, typer.Option(help="images below which a place is weak; default 3")
     ] = None,
     sigma_m: Annotated[
         float | None, typer.Option(help="sigma above which it is; default 3 times the median")

@@ -25,7 +25,7 @@ WIDTH, STEREO_WIDTH_PX = "compute.stereo_width", 640
 
 
 def replay(
-    video: Annotated[str, typer.Argument(help="a video, a folder of pictures, or - for a pipe")],
+    video: Annotated[str, typer.Argument(help="a video, a folder of images, or - for a pipe")],
     telemetry: Annotated[
         Path | None, typer.Option(help="flight log: .tlog, .BIN, .ulg or .SRT")
     ] = None,

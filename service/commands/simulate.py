@@ -61,7 +61,7 @@ def simulate(
     baro_noise_m: Annotated[float, typer.Option(help="Wander of the altitude.")] = 0.5,
     attitude_noise_deg: Annotated[float, typer.Option(help="Wander of roll and pitch.")] = 0.3,
     yaw_noise_deg: Annotated[float, typer.Option(help="Wander of the heading.")] = 1.0,
-    image_noise: Annotated[float, typer.Option(help="Sensor noise in grey levels.")] = 1.5,
+    image_noise: Annotated[float, typer.Option(help="Sensor noise in gray levels.")] = 1.5,
     telemetry: Annotated[bool, typer.Option(help="Write flight.tlog.")] = True,
     video: Annotated[bool, typer.Option(help="Render flight.mp4.")] = True,
     gimbal_frame: Annotated[str, typer.Option(help="Yaw of the gimbal: earth, vehicle.")] = "earth",

@@ -15,7 +15,7 @@ from service.stream.records import pack_covariance, pack_motion
 LEAST = 5
 """Readings of one kind left out before it is said."""
 
-SIGMAS, LEAST_SHARE = 3.0, 0.03
+SIGMAS, MIN_SHARE = 3.0, 0.03
 """Two scales disagree when they are further apart than both of these."""
 
 LOOK_GROWTH = 1.2
@@ -64,7 +64,7 @@ class GraphWatch:
         by_fixes, by_heights = scales
         if by_fixes is not None and by_heights is not None:
             apart = math.log(by_fixes.metres / by_heights.metres)
-            limit = max(SIGMAS * math.hypot(by_fixes.sigma, by_heights.sigma), LEAST_SHARE)
+            limit = max(SIGMAS * math.hypot(by_fixes.sigma, by_heights.sigma), MIN_SHARE)
             if abs(apart) > limit:
                 percent = 100.0 * (math.exp(abs(apart)) - 1.0)
                 which = "larger" if apart > 0 else "smaller"
@@ -88,7 +88,7 @@ def _off_in_sigmas(rows: F64 | None) -> float:
     return 1.4826 * float(np.median(np.abs(rows)))
 
 
-MOST_LOOPS = 300
+MAX_LOOPS = 300
 """Loops that a summary carries with their motions; of more, an even sample."""
 
 
@@ -102,7 +102,7 @@ def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:
     if len(graph) < 2:
         return None
     accepted = graph.metric_loops()
-    step = max(1, -(-len(accepted) // MOST_LOOPS))
+    step = max(1, -(-len(accepted) // MAX_LOOPS))
     edges = graph.loops
     return {
         "keyframes": graph.entered,
@@ -118,7 +118,7 @@ def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:
         "loops": {
             "used": sum(edge.accepted for edge in edges),
             "waiting": sum(not edge.accepted for edge in edges),
-            "pairs": [[edge.a, edge.b, edge.accepted] for edge in edges][-2 * MOST_LOOPS :],
+            "pairs": [[edge.a, edge.b, edge.accepted] for edge in edges][-2 * MAX_LOOPS :],
             "motions": [
                 [
                     loop.a,

@@ -25,7 +25,7 @@ from recon.types import F64, U8, DepthMap
 WIDTH_PX = 640
 """Of the images kept; loops need no finer ones."""
 
-LEAST_DEPTH_PX = 120
+MIN_DEPTH_PX = 120
 """A depth image at least twice as wide is kept at half its size."""
 
 TRIES = 2
@@ -48,7 +48,7 @@ class _Kept:
     seq: int
     ordinal: int  # among all keyframes
     segment: int
-    picture: U8  # JPEG, gray
+    image: U8  # JPEG, gray
     K: F64  # (3, 3) px of that image
     depth: npt.NDArray[np.uint16]  # (h, w) share of ``far``, 0 unknown
     far: float  # odometry units
@@ -58,7 +58,7 @@ class _Kept:
 
     def gray(self) -> U8:
         """(H, W) image."""
-        return np.asarray(cv2.imdecode(self.picture, cv2.IMREAD_GRAYSCALE), np.uint8)
+        return np.asarray(cv2.imdecode(self.image, cv2.IMREAD_GRAYSCALE), np.uint8)
 
     def unpacked(self, scale: float) -> LoopView:
         """The view with its depth in metres."""
@@ -72,19 +72,19 @@ class _Kept:
         )  # fmt: skip
 
 
-def _packed(seq: int, ordinal: int, segment: int, grey: U8, K: F64, depth: DepthMap) -> _Kept:
-    H, W = grey.shape
+def _packed(seq: int, ordinal: int, segment: int, gray: U8, K: F64, depth: DepthMap) -> _Kept:
+    H, W = gray.shape
     size = (min(WIDTH_PX, W), round(min(WIDTH_PX, W) * H / W))
-    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    _, picture = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 92])
-    step = 2 if depth.depth_m.shape[1] >= 2 * LEAST_DEPTH_PX else 1
+    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    _, image = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 92])
+    step = 2 if depth.depth_m.shape[1] >= 2 * MIN_DEPTH_PX else 1
     z, sigma = depth.depth_m[::step, ::step], depth.sigma_m[::step, ::step]
     depth_K = depth.K / np.array([[step], [step], [1.0]])  # every second pixel keeps its place
     known = np.isfinite(z)
     far = float(z[known].max()) if known.any() else 1.0
     share = np.where(known, np.maximum(np.rint(z * (65535.0 / far)), 1), 0)
     return _Kept(
-        seq, ordinal, segment, np.asarray(picture, np.uint8), scaled_K(K, size[0] / W, size[1] / H),
+        seq, ordinal, segment, np.asarray(image, np.uint8), scaled_K(K, size[0] / W, size[1] / H),
         share.astype(np.uint16), far, sigma.astype(np.float16), depth_K, size,
     )  # fmt: skip
 
@@ -96,12 +96,12 @@ class LoopSearch:
         self,
         trajectory: Trajectory,
         config: LoopConfig | None = None,
-        most_views: int = 400,
+        max_views: int = 400,
     ) -> None:
-        """Of more than ``most_views`` keyframes, about 0.1 MB each, every second of the older half
+        """Of more than ``max_views`` keyframes, about 0.1 MB each, every second of the older half
         is forgotten.
         """
-        self._most_views = most_views
+        self._max_views = max_views
         self.counts: Counter[str] = Counter()  # "tried", "verified", "taken"
         self.trajectory = trajectory
         self._config = config or LoopConfig()
@@ -113,20 +113,20 @@ class LoopSearch:
     def __len__(self) -> int:
         return len(self._kept)
 
-    def look(self, seq: int, segment: int, grey: U8, K: F64, depth: DepthMap) -> None:
+    def look(self, seq: int, segment: int, gray: U8, K: F64, depth: DepthMap) -> None:
         """Search for loops that end in this keyframe, and remember it.
 
         Args:
-            grey: (H, W) picture without distortion, ``K`` (3, 3) px of it.
+            gray: (H, W) image without distortion, ``K`` (3, 3) px of it.
             depth: of the same camera, in units of its segment's odometry.
         """
-        new = _packed(seq, self.trajectory.graph.entered - 1, segment, grey, K, depth)
+        new = _packed(seq, self.trajectory.graph.entered - 1, segment, gray, K, depth)
         self._kept[seq] = new
         if self._rest > 0:
             self._rest -= 1
         else:
             self._search(new)
-        if len(self._kept) > self._most_views:
+        if len(self._kept) > self._max_views:
             self._thin()
 
     def _search(self, new: _Kept) -> None:
@@ -188,7 +188,7 @@ class LoopSearch:
     def _is_apart(self, one: _Kept, two: _Kept) -> bool:
         """True when two keyframes are not neighbours on one chain."""
         gap = two.ordinal - one.ordinal
-        return gap >= self._config.least_gap or one.segment != two.segment
+        return gap >= self._config.min_gap or one.segment != two.segment
 
     def _thin(self) -> None:
         """Forget every second keyframe of the older half."""

@@ -434,7 +434,7 @@ def _chain(
     resources: ExitStack,
 ) -> Chain:
     """The pose graph and all that hangs on it."""
-    graph = PoseGraph(PoseGraphConfig(most_nodes=config.fusion.graph_keyframes))
+    graph = PoseGraph(PoseGraphConfig(max_nodes=config.fusion.graph_keyframes))
     trajectory, carriers = Trajectory(graph=graph), Carriers()
     if pages is not None:
         ledger = FileLedger(KEYFRAME, pages.parent)
@@ -443,7 +443,7 @@ def _chain(
         carriers = Carriers(FileLedger(VIEW, pages.parent))
     chain = Chain(trajectory, carriers, is_settled, rejected, stopwatch)
     if config.fusion.loops:
-        chain.loops = LoopSearch(trajectory, most_views=config.fusion.loop_views)
+        chain.loops = LoopSearch(trajectory, max_views=config.fusion.loop_views)
     return chain
 
 

@@ -21,13 +21,13 @@ from service.flight.viewpoints import StereoCandidate
 
 log = logging.getLogger(__name__)
 
-MOST_OVER = 4
+MAX_OVER = 4
 
 
 class PagedMap:
-    """A voxel map (:mod:`recon.mapping.voxel_map`) with about ``most_voxels`` in memory at most.
+    """A voxel map (:mod:`recon.mapping.voxel_map`) with about ``max_voxels`` in memory at most.
 
-    The tiles under the view stay, whatever they hold; where they alone have :data:`MOST_OVER`
+    The tiles under the view stay, whatever they hold; where they alone have :data:`MAX_OVER`
     times as many, the half seen longest ago is forgotten, and that surface is sent again.
 
     ``folder`` is made when the first tile leaves and removed by :meth:`close`. A disk that
@@ -35,11 +35,11 @@ class PagedMap:
     it is full, and that surface is sent again.
     """
 
-    def __init__(self, config: VoxelMapConfig, folder: Path, most_voxels: int = 2_000_000) -> None:
-        if most_voxels < 1000:
-            raise ValueError(f"most_voxels is {most_voxels}, must be at least 1000")
-        self.folder, self.most_voxels = folder, most_voxels
-        largest = min(config.largest_voxels, MOST_OVER * most_voxels)
+    def __init__(self, config: VoxelMapConfig, folder: Path, max_voxels: int = 2_000_000) -> None:
+        if max_voxels < 1000:
+            raise ValueError(f"max_voxels is {max_voxels}, must be at least 1000")
+        self.folder, self.max_voxels = folder, max_voxels
+        largest = min(config.largest_voxels, MAX_OVER * max_voxels)
         self._map = VoxelMap(replace(config, largest_voxels=largest))
         self._margin_m = config.voxel_m * (config.largest_reach_voxels + 1)
         self._away: set[int] = set()  # tiles that are on disk
@@ -64,7 +64,7 @@ class PagedMap:
         here = self._under(depth)
         self._bring_back(here)
         new = self._map.insert(depth, mask)
-        if len(self._map) > self.most_voxels and not self._broken:
+        if len(self._map) > self.max_voxels and not self._broken:
             self._send_away(here)
         return new
 
@@ -94,7 +94,7 @@ class PagedMap:
         tiles, counts = self._map.oldest_tiles()
         away = ~np.isin(tiles, keep)
         tiles, counts = tiles[away], counts[away]
-        surplus = len(self._map) - self.most_voxels // 2
+        surplus = len(self._map) - self.max_voxels // 2
         tiles = tiles[: int(np.searchsorted(np.cumsum(counts), surplus)) + 1]
         taken = self._map.take(tiles)
         home = tile_of(taken.keys)

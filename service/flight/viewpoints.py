@@ -98,7 +98,7 @@ class Viewpoints:
         self._between: deque[Viewpoint] = deque(maxlen=8 * partners if partners > KEPT - 2 else 0)
         self._recent: deque[Viewpoint] = deque(maxlen=6)  # a quarter of a step apart
         self._extra: tuple[Viewpoint, list[Viewpoint]] | None = None  # a last view's partner
-        self._most_partners = partners
+        self._max_partners = partners
         self._views_of: Counter[int] = Counter()  # views by segment
         self._take_next = False
         self.set_baseline(config)
@@ -107,11 +107,11 @@ class Viewpoints:
         """Follow another ``scan.baseline`` from the next frame on."""
         self._mode, self._amount, every = parse_baseline(config.baseline)
         self._stride = frames_apart(int(self._amount), every) if self._mode == "frames" else 0
-        self._partners = self._most_partners if self._mode == "auto" else 1
+        self._partners = self._max_partners if self._mode == "auto" else 1
 
     def set_partners(self, most: int) -> None:
         """Pair each view with at most ``most`` others from now on, where the baseline is "auto"."""
-        self._most_partners = most
+        self._max_partners = most
         self._partners = most if self._mode == "auto" else 1
 
     def take_next(self) -> None:

@@ -114,7 +114,7 @@ class Drones:
                 or (not member.drone.scans and now - member.drone.heard_at > DRONE_TIMEOUT_S)
             }
             if self._is_wanted and len(self._members) - len(gone) >= MAX_DRONES:
-                gone |= self._least_silent(now)
+                gone |= self._min_silent(now)
             self._is_wanted = False
             for name in gone:
                 del self._members[name]
@@ -138,7 +138,7 @@ class Drones:
             member.worker.join()
         return [scan for member in self._members.values() for scan in member.drone.scans]
 
-    def _least_silent(self, now: float) -> dict[str, _Member]:
+    def _min_silent(self, now: float) -> dict[str, _Member]:
         """The silent drone that brought least, the one heard longest ago of several; or none."""
         silent = [
             (_brought(member.drone), member.drone.heard_at, name)

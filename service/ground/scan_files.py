@@ -40,7 +40,7 @@ def file_routes(one: str) -> list[Route]:
     return [
         Route(one + "/files/{name}", _file),
         Route(one + "/tiles/{name:path}", _tile),
-        Route(one + "/keyframes/{seq}.jpg", _picture),
+        Route(one + "/keyframes/{seq}.jpg", _image),
         Route(one + "/coverage.png", _coverage),
         Route(one + "/coverage.json", _coverage),
     ]
@@ -67,7 +67,7 @@ def _tile(request: Request) -> Response:
     return FileResponse(path)
 
 
-def _picture(request: Request) -> Response:
+def _image(request: Request) -> Response:
     """What a keyframe's camera saw, as JPEG: its own colours, the rest from keyframes before it."""
     folder = state_of(request).library.folder(*names_of(request))
     if not SEQ.fullmatch(request.path_params["seq"]):
@@ -81,7 +81,7 @@ def _picture(request: Request) -> Response:
         bgr, known = _completed(keyframe, filter(None, map(store.keyframe, reversed(earlier))))
     ok, data = cv2.imencode(".jpg", _closed(bgr, known), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not ok:
-        raise InputError("no picture in this keyframe")
+        raise InputError("no image in this keyframe")
     return Response(data.tobytes(), media_type="image/jpeg")
 
 

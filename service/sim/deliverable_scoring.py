@@ -105,7 +105,7 @@ def _ortho(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
         raise InputError(f"{path}: {len(image.bands)} bands; expected red, green, blue, opacity")
     known = image.bands[3] > 0
     try:
-        should = _true_picture(image, known.shape, truth)
+        should = _true_image(image, known.shape, truth)
     except InputError as error:
         return image.facts | {"trouble": str(error)}
     colour = np.ascontiguousarray(image.bands[:3].transpose(1, 2, 0))
@@ -135,7 +135,7 @@ def _ortho(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
     return out
 
 
-def _true_picture(image: _Raster, shape: tuple[int, int], truth: Truth) -> F32:
+def _true_image(image: _Raster, shape: tuple[int, int], truth: Truth) -> F32:
     """(rows, cols) gray of the true place, rendered at half the cells and laid on the file's."""
     row, col = np.indices(shape).reshape(2, -1)
     ground = image.places(col, row, np.full(len(col), truth.frame.alt_amsl_m))
@@ -323,7 +323,7 @@ def view_from_above(
     T = np.eye(4)
     T[:3, :3] = np.diag([1.0, -1.0, -1.0])
     T[:3, 3] = west_m + 0.5 * cols * cell_m, north_m - 0.5 * rows * cell_m, HEIGHT_M
-    return Renderer(scene, simulation.renderer.picture, camera).frame(T, 0, Look(0.0, 0.0, 1.0))
+    return Renderer(scene, simulation.renderer.texture, camera).frame(T, 0, Look(0.0, 0.0, 1.0))
 
 
 def options_of(values: dict[str, Any]) -> SimulationOptions:

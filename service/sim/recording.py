@@ -22,9 +22,9 @@ from service.cameras.camera_file import save_camera
 from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
 from service.sim import flight as flights
-from service.sim import picture, scene
+from service.sim import ground_texture, scene
 from service.sim.flight import Flight, FlightPlan, SensorNoise, Sensors
-from service.sim.picture import patchwork
+from service.sim.ground_texture import patchwork
 from service.sim.render import Look, Renderer
 from service.sim.scene import Area
 from service.sim.telemetry import TelemetryOptions, packets, write_tlog
@@ -174,7 +174,7 @@ def prepare(options: SimulationOptions) -> Simulation:
     if options.photos is not None:
         size = [max(4, int(np.ceil(s / texel))) for s in area.size_m]
         mosaic = patchwork(options.photos, (size[0], size[1]), options.seed)
-    renderer = Renderer(place, picture.make(place, texel, mosaic), options.camera)
+    renderer = Renderer(place, ground_texture.make(place, texel, mosaic), options.camera)
     return Simulation(options, flight, place, renderer, times, poses)
 
 

@@ -12,8 +12,14 @@ from recon.camera_model import check_camera
 from recon.surface.triangle_grid import first_hit
 from recon.types import F32, F64, U8, Camera
 from service.sim import shapes
+from service.sim.ground_texture import (
+    AMBIENT,
+    SUN_STRENGTH,
+    GroundTexture,
+    crown_shade,
+    wall_colour,
+)
 from service.sim.noise import normal
-from service.sim.picture import AMBIENT, SUN_STRENGTH, Picture, crown_shade, wall_colour
 from service.sim.scene import Scene
 from service.sim.shapes import CROWN, TREE_B, TREE_SEED, WALL
 from service.sim.water import flood
@@ -62,9 +68,9 @@ class Look:
 class Renderer:
     """Renders one scene through one camera."""
 
-    def __init__(self, scene: Scene, picture: Picture, camera: Camera) -> None:
+    def __init__(self, scene: Scene, texture: GroundTexture, camera: Camera) -> None:
         """Prepare the rays and tables; raises ValueError for an unusable camera."""
-        self.scene, self.picture, self.camera = scene, picture, camera
+        self.scene, self.texture, self.camera = scene, texture, camera
         self.rays = camera_rays(camera)
         plain = Camera(camera.K, np.zeros(5), camera.size_px)
         self._straight = camera_rays(plain)
@@ -107,7 +113,7 @@ class Renderer:
         return np.asarray(t.reshape(H, W), np.float32)
 
     def _tables(self) -> tuple[object, ...]:
-        p = self.picture
+        p = self.texture
         return (
             self._normals, self.scene.material, self._owner, self._blocks, self._trees,
             p.bgr, p.levels, p.x0, p.y0, p.texel_m, p.sun,

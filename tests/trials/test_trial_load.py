@@ -38,7 +38,7 @@ from service.daemon.runtime import Daemon
 pytestmark = [pytest.mark.trial, pytest.mark.timeout(1800 if WHOLE else 280)]
 
 STREAMED = "640:480", f"-framerate 8 -pattern_type glob -i {DEMO}/frames/*.jpg"
-MOST_HOGS = 64
+MAX_HOGS = 64
 """Per core, before it is said that nothing makes the service late."""
 
 
@@ -69,7 +69,7 @@ def test_lag_is_relieved_and_passes(tmp_path: Path, record: Row) -> None:
 
         service.until(lambda: service.frames > 20, "frames")
         cores, count = os.cpu_count() or 1, 4
-        while count <= MOST_HOGS and step() in ("full", ""):
+        while count <= MAX_HOGS and step() in ("full", ""):
             with hogs(count * cores), contextlib.suppress(TimeoutError):
                 deadline = time.monotonic() + 40.0
                 while step() in ("full", "") and time.monotonic() < deadline:
@@ -141,14 +141,14 @@ def test_memory_short_is_relieved(tmp_path: Path, record: Row) -> None:
         service.until(lambda: service.frames > 0, "frames")
         service.reload((short, short + "least_memory_mib = 1e6\n"))
         service.until(lambda: service.get()["load"]["name"] == "record only", "relief")
-        service.until(lambda: service.get()["load"].get("pictures_kept", 0) > 1, "kept pictures")
+        service.until(lambda: service.get()["load"].get("pictures_kept", 0) > 1, "kept images")
         service.reload(("least_memory_mib = 1e6", "relief = false"))
         back_s = service.until_more_frames("frames")
         assert service.get()["load"]["name"] == "full"
         (folder,) = scan_folders(service.scans)
         assert service.stop() == 0
     kept = list((folder / "later").glob("*.jpg"))
-    record("memory short", 1, f"record only: {len(kept)} pictures kept for a replay", "-", back_s)
+    record("memory short", 1, f"record only: {len(kept)} images kept for a replay", "-", back_s)
     assert kept
     run = json.loads((folder / "scan.json").read_text())["run"]
     assert any("later/" in warning for warning in run["warnings"])

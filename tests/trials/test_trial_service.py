@@ -168,7 +168,7 @@ def test_camera_fails_and_comes_back(fault: str, tmp_path: Path, record: Row) ->
                         lambda n=connected: service.said("connected") > n,  # type: ignore[misc]
                         "the camera again",
                     )
-                service.until_more_frames("pictures again")
+                service.until_more_frames("images again")
                 back_s.append(time.monotonic() - start)
             scans = scan_folders(service.scans)
             assert service.stop() == 0

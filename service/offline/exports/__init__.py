@@ -27,7 +27,7 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
     "colmap": (
         "flight:write_colmap",
         "colmap",
-        "Keyframes as a COLMAP text model with pictures.",
+        "Keyframes as a COLMAP text model with images.",
     ),
     "3dtiles": ("clouds:write_tiles", "3dtiles", "Point tiles for Cesium."),
     "glb": ("model:write_glb", "mesh.glb", "Textured mesh, binary glTF."),

@@ -27,7 +27,7 @@ from recon.surface.texture_views import TextureView
 from recon.surface.texturing import texture
 from recon.types import F64, U8, Keyframe, PointCloud
 from service.errors import OutsideError, SkyreliefError
-from service.offline.exports.pictures import stored_pictures, video_pictures
+from service.offline.exports.images import stored_images, video_images
 from service.packages import needing
 from service.scans.fused_cloud import fused_cloud
 from service.stream.records import ScanHeader
@@ -63,7 +63,7 @@ class TilePart:
     """A tile's mesh and texture, and what it was made of."""
 
     mesh: Mesh
-    picture: U8
+    image: U8
     figures: dict[str, Any]
 
 
@@ -90,13 +90,13 @@ def footprints(store: ScanStore) -> list[Footprint]:
     return out
 
 
-def tile_boxes(prints: Sequence[Footprint], most_points: int) -> list[Box]:
-    """Boxes that cover the site, each with about ``most_points`` stored points at most.
+def tile_boxes(prints: Sequence[Footprint], max_points: int) -> list[Box]:
+    """Boxes that cover the site, each with about ``max_points`` stored points at most.
 
     One box without borders when all points are fewer. Empty boxes are left out. Points are
     taken as spread evenly over each keyframe's rectangle.
     """
-    if sum(p.points for p in prints) <= most_points:
+    if sum(p.points for p in prints) <= max_points:
         return [EVERYWHERE]
     boxes = np.array([p.box for p in prints])
     low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
@@ -104,7 +104,7 @@ def tile_boxes(prints: Sequence[Footprint], most_points: int) -> list[Box]:
     for _ in range(12):
         tiles = list(_grid(low, high, side))
         held = [_points_in(prints, tile) for tile in tiles]
-        if max(held) <= most_points:
+        if max(held) <= max_points:
             break
         side /= 1.5
     return [tile for tile, points in zip(tiles, held, strict=True) if points > 0.0]
@@ -153,8 +153,8 @@ def mesh_tile(job: TileJob, progress: Callable[[str], None] = lambda _: None) ->
             return None
         if not len(mesh.faces):
             return None
-        progress(f"{len(mesh.faces)} triangles; reading pictures")
-        views = _pictures(job, keyframes, store.header, progress)
+        progress(f"{len(mesh.faces)} triangles; reading images")
+        views = _images(job, keyframes, store.header, progress)
     finally:
         store.close()
     done = texture(mesh, views, job.largest_texture_px, progress)
@@ -164,12 +164,12 @@ def mesh_tile(job: TileJob, progress: Callable[[str], None] = lambda _: None) ->
         "seen": round(done.seen_share, 4),
         "views": done.views_used,
         "charts": done.charts,
-        "texture_px": [done.picture.shape[1], done.picture.shape[0]],
+        "texture_px": [done.image.shape[1], done.image.shape[0]],
     }
-    return TilePart(done.mesh, done.picture, figures)
+    return TilePart(done.mesh, done.image, figures)
 
 
-def _pictures(
+def _images(
     job: TileJob,
     keyframes: Sequence[Keyframe],
     header: ScanHeader,
@@ -177,14 +177,14 @@ def _pictures(
 ) -> list[TextureView]:
     """The views of the job's video, else of the store."""
     if job.video is None:
-        return stored_pictures(keyframes)
+        return stored_images(keyframes)
     try:
-        return video_pictures(keyframes, header, Path(job.video), job.video_epoch_ns)
+        return video_images(keyframes, header, Path(job.video), job.video_epoch_ns)
     except SkyreliefError as error:
         if job.video_named:
             raise
-        progress(f"textures from the scan's own pictures after all: {error}")
-        return stored_pictures(keyframes)
+        progress(f"textures from the scan's own images after all: {error}")
+        return stored_images(keyframes)
 
 
 def _overlap(a: Iterable[float], b: Iterable[float]) -> bool:

@@ -13,8 +13,8 @@ import numpy as np
 from recon.surface.meshing import Mesh
 from recon.types import U8
 from service.errors import InputError
+from service.offline.exports.images import check_video, recording_of
 from service.offline.exports.mesh_tiles import TileJob, footprints, run_tiles, tile_boxes
-from service.offline.exports.pictures import check_video, recording_of
 from service.offline.exports.view import ExportOptions, ScanView
 from service.packages import needing
 from service.scans.writing import writing
@@ -105,7 +105,7 @@ def write_mesh(
     options.progress(f"writing {figures['faces']} triangles")
     with writing(out) as part:
         extras = _extras(scan) | figures | {"pictures": "store" if video is None else "video"}
-        part.write_bytes(glb([(p.mesh, p.picture) for p in parts], extras))
+        part.write_bytes(glb([(p.mesh, p.image) for p in parts], extras))
     return figures
 
 

@@ -93,9 +93,9 @@ def network_of(
     given = own_camera.camera_of(header)
     times = [s.time_ns for s in states] + [f.time_unix_ns for f in marked]
     poses = np.array([s.T_world_camera for s in states] + [f.T_world_camera for f in marked])
-    pictures = own_camera.pictures_at(video, header.started_unix_ns, times)
+    images = own_camera.images_at(video, header.started_unix_ns, times)
     ground_m = float(np.median((poses[:, :3, 3] + ahead_m * poses[:, :3, 2])[:, 2]))
-    _, seen, start = own_camera.sightings(pictures, given, poses, ground_m)
+    _, seen, start = own_camera.sightings(images, given, poses, ground_m)
     known = loosely_placed(poses, seen)
     held = camera_information(given, FREE)
     found = network(given, start, seen, known, held)

@@ -85,7 +85,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pictures:
+class ScanImages:
     """What marks need to know of the scan."""
 
     states: Sequence[KeyframeState]
@@ -100,7 +100,7 @@ class Pictures:
         return np.array([s.T_world_camera for s in self.states])
 
 
-def candidates_of(survey: Sequence[SurveyPoint], scan: Pictures, path: str) -> list[Candidate]:
+def candidates_of(survey: Sequence[SurveyPoint], scan: ScanImages, path: str) -> list[Candidate]:
     """The survey's points with their marks. Raises InputError, with the line, for bad marks."""
     out = []
     for number, point in enumerate(survey):
@@ -110,10 +110,10 @@ def candidates_of(survey: Sequence[SurveyPoint], scan: Pictures, path: str) -> l
             if seen.xyz_m is not None:
                 one.marks += _in_map(seen, number, scan, where)
             else:
-                one.marks.append(_in_picture(seen, number, scan, where))
+                one.marks.append(_in_image(seen, number, scan, where))
         found = map_position(scan.poses, np.ones(len(scan.states)), one.marks)
         if found is None:
-            one.why_not = "the map has no surface at its mark; mark it in a second picture"
+            one.why_not = "the map has no surface at its mark; mark it in a second image"
         else:
             one.before_m, one.sigma_before_m = found
         out.append(one)
@@ -123,7 +123,7 @@ def candidates_of(survey: Sequence[SurveyPoint], scan: Pictures, path: str) -> l
 # ---- marks -------------------------------------------------------------------------------------
 
 
-def _in_picture(seen: Sighting, number: int, scan: Pictures, where: str) -> Mark:
+def _in_image(seen: Sighting, number: int, scan: ScanImages, where: str) -> Mark:
     """A mark from pixels of the camera's own, distorted image."""
     assert seen.uv_px is not None
     camera = scan.camera
@@ -132,7 +132,7 @@ def _in_picture(seen: Sighting, number: int, scan: Pictures, where: str) -> Mark
     u, v = seen.uv_px
     if not (-0.5 <= u <= camera["width"] - 0.5 and -0.5 <= v <= camera["height"] - 0.5):
         raise InputError(
-            f"{where}: pixel {u:g}, {v:g} is outside the camera's picture of "
+            f"{where}: pixel {u:g}, {v:g} is outside the camera's image of "
             f"{camera['width']}x{camera['height']}"
         )
     K = np.array(camera["K"], np.float64).reshape(3, 3)
@@ -140,7 +140,7 @@ def _in_picture(seen: Sighting, number: int, scan: Pictures, where: str) -> Mark
     flat = cv2.undistortPoints(np.array([[[u, v]]]), K, distortion)[0, 0]
     ray = np.array([flat[0], flat[1], 1.0])
     sigma = MARK_PX / float(K[0, 0])
-    index, T = _picture(seen, scan, where)
+    index, T = _image(seen, scan, where)
     if not np.array_equal(T, np.eye(4)):
         return Mark(number, index, ray, sigma, T_key_camera=T)
     depth = _surface_at(scan.keyframe(scan.states[index]), ray)
@@ -149,7 +149,7 @@ def _in_picture(seen: Sighting, number: int, scan: Pictures, where: str) -> Mark
     return Mark(number, index, ray, sigma, depth[0], depth[1])
 
 
-def _picture(seen: Sighting, scan: Pictures, where: str) -> tuple[int, F64]:
+def _image(seen: Sighting, scan: ScanImages, where: str) -> tuple[int, F64]:
     """Which keyframe a mark hangs on, and the image's pose in its camera."""
     seqs = [s.seq for s in scan.states]
     if seen.keyframe_seq is not None:
@@ -166,7 +166,7 @@ def _picture(seen: Sighting, scan: Pictures, where: str) -> tuple[int, F64]:
     times = np.array([f.time_unix_ns for f in scan.frames])
     k = int(np.argmin(np.abs(times - time_ns))) if len(times) else -1
     if k < 0 or abs(int(times[k]) - time_ns) > 20_000_000:
-        raise InputError(f"{where}: no picture within 20 ms of time {seen.time_unix_s:.3f}")
+        raise InputError(f"{where}: no image within 20 ms of time {seen.time_unix_s:.3f}")
     T = se3.inverse(scan.states[nearest].T_world_camera) @ scan.frames[k].T_world_camera
     return nearest, T
 
@@ -192,7 +192,7 @@ def _surface_at(keyframe: Keyframe | None, ray: F64) -> tuple[float, float] | No
     return middle, float(np.sqrt(noise**2 + (0.5 * spread) ** 2 + (0.1 * pixel_m) ** 2))
 
 
-def _in_map(seen: Sighting, number: int, scan: Pictures, where: str) -> list[Mark]:
+def _in_map(seen: Sighting, number: int, scan: ScanImages, where: str) -> list[Mark]:
     """Marks in the keyframes whose surface holds a point of the unrefined cloud."""
     assert seen.xyz_m is not None
     place = np.array([seen.xyz_m])

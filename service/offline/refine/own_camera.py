@@ -76,7 +76,7 @@ def camera_of(header: ScanHeader) -> Camera:
     return Camera(K, np.array(c["distortion"], np.float64), size)
 
 
-def pictures_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dict[int, U8]:
+def images_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dict[int, U8]:
     """Gray images by the position of the moment in ``times_ns`` they show.
 
     ``video`` is a recording or a folder of stills.
@@ -92,34 +92,34 @@ def pictures_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dic
                 found[k] = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
     if len(found) < max(3, MIN_SHARE * len(wanted)):
         raise InputError(
-            f"{video}: holds pictures of {len(found)} of {len(wanted)} keyframes; give the video "
+            f"{video}: holds images of {len(found)} of {len(wanted)} keyframes; give the video "
             "that the scan was made of"
         )
     return found
 
 
 def sightings(
-    pictures: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float
+    images: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float
 ) -> tuple[F64, Sightings, F64]:
     """(P, 3) landmarks, where they are seen in the distorted images, and (N, 4, 4) poses that
     agree with them.
 
-    ``pictures`` by view, with ``poses`` (N, 4, 4) of all views; the ground lies about
+    ``images`` by view, with ``poses`` (N, 4, 4) of all views; the ground lies about
     ``ground_m`` up in the world. Images whose ground overlaps are compared, and of few
     images all that look alike. Raises InputError when nothing ties them together.
     """
-    images = {k: image_of(gray, camera) for k, gray in pictures.items()}
-    views = sorted(images)
+    features = {k: image_of(gray, camera) for k, gray in images.items()}
+    views = sorted(features)
     overlap = _overlapping(views, camera, poses, ground_m)
     pairs = {(min(a, b), max(a, b)) for a, others in overlap.items() for b in others}
     if len(views) <= EXHAUSTIVE:
         some = [pair for pair in combinations(views, 2) if pair not in pairs]
-        pairs |= {(a, b) for a, b in some if are_alike(images[a], images[b])}
-    seen = joined(images, sorted(pairs), camera)
+        pairs |= {(a, b) for a, b in some if are_alike(features[a], features[b])}
+    seen = joined(features, sorted(pairs), camera)
     if len(seen.view) == 0:
-        raise InputError("no place was found again in another picture; is this the video?")
+        raise InputError("no place was found again in another image; is this the video?")
     flat = Undistorter(camera)
-    stack = lru_cache(maxsize=64)(lambda k: matching.Pyramid.build(flat.image(pictures[k])))
+    stack = lru_cache(maxsize=64)(lambda k: matching.Pyramid.build(flat.image(images[k])))
     seen = sharpened(stack, camera, seen)
     known = loosely_placed(poses, seen)
     try:
@@ -169,18 +169,18 @@ def _on_ground(T: F64, ways: F64, ground_m: float) -> F64:
 
 
 def found_camera(
-    pictures: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float, fixes: F64,
+    images: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float, fixes: F64,
     sigma_fixes: F64,
 ) -> SelfCalibrated:  # fmt: skip
     """The camera as the flight tells it; InputError, in one line, when it does not."""
-    landmarks, seen, poses = sightings(pictures, camera, poses, ground_m)
+    landmarks, seen, poses = sightings(images, camera, poses, ground_m)
     try:
         found = self_calibrate(camera, poses, landmarks, seen, fixes, sigma_fixes)
     except ValueError as error:
         raise InputError(f"--intrinsics: {error}") from error
     except (RuntimeError, np.linalg.LinAlgError) as error:  # an ill-posed problem
         raise InputError(
-            "--intrinsics: too few corners tie the pictures together; nothing was changed"
+            "--intrinsics: too few corners tie the images together; nothing was changed"
         ) from error
     if found.why_not:
         raise InputError(f"--intrinsics: {found.why_not}; nothing was changed")

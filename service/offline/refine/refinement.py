@@ -51,7 +51,7 @@ from service.offline.refine.by_images import (
 )
 from service.offline.refine.control_points import (
     Candidate,
-    Pictures,
+    ScanImages,
     candidates_of,
     clustered,
     place_by_survey,
@@ -194,11 +194,11 @@ class _Refinement:
         places_m = np.array([s.T_world_camera[:3, 3] for s in self.states])
         if self.options.video is not None:
             self._match_again(self.options.video, survey)
-        pictures = Pictures(self.states, self.frames, self.header.camera, self.keyframe, self.frame)
-        candidates = candidates_of(survey, pictures, str(self.options.gcp))
+        images = ScanImages(self.states, self.frames, self.header.camera, self.keyframe, self.frame)
+        candidates = candidates_of(survey, images, str(self.options.gcp))
         if self.images is not None:
             for one in candidates:
-                crossing_marks(one, pictures.poses)
+                crossing_marks(one, images.poses)
         if self.frame is None and candidates:
             self._place(candidates)
         if self.frame is not None:
@@ -232,11 +232,11 @@ class _Refinement:
         """The camera by the flight's own images, and the one that it was flown with."""
         track, given = self._track(), own_camera.camera_of(self.header)
         times = [s.time_ns for s in self.states]
-        pictures = own_camera.pictures_at(video, self.header.started_unix_ns, times)
+        images = own_camera.images_at(video, self.header.started_unix_ns, times)
         ahead = track.poses[:, :3, 2] * self._ahead_m()
         ground_m = float(np.median(track.poses[:, 2, 3] + ahead[:, 2]))
         fixes, sigma = fixes_of(track)
-        found = own_camera.found_camera(pictures, given, track.poses, ground_m, fixes, sigma)
+        found = own_camera.found_camera(images, given, track.poses, ground_m, fixes, sigma)
         return found, given
 
     # ---- what goes in ------------------------------------------------------------------------

@@ -52,7 +52,7 @@ class StoredLoops:
         """All pairs far apart in time that see the same place, verified."""
         tree = cKDTree(self._track.poses[:, :2, 3])
         out = []
-        for b in range(self._config.least_gap, len(self._track.poses)):
+        for b in range(self._config.min_gap, len(self._track.poses)):
             likely = self._likely(b, tree)
             found = 0
             for a in likely[:TRIES]:
@@ -71,13 +71,13 @@ class StoredLoops:
             return []
         depth_m = float(np.nanmedian(own.depth.depth_m))
         near = tree.query_ball_point(poses[b, :2, 3], 2.0 * depth_m)
-        earlier = sorted(a for a in near if a <= b - self._config.least_gap)
+        earlier = sorted(a for a in near if a <= b - self._config.min_gap)
         view = self._view(b, NEIGHBOURS) if earlier else None
         if view is None:
             return []
         h, w = view.depth.depth_m.shape
         some = {a: poses[a] for a in (*earlier, b)}
-        options = LoopConfig(least_gap=1, least_overlap=self._config.least_overlap)
+        options = LoopConfig(min_gap=1, min_overlap=self._config.min_overlap)
         ground = ground_seen(view.depth)
         return [a for a, _ in candidates(some, b, view.K, (w, h), ground, options)]
 
@@ -107,8 +107,8 @@ class StoredLoops:
         beside = range(max(k - reach, 0), min(k + reach, last) + 1)
         others = [self._at(j) for j in beside if j != k and self._breaks[j] == self._breaks[k]]
         whole = filled(own, [one for one in others if one is not None])
-        grey = np.asarray(cv2.cvtColor(whole.bgr, cv2.COLOR_BGR2GRAY), np.uint8)
-        return LoopView(grey, whole.depth.K, whole.depth)
+        gray = np.asarray(cv2.cvtColor(whole.bgr, cv2.COLOR_BGR2GRAY), np.uint8)
+        return LoopView(gray, whole.depth.K, whole.depth)
 
     def _at(self, k: int) -> Keyframe | None:
         """A keyframe with any surface."""

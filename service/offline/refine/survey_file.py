@@ -19,10 +19,10 @@ from service.small_file import read_small
 
 PLACE = ("lat", "lon")
 HEIGHT = "alt_amsl_m"
-PICTURE = ("u_px", "v_px")
+IMAGE = ("u_px", "v_px")
 MAP = ("x", "y", "z")
 COLUMNS = (
-    "name", "keyframe_seq", "time", *PICTURE, *MAP, *PLACE, HEIGHT, "sigma_h_m", "sigma_v_m",
+    "name", "keyframe_seq", "time", *IMAGE, *MAP, *PLACE, HEIGHT, "sigma_h_m", "sigma_v_m",
     "role",
 )  # fmt: skip
 ROLES = ("control", "check")
@@ -122,7 +122,7 @@ def _check_header(path: Path, header: list[str]) -> None:
             f"{path} line 1: column {missing[0]} is missing; name, {', '.join(PLACE)} and either "
             "u_px,v_px with keyframe_seq or time, or x,y,z are needed"
         )
-    if not (set(PICTURE) <= set(header) or set(MAP) <= set(header)):
+    if not (set(IMAGE) <= set(header) or set(MAP) <= set(header)):
         raise InputError(f"{path} line 1: neither u_px,v_px nor x,y,z; where are the points seen?")
 
 
@@ -153,15 +153,15 @@ def _point(path: Path, line: int, row: Mapping[str, str]) -> SurveyPoint:
 
 def _sighting(where: str, line: int, row: Mapping[str, str]) -> Sighting:
     in_map = [key for key in MAP if key in row]
-    in_picture = [key for key in (*PICTURE, "keyframe_seq", "time") if key in row]
-    if in_map and in_picture:
-        raise InputError(f"{where}: give {in_picture[0]} or {in_map[0]}, not both in one row")
+    in_image = [key for key in (*IMAGE, "keyframe_seq", "time") if key in row]
+    if in_map and in_image:
+        raise InputError(f"{where}: give {in_image[0]} or {in_map[0]}, not both in one row")
     if in_map:
         x, y, z = (_number(where, row, key) for key in MAP)
         return Sighting(line, xyz_m=(x, y, z))
-    u, v = (_number(where, row, key) for key in PICTURE)
+    u, v = (_number(where, row, key) for key in IMAGE)
     if ("keyframe_seq" in row) == ("time" in row):
-        raise InputError(f"{where}: give either keyframe_seq or time (unix seconds) of the picture")
+        raise InputError(f"{where}: give either keyframe_seq or time (unix seconds) of the image")
     if "time" in row:
         return Sighting(line, time_unix_s=_number(where, row, "time"), uv_px=(u, v))
     seq = _number(where, row, "keyframe_seq")

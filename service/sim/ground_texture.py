@@ -46,7 +46,7 @@ PAINT = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Picture:
+class GroundTexture:
     """The view from straight above, as a pyramid of ever coarser levels in one array."""
 
     bgr: U8  # (total texels, 3), level after level, rows from south to north
@@ -63,7 +63,7 @@ def sun_direction() -> F64:
     return np.array([np.cos(e) * np.sin(a), np.cos(e) * np.cos(a), np.sin(e)])
 
 
-def make(scene: Scene, texel_m: float, mosaic: U8 | None = None) -> Picture:
+def make(scene: Scene, texel_m: float, mosaic: U8 | None = None) -> GroundTexture:
     """The image of ``scene``; ``mosaic`` (H, W, 3), of any size, replaces the drawn ground."""
     sun = sun_direction()
     size = tuple(max(4, int(np.ceil(s / texel_m))) for s in scene.area.size_m)
@@ -78,7 +78,7 @@ def make(scene: Scene, texel_m: float, mosaic: U8 | None = None) -> Picture:
         scene.area.x0, scene.area.y0, texel_m, scene.terrain.step_m, sun, scene.seed,
     )  # fmt: skip
     flat, levels = _pyramid(out)
-    return Picture(flat, levels, scene.area.x0, scene.area.y0, texel_m, sun)
+    return GroundTexture(flat, levels, scene.area.x0, scene.area.y0, texel_m, sun)
 
 
 def _fit(mosaic: U8, size: tuple[int, ...]) -> U8:

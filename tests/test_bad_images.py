@@ -51,8 +51,8 @@ def photograph(ground: U8, i: int) -> U8:
     t = np.array([STEP_M * i + 60.0, 60.0, HEIGHT_M])
     plane = np.diag([M_PER_PX, M_PER_PX, 1.0])
     H = K @ R.T @ (np.c_[np.eye(3)[:, :2], -t] @ plane)
-    grey = cv2.warpPerspective(ground, H, CAMERA.size_px, flags=cv2.INTER_AREA)
-    return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), np.uint8)
+    gray = cv2.warpPerspective(ground, H, CAMERA.size_px, flags=cv2.INTER_AREA)
+    return np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR), np.uint8)
 
 
 def state(i: int) -> VehicleState:
@@ -61,13 +61,13 @@ def state(i: int) -> VehicleState:
     return VehicleState(time_ns=i * 40_000_000, q_ned_body_wxyz=level, alt_agl_m=HEIGHT_M)
 
 
-def fly(pictures: list[U8]) -> tuple[list[Keyframe], Counter[str], Pipeline]:
+def fly(images: list[U8]) -> tuple[list[Keyframe], Counter[str], Pipeline]:
     config = load_config(None, ["scan.assumed_agl_m=60", "compute.upsample=false"])
     pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu")))
     rig = Rig(config.camera, config.scan, config.fusion)
     keyframes: list[Keyframe] = []
-    for i, picture in enumerate(pictures):
-        frame = Frame(picture, i * 40_000_000, i, rig.prior(state(i), None))
+    for i, image in enumerate(images):
+        frame = Frame(image, i * 40_000_000, i, rig.prior(state(i), None))
         keyframes += pipeline.step(frame).keyframes
     keyframes += pipeline.finish().keyframes
     return keyframes, pipeline.refusals(), pipeline
@@ -91,22 +91,22 @@ def clean() -> list[U8]:
     return [photograph(ground, i) for i in range(FRAMES)]
 
 
-def half_green(picture: U8) -> U8:
-    out: U8 = picture.copy()
-    out[picture.shape[0] // 2 :] = (0, 255, 0)
+def half_green(image: U8) -> U8:
+    out: U8 = image.copy()
+    out[image.shape[0] // 2 :] = (0, 255, 0)
     return out
 
 
-def over_exposed(picture: U8) -> U8:
-    return np.full(picture.shape, 255, np.uint8)
+def over_exposed(image: U8) -> U8:
+    return np.full(image.shape, 255, np.uint8)
 
 
-def smeared(picture: U8) -> U8:
-    return np.asarray(cv2.filter2D(picture, -1, np.full((1, 21), 1 / 21.0)), np.uint8)
+def smeared(image: U8) -> U8:
+    return np.asarray(cv2.filter2D(image, -1, np.full((1, 21), 1 / 21.0)), np.uint8)
 
 
-def dark(picture: U8) -> U8:
-    return np.asarray(picture * 0.35, np.uint8)
+def dark(image: U8) -> U8:
+    return np.asarray(image * 0.35, np.uint8)
 
 
 def test_the_clean_flight_gives_the_plane(clean: list[U8]) -> None:
@@ -118,8 +118,8 @@ def test_the_clean_flight_gives_the_plane(clean: list[U8]) -> None:
 
 @pytest.mark.parametrize("spoil", [half_green, over_exposed, smeared, dark])
 def test_spoiled_frames_make_no_false_surface(clean: list[U8], spoil: Callable[[U8], U8]) -> None:
-    pictures = [spoil(p) if 25 <= i < 29 else p for i, p in enumerate(clean)]
-    keyframes, reasons, pipeline = fly(pictures)
+    images = [spoil(p) if 25 <= i < 29 else p for i, p in enumerate(clean)]
+    keyframes, reasons, pipeline = fly(images)
     assert len(keyframes) >= 4 and pipeline.segments == 1
     assert all(off_the_plane(k) < 0.01 for k in keyframes)
     if spoil is over_exposed:
@@ -144,8 +144,8 @@ def test_water_that_never_looks_the_same_gives_nothing() -> None:
     waves = []
     for _ in range(30):
         coarse = rng.normal(0, 1, (40, 70)).astype(np.float32)
-        grey = np.clip(120 + 40 * cv2.resize(coarse, CAMERA.size_px), 0, 255).astype(np.uint8)
-        waves.append(np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), np.uint8))
+        gray = np.clip(120 + 40 * cv2.resize(coarse, CAMERA.size_px), 0, 255).astype(np.uint8)
+        waves.append(np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR), np.uint8))
     keyframes, reasons, _ = fly(waves)
     assert not keyframes and sum(reasons.values()) > 20, reasons
 
@@ -158,13 +158,13 @@ def test_telemetry_goes_on_where_vision_was_lost(clean: list[U8]) -> None:
     metre_east = 1.0 / (111_319.49 * np.cos(np.radians(47.0)))
     seen: list[tuple[int, F64]] = []
     lost: list[tuple[int, F64]] = []
-    for i, picture in enumerate([*clean[:40], *[over_exposed(clean[0])] * 16]):
+    for i, image in enumerate([*clean[:40], *[over_exposed(clean[0])] * 16]):
         off_m = 3.0 if i >= 36 else 0.0
         told = replace(
             state(i), lat_deg=47.0, lon_deg=8.0 + (STEP_M * i + off_m) * metre_east,
             alt_amsl_m=500.0 + HEIGHT_M, sigma_h_m=1.0, sigma_v_m=1.5, sigma_yaw_rad=0.03,
         )  # fmt: skip
-        step = pipeline.step(Frame(picture, i * 40_000_000, i, rig.prior(told, None)))
+        step = pipeline.step(Frame(image, i * 40_000_000, i, rig.prior(told, None)))
         if step.placed is not None:
             kept = seen if step.anchor is not None else lost
             kept.append((i, step.placed.T_world_camera[:3, 3]))

@@ -25,7 +25,7 @@ MAX_BYTES = 1_500_000_000
 SAME_TIME_NS = 5_000_000
 
 
-def stored_pictures(keyframes: Sequence[Keyframe]) -> list[TextureView]:
+def stored_images(keyframes: Sequence[Keyframe]) -> list[TextureView]:
     """A view per keyframe from the store: where it holds depth, at the depth's resolution."""
     return [
         TextureView(
@@ -51,7 +51,7 @@ def recording_of(folder: Path, header: ScanHeader) -> Recording:
     ``scan.json`` names it (``run.source``). A relative path is looked for from here, from the
     scan folder and from the folder that holds it. Never raises.
     """
-    stored = "textures from the scan's own pictures, at the depth's resolution"
+    stored = "textures from the scan's own images, at the depth's resolution"
     try:
         named = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["run"]["source"]
         path = Path(named)
@@ -85,13 +85,13 @@ def _opened(header: ScanHeader, video: Path) -> CameraSource:
     if source.size_px != camera.size_px:
         source.close()
         raise InputError(
-            f"{video}: {source.size_px[0]}x{source.size_px[1]} pictures, but the scan's camera "
+            f"{video}: {source.size_px[0]}x{source.size_px[1]} images, but the scan's camera "
             f"is {camera.size_px[0]}x{camera.size_px[1]}; give the video that was flown"
         )
     return source
 
 
-def video_pictures(
+def video_images(
     keyframes: Sequence[Keyframe], header: ScanHeader, video: Path, epoch_ns: int | None
 ) -> list[TextureView]:
     """A view per keyframe from the frame of ``video`` (file or folder) taken at its time.
@@ -111,9 +111,9 @@ def video_pictures(
             time_ns = start + frame.time_ns
             nearest = int(np.abs(times - time_ns).argmin())
             if abs(int(times[nearest]) - time_ns) <= SAME_TIME_NS:
-                picture = np.dstack([undistort.image(frame.image), undistort.valid])
+                image = np.dstack([undistort.image(frame.image), undistort.valid])
                 pose = keyframes[nearest].depth.T_world_camera
-                found[nearest] = _view(picture, camera, pose, shrink)
+                found[nearest] = _view(image, camera, pose, shrink)
             if time_ns > times.max() + SAME_TIME_NS:
                 break
     finally:
@@ -123,7 +123,7 @@ def video_pictures(
             f"{video}: no frame was taken at the time of a keyframe; give the --video-epoch "
             "that the scan was made with"
         )
-    rest = stored_pictures(keyframes)
+    rest = stored_images(keyframes)
     return [found.get(n, rest[n]) for n in range(len(keyframes))]
 
 
