@@ -64,7 +64,7 @@ BLUR_WINDOW, MIN_KNOWN = 31, 5
 
 
 class BlurWatch:
-    """Tells blurred images from the usual ones of a recording."""
+    """Detects images that are blurred compared with the others of a recording."""
 
     def __init__(self) -> None:
         self._values: deque[float] = deque(maxlen=BLUR_WINDOW)

@@ -134,7 +134,7 @@ class RowTrack:
         self._refresh(frame)
 
     def add(self, frame: FrameRows, T_camera_odom: F64) -> None:
-        """Keep the frame with its final pose; it tells how those before it moved."""
+        """Keep the frame with its final pose; it gives the motion of those before it."""
         if self._clock is None:
             return
         self.place(frame, T_camera_odom)

@@ -67,7 +67,7 @@ class PosePrior:
     altitude_m: float | None = None  # world z up to a constant, as a barometer gives it
     sigma_altitude_m: float = 1.0
     fix_offset: F64 | None = None  # (3,) from the camera to where position_m was, in its frame, in
-    # units of the odometry: the mean of several fixes lies beside the track
+    # units of the odometry: the mean of several fixes lies off the track
     above_m: float | None = None  # altitude by the GNSS receiver alone less position_m's
     above_fixes: int = 0  # whose mean that is
     above_ns: int = 0  # time of the newest of them
@@ -140,7 +140,7 @@ class PolarPair:
     first_row_rad: float
     plane: F64  # (3,) n with n . X = 1 on the ground, in the polar axes of the left camera, 1/m
     first_label: float  # columns from the plane to label 0
-    relief: tuple[float, float]  # of what is believed: shares of the distance nearer than the plane
+    relief: tuple[float, float]  # of what is accepted: shares of the distance nearer than the plane
     R_left_keyframe: F64  # (3, 3) keyframe camera to polar axes
     guide: U8 | None = None  # (H, W, 3) left in colour, at guidance resolution
     left_seen: Bool | None = None  # (h, w) False where the left view has nothing

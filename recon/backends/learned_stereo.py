@@ -20,7 +20,7 @@ from recon.types import F32, U8, DisparityMap
 
 @dataclass(frozen=True, slots=True)
 class LearnedStereoConfig:
-    """How the model is fed; the file beside it says so."""
+    """How the model is fed; described by the JSON file next to it."""
 
     height: int  # px of the images that it takes
     width: int

@@ -117,7 +117,7 @@ def provider_options(
 ) -> list[tuple[str, dict[str, Any]]]:
     """The providers with their options: TensorRT keeps its engines, the others need none.
 
-    Each model has a folder of its own, named by its digest: TensorRT tells engines apart by the
+    Each model has a folder of its own, named by its digest: TensorRT distinguishes engines by the
     names in a model, which ours share whatever numbers they hold. ``engines`` must exist;
     TensorRT makes the folders in it.
     """

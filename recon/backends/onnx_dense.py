@@ -253,8 +253,8 @@ def _select(
     last = pair.labels - 1.0
     winner = graph.op("ArgMin", belief, axis=0, keepdims=1)
     best = winner.numbers()
-    beside = (best * -1.0 + graph.constant(index)).abs().less(1.5)
-    second = graph.where(beside, FAR, belief).min(0)
+    adjacent = (best * -1.0 + graph.constant(index)).abs().less(1.5)
+    second = graph.where(adjacent, FAR, belief).min(0)
     area = (2 * RADIUS + 1) ** 2
     pooled = graph.op(
         "AveragePool", graph.op("Unsqueeze", cost, _AXIS_0), kernel_shape=[2 * RADIUS + 1] * 2,
@@ -278,17 +278,17 @@ def _select(
     px = best + graph.where(graph.op("Or", edge, steep.less(0.5)), 0.0, offset)
     evidence = (mean - here) / (mean + area * NOISE)
     margin = (second - belief.min(0)) / (2.0 * config.truncation)
-    believed = margin.above(0.0)
+    accepted = margin.above(0.0)
     if config.min_evidence > 0:
         doubtful = evidence.less(config.min_evidence)
-        believed = graph.op("And", believed, graph.op("Not", doubtful))
+        accepted = graph.op("And", accepted, graph.op("Not", doubtful))
     sure = (evidence.at_least(0.01) / SURE_EVIDENCE).at_most(1.0)
     column = np.arange(w, dtype=np.float32)[None, None, :] - config.min_disparity
     there = best * -1.0 + column
     outside = graph.op("Or", there.less(-0.5), there.above(pair.w - 0.5))
     outside = graph.op("Or", outside, pair.inside(size).less(0.5))
-    believed = graph.op("And", believed, graph.op("Not", outside))
-    confidence = graph.where(believed, margin.at_most(1.0) * sure, 0.0)
+    accepted = graph.op("And", accepted, graph.op("Not", outside))
+    confidence = graph.where(accepted, margin.at_most(1.0) * sure, 0.0)
     px = graph.where(outside, math.nan, px)
     return graph.op("Squeeze", px, _AXIS_0), graph.op("Squeeze", confidence, _AXIS_0)
 

@@ -1,7 +1,7 @@
 """Sizes of arrays that hold the pairs of a flight, so that few shapes occur.
 
 Rectified pairs differ by a few pixels and labels from each other. A backend that builds
-something for each shape (a CUDA graph, an ONNX session, a TensorRT engine) would build anew for
+something for each shape (a CUDA graph, an ONNX session, a TensorRT engine) would build it again for
 almost every pair; here sizes are rounded up, and the true ones go along as numbers.
 """
 

@@ -1,6 +1,6 @@
 """Rectified pairs to the fused depth of a keyframe without leaving the device.
 
-Each pair goes up once, in one copy from pinned memory that nobody waits for; cost, belief
+Each pair goes up once, in one copy from pinned memory that no thread waits for; cost, belief
 propagation, visibility, upsampling, reprojection and fusion follow on the device, on CUDA as
 one graph a pair; the fused depth comes down once, and that is the only wait.
 """

@@ -64,8 +64,8 @@ class DeviceIcp:
                 lambda: Plan(self.device, _descent(config), [part(a) for a in given]),
             )  # fmt: skip
             plan.upload(given)
-            told = plan.run()[0].cpu().numpy()
-        return _concluded(told, start, config)
+            rows = plan.run()[0].cpu().numpy()
+        return _concluded(rows, start, config)
 
     def plan(self) -> Plan:
         """Of the last new pair of sizes, with its inputs on the device."""
@@ -122,13 +122,13 @@ def descend(
     return T, state, seen
 
 
-def _concluded(told: F64, start: F64, config: IcpConfig) -> Registration:
+def _concluded(rows: F64, start: F64, config: IcpConfig) -> Registration:
     """The registration from the numbers that came down."""
     ends = np.cumsum([36, 36, 6, 4, 1, 3, 1, 1, 1, 1, 16])
     H, common, g, sums, scale, centre, lever, partners, available, done, T, lags = np.split(
-        told, ends
+        rows, ends
     )
-    if not np.isfinite(told[: ends[-1]]).all():  # a start from which nothing can be computed
+    if not np.isfinite(rows[: ends[-1]]).all():  # a start from which nothing can be computed
         partners = np.zeros(1)
     equations = Equations(
         H.reshape(6, 6), common.reshape(6, 6), g, sums, float(scale[0]), centre, float(lever[0]),

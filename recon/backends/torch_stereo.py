@@ -1,4 +1,4 @@
-"""Stereo in torch: matching cost, belief propagation (Eq. 1), winner, and whether to believe it.
+"""Stereo in torch: matching cost, belief propagation (Eq. 1), winner, and its checks.
 
 Written in plain operations on fixed shapes, so that it runs on any device and is captured as
 one CUDA graph. The pairs of a flight differ by a few pixels and labels from each other: arrays
@@ -55,7 +55,7 @@ class DenseStereo(torch.nn.Module):
         self.messages = torch.int16 if short else torch.float32
 
     def forward(self, left: Tensor, right: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
-        """Labels, NaN where the partner is outside the right image; confidence, 0: not believed.
+        """Labels, NaN where the partner is outside the right image; confidence, 0: rejected.
 
         ``true`` (3,) is height, width and labels of the pair; beyond them the images repeat
         their last row and column, and the results mean nothing.
@@ -209,8 +209,8 @@ def select(
     ours = index < true[2]
     belief = torch.where(ours, belief, _beyond(belief))
     low, best = belief.min(0)
-    beside = (index - best).abs() <= 1
-    second = torch.where(beside | ~ours, FAR, belief.float()).amin(0)
+    adjacent = (index - best).abs() <= 1
+    second = torch.where(adjacent | ~ours, FAR, belief.float()).amin(0)
     area = (2 * RADIUS + 1) ** 2
     box = torch.round(F.avg_pool2d(cost[None], 2 * RADIUS + 1, 1, RADIUS)[0] * area)
     partner = column - index - config.min_disparity
@@ -225,13 +225,13 @@ def select(
     px = best.float() + torch.where(inner, offset, torch.zeros_like(offset))
     evidence = (mean - here) / (mean + area * NOISE)
     margin = (second - low) / (2.0 * config.truncation)
-    believed = margin > 0
+    accepted = margin > 0
     if config.min_evidence > 0:
-        believed = believed & (evidence >= config.min_evidence)
+        accepted = accepted & (evidence >= config.min_evidence)
     sure = (evidence.clamp(min=0.01) / SURE_EVIDENCE).clamp(max=1)
     there = column[0] - best - config.min_disparity
     sees = (there >= 0) & (there < true[1]) & inside(best.shape, true)
-    confidence = torch.where(believed & sees, margin.clamp(max=1) * sure, 0.0)
+    confidence = torch.where(accepted & sees, margin.clamp(max=1) * sure, 0.0)
     return torch.where(sees, px, math.nan), confidence
 
 
@@ -324,7 +324,7 @@ def _contrast(image: Tensor) -> Tensor:
 def _hidden(
     px: Tensor, confidence: Tensor, true: Tensor, config: BeliefPropagationConfig
 ) -> Tensor:
-    """True where the right view would see a nearer, believed surface."""
+    """True where the right view would see a nearer, accepted surface."""
     w = px.shape[1]
     known = px == px
     label = torch.where(known, px, 0.0)
@@ -332,8 +332,8 @@ def _hidden(
     partner = column - torch.floor(label + 0.5).long() - config.min_disparity
     sees = known & (partner >= 0) & (partner < true[1])
     partner = partner.clamp(0, w - 1)
-    told = torch.where(sees & (confidence > 0), label, -math.inf)
-    nearest = torch.full_like(px, -math.inf).scatter_reduce(1, partner, told, "amax")
+    known = torch.where(sees & (confidence > 0), label, -math.inf)
+    nearest = torch.full_like(px, -math.inf).scatter_reduce(1, partner, known, "amax")
     return sees & (nearest.gather(1, partner) > label + config.occlusion_tolerance)
 
 

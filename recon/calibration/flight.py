@@ -1,8 +1,8 @@
 """The camera's focal length, centre and distortion from a flight itself, by bundle adjustment.
 
-Poses, landmarks and one shared camera are adjusted at once. What the flight's geometry tells of
-the camera is in the covariance: seen straight down from one height, a longer focal length looks
-like a greater height.
+Poses, landmarks and one shared camera are adjusted at once. The covariance shows how well the
+flight's geometry determines the camera: seen straight down from one height, a longer focal length
+looks like a greater height.
 
 Tangential terms (Brown, Decentering Distortion of Lenses, 1966) are found with the others: a lens
 off its axis tilts the surface of each view its own way, and views of the same ground that are
@@ -41,8 +41,8 @@ class SelfCalibrationConfig:
     sigma_centre: float = 0.015  # of the centre, as a share of the width
     sigma_k: float = 0.1  # of k1 and of k2
     sigma_p: float = 0.005  # of p1 and of p2
-    max_sigma_focal: float = 0.003  # a focal length less sure than this is not told
-    max_sigmas: float = 3.0  # from the model given; a camera further off is not believed
+    max_sigma_focal: float = 0.003  # a less certain focal length is refused
+    max_sigmas: float = 3.0  # from the model given; a camera further off is refused
     pixel_sigma: float = 0.5
     huber_sigmas: float = 1.5
     gate_sigmas: float = 6.0  # sightings further off after the first round are left out
@@ -59,7 +59,7 @@ class SelfCalibrationConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SelfCalibrated:
-    """What the flight tells of its camera."""
+    """The camera estimated from a flight, and how well it is determined."""
 
     camera: Camera
     sigma_focal: float  # as a share
@@ -69,7 +69,7 @@ class SelfCalibrated:
     rms_after_px: float
     errors_px: F64  # (M,) lengths, of the sightings that took part
     poses: F64  # (N, 4, 4) T_world_camera
-    why_not: str  # empty when the camera may be believed
+    why_not: str  # empty when the camera is accepted
 
 
 def self_calibrate(
@@ -213,10 +213,10 @@ def shared(seen: Sightings, kept: Bool) -> Sightings:
 
 
 def doubt(found: Camera, given: Camera, sigma_focal: float, c: SelfCalibrationConfig) -> str:
-    """Why a camera is not to be believed; empty when it is."""
+    """Return why the camera is refused; empty when it is accepted."""
     if sigma_focal > c.max_sigma_focal:
         return (
-            f"the flight cannot tell the focal length (to {100 * sigma_focal:.1f} %, asked "
+            f"the flight does not determine the focal length (to {100 * sigma_focal:.1f} %, asked "
             f"{100 * c.max_sigma_focal:.1f} %): seen straight down from one height it looks "
             "like another height; fly two heights or an oblique turn"
         )

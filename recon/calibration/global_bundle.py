@@ -38,7 +38,7 @@ class Sightings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Knowledge:
-    """What is known of N poses and P points beside their pixels; NaN where nothing is."""
+    """Prior knowledge about N poses and P points, besides their pixels; NaN where there is none."""
 
     fixes: F64  # (N, 3) measured places of the cameras, m, world
     sigma_fixes: F64  # (N, 3)

@@ -26,7 +26,7 @@ WIDTH_PX, FEATURES = 1920, 2500
 """Of the image that features are found on, and how many of them are kept."""
 
 LIKELY, MIN_ALIKE = 600, 10
-"""So many of the strongest features tell whether two images are alike, by so many matches."""
+"""Number of strongest features compared, and of matches needed, for two images to be alike."""
 
 THRESHOLD_PX = 2.0
 """Distance to the epipolar line, at most."""
@@ -239,11 +239,11 @@ def _on_level_ground(camera: Camera, T_a: F64, T_b: F64, uv: F64, spots: F64) ->
     (N, 2, 2): what a step in a is in b on level ground through them."""
     T = se3.inverse(T_b)
     predicted = project(camera.K, se3.transform(T, spots))
-    beside = []
+    steps = []
     for axis in range(2):
         ways = rays(camera.K, uv + 8.0 * np.eye(2)[axis]) @ T_a[:3, :3].T
         far = (spots[:, 2] - T_a[2, 3]) / np.where(np.abs(ways[:, 2]) > 0.1, ways[:, 2], np.nan)
         there = se3.transform(T, T_a[:3, 3] + ways * far[:, None])
-        beside.append((project(camera.K, there) - predicted) / 8.0)
-    warp = np.nan_to_num(np.stack(beside, axis=2))
+        steps.append((project(camera.K, there) - predicted) / 8.0)
+    warp = np.nan_to_num(np.stack(steps, axis=2))
     return np.nan_to_num(predicted, nan=-1e6), warp

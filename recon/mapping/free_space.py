@@ -25,7 +25,7 @@ PLACES = 2048
 """In a tile, about."""
 
 SAMPLED = 100_000
-"""Places that tell how large a tile is."""
+"""Number of places that the size of a tile is estimated from."""
 
 HALF = 1 << 15
 """Rows and columns of tiles to either side; what lies farther off shares the last."""

@@ -216,7 +216,7 @@ def register_projective(
     The maps' own poses are not used. Directions that the surface does not determine (on flat
     ground: both horizontal shifts and the turn about the vertical) keep the start, get
     ``unknown_sigma_m`` in the covariance and make the verdict "degenerate". "rejected": too
-    little overlap, residuals too large, or a correction too large to be believed.
+    little overlap, residuals too large, or a correction too large to be plausible.
     """
     config = config or IcpConfig()
     return register_surfaces(

@@ -475,7 +475,7 @@ def _starts(anchors: Sequence[Anchor], readings: _Readings) -> list[tuple[F64, F
     """Rotation, shift and log scale to begin with: by the attitude, and by the track.
 
     The second matters when the compass is far off or there is none: then only the track of
-    the fixes tells the heading.
+    the fixes determines the heading.
     """
     R = np.eye(3)
     for a in anchors:

@@ -45,7 +45,7 @@ class FixAverage:
             self._above[prior.above_ns] = prior.above_m
 
     def given(self, T_odom_camera: F64, prior: PosePrior) -> PosePrior:
-        """The prior of a keyframe with all that was taken since the last one; begins anew."""
+        """The prior of a keyframe with all that was taken since the last one, and start again."""
         out = prior
         if len(self._fixes) > 1 and prior.position_m is not None:
             place = se3.transform(se3.inverse(T_odom_camera), np.mean(self._places, axis=0)[None])
@@ -62,7 +62,7 @@ class FixAverage:
         return out
 
     def forget(self) -> None:
-        """Begin anew, as when the track broke."""
+        """Start again, as after a break of the track."""
         self._places.clear()
         self._fixes.clear()
         self._above.clear()

@@ -2,7 +2,7 @@
 
 Vision turns with the camera, telemetry with the gimbal or the body. Between flights' headings
 the two differ by one rotation in the world (the odometry's frame) and one in the camera (the
-boresight); turns tell them apart, as in hand-eye calibration (Park and Martin 1994,
+boresight); turns separate them, as in hand-eye calibration (Park and Martin 1994,
 doi:10.1109/70.326576). About the vertical they stay one as long as the camera only turns about
 it: a boresight in heading is then a compass error, which the track of the fixes takes out.
 """

@@ -36,7 +36,7 @@ KEYFRAME = np.dtype(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spans:
-    """Stretches between two neighbouring nodes that others hang on."""
+    """Spans between two neighbouring nodes in which keyframes are interpolated."""
 
     rows: I64  # (G, 2) of the nodes in the ledger
     T_odom_camera: F64  # (G, 2, 4, 4)
@@ -83,9 +83,9 @@ def screws(twists: F64, shares: F64) -> F64:
 def left(rows: Rows, T_before: F64, scale_before: F64) -> tuple[F64, F64]:
     """(N, 4, 4) poses and (N,) scales of the ledger's rows that no node carries: as published,
     and in the place of the node before them, (N, 4, 4) and (N,), if they never were."""
-    told = rows["published"] > 0
-    poses = np.where(told[:, None, None], whole(rows["pose"]), T_before)
-    return poses, np.where(told, rows["scale"], scale_before)
+    published = rows["published"] > 0
+    poses = np.where(published[:, None, None], whole(rows["pose"]), T_before)
+    return poses, np.where(published, rows["scale"], scale_before)
 
 
 def whole(parts: F64) -> F64:

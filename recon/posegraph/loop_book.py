@@ -1,4 +1,4 @@
-"""Which loops are believed: two that agree, and that vision can have drifted to."""
+"""Accepts loops: two must agree, and the drift of vision must explain them."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class LoopBook:
         self._config, self._track = config, track
 
     def offer(self, loop: Loop) -> list[Loop]:
-        """The loops that are believed from now on; empty while this one waits or is refused."""
+        """Return the loops accepted from now on; empty while this one waits or is refused."""
         if not self._is_possible(loop):
             self.counts["loop impossible"] += 1
             return []
@@ -75,12 +75,12 @@ class LoopBook:
         return fresh
 
     def thin(
-        self, marginalised: Mapping[int, Marginalised], let_go: Collection[int], most: int
+        self, marginalised: Mapping[int, Marginalised], dropped: Collection[int], most: int
     ) -> None:
-        """Move the ends that are nodes no more; loops of those let go end, and at most ``most``
+        """Move ends that were marginalised; drop loops of dropped keyframes; at most ``most``
         stay."""
-        self.taken = moved_loops(self.taken, marginalised, let_go, most)
-        self.pending = moved_loops(self.pending, marginalised, let_go, most)
+        self.taken = moved_loops(self.taken, marginalised, dropped, most)
+        self.pending = moved_loops(self.pending, marginalised, dropped, most)
 
     def edges(self) -> list[Edge]:
         """All loops that were offered and not refused."""
@@ -88,7 +88,7 @@ class LoopBook:
         return found + [Edge(loop.a, loop.b, False) for loop in self.pending]
 
     def into(self, segment: int) -> list[Loop]:
-        """Believed loops from an earlier segment into this one."""
+        """Accepted loops from an earlier segment into this one."""
         return [loop for loop in self.taken if self.enters(loop, segment)]
 
     def enters(self, loop: Loop, segment: int) -> bool:

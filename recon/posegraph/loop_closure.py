@@ -1,4 +1,4 @@
-"""Places seen before: candidates by overlap of the views, each verified before it is believed.
+"""Places seen before: candidates by overlap of the views, each verified before it is accepted.
 
 Verification is independent of the pose graph: corners of one keyframe with their depths are
 matched in the other's image (ZSSD), give a pose by EPnP, and the two depth maps must then
@@ -223,8 +223,8 @@ def warps(K_a: F64, K_b: F64, T_b_a: F64, uv: F64, points: F64) -> F64:
     for axis in range(2):
         ways = rays(K_a, uv + 8.0 * np.eye(2)[axis])
         slope = ways @ normal
-        beside = ways * (level / np.where(np.abs(slope) > 1e-6, slope, np.nan))[:, None]
-        out[:, :, axis] = (project(K_b, se3.transform(T_b_a, beside)) - here) / 8.0
+        stepped = ways * (level / np.where(np.abs(slope) > 1e-6, slope, np.nan))[:, None]
+        out[:, :, axis] = (project(K_b, se3.transform(T_b_a, stepped)) - here) / 8.0
     return out
 
 

@@ -39,14 +39,14 @@ class Motions:
         # by segment, its last scale, that scale's first node, and how many keyframes it stands for
 
     def first(self, node: Node) -> tuple[F64, F64]:
-        """Pose and covariance of the first keyframe: loose where readings will tell.
+        """Pose and covariance of the first keyframe: loose where readings will follow.
 
         The gauge that no reading ever fixes is held at the start.
         """
         frame = self._segments.frame(node.segment)
         T = frame.pose(node.T_odom_camera)
         sigma_t, sigma_r = 0.01, 1.0 if node.prior.R_world_camera is not None else 0.01
-        if "gnss" in frame.sources:  # places along a line do not tell the roll about it
+        if "gnss" in frame.sources:  # places along a line leave the roll about it free
             known = float(np.sqrt(np.linalg.eigvalsh(frame.covariance[:3, :3])[-1]))
             sigma_t, sigma_r = 50.0, max(sigma_r, min(known, 1.0))
         sigma = np.array([sigma_r] * 3 + [sigma_t] * 3)
@@ -112,7 +112,7 @@ class Motions:
         sigma_r = self._config.sigma_link_rad if is_turn_known else 1.5
         sigma_m = self._config.sigma_link_m * max(passed_s, 1.0) + 5.0
         motion = se3.inverse(T_last) @ T
-        # Where it went and how it turned are told apart: the one does not swing by the other.
+        # Translation and rotation are separate: an error of one does not rotate the other.
         apart = np.diag(np.square([sigma_r] * 3 + [sigma_m] * 3))
         return motion, left_covariance(motion, apart)
 

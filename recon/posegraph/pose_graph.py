@@ -70,7 +70,7 @@ class PoseGraph:
         """The new keyframe's pose after all that is known.
 
         Of more than ``max_nodes`` some older ones stop being nodes: their motions are those of
-        the nodes beside them (:mod:`recon.posegraph.thinning`), and all is built anew.
+        the neighbouring nodes (:mod:`recon.posegraph.thinning`), and the graph is rebuilt.
 
         Args:
             seq: number of the keyframe; greater than those before.
@@ -107,7 +107,7 @@ class PoseGraph:
 
         ``T_a_b`` (4, 4) in metres between the cameras of keyframes ``a`` and ``b``, with a
         ``covariance`` (6, 6) as a left perturbation in a's frame; ``growth`` is what b's depths
-        must be multiplied by to fit a's. One loop alone is not believed: a repeated texture
+        must be multiplied by to fit a's. A single loop is not accepted: a repeated texture
         gives perfect matches at the wrong place. A second one nearby must close the same circle.
         """
         if a not in self._nodes or b not in self._nodes or a == b:
@@ -130,7 +130,7 @@ class PoseGraph:
         return True
 
     def solve(self) -> None:
-        """Fit every segment's frame once more to all its telemetry, and build all anew."""
+        """Fit every segment's frame to all its telemetry again, and rebuild the graph."""
         for segment, nodes in self._segments.nodes.items():
             if self._segments.forget(segment) and nodes[0].key > 0:
                 self.rebuild()  # so that the segment's start is known
@@ -174,7 +174,7 @@ class PoseGraph:
         return self._segments.constants(self._newest().segment) if self._nodes else Constants()
 
     def is_tied(self, segment: int) -> bool:
-        """True when fixes or a loop tell where the segment lies."""
+        """True when fixes or a loop locate the segment."""
         return self._segments.is_tied(segment)
 
     def node(self, seq: int) -> Node:
@@ -213,7 +213,7 @@ class PoseGraph:
 
     @property
     def version(self) -> int:
-        """Changes whenever poses told before may be others now."""
+        """A number that changes whenever published poses may have changed."""
         return self._built * 1_000_000 + self._smoother.updates
 
     def pose_array(self) -> F64:
@@ -261,7 +261,7 @@ class PoseGraph:
         self._path: list[float] = []  # m flown up to each keyframe
 
     def rebuild(self) -> None:
-        """Make the whole graph anew from all readings and the segments' present frames."""
+        """Rebuild the graph from all readings and the segments' present frames."""
         self._start()
         last: Node | None = None
         for node in self._nodes.values():
@@ -280,14 +280,14 @@ class PoseGraph:
             self._kept_counts["solved badly"] += 1
 
     def _thin(self) -> None:
-        """Let some of the older keyframes ride on their neighbours, and build anew."""
+        """Interpolate some of the older keyframes between their neighbours, and rebuild."""
         poses = dict(zip(self._nodes, self._smoother.poses(), strict=False))  # but the newest
         done = thin(list(self._nodes.values()), self._refused(), poses)
         nodes = done.nodes
-        self._kept_counts["keyframe let go"] += len(done.let_go)
+        self._kept_counts["keyframe dropped"] += len(done.dropped)
         self._nodes = {node.seq: node for node in nodes}
         self._segments.thin(nodes)
-        self._book.thin(done.marginalised, done.let_go, len(nodes))
+        self._book.thin(done.marginalised, done.dropped, len(nodes))
         self._thin_at = max(self.config.max_nodes, int(len(nodes) * (1.0 + GONE_SHARE)))
         self.generation += 1
         self.rebuild()

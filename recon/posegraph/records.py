@@ -38,7 +38,7 @@ class PoseGraphConfig:
     loop_slack_m: float = 2.0  # and this
     loop_turn_rad: float = 0.5
     loop_window: int = 15  # keyframes within which two loops support each other
-    max_nodes: int = 100_000  # keyframes in the graph; of more, some ride on their neighbours
+    max_nodes: int = 100_000  # keyframes in the graph; of more, some are interpolated
 
     def __post_init__(self) -> None:
         """Raise ValueError when a parameter makes no sense."""

@@ -25,7 +25,7 @@ SETTLED = 100
 
 
 class SegmentFrames:
-    """Keyframes by segment, and each segment's similarity once telemetry or a loop tells it."""
+    """Keyframes by segment, and each segment's similarity once telemetry or a loop gives it."""
 
     def __init__(self, min_anchors: int, fix_s: float = 60.0, attitude_s: float = 40.0) -> None:
         """``min_anchors`` keyframes must be there before telemetry places a segment.
@@ -56,7 +56,7 @@ class SegmentFrames:
             self._seen.pop(segment)
 
     def known(self, segment: int) -> Similarity | None:
-        """The segment's similarity; None before telemetry or a loop tells it."""
+        """The segment's similarity; None before telemetry or a loop gives it."""
         return self._frames.get(segment)
 
     def frame(self, segment: int) -> Similarity:
@@ -96,7 +96,7 @@ class SegmentFrames:
         return frame is not None and "gnss" in frame.sources
 
     def is_tied(self, segment: int) -> bool:
-        """True when fixes or a loop tell where the segment lies."""
+        """True when fixes or a loop locate the segment."""
         return segment in self._tied or self.rests_on_fixes(segment)
 
     def tie(self, segment: int, scale: float, R: F64, t: F64) -> None:
@@ -118,7 +118,7 @@ class SegmentFrames:
         self._tied.discard(segment)
 
     def refit(self, segment: int, pose: Callable[[int], F64]) -> bool:
-        """True when the segment's frame was fitted anew, which is due as the segment grows.
+        """True when the segment's frame was fitted again, which is due as the segment grows.
 
         ``pose`` gives the present pose of a key in the graph.
         """
@@ -187,7 +187,7 @@ def _differ(before: Similarity, found: Similarity, nodes: list[Node]) -> bool:
 
 def _kept_in_place(found: Similarity, first: Node, T: F64) -> Similarity:
     """A frame without fixes, moved so that its first keyframe stays at ``T``, and turned to the
-    heading there when no compass tells one."""
+    heading there when no compass gives one."""
     R = found.R
     if "attitude" not in found.sources:
         turn = T[:3, :3] @ (R @ first.T_odom_camera[:3, :3]).T

@@ -78,7 +78,7 @@ class Offsets:
     def applied(self, prior: PosePrior, lean: float) -> PosePrior:
         """The prior's attitude, position and height without their constants.
 
-        ``lean`` is that of the ground whose height vision tells.
+        ``lean`` is that of the ground whose height vision measures.
         """
         R, position, agl = prior.R_world_camera, prior.position_m, prior.agl_m
         if R is not None:

@@ -158,7 +158,7 @@ def filled(own: Keyframe, others: Sequence[Keyframe]) -> Keyframe:
     """``own`` with the nearest surface of ``others`` as its camera sees it, in depth and colour.
 
     Every depth's ``T_world_camera`` counts. What ``own`` measured itself stays; holes of single
-    pixels are closed, and what nobody measured is black.
+    pixels are closed, and unmeasured ones are black.
     """
     at = own.depth
     h, w = at.depth_m.shape

@@ -6,8 +6,8 @@ ended at it end at the node before it, moved there by vision. Its fix goes into 
 next node's; other readings of it go. Readings are weighed by how many of them there are in the
 time flown (:mod:`recon.posegraph.readings`), so those that stay then weigh more.
 
-Where segments are so many and short that this finds too few, whole segments are let go, those
-first that leave the smallest holes. Their keyframes stay where they were told to be; their
+Where segments are so many and short that this finds too few, whole segments are dropped, those
+first that leave the smallest holes. Their keyframes stay where they were published; their
 readings and loops are gone.
 """
 
@@ -26,10 +26,10 @@ from recon.posegraph.smoother import reversed_motion
 from recon.types import F64, PosePrior
 
 NEWEST_SHARE = 0.25
-"""Of the nodes, the newest, which always stay: vision's next motions and loops hang on them."""
+"""Of the nodes, the newest, which always stay: vision's next motions and loops start from them."""
 
 GONE_SHARE = 0.25
-"""Of the nodes, how many go at once, so that building anew is seldom due."""
+"""Of the nodes, how many go at once, so that rebuilding is rare."""
 
 MAX_WORSE = 2.0
 """A fix whose sigma is so many times that of another spoils their mean."""
@@ -37,7 +37,7 @@ MAX_WORSE = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Marginalised:
-    """A keyframe that hangs on the node before it."""
+    """A keyframe attached to the node before it."""
 
     node: int  # number of that node
     T_node_camera: F64  # (4, 4) in units of the odometry
@@ -49,8 +49,8 @@ class Thinned:
     """A graph's nodes after it was thinned out."""
 
     nodes: list[Node]  # that stay, with keys that follow each other
-    marginalised: dict[int, Marginalised]  # by number, those that hang on the node before them
-    let_go: set[int]  # numbers of those that went with their whole segment
+    marginalised: dict[int, Marginalised]  # by number, those attached to the node before them
+    dropped: set[int]  # numbers of those dropped with their whole segment
 
 
 def thin(nodes: Sequence[Node], refused: Collection[int], poses: Mapping[int, F64]) -> Thinned:
@@ -89,9 +89,9 @@ def surplus(nodes: Sequence[Node]) -> set[int]:
 
 
 def thinned(nodes: Sequence[Node], gone: set[int]) -> tuple[list[Node], dict[int, Marginalised]]:
-    """The nodes that stay, with keys that follow each other, and where the others hang.
+    """The nodes that stay, with keys that follow each other, and where the others are attached.
 
-    Those of segments of which nothing stays hang nowhere.
+    Those of segments of which nothing stays are attached to nothing.
     """
     kept: list[Node] = []
     marginalised: dict[int, Marginalised] = {}
@@ -126,14 +126,14 @@ def over_gaps(nodes: Sequence[Node], poses: Mapping[int, F64]) -> list[Node]:
 def moved_loops(
     loops: Sequence[Loop],
     marginalised: Mapping[int, Marginalised],
-    let_go: Collection[int],
+    dropped: Collection[int],
     most: int,
 ) -> list[Loop]:
-    """The loops between nodes that stay, or that others hang on: the surest of several between
-    the same two, and of more than ``most`` every second of the older half."""
+    """Loops between nodes that stay or have others attached: the surest of several between the
+    same two, and of more than ``most`` every second of the older half."""
     best: dict[tuple[int, int], Loop] = {}
     for loop in loops:
-        if loop.a in let_go or loop.b in let_go:
+        if loop.a in dropped or loop.b in dropped:
             continue
         moved = moved_loop(loop, marginalised)
         if moved.a >= moved.b:
@@ -149,7 +149,7 @@ def moved_loops(
 
 
 def moved_loop(loop: Loop, marginalised: Mapping[int, Marginalised]) -> Loop:
-    """The loop with its ends at the nodes that they hang on."""
+    """The loop with its ends at the nodes that they are attached to."""
     if (one := marginalised.get(loop.a)) is not None:
         A = se3.adjoint(one.T_node_camera)
         covariance = one.covariance + A @ loop.covariance @ A.T

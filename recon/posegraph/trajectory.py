@@ -120,7 +120,7 @@ class _Published:
 class Trajectory:
     """Keyframe poses of one scan, segment by segment.
 
-    The graph may let keyframes go that it has no room for; they are carried by the nodes beside
+    The graph may drop keyframes that it has no room for; they move with the nodes next to
     them (:mod:`recon.posegraph.interpolated`), and little of each is kept, in a ledger.
     """
 
@@ -139,7 +139,7 @@ class Trajectory:
         self._seqs = array("q")  # numbers of all keyframes, as in the ledger
         self._nodes: list[int] = []  # their numbers, in order
         self._generation = 0  # of the graph
-        self._owed: deque[int] = deque()  # nodes after which others may have moved
+        self._pending: deque[int] = deque()  # nodes after which others may have moved
 
     def add(
         self,
@@ -183,7 +183,7 @@ class Trajectory:
     def place(self, seq: int) -> Placed:
         """The keyframe in the world, as known now. Raises KeyError for an unknown keyframe."""
         if seq not in self.graph:
-            row, ends = self._row(seq), self._beside(seq)
+            row, ends = self._row(seq), self._neighbours(seq)
             at = np.array([row]), np.array([0])
             T, scales = interpolated(self._read(row), *at, self._spans([ends]))
             node = self.place(ends[0])
@@ -215,7 +215,7 @@ class Trajectory:
         then the loop is moved to the node before it; False where that is of another
         segment."""
         if a not in self.graph:
-            before, after = self._beside(a)
+            before, after = self._neighbours(a)
             if not self._same_segment(before, after):
                 return False  # no node carries it
             T = self.step_between(before, a)
@@ -229,34 +229,34 @@ class Trajectory:
     # ---- publishing ----------------------------------------------------------------------------
 
     def moved(self, final: bool = False) -> list[Placed]:
-        """Keyframes whose world pose changed since it was told by more than is worth it.
+        """Keyframes whose world pose has changed since it was published by more than a threshold.
 
         In flight a change must exceed ``repose_m`` and a tenth of the pose's own sigma, or
         each fix of a poor receiver would move the whole scan; those carried by nodes that moved
         follow by and by, :data:`AT_ONCE` at a time. At the end (``final``) the graph is solved
-        once more and every change is told, so that the result does not hang on when corrections
+        again and every change is published, so that the result does not depend on when corrections
         were asked for.
         """
         if final:
             self.graph.solve()
         nodes = self._moved_nodes(final)
         if final:
-            self._owed = deque(self._nodes[:-1])
+            self._pending = deque(self._nodes[:-1])
         return nodes + self._moved_interpolated(final)
 
     def _moved_nodes(self, final: bool) -> list[Placed]:
-        told = self._published
-        if not len(told) or (told.checked == self.graph.version and not final):
+        published = self._published
+        if not len(published) or (published.checked == self.graph.version and not final):
             return []
-        told.checked = self.graph.version
-        keys = told.keys
+        published.checked = self.graph.version
+        keys = published.keys
         T, scales = self.graph.pose_array()[keys], self.graph.scales()[keys]
-        least = np.maximum(self.config.repose_m, self.config.repose_sigmas * told.sigma)
-        rows = np.flatnonzero(told.change(T, scales) > (1e-6 if final else least))
+        least = np.maximum(self.config.repose_m, self.config.repose_sigmas * published.sigma)
+        rows = np.flatnonzero(published.change(T, scales) > (1e-6 if final else least))
         if final:
-            return [self.place(told.placed[i].seq) for i in rows]
-        # In flight with the sigmas told before: newer readings have only made them smaller.
-        before = [told.placed[i] for i in rows]
+            return [self.place(published.placed[i].seq) for i in rows]
+        # In flight with the sigmas published before: newer readings have only made them smaller.
+        before = [published.placed[i] for i in rows]
         self._owe([p.seq for p in before])
         return [
             Placed(p.seq, T[i], float(scales[i]), p.covariance, self.graph.sources(p.seq))
@@ -265,21 +265,21 @@ class Trajectory:
 
     def _owe(self, seqs: Sequence[int]) -> None:
         """Look at the keyframes on both sides of these nodes soon."""
-        owed = set(self._owed)
+        pending = set(self._pending)
         for seq in seqs:
             i = bisect_left(self._nodes, seq)
             for k in (i - 1, i):
-                if 0 <= k < len(self._nodes) - 1 and self._nodes[k] not in owed:
-                    owed.add(self._nodes[k])
-                    self._owed.append(self._nodes[k])
+                if 0 <= k < len(self._nodes) - 1 and self._nodes[k] not in pending:
+                    pending.add(self._nodes[k])
+                    self._pending.append(self._nodes[k])
 
     def _moved_interpolated(self, final: bool) -> list[Placed]:
         out: list[Placed] = []
-        while self._owed:
+        while self._pending:
             spans: list[tuple[int, int]] = []
             count = 0
-            while self._owed and count < AT_ONCE:
-                before = self._owed.popleft()
+            while self._pending and count < AT_ONCE:
+                before = self._pending.popleft()
                 after = self._nodes[bisect_left(self._nodes, before) + 1]
                 held = self._row(after) - self._row(before) - 1
                 spans += [(before, after)] if held else []
@@ -295,8 +295,8 @@ class Trajectory:
         span = np.repeat(np.arange(len(spans)), [len(held) for held in numbers])
         rows = np.concatenate([self._ledger.read(held[0], held[-1] + 1) for held in numbers])
         number = np.concatenate(numbers)
-        told = rows["published"] > 0
-        rows, number, span = rows[told], number[told], span[told]
+        published = rows["published"] > 0
+        rows, number, span = rows[published], number[published], span[published]
         T, scales = interpolated(rows, number, span, self._spans(spans))
         known = [
             self.place(before) if final else self._published.of(before) or self.place(before)
@@ -337,12 +337,12 @@ class Trajectory:
         self._generation = self.graph.generation
         self._nodes = list(self.graph.seqs)
         self._published.thin({seq: key for key, seq in enumerate(self._nodes)})
-        self._owed = deque(seq for seq in self._owed if seq in self.graph)
+        self._pending = deque(seq for seq in self._pending if seq in self.graph)
 
     def _same_segment(self, a: int, b: int) -> bool:
         return self.graph.node(a).segment == self.graph.node(b).segment
 
-    def _beside(self, seq: int) -> tuple[int, int]:
+    def _neighbours(self, seq: int) -> tuple[int, int]:
         """The nodes before and after a keyframe that is none."""
         i = bisect_left(self._nodes, seq)
         if not 0 < i < len(self._nodes):

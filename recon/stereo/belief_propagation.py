@@ -40,7 +40,7 @@ SPECKLE_STEP = 16
 
 @dataclass(frozen=True, slots=True)
 class BeliefPropagationConfig:
-    """How the labels are found and which of them are believed."""
+    """How the labels are found and which of them are accepted."""
 
     iterations: int = 5  # per level; one iteration updates one colour of the checkerboard
     levels: int = 5  # of the pyramid; fewer when the image is small
@@ -49,8 +49,8 @@ class BeliefPropagationConfig:
     edge_contrast: int = 32  # gray levels between neighbours that make a strong edge
     min_disparity: int = 0  # px, disparity of label 0
     cost: MatchingCostConfig = field(default_factory=MatchingCostConfig)
-    min_evidence: float = 0.2  # how much better than the mean label, 0 to 1; 0: believe all
-    min_contrast: float = 0.5  # gray levels of standard deviation in 9x9; 0: believe all
+    min_evidence: float = 0.2  # how much better than the mean label, 0 to 1; 0: accept all
+    min_contrast: float = 0.5  # gray levels of standard deviation in 9x9; 0: accept all
     occlusion_tolerance: float = 1.0  # labels; a surface seen behind another one; < 0: no check
     fill_occluded: bool = False  # with the farther neighbour of the row, at low confidence
     speckle_px: int = 24  # smaller islands are dropped; 0: none
@@ -156,12 +156,12 @@ NOISE = 0.2 * COST_UNIT
 def select(
     data: I16, messages: I16, cost: I16, min_disparity: int, truncation: int, min_evidence: float
 ) -> tuple[F32, F32]:
-    """Real-valued labels (h, w) and their confidence, 0 to 1; 0 where not believed.
+    """Real-valued labels (h, w) and their confidence, 0 to 1; 0 where rejected.
 
     ``data`` and ``messages`` come from :func:`recon.stereo.message_passing.propagate` for ``cost``
     (h, L, w). Evidence is how far the winner's cost lies below the mean over the labels that
     are seen, relative to that mean: about 0.1 for unrelated images, 0.6 for texture. Not
-    believed are winners with less than ``min_evidence`` and those that tie with another
+    accepted are winners with less than ``min_evidence`` and those that tie with another
     label. NaN are those whose partner lies outside the right image.
     """
     height, _, width = cost.shape
@@ -176,10 +176,10 @@ def check_visibility(
 ) -> None:
     """NaN, in place, where the right view would see a nearer surface (by ``tolerance`` labels).
 
-    Only believed labels (confidence above 0) hide others. With ``fill`` a hidden pixel takes
-    the farther of the nearest believed labels of its row, at ``FILLED_CONFIDENCE``, unless its
+    Only accepted labels (confidence above 0) hide others. With ``fill`` a hidden pixel takes
+    the farther of the nearest accepted labels of its row, at ``FILLED_CONFIDENCE``, unless its
     partner would lie outside the right image; so does an unknown strip to the left of a nearer
-    surface that is no wider than the step in disparity. What is neither believed nor filled
+    surface that is no wider than the step in disparity. What is neither accepted nor filled
     becomes NaN.
     """
     _check_visibility(px, confidence, min_disparity, float(tolerance), bool(fill))
@@ -223,7 +223,7 @@ def _window_costs(
 def _best_labels(
     data: Any, messages: Any, v: int, parity: int, belief: Any, best: Any, low: Any, second: Any
 ) -> None:  # pragma: no cover - compiled
-    """Winner, its belief and that of the best label not beside it, of one parity of a row."""
+    """Winner, its belief and that of the best label not adjacent to it, of one parity of a row."""
     _, _, labels, cells = data.shape
     count = cells - 1
     low[:] = 32767
@@ -250,8 +250,8 @@ def _best_labels(
     for label in range(labels):
         b = belief[label]
         for i in range(count):
-            beside = abs(np.int16(best[i] - np.int16(label))) <= 1
-            second[i] = second[i] if beside else min(second[i], b[i])
+            adjacent = abs(np.int16(best[i] - np.int16(label))) <= 1
+            second[i] = second[i] if adjacent else min(second[i], b[i])
 
 
 @njit(cache=True, nogil=True)

@@ -100,7 +100,7 @@ def matching_cost(
 def plain(array: Any) -> Any:
     """The array, or a copy: in C order and writeable, as the kernels are compiled for.
 
-    Any other kind would be compiled anew, which takes seconds, in flight.
+    Any other kind would be compiled in flight, which takes seconds.
     """
     return np.require(array, requirements=["C", "W"])
 

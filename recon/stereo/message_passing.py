@@ -346,7 +346,7 @@ def _update_row(
     base = messages.ctypes.data
     step = (data.shape[0] + 2) * 2 * row  # from direction to direction
     here = base + (2 * (v + 1) + parity) * row
-    beside = base + (2 * (v + 1) + 1 - parity) * row
+    adjacent = base + (2 * (v + 1) + 1 - parity) * row
     d = data.ctypes.data + (2 * v + parity) * row
     line = 2 * cells  # bytes of the edges of one parity of a row
     side = (data.shape[0] + 2) * 2 * line  # from vertical to horizontal edges
@@ -355,8 +355,8 @@ def _update_row(
         arriving = (
             here + 2 * row + UP * step + at,
             here - 2 * row + DOWN * step + at,
-            beside + LEFT * step + at + 2 * parity,
-            beside + RIGHT * step + at + 2 * parity - 2,
+            adjacent + LEFT * step + at + 2 * parity,
+            adjacent + RIGHT * step + at + 2 * parity - 2,
         )
         leaving = (here + at, here + step + at, here + 2 * step + at, here + 3 * step + at)
         e = edges.ctypes.data + at
@@ -396,7 +396,7 @@ def _sweep_band(
 ) -> None:  # pragma: no cover - compiled
     """All iterations of a band of rows, as far as it can go alone, in one pass of the memory.
 
-    Iteration t of a row needs iteration t - 1 of the rows beside it, so a band does one row
+    Iteration t of a row needs iteration t - 1 of the neighbouring rows, so a band does one row
     less at each inner edge per iteration.
     """
     height, _, labels, cells = data.shape

@@ -137,16 +137,16 @@ def sampling(rays: F64, px_per_rad: float, masked: float) -> Sampling | None:
 def relief_of(
     points: F64, plane: F64, known: tuple[float, float], margin: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """(lowest, highest) surface that labels must reach, and that is believed at all.
+    """(lowest, highest) surface that labels must reach, and that is accepted at all.
 
     Shares of the distance nearer than the plane: of the camera's height, so that one surface
     has one share in the whole of an oblique image, and 1 at the horizon. ``points`` (N, 3) show
-    the relief, ``margin`` more is believed, and ``known`` widens what the labels reach up to that.
+    the relief, ``margin`` more is accepted, and ``known`` widens what the labels reach up to that.
     """
     low, high = np.percentile(1.0 - points @ plane, [1.0, 99.0])
-    believed = float(low) - margin, float(high) + margin
-    low, high = (float(np.clip(k, *believed)) for k in (min(low, known[0]), max(high, known[1])))
-    return (low, high), believed
+    accepted = float(low) - margin, float(high) + margin
+    low, high = (float(np.clip(k, *accepted)) for k in (min(low, known[0]), max(high, known[1])))
+    return (low, high), accepted
 
 
 def label_window(
@@ -207,7 +207,7 @@ def rectify_polar(
     usable = is_usable(rays, plane, baseline, f, config.max_sigma_share)
     if sector is None or usable.mean() < config.min_usable:
         return "flying along the line of sight"
-    reached, believed = relief_of(points, plane, relief, config.margin_share)
+    reached, accepted = relief_of(points, plane, relief, config.margin_share)
     low, high = label_window(points, plane, baseline, f, reached)
     need = (high - low) + 2 * config.margin_labels
     labels = max(config.labels, int(np.ceil(need / 16) * 16))
@@ -233,7 +233,7 @@ def rectify_polar(
         first_row_rad=sector.first_row_rad,
         plane=plane,
         first_label=lowest,
-        relief=believed,
+        relief=accepted,
         R_left_keyframe=R_left,
         guide=guide,
         left_seen=left_seen,

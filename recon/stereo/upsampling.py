@@ -32,7 +32,7 @@ MIN_CONFIDENCE = 1e-3
 FARTHEST = -40.0
 OUTSIDE = -60.0
 """log2 of the least spatial weight along one axis, and of that of a tap outside the coarse
-image: nothing beside the nearest tap, and no sum leaves the range of :func:`_exp2`."""
+image: nothing next to the nearest tap, and no sum leaves the range of :func:`_exp2`."""
 
 TILE = 64
 GROUP = 5
@@ -224,7 +224,7 @@ def _aligned(size: int) -> Any:  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _spread(row: Any, index: Any, tap: Any) -> None:  # pragma: no cover - compiled
-    """Lay the taps of one coarse row beside each fine pixel: (group, [tap, channel, pixel])."""
+    """Lay the taps of one coarse row next to each fine pixel: (group, [tap, channel, pixel])."""
     for k in range(index.shape[0]):
         column = index[k]
         out = tap[k // GROUP]

@@ -157,7 +157,7 @@ class CoverageMap:
     def put(self, seq: int, time_ns: int, depth: DepthMap, finer: bool = False) -> None:
         """Add a keyframe, or put it where it is now known to have been.
 
-        A keyframe that moved leaves stale tiles; :meth:`refill` mends them. So does one with
+        A keyframe that moved leaves stale tiles; :meth:`refill` recomputes them. So does one with
         ``finer`` depth than before. One without any depth is passed over.
         """
         place = footprint(depth)
@@ -220,7 +220,7 @@ class CoverageMap:
         return [int(seq) for seq in rows["seq"][due]]
 
     def refill(self, depths: Iterable[tuple[int, DepthMap]]) -> None:
-        """Sum up the surface of the stale tiles anew, from the keyframes of :meth:`stale`."""
+        """Sum up the surface of the stale tiles again, from the keyframes of :meth:`stale`."""
         for key in self._stale:
             if key in self._tiles:
                 self._tiles[key].forget_surface()

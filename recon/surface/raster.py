@@ -168,7 +168,7 @@ def _top_surface(
 def surface_model(xyz_m: F64 | F32, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:
     """The surface model that is delivered: the upper surface where it is certain.
 
-    Cells beside a step that may as well be roof as ground stay unknown (:func:`reliable`);
+    Cells next to a step that may as well be roof as ground stay unknown (:func:`reliable`);
     holes are filled on level ground only.
     """
     all_cells = rasterise_points(xyz_m, rgb, sigma_m, grid)
@@ -184,7 +184,7 @@ def reliable(raster: Raster) -> Raster:
     matching draws across the ground hidden behind a wall. Cells above a step, within the
     width that matching windows make a roof too wide, are kept only where they are known
     clearly better than their neighbourhood: a true roof edge is seen by all views, a spill
-    beside it by few. And cells high above ground nearby with less than SPARSE_SHARE
+    next to it by few. And cells high above ground nearby with less than SPARSE_SHARE
     of the usual number of known neighbours: crumbs of what hides behind a roof or in a crown.
     """
     height = raster.height_m.copy()

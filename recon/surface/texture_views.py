@@ -65,7 +65,7 @@ def look(
     """The sightings of every triangle of ``mesh``.
 
     A view sees a triangle when no surface stands before its corners and its middle, it faces
-    the camera, and at least half of those four places have colour. ``progress`` is told the
+    the camera, and at least half of those four places have colour. ``progress`` receives the
     share done.
     """
     reach = _rays(mesh)

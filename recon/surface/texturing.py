@@ -50,12 +50,12 @@ def texture(
     """
     if mesh.rgb is None or not len(mesh.faces):
         raise ValueError("a mesh to be textured needs triangles and colours at its vertices")
-    told = [-1]
+    reported = [-1]
 
     def share(done: float) -> None:
-        if int(10 * done) > told[0]:
-            told[0] = int(10 * done)
-            progress(f"visibility {10 * told[0]} %")
+        if int(10 * done) > reported[0]:
+            reported[0] = int(10 * done)
+            progress(f"visibility {10 * reported[0]} %")
 
     found = consistent(look(mesh, views, share))
     progress("choosing a view for each triangle")

@@ -322,7 +322,7 @@ class Odometry:
             self._unsettled = None
 
     def _forget(self) -> None:
-        """Let go of what left the window: images, corners, and landmarks nobody sees."""
+        """Drop what left the window: images, corners, and landmarks out of sight."""
         window = self.keyframes[-self.config.window - 2 :]
         for old in self.keyframes[: -len(window)]:
             old.pyramid = matching.Pyramid(())

@@ -88,7 +88,7 @@ def base_to_height(uv_a: F64, uv_b: F64, K: F64, R_b_a: F64 | None) -> float:
     """Median motion of the matches in focal lengths, with the turn taken out when known.
 
     Without an attitude the turn about the optical axis and the mean shift that a tilt would
-    give cannot be told from motion; the shift is then counted as motion.
+    give cannot be distinguished from motion; the shift is then counted as motion.
     """
     a, b = rays(K, uv_a), rays(K, uv_b)
     if R_b_a is not None:

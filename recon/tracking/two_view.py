@@ -112,7 +112,7 @@ def ground_normal(points: F64) -> F64:
     """(3,) unit normal of the plane through most of the (N, 3) points, z component < 0.
 
     In a camera frame (z forward) that normal points back at the camera. Re-weighted total
-    least squares; good for relief that is small beside the distance.
+    least squares; good for relief that is small compared with the distance.
     """
     weights = np.ones(len(points))
     normal = np.array([0.0, 0.0, -1.0])
@@ -141,7 +141,7 @@ def solve(
     Args:
         uv_a, uv_b: (N, 2) matched undistorted pixels.
         R_b_a: (3, 3) rotation that telemetry gives, or None.
-        max_turn_rad: largest believable difference from ``R_b_a``.
+        max_turn_rad: largest plausible difference from ``R_b_a``.
         up_a: (3,) where up is expected in camera a (telemetry or the mount); among solutions
             that explain the pixels alike, the one whose ground is most level is taken.
     """
