@@ -37,7 +37,7 @@ check: lint types test
 bench: $(STAMP)
 	$(BIN)/skyrelief bench $(ARGS)
 
-# Over an hour: fifty kills, the fuzzers, and beside them an hour of flights and a scan of an hour
+# Over an hour: fifty kills, the fuzzers, and in parallel an hour of flights and a scan of an hour
 # (MINUTES=6 is shorter), which are their load. As root with systemd-container and debootstrap it
 # also installs into a bare Debian and boots that. Writes trials.md and boot-log.md of docs/reports.
 MINUTES ?= 60

@@ -17,7 +17,7 @@ from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 from service.compute.stopwatch import Stopwatch
 from service.errors import OutsideError
-from service.flight.anchorage import Anchorage, Carriers, Key, Told, ToldFrames
+from service.flight.anchorage import Anchorage, Carriers, Key, PublishedFrame, PublishedFrames
 from service.flight.chain import Chain, KeyframeStep
 
 RNG = np.random.default_rng(4)
@@ -45,15 +45,15 @@ def before(limit: int) -> Any:
     return is_settled
 
 
-def told(seq: int, key: Key, agl_m: float | None = 41.5) -> Told:
+def published(seq: int, key: Key, agl_m: float | None = 41.5) -> PublishedFrame:
     anchor = Anchorage(seq, key, some_pose())
-    return Told(10**18 + seq, anchor, RNG.normal(size=3), agl_m, seq % 2 == 0)
+    return PublishedFrame(10**18 + seq, anchor, RNG.normal(size=3), agl_m, seq % 2 == 0)
 
 
 def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
     keys = [Refined(n, n // 20, some_pose()) for n in range(0, 40, 10)]
-    frames = [told(seq, keys[seq // 10], None if seq == 3 else 41.5) for seq in range(40)]
-    kept = ToldFrames(tmp_path)
+    frames = [published(seq, keys[seq // 10], None if seq == 3 else 41.5) for seq in range(40)]
+    kept = PublishedFrames(tmp_path)
     for frame in frames:
         kept.add(frame, before(20))
     keys[2].T_odom_camera = some_pose()  # still in the window: the newest pose counts
@@ -71,24 +71,24 @@ def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
 
 
 def test_only_frames_of_keyframes_that_change_stay_in_memory(tmp_path: Path) -> None:
-    kept = ToldFrames(tmp_path)
+    kept = PublishedFrames(tmp_path)
     for seq in range(500):
         key = Refined(seq, 0, some_pose())
-        kept.add(told(seq, key), before(seq - 9))
-        kept.add(Told(10**18 + seq, None, np.zeros(3), None, False), before(seq - 9))
+        kept.add(published(seq, key), before(seq - 9))
+        kept.add(PublishedFrame(10**18 + seq, None, np.zeros(3), None, False), before(seq - 9))
     assert len(kept._fresh) <= 22
     assert len(list(kept.corrigible())) == 500
     kept.close()
 
 
 def test_a_full_disk_is_the_outside_worlds_fault(tmp_path: Path) -> None:
-    kept = ToldFrames(tmp_path)
+    kept = PublishedFrames(tmp_path)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
     try:
         with pytest.raises(OutsideError):
             for seq in range(1000):
-                kept.add(told(seq, Refined(seq, 0, some_pose())), before(seq))
+                kept.add(published(seq, Refined(seq, 0, some_pose())), before(seq))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     kept.close()

@@ -54,7 +54,7 @@ def test_pose_velocity_and_covariance_are_the_bodys_in_ned() -> None:
     sent: list[tuple[Odometry, int]] = []
     report = OdometryReport(CameraConfig(), lambda o, t: sent.append((o, t)))
     for k in range(3):
-        report.tell(step_at((4.0 * k / 10, 1.0, 30.0)), state(), k * S // 10)
+        report.send(step_at((4.0 * k / 10, 1.0, 30.0)), state(), k * S // 10)
     odometry, time_ns = sent[-1]
     assert time_ns == 2 * S // 10
     assert odometry.position_ned_m == pytest.approx((1.0, 0.8, -30.0))
@@ -70,7 +70,7 @@ def test_a_fixed_mount_needs_no_gimbal() -> None:
     camera = CameraConfig(mount="fixed", mount_pitch_deg=-60.0, mount_yaw_deg=20.0)
     mount = Rotation.from_euler("ZYX", [20.0, -60.0, 0.0], degrees=True)
     report = OdometryReport(camera, lambda o, t: sent.append(o))
-    report.tell(step_at((0.0, 0.0, 30.0), BODY * mount), None, 0)
+    report.send(step_at((0.0, 0.0, 30.0), BODY * mount), None, 0)
     assert abs(float(np.dot(sent[0].q_ned_body, wxyz(BODY)))) == pytest.approx(1.0, abs=1e-9)
 
 
@@ -79,17 +79,17 @@ def test_resets_are_counted_and_lost_frames_left_out() -> None:
     report = OdometryReport(CameraConfig(), lambda o, t: sent.append(o))
     way = [(k * 1.0, 0.0, 30.0) for k in range(6)]
     for k, place in enumerate(way):  # a fast vehicle: no step of it is a jump
-        report.tell(step_at(place), state(), k * S // 10)
+        report.send(step_at(place), state(), k * S // 10)
     assert report.resets == 0
-    report.tell(step_at((9.0, 0.0, 30.0)), state(), 6 * S // 10)  # a loop was closed
+    report.send(step_at((9.0, 0.0, 30.0)), state(), 6 * S // 10)  # a loop was closed
     assert sent[-1].reset_counter == 1
     assert sent[-1].velocity_frd_m_s == pytest.approx(BODY.inv().apply([0.0, 10.0, 0.0]))
-    report.tell(step_at((10.0, 0.0, 30.0)), state(), 7 * S // 10)
+    report.send(step_at((10.0, 0.0, 30.0)), state(), 7 * S // 10)
     assert report.resets == 1
     lost = Step(Tracked("lost", 0))
-    report.tell(lost, state(), 8 * S // 10)
+    report.send(lost, state(), 8 * S // 10)
     assert len(sent) == 8
-    report.tell(step_at((11.0, 0.0, 30.0), segment=1), state(), 9 * S // 10)
+    report.send(step_at((11.0, 0.0, 30.0), segment=1), state(), 9 * S // 10)
     assert sent[-1].reset_counter == 2
 
 
@@ -110,7 +110,7 @@ def test_it_reaches_the_autopilot_stamped_with_its_clock_only_when_wanted(wanted
             until(lambda: vehicle.link.boot_time_us(0) is not None)
             now_ns = time.monotonic_ns()
             report = OdometryReport(CameraConfig(), vehicle.link.report_odometry)
-            report.tell(step_at((1.0, 2.0, 30.0)), state(), now_ns)
+            report.send(step_at((1.0, 2.0, 30.0)), state(), now_ns)
             ear, framer = dialect.MAVLink(None), Framer()
             heard: list[Any] = []
             end = time.monotonic() + (5.0 if wanted else 0.5)

@@ -232,8 +232,8 @@ class WallTime:
     def correct(self, offset_ns: int) -> int:
         """The offset to use: the computer's own ``offset_ns``, or the autopilot's where the two
         disagree."""
-        told_ns = self.offset_ns
-        return offset_ns if told_ns is None or agree(offset_ns, told_ns) else told_ns
+        given_ns = self.offset_ns
+        return offset_ns if given_ns is None or agree(offset_ns, given_ns) else given_ns
 
 
 def computer_offset_ns() -> int:

@@ -1,4 +1,4 @@
-"""Benchmarks that run on the board: each figure beside a peer's from the same run.
+"""Benchmarks that run on the board: each figure next to a peer's from the same run.
 
 A benchmark is a module with ``run(options) -> list[BenchResult]`` and one line in the table.
 Ours and the peer's rounds alternate, after a warm-up, so that a busy machine slows both.

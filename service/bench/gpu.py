@@ -1,4 +1,4 @@
-"""Every stage on a device, and the whole dense path, beside the floor of that device.
+"""Every stage on a device, and the whole dense path, compared with the floor of that device.
 
 The floor is the larger of the bytes that a stage cannot but move over the bandwidth of a copy,
 and its operations over the rate of a matrix product, both measured in the same run. Figures
@@ -70,7 +70,7 @@ def onnx_results(compiled: Backend, options: BenchOptions) -> list[BenchResult]:
 
 
 def against_floor(stage: Stage, floor: Floor, options: BenchOptions) -> BenchResult:
-    """The stage on the device beside its floor."""
+    """The stage on the device compared with its floor."""
     found = compare("gpu", stage.what, finished(stage.device, stage.work), options)
     least = floor.ms(stage.moved_bytes, stage.operations)
     return BenchResult(
@@ -82,7 +82,7 @@ def against_floor(stage: Stage, floor: Floor, options: BenchOptions) -> BenchRes
 def calls(
     backend: Backend, compiled: Backend, guide_px: tuple[int, int], options: BenchOptions
 ) -> list[BenchResult]:
-    """The backend's three calls, images up and results down, beside the compiled ones."""
+    """The backend's three calls, images up and results down, compared with the compiled ones."""
     left, right = scene(*SIZE, LABELS)
     matching, upsampling = BeliefPropagationConfig(), UpsamplingConfig()
     coarse = compiled.belief_propagation(left, right, LABELS, matching)

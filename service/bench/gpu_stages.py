@@ -136,7 +136,7 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
     taps, pixels = upsampling.diameter_px**2, w * h
     return [
         *found,
-        staged(f"what is believed, {w}x{h}, on the device", device, trusted,
+        staged(f"checks of labels, {w}x{h}, on the device", device, trusted,
               20.0 * pixels, 60.0 * pixels, "contrast, visibility, speckles, both images"),
         staged(f"upsampling to {W}x{H}, exact, on the device", device, finer,
               11.0 * W * H, 20.0 * taps * W * H, f"{taps} taps"),

@@ -136,7 +136,7 @@ def _keyframe(flight: _Flight, i: int, flown: _Flown) -> None:
 
 
 def _opposite(i: int) -> int | None:
-    """The keyframe beside ``i`` on the leg before; None on the first leg and near the turns."""
+    """Keyframe ``i``'s neighbour on the leg before; None on the first leg and near the turns."""
     leg, along = divmod(i, LEG)
     if leg == 0 or not 15 < along < LEG - 15:
         return None

@@ -131,7 +131,7 @@ def _fly(
 
 
 def resident_mib() -> float:
-    """Resident memory of this process now; NaN where the system does not tell."""
+    """Resident memory of this process now; NaN where the system does not report it."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except (OSError, ValueError, IndexError):

@@ -27,7 +27,7 @@ def calibrate(
 ) -> None:
     """Intrinsics and radial distortion from a chessboard, as ROS camera_info YAML.
 
-    Writes an image of where the corners were beside the model.
+    Writes an image of where the corners were, next to the model.
     """
     from recon.calibration.board import MIN_VIEWS, CalibrationConfig
     from recon.calibration.board import calibrate as fit

@@ -15,7 +15,7 @@ def refine(
         Path | None, typer.Option(help="CSV of ground control and check points (docs/refine.md)")
     ] = None,
     telemetry: Annotated[
-        Path | None, typer.Option(help="flight log; default: link.tlog beside the scan, if any")
+        Path | None, typer.Option(help="flight log; default: link.tlog next to the scan, if any")
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="folder for the refined scan; default: in place")

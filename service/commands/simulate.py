@@ -53,7 +53,8 @@ def simulate(
     photos: Annotated[Path | None, typer.Option(help="Aerial photos as the ground.")] = None,
     gps_noise_m: Annotated[float, typer.Option(help="Wander of the GPS.")] = 1.0,
     gnss_noise: Annotated[
-        str, typer.Option(help="wander: slowly; white: each fix anew; exact: no sensor errs.")
+        str,
+        typer.Option(help="wander: slowly; white: from fix to fix; exact: no sensor errs."),
     ] = "wander",
     boresight_deg: Annotated[
         str, typer.Option(help="RIGHT:UP degrees, where the camera looks off the gimbal's word.")

@@ -180,7 +180,7 @@ class ScanRun:
             history=vehicle.history,
             extra={"backend": backend.name, "source": source.description},
             latency_ms=host.latency_ms,
-            tell=lambda text: vehicle.statustext(text, WARNING),
+            warn=lambda text: vehicle.statustext(text, WARNING),
             on_step=odometry_reporter(host.config, vehicle),
             on_keyframe=self._on_keyframe,
         )
@@ -234,7 +234,7 @@ def odometry_reporter(
         return None
     from service.flight.vehicle_reports import OdometryReport
 
-    return OdometryReport(config.camera, vehicle.report_odometry).tell
+    return OdometryReport(config.camera, vehicle.report_odometry).send
 
 
 def report_keyframe(vehicle: VehicleLink, scan: Scan, keyframe: Keyframe) -> None:

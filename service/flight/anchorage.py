@@ -1,4 +1,4 @@
-"""Where frames hang on the odometry's keyframes, in little memory for as long as a scan lasts.
+"""Poses of frames relative to the odometry's keyframes, in little memory over a whole scan.
 
 A keyframe of the odometry is refined while it is in the window that is adjusted together, and
 holds images and corners meanwhile. Afterwards its pose is all that is wanted of it.
@@ -23,7 +23,7 @@ from service.errors import OutsideError
 
 
 class Key(Protocol):
-    """A keyframe of the odometry, as far as frames hang on it."""
+    """A keyframe of the odometry, as far as frames refer to it."""
 
     @property
     def seq(self) -> int:
@@ -147,7 +147,7 @@ class _Seqs(Sequence[int]):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Told:
+class PublishedFrame:
     """A frame's pose as it was written."""
 
     time_ns: int
@@ -160,22 +160,22 @@ class Told:
 _ROW = struct.Struct("<qqqi?16d3dd")
 
 
-class ToldFrames:
+class PublishedFrames:
     """What was written of every frame, in order; on the disk but for the newest.
 
     The file has no name and is gone with the process.
     """
 
     def __init__(self, folder: Path) -> None:
-        self._fresh: deque[Told] = deque()
+        self._fresh: deque[PublishedFrame] = deque()
         self._file = tempfile.TemporaryFile(dir=folder, buffering=1 << 16)  # noqa: SIM115
 
-    def add(self, told: Told, is_settled: Callable[[Key], bool]) -> None:
+    def add(self, frame: PublishedFrame, is_settled: Callable[[Key], bool]) -> None:
         """Take the next frame; those whose keyframes no longer change go to the disk.
 
         Raises OutsideError when the disk takes no more.
         """
-        self._fresh.append(told)
+        self._fresh.append(frame)
         while self._fresh:
             anchor = self._fresh[0].anchor
             if anchor is not None and not is_settled(anchor.key):
@@ -188,31 +188,31 @@ class ToldFrames:
         try:
             self._file.write(row)
         except OSError as error:
-            raise OutsideError(f"poses cannot be kept beside the scan: {error.strerror}") from error
+            raise OutsideError(f"poses cannot be stored for the scan: {error.strerror}") from error
 
-    def corrigible(self) -> Iterator[Told]:
-        """The frames that hang on a keyframe, in order."""
+    def corrigible(self) -> Iterator[PublishedFrame]:
+        """The frames that refer to a keyframe, in order."""
         self._file.seek(0)
         while row := self._file.read(_ROW.size):
             yield _unpacked(row)
-        yield from (told for told in self._fresh if told.anchor is not None)
+        yield from (frame for frame in self._fresh if frame.anchor is not None)
 
     def close(self) -> None:
         """Let go of the file."""
         self._file.close()
 
 
-def _packed(told: Told, anchor: Anchorage) -> bytes:
-    agl = np.nan if told.agl_m is None else told.agl_m
+def _packed(frame: PublishedFrame, anchor: Anchorage) -> bytes:
+    agl = np.nan if frame.agl_m is None else frame.agl_m
     return _ROW.pack(
-        told.time_ns, anchor.seq, anchor.key.seq, anchor.key.segment, told.is_view,
-        *anchor.T_odom_camera.ravel(), *told.position_m, agl,
+        frame.time_ns, anchor.seq, anchor.key.seq, anchor.key.segment, frame.is_view,
+        *anchor.T_odom_camera.ravel(), *frame.position_m, agl,
     )  # fmt: skip
 
 
-def _unpacked(row: bytes) -> Told:
+def _unpacked(row: bytes) -> PublishedFrame:
     time_ns, seq, key_seq, segment, is_view, *rest = _ROW.unpack(row)
     numbers = np.array(rest)
     key = SettledKey(key_seq, segment, numbers[:16].reshape(4, 4))
     agl_m = None if np.isnan(numbers[19]) else float(numbers[19])
-    return Told(time_ns, Anchorage(seq, key, UNMOVED), numbers[16:19], agl_m, is_view)
+    return PublishedFrame(time_ns, Anchorage(seq, key, UNMOVED), numbers[16:19], agl_m, is_view)

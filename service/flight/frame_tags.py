@@ -1,4 +1,4 @@
-"""What telemetry said of every frame, with its age and sigma, kept beside the scan."""
+"""The telemetry of every frame, with its age and sigma, kept next to the scan."""
 
 from __future__ import annotations
 

@@ -39,15 +39,15 @@ class GraphWatch:
     def __init__(self, graph: PoseGraph) -> None:
         self._graph = graph
         self._seen = 0
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
 
     def look(self) -> list[str]:
         """What is newly found, once for each kind; looks when the keyframes have grown enough."""
         if self._graph.entered < max(LEAST, LOOK_GROWTH * self._seen):
             return []
         self._seen = self._graph.entered
-        fresh = {k: text for k, text in self._findings().items() if k not in self._told}
-        self._told |= fresh.keys()
+        fresh = {k: text for k, text in self._findings().items() if k not in self._reported}
+        self._reported |= fresh.keys()
         return list(fresh.values())
 
     def sentences(self) -> list[str]:
@@ -95,7 +95,7 @@ MAX_LOOPS = 300
 def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:
     """Residuals by kind of factor, loops and readings left out, fit for JSON; None when empty.
 
-    ``nodes`` of the ``keyframes`` are in the graph; the others ride on them.
+    ``nodes`` of the ``keyframes`` are in the graph; the others are interpolated between them.
     ``loops.motions`` are the accepted loops as refinement takes them: two keyframes, seven
     numbers of the motion and 21 of its covariance.
     """

@@ -90,7 +90,7 @@ def _packed(seq: int, ordinal: int, segment: int, gray: U8, K: F64, depth: Depth
 
 
 class LoopSearch:
-    """Remembers keyframes, finds earlier ones that see the same, and tells the trajectory."""
+    """Keeps keyframes, finds earlier ones that see the same, and adds loops to the trajectory."""
 
     def __init__(
         self,
@@ -136,12 +136,12 @@ class LoopSearch:
             guess = self.trajectory.step_between(seq, new.seq)
             known = self._kept[seq].unpacked(self.trajectory.scale(seq))
             found = verify(known, view, guess, self._config)
-            if found is not None and self._tell(seq, new, found):
+            if found is not None and self._add(seq, new, found):
                 self._rest = PAUSE
                 return
 
-    def _tell(self, seq: int, new: _Kept, found: LoopClosure) -> bool:
-        """True when the graph believes the loop."""
+    def _add(self, seq: int, new: _Kept, found: LoopClosure) -> bool:
+        """True when the graph accepts the loop."""
         self.counts["verified"] += 1
         taken = self.trajectory.add_loop(seq, new.seq, found.T_a_b, found.covariance, found.growth)
         self.counts["taken"] += taken
@@ -171,7 +171,7 @@ class LoopSearch:
     def _by_look(self, new: _Kept, seqs: list[int]) -> list[int]:
         """Earlier keyframes that look like this one, the most alike first; some of them a time.
 
-        Where fixes or a loop tell where the segment lies, the place says more.
+        Where fixes or a loop locate the segment, its place is the better criterion.
         """
         if self.trajectory.graph.is_tied(new.segment):
             return []

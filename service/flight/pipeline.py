@@ -38,7 +38,7 @@ class Pipeline:
 
     def __init__(self, stages: Stages) -> None:
         self.stages = stages
-        self._beside = stages.beside(self.reconstruct)
+        self._background = stages.in_background(self.reconstruct)
 
     # ---- the figure --------------------------------------------------------------------
 
@@ -54,7 +54,7 @@ class Pipeline:
         if anchor is None:
             return Step(tracked, s.chain.by_telemetry(image, tracked))
         for view in s.views.ready():
-            self._beside.offer(view)  # to be reconstructed
+            self._background.offer(view)  # to be reconstructed
         keyframes = self._finished()
         moved = s.chain.corrections() if keyframes else ()
         placed = s.chain.follow(image, anchor)
@@ -87,7 +87,7 @@ class Pipeline:
         s = self.stages
         s.views.end_stretch()
         for view in s.views.ready(everything=True):
-            self._beside.offer(view)
+            self._background.offer(view)
         keyframes = self._finished(everything=True)
         tracked = Tracked("lost", s.track.segment, reason="end of the recording")
         return Step(tracked, keyframes=keyframes)
@@ -97,13 +97,13 @@ class Pipeline:
         try:
             step = self.drain()
         finally:
-            self._beside.close()
+            self._background.close()
         self.stages.map.clear()
         return replace(step, moved=self.stages.chain.corrections(final=True))
 
     def _finished(self, everything: bool = False) -> tuple[Keyframe, ...]:
         """Keyframes that are done, in order."""
-        done = self._beside.finished(everything)
+        done = self._background.finished(everything)
         for view, keyframe in done:
             self.stages.chain.reconstructed(view, keyframe)
         self.stages.chain.settle()
@@ -131,7 +131,7 @@ class Pipeline:
         self.stages.map.clear()
 
     def close(self) -> None:
-        """End what runs beside; call it last. The graph stays readable."""
+        """Stop the background work; call it last. The graph stays readable."""
         self.stages.resources.close()
 
     # ---- figures -----------------------------------------------------------------------
@@ -149,12 +149,12 @@ class Pipeline:
     @property
     def dropped(self) -> int:
         """Views that were not reconstructed because newer ones came faster."""
-        return self._beside.dropped
+        return self._background.dropped
 
     @property
     def busy_s(self) -> float:
         """Seconds for which one view has been under reconstruction; 0 when none is."""
-        return self._beside.busy_s
+        return self._background.busy_s
 
     @property
     def held(self) -> dict[str, int]:

@@ -12,7 +12,7 @@ import numpy as np
 from recon.posegraph.trajectory import Placed
 from recon.types import F64, Keyframe
 from service.cameras.rig import Rig, attitude_of
-from service.flight.anchorage import Told, ToldFrames
+from service.flight.anchorage import PublishedFrame, PublishedFrames
 from service.flight.graph_report import graph_figures
 from service.flight.pipeline import Pipeline, Step
 from service.scans.drawing import save_debug
@@ -20,7 +20,7 @@ from service.stream.codec import CodecConfig, encode
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
-TOLD_M = 0.05
+REPUBLISH_M = 0.05
 """A frame's pose that moved by more than this until the end is written again."""
 
 
@@ -45,7 +45,7 @@ class Recorder:
         self.last: PoseRecord | None = None
         self._offset_ns = clock_offset_ns
         self._codec = CodecConfig()
-        self._told = ToldFrames(store.path.parent)
+        self._frames = PublishedFrames(store.path.parent)
         self._last: tuple[int, F64] | None = None  # unix ns and T_world_camera of the last pose
         self._origin_written = False
 
@@ -58,9 +58,11 @@ class Recorder:
         if step.placed is None:
             return
         position = step.placed.T_world_camera[:3, 3]
-        told = Told(time_ns + self._offset_ns, step.anchor, position, agl_m, step.is_view)
-        self._told.add(told, self._is_settled)
-        self.last = self._record(told, step.placed)
+        frame = PublishedFrame(
+            time_ns + self._offset_ns, step.anchor, position, agl_m, step.is_view
+        )
+        self._frames.add(frame, self._is_settled)
+        self.last = self._record(frame, step.placed)
         self.store.add_pose(self.last)
 
     def flush(self) -> None:
@@ -70,7 +72,7 @@ class Recorder:
         finally:
             self._write_keyframes(self.pipeline.finish())
         self._correct_trajectory()
-        self._told.close()
+        self._frames.close()
 
     def close(self, extra: dict[str, Any]) -> dict[str, Any]:
         """Close the scan, which is flushed; return its summary."""
@@ -83,10 +85,10 @@ class Recorder:
     def _correct_trajectory(self) -> None:
         """Write those poses again that corrections have moved; the newest of a time holds."""
         self._last, self.distance_m = None, 0.0
-        for told in self._told.corrigible():
-            assert told.anchor is not None
-            record = self._record(told, self._chain.place(told.anchor))
-            if np.linalg.norm(record.T_world_camera[:3, 3] - told.position_m) > TOLD_M:
+        for frame in self._frames.corrigible():
+            assert frame.anchor is not None
+            record = self._record(frame, self._chain.place(frame.anchor))
+            if np.linalg.norm(record.T_world_camera[:3, 3] - frame.position_m) > REPUBLISH_M:
                 self.store.add_pose(record)
 
     def summary(self) -> dict[str, Any]:
@@ -156,30 +158,30 @@ class Recorder:
         if step.moved:
             self.store.add_reposes(step.moved)
 
-    def _record(self, told: Told, placed: Placed) -> PoseRecord:
+    def _record(self, frame: PublishedFrame, placed: Placed) -> PoseRecord:
         """The pose record of a frame, with speed and turn from the one before it."""
         T = placed.T_world_camera
         roll, pitch, yaw = attitude_of(T)
         speed = turn = 0.0
-        if self._last is not None and told.time_ns > self._last[0]:
-            dt = (told.time_ns - self._last[0]) * 1e-9
+        if self._last is not None and frame.time_ns > self._last[0]:
+            dt = (frame.time_ns - self._last[0]) * 1e-9
             step = float(np.linalg.norm(T[:3, 3] - self._last[1][:3, 3]))
             self.distance_m += step
             speed, turn = step / dt, _heading_change(self._last[1], T) / dt
-        self._last = (told.time_ns, T)
+        self._last = (frame.time_ns, T)
         self.speed_m_s, self.turn_rate_rad_s = speed, turn
         lat = lon = alt = None
-        frame = self._rig.frame
-        if frame is not None:
-            lat, lon, alt = (float(x) for x in frame.to_geodetic(T[None, :3, 3])[0])
+        local = self._rig.frame
+        if local is not None:
+            lat, lon, alt = (float(x) for x in local.to_geodetic(T[None, :3, 3])[0])
         return PoseRecord(
-            time_unix_ns=told.time_ns,
+            time_unix_ns=frame.time_ns,
             T_world_camera=T,
             covariance=placed.covariance,
             lat_deg=lat,
             lon_deg=lon,
             alt_amsl_m=alt,
-            agl_m=told.agl_m,
+            agl_m=frame.agl_m,
             roll_rad=roll,
             pitch_rad=pitch,
             yaw_rad=yaw,
@@ -188,7 +190,7 @@ class Recorder:
             turn_rate_rad_s=turn,
             sources=placed.sources,
             sigma_m=float(np.sqrt(np.trace(placed.covariance[3:, 3:]))),
-            keyframe_seq=told.anchor.seq if told.is_view and told.anchor else None,
+            keyframe_seq=frame.anchor.seq if frame.is_view and frame.anchor else None,
         )
 
 

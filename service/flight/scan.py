@@ -79,7 +79,7 @@ class ScanInputs:
     assumed: tuple[str, ...] = ()  # of "lens"
     extra: dict[str, Any] = field(default_factory=dict)  # goes into scan.json
     latency_ms: float | None = None  # the camera's as an earlier scan found it
-    tell: Callable[[str], None] = log.warning  # the operator
+    warn: Callable[[str], None] = log.warning  # the operator
     on_step: Callable[[Step, VehicleState | None, int], None] | None = None  # and its exposure
     on_keyframe: Callable[[Keyframe], None] | None = None
 
@@ -126,9 +126,9 @@ class Scan:
             store, self.pipeline, self.rig, inputs.unix_offset_ns, inputs.on_keyframe
         )
         self.check = TelemetryCheck(
-            inputs.config.camera, inputs.history, inputs.tell, inputs.latency_ms
+            inputs.config.camera, inputs.history, inputs.warn, inputs.latency_ms
         )
-        self.tracking = TrackingWatch(inputs.tell)
+        self.tracking = TrackingWatch(inputs.warn)
         self.tags = FrameTags(inputs.folder / TAGS) if inputs.history is not None else None
         self.tagged = self.odd_sized = self.heights = self.attitudes = 0
         self._started = time.monotonic()
@@ -157,7 +157,7 @@ class Scan:
         self.check.add(time_ns, step.tracked)
         self.tracking.look(step.tracked, time_ns)
         for doubt in self.pipeline.stages.chain.new_doubts():
-            inputs.tell(doubt)
+            inputs.warn(doubt)
         self.recorder.write(step, exposed_ns, state.alt_agl_m if state is not None else None)
         if inputs.on_step is not None:
             inputs.on_step(step, state, exposed_ns)
@@ -226,7 +226,7 @@ class Scan:
 
     def _doubts(self) -> list[str]:
         """What the reader of this scan must know."""
-        out = [*self.check.told.values(), *self.pipeline.stages.chain.watch.sentences()]
+        out = [*self.check.reported.values(), *self.pipeline.stages.chain.watch.sentences()]
         if self.odd_sized:
             W, H = self.inputs.camera.size_px
             out.append(f"{self.odd_sized} frames were not {W}x{H} like the camera model: left out")

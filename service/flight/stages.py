@@ -343,7 +343,7 @@ class Stages:
     chain: Chain
     map: SurfaceMap
     keyframe: MakeKeyframe
-    beside: Callable[
+    in_background: Callable[
         [Callable[[StereoCandidate], Keyframe | None]],
         BackgroundWorker[StereoCandidate, Keyframe | None],
     ]
@@ -364,9 +364,9 @@ def build_stages(
     """The stages that the configuration asks for. Raises ValueError for an unusable camera model.
 
     ``live`` lets old work give way when reconstruction cannot keep up; otherwise nothing is
-    dropped. ``pages`` is a folder that the parts of the map flown long ago may go to; beside it
-    what is remembered of every view lies in files without a name. None: keep all that in memory,
-    and forget the map's oldest.
+    dropped. ``pages`` is a folder that the parts of the map flown long ago may go to; what
+    is kept of every view lies there too, in files without a name. None: keep all in memory, and
+    drop the oldest parts of the map.
     """
     compute, stopwatch, resources = config.compute, Stopwatch(), ExitStack()
     refused: Counter[str] = Counter()
@@ -394,7 +394,7 @@ def build_stages(
     pair = PairStages(backend, dense, debug, stopwatch)
     views = StereoViews(selection, odometry, undistort.camera, undistort.valid, refused)
 
-    def beside(
+    def in_background(
         work: Callable[[StereoCandidate], Keyframe | None],
     ) -> BackgroundWorker[StereoCandidate, Keyframe | None]:
         if debug is not None or not kernels_may_overlap():
@@ -416,7 +416,7 @@ def build_stages(
         chain=_chain(config, pages, track.is_settled, rejected, stopwatch, resources),
         map=SurfaceMap(pages, compute.map_voxels, config.scan.resolution_m, stopwatch),
         keyframe=MakeKeyframe(debug),
-        beside=beside,
+        in_background=in_background,
         stopwatch=stopwatch,
         refused=refused,
         rejected=rejected,
@@ -433,7 +433,7 @@ def _chain(
     stopwatch: Stopwatch,
     resources: ExitStack,
 ) -> Chain:
-    """The pose graph and all that hangs on it."""
+    """The pose graph and all that depends on it."""
     graph = PoseGraph(PoseGraphConfig(max_nodes=config.fusion.graph_keyframes))
     trajectory, carriers = Trajectory(graph=graph), Carriers()
     if pages is not None:

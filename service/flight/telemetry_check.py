@@ -1,6 +1,6 @@
 """What the images say of the telemetry: the camera's latency, the gimbal's frame.
 
-The operator is told once; the latency found is applied when ``camera.latency`` is "auto",
+The operator is warned once; the latency found is applied when ``camera.latency`` is "auto",
 the gimbal's frame when ``mavlink.gimbal_yaw_frame`` is "auto".
 """
 
@@ -36,14 +36,14 @@ class TelemetryCheck:
         self,
         camera: CameraConfig,
         history: VehicleHistory | None,
-        tell: Callable[[str], None] = log.warning,
+        warn: Callable[[str], None] = log.warning,
         earlier_ms: float | None = None,
     ) -> None:
         """``earlier_ms``, found by an earlier scan, is taken with "auto" until there is news."""
         self.latency: LatencyEstimate | None = None
         self.frame: FrameVerdict | None = None
-        self.told: dict[str, str] = {}  # by subject
-        self._history, self._tell = history, tell
+        self.reported: dict[str, str] = {}  # by subject
+        self._history, self._warn = history, warn
         self._fixed = camera.mount == "fixed"
         self._earlier_ms = earlier_ms
         self._camera = camera
@@ -145,9 +145,9 @@ class TelemetryCheck:
             self._once("frame", f"{seen}; {used.value} is set" if used else seen)
 
     def _once(self, subject: str, text: str) -> None:
-        if subject not in self.told:
-            self.told[subject] = text
-            self._tell(text)
+        if subject not in self.reported:
+            self.reported[subject] = text
+            self._warn(text)
 
     def summary(self) -> dict[str, Any]:
         """What was found, fit for JSON; empty without telemetry."""

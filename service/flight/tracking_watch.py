@@ -1,4 +1,4 @@
-"""Tells the operator when vision has lost its way for long, why, and when it has it again."""
+"""Warns the operator when tracking is lost for long, with the reason, and when it recovers."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ FOUND = ("tracked", "keyframe")
 
 
 class TrackingWatch:
-    """Looks at every frame; what is to be said goes to ``tell``, once for each loss."""
+    """Looks at every frame; ``warn`` gets one text for each loss and one for its end."""
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell = tell
+    def __init__(self, warn: Callable[[str], None]) -> None:
+        self._warn = warn
         self._since_ns: int | None = None  # the first frame without a pose
-        self._frames, self._is_told = 0, False
+        self._frames, self._is_reported = 0, False
         self._reasons: Counter[str] = Counter()
 
     def look(self, tracked: Tracked, time_ns: int) -> None:
         """Take what a frame gave; times never go back. A camera that stands still is not lost."""
         if tracked.state in FOUND:
-            if self._is_told:
-                self._tell("Tracking recovered")
-            self._since_ns, self._frames, self._is_told = None, 0, False
+            if self._is_reported:
+                self._warn("Tracking recovered")
+            self._since_ns, self._frames, self._is_reported = None, 0, False
             self._reasons.clear()
             return
         self._since_ns = time_ns if self._since_ns is None else self._since_ns
@@ -34,7 +34,7 @@ class TrackingWatch:
         self._reasons[tracked.reason] += tracked.state == "lost"
         for_s = 1e-9 * (time_ns - self._since_ns)
         is_lost = 2 * self._reasons.total() > self._frames
-        if for_s >= LOST_S and is_lost and not self._is_told:
+        if for_s >= LOST_S and is_lost and not self._is_reported:
             ((reason, _),) = self._reasons.most_common(1)
-            self._tell(f"Tracking lost for {for_s:.0f} s ({reason}): nothing is scanned")
-            self._is_told = True
+            self._warn(f"Tracking lost for {for_s:.0f} s ({reason}): nothing is scanned")
+            self._is_reported = True

@@ -1,4 +1,4 @@
-"""What the autopilot and the ground station are told of frames: odometry and keyframes."""
+"""Reports to the autopilot and the ground station: odometry and keyframes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class OdometryReport:
 
     Position and attitude are those of the body; the way from body to camera is neglected. With
     a gimbal, telemetry says how the head stands on the body. The reset counter grows when
-    tracking starts anew and when a correction moves the estimate.
+    tracking starts again and when a correction moves the estimate.
     """
 
     def __init__(self, camera: CameraConfig, send: Callable[[Odometry, int], object]) -> None:
@@ -39,7 +39,7 @@ class OdometryReport:
         self._velocity: F64 | None = None  # NED, m/s
         self.resets = 0
 
-    def tell(self, step: Step, state: VehicleState | None, time_ns: int) -> None:
+    def send(self, step: Step, state: VehicleState | None, time_ns: int) -> None:
         """Hand on the pose of one frame; nothing for a frame without one by vision."""
         placed = step.placed
         if placed is None or step.anchor is None:

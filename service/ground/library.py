@@ -1,7 +1,7 @@
 """The scans kept at a ground station: list, rename, tag, delete to a bin, bring back, import.
 
 A scan is a folder with a ``scan.db``, two levels below the store (drone, then scan). Names
-given by people live in ``library.json`` beside it and are never used as paths.
+given by people live in ``library.json`` next to it and are never used as paths.
 """
 
 from __future__ import annotations

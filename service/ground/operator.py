@@ -150,8 +150,8 @@ class Operator:
     def command(self, number: int, component: int, params: tuple[float, ...] = ()) -> Ack:
         """Send a command and wait for the final answer of the component asked.
 
-        OutsideError when nobody answers, or somebody else: an autopilot that has not heard the
-        companion carries its commands out itself.
+        OutsideError when nothing answers, or another component does: an autopilot that has not
+        heard the companion carries out its commands itself.
         """
         padded = [*params, *[0.0] * (7 - len(params))]
         fields = {

@@ -300,7 +300,7 @@ def view_from_above(
 ) -> U8:
     """(rows, cols, 3) BGR of the place that ``truth`` was made of, north up, in its own ENU.
 
-    The place is laid out anew from ``params.json`` and must agree with ``surface.ply``.
+    The place is laid out again from ``params.json`` and must agree with ``surface.ply``.
     Raises InputError where it does not, or where its ground was made of photographs, which
     the truth does not hold.
     """

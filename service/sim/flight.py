@@ -219,8 +219,7 @@ class SensorNoise:
     def of(gnss: str, noise: SensorNoise) -> SensorNoise:
         """The noise with a GNSS that errs as ``gnss`` says; ValueError for an unknown word.
 
-        "wander": slowly, as it is; "white": by as much in each fix anew; "exact": no sensor
-        errs at all.
+        "wander": slowly, as it is; "white": by as much, from fix to fix; "exact": no sensor errs.
         """
         if gnss == "wander":
             return noise

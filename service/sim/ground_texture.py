@@ -234,8 +234,8 @@ def _road(x, y, cover, seed):  # type: ignore[no-untyped-def]
         return 108.0 * shade, 138.0 * shade, 160.0 * shade
     crack = abs(fractal2(x, y, 1.9, 2, 0.6, seed + 603))
     dark = 0.72 if crack < 0.035 else 1.0
-    mend = 0.8 if value2(x / 4.1, y / 4.1, seed + 604) > 0.78 else 1.0
-    shade = dark * mend * (1.0 + 0.12 * broad + 0.18 * fine)
+    repaired = 0.8 if value2(x / 4.1, y / 4.1, seed + 604) > 0.78 else 1.0
+    shade = dark * repaired * (1.0 + 0.12 * broad + 0.18 * fine)
     if cover == PAINT and fine < 0.6:
         return 205.0 * shade, 210.0 * shade, 210.0 * shade
     return 104.0 * shade, 102.0 * shade, 100.0 * shade

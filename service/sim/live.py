@@ -1,6 +1,6 @@
 """Plays a simulated flight in real time: H.264 in MPEG-TS for the camera, MAVLink over UDP.
 
-The flight's own packets are sent when they are due. SYSTEM_TIME is renewed, so that it tells
+The flight's own packets are sent when they are due. SYSTEM_TIME is renewed, so that it gives
 the present, and TIMESYNC requests are answered with the boot time, as an autopilot does.
 """
 
@@ -92,7 +92,7 @@ class MavlinkPlayer:
         while True:
             try:
                 data, _ = self.socket.recvfrom(2048)
-            except OSError:  # nothing there, or nobody listens yet
+            except OSError:  # nothing there, or nothing listens yet
                 return
             for message in self._requests.parse_buffer(data) or []:
                 if message.get_type() == "TIMESYNC" and message.tc1 == 0:

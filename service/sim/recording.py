@@ -140,15 +140,15 @@ class Simulation:
     def surface_range(self, origins: F64, directions: F64) -> F64:
         """(N,) metres from (N, 3) places along (N, 3) unit directions to the first surface.
 
-        Beside the scene it is the terrain's, for directions that lead downwards.
+        Outside the scene it is the terrain's, for directions that lead downwards.
         """
         met, _ = self.scene.grid.cast(origins, directions)
-        beside = np.zeros(len(origins))
+        outside = np.zeros(len(origins))
         for _ in range(TERRAIN_STEPS):
-            at = origins + beside[:, None] * directions
+            at = origins + outside[:, None] * directions
             above = at[:, 2] - self.scene.terrain.height(at[:, 0], at[:, 1])
-            beside += above / np.maximum(-directions[:, 2], 0.1)
-        return np.asarray(np.where(np.isfinite(met), met, beside))
+            outside += above / np.maximum(-directions[:, 2], 0.1)
+        return np.asarray(np.where(np.isfinite(met), met, outside))
 
     def sensors(self) -> Sensors:
         """The drone's sensors, fresh from their seed."""

@@ -172,7 +172,7 @@ def _houses(
     density: float,
     rng: np.random.Generator,
 ) -> list[F64]:
-    """Houses, halls and garages beside the asphalt roads, with chimneys."""
+    """Houses, halls and garages along the asphalt roads, with chimneys."""
     out: list[F64] = []
     for road in (r for r in roads if r.surface == ASPHALT):
         for x, y, heading in _stations(road, (15.0, 30.0), rng):
@@ -192,7 +192,7 @@ def _houses(
                 if free.take(shapes.footprint(row, 1.5)):
                     _stand(row, ground, rng.uniform(3.0, 6.5), 0.5 * size[1] * rng.uniform(0.6, 1))
                     _paint(row, _pick(ROOFS, rng), _pick(WALLS, rng), rng)
-                    out += [row, *_beside(row, ground, free, rng)]
+                    out += [row, *_next_to(row, ground, free, rng)]
     return out
 
 
@@ -200,7 +200,7 @@ def _pick(colours: tuple[tuple[int, ...], ...], rng: np.random.Generator) -> tup
     return colours[int(rng.integers(len(colours)))]
 
 
-def _beside(house: F64, ground: Terrain, free: _FreeGround, rng: np.random.Generator) -> list[F64]:
+def _next_to(house: F64, ground: Terrain, free: _FreeGround, rng: np.random.Generator) -> list[F64]:
     """A chimney on the roof and perhaps a garage next to a house."""
     out = []
     heading = float(np.arctan2(house[shapes.SIN], house[shapes.COS]))

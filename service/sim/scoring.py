@@ -168,7 +168,7 @@ def _truth_heights(truth: Truth, grid: Grid) -> F64:
 
 
 def _range_of_three(height: F64) -> F64:
-    """(rows, cols) highest less lowest of the 3x3 cells about each; NaN beside unknown ones."""
+    """(rows, cols) highest less lowest of the 3x3 cells about each; NaN next to unknown ones."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     return np.asarray(maximum_filter(height, 3) - minimum_filter(height, 3))

@@ -140,7 +140,7 @@ def _image_lines(one: Keyframe, camera: int) -> str:
 
 @contextmanager
 def writing_folder(path: Path) -> Iterator[Path]:
-    """An empty folder beside ``path``, renamed onto it when all went well.
+    """An empty folder next to ``path``, renamed onto it when all went well.
 
     A folder that is there already is replaced only then. A failure of the disk becomes an
     OutsideError.

@@ -268,11 +268,11 @@ def run_tiles(
     for n, job in enumerate(jobs):
         if n not in done:
             name = f"tile {n + 1} of {len(jobs)}: " if len(jobs) > 1 else ""
-            done[n] = mesh_tile(job, partial(_told, progress, name))
+            done[n] = mesh_tile(job, partial(_report, progress, name))
     return [part for n in range(len(jobs)) if (part := done[n]) is not None]
 
 
-def _told(progress: Callable[[str], None], name: str, text: str) -> None:
+def _report(progress: Callable[[str], None], name: str, text: str) -> None:
     progress(name + text)
 
 

@@ -34,7 +34,7 @@ MAX_CONTOURS = 5000
 OPEN_STEP_M = 2
 SIDEWAYS_DEG = 15.0
 MAX_OPEN_M, MAX_OPEN_SIDEWAYS_M = 4, 6
-"""Free air above a cell that is asked for at most: trees and eaves hang over higher up as well,
+"""Free air above a cell that is asked for at most: trees and eaves overhang higher up as well,
 but every metre costs ground at the border of the survey. Looking sideways one sees more of
 the ground below them."""
 
@@ -42,7 +42,7 @@ the ground below them."""
 def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """Heights in AMSL metres (float32, -9999 where unknown); band 2 holds their sigma.
 
-    Unknown is also what cannot be placed beside a step
+    Unknown is also what cannot be placed next to a step
     (:func:`recon.surface.raster.surface_model`), and ground above which something may stand that
     no image shows.
     """

@@ -1,8 +1,8 @@
 """A finished scan adjusted by its own images: ``refine --video FLIGHT``.
 
 The keyframes' images, and those that hold marks of surveyed points, are matched again at full
-size. One adjustment has their poses, the places seen, the camera where the flight tells it, what
-telemetry knows and the surveyed points in it. Depth images stay as they are; each is scaled to
+size. One adjustment has their poses, the places seen, the camera (if observable), the telemetry
+and the surveyed points in it. Depth images stay as they are; each is scaled to
 the places that it shows.
 """
 
@@ -58,7 +58,7 @@ Surfaces = Callable[[KeyframeState], Keyframe | None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageNetwork:
-    """What the images tell of a scan."""
+    """The result of an adjustment by images."""
 
     keyframes: int
     given: Camera
@@ -114,7 +114,7 @@ def network_of(
 def marked_frames(
     survey: Sequence[SurveyPoint], frames: Sequence[PoseRecord], states: Sequence[KeyframeState]
 ) -> list[PoseRecord]:
-    """Frames beside the keyframes in which surveyed points are marked."""
+    """Frames other than keyframes in which surveyed points are marked."""
     keys = np.array([s.time_ns for s in states])
     wanted = {
         round(seen.time_unix_s * 1e9)
@@ -220,7 +220,7 @@ def _view_of(images: ImageNetwork, mark: Mark) -> int:
 def _known(
     images: ImageNetwork, track: Track, points: Sequence[Point], used: set[int]
 ) -> Knowledge:
-    """What telemetry, or the placing that the flight ended with, and the survey tell."""
+    """Priors from telemetry, or from the flight's last georeference, and from the survey."""
     n, first = len(track.poses), len(images.points)
     out = Knowledge.none(len(images.poses), first + len(points))
     for k in used:
@@ -261,7 +261,7 @@ def _residuals(found: Network, known: Knowledge) -> dict[str, F64]:
 
 
 def crossing_marks(candidate: Candidate, poses: F64) -> None:
-    """Let the rays of its marks tell where the map has a point, if they cross."""
+    """Find a point's place in the map from the rays of its marks, if they cross."""
     bare = [replace(m, depth_m=None) for m in candidate.marks]
     crossing = map_position(poses, np.ones(len(poses)), bare)
     if crossing is not None:

@@ -1,4 +1,4 @@
-"""Surveyed points brought onto a scan: marks in its keyframes, and which points to believe."""
+"""Surveyed points brought onto a scan: marks in its keyframes, and which points to accept."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def _in_image(seen: Sighting, number: int, scan: ScanImages, where: str) -> Mark
     assert seen.uv_px is not None
     camera = scan.camera
     if not {"K", "width", "height"} <= set(camera):
-        raise InputError(f"{where}: the scan does not tell its camera; give x,y,z instead")
+        raise InputError(f"{where}: the scan does not record its camera; give x,y,z instead")
     u, v = seen.uv_px
     if not (-0.5 <= u <= camera["width"] - 0.5 and -0.5 <= v <= camera["height"] - 0.5):
         raise InputError(
@@ -150,7 +150,7 @@ def _in_image(seen: Sighting, number: int, scan: ScanImages, where: str) -> Mark
 
 
 def _image(seen: Sighting, scan: ScanImages, where: str) -> tuple[int, F64]:
-    """Which keyframe a mark hangs on, and the image's pose in its camera."""
+    """The keyframe that a mark refers to, and the image's pose in its camera."""
     seqs = [s.seq for s in scan.states]
     if seen.keyframe_seq is not None:
         if seen.keyframe_seq not in seqs:
@@ -215,7 +215,7 @@ def _in_map(seen: Sighting, number: int, scan: ScanImages, where: str) -> list[M
     return sorted(found, key=lambda m: m.sigma_depth_m)[:MAX_VIEWS]
 
 
-# ---- whom to believe -----------------------------------------------------------------------------
+# ---- which points to accept ----------------------------------------------------------------------
 
 
 def screen(candidates: Sequence[Candidate], frame: LocalFrame) -> None:
@@ -240,7 +240,7 @@ def screen(candidates: Sequence[Candidate], frame: LocalFrame) -> None:
         apart = float(np.linalg.norm((surveyed - mapped)[0] - (surveyed - mapped)[1]))
         for one in voters:
             other = next(c for c in voters if c is not one)
-            one.why_not = f"contradicts {other.point.name} by {apart:.2f} m; a third would tell"
+            one.why_not = f"contradicts {other.point.name} by {apart:.2f} m; a third would decide"
         return
     for one, fits, off in zip(voters, agree, surveyed - mapped - usual, strict=True):
         if not fits:
@@ -273,7 +273,7 @@ def _odd_one(voters: Sequence[Candidate]) -> tuple[Candidate, F64] | None:
     """The point that lies farthest from where a similarity of all others puts it, and its offset.
 
     None when every point lies within its tolerance: its sigmas, 1 % of the distance to the
-    others' middle, and 0.2 m for what bends a map. It takes five points to tell which is wrong.
+    others' middle, and 0.2 m for what bends a map. It takes five points to find the wrong one.
     """
     if len(voters) < 5:
         return None
@@ -295,7 +295,7 @@ def _odd_one(voters: Sequence[Candidate]) -> tuple[Candidate, F64] | None:
 
 
 def clustered(candidates: Sequence[Candidate], places_m: F64) -> str:
-    """What to tell when the control points span little of the track (N, 3); empty otherwise."""
+    """A warning when the control points span little of the track (N, 3); empty otherwise."""
     points = [
         c.surveyed_m for c in candidates
         if c.usable and not c.point.is_check and c.surveyed_m is not None

@@ -137,7 +137,7 @@ def sightings(
 def _overlapping(
     views: Sequence[int], camera: Camera, poses: F64, ground_m: float
 ) -> dict[int, list[int]]:
-    """For each view those beside it in time, and of all that show its ground those turned most."""
+    """For each view its neighbours in time, and of all that show its ground those turned most."""
     W, H = camera.size_px
     v, u = np.mgrid[0.1:0.9:4j, 0.1:0.9:4j]
     grid = rays(camera.K, np.column_stack([u.ravel() * W, v.ravel() * H]))
@@ -146,18 +146,18 @@ def _overlapping(
     reach = np.linalg.norm(grounds - middle[:, None], axis=2).max(axis=1)
     out = {}
     for position, k in enumerate(views):
-        beside = views[max(position - REACH, 0) : position + REACH + 1]
+        nearby = views[max(position - REACH, 0) : position + REACH + 1]
         near = np.linalg.norm(middle - middle[position], axis=1) < reach[position]
         turned = []
         for other in (views[i] for i in np.flatnonzero(near)):
             there = se3.transform(se3.inverse(poses[other]), grounds[position])
             uv = project(camera.K, there)
             shown = (there[:, 2] > 0) & (uv >= 0).all(axis=1) & (uv < (W, H)).all(axis=1)
-            if other not in beside and shown.mean() >= MIN_SHOWN:
+            if other not in nearby and shown.mean() >= MIN_SHOWN:
                 R = poses[k][:3, :3].T @ poses[other][:3, :3]
                 turned.append((-float(np.linalg.norm(se3.so3_log(R))), other))
         across = [other for _, other in sorted(turned)[:ACROSS]]
-        out[k] = [other for other in (*beside, *across) if other != k]
+        out[k] = [other for other in (*nearby, *across) if other != k]
     return out
 
 
@@ -172,7 +172,7 @@ def found_camera(
     images: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float, fixes: F64,
     sigma_fixes: F64,
 ) -> SelfCalibrated:  # fmt: skip
-    """The camera as the flight tells it; InputError, in one line, when it does not."""
+    """The camera estimated from the flight; InputError, in one line, when it is not determined."""
     landmarks, seen, poses = sightings(images, camera, poses, ground_m)
     try:
         found = self_calibrate(camera, poses, landmarks, seen, fixes, sigma_fixes)

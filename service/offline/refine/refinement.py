@@ -57,7 +57,7 @@ from service.offline.refine.control_points import (
     place_by_survey,
     screen,
 )
-from service.offline.refine.refinement_figures import in_words, off_by, told
+from service.offline.refine.refinement_figures import figures_of, in_words, off_by
 from service.offline.refine.revisions import Revisions, copy_store, grown, moved_frames
 from service.offline.refine.stored_loops import StoredLoops, loose
 from service.offline.refine.survey_file import SurveyPoint, read_survey
@@ -74,7 +74,7 @@ from service.stream.store import ScanStore
 log = logging.getLogger(__name__)
 
 LINK_LOG = "link.tlog"
-"""What the daemon keeps of the flight's telemetry beside a scan."""
+"""The flight's telemetry that the daemon keeps next to a scan."""
 
 MIN_SIGMA_SCALE = 0.003
 BY_SURVEY = "control points"
@@ -82,7 +82,7 @@ MIN_OTHERS = 3
 """Control points that hold a scan without one of them."""
 
 MAX_REFUSALS = 0.4
-"""Of the control points; when more contradict the rest, nobody knows which half is right."""
+"""Of the control points; when more contradict the rest, it is not known which half is right."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,9 +124,10 @@ def undo(folder: Path) -> dict[str, Any]:
 def intrinsics(
     folder: Path, video: Path, telemetry: Path | None, out: Path | None
 ) -> dict[str, Any]:
-    """Find the camera from the flight's video and write its file beside the scan, or in ``out``.
+    """Find the camera from the flight's video and write its file next to the scan, or in ``out``.
 
-    The scan itself stays as it is. Raises InputError, in one line, when the flight cannot tell.
+    The scan itself stays as it is. Raises InputError, in one line, where the flight
+    does not determine the camera.
     """
     _open_target(folder, None)
     with ScanStore.open(folder / "scan.db") as store, Revisions(store) as revisions:
@@ -211,12 +212,12 @@ class _Refinement:
         if self.options.loops and self.images is None:
             track, verified = self._with_loops(track)
         found = self._adjusted(track, candidates)
-        told_clustered = clustered(candidates, track.poses[:, :3, 3])
-        self.notes += [told_clustered] if told_clustered else []
+        warning = clustered(candidates, track.poses[:, :3, 3])
+        self.notes += [warning] if warning else []
         seqs = [s.seq for s in self.states]
         if self.images is None or self.grown != 1.0:
             places_m = track.poses[:, :3, 3]
-        figures = told(seqs, track, found, candidates, verified, self._ahead_m(), places_m)
+        figures = figures_of(seqs, track, found, candidates, verified, self._ahead_m(), places_m)
         if self.images is not None:
             figures["images"] = self.images.figures(self.header.camera["K"][0])
         alone = self._left_out(track, candidates)
@@ -309,10 +310,10 @@ class _Refinement:
         control = [c for c in candidates if not c.point.is_check]
         refused = [c for c in control if not c.usable]
         if control and len(refused) > MAX_REFUSALS * len(control):
-            told = "; ".join(f"{c.point.name}: {c.why_not}" for c in refused[:4])
+            reasons = "; ".join(f"{c.point.name}: {c.why_not}" for c in refused[:4])
             raise InputError(
                 f"{self.options.gcp}: {len(refused)} of {len(control)} control points do not "
-                f"fit ({told}); nothing was changed"
+                f"fit ({reasons}); nothing was changed"
             )
 
     def _track(self) -> Track:
@@ -332,13 +333,13 @@ class _Refinement:
             history = load_telemetry(path).history
         except ValueError as error:
             if self.options.telemetry is None:
-                self.notes.append(f"{LINK_LOG} beside the scan was not used: {error}")
+                self.notes.append(f"{LINK_LOG} next to the scan was not used: {error}")
                 return []
             raise InputError(str(error)) from error
         rig = _rig(self.header, self.frame)
         states = [history.state_at(s.time_ns) for s in self.states]
         if not any(s is not None and s.lat_deg is not None for s in states):
-            self.notes.append(f"{path.name} tells no position of any keyframe: not used")
+            self.notes.append(f"{path.name} gives no position of any keyframe: not used")
             return []
         priors = [PosePrior() if s is None else rig.prior(s, None) for s in states]
         span_s = (self.states[-1].time_ns - self.states[0].time_ns) * 1e-9

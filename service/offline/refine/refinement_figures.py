@@ -13,7 +13,7 @@ from service.offline.refine.control_points import Candidate
 from service.offline.refine.stored_loops import steps_m
 
 
-def told(
+def figures_of(
     seqs: Sequence[int],
     track: Track,
     found: Adjusted,
@@ -28,7 +28,7 @@ def told(
     has those with support. ``ahead_m`` is the usual distance of the ground.
     """
     shift = np.linalg.norm(found.poses[:, :3, 3] - places_m, axis=1)
-    points = [_told_point(c, found) for c in candidates]
+    points = [_point(c, found) for c in candidates]
     return {
         "keyframes": len(track.poses),
         "moved_m": {"median": _round(np.median(shift)), "most": _round(shift.max())},
@@ -70,7 +70,7 @@ def _steps(track: Track, found: Adjusted, ahead_m: float) -> dict[str, Any] | No
     return out
 
 
-def _told_point(one: Candidate, found: Adjusted) -> dict[str, Any]:
+def _point(one: Candidate, found: Adjusted) -> dict[str, Any]:
     after = map_position(found.poses, found.scales, one.marks)
     return {
         "name": one.point.name,

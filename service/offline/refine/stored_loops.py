@@ -31,7 +31,7 @@ LOOPS_PER_KEYFRAME, TRIES = 2, 5
 """Loops that end in one keyframe, and verifications for them, at most."""
 
 TELLING = 2.0
-"""Loops less sure by this factor than the surest tell no step between their ends."""
+"""Loops less sure by this factor than the surest give no step between their ends."""
 
 LOOP_SCALE = 0.005
 """Sigma of a loop's length, as a share of it, from the scale of the depths that gave it."""
@@ -104,8 +104,8 @@ class StoredLoops:
         if own is None:
             return None
         last = len(self._track.poses) - 1
-        beside = range(max(k - reach, 0), min(k + reach, last) + 1)
-        others = [self._at(j) for j in beside if j != k and self._breaks[j] == self._breaks[k]]
+        nearby = range(max(k - reach, 0), min(k + reach, last) + 1)
+        others = [self._at(j) for j in nearby if j != k and self._breaks[j] == self._breaks[k]]
         whole = filled(own, [one for one in others if one is not None])
         gray = np.asarray(cv2.cvtColor(whole.bgr, cv2.COLOR_BGR2GRAY), np.uint8)
         return LoopView(gray, whole.depth.K, whole.depth)
@@ -132,7 +132,7 @@ def steps_m(loops: Sequence[Closure], poses: F64, scales: F64, ahead_m: float) -
     """(n,) metres between where the two ends of a loop have the same ground.
 
     The ground is taken ``ahead_m`` before the later camera; the loop's own length grows with
-    the scale there. Told by the loops that are surest of it, others are left out.
+    the scale there. It follows from the loops that are surest of it; others are left out.
     """
     spot, sigma, steps = np.array([[0.0, 0.0, ahead_m]]), [], []
     for loop in loops:
