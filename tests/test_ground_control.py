@@ -8,6 +8,7 @@ import pytest
 from recon import se3
 from recon.posegraph import ground_control
 from recon.posegraph.ground_control import Closure, Mark, Point, Track, adjust, map_position
+from recon.posegraph.smoother import State
 from recon.types import F64, PosePrior
 
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
@@ -169,39 +170,20 @@ def test_telemetry_places_a_track_and_a_wild_fix_does_not_move_it() -> None:
 
 
 def test_the_derivatives_of_a_mark_are_those_of_differences() -> None:
-    gtsam = pytest.importorskip("gtsam")
     rng = np.random.default_rng(0)
     side = se3.exp(rng.normal(0, 0.2, 6))
-    mark = Mark(0, 0, np.array([0.1, -0.2, 1.0]), 0.01, 12.0, 0.3, side)
-    T, P, log_scale = se3.exp(rng.normal(0, 0.3, 6)), np.array([1.0, 2.0, 14.0]), 0.07
-    error = ground_control.mark_error(mark)
-
-    class Keys:
-        def keys(self) -> list[int]:
-            return [0, 1, 2]
-
-    def value(twist: F64, move: F64, grow: float) -> F64:
-        values = gtsam.Values()
-        values.insert(0, gtsam.Pose3(T).retract(twist))
-        values.insert(1, P + move)
-        values.insert(2, np.array([log_scale + grow]))
-        return np.asarray(error(Keys(), values, None))
-
-    values = gtsam.Values()
-    values.insert(0, gtsam.Pose3(T))
-    values.insert(1, P)
-    values.insert(2, np.array([log_scale]))
-    found: list[F64] = [np.zeros(0)] * 3
-    error(Keys(), values, found)
+    T = se3.exp(rng.normal(0, 0.3, 6))
+    row = (0, 1, 1, [0.1, -0.2, 1.0], 12.0, side[:3, :3].T, side[:3, 3], [100.0, 100.0, 3.0])
+    rows = np.array([row], ground_control.MARK)
+    places = np.array([T[:3, 3], [1.0, 2.0, 14.0]])
+    at = State(np.array([T[:3, :3], np.eye(3)]), places, np.array([0.0, 0.07]))
+    error, J, columns = ground_control.of_marks(rows, at)
+    assert error.shape == (1, 3) and J.shape == (1, 3, 10)
     h = 1e-6
-    zero = np.zeros(3)
-    poses = [(value(h * e, zero, 0) - value(-h * e, zero, 0)) / (2 * h) for e in np.eye(6)]
-    places = [(value(np.zeros(6), h * e, 0) - value(np.zeros(6), -h * e, 0)) / (2 * h)
-              for e in np.eye(3)]  # fmt: skip
-    grown = (value(np.zeros(6), zero, h) - value(np.zeros(6), zero, -h)) / (2 * h)
-    assert np.allclose(found[0], np.array(poses).T, rtol=1e-4, atol=1e-4)
-    assert np.allclose(found[1], np.array(places).T, rtol=1e-4, atol=1e-4)
-    assert np.allclose(found[2][:, 0], grown, rtol=1e-4, atol=1e-4)
+    for k, column in enumerate(columns[0]):
+        step = h * (np.arange(14) == column)
+        ahead, back = (ground_control.of_marks(rows, at.moved(s)).error for s in (step, -step))
+        assert np.allclose(J[0, :, k], (ahead - back)[0] / (2 * h), rtol=1e-4, atol=1e-4)
 
 
 def test_points_that_contradict_the_others_are_named() -> None:

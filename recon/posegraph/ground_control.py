@@ -1,7 +1,7 @@
 """All keyframes of a scan adjusted at once, with surveyed points on the ground.
 
-One batch over poses and the scale of each stretch (Levenberg-Marquardt of GTSAM): the motions
-between keyframes as vision had them, loops, telemetry or the placing it once gave, and ground
+One batch over poses and the scale of each stretch (:mod:`recon.posegraph.smoother`): the motions
+between keyframes as vision measured them, loops, telemetry or the placing it once gave, and ground
 control points. A control point is seen in images: each mark gives a direction and, where the
 keyframe has a surface there, a distance. The point itself is unknown within its survey's
 sigma. Check points take no part; :func:`map_position` says where the map has them.
@@ -11,15 +11,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from recon import se3
-from recon.posegraph import factors as graph_factors
-from recon.posegraph.factors import matrix, pose3
+from recon.posegraph.ledger import Rows
 from recon.posegraph.records import loops_agree
-from recon.posegraph.smoother import left_covariance
+from recon.posegraph.smoother import (
+    NO_SCALE,
+    Linear,
+    Smoother,
+    State,
+    columns_of,
+    left_covariance,
+    scale_columns,
+)
 from recon.types import F64, Bool, PosePrior
 
 CHI2_LIMIT = 22.5
@@ -27,6 +33,17 @@ CHI2_LIMIT = 22.5
 
 ATTITUDE_S, FIX_S = 40.0, 60.0
 """Errors of attitude and fixes wander with these time constants."""
+
+STEPS = 60
+"""Of the solution, at most."""
+
+HELD, HELD_PLACE, HELD_SIGMA = "held", "held place", 1e-5
+"""Kinds of factors that hold what is no unknown; rad and m."""
+
+MARK = np.dtype(
+    [("key", int), ("point", int), ("scale", int), ("ray", float, (3,)), ("depth", float),
+     ("R", float, (3, 3)), ("t", float, (3,)), ("weight", float, (3,))]
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,113 +234,86 @@ def placed_by_points(mapped_m: F64, surveyed_m: F64) -> tuple[float, F64, F64] |
     return scale, R, np.asarray(surveyed_m.mean(axis=0) - scale * R @ mapped_m.mean(axis=0))
 
 
-def mark_error(mark: Mark) -> Any:
-    """Error function of (pose, point[, log scale]): direction and, if known, distance."""
-    R_camera_key = mark.T_key_camera[:3, :3].T
-    t_key_camera = mark.T_key_camera[:3, 3]
-    sigma, depth = mark.sigma, mark.depth_m
+def of_marks(rows: Rows, at: State) -> Linear:
+    """Direction and, where it is known, distance of a point as an image sees it.
 
-    def error(factor: Any, values: Any, jacobians: Any) -> F64:
-        keys = factor.keys()
-        pose = values.atPose3(keys[0])
-        R = pose.rotation().matrix()
-        in_key = R.T @ (values.atPoint3(keys[1]) - pose.translation())
-        p = R_camera_key @ (in_key - t_key_camera)
-        z = max(float(p[2]), 1e-3)
-        rows = [(p[:2] / z - mark.ray[:2]) / sigma]
-        D = np.array([[1.0 / z, 0.0, -p[0] / z**2], [0.0, 1.0 / z, -p[1] / z**2]]) / sigma
-        if depth is not None:
-            grown = depth * float(np.exp(values.atVector(keys[2])[0]))
-            rows.append(np.array([(p[2] - grown) / mark.sigma_depth_m]))
-            D = np.vstack([D, [0.0, 0.0, 1.0 / mark.sigma_depth_m]])
-        if jacobians is not None:
-            D = D @ R_camera_key
-            jacobians[0] = np.hstack([D @ se3.hat(in_key), -D])
-            jacobians[1] = D @ R.T
-            if depth is not None:
-                jacobians[2] = np.array([[0.0], [0.0], [-grown / mark.sigma_depth_m]])
-        return np.concatenate(rows)
-
-    return error
+    p = R_camera_key (R^T (P - t) - t_key_camera); the place P of a point is the shift of its key.
+    """
+    key, point, scale = rows["key"], rows["point"], rows["scale"]
+    R_key_world = at.R[key].transpose(0, 2, 1)
+    apart = at.t[point] - at.t[key]
+    in_camera = rows["R"] @ (np.einsum("nij,nj->ni", R_key_world, apart) - rows["t"])[:, :, None]
+    x, y, z = in_camera[:, :, 0].T
+    z = np.maximum(z, 1e-3)
+    grown = rows["depth"] * np.exp(at.logs[scale])
+    error = np.stack([x / z - rows["ray"][:, 0], y / z - rows["ray"][:, 1], z - grown], axis=1)
+    D = np.zeros((len(rows), 3, 3))
+    D[:, 0, 0] = D[:, 1, 1] = 1.0 / z
+    D[:, 0, 2], D[:, 1, 2], D[:, 2, 2] = -x / z**2, -y / z**2, 1.0
+    to_world = (rows["weight"][:, :, None] * D) @ rows["R"] @ R_key_world
+    of_scale = np.zeros((len(rows), 3, 1))
+    of_scale[:, 2, 0] = -grown * rows["weight"][:, 2]
+    J = np.concatenate([to_world @ se3.hat(apart), -to_world, to_world, of_scale], axis=2)
+    columns = [columns_of(key, 0, 6), columns_of(point, 3, 6), scale_columns(at, scale)]
+    return Linear(error * rows["weight"], J, np.hstack(columns))
 
 
 class _Batch:
-    """The factors of one adjustment and its solution."""
+    """The factors of one adjustment and its solution.
+
+    Keys of the smoother: keyframes, then the world itself, then points, whose turns are held.
+    """
 
     def __init__(
         self, track: Track, loops: Sequence[int], points: Sequence[Point], marks: Sequence[Mark],
         config: BatchConfig,
     ) -> None:  # fmt: skip
-        import gtsam
-
-        self._gtsam, self._track, self._config = gtsam, track, config
-        self._graph, self._start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        self._kinds: list[str] = []
-        self._noises: list[Any] = []
-        for key, T in enumerate(track.poses):
-            self._start.insert(key, pose3(T))
+        self._track, self._config, self._smoother = track, config, Smoother()
+        for T, spread in zip(track.poses, track.covariances, strict=True):
+            self._smoother.append_pose(T, spread)
         self._add_scales()
         for key in range(1, len(track.poses)):
             self._add_step(key)
         self._add_telemetry() if track.priors else self._add_placing()
         for k in loops:
-            self._add_loop(track.loops[k])
+            one = track.loops[k]
+            self._smoother.add_motion(
+                "loop", (one.a, one.b), one.T_a_b, one.covariance, self._scale_key(one.a), 1.5
+            )
         self._add_points(points, marks)
-        settings = gtsam.LevenbergMarquardtParams()
-        settings.setMaxIterations(60)
-        settings.setRelativeErrorTol(1e-7)
-        solver = gtsam.LevenbergMarquardtOptimizer(self._graph, self._start, settings)
-        self._values: Any = solver.optimize()
+        self._smoother.update(now=True, steps=STEPS)
 
     def states(self) -> tuple[F64, F64, F64]:
         """Poses (N, 4, 4), left covariances (N, 6, 6) and scales (N,)."""
-        n = len(self._track.poses)
-        marginals = self._gtsam.Marginals(self._graph, self._values)
-        poses = np.array([matrix(self._values.atPose3(key)) for key in range(n)])
-        spread = [
-            left_covariance(T, np.asarray(marginals.marginalCovariance(key)))
-            for key, T in enumerate(poses)
-        ]
-        logs = [float(self._values.atVector(self._scale_key(key))[0]) for key in range(n)]
-        return poses, np.array(spread), np.exp(logs)
+        keys = range(len(self._track.poses))
+        poses, spread = zip(*(self._smoother.state(key) for key in keys), strict=True)
+        logs = self._smoother.logs()[[self._scale_key(key) for key in keys]]
+        return np.array(poses), np.array(spread), np.exp(logs)
 
     def residuals(self) -> dict[str, F64]:
         """Whitened residuals by kind, without the robust losses."""
-        out: dict[str, list[F64]] = {}
-        for i, kind in enumerate(self._kinds):
-            error = graph_factors.whitened(self._graph.at(i), self._noises[i], self._values)
-            out.setdefault(kind, []).append(np.pad(error, (0, 6 - len(error))))
-        return {kind: np.array(rows) for kind, rows in out.items()}
+        found = self._smoother.residuals()
+        return {kind: rows for kind, rows in found.items() if kind not in (HELD, HELD_PLACE)}
 
     # ---- factors ---------------------------------------------------------------------------
 
-    def _add(self, factor: Any, kind: str, noise: Any = None) -> None:
-        """``noise`` is the factor's noise model without a robust loss, when it has one."""
-        self._graph.add(factor)
-        self._kinds.append(kind)
-        self._noises.append(noise or factor.noiseModel())
-
-    def _robust(self, noise: Any, loss: str = "Huber", at: float = 1.5) -> Any:
-        model = self._gtsam.noiseModel
-        return model.Robust.Create(getattr(model.mEstimator, loss).Create(at), noise)
-
     def _scale_key(self, key: int) -> int:
-        return int(self._gtsam.symbol("s", key // self._config.stretch))
+        return NO_SCALE + 1 + key // self._config.stretch
 
     def _add_scales(self) -> None:
-        one, gtsam = self._gtsam.noiseModel.Isotropic, self._gtsam
-        keys = sorted({self._scale_key(key) for key in range(len(self._track.poses))})
-        for before, key in zip([None, *keys], keys, strict=False):
-            self._start.insert(key, np.zeros(1))
-            if before is None:
-                noise = one.Sigma(1, self._config.sigma_scale)
-                self._add(gtsam.PriorFactorVector(key, np.zeros(1), noise), "scale")
-            else:
-                noise = one.Sigma(1, self._config.sigma_scale_walk)
-                self._add(gtsam.BetweenFactorVector(before, key, np.zeros(1), noise), "scale")
+        sigma = self._config.sigma_scale
+        for key in range(NO_SCALE + 1, self._scale_key(len(self._track.poses) - 1) + 1):
+            self._smoother.append_scale(0.0)
+            before = key - 1
+            self._smoother.add_scale("scale", (before, key), 0.0, sigma)
+            sigma = self._config.sigma_scale_walk
+
+    def _hold(self, key: int, T: F64, sigma_rad: float, sigma_m: float) -> None:
+        self._smoother.add_turn(HELD, key, T[:3, :3], np.full(3, sigma_rad))
+        self._smoother.add_place(HELD_PLACE, key, T[:3, 3], np.full(3, sigma_m))
 
     def _add_step(self, key: int) -> None:
-        """The motion from the keyframe before, as vision and ICP had it."""
+        """The motion from the keyframe before, as vision and ICP measured it."""
         track, c = self._track, self._config
         motion = se3.inverse(track.poses[key - 1]) @ track.poses[key]
         length = float(np.linalg.norm(motion[:3, 3]))
@@ -331,67 +321,53 @@ class _Batch:
         pause = float(track.times_s[key] - track.times_s[key - 1])
         if pause > c.break_s:
             turn, shift, kind = c.sigma_break_rad, c.sigma_break_m * pause / c.break_s, "link"
-        noise = self._gtsam.noiseModel.Diagonal.Sigmas(np.array([turn] * 3 + [shift] * 3))
-        keys = [key - 1, key, self._scale_key(key - 1)]
-        error = graph_factors.scaled_motion_error(motion)
-        self._add(self._gtsam.CustomFactor(noise, keys, error), kind)
-
-    def _add_loop(self, loop: Closure) -> None:
-        noise = self._gtsam.noiseModel.Gaussian.Covariance(
-            graph_factors.right_covariance(loop.T_a_b, loop.covariance)
-        )
-        keys = [loop.a, loop.b, self._scale_key(loop.a)]
-        error = graph_factors.scaled_motion_error(loop.T_a_b)
-        self._add(self._gtsam.CustomFactor(self._robust(noise), keys, error), "loop", noise)
+        right = np.diag([turn**2] * 3 + [shift**2] * 3)
+        spread = left_covariance(motion, right)
+        self._smoother.add_motion(kind, (key - 1, key), motion, spread, self._scale_key(key - 1))
 
     def _add_placing(self) -> None:
         """The poses' own covariances: they err together, so each counts one N-th."""
         n = len(self._track.poses)
+        floor = np.diag([1e-8] * 3 + [1e-6] * 3)
         for key, (T, spread) in enumerate(
             zip(self._track.poses, self._track.covariances, strict=True)
         ):
-            floor = np.diag([1e-8] * 3 + [1e-6] * 3)
-            right = graph_factors.right_covariance(T, n * (spread + floor))
-            noise = self._gtsam.noiseModel.Gaussian.Covariance(0.5 * (right + right.T))
-            self._add(self._gtsam.PriorFactorPose3(key, pose3(T), noise), "placing")
+            self._smoother.add_motion("placing", (n, key), T, n * (spread + floor))
 
     def _add_telemetry(self) -> None:
-        """Attitude and fixes; sigmas grow as their errors wander slowly (cf. graph_readings)."""
-        gtsam, times = self._gtsam, self._track.times_s
-        loose = gtsam.noiseModel.Diagonal.Sigmas(np.array([2.0] * 3 + [1e4] * 3))
-        self._add(gtsam.PriorFactorPose3(0, pose3(self._track.poses[0]), loose), "placing")
-        gap_s = max(float(np.median(np.diff(times))), 1e-3)
+        """Attitude and fixes; sigmas grow as their errors wander slowly (cf. readings.py)."""
+        self._hold(0, self._track.poses[0], 2.0, 1e4)
+        gap_s = max(float(np.median(np.diff(self._track.times_s))), 1e-3)
         for key, prior in enumerate(self._track.priors):
             R = prior.R_world_camera
             if R is not None:
                 yaw = prior.sigma_yaw_rad if prior.sigma_yaw_rad < 1.0 else 10.0
                 sigma = np.array([prior.sigma_tilt_rad, prior.sigma_tilt_rad, yaw])
                 sigma = sigma * np.sqrt(max(1.0, 2.0 * ATTITUDE_S / gap_s))
-                spread = R.T @ np.diag(sigma**2) @ R
-                noise = gtsam.noiseModel.Gaussian.Covariance(spread)
-                turn = pose3(se3.compose(R, np.zeros(3))).rotation()
-                factor = gtsam.PoseRotationPrior3D(key, turn, self._robust(noise))
-                self._add(factor, "attitude", noise)
+                self._smoother.add_turn("attitude", key, R, sigma, 1.5)
             if prior.position_m is not None and prior.sigma_position_m is not None:
                 sigma = np.maximum(prior.sigma_position_m, 0.005)
                 sigma = sigma * np.sqrt(max(1.0, 2.0 * FIX_S / gap_s))
-                noise = gtsam.noiseModel.Diagonal.Sigmas(sigma)
-                robust = self._robust(noise, "Cauchy", 2.0)
-                self._add(gtsam.GPSFactor(key, prior.position_m, robust), "position", noise)
+                place = prior.position_m
+                self._smoother.add_place("position", key, place, sigma, cauchy=2.0)
 
     def _add_points(self, points: Sequence[Point], marks: Sequence[Mark]) -> None:
-        gtsam = self._gtsam
-        for k in sorted({m.point for m in marks}):
-            key = int(gtsam.symbol("p", k))
-            self._start.insert(key, np.array(points[k].position_m, np.float64))
-            noise = gtsam.noiseModel.Diagonal.Sigmas(np.maximum(points[k].sigma_m, 1e-3))
-            self._add(gtsam.PriorFactorPoint3(key, points[k].position_m, noise), "survey")
+        """The world at key N, and the points that images see behind it."""
+        world = len(self._track.poses)
+        self._smoother.append_pose(np.eye(4), np.zeros((6, 6)))
+        self._hold(world, np.eye(4), HELD_SIGMA, HELD_SIGMA)
+        seen = sorted({m.point for m in marks})
+        for key, k in enumerate(seen, world + 1):
+            self._smoother.append_pose(se3.compose(np.eye(3), points[k].position_m), np.eye(6))
+            self._smoother.add_turn(HELD, key, np.eye(3), np.full(3, HELD_SIGMA))
+            sigma = np.maximum(points[k].sigma_m, 1e-3)
+            self._smoother.add_place("survey", key, points[k].position_m, sigma)
         for mark in marks:
-            keys = [mark.keyframe, int(gtsam.symbol("p", mark.point))]
-            rows = 2
-            if mark.depth_m is not None:
-                keys.append(self._scale_key(mark.keyframe))
-                rows = 3
-            noise = gtsam.noiseModel.Unit.Create(rows)
-            robust = self._robust(noise, at=2.5)
-            self._add(gtsam.CustomFactor(robust, keys, mark_error(mark)), "control", noise)
+            R_camera_key = mark.T_key_camera[:3, :3].T
+            far = 0.0 if mark.depth_m is None else 1.0 / mark.sigma_depth_m
+            row = (
+                mark.keyframe, world + 1 + seen.index(mark.point), self._scale_key(mark.keyframe),
+                mark.ray, mark.depth_m or 0.0, R_camera_key, mark.T_key_camera[:3, 3],
+                (1.0 / mark.sigma, 1.0 / mark.sigma, far),
+            )  # fmt: skip
+            self._smoother.add(of_marks, MARK, "control", row, 2.5)

@@ -92,7 +92,7 @@ def _of_motions(rows: Rows, at: State) -> Linear:
     J[:, 3:, 6:9] = R_a_world @ se3.hat(expected)
     J[:, 3:, 12] = -np.einsum("nij,nj->ni", R_a_world, expected)
     J[scale == NO_SCALE, :, 12] = 0.0
-    columns = np.hstack([_unknowns(a, 0, 6), _unknowns(b, 0, 6), _logs(at, scale)])
+    columns = np.hstack([columns_of(a, 0, 6), columns_of(b, 0, 6), scale_columns(at, scale)])
     error = np.einsum("nij,nj->ni", rows["weight"], error)
     return Linear(error, rows["weight"] @ J, columns)
 
@@ -100,12 +100,12 @@ def _of_motions(rows: Rows, at: State) -> Linear:
 def _of_turns(rows: Rows, at: State) -> Linear:
     """Rotation from the measured one, in world axes."""
     error = _log(at.R[rows["key"]] @ rows["R"].transpose(0, 2, 1)) * rows["weight"]
-    return Linear(error, np.eye(3) * rows["weight"][:, :, None], _unknowns(rows["key"], 0, 3))
+    return Linear(error, np.eye(3) * rows["weight"][:, :, None], columns_of(rows["key"], 0, 3))
 
 
 def _of_places(rows: Rows, at: State) -> Linear:
     error = (at.t[rows["key"]] - rows["t"]) * rows["weight"]
-    return Linear(error, np.eye(3) * rows["weight"][:, :, None], _unknowns(rows["key"], 3, 6))
+    return Linear(error, np.eye(3) * rows["weight"][:, :, None], columns_of(rows["key"], 3, 6))
 
 
 def _of_scales(rows: Rows, at: State) -> Linear:
@@ -113,7 +113,7 @@ def _of_scales(rows: Rows, at: State) -> Linear:
     weight = rows["weight"][:, None]
     error = (at.logs[rows["b"]] - at.logs[rows["a"]] - rows["log"])[:, None] * weight
     J = np.stack([np.where(rows["a"][:, None] == NO_SCALE, 0.0, -weight), weight], axis=2)
-    return Linear(error, J, np.hstack([_logs(at, rows["a"]), _logs(at, rows["b"])]))
+    return Linear(error, J, np.hstack([scale_columns(at, rows["a"]), scale_columns(at, rows["b"])]))
 
 
 def _log(R: F64) -> F64:
@@ -127,12 +127,12 @@ def _log(R: F64) -> F64:
     return np.asarray(out)
 
 
-def _unknowns(keys: I64, first: int, end: int) -> I64:
-    """(n, end - first) columns of poses."""
+def columns_of(keys: I64, first: int, end: int) -> I64:
+    """(n, end - first) columns of poses: 0 to 3 turn them, 3 to 6 shift them."""
     return np.asarray(6 * keys[:, None] + np.arange(first, end))
 
 
-def _logs(at: State, keys: I64) -> I64:
+def scale_columns(at: State, keys: I64) -> I64:
     """(n, 1) columns of scales."""
     return np.asarray(6 * len(at.R) + keys[:, None])
 
@@ -141,11 +141,20 @@ class Factors:
     """The factors of one kind."""
 
     def __init__(
-        self, form: Callable[[Rows, State], Linear], dtype: np.dtype[Any], huber: float
-    ) -> None:
-        """Whitened errors longer than ``huber`` lose weight."""
-        self.form, self.huber = form, huber
+        self, form: Callable[[Rows, State], Linear], dtype: np.dtype[Any], huber: float,
+        cauchy: float = np.inf,
+    ) -> None:  # fmt: skip
+        """Whitened errors longer than ``huber`` lose weight; by ``cauchy`` they lose all of it."""
+        self.form, self.huber, self.cauchy = form, huber, cauchy
         self.rows = MemoryLedger(dtype)
+
+    def loss(self, length: F64) -> tuple[F64, F64]:
+        """(n,) weights and costs of whitened errors of this length (n,)."""
+        if np.isfinite(self.cauchy):
+            share = (length / self.cauchy) ** 2
+            return 1.0 / (1.0 + share), 0.5 * self.cauchy**2 * np.log1p(share)
+        weight = np.minimum(1.0, self.huber / np.maximum(length, 1e-12))
+        return weight, weight * length * (length - 0.5 * weight * length)
 
     def about(self, at: State) -> Linear:
         """All of them about a state."""
@@ -169,9 +178,8 @@ class System:
         values, rows, columns, g, cost = [np.ones(1)], [held], [held], np.zeros(count), 0.0
         for one in factors:
             error, J, unknowns = one.about(at)
-            length = np.linalg.norm(error, axis=1)
-            weight = np.minimum(1.0, one.huber / np.maximum(length, 1e-12))
-            cost += float(np.sum(weight * length * (length - 0.5 * weight * length)))
+            weight, costs = one.loss(np.linalg.norm(error, axis=1))
+            cost += float(np.sum(costs))
             JW, width = J.transpose(0, 2, 1) * weight[:, None, None], unknowns.shape[1]
             g += np.bincount(unknowns.ravel(), (JW @ error[:, :, None]).ravel(), count)
             values.append((JW @ J).ravel())
@@ -236,33 +244,39 @@ class Smoother:
     # ---- what goes in --------------------------------------------------------------------------
 
     def add_motion(
-        self, kind: str, keys: tuple[int, int], T_a_b: F64, covariance: F64, scale: int = NO_SCALE
-    ) -> None:
+        self, kind: str, keys: tuple[int, int], T_a_b: F64, covariance: F64,
+        scale: int = NO_SCALE, huber: float = np.inf,
+    ) -> None:  # fmt: skip
         """A motion (4, 4) between poses a and b, whose lengths grow with a scale; its covariance
         (6, 6) is of the left perturbation in a's frame."""
         weight = np.linalg.inv(np.linalg.cholesky(covariance))
-        self._add(_of_motions, MOTION, kind, (*keys, scale, T_a_b[:3, :3], T_a_b[:3, 3], weight))
+        row = (*keys, scale, T_a_b[:3, :3], T_a_b[:3, 3], weight)
+        self.add(_of_motions, MOTION, kind, row, huber)
 
     def add_turn(self, kind: str, key: int, R: F64, sigma: F64, huber: float = np.inf) -> None:
         """A rotation (3, 3) of a pose; sigma (3,) in rad about the world's axes."""
-        self._add(_of_turns, TURN, kind, (key, R, 1.0 / sigma), huber)
+        self.add(_of_turns, TURN, kind, (key, R, 1.0 / sigma), huber)
 
-    def add_place(self, kind: str, key: int, place: F64, sigma: F64, huber: float = np.inf) -> None:
+    def add_place(
+        self, kind: str, key: int, place: F64, sigma: F64, huber: float = np.inf,
+        cauchy: float = np.inf,
+    ) -> None:  # fmt: skip
         """A place (3,) of a pose, with sigma (3,) m; infinite where nothing is known."""
-        self._add(_of_places, PLACE, kind, (key, place, 1.0 / sigma), huber)
+        self.add(_of_places, PLACE, kind, (key, place, 1.0 / sigma), huber, cauchy)
 
     def add_scale(
         self, kind: str, keys: tuple[int, int], log: float, sigma: float, huber: float = np.inf
     ) -> None:
         """The log of scale b over scale a."""
-        self._add(_of_scales, SCALE, kind, (*keys, log, 1.0 / sigma), huber)
+        self.add(_of_scales, SCALE, kind, (*keys, log, 1.0 / sigma), huber)
 
-    def _add(
+    def add(
         self, form: Callable[[Rows, State], Linear], dtype: np.dtype[Any], kind: str,
-        row: tuple[Any, ...], huber: float = np.inf,
+        row: tuple[Any, ...], huber: float = np.inf, cauchy: float = np.inf,
     ) -> None:  # fmt: skip
+        """A factor of any form; all of one kind share a loss (:class:`Factors`)."""
         if kind not in self._factors:
-            self._factors[kind] = Factors(form, dtype, huber)
+            self._factors[kind] = Factors(form, dtype, huber, cauchy)
         self._factors[kind].rows.append(np.array([row], dtype))
 
     def append_pose(self, T: F64, covariance: F64) -> None:
