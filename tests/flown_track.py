@@ -32,7 +32,7 @@ def sensed(
     return odom, priors
 
 
-def tell(trajectory: Trajectory, seq: int) -> None:
+def publish(trajectory: Trajectory, seq: int) -> None:
     """Publish a new keyframe, and those that have moved since they were."""
     trajectory.publish(trajectory.place(seq))
     for placed in trajectory.moved():

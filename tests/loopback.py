@@ -13,7 +13,7 @@ PAUSE_S = 0.02
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    """A port of this machine that nobody uses."""
+    """A port of this machine that nothing uses."""
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

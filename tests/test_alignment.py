@@ -163,7 +163,7 @@ def test_fixes_that_jump_for_a_third_of_the_flight_do_not_shift_it() -> None:
 
 
 @pytest.mark.parametrize("wrong", [1.0, 1.2])
-def test_scales_by_fixes_and_by_heights_are_told_apart(wrong: float) -> None:
+def test_scales_by_fixes_and_by_heights_are_distinguished(wrong: float) -> None:
     """Ten runs each: agreeing readings are within three sigmas, a fifth more height is not."""
     for seed in range(10):
         some = []

@@ -105,7 +105,7 @@ def test_doctor_explains_a_named_backend_that_cannot_run(monkeypatch: pytest.Mon
         open_backend(config.compute)
 
 
-def test_tensorrt_keeps_its_engines_and_no_other_provider_is_told(tmp_path: Path) -> None:
+def test_tensorrt_keeps_its_engines_and_no_other_provider_is_reported(tmp_path: Path) -> None:
     """Each model has its own folder: TensorRT tells models apart by names, which ours share."""
     pytest.importorskip("onnxruntime")
     pytest.importorskip("onnx")

@@ -1,4 +1,4 @@
-"""Work beside the caller: order, waiting, giving way, faults."""
+"""Work in the background: order, waiting, giving way, faults."""
 
 from __future__ import annotations
 
@@ -132,12 +132,12 @@ def test_a_fault_at_the_end_of_a_scan_leaves_no_thread_behind() -> None:
 
     jobs: list[BackgroundWorker[int, int]] = []
 
-    def beside(_: object) -> BackgroundWorker[int, int]:
+    def in_background(_: object) -> BackgroundWorker[int, int]:
         jobs.append(BackgroundWorker("dense", work, 2))
         return jobs[-1]
 
     views = SimpleNamespace(end_stretch=lambda: None, ready=lambda everything: [1, 2, 3])
-    stages: Any = SimpleNamespace(beside=beside, views=views)
+    stages: Any = SimpleNamespace(in_background=in_background, views=views)
     pipeline = Pipeline(stages)
     with pytest.raises(RuntimeError, match="no luck"):
         pipeline.finish()

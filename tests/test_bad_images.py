@@ -160,11 +160,11 @@ def test_telemetry_goes_on_where_vision_was_lost(clean: list[U8]) -> None:
     lost: list[tuple[int, F64]] = []
     for i, image in enumerate([*clean[:40], *[over_exposed(clean[0])] * 16]):
         off_m = 3.0 if i >= 36 else 0.0
-        told = replace(
+        sensed = replace(
             state(i), lat_deg=47.0, lon_deg=8.0 + (STEP_M * i + off_m) * metre_east,
             alt_amsl_m=500.0 + HEIGHT_M, sigma_h_m=1.0, sigma_v_m=1.5, sigma_yaw_rad=0.03,
         )  # fmt: skip
-        step = pipeline.step(Frame(image, i * 40_000_000, i, rig.prior(told, None)))
+        step = pipeline.step(Frame(image, i * 40_000_000, i, rig.prior(sensed, None)))
         if step.placed is not None:
             kept = seen if step.anchor is not None else lost
             kept.append((i, step.placed.T_world_camera[:3, 3]))

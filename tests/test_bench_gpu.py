@@ -20,7 +20,7 @@ STAGES = (
 )  # fmt: skip
 
 
-def test_every_stage_is_measured_beside_its_floor(
+def test_every_stage_is_compared_with_its_floor(
     monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
     """Small images here; the figures are those of ``skyrelief bench gpu``."""
@@ -42,9 +42,9 @@ def test_every_stage_is_measured_beside_its_floor(
     assert [r.what.rpartition(", ")[2] for r in whole] == [
         "on the device", "with uploads", "with uploads",
     ]  # fmt: skip
-    beside = [r for r in results if r.peer == "cpu backend"]
-    assert all(math.isfinite(r.value) and r.value > 0 for r in beside)
-    assert {r.note.partition(" on ")[0] for r in beside} >= {"torch"}
+    nearby = [r for r in results if r.peer == "cpu backend"]
+    assert all(math.isfinite(r.value) and r.value > 0 for r in nearby)
+    assert {r.note.partition(" on ")[0] for r in nearby} >= {"torch"}
     (named,) = [r for r in results if r.what == "bandwidth of the device"]
     assert named.note and named.value > 0
 

@@ -1,4 +1,4 @@
-"""A recording decoded ahead gives the same images, and lets go when nobody wants more."""
+"""A recording decoded ahead gives the same images, and stops when no caller wants more."""
 
 from __future__ import annotations
 

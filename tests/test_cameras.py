@@ -1,4 +1,4 @@
-"""Recorded cameras: every image and its time come out, and bad input is told in one line."""
+"""Recorded cameras: every image and its time come out, and bad input is reported in one line."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def test_concealed_damage_is_not_passed_on(tmp_path: Path) -> None:
     assert any("damaged" in w for w in source.warnings)
 
 
-def test_bad_files_are_told_in_one_line(tmp_path: Path) -> None:
+def test_bad_files_are_reported_in_one_line(tmp_path: Path) -> None:
     empty = tmp_path / "empty.mp4"
     empty.touch()
     text = tmp_path / "notes.mp4"

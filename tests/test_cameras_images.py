@@ -188,7 +188,7 @@ def test_useless_gps_is_no_position(tmp_path: Path) -> None:
         assert read_tags(path).geotag is None, name
 
 
-def test_odd_ones_are_left_out_and_told(tmp_path: Path) -> None:
+def test_odd_ones_are_left_out_and_reported(tmp_path: Path) -> None:
     for i in range(3):
         write_still(tmp_path / f"{i}.jpg", f"2024:06:01 12:00:0{i}", offset="+00:00")
     write_still(tmp_path / "wide.jpg", "2024:06:01 12:00:09", size_px=(96, 48))
@@ -199,9 +199,9 @@ def test_odd_ones_are_left_out_and_told(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("not looked at")
     source = open_camera(str(tmp_path))
     assert [(f.seq, f.name) for f in source] == [(0, "0.jpg"), (1, "2.jpg")]
-    told = "\n".join(source.warnings)
+    reported = "\n".join(source.warnings)
     for name in ("bad.jpg", "empty.jpg", "1.jpg", "not 64x48"):
-        assert name in told
+        assert name in reported
 
 
 def test_folders_without_images_are_refused(tmp_path: Path) -> None:

@@ -151,7 +151,7 @@ def test_one_time_axis_through_losses() -> None:
     assert any("cannot be opened" in w for w in source.warnings)
 
 
-def test_absent_camera_is_told_at_once() -> None:
+def test_absent_camera_is_reported_at_once() -> None:
     with pytest.raises(OutsideError, match="gives no image"):
         LiveSource(opener(OSError("no route")), "test", QUICK)
 
@@ -194,7 +194,7 @@ def test_waiting_for_a_dead_camera_can_be_ended() -> None:
 
 @pytest.mark.parametrize("taken", [0, 1, 5])
 @pytest.mark.parametrize("pace", [Paced, lambda source: source], ids=["paced", "direct"])
-def test_an_ended_stream_is_let_go_at_once(
+def test_an_ended_stream_is_released_at_once(
     pace: Callable[[CameraSource], CameraSource], taken: int, no_collector: None
 ) -> None:
     """Its port or device must be free for the next scan, not when the collector comes round."""
@@ -240,7 +240,7 @@ def test_nonsense_settings_are_refused(wrong: dict[str, float]) -> None:
         LiveConfig(**wrong)
 
 
-def test_wrong_live_sources_are_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_wrong_live_sources_are_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     with pytest.raises(OutsideError, match="no such camera device"):
         open_camera(f"v4l2:{tmp_path / 'video7'}")
     with pytest.raises(InputError, match="no option 'fps'"):
@@ -355,7 +355,7 @@ def test_a_gstreamer_decoder_with_padded_images_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not has_gstreamer(), reason="needs GStreamer")
-def test_what_gstreamer_complains_about_is_told() -> None:
+def test_what_gstreamer_complains_about_is_reported() -> None:
     with pytest.raises(OutsideError, match='no element "nosuchsource"'):
         open_camera("gst:nosuchsource ! queue")
 

@@ -133,10 +133,10 @@ def test_an_arming_while_the_last_scan_is_closed_is_followed_then(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given = [f"scan.folder={tmp_path}", "scan.start=on-arm", "health.http="]
-    daemon, told = Daemon(load_config(None, given)), []
+    daemon, reported = Daemon(load_config(None, given)), []
     scanning, hung = daemon.scanning, Hung(daemon.scanning, tmp_path)
     monkeypatch.setattr(ScanRun, "carry_out", lambda run: hung.carry_out(run))
-    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_: told.append(text))
+    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_: reported.append(text))
     daemon.actions.is_ready = True
     armed, was = False, False
 
@@ -152,7 +152,7 @@ def test_an_arming_while_the_last_scan_is_closed_is_followed_then(
     assert not look(False)
     assert scanning.is_closing
     assert look(True)
-    assert told == ["Scan starts once the last one is closed"]
+    assert reported == ["Scan starts once the last one is closed"]
     assert not look(False)  # and off again
     hung.step.set()
     assert look(True)

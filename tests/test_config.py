@@ -126,7 +126,7 @@ def test_later_override_wins_over_earlier_and_file(tmp_path: Path) -> None:
         ("[mavlink]\nsystem_id = 256\n", "mavlink.system_id"),
     ],
 )
-def test_mistakes_are_told_in_one_line(tmp_path: Path, text: str, expected: str) -> None:
+def test_mistakes_are_reported_in_one_line(tmp_path: Path, text: str, expected: str) -> None:
     with pytest.raises(InputError) as caught:
         load_config(written(tmp_path, text))
     assert expected in str(caught.value)
@@ -135,12 +135,12 @@ def test_mistakes_are_told_in_one_line(tmp_path: Path, text: str, expected: str)
 
 
 @pytest.mark.parametrize("override", ["baseline=3", "scan.baseline", "scan.nope=1", "x.y=1", "=="])
-def test_wrong_overrides_are_told(override: str) -> None:
+def test_wrong_overrides_are_reported(override: str) -> None:
     with pytest.raises(InputError, match="--set"):
         load_config(None, [override])
 
 
-def test_unreadable_files_are_told(tmp_path: Path) -> None:
+def test_unreadable_files_are_reported(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         load_config(tmp_path / "none.toml")
     binary = tmp_path / "x.toml"

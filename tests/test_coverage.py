@@ -219,7 +219,7 @@ def test_the_layer_of_a_scan_has_the_house_in_its_heights(
     assert layer.height_m[r2, c2] == pytest.approx(0.0, abs=0.05)
     assert layer.sigma_m[r1, c1] == pytest.approx(0.05, rel=0.2)
     assert layer.views[r2, c2] == 5
-    row, col = np.nonzero(layer.gaps)  # only what the roof hides beside the house
+    row, col = np.nonzero(layer.gaps)  # only what the roof hides next to the house
     north = layer.grid.north_m - (row + 0.5) * layer.grid.cell_m
     east = layer.grid.west_m + (col + 0.5) * layer.grid.cell_m
     assert (np.abs(np.abs(north - 2.0) - 4.6) < 1.0).all() and (np.abs(east - 10.0) < 7.5).all()
@@ -308,7 +308,9 @@ def test_the_portal_shows_the_layer(tmp_path: Path, house: HouseFlight) -> None:
         portal.close()
 
 
-def test_a_growing_scan_has_its_layer_written_beside_it(tmp_path: Path, house: HouseFlight) -> None:
+def test_a_growing_scan_has_its_layer_written_next_to_it(
+    tmp_path: Path, house: HouseFlight
+) -> None:
     def figures() -> dict[str, Any]:
         path = tmp_path / FIGURES
         return dict(json.loads(path.read_text())) if path.exists() else {}
@@ -328,7 +330,7 @@ def test_a_growing_scan_has_its_layer_written_beside_it(tmp_path: Path, house: H
     assert cv2.imread(str(tmp_path / IMAGE)) is not None
 
 
-def test_few_layers_are_kept_and_rarely_made_anew(tmp_path: Path, house: HouseFlight) -> None:
+def test_few_layers_are_kept_and_rarely_made_again(tmp_path: Path, house: HouseFlight) -> None:
     folders = [tmp_path / str(n) for n in range(3)]
     for folder in folders:
         house.flown(folder).close()

@@ -211,7 +211,7 @@ def test_uninstall_keeps_scans_and_configuration(machine: Machine) -> None:
     assert (machine.root / "etc" / "skyrelief" / "skyrelief.toml").is_file()
 
 
-def test_wrong_usage_is_told(machine: Machine) -> None:
+def test_wrong_usage_is_reported(machine: Machine) -> None:
     assert "no option --nonsense" in machine.install("--nonsense").stderr
     assert "sudo deploy/install.sh" in machine.install("--help").stdout
     assert "no version before" in machine.install("--rollback").stderr
@@ -233,8 +233,8 @@ def test_units_are_valid(unit: Path, tmp_path: Path) -> None:
         timeout=60,
         check=False,
     )
-    told = [line for line in done.stderr.splitlines() if unit.name in line]
-    assert told == []
+    reported = [line for line in done.stderr.splitlines() if unit.name in line]
+    assert reported == []
 
 
 @needs_systemd

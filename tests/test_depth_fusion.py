@@ -77,7 +77,7 @@ def test_pairs_that_mostly_contradict_each_other_give_nothing() -> None:
     assert np.isnan(fused.depth_m).all() and np.isnan(fused.sigma_m).all()
     assert (fused.views == 0).all()
     few = fuse(pairs[2:], K, np.eye(4), FusionConfig())
-    assert np.isfinite(few.depth_m).all()  # one pair contradicts nobody
+    assert np.isfinite(few.depth_m).all()  # one pair alone contradicts none
 
 
 def test_useless_readings_are_left_out() -> None:

@@ -39,7 +39,7 @@ def test_noise_as_the_sigmas_say_leaves_them() -> None:
     assert max(factors) < 1.05 and min(factors) >= 1.0
 
 
-def test_noise_of_twice_the_sigma_is_told() -> None:
+def test_noise_of_twice_the_sigma_is_reported() -> None:
     found = Disagreement()
     factors = [found.take(_seen(T, 0.1, k, noise=2.0)) for k, T in enumerate(PLACES)]
     assert factors[0] == 1.0 and factors[1:] == pytest.approx([2.0] * 3, rel=0.05)

@@ -59,7 +59,7 @@ def test_everything_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         assert found[what][0] == GOOD, found[what]
 
 
-def test_what_is_missing_is_told(tmp_path: Path) -> None:
+def test_what_is_missing_is_reported(tmp_path: Path) -> None:
     found = findings(
         f"scan.folder={tmp_path}",
         f"camera.source={tmp_path / 'none.mp4'}",
@@ -78,7 +78,7 @@ def test_what_is_missing_is_told(tmp_path: Path) -> None:
     assert findings("mavlink.links=modem:1")["mavlink"][0] == BAD
 
 
-def test_camera_model_of_another_size_is_told(tmp_path: Path) -> None:
+def test_camera_model_of_another_size_is_reported(tmp_path: Path) -> None:
     model = tmp_path / "camera.yaml"
     model.write_text(
         (DEMO / "camera.yaml").read_text().replace("image_width: 1600", "image_width: 800")
@@ -90,7 +90,7 @@ def test_camera_model_of_another_size_is_told(tmp_path: Path) -> None:
     assert "calibrate at 1600x1200" in found["camera"][1]
 
 
-def test_foreign_package_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_foreign_package_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.daemon.diagnosis._parent", lambda name: f"/somewhere/{name}")
     assert "shadows one of ours" in findings()["packages"][1]
 
@@ -122,7 +122,7 @@ def test_command_line(tmp_path: Path) -> None:
     assert "not ready to fly: " in last and "camera" in last
 
 
-def test_what_is_missing_to_fly_is_told(tmp_path: Path) -> None:
+def test_what_is_missing_to_fly_is_reported(tmp_path: Path) -> None:
     given = [f"scan.folder={tmp_path}", f"camera.source={DEMO / 'frames'}"]
     assert findings(given[0])["to fly"] == (
         BAD,
@@ -146,8 +146,8 @@ def test_the_boards_settings_are_compared() -> None:
     assert path is not None
     changed = load_config(path, ["compute.threads=1"])
     assert other_than_profile(changed, path) == ["compute.threads = 1, not 3"]
-    told = findings("compute.threads=1")["board"]
-    assert told[0] == NOTE
+    reported = findings("compute.threads=1")["board"]
+    assert reported[0] == NOTE
 
 
 def test_threads_and_kernels_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:

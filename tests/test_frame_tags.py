@@ -1,4 +1,4 @@
-"""Age and sigma of telemetry, frame by frame, beside the scan."""
+"""Age and sigma of telemetry, frame by frame, next to the scan."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_each_frame_has_a_line_and_what_is_unknown_stays_empty(tmp_path: Path) -
     assert (row["sigma_horizontal_m"], row["sigma_agl_m"]) == ("1.250", "0.500")
 
 
-def test_a_full_disk_is_told_once_and_costs_nothing_else(
+def test_a_full_disk_is_reported_once_and_costs_nothing_else(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     FrameTags(tmp_path / "missing" / FILE).write(0, STATE)

@@ -165,7 +165,7 @@ def test_poses_that_are_metres_off_and_wild_sightings_do_no_harm() -> None:
     assert len(found.seen.view) < len(uv) - 0.8 * len(wild)
 
 
-def test_a_camera_that_starts_anew_each_round_is_held_to_the_one_given() -> None:
+def test_a_camera_that_starts_again_each_round_is_held_to_the_one_given() -> None:
     T, points, seen = scene(0.2)
     given = Camera(TRUE.K * [[1.03, 1, 1], [1, 1.03, 1], [1, 1, 1]], TRUE.distortion, SIZE)
     known = replace(

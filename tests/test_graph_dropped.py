@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from flown_track import SPREAD, landed, sensed, tell
+from flown_track import SPREAD, landed, publish, sensed
 
 from recon import se3
 from recon.posegraph.interpolated import KEYFRAME, left
@@ -40,7 +40,7 @@ def fly(trajectory: Trajectory, first: int = 0, count: int = COUNT, fixes: bool 
         prior = priors[i] if fixes else PosePrior()
         height = (HEIGHT_M / SCALE, 0.0) if fixes else None
         trajectory.add(i, segment, T, prior, height, i * 10**9, SPREAD * UNITS)
-        tell(trajectory, i)
+        publish(trajectory, i)
         most = max(most, len(trajectory.graph))
     return most
 
@@ -69,7 +69,7 @@ def test_many_short_segments_keep_to_the_bound_and_near_the_truth() -> None:
 
 
 def test_without_fixes_nothing_jumps_when_segments_go() -> None:
-    """Dead reckoning over a gap is told once: what stays, stays where it was."""
+    """Dead reckoning over a gap is published once: what stays, stays where it was."""
     trajectory, worst = Trajectory(graph=bounded()), 0.0
     for i in range(COUNT):
         before = {seq: trajectory.place(seq).T_world_camera for seq in range(max(0, i - 30), i)}
@@ -92,15 +92,15 @@ def test_dropped_keyframes_stay_as_published() -> None:
     graph = trajectory.graph
     before, after = next((a, b) for a, b in pairwise(graph.seqs) if b - a > EACH)
     assert graph.node(after).segment > graph.node(before).segment + 1
-    told = trajectory.place(before + 1)
-    apart = np.linalg.norm((told.T_world_camera - flight()[0][before + 1])[:3, 3])
+    published = trajectory.place(before + 1)
+    apart = np.linalg.norm((published.T_world_camera - flight()[0][before + 1])[:3, 3])
     assert 0.0 < apart < 5.0
     assert not trajectory.add_loop(before + 1, COUNT - 1, np.eye(4), SPREAD)
     landed(trajectory, COUNT)
     assert graph.seqs[0] == 0
     found = trajectory.place(before + 1)
-    np.testing.assert_array_equal(found.T_world_camera, told.T_world_camera)
-    assert found.scale == told.scale
+    np.testing.assert_array_equal(found.T_world_camera, published.T_world_camera)
+    assert found.scale == published.scale
 
 
 def nodes_of(sizes: list[int]) -> list[Node]:
@@ -125,9 +125,9 @@ def test_segments_go_whole_but_neither_the_first_nor_the_newest() -> None:
     assert [
         one.ends for one in moved_loops(loops, marginalised, gone - marginalised.keys(), 9)
     ] == [(0, 9)]
-    told = {n.seq: n.over for n in over_gaps(kept, poses) if n.over is not None}
-    assert told.keys() == {5, 8, 12, 14, 16}
-    np.testing.assert_allclose(told[8][:3, 3], [2.0, 0.0, 0.0])  # over the seventh
+    found_over = {n.seq: n.over for n in over_gaps(kept, poses) if n.over is not None}
+    assert found_over.keys() == {5, 8, 12, 14, 16}
+    np.testing.assert_allclose(found_over[8][:3, 3], [2.0, 0.0, 0.0])  # over the seventh
 
 
 def test_of_what_was_never_told_the_node_before_tells() -> None:
@@ -142,7 +142,7 @@ def test_of_what_was_never_told_the_node_before_tells() -> None:
 
 @pytest.mark.parametrize("fixes", [True, False])
 def test_rounding_errors_do_not_grow_from_break_to_break(fixes: bool) -> None:
-    """Each segment's pose is made of the last one's and of its inverse when all is built anew."""
+    """Each segment's pose is made of the last one's and of its inverse when all is built again."""
     trajectory, (_, odom, priors) = Trajectory(graph=PoseGraph()), flight()
     for i in range(0, 200, 2):
         prior = priors[i] if fixes else PosePrior()

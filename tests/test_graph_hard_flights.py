@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from flown_track import SPREAD, landed, sensed, tell
+from flown_track import SPREAD, landed, publish, sensed
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
@@ -60,7 +60,7 @@ def flown(hard: Hard) -> tuple[list[F64], Trajectory]:
             T = se3.inverse(truth[a]) @ truth[i]
             T[:3, 3] *= trajectory.scale(a) / hard.scale  # it is seen in units of the odometry
             trajectory.add_loop(a, i, T, LOOP)
-        tell(trajectory, i)
+        publish(trajectory, i)
     return truth, trajectory
 
 

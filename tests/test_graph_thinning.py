@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flown_track import SPREAD, landed, sensed, tell
+from flown_track import SPREAD, landed, publish, sensed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -41,7 +41,7 @@ def bounded(most: int = MOST) -> PoseGraph:
 
 
 def fly(trajectory: Trajectory, count: int = COUNT, first: int = 0) -> None:
-    """Every keyframe entered and told, with loops between neighbouring legs."""
+    """Every keyframe entered and published, with loops between neighbouring legs."""
     truth, odom, priors = flight()
     for i in range(first, count):
         height = (HEIGHT_M / SCALE, 0.0)
@@ -50,7 +50,7 @@ def fly(trajectory: Trajectory, count: int = COUNT, first: int = 0) -> None:
         if leg and 10 < along < LEG - 10 and i % 4 == 0:
             other = leg * LEG - 1 - along
             trajectory.add_loop(other, i, se3.inverse(truth[other]) @ truth[i], LOOP)
-        tell(trajectory, i)
+        publish(trajectory, i)
 
 
 def rms_m(poses: F64) -> float:
@@ -118,10 +118,10 @@ def test_riders_lie_between_their_nodes_as_vision_saw_them() -> None:
 def test_everything_told_is_corrected_at_the_end_and_counted() -> None:
     trajectory = Trajectory(graph=bounded())
     fly(trajectory)
-    told = {i: trajectory.place(i) for i in range(0, COUNT, 3)}
+    published = {i: trajectory.place(i) for i in range(0, COUNT, 3)}
     poses = landed(trajectory, COUNT)
     assert trajectory.moved(final=True) == []
-    for i, before in told.items():
+    for i, before in published.items():
         times, growth = trajectory.publish(trajectory.place(i))
         assert times >= 1 and growth > 0
         if np.linalg.norm(before.T_world_camera[:3, 3] - poses[i, :3, 3]) > 0.01:

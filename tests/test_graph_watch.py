@@ -1,4 +1,4 @@
-"""What the operator is told of telemetry that contradicts itself."""
+"""Warnings about telemetry that contradicts itself."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def prior(T: F64, agl_m: float = 60.0) -> PosePrior:
     return PosePrior(T[:3, :3], 0.01, 0.05, T[:3, 3].copy(), np.full(3, 0.5), agl_m, 2.0)
 
 
-def told(priors: list[PosePrior]) -> tuple[list[str], GraphWatch]:
+def warnings_of(priors: list[PosePrior]) -> tuple[list[str], GraphWatch]:
     graph, heard = PoseGraph(), list[str]()
     watch = GraphWatch(graph)
     for i, (T, p) in enumerate(zip(track(len(priors)), priors, strict=True)):
@@ -37,25 +37,25 @@ def told(priors: list[PosePrior]) -> tuple[list[str], GraphWatch]:
 
 
 def test_agreeing_sensors_are_no_news() -> None:
-    heard, watch = told([prior(T) for T in track()])
+    heard, watch = warnings_of([prior(T) for T in track()])
     assert heard == [] and watch.sentences() == []
 
 
 @pytest.mark.parametrize(("agl_m", "word"), [(75.0, "smaller"), (48.0, "larger")])
-def test_scales_that_disagree_are_told_once(agl_m: float, word: str) -> None:
-    heard, watch = told([prior(T, agl_m) for T in track()])
+def test_scales_that_disagree_are_reported_once(agl_m: float, word: str) -> None:
+    heard, watch = warnings_of([prior(T, agl_m) for T in track()])
     assert len(heard) == 1
     assert heard[0].startswith("scale: GNSS makes the map 25 % " + word)
     assert watch.sentences() == heard
 
 
-def test_a_jump_of_the_receiver_is_told() -> None:
+def test_a_jump_of_the_receiver_is_reported() -> None:
     priors = [prior(T) for T in track(40)]
     for i in range(20, 28):
         place = priors[i].position_m
         assert place is not None
         priors[i] = replace(priors[i], position_m=place + np.array([30.0, 0.0, 0.0]))
-    heard, watch = told(priors)
+    heard, watch = warnings_of(priors)
     assert any("does GNSS jump" in text for text in heard)
     assert any(text.startswith("8 positions") for text in watch.sentences())
 
@@ -64,14 +64,14 @@ def test_a_position_that_repeats_on_the_ground_is_no_news() -> None:
     priors = [prior(T) for T in track(40)]
     place = priors[19].position_m
     priors[20:] = [replace(p, position_m=place, is_at_rest=True) for p in priors[20:]]
-    heard, watch = told(priors)
+    heard, watch = warnings_of(priors)
     assert not any("frozen" in text for text in [*heard, *watch.sentences()])
 
 
-def test_a_frozen_receiver_is_told() -> None:
+def test_a_frozen_receiver_is_reported() -> None:
     priors = [prior(T) for T in track(40)]
     priors[20:] = [replace(p, position_m=priors[19].position_m) for p in priors[20:]]
-    heard, _ = told(priors)
+    heard, _ = warnings_of(priors)
     assert any("is GNSS frozen" in text for text in heard)
 
 

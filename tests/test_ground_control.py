@@ -123,10 +123,10 @@ def test_covariances_cover_the_errors() -> None:
 def test_marks_between_keyframes_count_alike() -> None:
     truth = true_poses()
     before = moved(drifted(truth), np.array([1.0, 1.0, -1.0]), np.zeros(3))
-    beside = se3.compose(se3.so3_exp(np.array([0.0, 0.02, 0.01])), np.array([1.5, 0.4, 0.1]))
+    nearby = se3.compose(se3.so3_exp(np.array([0.0, 0.02, 0.01])), np.array([1.5, 0.4, 0.1]))
     marks = []
-    for m in marks_of(np.array([T @ beside for T in truth]), SPOTS, with_depth=False):
-        marks.append(Mark(m.point, m.keyframe, m.ray, m.sigma, None, 1.0, beside))
+    for m in marks_of(np.array([T @ nearby for T in truth]), SPOTS, with_depth=False):
+        marks.append(Mark(m.point, m.keyframe, m.ray, m.sigma, None, 1.0, nearby))
     found = adjust(Track(before, TIMES, loose(40)), [Point(P, SURVEY) for P in SPOTS],
                    marks)  # fmt: skip
     assert rms(found.poses, truth) < 0.25

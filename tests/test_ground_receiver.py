@@ -193,7 +193,7 @@ def test_both_ends_may_restart(tmp_path: Path) -> None:
     onboard.close()
 
 
-def test_a_session_on_which_stations_fell_silent_is_opened_anew(
+def test_a_session_on_which_stations_fell_silent_is_opened_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     endpoint = free_endpoint()

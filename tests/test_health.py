@@ -118,7 +118,7 @@ def test_http_survives_hostile_bytes(hostile: bytes) -> None:
         server.close()
 
 
-def test_why_it_cannot_start_is_told_before_it_is_started_again(
+def test_why_it_cannot_start_is_reported_before_it_is_started_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("service.daemon.runtime.REPORT_FAULT_S", 60.0)
@@ -149,10 +149,10 @@ def test_why_it_cannot_start_is_told_before_it_is_started_again(
             with pytest.raises(InputError, match=r"camera\.source is not set"):
                 daemon.run()
             operator.join()
-        told = [listener.recv(200).decode() for _ in range(2)]
+        reported = [listener.recv(200).decode() for _ in range(2)]
     assert said["text"].startswith("Not ready: camera.source is not set")
     assert said["ok"] is False
-    assert told == [
+    assert reported == [
         "STATUS=camera.source is not set; give it in the configuration file",
         "STOPPING=1",
     ]
@@ -165,7 +165,7 @@ def test_why_it_cannot_start_is_told_before_it_is_started_again(
         ("[mavlink]\nlinks = [\n", "is not TOML"),
     ],
 )
-def test_a_broken_configuration_is_told_before_it_is_tried_again(
+def test_a_broken_configuration_is_reported_before_it_is_tried_again(
     tmp_path: Path, broken: str, complaint: str
 ) -> None:
     """By systemd's status, and by MAVLink where the section of the links is whole."""
@@ -186,13 +186,13 @@ def test_a_broken_configuration_is_told_before_it_is_tried_again(
         with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE) as service:
             try:
                 status = init.recv(500).decode()
-                told = "" if not is_heard else _first_text(radio)
+                reported = "" if not is_heard else _first_text(radio)
                 service.terminate()
                 assert service.wait(timeout=60.0) == 2
             finally:
                 service.kill()
     assert status.startswith(f"STATUS={file}") and complaint in status
-    assert told == ("Not ready: " + status[7:])[: len(told)] and bool(told) == is_heard
+    assert reported == ("Not ready: " + status[7:])[: len(reported)] and bool(reported) == is_heard
 
 
 def _first_text(radio: socket.socket) -> str:
@@ -211,7 +211,7 @@ def test_metric_names_are_plain() -> None:
     )
 
 
-def test_systemd_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_systemd_is_notified(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
         listener.bind(path)
@@ -220,9 +220,9 @@ def test_systemd_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         notifier.ready()
         notifier.alive("scanning")
         notifier.stopping()
-        told = [listener.recv(200).decode() for _ in range(3)]
-    assert told == ["READY=1", "WATCHDOG=1\nSTATUS=scanning", "STOPPING=1"]
-    notifier.alive()  # nobody listens any more
+        reported = [listener.recv(200).decode() for _ in range(3)]
+    assert reported == ["READY=1", "WATCHDOG=1\nSTATUS=scanning", "STOPPING=1"]
+    notifier.alive()  # nothing listens any more
     monkeypatch.delenv("NOTIFY_SOCKET")
     Notifier().ready()
 
@@ -364,7 +364,7 @@ def test_a_second_service_leaves_the_scans_of_the_first_alone(
     with ScanStore.open(running / "scan.db") as store:
         assert store.finished
     assert Claim().take(tmp_path / "new") and (tmp_path / "new").is_dir()
-    assert Claim().take(Path("/proc/no-such-place"))  # nobody makes scans there
+    assert Claim().take(Path("/proc/no-such-place"))  # nothing makes scans there
 
 
 class Usage(NamedTuple):

@@ -315,12 +315,12 @@ def test_a_scan_that_is_being_closed_is_not_critical(
 def test_a_scan_by_command_is_closed_after_landing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    daemon, told, now_s, armed = daemon_in(tmp_path), list[str](), 1000.0, True
+    daemon, reported, now_s, armed = daemon_in(tmp_path), list[str](), 1000.0, True
     presence = type(daemon.vehicle.presence)
     monkeypatch.setattr(presence, "is_armed", property(lambda _: armed))
     monkeypatch.setattr(presence, "is_disarmed", lambda *_: not armed)
     monkeypatch.setattr("service.daemon.runtime.time.monotonic", lambda: now_s)
-    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_, **__: told.append(text))
+    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_, **__: reported.append(text))
     monkeypatch.setattr(ScanRun, "carry_out", lambda run: run.stop.wait(60.0))
     daemon.actions.is_ready = True
 
@@ -333,13 +333,13 @@ def test_a_scan_by_command_is_closed_after_landing(
     fly(0.0, True)
     fly(600.0, True)
     fly(1.0, False)
-    assert told == ["Landed: scan closes in 60 s unless you arm"]
+    assert reported == ["Landed: scan closes in 60 s unless you arm"]
     fly(30.0, True)  # take-off again
     fly(1.0, False)
     fly(59.0, False)
     assert daemon.scanning.phase is Phase.SCANNING
     fly(1.5, False)
-    assert told[1:] == [told[0], "Scan closed after landing: no stop command"]
+    assert reported[1:] == [reported[0], "Scan closed after landing: no stop command"]
     until(lambda: daemon.scanning.phase is Phase.IDLE)
 
 
@@ -353,7 +353,7 @@ def test_only_a_flight_that_ended_closes_a_scan() -> None:
     bench = [(t, False, True) for t in (0.0, 100.0, 1000.0)]
     assert landings(LandingWatch(), *bench) == "..."  # never armed
     silent = [(0.0, True, False), (10.0, False, False), (500.0, False, False)]
-    assert landings(LandingWatch(), *silent) == "..."  # nobody says that it is disarmed
+    assert landings(LandingWatch(), *silent) == "..."  # nothing says that it is disarmed
     down = [(0.0, True, False), (10.0, False, True), (69.0, False, False), (70.0, False, False)]
     assert landings(LandingWatch(), *down) == ".L.C"  # the battery is pulled after landing
     assert landings(LandingWatch(), *down, after_s=0.0) == "...."

@@ -133,7 +133,9 @@ def daemon(tmp_path: Path) -> Daemon:
     return Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
 
 
-def test_heat_is_told_acted_on_and_undone(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_heat_is_reported_acted_on_and_undone(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
     operator = Operator(daemon, monkeypatch)
     control = daemon.load_control
     for now_s in range(0, 100, 2):
@@ -182,7 +184,7 @@ class Dying(CpuBackend):
         return super().belief_propagation(left, right, labels, config)
 
 
-def test_a_device_that_fails_is_told_once_and_the_cpu_goes_on(
+def test_a_device_that_fails_is_reported_once_and_the_cpu_goes_on(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     operator = Operator(daemon, monkeypatch)

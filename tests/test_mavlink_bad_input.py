@@ -1,4 +1,4 @@
-"""Whatever comes in: nothing raises or hangs, the state stays right, the operator is told once."""
+"""Whatever comes in: nothing raises or hangs, the state stays right, faults are reported once."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ def test_stop_without_start_and_start_twice(peer: Peer) -> None:
     assert peer.vehicle.control.asked == ["start_scan"] and not peer.texts
 
 
-def test_two_autopilots_and_a_second_companion_are_told_once(peer: Peer) -> None:
+def test_two_autopilots_and_a_second_companion_are_reported_once(peer: Peer) -> None:
     for k in range(REPEATS):
         peer.beat(1)
         peer.beat(2)
@@ -201,7 +201,7 @@ def test_two_autopilots_and_a_second_companion_are_told_once(peer: Peer) -> None
     assert any("Another companion" in text for text in peer.texts)
 
 
-def test_a_reboot_of_the_autopilot_in_mid_scan_is_told_once(peer: Peer) -> None:
+def test_a_reboot_of_the_autopilot_in_mid_scan_is_reported_once(peer: Peer) -> None:
     peer.works()
     peer.beat(1)
     for boot in (900_000, 900_020, 900_040, 1_000, 1_020, 1_040):

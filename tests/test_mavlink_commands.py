@@ -433,7 +433,7 @@ def test_erase(ends: Ends) -> None:
     assert ends.command(526, 100, 1, 1) == [BUSY]
     assert any("refused while scanning" in text for text in ends.texts())
     ends.command(2501, 100)
-    assert ends.command(526, 100, 1, 1, 0, 1) == [BUSY]  # nobody says that it is disarmed
+    assert ends.command(526, 100, 1, 1, 0, 1) == [BUSY]  # nothing says that it is disarmed
     ends.arm()
     assert ends.command(526, 100, 1, 1, 0, 2) == [BUSY]
     ends.disarm()
@@ -653,7 +653,7 @@ def test_parameters_are_listed_read_set_and_refused(ends: Ends) -> None:
     assert ends.companion.parameters["SR_BASELINE_M"] == 2.5
 
 
-# What the operator is told
+# What the operator sees
 
 
 def test_texts_are_spaced_and_not_repeated(ends: Ends) -> None:
@@ -708,7 +708,7 @@ def test_a_long_text_comes_in_chunks(ends: Ends) -> None:
     assert len({m.id for m in chunks}) == 1
 
 
-def test_speed_and_distance_without_gps_are_told() -> None:
+def test_speed_and_distance_without_gps_are_reported() -> None:
     ends = Ends()
     ends.companion.streams.set_interval(191, 251, 1_000_000)
     ends.control.state = replace(
@@ -718,15 +718,15 @@ def test_speed_and_distance_without_gps_are_told() -> None:
     assert {m.name: m.value for m in named} == {"SR_SPEED": 5.5, "SR_DIST": 120.0}
 
 
-def test_the_companions_load_is_told_once_it_is_known(ends: Ends) -> None:
+def test_the_companions_load_is_reported_once_it_is_known(ends: Ends) -> None:
     assert ends.command(512, 191, 390) == [UNSUPPORTED]
     ends.companion.load = ComputerLoad(
         (50, 100), 30, 71, 900, 4000, 2000, 64_000, 12, 125, throttled=True, disk_full=True
     )
     assert ends.command(512, 191, 390) == [ACCEPTED]
-    told = [m for m in ends.pass_time(4.0) if m.get_type() == "ONBOARD_COMPUTER_STATUS"]
-    assert len(told) in (2, 3)
-    m = told[-1]
+    reported = [m for m in ends.pass_time(4.0) if m.get_type() == "ONBOARD_COMPUTER_STATUS"]
+    assert len(reported) in (2, 3)
+    m = reported[-1]
     assert list(m.cpu_cores[:3]) == [50, 100, 255] and m.cpu_combined[0] == 75
     assert (m.gpu_cores[0], m.temperature_board) == (30, 71)
     assert (m.ram_usage, m.ram_total) == (900, 4000)
@@ -748,7 +748,7 @@ def test_a_text_of_whole_chunks_is_closed_by_an_empty_one(ends: Ends) -> None:
     assert len(ends.texts()) < 30
 
 
-def test_health_is_confirmed_or_it_is_not_told() -> None:
+def test_health_is_confirmed_or_it_is_not_reported() -> None:
     presence = Presence(PresenceConfig(stale_s=5, dead_s=20, boot_s=60), 1, 0)
     first = presence.due(0)
     assert [o.component for o in first] == [191, 100]
@@ -757,7 +757,7 @@ def test_health_is_confirmed_or_it_is_not_told() -> None:
     assert presence.due(int(0.5 * S)) == [] and len(presence.due(S)) == 2
     presence.confirm(Health.ACTIVE, 2 * S)
     assert presence.due(2 * S)[0].message.system_status == 4
-    assert presence.due(8 * S)[0].message.system_status == 5  # nobody confirmed it
+    assert presence.due(8 * S)[0].message.system_status == 5  # nothing confirmed it
     assert presence.due(23 * S) == []  # dead: silent
     presence.confirm(Health.STANDBY, 24 * S)
     assert presence.due(24 * S)[0].message.system_status == 3

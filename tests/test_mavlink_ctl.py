@@ -1,4 +1,4 @@
-"""``skyrelief ctl`` against a companion, an impostor, and nobody."""
+"""``skyrelief ctl`` against a companion, an impostor, and nothing."""
 
 from __future__ import annotations
 

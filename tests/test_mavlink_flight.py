@@ -167,15 +167,15 @@ def test_a_flight_by_mavlink(tmp_path: Path, autopilot: Autopilot) -> None:
     assert kinds[(1, 191, 0)] and kinds[(1, 191, 331)] >= 20 and kinds[(255, 190, 76)] >= 1
 
 
-def _check_keyframes(told: list[Any], folder: Path) -> None:
-    """Every keyframe is told once, at its own place."""
-    assert len(told) == json.loads((folder / SUMMARY).read_text())["counts"]["keyframes"] >= 3
-    assert [m.image_index for m in told] == list(range(len(told)))
-    assert all(m.capture_result == 1 for m in told)
-    lons = [m.lon for m in told]
-    assert lons == sorted(lons) and abs(told[0].lat * 1e-7 - LAT) < 5e-5
-    assert told[0].relative_alt == pytest.approx(AGL_M * 1e3, rel=0.05)
-    down = Rotation.from_quat([*told[0].q[1:], told[0].q[0]]).apply([1.0, 0.0, 0.0])
+def _check_keyframes(reported: list[Any], folder: Path) -> None:
+    """Every keyframe is reported once, at its own place."""
+    assert len(reported) == json.loads((folder / SUMMARY).read_text())["counts"]["keyframes"] >= 3
+    assert [m.image_index for m in reported] == list(range(len(reported)))
+    assert all(m.capture_result == 1 for m in reported)
+    lons = [m.lon for m in reported]
+    assert lons == sorted(lons) and abs(reported[0].lat * 1e-7 - LAT) < 5e-5
+    assert reported[0].relative_alt == pytest.approx(AGL_M * 1e3, rel=0.05)
+    down = Rotation.from_quat([*reported[0].q[1:], reported[0].q[0]]).apply([1.0, 0.0, 0.0])
     assert down == pytest.approx([0.0, 0.0, 1.0], abs=0.05)  # the optical axis in NED
 
 
@@ -192,9 +192,9 @@ def _check_tags(lines: list[str]) -> None:
     assert times == sorted(times) and abs(times[0] - time.time()) < 300.0
 
 
-def _check_odometry(told: list[Any]) -> None:
+def _check_odometry(reported: list[Any]) -> None:
     """It flies east, level, at the pace of the images; after a long step no velocity is known."""
-    moving = told[10:20]
+    moving = reported[10:20]
     assert [m.q[0] for m in moving] == pytest.approx([1.0] * 10, abs=0.01)
     east = [m.y for m in moving]
     speed = (east[-1] - east[0]) / (moving[-1].time_usec - moving[0].time_usec) * 1e6

@@ -369,7 +369,7 @@ def test_too_little_sway_decides_nothing() -> None:
     assert steadiest_frame(level, level) is None
 
 
-def test_the_gimbal_itself_is_believed_before_its_relay_and_before_older_messages() -> None:
+def test_the_gimbal_itself_is_accepted_before_its_relay_and_before_older_messages() -> None:
     history = VehicleHistory()
     for t in (T0, T0 + 100 * MS):
         history.add(AttitudeSample(None, quaternion.IDENTITY), t)

@@ -73,7 +73,7 @@ def test_the_latency_is_found(latency_s: float, camera_hz: float, telemetry_hz: 
 
 
 def test_a_gimbal_that_only_trembles_is_enough() -> None:
-    # Half a degree of unsteadiness, seen and told with errors a tenth of that.
+    # Half a degree of unsteadiness, seen and measured with errors a tenth of that.
     found = watch_flight(0.07, 2e-4, 0.08, 30.0).estimate(attitudes(20.0, 0.08, 9e-4))
     assert found is not None
     assert abs(found.latency_ms - 70.0) < 3.0 * found.sigma_ms < 40.0

@@ -323,7 +323,7 @@ def test_the_servo_mount_of_a_real_log_looks_straight_down() -> None:
     assert np.percentile(off, 90) < 5.0  # in the turns the servo runs into its stop
 
 
-def test_a_gimbal_device_that_keeps_the_horizon_is_believed() -> None:
+def test_a_gimbal_device_that_keeps_the_horizon_is_accepted() -> None:
     log = load_telemetry(shared("ardupilot_survey/gimbal_device_companion.tlog"))
     state = log.history.state_at(log.first_ns + 50 * 10**9)
     assert state is not None and state.q_ned_gimbal_wxyz is not None

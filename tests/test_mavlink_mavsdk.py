@@ -251,7 +251,7 @@ def test_mavsdk_waits_for_work_and_survives_lost_answers() -> None:
 
 
 class LossyRelay:
-    """Passes datagrams between the companion and a ground station, less what it is told to lose."""
+    """Passes datagrams between the companion and a ground station, less what it is set to lose."""
 
     def __init__(self, inner: int, outer: int) -> None:
         self._inside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

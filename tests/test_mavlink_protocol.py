@@ -119,7 +119,7 @@ def test_we_take_the_id_of_the_one_autopilot(system: int) -> None:
     assert station.presence.system == system and station.presence.autopilot == (system, 1)
 
 
-def test_two_autopilots_at_once_are_told_once_and_none_is_taken() -> None:
+def test_two_autopilots_at_once_are_reported_once_and_none_is_taken() -> None:
     station = Station()
     for _ in range(5):
         for system in (5, 6):
@@ -146,7 +146,7 @@ def test_ground_stations_and_gimbals_are_no_autopilots() -> None:
     assert station.presence.system == 1 and station.presence.autopilot is None
 
 
-def test_a_second_companion_is_told_once_and_our_own_echo_is_not_one() -> None:
+def test_a_second_companion_is_reported_once_and_our_own_echo_is_not_one() -> None:
     station = Station()
     station.feed(packed(beat(), (1, 1)))
     own = dialect.MAVLink_heartbeat_message(18, 8, 0, 4711, 4, 3)
@@ -451,7 +451,7 @@ def test_the_gimbals_frame_is_tuned_in_flight() -> None:
     assert station.history.config.gimbal.yaw_frame == "body"
 
 
-def test_kept_parameters_are_told_to_the_service_and_dropped_when_it_refuses() -> None:
+def test_kept_parameters_are_reported_to_the_service_and_dropped_when_it_refuses() -> None:
     history, control = VehicleHistory(), RehearsalControl()
     control.answers["SR_LINK_KBIT_S"] = Answer(Result.UNSUPPORTED)
     kept = {"SR_YAW_FRAME": 2.0, "SR_BASELINE_M": 2.5, "SR_LINK_KBIT_S": 5.0, "X": 1.0}

@@ -109,10 +109,10 @@ def test_the_same_mesh_comes_from_a_cluster(
     tmp_path: Path, house: HouseFlight, cluster: Any
 ) -> None:
     house.flown(tmp_path).close()
-    told: list[str] = []
+    reported: list[str] = []
     here = run_tiles(jobs(tmp_path), None, lambda _: None)
-    there = run_tiles(jobs(tmp_path), cluster.scheduler_address, told.append)
-    assert [t for t in told if "came from the cluster" in t] == [
+    there = run_tiles(jobs(tmp_path), cluster.scheduler_address, reported.append)
+    assert [t for t in reported if "came from the cluster" in t] == [
         "tile 1 of 2 came from the cluster",
         "tile 2 of 2 came from the cluster",
     ]
@@ -124,15 +124,15 @@ def test_a_scheduler_that_goes_away_is_said_and_the_rest_made_here(
 ) -> None:
     house.flown(tmp_path).close()
     here = run_tiles(jobs(tmp_path), None, lambda _: None)
-    told: list[str] = []
+    reported: list[str] = []
 
     def say(text: str) -> None:
-        told.append(text)
+        reported.append(text)
         if text.startswith("tile 1"):
             cluster.close()
 
     same(here, run_tiles(jobs(tmp_path), cluster.scheduler_address, say))
-    assert len([t for t in told if "went away" in t]) == 1
+    assert len([t for t in reported if "went away" in t]) == 1
 
 
 def test_a_scheduler_that_is_not_there_ends_in_one_line(
@@ -252,7 +252,7 @@ def test_the_recording_that_a_scan_names_is_found(
     assert name("flight.mp4").path is None and "is not there" in name("flight.mp4").words
     video = tmp_path / "flight.mp4"
     video.touch()
-    assert name("flight.mp4").path == video  # beside the scan folder
+    assert name("flight.mp4").path == video  # next to the scan folder
     assert name(str(video)).path == video
     for unfit in (None, 7, ["x"]):
         assert "does not name" in name(unfit).words
@@ -268,8 +268,8 @@ def test_a_recording_found_by_itself_that_does_not_fit_is_left(
     """The scan names a file that is no video: the mesh is made from the store, and says so."""
     house.flown(tmp_path).close()
     job = replace(jobs(tmp_path)[0], video=str(tmp_path / "none.mp4"))
-    told: list[str] = []
-    assert mesh_tile(replace(job, video_named=False), told.append) is not None
-    assert any("after all" in text for text in told)
+    reported: list[str] = []
+    assert mesh_tile(replace(job, video_named=False), reported.append) is not None
+    assert any("after all" in text for text in reported)
     with pytest.raises(InputError, match="its video cannot be used"):
-        mesh_tile(job, told.append)
+        mesh_tile(job, reported.append)

@@ -161,7 +161,7 @@ def test_a_wrong_prior_does_no_harm() -> None:
     assert np.linalg.norm(centre(result.T_camera_points) - centre(s.T)) < 0.04
 
 
-def test_a_thin_consensus_against_the_prior_is_not_believed() -> None:
+def test_a_thin_consensus_against_the_prior_is_rejected() -> None:
     """Four matches in ten agree on a pose turned away from what telemetry says."""
     s = scene(7, outliers=0.6)
     prior = se3.exp(np.array([0.0, 0.0, 1.2, 0.0, 0.0, 0.0])) @ s.T

@@ -129,9 +129,9 @@ def label_of(pair: PolarPair, left: View, right: View, away: float, about: float
 def test_only_motion_along_the_view_makes_a_polar_pair() -> None:
     """A camera that looks down takes the ordinary way."""
     down = camera(np.array([0.0, 0.0, HEIGHT_M]), -90.0)
-    beside = camera(np.array([5.0, 0.0, HEIGHT_M]), -90.0)
+    nearby = camera(np.array([5.0, 0.0, HEIGHT_M]), -90.0)
     points = landmarks(down, np.random.default_rng(0))
-    assert isinstance(rectify(view(down), view(beside), points, CONFIG), StereoPair)
+    assert isinstance(rectify(view(down), view(nearby), points, CONFIG), StereoPair)
     ahead = flown(np.array([8.0, 0.0, 0.0]), -20.0, np.zeros(3))
     assert isinstance(rectify(*ahead, CONFIG), PolarPair)
 

@@ -186,7 +186,7 @@ def test_without_a_headset_there_is_no_vr_button(browser: Browser, portal: Porta
     assert browser.run("document.querySelector('#VRButton')") is None
 
 
-def test_of_two_people_renaming_at_once_the_second_is_told(
+def test_of_two_people_renaming_at_once_the_second_is_warned(
     browser: Browser, portal: Portal
 ) -> None:
     other = browser.other()

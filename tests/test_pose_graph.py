@@ -234,7 +234,7 @@ def test_a_jump_of_the_receiver_is_left_out() -> None:
     assert rms_m(graph, f) < 0.6
 
 
-def test_a_frozen_receiver_is_not_believed() -> None:
+def test_a_frozen_receiver_is_rejected() -> None:
     f = flight(120)
     for i in range(60, 100):
         f.priors[i] = replace(f.priors[i], position_m=f.priors[59].position_m)
@@ -346,7 +346,7 @@ def test_without_fixes_a_gap_is_bridged_at_the_last_velocity(burst_ns: int) -> N
 
 def to_and_fro(breaks: int, seed: int) -> PoseGraph:
     """A level track over one strip at 50 m, vision lost again and again; only a mount that is
-    about level tells the tilt, and nobody the heading."""
+    about level gives the tilt, and nothing the heading."""
     rng, graph, down = np.random.default_rng(seed), PoseGraph(), np.diag([1.0, -1.0, -1.0])
     covariance, n, time_ns = np.diag([2e-6] * 3 + [1e-4] * 3), 0, 0
     for segment in range(breaks + 1):
@@ -367,7 +367,7 @@ def to_and_fro(breaks: int, seed: int) -> PoseGraph:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_breaks_in_vision_do_not_swing_the_track(seed: int) -> None:
-    """A turn that nobody knows at the break must not become a way at the end of its lever."""
+    """A turn that nothing knows at the break must not become a way at the end of its lever."""
     z_m = to_and_fro(5, seed).pose_array()[:, 2, 3]
     assert np.abs(z_m).max() < 1.5
 
@@ -399,7 +399,7 @@ def test_two_loops_that_agree_close_the_circle() -> None:
     assert before > 0.2
     assert not graph.add_loop(3, 43, true_loop(f, 3, 43), LOOP_COVARIANCE)
     assert apart() == pytest.approx(before)
-    # Told the other way round, and found a little further on.
+    # Given the other way round, and found a little further on.
     assert graph.add_loop(46, 6, true_loop(f, 46, 6), LOOP_COVARIANCE)
     assert apart() < 0.15
     assert "loop" in graph.pose(43).sources

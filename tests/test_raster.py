@@ -158,7 +158,7 @@ def test_a_smear_down_a_wall_is_no_surface_but_a_steep_roof_is() -> None:
 
 def test_of_cells_above_a_step_the_uncertain_are_left_out() -> None:
     sigma = np.full((40, 40), 0.08, np.float32)
-    sigma[:, 20:22] = 0.3  # the spill beside the roof: few views
+    sigma[:, 20:22] = 0.3  # the spill next to the roof: few views
     left = reliable(step_raster(sigma))
     assert not left.known[:, 20:22].any()
     assert left.known[:, 23:].all() and left.known[:, :20].all()
@@ -166,7 +166,7 @@ def test_of_cells_above_a_step_the_uncertain_are_left_out() -> None:
     assert reliable(step_raster(sigma)).known[:, 20:22].all()
 
 
-def test_holes_beside_a_step_stay_holes() -> None:
+def test_holes_next_to_a_step_stay_holes() -> None:
     raster = step_raster(np.full((40, 40), 0.05, np.float32))
     raster.height_m[10:12, 19:21] = np.nan
     raster.height_m[10:12, 5:7] = np.nan

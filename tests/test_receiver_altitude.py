@@ -1,4 +1,4 @@
-"""The receiver's own altitude beside the autopilot's, from messages to the prior."""
+"""The receiver's own altitude in addition to the autopilot's, from messages to the prior."""
 
 from __future__ import annotations
 

@@ -359,7 +359,7 @@ def test_the_command_prints_points_without_heights(flight: Flight) -> None:
     assert "left out" in answer.stdout and "vertical" not in answer.stdout
 
 
-def test_each_control_point_is_told_from_the_others(flight: Flight) -> None:
+def test_each_control_point_is_distinguished_from_the_others(flight: Flight) -> None:
     """A point that is off by decimetres shows where it is left out, not where it takes part."""
     rows = flight.survey(SPOTS)
     figures = refine(flight.scan, RefineOptions(write_csv(flight.folder / "a.csv", rows)))
@@ -426,7 +426,7 @@ def test_an_outlier_is_refused_and_named(
     assert errors(flight).max() < 0.2
 
 
-def test_a_point_two_metres_off_is_told_from_the_others(flight: Flight) -> None:
+def test_a_point_two_metres_off_is_distinguished_from_the_others(flight: Flight) -> None:
     rows = flight.survey(SPOTS)
     for row in rows:
         if row["name"] == "B":
@@ -437,7 +437,7 @@ def test_a_point_two_metres_off_is_told_from_the_others(flight: Flight) -> None:
     assert errors(flight).max() < 0.2
 
 
-def test_points_in_one_corner_are_told(flight: Flight) -> None:
+def test_points_in_one_corner_are_reported(flight: Flight) -> None:
     corner = {"A": (4.0, -6.0), "B": (14.0, -4.0), "D": (12.0, 6.0), "C1": (36.0, 18.0)}
     gcp = write_csv(flight.folder / "points.csv", flight.survey(corner))
     (note,) = refine(flight.scan, RefineOptions(gcp))["notes"]
@@ -499,16 +499,16 @@ def write_log(flight: Flight, path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("beside", [True, False])
-def test_the_flights_telemetry_places_the_track(flight: Flight, beside: bool) -> None:
-    log = flight.scan / "link.tlog" if beside else flight.folder / "flight.tlog"
+@pytest.mark.parametrize("nearby", [True, False])
+def test_the_flights_telemetry_places_the_track(flight: Flight, nearby: bool) -> None:
+    log = flight.scan / "link.tlog" if nearby else flight.folder / "flight.tlog"
     write_log(flight, log)
-    figures = refine(flight.scan, RefineOptions(telemetry=None if beside else log))
+    figures = refine(flight.scan, RefineOptions(telemetry=None if nearby else log))
     assert figures["telemetry"] and {"position", "attitude"} <= set(figures["residuals"])
     assert errors(flight).max() < 0.6
 
 
-def test_a_broken_log_beside_the_scan_is_noted_and_a_given_one_refused(flight: Flight) -> None:
+def test_a_broken_log_next_to_the_scan_is_noted_and_a_given_one_refused(flight: Flight) -> None:
     log = flight.scan / "link.tlog"
     log.write_bytes(b"no telemetry at all" * 40)
     figures = refine(flight.scan, RefineOptions())

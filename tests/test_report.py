@@ -79,7 +79,7 @@ def test_ellipses_are_those_of_sampled_poses() -> None:
     assert np.allclose(found, np.cov(places.T), rtol=0.15, atol=0.05 * np.trace(found))
 
 
-def test_residuals_loops_drift_and_points_are_told() -> None:
+def test_residuals_loops_drift_and_points_are_reported() -> None:
     pose = PoseRecord(0, np.eye(4), np.eye(6) * 0.01)
     page = "".join(consistency(SUMMARY, [pose, pose]))
     cells = re.findall(r"<td>(.*?)</td>", page)

@@ -83,7 +83,7 @@ def test_the_first_position_is_the_origin() -> None:
     np.testing.assert_allclose(second.position_m, [0.0, 111.2, 10.0], atol=0.2)
 
 
-def test_the_camera_hangs_beside_the_vehicles_position() -> None:
+def test_the_camera_is_mounted_off_the_vehicles_position() -> None:
     """Half a metre ahead, 0.2 to the right and 0.1 below, of a vehicle heading east."""
     hung = rig(CameraConfig(lever_forward_m=0.5, lever_right_m=0.2, lever_down_m=0.1))
     state = VehicleState(

@@ -175,7 +175,9 @@ def test_affine_maps_are_exact_in_spite_of_outliers() -> None:
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e6])
 @pytest.mark.parametrize("far", [0.0, 1e4, 1e6])
-def test_a_plane_is_told_from_a_line_at_any_scale_and_place(scale: float, far: float) -> None:
+def test_a_plane_is_distinguished_from_a_line_at_any_scale_and_place(
+    scale: float, far: float
+) -> None:
     rng = np.random.default_rng(6)
     plane = scale * (rng.normal(size=(50, 2)) @ rng.normal(size=(2, 3)) + far)
     line = scale * (rng.normal(size=(50, 1)) * rng.normal(size=3) + far)

@@ -1,4 +1,4 @@
-"""One scan at a time; what a scan cannot start with is told."""
+"""One scan at a time; what a scan cannot start with is reported."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ def daemon(tmp_path: Path) -> Daemon:
 def test_images_that_the_camera_model_does_not_fit_are_refused(
     daemon: Daemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    closed, told, scanning = threading.Event(), [], daemon.scanning
+    closed, reported, scanning = threading.Event(), [], daemon.scanning
     source: Any = SimpleNamespace(
         size_px=(320, 240), description="gimbal", start_monotonic_ns=0, close=closed.set
     )
-    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_, **__: told.append(text))
+    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_, **__: reported.append(text))
     monkeypatch.setattr(ScanRun, "_open_camera", lambda _: source)
     scanning.camera, scanning._backend = load_camera(MODEL), CpuBackend()
     scanning.start()
-    until(lambda: told and not scanning.is_running)
-    assert told == [f"Scan failed: {scanning.fault}"]
+    until(lambda: reported and not scanning.is_running)
+    assert reported == [f"Scan failed: {scanning.fault}"]
     assert "for 1600x1200 images, gimbal has 320x240" in scanning.fault
     assert closed.is_set()
     assert not [path for path in tmp_path.iterdir() if path.is_dir()]
@@ -60,10 +60,10 @@ def test_a_scan_that_was_stopped_counts_as_closing_at_once(
     until(lambda: daemon.actions.status().phase is Phase.IDLE)
 
 
-def test_a_camera_that_fails_is_told(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
-    told, gate = [], SimpleNamespace(warnings=["told when it was opened"])
+def test_a_camera_that_fails_is_reported(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    reported, gate = [], SimpleNamespace(warnings=["known when it was opened"])
     scanning: Any = daemon.scanning
-    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, _: told.append(text))
+    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, _: reported.append(text))
     daemon._report_camera()
     run: Any = ScanRun(scanning, is_asked=True)
     run.gate, run._news_reported, scanning._run = gate, 1, run
@@ -74,7 +74,7 @@ def test_a_camera_that_fails_is_told(daemon: Daemon, monkeypatch: pytest.MonkeyP
         daemon._report_camera()
     run.progress_s = time.monotonic()
     daemon._report_camera()
-    assert told == [
+    assert reported == [
         "Camera: the image is frozen for 8 s",
         "No images for 10 s: nothing is scanned",
         "Camera images recovered",
@@ -83,13 +83,13 @@ def test_a_camera_that_fails_is_told(daemon: Daemon, monkeypatch: pytest.MonkeyP
     daemon._report_camera()
     scanning._run = None  # stopped meanwhile
     daemon._report_camera()
-    assert told[3:] == ["No images for 10 s: nothing is scanned"]
+    assert reported[3:] == ["No images for 10 s: nothing is scanned"]
 
 
 @pytest.mark.parametrize(
     ("boot", "heard", "armed", "goes_on"),
     [
-        ("this", False, False, True),  # the service was killed: nobody need say more
+        ("this", False, False, True),  # the service was killed: nothing need say more
         ("another", False, False, False),  # power cut: wait for the autopilot
         ("another", True, True, True),
         ("another", True, False, False),

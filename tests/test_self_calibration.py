@@ -120,7 +120,7 @@ def test_a_lens_off_its_axis_is_found_where_turned_views_meet() -> None:
     assert np.abs(apart - apart.mean(axis=0)).max() < 1.0
 
 
-def test_straight_down_from_one_height_it_cannot_be_told() -> None:
+def test_straight_down_from_one_height_it_is_not_determined() -> None:
     poses = _nadir((60.0, 60.0))
     points, seen = _seen(poses, TRUE)
     start, near = _guess(points, poses)
@@ -129,7 +129,7 @@ def test_straight_down_from_one_height_it_cannot_be_told() -> None:
     assert "straight down from one height" in found.why_not
 
 
-def test_two_heights_known_to_centimetres_tell_it() -> None:
+def test_two_heights_known_to_centimetres_determine_it() -> None:
     poses = _nadir((60.0, 90.0))
     points, seen = _seen(poses, TRUE)
     start, near = _guess(points, poses)

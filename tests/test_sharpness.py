@@ -1,4 +1,4 @@
-"""Blurred images are told from sharp ones of the same scene."""
+"""Blurred images are distinguished from sharp ones of the same scene."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def test_blur_lowers_sharpness_but_contrast_and_brightness_do_not() -> None:
     assert np.isnan(sharpness(np.full((64, 64), 9, np.uint8)))
 
 
-def test_a_blurred_frame_among_sharp_ones_is_told() -> None:
+def test_a_blurred_frame_among_sharp_ones_is_reported() -> None:
     watch = BlurWatch()
-    told = []
+    reported = []
     for i in range(30):
         image = scene(i)
-        told.append(watch.blurred(motion_blur(image, 15) if i in (12, 20) else image))
-    assert [i for i, blurred in enumerate(told) if blurred] == [12, 20]
+        reported.append(watch.blurred(motion_blur(image, 15) if i in (12, 20) else image))
+    assert [i for i, blurred in enumerate(reported) if blurred] == [12, 20]
 
 
 def test_a_recording_that_is_soft_throughout_is_taken_as_it_is() -> None:

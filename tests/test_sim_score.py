@@ -116,13 +116,13 @@ def test_ground_near_the_track_counts_apart(
     """A cloud with a gap below the flight is complete elsewhere."""
     monkeypatch.setattr("service.sim.scoring.NEAR_TRACK_M", 5.0)
     points, track = true_cloud(flight), np.loadtxt(flight / "truth" / "trajectory.tum")[:, 1:3]
-    beside = np.linalg.norm(points[:, None, :2] - track[None], axis=2).min(axis=1) > 6.0
-    scan = write_scan(tmp_path / "scan", flight, points[beside], True, np.eye(3), np.zeros(3), 0.01)
+    nearby = np.linalg.norm(points[:, None, :2] - track[None], axis=2).min(axis=1) > 6.0
+    scan = write_scan(tmp_path / "scan", flight, points[nearby], True, np.eye(3), np.zeros(3), 0.01)
     complete = score(scan, flight)["completeness"]
     assert complete["share_near_track"] < 0.15 < 0.5 < complete["share"]
 
 
-def test_known_displacement_and_noise_are_told_apart(flight: Path, tmp_path: Path) -> None:
+def test_known_displacement_and_noise_are_distinguished(flight: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     points = true_cloud(flight)
     points += 0.1 * rng.normal(size=points.shape)

@@ -185,9 +185,9 @@ def test_exported_model_gives_the_same_labels(
     left, right = (cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) for p in pair)
     session = runtime.InferenceSession(str(out), providers=["CPUExecutionProvider"])
     px, confidence = session.run(None, {"left": left, "right": right})
-    believed = confidence > 0
-    assert believed[:, 24:].mean() > 0.95
-    assert abs(np.median(px[believed]) - 9.5) < 0.1
+    accepted = confidence > 0
+    assert accepted[:, 24:].mean() > 0.95
+    assert abs(np.median(px[accepted]) - 9.5) < 0.1
     assert run(monkeypatch, "export-model", "--size", "160", "--out", out) == 2
     assert run(monkeypatch, "export-model", "--out", tmp_path / "stereo.bin") == 2
 

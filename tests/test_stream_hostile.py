@@ -104,7 +104,7 @@ def test_a_request_says_only_what_can_be(changes: dict[str, Any]) -> None:
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-32", "utf-8-sig"])
 def test_json_is_strict_utf_8(encoding: str) -> None:
     assert unpack_head(json.dumps(HEAD).encode(encoding)) is None
-    broken = made(HEAD, more="x").replace(b'"x"', b'"\xff"')  # in a field nobody reads
+    broken = made(HEAD, more="x").replace(b'"x"', b'"\xff"')  # in a field nothing reads
     assert unpack_head(broken) is None
 
 

@@ -82,15 +82,15 @@ def test_the_other_end_is_rebuilt_from_records(tmp_path: Path) -> None:
         ScanStore.create(tmp_path / "a.db", HEADER) as a,
         ScanStore.create(tmp_path / "b.db", ScanHeader("scan-1", "drone-a", 0)) as b,
     ):
-        told: list[tuple[str, int]] = []
-        a.listen(lambda kind, number: told.append((kind, number)))
+        reported: list[tuple[str, int]] = []
+        a.listen(lambda kind, number: reported.append((kind, number)))
         a.add_keyframe(0, codec.encode(keyframe(0), 0))
         a.add_pose(pose(1))
         a.add_repose(Repose(0, 1, np.eye(4), 1.0, np.eye(6)))
         a.add_repose(Repose(0, 2, np.eye(4), 2.0, np.eye(6)))
         a.update_header(epsg=32632)
         a.finish({"points": 1})
-        assert told[:4] == [("k0", 0), ("k1", 0), ("pose", 1), ("repose", 1)]
+        assert reported[:4] == [("k0", 0), ("k1", 0), ("pose", 1), ("repose", 1)]
         for kind, numbers in a.numbers().items():
             for number in numbers:
                 record = a.record(kind, number)

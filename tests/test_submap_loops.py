@@ -87,9 +87,9 @@ def _view(one: Keyframe) -> LoopView:
 def test_a_view_is_filled_with_what_its_neighbours_measured() -> None:
     whole = _keyframe(1, _oblique(0.0, 0.0, False))
     own = _masked(whole, slice(0, 60))
-    beside = _keyframe(2, _oblique(5.0, 1.0, False))
+    nearby = _keyframe(2, _oblique(5.0, 1.0, False))
     behind = _keyframe(3, _oblique(-9.0, -1.0, False))
-    found = filled(own, [beside, behind])
+    found = filled(own, [nearby, behind])
     z = found.depth.depth_m
     assert np.isfinite(z).mean() > 0.97 and np.isfinite(own.depth.depth_m).mean() < 0.4
     np.testing.assert_array_equal(z[:60], own.depth.depth_m[:60])

@@ -75,34 +75,36 @@ def fly(
 
 @pytest.mark.parametrize("gimbal", ["none", "honest"])
 def test_the_latency_is_shown_and_not_applied_unless_asked(gimbal: str) -> None:
-    told: list[str] = []
-    check = TelemetryCheck(CameraConfig(), history_of(gimbal, 1.0), told.append)
+    reported: list[str] = []
+    check = TelemetryCheck(CameraConfig(), history_of(gimbal, 1.0), reported.append)
     exposed = fly(check, gap=True)
     assert exposed[-1] == round((1.0 + 599 / 15 + LATE_S) * S)
     latency = check.summary()["camera_latency"]
     assert latency["applied_ms"] == 0.0
     assert latency["estimate_ms"] == pytest.approx(70.0, abs=10.0)
     assert abs(latency["estimate_ms"] - 70.0) < 3.0 * latency["sigma_ms"]
-    assert len(told) == 1 and told[0].endswith("by the images, 0 ms is set")
+    assert len(reported) == 1 and reported[0].endswith("by the images, 0 ms is set")
 
 
 def test_auto_applies_what_was_found_and_keeps_the_frames_in_order() -> None:
-    told: list[str] = []
-    check = TelemetryCheck(CameraConfig(latency="auto"), history_of("none", 1.0), told.append)
+    reported: list[str] = []
+    check = TelemetryCheck(CameraConfig(latency="auto"), history_of("none", 1.0), reported.append)
     exposed = fly(check)
     assert all(b > a for a, b in pairwise(exposed))
     assert check.applied_ms == pytest.approx(70.0, abs=10.0)
     assert exposed[-1] == pytest.approx((1.0 + 599 / 15) * S, abs=0.01 * S)
-    assert len(told) == 1 and told[0].endswith("applied")
-    again = TelemetryCheck(CameraConfig(latency="auto"), None, told.append, 70.0)
+    assert len(reported) == 1 and reported[0].endswith("applied")
+    again = TelemetryCheck(CameraConfig(latency="auto"), None, reported.append, 70.0)
     assert again.exposed_ns(S) == S - 70_000_000  # what the last scan found serves at once
 
 
 def test_a_right_setting_needs_no_words_and_can_change_in_flight() -> None:
-    told: list[str] = []
-    check = TelemetryCheck(CameraConfig(latency_ms=68.0), history_of("honest", 1.0), told.append)
+    reported: list[str] = []
+    check = TelemetryCheck(
+        CameraConfig(latency_ms=68.0), history_of("honest", 1.0), reported.append
+    )
     assert fly(check)[0] == round((1.0 + LATE_S) * S) - 68_000_000
-    assert told == []
+    assert reported == []
     check.set_camera(CameraConfig(latency_ms=20.0))
     before = check.exposed_ns(60 * S)
     check.set_camera(CameraConfig(latency_ms=500.0))
@@ -111,25 +113,25 @@ def test_a_right_setting_needs_no_words_and_can_change_in_flight() -> None:
 
 
 def test_a_calm_flight_is_given_no_latency() -> None:
-    told: list[str] = []
-    check = TelemetryCheck(CameraConfig(latency="auto"), history_of("none", 0.0), told.append)
+    reported: list[str] = []
+    check = TelemetryCheck(CameraConfig(latency="auto"), history_of("none", 0.0), reported.append)
     fly(check, 0.0)
-    assert check.latency is None and told == [] and check.applied_ms == 0.0
+    assert check.latency is None and reported == [] and check.applied_ms == 0.0
     assert check.summary()["camera_latency"] == {"applied_ms": 0.0}
-    silent = TelemetryCheck(CameraConfig(), None, told.append)
+    silent = TelemetryCheck(CameraConfig(), None, reported.append)
     fly(silent)
-    assert silent.summary() == {} and told == []
+    assert silent.summary() == {} and reported == []
 
 
-def test_a_gimbal_that_claims_the_wrong_frame_is_corrected_and_told_once() -> None:
-    told: list[str] = []
+def test_a_gimbal_that_claims_the_wrong_frame_is_corrected_and_reported_once() -> None:
+    reported: list[str] = []
     history = history_of("wrong", 1.0)
-    check = TelemetryCheck(CameraConfig(), history, told.append)
+    check = TelemetryCheck(CameraConfig(), history, reported.append)
     fly(check)
     assert history.gimbal_frame() in (GimbalFrame.BODY, GimbalFrame.SERVO)
     frame = check.summary()["gimbal_frame"]
     assert frame["by_pictures"] in ("body", "servo") and frame["used"] == frame["by_pictures"]
-    assert sum(text.startswith("Gimbal angles refer to") for text in told) == 1
+    assert sum(text.startswith("Gimbal angles refer to") for text in reported) == 1
     state = history.state_at(30 * S)
     assert state is not None and state.q_ned_gimbal_wxyz is not None
     w, x, y, z = state.q_ned_gimbal_wxyz
@@ -138,17 +140,17 @@ def test_a_gimbal_that_claims_the_wrong_frame_is_corrected_and_told_once() -> No
 
 
 def test_a_frame_that_was_configured_stands_against_the_images() -> None:
-    told: list[str] = []
+    reported: list[str] = []
     history = history_of("wrong", 1.0, GimbalConfig(yaw_frame="earth"))
-    fly(TelemetryCheck(CameraConfig(), history, told.append))
+    fly(TelemetryCheck(CameraConfig(), history, reported.append))
     assert history.gimbal_frame() is GimbalFrame.EARTH
-    (text,) = [text for text in told if "Gimbal" in text]
+    (text,) = [text for text in reported if "Gimbal" in text]
     assert text.endswith("; earth is set")
 
 
 def test_an_honest_gimbal_is_left_alone() -> None:
-    told: list[str] = []
+    reported: list[str] = []
     history = history_of("honest", 1.0)
-    fly(TelemetryCheck(CameraConfig(), history, told.append))
+    fly(TelemetryCheck(CameraConfig(), history, reported.append))
     assert history.gimbal_frame() is GimbalFrame.EARTH
-    assert not any("Gimbal" in text for text in told)
+    assert not any("Gimbal" in text for text in reported)

@@ -218,7 +218,7 @@ def by_stages(pairs: list[StereoPair], matching: BeliefPropagationConfig) -> Dep
 
 @pytest.mark.parametrize("guide", [0, 2])
 def test_the_whole_path_equals_the_stages(device: str, guide: int) -> None:
-    """Pairs of several sizes, twice over; the second time nothing is built anew."""
+    """Pairs of several sizes, twice over; the second time nothing is built again."""
     from recon.backends.torch_depth import DensePath
 
     matching = BeliefPropagationConfig()

@@ -10,15 +10,15 @@ S = 1_000_000_000
 
 def flown(*states: str) -> list[str]:
     """What is said of a flight of so many states, one each half second."""
-    told: list[str] = []
-    watch = TrackingWatch(told.append)
+    reported: list[str] = []
+    watch = TrackingWatch(reported.append)
     for k, state in enumerate(states):
         reason = {"lost": "too little texture", "waiting": "too little motion"}.get(state, "")
         watch.look(Tracked(state, 0, reason=reason), 100 * S + k * S // 2)
-    return told
+    return reported
 
 
-def test_a_long_loss_is_told_once_with_its_reason_and_its_end() -> None:
+def test_a_long_loss_is_reported_once_with_its_reason_and_its_end() -> None:
     lost = "Tracking lost for 10 s (too little texture): nothing is scanned"
     assert flown("started", "keyframe", *["lost"] * 300) == [lost]
     once = ["keyframe", *["lost"] * 30, "tracked", "tracked"]
@@ -28,7 +28,7 @@ def test_a_long_loss_is_told_once_with_its_reason_and_its_end() -> None:
     assert len(flown("keyframe", *(["lost"] * 12 + ["started", "waiting"]) * 9)) == 1
 
 
-def test_short_losses_and_a_hover_are_not_told() -> None:
+def test_short_losses_and_a_hover_are_not_reported() -> None:
     assert flown("keyframe", *["lost"] * 19, "keyframe", *["lost"] * 19, "tracked") == []
     assert flown("started", *["waiting"] * 500) == []
     assert flown("keyframe", *["tracked"] * 500) == []

@@ -1,4 +1,4 @@
-"""Corrections travel: what the graph moves is told once, and both ends of the link agree."""
+"""Corrections travel: what the graph moves is published once, and both ends of the link agree."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_a_loop_closure_reaches_store_and_ground_alike(tmp_path: Path) -> None:
     assert abs(step) < 0.1
 
 
-def test_a_correction_is_told_once_and_small_ones_only_at_the_end() -> None:
+def test_a_correction_is_published_once_and_small_ones_only_at_the_end() -> None:
     truth = legs()
     trajectory = flown(truth, drifted(truth, 0.0))
     for i in range(len(truth)):
@@ -155,7 +155,7 @@ def test_a_frame_rides_on_its_keyframe() -> None:
     trajectory = flown(truth, halved, 0.5 * HEIGHT_M)
     step = se3.compose(np.eye(3), np.array([0.5, 0.0, 0.0]))
     key = trajectory.place(50)
-    ridden = key.carry(step)
+    carried = key.carry(step)
     assert key.scale == pytest.approx(2.0, rel=0.03)
-    here = se3.inverse(key.T_world_camera) @ ridden.T_world_camera
+    here = se3.inverse(key.T_world_camera) @ carried.T_world_camera
     assert here[0, 3] == pytest.approx(0.5 * key.scale)

@@ -141,7 +141,7 @@ def test_parameters_begin_as_the_file_says_and_follow_it(tmp_path: Path) -> None
         until(lambda: operator.heard().get("SR_BASELINE_M") == [6.0])
         until(lambda: operator.heard().get("SR_LINK_KBIT_S") == [9.0])
         assert operator.config.camera.latency_ms == 80.0  # tuned, and the file says as before
-    assert "SR_CAM_LATENCY" in (tmp_path / "mavlink.json").read_text()  # beside the scans
+    assert "SR_CAM_LATENCY" in (tmp_path / "mavlink.json").read_text()  # next to the scans
     # What was not tuned follows the file.
     with Operator(tmp_path, "scan.resolution_m=0.3", "scan.baseline=2/10") as operator:
         until(lambda: operator.config.camera.latency_ms == 80.0)

@@ -1,4 +1,4 @@
-"""What no record may say, byte by byte from docs/wire.md, and grids that nobody can inflate."""
+"""What no record may say, byte by byte from docs/wire.md, and grids that nothing can inflate."""
 
 from __future__ import annotations
 

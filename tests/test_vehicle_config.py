@@ -37,7 +37,7 @@ def test_the_default_takes_the_autopilots_system_id() -> None:
     vehicle = vehicle_config(load_config(None, []))
     assert vehicle.presence.system is None and vehicle.links == ()
     assert vehicle.signing_key is None and not vehicle.odometry
-    assert vehicle.state_dir == Path("/var/lib/skyrelief/scans")  # beside the scans
+    assert vehicle.state_dir == Path("/var/lib/skyrelief/scans")  # next to the scans
 
 
 @pytest.mark.parametrize(

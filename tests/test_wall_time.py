@@ -22,7 +22,7 @@ def test_the_autopilots_time_is_taken_where_the_clocks_differ() -> None:
     wall, true_ns = WallTime(), NOW_UNIX_NS - 7 * S
     for never_set in (0, 1_000_000, 2**63):
         wall.hear(never_set, 7 * S)
-    assert wall.correct(true_ns - MONTH_NS) == true_ns - MONTH_NS  # nobody knows better
+    assert wall.correct(true_ns - MONTH_NS) == true_ns - MONTH_NS  # nothing knows better
     wall.hear(NOW_UNIX_NS // 1000, 7 * S)
     assert wall.correct(true_ns - MONTH_NS) == true_ns
     assert wall.correct(true_ns + MONTH_NS) == true_ns
@@ -43,7 +43,7 @@ def test_what_is_said_of_clocks_that_differ(ahead_ns: int, word: str) -> None:
     assert text.endswith("90 s ahead")
 
 
-def test_only_our_own_autopilot_tells_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_our_own_autopilot_sets_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     now_ns = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: now_ns() - MONTH_NS)
     port = free_port()
@@ -53,7 +53,7 @@ def test_only_our_own_autopilot_tells_the_time(monkeypatch: pytest.MonkeyPatch) 
     ):
         peer.connect(("127.0.0.1", port))
 
-        def tell(system: int, late_ns: int) -> None:
+        def report(system: int, late_ns: int) -> None:
             mouth = dialect.MAVLink(None, system, 1)
             peer.send(bytes(dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(mouth)))
             unix_us = (now_ns() - late_ns) // 1000
@@ -63,8 +63,8 @@ def test_only_our_own_autopilot_tells_the_time(monkeypatch: pytest.MonkeyPatch) 
             return 1e-9 * (now_ns() - time.monotonic_ns() - daemon.link.unix_offset_ns())
 
         assert behind_s() == pytest.approx(1e-9 * MONTH_NS, abs=5.0)
-        tell(1, 0)
+        report(1, 0)
         until(lambda: abs(behind_s()) < 5.0)
-        tell(2, MONTH_NS // 2)
-        tell(1, 100 * S)  # it was set
+        report(2, MONTH_NS // 2)
+        report(1, 100 * S)  # it was set
         until(lambda: abs(behind_s() - 100.0) < 5.0)

@@ -38,11 +38,11 @@ class Landing:
     def __init__(self, folder: Path) -> None:
         header = ScanHeader("s", "d", 1, camera={}, configuration={}, software="test")
         self.store = ScanStore.create(folder / "s" / "scan.db", header)
-        self.told: list[str] = []
+        self.reported: list[str] = []
         self.asked: list[str] = []
         self.work = Work()
         self.in_haste = threading.Event()
-        self.writings = Writings(self.told.append)
+        self.writings = Writings(self.reported.append)
 
     def write(self) -> None:
         self.writings.write(
@@ -102,7 +102,7 @@ def test_what_went_wrong_with_them_is_raised(slow: Slow, landing: Landing) -> No
         landing.write()
     assert landing.asked == ["land"]
     assert not landing.is_open
-    assert not landing.told
+    assert not landing.reported
 
 
 def test_another_scan_does_not_wait_for_them(slow: Slow, landing: Landing) -> None:
@@ -118,16 +118,16 @@ def test_another_scan_does_not_wait_for_them(slow: Slow, landing: Landing) -> No
     until(lambda: landing.work.answer)
     assert landing.work.answer is not None and landing.work.answer.result is Result.ACCEPTED
     assert not landing.is_open
-    assert not landing.told
+    assert not landing.reported
 
 
-def test_what_went_wrong_beside_another_scan_is_told(slow: Slow, landing: Landing) -> None:
+def test_a_fault_during_another_scan_is_reported(slow: Slow, landing: Landing) -> None:
     slow.error = OutsideError("the disk is full")
     landing.in_haste.set()
     landing.write()
     slow.may_end.set()
     until(lambda: landing.work.answer)
-    assert landing.told == ["Scan s is stored, its files are not written: the disk is full"]
+    assert landing.reported == ["Scan s is stored, its files are not written: the disk is full"]
     assert landing.work.answer is not None and landing.work.answer.result is Result.FAILED
     assert not landing.is_open
 

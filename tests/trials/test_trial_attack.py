@@ -184,7 +184,7 @@ def hostile_rate(stop: threading.Event, session: Any, seed: int, tally: Counter[
 
 
 def rogue_station(stop: threading.Event, session: Any, keys: list[str], tally: Any) -> None:
-    """A ground station of the fleet that reports and asks what nobody can mean."""
+    """A ground station of the fleet that reports and asks what nothing can mean."""
     rng = random.Random(SEED)
     reports = [data for _, data in hostile_reports("rogue")]
     while not stop.wait(0.05):
@@ -195,7 +195,7 @@ def rogue_station(stop: threading.Event, session: Any, keys: list[str], tally: A
         tally["requests"] += asked(session, f"{key}/item/{kind}/{numbers}", data)
 
 
-def test_hostile_datalink_beside_honest_drones(tmp_path: Path, record: Row) -> None:
+def test_hostile_datalink_next_to_honest_drones(tmp_path: Path, record: Row) -> None:
     """A member of the fleet that turned hostile, as a drone and as a ground station."""
     names = ["honest-a", "honest-b"]
     fleet = Fleet(tmp_path / "keys", names, ATTACKER)

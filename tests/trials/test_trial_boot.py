@@ -70,7 +70,7 @@ class Aircraft:
         return self.machine.root / "var" / "lib" / "skyrelief" / "scans"
 
     def status(self) -> dict[str, Any]:
-        """What the service says; empty while nobody answers."""
+        """What the service says; empty while nothing answers."""
         return answer(self.health)
 
     def until_scanning(self, since_s: float, limit_s: float = 90.0) -> float:

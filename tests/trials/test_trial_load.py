@@ -87,19 +87,19 @@ def test_lag_is_relieved_and_passes(tmp_path: Path, record: Row) -> None:
         back_s = service.until_more_frames("frames")
         (folder,) = scan_folders(service.scans)
         assert service.stop() == 0
-    told = [text for text in autopilot.texts if text.startswith("Load:")]
+    reported = [text for text in autopilot.texts if text.startswith("Load:")]
     record(
         f"lag: {count // 2 * cores} processes that take the cores",
         1,
-        f"{' > '.join(steps)}; each step told ({len(told)} texts); full again after {calm_s:.0f} s",
+        f"{' > '.join(steps)}; {len(reported)} texts; full again after {calm_s:.0f} s",
         "-",
         back_s,
     )
     assert steps[0] == "full"
     assert steps[-1] == "full"
     assert down > 1, "nothing made the service late"
-    assert "Load: full quality again" in told
-    assert any("lower rate" in text and "(" in text for text in told)
+    assert "Load: full quality again" in reported
+    assert any("lower rate" in text and "(" in text for text in reported)
     assert (folder / "cloud.laz").is_file()
 
 

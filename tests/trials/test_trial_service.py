@@ -143,7 +143,7 @@ def test_camera_fails_and_comes_back(fault: str, tmp_path: Path, record: Row) ->
         with Service(tmp_path, camera=camera, model=model) as service:
             service.until(lambda: service.frames >= 2, "pictures")
             for _ in range(times):
-                told = service.said("WARNING service.cameras.live: udp")
+                reported = service.said("WARNING service.cameras.live: udp")
                 if fault == "stalls":
                     sender.send_signal(signal.SIGSTOP)
                 else:
@@ -152,7 +152,7 @@ def test_camera_fails_and_comes_back(fault: str, tmp_path: Path, record: Row) ->
                 if fault == "changes size":
                     sender = stream_to(port, "160:120")
                 service.until(
-                    lambda n=told: service.said("WARNING service.cameras.live: udp") > n,  # type: ignore[misc]
+                    lambda n=reported: service.said("WARNING service.cameras.live: udp") > n,  # type: ignore[misc]
                     "the fault being noticed",
                 )
                 connected = service.said("connected")
@@ -357,9 +357,9 @@ def test_broken_configuration_at_reload_changes_nothing(tmp_path: Path, record: 
             service.until(lambda: "in force: scan.baseline" in service.log.read_text(), "reload")
             assert service.get("/healthz").get("ok") is True
             assert service.stop() == 0
-            told: list[bytes] = []
-            while not told or told[-1] != b"STOPPING=1":
-                told.append(systemd.recv(100))
+            reported: list[bytes] = []
+            while not reported or reported[-1] != b"STOPPING=1":
+                reported.append(systemd.recv(100))
     record("broken configuration at reload", 4, "refused, service unharmed")
 
 

@@ -84,7 +84,7 @@ class Sample:
     """What was seen at one moment of one flight."""
 
     flight: int
-    aloft_s: float  # LANDED: at rest after it
+    flying_s: float  # LANDED: at rest after it
     hours: float  # of the soak
     memory_mib: float  # resident, of the service and its own processes
     files: int
@@ -133,8 +133,8 @@ def flown(
     service.until(lambda: service.get().get("clouds", 0) > 0, "a keyframe")
     start, out = time.monotonic(), []
     still_at_s = STILL_EVERY_S
-    while (aloft_s := time.monotonic() - start) < long_s:
-        is_still = camera is not None and aloft_s > still_at_s
+    while (flying_s := time.monotonic() - start) < long_s:
+        is_still = camera is not None and flying_s > still_at_s
         if camera is not None and is_still:
             still_at_s += STILL_EVERY_S
             camera.send_signal(signal.SIGSTOP)
@@ -144,14 +144,14 @@ def flown(
         hours = (time.monotonic() - begin_s) / 3600.0
         frames, clouds, *budgets = (int(status.get(name, 0)) for name in COUNTS)
         counts = (now.files, frames, clouds, tuple(budgets))
-        out.append(Sample(number, aloft_s, hours, now.mib, *counts, now.own_mib, is_still))
+        out.append(Sample(number, flying_s, hours, now.mib, *counts, now.own_mib, is_still))
         if camera is not None and is_still:
             camera.send_signal(signal.SIGCONT)
         assert service.process.poll() is None
         time.sleep(min(2.0, 0.1 * long_s))
     assert not status["fault"]
     autopilot.armed.clear()
-    limit_s = max(PATIENCE_S, long_s)  # closing a long scan takes minutes beside other work
+    limit_s = max(PATIENCE_S, long_s)  # closing a long scan takes minutes next to other work
     service.until(lambda: service.get().get("state") == "idle", "landing", limit_s)
     time.sleep(5.0)  # until what the scan held is given back
     now = held(service.process.pid)
@@ -159,7 +159,7 @@ def flown(
     (folder,) = set(scan_folders(service.scans)) - scans
     assert (folder / "cloud.laz").is_file()
     keyframes = int(json.loads((folder / "scan.json").read_text())["counts"]["keyframes"])
-    landed = replace(out[-1], aloft_s=LANDED, hours=hours, keyframes=keyframes, files=now.files)
+    landed = replace(out[-1], flying_s=LANDED, hours=hours, keyframes=keyframes, files=now.files)
     return [*out, replace(landed, memory_mib=now.mib, own_mib=now.own_mib)]
 
 
@@ -167,7 +167,7 @@ def slope_mib_per_h(samples: list[Sample]) -> float:
     """Median slope between flights, over all pairs at the same time after take-off (Theil-Sen)."""
     bins: dict[int, list[Sample]] = {}
     for sample in samples:
-        bins.setdefault(int(sample.aloft_s // 5.0), []).append(sample)
+        bins.setdefault(int(sample.flying_s // 5.0), []).append(sample)
     slopes = [
         (b.memory_mib - a.memory_mib) / (b.hours - a.hours)
         for same in bins.values()
@@ -184,7 +184,7 @@ Slope = tuple[float, float, float]
 def slope_at_rest(samples: list[Sample], memory: Callable[[Sample], float]) -> Slope:
     """MiB/h of ``memory`` after the landings by Theil and Sen, and the ends of its interval of
     90 %."""
-    rest = [s for s in samples if s.aloft_s == LANDED]
+    rest = [s for s in samples if s.flying_s == LANDED]
     found = theilslopes([memory(s) for s in rest], [s.hours for s in rest], 0.9)
     return float(found[0]), float(found[2]), float(found[3])
 
@@ -192,8 +192,8 @@ def slope_at_rest(samples: list[Sample], memory: Callable[[Sample], float]) -> S
 def slope_within(samples: list[Sample], memory: Callable[[Sample], float]) -> Slope:
     """MiB/h of ``memory`` in one scan, while the camera held still, after its budgets were
     filled; by Theil and Sen, with the ends of its interval of 90 %."""
-    late_s = WARM_SHARE * max(s.aloft_s for s in samples)
-    still = [s for s in samples if s.still and s.aloft_s > late_s]
+    late_s = WARM_SHARE * max(s.flying_s for s in samples)
+    still = [s for s in samples if s.still and s.flying_s > late_s]
     found = theilslopes([memory(s) for s in still], [s.hours for s in still], 0.9)
     return float(found[0]), float(found[2]), float(found[3])
 
@@ -208,7 +208,7 @@ def kib_per_keyframe(samples: list[Sample]) -> float:
     out = []
     for _, group in itertools.groupby(samples, lambda s: s.flight):
         flight = list(group)
-        half = [s for s in flight if s.aloft_s > 0.5 * max(s.aloft_s for s in flight)]
+        half = [s for s in flight if s.flying_s > 0.5 * max(s.flying_s for s in flight)]
         keyframes = np.array([s.keyframes for s in half], np.float64)
         if np.ptp(keyframes) > 5:
             memory = 1024.0 * np.array([s.memory_mib for s in half])
@@ -279,7 +279,7 @@ def tell_flights(samples: list[Sample], record: Row, lost: str) -> bool:
     """Write the row of the short flights; True when memory at rest grows beyond doubt."""
     warm = max(1, round(WARM_SHARE * FLIGHTS)) if FLIGHTS > 2 else 0
     late = [s for s in samples if s.flight >= warm]
-    slope, files = slope_mib_per_h([s for s in late if s.aloft_s != LANDED]), late[-1].files
+    slope, files = slope_mib_per_h([s for s in late if s.flying_s != LANDED]), late[-1].files
     rest = slope_at_rest(late, lambda s: s.memory_mib)
     own = slope_at_rest(late, lambda s: s.own_mib)
     ends = [[s for s in samples if s.flight == n][-1] for n in range(FLIGHTS)]
@@ -287,7 +287,7 @@ def tell_flights(samples: list[Sample], record: Row, lost: str) -> bool:
     voxels, tiles, views, nodes = (
         max(column) for column in zip(*(e.budgets for e in ends), strict=True)
     )
-    aloft = max(s.memory_mib for s in late)
+    flying = max(s.memory_mib for s in late)
     record(
         f"soak of {MINUTES:g} minutes: flights one after the other",
         FLIGHTS,
@@ -295,7 +295,7 @@ def tell_flights(samples: list[Sample], record: Row, lost: str) -> bool:
         f"{sum(e.keyframes for e in ends)} keyframes; after "
         f"the first {warm} flights: at rest {ends[-1].memory_mib:.0f} MiB, slope {in_words(rest)}, "
         f"without pages of files {ends[-1].own_mib:.0f} MiB, slope {in_words(own)}; "
-        f"aloft up to {aloft:.0f} MiB, slope {slope:+.1f} "
+        f"aloft up to {flying:.0f} MiB, slope {slope:+.1f} "
         f"MiB/h; within a flight {kib_per_keyframe(late):+.1f} KiB a keyframe, the map at {voxels} "
         f"voxels and {tiles} tiles on disk, {views} views for loops, {nodes} keyframes in the pose "
         f"graph; files open at rest {files}, growth {growth:+d}",
@@ -307,9 +307,9 @@ def tell_flights(samples: list[Sample], record: Row, lost: str) -> bool:
 
 def tell_scan(samples: list[Sample], record: Row, lost: str) -> bool:
     """Write the row of the long scan; True when memory grows within it beyond doubt."""
-    aloft = [s for s in samples if s.aloft_s != LANDED]
-    end = [s for s in aloft if s.still][-1]
-    slope = slope_within(aloft, lambda s: s.memory_mib)
+    flying = [s for s in samples if s.flying_s != LANDED]
+    end = [s for s in flying if s.still][-1]
+    slope = slope_within(flying, lambda s: s.memory_mib)
     record(
         f"soak of {MINUTES:g} minutes: one scan",
         1,

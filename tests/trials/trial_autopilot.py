@@ -19,7 +19,7 @@ ARMED, CUSTOM = 128, 1
 
 
 class Autopilot(threading.Thread):
-    """Speaks by UDP to a port of this machine, with a boot clock that can start anew."""
+    """Speaks by UDP to a port of this machine, with a boot clock that can start again."""
 
     def __init__(self, port: int, attitude: bool = True) -> None:
         """With ``attitude`` it tells that too, not only that it is there."""
@@ -39,7 +39,7 @@ class Autopilot(threading.Thread):
             while not self.ended.wait(0.1):
                 if not self.silent.is_set():
                     for message in self._due():
-                        with contextlib.suppress(OSError):  # nobody is there yet
+                        with contextlib.suppress(OSError):  # nothing is there yet
                             port.sendto(message.pack(link), ("127.0.0.1", self.port))
                 self._hear(port, link)
 

@@ -103,7 +103,7 @@ def _write(page: Path, kept: Path, lines: list[Line]) -> None:
 
 
 def answer(port: int, path: str = "/status") -> dict[str, Any]:
-    """The JSON answer of a health page; empty while nobody answers."""
+    """The JSON answer of a health page; empty while nothing answers."""
     try:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=5) as page:
             return dict(json.loads(page.read()))
@@ -159,7 +159,7 @@ class Service:
         self.process.wait()
 
     def get(self, path: str = "/status") -> dict[str, Any]:
-        """The JSON answer of the health page; empty while nobody answers."""
+        """The JSON answer of the health page; empty while nothing answers."""
         return answer(self.port, path)
 
     @property

@@ -84,9 +84,11 @@ def bias(log: Path, truth: Truth) -> F64:
     """(3,) metres by which the autopilot's positions are off on average, ENU."""
     history = load_telemetry(log).history
     states = [history.state_at(round(t * 1e9)) for t in truth.times_s]
-    told = [[s.lat_deg, s.lon_deg, s.alt_amsl_m] for s in states if s and s.lat_deg is not None]
+    reported = [[s.lat_deg, s.lon_deg, s.alt_amsl_m] for s in states if s and s.lat_deg is not None]
     known = [s is not None and s.lat_deg is not None for s in states]
-    return np.asarray((truth.frame.to_enu(np.array(told)) - truth.poses[known, :3, 3]).mean(axis=0))
+    return np.asarray(
+        (truth.frame.to_enu(np.array(reported)) - truth.poses[known, :3, 3]).mean(axis=0)
+    )
 
 
 def row(flight: Path, out: Path, key: str, truth: Truth) -> str:
@@ -112,7 +114,7 @@ def row(flight: Path, out: Path, key: str, truth: Truth) -> str:
     fitted = metrics.fit_trajectory(poses, at, False).poses(poses)
     apart = step(fitted[:, :3, 3] - at[:, :3, 3], at[:, :3, 3], found.times_s[known])
     surface = f"{report['surface'][report['judged_after']]['median_m']:.3f}"
-    return " | ".join(["| " + name, *placed, *fits, drift, apart, surface]) + " |" + told(scan)
+    return " | ".join(["| " + name, *placed, *fits, drift, apart, surface]) + " |" + reported(scan)
 
 
 def replay(flight: Path, log: Path, scan: Path, settings: tuple[str, ...]) -> None:
@@ -133,7 +135,7 @@ def step(off: F64, places: F64, times_s: F64) -> str:
     return f"{np.median(np.linalg.norm(off[pairs[:, 0]] - off[pairs[:, 1]], axis=1)):.2f}"
 
 
-def told(scan: Path) -> str:
+def reported(scan: Path) -> str:
     """The boresight that the scan reports, when it is sure of one."""
     summary: dict[str, Any] = json.loads((scan / "scan.json").read_text())
     found = (summary.get("run") or {}).get("graph") or {}
