@@ -55,7 +55,7 @@ class Travel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosePrior:
-    """What telemetry says of the camera's pose; a missing part is None."""
+    """The camera's pose by telemetry; a missing part is None."""
 
     R_world_camera: F64 | None = None  # (3, 3)
     sigma_tilt_rad: float = 0.02  # roll and pitch, 1 sigma
@@ -80,7 +80,7 @@ class PosePrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One image of the camera, still distorted, and what telemetry says of its instant."""
+    """One image of the camera, still distorted, and the telemetry at its instant."""
 
     image: U8  # (H, W, 3) BGR
     time_ns: int  # mid-exposure; companion monotonic live, unix nanoseconds in a replay

@@ -1,4 +1,4 @@
-"""What a camera and an autopilot say of a known track, for the tests of the pose graph."""
+"""Camera and autopilot readings of a known track, for the tests of the pose graph."""
 
 from __future__ import annotations
 

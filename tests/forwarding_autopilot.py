@@ -21,7 +21,7 @@ NAK, NOT_FOUND = 129, 10
 
 
 class ForwardingAutopilot:
-    """1/1 with a camera that it has found: what the camera says of itself it sends as its own.
+    """1/1 with a camera that it has found: it sends the camera's information as its own.
 
     What is meant for another component goes to the companion alone, broadcasts as well.
     """

@@ -182,7 +182,7 @@ def test_scales_by_fixes_and_by_heights_are_distinguished(wrong: float) -> None:
 
 
 def test_the_height_exactly_below_is_read_from_the_depth_map() -> None:
-    """A camera leaning over a slope: only the point below tells the height, and edges do not."""
+    """A camera leaning over a slope: only the point below gives the height, and edges do not."""
     K = np.array([[300.0, 0, 159.5], [0, 300.0, 89.5], [0, 0, 1]])
     lean = se3.so3_exp(np.array([math.pi + 0.15, 0.0, 0.0]))
     T = se3.compose(lean, np.array([0.0, 0.0, 50.0]))

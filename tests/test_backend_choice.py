@@ -154,7 +154,7 @@ def test_a_learned_model_serves_the_whole_path(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "backend", "width", "picture", "said"),
+    ("text", "backend", "width", "image", "said"),
     [
         (GOOD, "torch", 160, None, "must be onnx or auto, not torch"),
         (GOOD, "onnx", 320, None, "takes pairs up to 192x96, but they would be 320 wide"),

@@ -117,7 +117,7 @@ def test_without_a_thread_the_work_is_done_at_once() -> None:
     assert seen == [1] and len(jobs.finished()) == 1
 
 
-def test_a_worker_that_nobody_closes_ends_with_its_owner() -> None:
+def test_a_worker_that_is_not_closed_ends_with_its_owner() -> None:
     jobs = BackgroundWorker("dense", str, 2)
     jobs.offer(1)
     assert jobs.finished(everything=True) == [(1, "1")]

@@ -16,7 +16,7 @@ from service.cli import main
 pytest.importorskip("torch")
 
 STAGES = (
-    "stereo", "what is believed", "upsampling", "reprojection", "fusion", "ICP", "cloud",
+    "stereo", "checks of labels", "upsampling", "reprojection", "fusion", "ICP", "cloud",
 )  # fmt: skip
 
 

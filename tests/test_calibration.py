@@ -260,7 +260,7 @@ def test_command_reads_a_video(tmp_path: Path) -> None:
 def test_bad_input_is_refused_in_one_line(arguments: list[str], word: str, tmp_path: Path) -> None:
     blank, broken, empty = tmp_path / "blank.png", tmp_path / "broken.jpg", tmp_path / "empty"
     cv2.imwrite(str(blank), np.full((240, 320), 128, np.uint8))
-    broken.write_bytes(b"\xff\xd8 not a picture")
+    broken.write_bytes(b"\xff\xd8 not an image")
     empty.mkdir()
     filled = [a.format(blank=blank, broken=broken, empty=empty) for a in arguments]
     with pytest.raises(InputError, match=word) as caught:

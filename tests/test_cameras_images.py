@@ -192,7 +192,7 @@ def test_odd_ones_are_left_out_and_reported(tmp_path: Path) -> None:
     for i in range(3):
         write_still(tmp_path / f"{i}.jpg", f"2024:06:01 12:00:0{i}", offset="+00:00")
     write_still(tmp_path / "wide.jpg", "2024:06:01 12:00:09", size_px=(96, 48))
-    (tmp_path / "bad.jpg").write_bytes(b"no picture")
+    (tmp_path / "bad.jpg").write_bytes(b"no image")
     (tmp_path / "empty.jpg").touch()
     whole = (tmp_path / "1.jpg").read_bytes()
     (tmp_path / "1.jpg").write_bytes(whole[: whole.index(b"\xff\xda")])  # tags, but no pixels

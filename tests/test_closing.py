@@ -119,7 +119,7 @@ def test_systemd_is_asked_to_wait_only_while_closing_gets_on(
     def alive() -> None:
         nonlocal now_s
         asked.append(now_s)
-        now_s += 100.0  # from here on nothing gets on
+        now_s += 100.0  # no progress from here on
         hung.step.set()
         hung.end.set()
 

@@ -192,7 +192,7 @@ def test_what_a_running_service_holds_is_asked_of_it(tmp_path: Path) -> None:
     ]
     try:
         found = findings(*given)
-        status |= {"ok": False, "fault": "no picture", "mavlink": {}}
+        status |= {"ok": False, "fault": "no image", "mavlink": {}}
         worse = findings(*given)
     finally:
         server.close()
@@ -201,5 +201,5 @@ def test_what_a_running_service_holds_is_asked_of_it(tmp_path: Path) -> None:
     assert found["service"] == (GOOD, "skyrelief 9.9 runs here: scanning")
     assert found["worker"] == (GOOD, "camera: running, 2 of 2 waiting (drop oldest), 0.3 s behind")
     assert worse["mavlink"][0] == NOTE
-    assert worse["service"] == (BAD, "skyrelief 9.9 runs here: no picture")
+    assert worse["service"] == (BAD, "skyrelief 9.9 runs here: no image")
     assert "service" not in findings(*given)  # it ended

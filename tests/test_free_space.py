@@ -60,7 +60,7 @@ def test_who_confirms_counts_as_much_as_who_contradicts(house: HouseFlight) -> N
     assert seen_through(blob, [inventor, seer, seer]).all()
 
 
-def test_points_that_nobody_looks_at_are_kept(house: HouseFlight) -> None:
+def test_points_out_of_every_view_are_kept(house: HouseFlight) -> None:
     blob = flyers(10, 5.0)
     away = house.keyframe(0, 500.0).depth
     blank = house.keyframe(0, 22.0).depth

@@ -130,7 +130,7 @@ def test_segments_go_whole_but_neither_the_first_nor_the_newest() -> None:
     np.testing.assert_allclose(found_over[8][:3, 3], [2.0, 0.0, 0.0])  # over the seventh
 
 
-def test_of_what_was_never_told_the_node_before_tells() -> None:
+def test_unpublished_keyframes_follow_the_node_before() -> None:
     rng = np.random.default_rng(5)
     rows, poses = np.zeros(2, KEYFRAME), np.array([se3.exp(rng.normal(size=6)) for _ in range(2)])
     rows["pose"], rows["scale"], rows["published"] = poses[:, :3], 3.0, [2, 0]

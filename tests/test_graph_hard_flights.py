@@ -67,7 +67,7 @@ def flown(hard: Hard) -> tuple[list[F64], Trajectory]:
 def heard(
     hard: Hard, rng: np.random.Generator, truth: list[F64], priors: list[PosePrior]
 ) -> Iterator[PosePrior]:
-    """What telemetry says of each keyframe."""
+    """The telemetry of each keyframe."""
     for i, prior in enumerate(priors):
         if i % hard.every:
             prior = replace(prior, position_m=None, sigma_position_m=None)

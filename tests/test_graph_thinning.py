@@ -1,4 +1,4 @@
-"""A pose graph with a bound: fewer nodes, the same track, and riders that follow it."""
+"""A pose graph with a bound: fewer nodes, the same track, and interpolated keyframes on it."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_riders_lie_between_their_nodes_as_vision_saw_them() -> None:
         trajectory.place(COUNT)
 
 
-def test_everything_told_is_corrected_at_the_end_and_counted() -> None:
+def test_everything_published_is_corrected_at_the_end_and_counted() -> None:
     trajectory = Trajectory(graph=bounded())
     fly(trajectory)
     published = {i: trajectory.place(i) for i in range(0, COUNT, 3)}

@@ -107,7 +107,7 @@ def introduce(session: zenoh.Session, drone: str, scan_id: str) -> None:
 
 
 @pytest.mark.parametrize("last", [(1 << 32) - 1, (1 << 24) - 1])
-def test_a_head_that_names_billions_stops_nobody(tmp_path: Path, last: int) -> None:
+def test_a_head_that_names_billions_stops_nothing(tmp_path: Path, last: int) -> None:
     with serving(tmp_path / "ground") as (ground, endpoint), hostile(endpoint) as session:
         for scan_id in ("a", "b"):
             until(partial(_introduced, ground, session, "evil", scan_id))

@@ -122,7 +122,7 @@ def test_two_runs_of_one_time_stay_two_scans(tmp_path: Path, written: list[Path]
     for store in runs:
         assert again.folder("drone-a", store.header.name) == by_run[store.header.run_id]
     assert again.folder("drone-a", "scan-1." + "2" * 32).name == "scan-1-3"
-    assert again.folder("drone-a", "scan-1").name == "scan-1-3"  # of a drone that tells no run
+    assert again.folder("drone-a", "scan-1").name == "scan-1-3"  # of a drone that gives no run
 
 
 def test_a_scan_arrives_whole_with_its_corrections(tmp_path: Path, written: list[Path]) -> None:

@@ -1,4 +1,4 @@
-"""What the service says of itself and of the machine, and what it keeps on the disk."""
+"""The service's report about itself and the machine, and its files on the disk."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ def test_a_closed_connection_makes_room() -> None:
             connect(listener)
 
 
-def test_a_peer_that_is_not_known_is_nobody() -> None:
+def test_an_unknown_peer_is_ignored() -> None:
     with BoundedListener("127.0.0.1", 0) as listener:
         for peer in (None, ("10.0.0.1", 5)):
             listener.begin(peer)

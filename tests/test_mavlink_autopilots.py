@@ -103,7 +103,7 @@ def test_the_nearer_of_two_that_answer_is_ours() -> None:
     assert net.presence.autopilot == (7, 1)
 
 
-def test_the_one_that_says_max_is_ours_where_nobody_answers() -> None:
+def test_the_one_that_says_most_is_ours_where_none_answers() -> None:
     net = Net(Vehicle(2), Vehicle(7, chatter=5))
     net.wait(7.0)
     assert net.presence.autopilot == (7, 1)
@@ -122,7 +122,7 @@ def test_telemetry_of_the_wrong_vehicle_is_dropped() -> None:
     assert clock is not None and clock.offset_ns == pytest.approx(7 * S, abs=2 * MS)
 
 
-def test_two_that_are_alike_are_asked_about_and_nobody_is_followed() -> None:
+def test_two_that_are_alike_are_asked_about_and_none_is_followed() -> None:
     net = Net(Vehicle(5, 0.002), Vehicle(6, 0.002))
     net.wait(10.0)
     assert net.presence.autopilot is None and not net.presence.is_disarmed(net.now_ns)
@@ -176,7 +176,7 @@ def test_a_system_that_is_given_is_never_left() -> None:
     assert net.presence.autopilots.others(net.now_ns) == [2]
 
 
-def test_answers_of_strangers_count_for_nobody() -> None:
+def test_answers_of_strangers_are_ignored() -> None:
     """A system without an autopilot, or another component, may answer TIMESYNC as well."""
     net = Net(Vehicle(2, chatter=3), Vehicle(7, chatter=3))
     for _ in range(100):

@@ -84,11 +84,11 @@ def test_ctl_watches(as_json: bool) -> None:
         assert any("at 47.3000000, 8.5000000, 512.0 m" in line for line in lines)
 
 
-def test_ctl_says_when_nobody_or_the_wrong_one_answers() -> None:
+def test_ctl_says_when_none_or_the_wrong_one_answers() -> None:
     pytest.importorskip("mavsdk")
     port = free_port()
-    nobody = run_ctl(port, "start", "--timeout", "1")
-    assert nobody.returncode == 3 and "no skyrelief companion heard" in nobody.stderr
+    unheard = run_ctl(port, "start", "--timeout", "1")
+    assert unheard.returncode == 3 and "no skyrelief companion heard" in unheard.stderr
     with Impostor(port):
         wrong = run_ctl(port, "pause")
         assert wrong.returncode == 3

@@ -1,4 +1,4 @@
-"""Heartbeats made by hand before the dialect is there, and who takes over from them."""
+"""Heartbeats made by hand before the dialect is there, and the handover to the real ones."""
 
 from __future__ import annotations
 

@@ -118,11 +118,11 @@ def autopilot() -> Iterator[Autopilot]:
 
 
 def test_a_flight_by_mavlink(tmp_path: Path, autopilot: Autopilot) -> None:
-    draw_flight(tmp_path / "pictures")
+    draw_flight(tmp_path / "images")
     settings = {
         "scan.folder": tmp_path / "scans",
         "camera.source": f"images:{tmp_path / 'images'}?interval_s={INTERVAL_S}",
-        "camera.model": tmp_path / "pictures" / "camera.yaml",
+        "camera.model": tmp_path / "images" / "camera.yaml",
         "mavlink.links": f"udpout:127.0.0.1:{autopilot.port}",
         "mavlink.odometry": "true",
         "health.http": "",

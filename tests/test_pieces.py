@@ -1,4 +1,4 @@
-"""Stretches of a flight that nothing ties together, and what a short scan says of itself."""
+"""Segments of a flight that nothing ties together, and the report of a short scan."""
 
 from __future__ import annotations
 

@@ -597,10 +597,10 @@ def test_without_a_vehicle_orders_are_refused(client: Client) -> None:
 
 
 def test_a_vehicle_that_is_not_there_says_so() -> None:
-    def nobody(_: str) -> Any:
+    def unreachable(_: str) -> Any:
         raise OutsideError("no companion heard")
 
-    vehicle = Vehicle("udpin://x", nobody)
+    vehicle = Vehicle("udpin://x", unreachable)
     vehicle.start()
     until(lambda: vehicle.figures()["trouble"] == "no companion heard")
     with pytest.raises(OutsideError, match="no companion heard"):

@@ -65,7 +65,7 @@ Object.defineProperty(navigator, 'xr', { configurable: true, value: {
   },
 } });
 """
-TOLD = " field.dispatchEvent(new Event('input', { bubbles: true }))"
+CHANGED = " field.dispatchEvent(new Event('input', { bubbles: true }))"
 IMAGE = "document.querySelector('.stage canvas').toDataURL('image/png').split(',')[1]"
 
 
@@ -131,12 +131,12 @@ def test_settings_change_the_image_and_go_back(browser: Browser, portal: Portal)
         browser.run("new Promise(r => setTimeout(r, 700))")  # the effects are loaded when asked
         assert difference(plain, drawn(browser)) > 0.01, name
         setting(browser, name, "field.click()")
-    setting(browser, "Field of view", "field.value = 25;" + TOLD)
+    setting(browser, "Field of view", "field.value = 25;" + CHANGED)
     narrow = drawn(browser)
     assert difference(plain, narrow) > 0.1
     ground = narrow.max(axis=2) > 60
     assert ground.mean() > 1.5 * (plain.max(axis=2) > 60).mean()  # nearer, so larger
-    setting(browser, "Field of view", "field.value = 60;" + TOLD)
+    setting(browser, "Field of view", "field.value = 60;" + CHANGED)
     assert difference(plain, drawn(browser)) < 0.03  # points in one place hide each other by turns
 
 
@@ -149,10 +149,10 @@ def test_tone_mapping_and_exposure_change_the_mesh(
     browser.wait("document.body.dataset.mesh === 'shown'", 60)
     plain = drawn(browser)
     choose = "field.value = [...field.options].find(o => o.text === 'Reinhard').value;"
-    setting(browser, "Tone", choose + TOLD.replace("input", "change"))
+    setting(browser, "Tone", choose + CHANGED.replace("input", "change"))
     reinhard = drawn(browser)
     assert difference(plain, reinhard) > 0.05
-    setting(browser, "Exposure", "field.value = 1.5;" + TOLD)
+    setting(browser, "Exposure", "field.value = 1.5;" + CHANGED)
     brighter = drawn(browser)
     assert brighter.mean() > reinhard.mean() + 3.0
     browser.click("Points")

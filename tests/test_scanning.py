@@ -131,7 +131,7 @@ def test_a_scan_by_command_goes_on_after_a_fall(
         assert not mark.exists()  # landed, or stopped
 
 
-def test_only_a_scan_that_nobody_ended_goes_on(
+def test_only_a_scan_that_was_not_ended_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def next_life(start: str = "on-command") -> Daemon:

@@ -206,7 +206,7 @@ def test_new_coarse_layers_overtake_waiting_detail(tmp_path: Path) -> None:
     assert first.topic == "item/k0/2"
 
 
-def test_nothing_but_heads_is_sent_while_nobody_listens(tmp_path: Path) -> None:
+def test_nothing_but_heads_is_sent_while_nothing_listens(tmp_path: Path) -> None:
     world = World(tmp_path, cut=(0.0, 60.0))
     world.produce(0, 4)
     world.run(20.0)

@@ -1,4 +1,4 @@
-"""What the images say of the telemetry, from tracked frames to the operator's words."""
+"""Telemetry checked against the images, from tracked frames to the operator's words."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ S = 1_000_000_000
 
 
 def flown(*states: str) -> list[str]:
-    """What is said of a flight of so many states, one each half second."""
+    """The reports about a flight of so many states, one each half second."""
     reported: list[str] = []
     watch = TrackingWatch(reported.append)
     for k, state in enumerate(states):

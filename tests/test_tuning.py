@@ -171,7 +171,7 @@ def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> N
 
     from recon.backends.cpu import CpuBackend
 
-    images = tmp_path / "pictures"
+    images = tmp_path / "images"
     images.mkdir()
     cv2.imwrite(str(images / "20260101000000000Z.png"), np.zeros((90, 160, 3), np.uint8))
     source = open_images(str(images), {})

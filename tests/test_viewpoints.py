@@ -106,7 +106,7 @@ def test_fewer_partners_from_now_on() -> None:
     assert sorted(v.seq for v in views.partners(middle)) == [1, 3]
 
 
-def test_blurred_views_are_nobodys_partner() -> None:
+def test_blurred_views_are_no_partners() -> None:
     views = Viewpoints(ScanConfig(), partners=2)
     kept = [
         offer(views, i, 5.0 * i, "keyframe" if i else "started", blurred=i == 1) for i in range(5)

@@ -95,7 +95,7 @@ class Plan:
         ]
 
     def _capture(self) -> None:
-        """Record the kernels once; capture needs them loaded, hence the rounds before."""
+        """Record the kernels once; capture needs them loaded, so some rounds run before it."""
         stream: Any = torch.cuda.Stream()  # type: ignore[no-untyped-call]
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):

@@ -37,7 +37,7 @@ class FixAverage:
     _last_ns: int = 0
 
     def take(self, T_odom_camera: F64, prior: PosePrior) -> None:
-        """A frame of the track, with what telemetry says of it."""
+        """Add a frame of the track with its telemetry."""
         if prior.position_m is not None and prior.sigma_position_m is not None:
             self._places.append(T_odom_camera[:3, 3])
             self._fixes.append(prior.position_m)

@@ -61,7 +61,7 @@ class Boresight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Turns:
-    """One unbroken stretch: the camera's rotations and what telemetry says of them."""
+    """One segment: the camera's rotations and those by telemetry."""
 
     R_odom: F64  # (N, 3, 3)
     R_reported: F64  # (N, 3, 3) world from camera
@@ -118,7 +118,7 @@ def _mean_frame(stretch: Turns) -> F64:
 
 
 def _stretch(stretch: Turns, frame: F64, turn: F64) -> tuple[F64, F64, F64, F64]:
-    """One Gauss-Newton step: the stretch's better frame, what it says of the boresight as
+    """One Gauss-Newton step: the segment's better frame, its contribution to the boresight as
     information (3, 3) and right-hand side (3,), and the whitened residuals (N,)."""
     Q = stretch.R_reported @ se3.so3_exp(turn)
     r = Rotation.from_matrix(frame @ stretch.R_odom @ Q.transpose(0, 2, 1)).as_rotvec()

@@ -29,7 +29,7 @@ class Ledger(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of them all."""
+        """Release them all."""
         ...
 
 
@@ -59,5 +59,5 @@ class MemoryLedger:
         self._rows[first : first + len(rows)] = rows
 
     def close(self) -> None:
-        """Let go of them all."""
+        """Release them all."""
         self._count = 0

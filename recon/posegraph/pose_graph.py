@@ -74,11 +74,11 @@ class PoseGraph:
 
         Args:
             seq: number of the keyframe; greater than those before.
-            segment: stretch of unbroken vision; each has an odometry frame of its own.
+            segment: keyframes tracked without interruption; each has an odometry frame of its own.
             T_odom_camera: (4, 4) in the segment's frame.
             covariance: (6, 6) of the motion since the last keyframe, a left perturbation in
                 the last camera's frame, in units of the odometry.
-            prior: telemetry's word on this moment; parts may be missing.
+            prior: telemetry at this moment; parts may be missing.
             height: above ground as :func:`recon.posegraph.alignment.height_above` gives it.
         """
         if self._nodes and seq <= next(reversed(self._nodes)):

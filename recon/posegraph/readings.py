@@ -1,4 +1,4 @@
-"""What telemetry says of a keyframe, as factors of the pose graph.
+"""Telemetry of a keyframe, as factors of the pose graph.
 
 Errors of one sensor wander: readings closer in time than the wander's time constant err
 together. All readings of a first-order Gauss-Markov error with time constant tau over a time

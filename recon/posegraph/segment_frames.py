@@ -1,4 +1,4 @@
-"""Stretches of unbroken vision, and what brings each one's odometry to the world."""
+"""Segments of the track, and the similarity from each one's odometry to the world."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def constants(
     fix_s: float = 60.0,
     attitude_s: float = 40.0,
 ) -> Constants:
-    """Those of a flight of ``span_s`` from poses (4, 4) and priors, stretch by stretch of vision.
+    """Those of a flight of ``span_s`` from poses (4, 4) and priors, segment by segment.
 
     ``fix_s`` and ``attitude_s`` are the time constants with which the sensors wander.
     """

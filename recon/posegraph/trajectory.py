@@ -233,7 +233,7 @@ class Trajectory:
 
         In flight a change must exceed ``repose_m`` and a tenth of the pose's own sigma, or
         each fix of a poor receiver would move the whole scan; those carried by nodes that moved
-        follow by and by, :data:`AT_ONCE` at a time. At the end (``final``) the graph is solved
+        follow gradually, :data:`AT_ONCE` at a time. At the end (``final``) the graph is solved
         again and every change is published, so that the result does not depend on when corrections
         were asked for.
         """
@@ -331,7 +331,7 @@ class Trajectory:
     # ---- keyframes that are no nodes -----------------------------------------------------------
 
     def _follow(self) -> None:
-        """Let go of what was kept of keyframes that are nodes no more."""
+        """Drop cached data of marginalised keyframes."""
         if self.graph.generation == self._generation:
             return
         self._generation = self.graph.generation

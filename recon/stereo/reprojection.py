@@ -20,7 +20,7 @@ MIN_CONFIDENCE = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairDepth:
-    """What one stereo pair says of the keyframe's depth, on the keyframe's own grid."""
+    """The keyframe's depth by one stereo pair, on the keyframe's own grid."""
 
     depth_m: F32  # (h, w), NaN = unknown
     sigma_m: F32  # (h, w)

@@ -114,7 +114,7 @@ def usual_cell_m(depth: DepthMap) -> float | None:
 def _near(keys: I64) -> I64:
     """The (N, 2) tiles whose rectangle has at most MAX_CELLS: all, or those about the middle.
 
-    A track that went astray must not ask for a grid from here to the moon.
+    A track that diverged must not ask for a grid from here to the moon.
     """
     if float(np.prod((np.ptp(keys, axis=0) + 1.0) * TILE)) <= MAX_CELLS:
         return keys

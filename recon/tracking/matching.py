@@ -403,7 +403,7 @@ def _follow_others(
     a: F64, uv: F64, predicted: F64, active: Bool, everyone: Bool, tolerance_px: float,
     stray_px: float,
 ) -> tuple[F64, Bool]:  # fmt: skip
-    """Places and who takes part, after points without an answer got one from the trend.
+    """Places, and which of them take part, after points without an answer got one from the trend.
 
     So did those further than ``stray_px`` from it: relief moves points, but not that far.
     """

@@ -98,7 +98,7 @@ class Odometry:
 
         Args:
             gray: (H, W) undistorted image.
-            prior: telemetry's word on this frame; parts may be missing.
+            prior: telemetry at this frame; parts may be missing.
             mask: (H, W) non-zero where the image is valid.
             blurred: a later frame makes a better keyframe, if it comes soon.
         """

@@ -48,7 +48,7 @@ class Launches(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
 
 def stages(device: str, pair: StereoPair) -> list[Stage]:
-    """Cost and belief propagation, what is believed, upsampling, depth, fusion, ICP."""
+    """Cost and belief propagation, checks of labels, upsampling, depth, fusion, ICP."""
     return [*dense_stages(device, pair), icp_stage(device)]
 
 

@@ -60,7 +60,7 @@ class Page:
             self.call(f"{domain}.enable")
 
     def leave(self) -> None:
-        """Let go of the page."""
+        """Close the page."""
         self._socket.close()
 
     def call(self, method: str, **params: Any) -> Any:

@@ -32,7 +32,7 @@ class Key(Protocol):
 
     @property
     def segment(self) -> int:
-        """Stretch of unbroken vision."""
+        """Number of the segment."""
         ...
 
     @property
@@ -91,7 +91,7 @@ class Carriers:
         self._fresh.append(view)
 
     def settle(self, is_settled: Callable[[Key], bool]) -> None:
-        """Let go of the keyframes that no longer change."""
+        """Release the keyframes that no longer change."""
         while self._fresh and is_settled(self._fresh[0].key):
             self._newest = view = self._fresh.popleft().settled()
             row = np.zeros(1, VIEW)
@@ -129,7 +129,7 @@ class Carriers:
         return Anchorage(seq, key, UNMOVED)
 
     def close(self) -> None:
-        """Let go of the ledger."""
+        """Release the ledger."""
         self._settled.close()
 
 
@@ -198,7 +198,7 @@ class PublishedFrames:
         yield from (frame for frame in self._fresh if frame.anchor is not None)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Release the file."""
         self._file.close()
 
 

@@ -138,7 +138,7 @@ class Pipeline:
 
     @property
     def segments(self) -> int:
-        """Stretches of unbroken vision so far."""
+        """Number of segments so far."""
         return self.stages.track.segment + 1
 
     @property

@@ -122,7 +122,7 @@ class Track:
 
     @property
     def segment(self) -> int:
-        """Stretch of unbroken vision."""
+        """Number of the segment."""
         return self.odometry.segment
 
     def is_settled(self, key: Key) -> bool:
@@ -262,7 +262,7 @@ class Plausible:
         self._balance: Counter[int] = Counter()  # views kept less those refuted, by segment
 
     def __call__(self, view: StereoCandidate, depth: DepthMap | None) -> DepthMap | None:
-        """What is left of ``depth``; None where there is nothing."""
+        """The plausible part of ``depth``; None where there is nothing."""
         if depth is None:
             return None
         kept = plausible(depth, view.prior)

@@ -1,4 +1,4 @@
-"""What the images say of the telemetry: the camera's latency, the gimbal's frame.
+"""Telemetry checked against the images: the camera's latency, the gimbal's frame.
 
 The operator is warned once; the latency found is applied when ``camera.latency`` is "auto",
 the gimbal's frame when ``mavlink.gimbal_yaw_frame`` is "auto".

@@ -102,7 +102,7 @@ def _covariance(covariance: F64) -> list[list[float]]:
 def keyframe_report(
     time_unix_ns: int, T_world_camera: F64, frame: LocalFrame | None, agl_m: float | None
 ) -> KeyframeReport:
-    """Its place on the globe and the attitude of its head; no place without a georeference."""
+    """Its geographic position and the attitude of its head; no place without a georeference."""
     R_ned_head = R_ENU_NED.T @ T_world_camera[:3, :3] @ R_GIMBAL_CAMERA.T
     w, x, y, z = (float(v) for v in se3.quaternion_from_rotation(np.asarray(R_ned_head)))
     lat = lon = alt = None

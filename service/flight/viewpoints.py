@@ -59,7 +59,7 @@ class Viewpoint:
 
     @property
     def segment(self) -> int:
-        """Stretch of unbroken vision."""
+        """Number of the segment."""
         return self.key.segment
 
     @property

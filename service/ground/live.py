@@ -200,7 +200,7 @@ class LiveFeed:
 
 
 def track_message(poses: list[PoseRecord]) -> str:
-    """The way flown, thinned, and the state of the last pose."""
+    """The flight path, thinned, and the state of the last pose."""
     step = max(1, math.ceil(len(poses) / TRACK_POINTS))
     thinned = poses[::step] + (poses[-1:] if poses and (len(poses) - 1) % step else [])
     message: dict[str, Any] = {
@@ -246,7 +246,7 @@ def link_message(entry: dict[str, Any], heard_unix_s: float) -> str:
 
 
 def _entry(folder: Path, entries: list[dict[str, Any]]) -> dict[str, Any]:
-    """What the receiver says of the scan in ``folder``; empty when it does not receive it."""
+    """The receiver's report about the scan in ``folder``; empty when it does not receive it."""
     names = (folder.parent.name, folder.name)
     return next((e for e in entries if (e["drone"], e["scan"]) == names), {})
 

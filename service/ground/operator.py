@@ -275,7 +275,7 @@ def _wait(done: Callable[[], bool], limit_s: float = 0.5) -> None:
 
 
 def status(operator: Operator) -> dict[str, Any]:
-    """What the companion says of itself, its scan and its storage."""
+    """The companion's report about itself, its scan and its storage."""
     beats: dict[int, dict[str, Any]] = {}
     values: dict[str, float] = {}
     operator.subscribe("HEARTBEAT", lambda sender, fields: beats.update({sender: fields}))

@@ -1,7 +1,7 @@
 """The exported files of a scan against the truth of a simulated flight.
 
 The files are read as anyone would read them (rasterio, laspy, trimesh), and placed by what
-they say of themselves: the coordinate system and geotransform, or the origin in the glTF's
+they declare: the coordinate system and geotransform, or the origin in the glTF's
 ``asset.extras``.
 """
 
@@ -241,7 +241,7 @@ class _Raster:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What the file says of itself."""
+        """The file's own metadata."""
         return {"epsg": None if self._crs is None else self._crs.to_epsg(), "cell_m": self.cell_m}
 
     def places(self, col: Array, row: Array, height_m: Array) -> F64:

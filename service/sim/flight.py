@@ -1,4 +1,4 @@
-"""The flown path and attitudes, exact at any moment, and what the drone's sensors say of them."""
+"""The flown path and attitudes, exact at any moment, and the drone's sensor readings."""
 
 from __future__ import annotations
 

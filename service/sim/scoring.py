@@ -39,7 +39,7 @@ MAX_POINTS = 300_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanResult:
-    """What a scan folder claims, in the truth's frame when the scan has a place on the globe."""
+    """What a scan folder claims, in the truth's frame when the scan is georeferenced."""
 
     points: F64  # (N, 3)
     sigma_m: F32 | None  # (N,)
@@ -214,7 +214,7 @@ def _completeness(scan: ScanResult, truth: Truth, seen: SeenSurface, fit: Fit) -
 
 
 def read_scan(folder: Path, frame: LocalFrame) -> ScanResult:
-    """The scan in ``folder``, brought into ``frame`` when it has a place on the globe."""
+    """The scan in ``folder``, brought into ``frame`` when it is georeferenced."""
     if not folder.is_dir():
         raise InputError(f"scan {folder}: no such folder")
     summary = json_object(folder / "scan.json")

@@ -157,7 +157,7 @@ def test_taking_off_while_files_are_written(tmp_path: Path, record: Row) -> None
     record(
         "take-off while the last flight's files are written",
         1,
-        "scanning beside that; both scans have their files",
+        "scanning in parallel; both scans have their files",
         f"{len(lost)} of {len(acknowledged)} chunks",
         back_s,
     )

@@ -141,7 +141,7 @@ def test_camera_fails_and_comes_back(fault: str, tmp_path: Path, record: Row) ->
     try:
         camera = f"stream:udp://127.0.0.1:{port}"
         with Service(tmp_path, camera=camera, model=model) as service:
-            service.until(lambda: service.frames >= 2, "pictures")
+            service.until(lambda: service.frames >= 2, "images")
             for _ in range(times):
                 reported = service.said("WARNING service.cameras.live: udp")
                 if fault == "stalls":

@@ -295,7 +295,7 @@ def tell_flights(samples: list[Sample], record: Row, lost: str) -> bool:
         f"{sum(e.keyframes for e in ends)} keyframes; after "
         f"the first {warm} flights: at rest {ends[-1].memory_mib:.0f} MiB, slope {in_words(rest)}, "
         f"without pages of files {ends[-1].own_mib:.0f} MiB, slope {in_words(own)}; "
-        f"aloft up to {flying:.0f} MiB, slope {slope:+.1f} "
+        f"in flight up to {flying:.0f} MiB, slope {slope:+.1f} "
         f"MiB/h; within a flight {kib_per_keyframe(late):+.1f} KiB a keyframe, the map at {voxels} "
         f"voxels and {tiles} tiles on disk, {views} views for loops, {nodes} keyframes in the pose "
         f"graph; files open at rest {files}, growth {growth:+d}",

@@ -22,7 +22,7 @@ class Autopilot(threading.Thread):
     """Speaks by UDP to a port of this machine, with a boot clock that can start again."""
 
     def __init__(self, port: int, attitude: bool = True) -> None:
-        """With ``attitude`` it tells that too, not only that it is there."""
+        """With ``attitude`` it sends that too, not only heartbeats."""
         super().__init__(daemon=True)
         self.port, self.attitude = port, attitude
         self.ended, self.silent, self.armed = (threading.Event() for _ in range(3))

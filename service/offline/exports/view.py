@@ -69,7 +69,7 @@ class ScanView:
 
     @cached_property
     def frame(self) -> LocalFrame | None:
-        """The scan's place on the globe, or None."""
+        """The scan's georeference, or None."""
         return local_frame(self.store.header)
 
     @cached_property

@@ -323,7 +323,7 @@ class _Refinement:
         return Track(poses, times - times[0], spread, self._priors())
 
     def _priors(self) -> list[PosePrior]:
-        """What the flight's telemetry says of each keyframe; empty without a log."""
+        """The flight's telemetry at each keyframe; empty without a log."""
         path = self.options.telemetry or self.folder / LINK_LOG
         if self.frame is None or (self.options.telemetry is None and not path.is_file()):
             return []

@@ -94,7 +94,7 @@ class Refly:
 def flown_swath(
     places: Sequence[Footprint], frame: LocalFrame, speed_m_s: float, height_m: float | None
 ) -> Swath:
-    """What the keyframes' images say of camera and flight. Raises InputError for one alone."""
+    """Camera and flight by the keyframes' images. Raises InputError for one alone."""
     if len(places) < 2:
         raise InputError("the scan holds a single keyframe: no line was flown to go by")
     cameras = np.array([p.camera_m for p in places])
@@ -138,10 +138,10 @@ def _usual_heading(ways: F64) -> float:
 def weak_patches(weak: Bool, grid: Grid, swath: Swath) -> list[F64]:
     """(N, 2) cell centres of each group of weak patches that one set of lines can serve."""
     cell = grid.cell_m
-    tidy = weak.astype(np.uint8)
+    cleaned = weak.astype(np.uint8)
     for step in (cv2.MORPH_CLOSE, cv2.MORPH_OPEN):  # heal single cells, then drop thin strips
-        tidy = np.asarray(cv2.morphologyEx(tidy, step, np.ones((3, 3), np.uint8)), np.uint8)
-    count, label, stats, _ = cv2.connectedComponentsWithStats(tidy, connectivity=8)
+        cleaned = np.asarray(cv2.morphologyEx(cleaned, step, np.ones((3, 3), np.uint8)), np.uint8)
+    count, label, stats, _ = cv2.connectedComponentsWithStats(cleaned, connectivity=8)
     least = max(4.0, SMALLEST_SHARE * swath.across_m * swath.along_m / cell**2)
     large = np.array([n > 0 and stats[n, cv2.CC_STAT_AREA] >= least for n in range(count)])
     kept = large[label]
@@ -233,7 +233,7 @@ def suggest(
     ``overlap`` is that of neighbouring lines' images. Altitudes are AMSL as flown, or
     ``relative`` to home by the height above ground flown.
 
-    Raises InputError when the scan has no place on the globe, holds too few keyframes, or the
+    Raises InputError when the scan is not georeferenced, holds too few keyframes, or the
     weak areas would take more than MAX_LINES lines.
     """
     if not 0.0 <= overlap <= 0.9:

@@ -1,4 +1,4 @@
-// Where pictures were taken: a frustum per keyframe, the aircraft's with its latest picture.
+// Where images were taken: a frustum per keyframe, the aircraft's with its latest image.
 
 import * as THREE from "three";
 
@@ -17,7 +17,7 @@ export class Cameras {
     new THREE.BufferGeometry().setFromPoints(frustum()),
     new THREE.LineBasicMaterial({ color: 0x59b4ff }),
   );
-  private readonly picture = new THREE.Mesh(
+  private readonly image = new THREE.Mesh(
     pane(),
     new THREE.MeshBasicMaterial({ side: THREE.DoubleSide, toneMapped: false }),
   );
@@ -25,12 +25,12 @@ export class Cameras {
   private stale = false;
 
   constructor() {
-    for (const object of [this.all, this.now, this.picture]) object.frustumCulled = false;
-    for (const object of [this.now, this.picture]) {
+    for (const object of [this.all, this.now, this.image]) object.frustumCulled = false;
+    for (const object of [this.now, this.image]) {
       object.matrixAutoUpdate = false;
       object.visible = false;
     }
-    this.group.add(this.all, this.now, this.picture);
+    this.group.add(this.all, this.now, this.image);
   }
 
   get shown(): boolean {
@@ -60,23 +60,23 @@ export class Cameras {
     this.now.visible = true;
   }
 
-  /** Hangs the picture of keyframe `seq` into its frustum. */
+  /** Shows the image of keyframe `seq` in its frustum. */
   show(seq: number, image: HTMLImageElement): void {
     const T = this.taken.get(seq);
     if (!T) return;
     const texture = new THREE.Texture(image);
     texture.colorSpace = THREE.SRGBColorSpace;
     texture.needsUpdate = true;
-    this.picture.material.map?.dispose();
-    this.picture.material.map = texture;
-    this.picture.material.needsUpdate = true;
+    this.image.material.map?.dispose();
+    this.image.material.map = texture;
+    this.image.material.needsUpdate = true;
     const s = this.reach / 4;
-    this.picture.matrix.copy(T).scale(new THREE.Vector3(s, s, s));
-    this.picture.matrixWorldNeedsUpdate = true;
-    this.picture.visible = true;
+    this.image.matrix.copy(T).scale(new THREE.Vector3(s, s, s));
+    this.image.matrixWorldNeedsUpdate = true;
+    this.image.visible = true;
   }
 
-  /** Draws the frusta anew when keyframes came; call now and then. True when it did. */
+  /** Draws the frusta again if keyframes were added; call periodically. True when it did. */
   refresh(): boolean {
     if (!this.stale) return false;
     this.stale = false;
@@ -102,7 +102,7 @@ function frustum(): THREE.Vector3[] {
   return out.map((p) => p.clone());
 }
 
-/** The pyramid's base, with the picture the right way up. */
+/** The pyramid's base, with the image the right way up. */
 function pane(): THREE.BufferGeometry {
   const geometry = new THREE.BufferGeometry().setFromPoints(
     CORNERS.map(([x, y]) => new THREE.Vector3(x, y, 1)),

@@ -14,7 +14,7 @@ export function el<K extends keyof HTMLElementTagNameMap>(
 }
 
 /** Says what went wrong, for a few seconds. */
-export function tell(error: unknown): void {
+export function notify(error: unknown): void {
   const text = error instanceof Error ? error.message : String(error);
   const note = el("div", { className: "note", textContent: text });
   note.setAttribute("role", "alert");

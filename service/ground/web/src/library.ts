@@ -1,7 +1,7 @@
 // The list of scans: look, open, rename, tag, download, make files, delete, bring back.
 
 import * as api from "./api";
-import { count, date, el, size, tell } from "./dom";
+import { count, date, el, notify, size } from "./dom";
 import { vehicleStrip } from "./vehicle";
 
 const KINDS = [
@@ -17,7 +17,7 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
   search.setAttribute("aria-label", "find");
   const bin = el("section", { className: "bin" });
   bin.setAttribute("aria-label", "bin");
-  const again = (): void => void load().catch(tell);
+  const again = (): void => void load().catch(notify);
   root.replaceChildren(
     el("header", {}, el("h1", { textContent: "skyrelief" }), search, vehicleStrip(), importForm(again)),
     list,
@@ -46,7 +46,7 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
     bin.replaceChildren(...binRows(deleted, again));
   }
   const refresh = setInterval(() => void (document.hidden || load().catch(() => undefined)), REFRESH_MS);
-  await load().catch(tell);
+  await load().catch(notify);
   return () => clearInterval(refresh);
 }
 
@@ -98,20 +98,20 @@ function importForm(again: () => void): HTMLElement {
   folder.setAttribute("aria-label", "folder to import");
   const act = el("button", {
     textContent: "Import",
-    onclick: () => void api.importFolder(folder.value).then(again, tell),
+    onclick: () => void api.importFolder(folder.value).then(again, notify),
   });
   return el("span", { className: "import" }, folder, act);
 }
 
 function card(s: api.Scan, again: () => void): HTMLElement {
   const open = `#/view/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`;
-  const picture = s.preview
+  const thumbnail = s.preview
     ? el("img", { src: api.file(s, "preview.jpg"), alt: `preview of ${s.title}`, loading: "lazy" })
     : el("div", { className: "blank", textContent: "no preview yet" });
   return el(
     "article",
     {},
-    el("a", { href: open, className: "picture" }, picture),
+    el("a", { href: open, className: "thumbnail" }, thumbnail),
     el(
       "h2",
       {},
@@ -174,31 +174,31 @@ function downloads(s: api.Scan): HTMLElement {
 function makeMenu(s: api.Scan, again: () => void): HTMLElement {
   const kinds = el("select", {}, ...KINDS.map((kind) => el("option", { value: kind, textContent: kind })));
   kinds.setAttribute("aria-label", "deliverable");
-  const act = el("button", { textContent: "Make", onclick: () => void make(s, kinds.value).then(again, tell) });
+  const act = el("button", { textContent: "Make", onclick: () => void make(s, kinds.value).then(again, notify) });
   act.setAttribute("aria-label", `Make a deliverable of ${s.title}`);
   return el("span", { className: "group" }, kinds, act);
 }
 
 async function make(s: api.Scan, kind: string): Promise<void> {
   await api.make(s, kind);
-  tell(`making ${kind} of “${s.title}” …`);
+  notify(`making ${kind} of “${s.title}” …`);
   await api.finished(s, kind);
 }
 
 function rename(s: api.Scan, again: () => void): void {
   const title = prompt("Name of this scan", s.title);
-  if (title !== null) void api.label(s, { title }).catch(tell).then(again);
+  if (title !== null) void api.label(s, { title }).catch(notify).then(again);
 }
 
 function retag(s: api.Scan, again: () => void): void {
   const text = prompt("Tags, separated by commas", s.tags.join(", "));
   if (text === null) return;
   const tags = text.split(",").map((t) => t.trim()).filter(Boolean);
-  void api.label(s, { tags }).catch(tell).then(again);
+  void api.label(s, { tags }).catch(notify).then(again);
 }
 
 function remove(s: api.Scan, again: () => void): void {
-  if (confirm(`Move “${s.title}” to the bin?`)) void api.remove(s).then(again, tell);
+  if (confirm(`Move “${s.title}” to the bin?`)) void api.remove(s).then(again, notify);
 }
 
 function binRows(names: string[], again: () => void): HTMLElement[] {
@@ -211,7 +211,7 @@ function binRows(names: string[], again: () => void): HTMLElement[] {
       " ",
       el("button", {
         textContent: "Bring back",
-        onclick: () => void api.restore(name).then(again, tell),
+        onclick: () => void api.restore(name).then(again, notify),
       }),
     ),
   );

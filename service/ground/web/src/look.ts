@@ -1,4 +1,4 @@
-// Bloom and depth of field over the plain picture, for those whose graphics card has the time.
+// Bloom and depth of field over the plain frame, for those whose graphics card has the time.
 
 import * as THREE from "three";
 import { BokehPass } from "three/addons/postprocessing/BokehPass.js";

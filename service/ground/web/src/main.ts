@@ -1,7 +1,7 @@
 // Two pages behind the address: the list of scans, and one scan in 3D.
 
 import "./style.css";
-import { tell } from "./dom";
+import { notify } from "./dom";
 import { showLibrary } from "./library";
 
 const root = document.getElementById("app")!;
@@ -21,5 +21,5 @@ async function show(): Promise<void> {
   else end(); // another page was asked for meanwhile
 }
 
-addEventListener("hashchange", () => void show().catch(tell));
-void show().catch(tell);
+addEventListener("hashchange", () => void show().catch(notify));
+void show().catch(notify);

@@ -2,7 +2,7 @@
 
 import * as THREE from "three";
 import type { Origin } from "./api";
-import { count, el, save, svg, tell } from "./dom";
+import { count, el, notify, save, svg } from "./dom";
 import { along, area, lastStep, profile, type Points, type Volume, volume } from "./figures";
 import { coordinates, placeOf } from "./globe";
 import { eachPoint, HOVER_POINTS, pick } from "./pick";
@@ -105,7 +105,7 @@ export class Ruler {
     const place = this.at(event);
     this.cursor.value = place ? coordinates(this.scene.origin, place) : "";
     if (!this.active) return;
-    if (!place) return tell("no point there");
+    if (!place) return notify("no point there");
     this.places.push(place);
     this.measure();
   }
@@ -145,13 +145,13 @@ export class Ruler {
     const button = (text: string, title: string, off: boolean, onclick: () => void): HTMLElement =>
       el("button", { textContent: text, title, disabled: off, onclick });
     const homeless = this.scene.origin === null;
-    const out = homeless ? "this scan has no place on the globe" : "the places as GeoJSON";
+    const out = homeless ? "this scan is not georeferenced" : "the places as GeoJSON";
     const acts = el(
       "p",
       { className: "acts" },
       button("Undo", "take back the last point (Backspace)", !n, () => this.back()),
       button("Clear", "take back all points (Esc)", !n, () => this.clear()),
-      button("Copy", out, !n || homeless, () => void copy(this.geojson()).then(() => tell("copied"), tell)),
+      button("Copy", out, !n || homeless, () => void copy(this.geojson()).then(() => notify("copied"), notify)),
       button("GeoJSON", out, !n || homeless, () => save("measurement.geojson", this.geojson())),
     );
     if (n < 2) {

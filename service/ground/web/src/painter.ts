@@ -1,5 +1,5 @@
 // When and how much is drawn: little while the view moves, then the rest slice by slice, so that
-// no picture takes long and the page stays usable however many points there are.
+// no frame takes long and the page stays usable however many points there are.
 
 import * as THREE from "three";
 import { Dome } from "./dome";
@@ -12,7 +12,7 @@ export interface Gradual {
   range(from: number, to: number, whole: boolean): void;
 }
 
-/** What lays effects over the plain picture; it draws the whole picture at once. */
+/** What lays effects over the plain frame; it draws the whole frame at once. */
 export interface Effects {
   render(): void;
   resize(w: number, h: number): void;
@@ -22,8 +22,8 @@ export interface Effects {
 const MOVING_MS = 70;
 const SLICE_MS = 90;
 const FIRST_POINTS = 100_000;
-const LEAST_POINTS = 20_000;
-const SHOWN_FROM = 0.5; // of the points; until then the last, thinned picture with large points stays
+const MIN_POINTS = 20_000;
+const SHOWN_FROM = 0.5; // of the points; until then the last, thinned frame with large points stays
 const EFFECTS_TIMES = 3; // of the points drawn while moving, once the view stands still
 
 /** Work given to the graphics card, until it has done it. */
@@ -34,15 +34,15 @@ interface Work {
 }
 
 export class Painter {
-  /** Draw all points in every picture, however long it takes. */
+  /** Draw all points in every frame, however long it takes. */
   fullDetail = false;
   effects: Effects | null = null;
   frames_per_s = 0;
-  /** Share of the points that the picture shows so far. */
+  /** Share of the points that the frame shows so far. */
   shown = 0;
   gradual: Gradual | null = null;
   readonly dome = new Dome();
-  /** Objects drawn with every slice; all others are in the first picture only. */
+  /** Objects drawn with every slice; all others are in the first frame only. */
   readonly again = new Set<THREE.Object3D>();
   private moving = FIRST_POINTS;
   private slice = FIRST_POINTS;
@@ -56,13 +56,13 @@ export class Painter {
     private readonly world: THREE.Group,
   ) {}
 
-  /** True when the picture is whole and nothing is being drawn. */
+  /** True when the frame is whole and nothing is being drawn. */
   get still(): boolean {
     return this.settled && this.shown >= 1 && !this.work;
   }
 
   /**
-   * One tick: a new picture while something changes, then slices over it until all is drawn.
+   * One tick: a new frame while something changes, then slices over it until all is drawn.
    * Nothing is given to the graphics card before it has done what it was given.
    */
   tick(now: number, lively: boolean, before: readonly (() => void)[]): void {
@@ -80,7 +80,7 @@ export class Painter {
     this.give("whole", now);
   }
 
-  /** Draws the picture again; when the view stands still, slices follow unless effects lie over it. */
+  /** Draws the frame again; when the view stands still, slices follow unless effects lie over it. */
   private whole(still: boolean): void {
     const wanted = Math.max(1, this.gradual?.wanted ?? 0);
     const last = still && this.effects !== null;
@@ -93,7 +93,7 @@ export class Painter {
     this.shown = last || !this.gradual?.wanted ? 1 : share;
   }
 
-  /** Draws the next slice of the points over the picture there is. */
+  /** Draws the next slice of the points over the frame there is. */
   private addSlice(now: number): void {
     const gradual = this.gradual;
     if (!gradual) return;
@@ -133,12 +133,12 @@ export class Painter {
   private paced(work: Work, now: number): void {
     const ms = Math.max(now - work.since, 1);
     if (work.kind === "slice") {
-      this.slice = Math.max(LEAST_POINTS, this.slice * Math.min(Math.max(SLICE_MS / ms, 0.25), 1.2));
+      this.slice = Math.max(MIN_POINTS, this.slice * Math.min(Math.max(SLICE_MS / ms, 0.25), 1.2));
       return;
     }
     this.frames_per_s = 1000 / ms;
     const most = Math.max(this.gradual?.wanted ?? 0, FIRST_POINTS);
     const change = Math.min(Math.max(MOVING_MS / ms, 0.5), 1.2);
-    this.moving = Math.min(Math.max(this.moving * change, LEAST_POINTS), most);
+    this.moving = Math.min(Math.max(this.moving * change, MIN_POINTS), most);
   }
 }

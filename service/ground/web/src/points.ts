@@ -13,7 +13,7 @@ const VERTEX = /* glsl */ `
   attribute float views;
   uniform float size;    // of a point, in distances to its neighbour
   uniform float apart;   // of neighbours, in depths of the camera that took them
-  uniform float thin;    // as 1, for the points left out of the picture
+  uniform float thin;    // as 1, for the points left out of the frame
   uniform float height_px;
   uniform float mode;
   uniform vec2 range;

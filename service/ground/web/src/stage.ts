@@ -31,7 +31,7 @@ export class Stage {
   readonly model = new THREE.Group();
   follow = true;
   readonly painter: Painter;
-  /** Called before each picture. */
+  /** Called before each frame. */
   readonly before: (() => void)[] = [];
   private readonly world = new THREE.Group(); // what VR shrinks and lays at one's feet
   private readonly track = new THREE.Line(
@@ -182,7 +182,7 @@ export class Stage {
     this.world.matrixWorldNeedsUpdate = true;
   }
 
-  /** Something changed that is to be seen: pictures are drawn again for a moment. */
+  /** Something changed that is to be seen: frames are drawn again for a moment. */
   readonly touch = (): void => {
     document.body.dataset["still"] = "no";
     this.touched = performance.now();

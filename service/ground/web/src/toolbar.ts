@@ -3,7 +3,7 @@
 import * as THREE from "three";
 import * as api from "./api";
 import type { Cameras } from "./cameras";
-import { el, tell } from "./dom";
+import { el, notify } from "./dom";
 import type { Ruler } from "./measure";
 import { COLOURS, type Cloud, type Colour } from "./points";
 import type { Stage } from "./stage";
@@ -83,7 +83,7 @@ function pressed(button: HTMLElement, on: boolean): void {
 }
 
 function cameraButton(cameras: Cameras): HTMLElement {
-  const button = el("button", { textContent: "Cameras", className: "on", title: "where pictures were taken" });
+  const button = el("button", { textContent: "Cameras", className: "on", title: "where images were taken" });
   button.onclick = () => {
     cameras.toggle();
     pressed(button, cameras.shown);
@@ -102,17 +102,17 @@ function key(text: string, colour: string): HTMLElement {
   return el("span", {}, patch, text);
 }
 
-/** The coverage layer beside the scene: gaps and weak places, new every few seconds. */
+/** The coverage layer next to the scene: gaps and weak places, new every few seconds. */
 function coverageButton({ coverage, id }: Parts): HTMLElement {
   const button = el("button", { textContent: "Coverage", title: "gaps and weak places so far" });
-  const picture = el("img", { alt: "coverage: gaps red, weak yellow, good green" });
+  const image = el("img", { alt: "coverage: gaps red, weak yellow, good green" });
   const none = el("p", { textContent: "No surface yet." });
   const keys = el("p", { className: "keys" }, ...COVERAGE_KEYS.map(([text, colour]) => key(text, colour)));
-  picture.onerror = () => coverage.replaceChildren(none);
-  picture.onload = () => coverage.replaceChildren(picture, keys);
+  image.onerror = () => coverage.replaceChildren(none);
+  image.onload = () => coverage.replaceChildren(image, keys);
   const refresh = (): void => {
     if (coverage.hidden || !coverage.isConnected) return;
-    picture.src = `${api.scanAddress(id)}/coverage.png?t=${Date.now()}`;
+    image.src = `${api.scanAddress(id)}/coverage.png?t=${Date.now()}`;
     setTimeout(refresh, 5000);
   };
   button.onclick = () => {
@@ -142,7 +142,7 @@ function showGroup(parts: Parts): HTMLElement {
       stage.touch();
       buttons.forEach((b) => pressed(b, b === chosen));
     } catch (error) {
-      tell(error);
+      notify(error);
     }
     buttons.forEach((b) => (b.disabled = false));
   };
@@ -157,7 +157,7 @@ function showGroup(parts: Parts): HTMLElement {
   tiles.onclick = () =>
     void show(tiles, async () => {
       const scan = await made(id, "3dtiles", "3dtiles", "There are no 3D Tiles yet. Make them now?");
-      if (!scan.origin) throw new Error("this scan has no place on the globe, so no tiles");
+      if (!scan.origin) throw new Error("this scan is not georeferenced, so it has no tiles");
       const { showTiles } = await import("./tiles");
       return showTiles(stage, `${api.scanAddress(id)}/tiles/tileset.json`, scan.origin, () => 2);
     });
@@ -170,7 +170,7 @@ async function made(id: { drone: string; scan: string }, kind: string, name: str
   const scan = await api.scan(id.drone, id.scan);
   if (has(scan)) return scan;
   if (!confirm(ask)) throw new Error("not made");
-  tell(`making ${kind} …`);
+  notify(`making ${kind} …`);
   await api.make(scan, kind);
   return api.finished(scan, kind);
 }
@@ -205,7 +205,7 @@ function settings({ stage, cloud }: Parts): HTMLElement {
   panel.append(el("label", {}, el("span", { textContent: "Tone" }), tone));
   const bloom = el("input", { type: "checkbox" });
   const blur = el("input", { type: "checkbox" });
-  bloom.onchange = blur.onchange = () => void looks(stage, bloom.checked, blur.checked).catch(tell);
+  bloom.onchange = blur.onchange = () => void looks(stage, bloom.checked, blur.checked).catch(notify);
   const full = el("input", { type: "checkbox" });
   full.onchange = () => (stage.painter.fullDetail = full.checked);
   panel.append(

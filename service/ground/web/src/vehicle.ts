@@ -1,7 +1,7 @@
 // The vehicle's figures and the operator's buttons; hidden where no vehicle was named.
 
 import * as api from "./api";
-import { el, tell } from "./dom";
+import { el, notify } from "./dom";
 
 /** A strip of figures and buttons that keeps itself up to date while it is in the page. */
 export function vehicleStrip(): HTMLElement {
@@ -39,13 +39,13 @@ function words(v: api.Vehicle): string {
 
 function give(action: string): void {
   if (confirm(`${action} the scan on the vehicle?`))
-    void api.order(action).then((a) => tell(`${action}: ${a.result}`), tell);
+    void api.order(action).then((a) => notify(`${action}: ${a.result}`), notify);
 }
 
 function baseline(): void {
   const text = prompt("Baseline in metres; 0 follows the altitude", "0");
   if (text === null) return;
   const metres = Number(text);
-  if (!Number.isFinite(metres)) return tell("not a number");
-  void api.order("baseline", metres).then((a) => tell(`baseline ${metres} m: ${a.result}`), tell);
+  if (!Number.isFinite(metres)) return notify("not a number");
+  void api.order("baseline", metres).then((a) => notify(`baseline ${metres} m: ${a.result}`), notify);
 }

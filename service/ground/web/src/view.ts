@@ -1,4 +1,4 @@
-// One scan in 3D: live cloud, track, cameras, key figures, latest picture.
+// One scan in 3D: live cloud, track, cameras, key figures, latest image.
 
 import * as api from "./api";
 import { Cameras } from "./cameras";
@@ -11,7 +11,7 @@ import { canDraw, Stage } from "./stage";
 import { toolbar } from "./toolbar";
 import { vehicleStrip } from "./vehicle";
 
-const PICTURE_EVERY_MS = 1500;
+const IMAGE_EVERY_MS = 1500;
 const ASK_EVERY_MS = 2000;
 
 /** Shows a scan, or why there is none; gives what closes it. */
@@ -127,7 +127,7 @@ function view(root: HTMLElement, scan: api.Scan): () => void {
   const asking = setInterval(() => {
     if (link.finished && report.hidden) void api.scan(id.drone, id.scan).then(learn, () => undefined);
   }, ASK_EVERY_MS);
-  const stopPictures = keepLatest(id, latest, cameras, stage, () => newest);
+  const stopImages = keepLatest(id, latest, cameras, stage, () => newest);
   const clock = setInterval(() => {
     link.draw();
     if (cameras.refresh()) stage.touch();
@@ -139,14 +139,14 @@ function view(root: HTMLElement, scan: api.Scan): () => void {
   return () => {
     clearInterval(clock);
     clearInterval(asking);
-    stopPictures();
+    stopImages();
     live.close();
     ruler.close();
     stage.close();
   };
 }
 
-/** Keeps the picture of the newest keyframe in the corner and in its frustum. */
+/** Keeps the image of the newest keyframe in the corner and in its frustum. */
 function keepLatest(
   id: { drone: string; scan: string },
   place: HTMLElement,
@@ -166,10 +166,10 @@ function keepLatest(
       stage.touch();
       place.hidden = false;
       place.replaceChildren(image, el("figcaption", { textContent: `latest keyframe, ${seq}` }));
-      document.body.dataset["picture"] = String(seq);
+      document.body.dataset["image"] = String(seq);
     };
     image.src = `${api.scanAddress(id)}/keyframes/${seq}.jpg`;
-  }, PICTURE_EVERY_MS);
+  }, IMAGE_EVERY_MS);
   return () => clearInterval(timer);
 }
 
