@@ -118,6 +118,11 @@ class RowTrack:
         self._clock = RowClock(camera) if camera.shutter.readout_s else None
         self._frames: deque[FrameRows] = deque(maxlen=32)
 
+    @property
+    def is_rolling(self) -> bool:
+        """False for a global shutter."""
+        return self._clock is not None
+
     def begin(self) -> None:
         """Forget the segment before."""
         self._frames.clear()

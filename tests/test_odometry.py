@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import pytest
 from recon import se3
 from recon.tracking.localisation import OdometryConfig
 from recon.tracking.odometry import Odometry, Tracked
-from recon.types import F64, U8, Camera, PosePrior
+from recon.types import F64, U8, Camera, PosePrior, Shutter
 
 K = np.array([[400.0, 0, 239.5], [0, 400.0, 179.5], [0, 0, 1]])
 CAMERA = Camera(K, np.zeros(5), (480, 360))
@@ -150,3 +152,42 @@ def test_noise_is_not_followed() -> None:
         for i in range(12)
     ]
     assert "keyframe" not in states and "tracked" not in states
+
+
+def skipping(ground: U8, track: list[F64], fps: float, lens: Camera | None = None) -> list[Tracked]:
+    """Run the odometry with telemetry of constant error, without the frames that it can skip."""
+    odometry, out = Odometry(CAMERA, OdometryConfig(), lens), []
+    for i, T in enumerate(track):
+        time_ns, prior = round(i * 1e9 / fps), prior_of(T, np.random.default_rng(2))
+        if odometry.can_skip(time_ns, prior, frames_per_step=6.0):
+            out.append(Tracked("skipped", odometry.segment))
+        else:
+            out.append(odometry.track(photograph(ground, T), i, time_ns, prior))
+    return out
+
+
+def test_frames_that_hardly_differ_are_skipped_and_cost_no_accuracy(ground: U8) -> None:
+    track = poses(90, step_m=0.2, wobble=0.001)
+    found = skipping(ground, track, fps=30.0)
+    after = found[next(i for i, f in enumerate(found) if f.state == "keyframe") :]
+    followed = [i for i, f in enumerate(after) if f.state != "skipped"]
+    assert max(np.diff(followed)) == 3, "ten frames a second are followed"
+    assert len(followed) < 0.5 * len(after)
+    assert sum(f.state == "keyframe" for f in after) >= 2
+    assert drift(track, found) < 0.05
+
+
+def test_no_frame_of_a_fast_turn_or_a_fast_flight_is_skipped(ground: U8) -> None:
+    swung = poses(40, step_m=0.2, wobble=0.03)
+    fast = poses(40, step_m=1.5, wobble=0.001)
+    for track in (swung, fast):
+        found = skipping(ground, track, fps=30.0)
+        metric = next(i for i, f in enumerate(found) if f.state == "keyframe")
+        assert np.mean([f.state == "skipped" for f in found[metric:]]) < 0.15
+
+
+def test_a_rolling_shutter_skips_less(ground: U8) -> None:
+    lens = replace(CAMERA, shutter=Shutter(1e-6))
+    found = skipping(ground, poses(60, step_m=0.2, wobble=0.001), 30.0, lens)
+    followed = [i for i, f in enumerate(found) if f.state in ("tracked", "keyframe")]
+    assert max(np.diff(followed)) == 2

@@ -154,3 +154,17 @@ def test_an_honest_gimbal_is_left_alone() -> None:
     fly(TelemetryCheck(CameraConfig(), history, reported.append))
     assert history.gimbal_frame() is GimbalFrame.EARTH
     assert not any("Gimbal" in text for text in reported)
+
+
+def test_skipped_frames_do_not_interrupt_the_turns_of_the_others() -> None:
+    """Frames that were not tracked come between those that were."""
+    check = TelemetryCheck(CameraConfig(), history_of("honest", 1.0))
+    mount = Rotation.from_euler("Y", -math.pi / 3)
+    for k in range(40 * 30):
+        T = np.eye(4)
+        T[:3, :3] = (body(k / 30) * mount).as_matrix() @ R_GIMBAL_CAMERA
+        tracked = Tracked("skipped", 0) if k % 3 else Tracked("tracked", 0, T)
+        check.add(round(k * S / 30 + LATE_S * S), tracked)
+    check.finish()
+    assert check.latency is not None
+    assert abs(check.latency.latency_ms - 1e3 * LATE_S) < 5.0

@@ -32,4 +32,5 @@ def test_short_losses_and_a_hover_are_not_reported() -> None:
     assert flown("keyframe", *["lost"] * 19, "keyframe", *["lost"] * 19, "tracked") == []
     assert flown("started", *["waiting"] * 500) == []
     assert flown("keyframe", *["tracked"] * 500) == []
+    assert flown("keyframe", *["lost"] * 19, *["skipped"] * 2, *["lost"] * 19) == []
     assert flown("keyframe", *["lost"] * 9, "started", *["waiting"] * 100, "keyframe") == []

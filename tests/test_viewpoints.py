@@ -130,3 +130,18 @@ def test_the_last_frame_of_a_stretch_becomes_a_view_when_it_shows_more() -> None
     for i in range(3):
         offer(fixed, i, 2.5 * i, "tracked" if i else "started")
     assert not fixed.end_stretch(frame(3, 6.5))
+
+
+def test_all_frames_count_where_the_operator_chose_the_baseline_or_wants_the_next_one() -> None:
+    assert Viewpoints(ScanConfig(baseline=2.0)).frames_per_step == np.inf
+    assert Viewpoints(ScanConfig(baseline="2/10")).frames_per_step == np.inf
+    views = Viewpoints(ScanConfig())
+    views.take_next()
+    assert views.frames_per_step == np.inf
+
+
+def test_as_many_frames_are_needed_as_pair_up() -> None:
+    few, many = Viewpoints(ScanConfig(), partners=4), Viewpoints(ScanConfig(), partners=30)
+    assert np.isfinite(few.frames_per_step)
+    steps_with_partners = 2 * (2.2 - 0.6)
+    assert many.frames_per_step * steps_with_partners >= 30

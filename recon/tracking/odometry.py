@@ -36,12 +36,16 @@ from recon.types import F64, U8, Bool, Camera, PosePrior
 OVERDUE = 1.3
 """A blurred frame becomes a keyframe when the last is this many steps away."""
 
+MAX_GAP_S, ROLLING_GAP_S = 0.09, 0.05
+"""A frame this long after the last is followed: a gimbal trembles at a few Hz. A rolling shutter's
+rows need neighbours closer by."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracked:
     """What one frame gave."""
 
-    state: str  # "started", "waiting", "tracked", "keyframe" or "lost"
+    state: str  # "started", "waiting", "tracked", "keyframe", "skipped" or "lost"
     segment: int
     T_odom_camera: F64 | None = None  # (4, 4)
     tracks: int = 0
@@ -82,8 +86,20 @@ class Odometry:
             features,
         )
         self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
+        self._depth = float("nan")  # median of the last keyframe's landmarks
+        self._max_gap_s = ROLLING_GAP_S if self._row_track.is_rolling else MAX_GAP_S
 
     # ---- one frame -------------------------------------------------------------------
+
+    def can_skip(self, time_ns: int, prior: PosePrior, frames_per_step: float) -> bool:
+        """True for a frame that :meth:`track` need not see: the camera has hardly moved since.
+
+        ``frames_per_step`` is how many frames at least are followed from keyframe to keyframe.
+        """
+        if not self._metric or self._lost or self._motion is None:
+            return False
+        shift, gap_s = self._motion.shift(time_ns, prior, self._depth)
+        return gap_s < self._max_gap_s and shift < self.config.base_to_height / frames_per_step
 
     def track(
         self,
@@ -243,7 +259,7 @@ class Odometry:
         key = found.key
         T_camera_odom = found.pose.T_camera_points
         moved = T_camera_odom @ key.T_odom_camera
-        depth = self.median_depth(key)
+        depth = self._depth if key is self.keyframes[-1] else self.median_depth(key)
         base = float(np.linalg.norm(moved[:3, 3])) / max(depth, 1e-6)
         tracks = int(found.ok.sum())
         turned = float(np.linalg.norm(se3.so3_log(moved[:3, :3])))
@@ -313,6 +329,7 @@ class Odometry:
         self.keyframes.append(key_new)
         self._unsettled = key_new if new.moving.rows is not None else None
         adjust_window(self.keyframes[-self.config.window - 2 :], self.K)
+        self._depth = self.median_depth(key_new)
         self._forget()
 
     def _settle(self) -> None:

@@ -143,6 +143,7 @@ class Motion:
         """At rest there; ``prior`` is telemetry's word of that moment."""
         self._last = (time_ns, T_odom_camera, prior)
         self._velocity = np.zeros(3)
+        self._turn_rad_s = 0.0
 
     def update(self, time_ns: int, T_odom_camera: F64, prior: PosePrior) -> None:
         """Take in the next frame's pose (4, 4)."""
@@ -152,12 +153,21 @@ class Motion:
             velocity = (T_odom_camera[:3, 3] - T_last[:3, 3]) / dt
             keep = 0.5 if dt < STEADY_S and np.any(self._velocity) else 0.0
             self._velocity = keep * self._velocity + (1 - keep) * velocity
+            self._turn_rad_s = _angle(T_last[:3, :3].T @ T_odom_camera[:3, :3]) / dt
         self._last = (time_ns, T_odom_camera, prior)
 
     def correct(self, T_odom_camera: F64) -> None:
         """The last frame's pose was adjusted; the velocity stays."""
         time_ns, _, prior = self._last
         self._last = (time_ns, T_odom_camera, prior)
+
+    def shift(self, time_ns: int, prior: PosePrior, depth: float) -> tuple[float, float]:
+        """How far (rad) the ground at ``depth`` moves in the image from the last frame until then,
+        and the seconds. Without telemetry's turn the camera turns on as it did."""
+        _, turn, gap_s = self.ahead(time_ns, prior)
+        moved = float(np.linalg.norm(self._velocity)) * gap_s / depth
+        turned = self._turn_rad_s * gap_s if turn is None else _angle(turn)
+        return moved + turned, gap_s
 
     def ahead(self, time_ns: int, prior: PosePrior) -> tuple[F64, F64 | None, float]:
         """T_odom_camera (4, 4) expected then, the turn R_new_last of telemetry, and seconds."""
@@ -168,3 +178,7 @@ class Motion:
         if turn is not None:
             R = R @ turn.T
         return se3.compose(R, T_last[:3, 3] + self._velocity * dt), turn, dt
+
+
+def _angle(R: F64) -> float:
+    return float(np.linalg.norm(se3.so3_log(R)))

@@ -48,6 +48,8 @@ class Pipeline:
         Raises ValueError when the image is not of the camera model's size.
         """
         s = self.stages
+        if s.track.can_skip(frame):  # frames are followed as fast as the image moves
+            return Step(Tracked("skipped", s.track.segment))
         image = s.undistort(frame)  # section 2.1
         tracked = s.track(image)  # Harris and ZSSD (Eq. 4-5), EPnP (Eq. 6-7)
         anchor, is_view = s.views.take(image, tracked)  # virtual stereo camera, section 2.3

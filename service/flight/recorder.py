@@ -15,6 +15,7 @@ from service.cameras.rig import Rig, attitude_of
 from service.flight.anchorage import PublishedFrame, PublishedFrames
 from service.flight.graph_report import graph_figures
 from service.flight.pipeline import Pipeline, Step
+from service.flight.tracking_watch import FOUND
 from service.scans.drawing import save_debug
 from service.stream.codec import CodecConfig, encode
 from service.stream.records import PoseRecord
@@ -96,7 +97,7 @@ class Recorder:
         pipeline = self.pipeline
         return {
             "frames": self.frames,
-            "frames_tracked": self.states["tracked"] + self.states["keyframe"],
+            "frames_tracked": sum(self.states[state] for state in FOUND),
             "frames_lost": self.states["lost"],
             "segments": pipeline.segments,
             "pairs": pipeline.pairs,

@@ -107,8 +107,19 @@ class Undistort:
 class Track:
     """The odometry: Harris corners, ZSSD (Eq. 4-5) and EPnP (Eq. 6-7)."""
 
-    def __init__(self, odometry: Odometry, refused: Counter[str], stopwatch: Stopwatch) -> None:
-        self.odometry, self._refused, self._stopwatch = odometry, refused, stopwatch
+    def __init__(
+        self,
+        odometry: Odometry,
+        selection: Viewpoints,
+        refused: Counter[str],
+        stopwatch: Stopwatch,
+    ) -> None:
+        self.odometry, self._selection = odometry, selection
+        self._refused, self._stopwatch = refused, stopwatch
+
+    def can_skip(self, frame: Frame) -> bool:
+        """True for a frame so close to the last one that nothing needs its pose."""
+        return self.odometry.can_skip(frame.time_ns, frame.prior, self._selection.frames_per_step)
 
     def __call__(self, image: UndistortedFrame) -> Tracked:
         """The frame's pose, or why there is none."""
@@ -379,8 +390,8 @@ def build_stages(
         OdometryConfig(base_to_height=config.scan.base_to_height),
         camera,
     )
-    track = Track(odometry, refused, stopwatch)
     selection = Viewpoints(config.scan, compute.pairs)
+    track = Track(odometry, selection, refused, stopwatch)
     stereo = VirtualStereoConfig(
         min_base_to_height=selection.min_base_to_height,
         width_px=compute.stereo_width,

@@ -81,7 +81,7 @@ class TelemetryCheck:
 
     def add(self, stamp_ns: int, tracked: Tracked) -> None:
         """Take in a frame's pose by vision, at its stamp, and look at all of them now and then."""
-        if self._history is None:
+        if self._history is None or tracked.state == "skipped":
             return
         T = tracked.T_odom_camera
         last, self._last = self._last, None

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from recon.tracking.odometry import Tracked
 
 LOST_S = 10.0
-FOUND = ("tracked", "keyframe")
+FOUND = ("tracked", "keyframe", "skipped")
 """States with a pose that rests on more than the segment's first image."""
 
 

@@ -25,6 +25,13 @@ from service.config import ScanConfig, parse_baseline
 from service.flight.anchorage import Anchorage
 
 KEPT = 6
+MIN_FRAMES_PER_STEP = 6.0
+"""A keyframe comes up to one part in so many late."""
+
+NEAREST_PARTNER, FARTHEST_PARTNER = 0.6, 2.2
+PARTNER_SPAN = 2 * (FARTHEST_PARTNER - NEAREST_PARTNER)
+"""Steps away that partners between the views are, and over how many steps they spread."""
+
 LAST_VIEW_SHARE = 0.1
 """A stretch's last frame becomes a view when it is this share of a usual step further on."""
 
@@ -117,6 +124,13 @@ class Viewpoints:
     def take_next(self) -> None:
         """Make the next frame with a pose a view, whatever the baseline asks for."""
         self._take_next = True
+
+    @property
+    def frames_per_step(self) -> float:
+        """Frames between two keyframes that are needed: as many as pair up, or all of them."""
+        if self._mode != "auto" or self._take_next:
+            return np.inf
+        return max(MIN_FRAMES_PER_STEP, self._partners / PARTNER_SPAN)
 
     @property
     def min_base_to_height(self) -> float:
@@ -233,7 +247,8 @@ class Viewpoints:
         base = [_apart(v, view) for v in others]
         steps = [b for v, b in zip(others, base, strict=True) if v.bgr is not None]
         spacing = steps[0] if steps else 0.0
-        good = [v for v, b in zip(others, base, strict=True) if 0.6 * spacing <= b <= 2.2 * spacing]
+        near, far = NEAREST_PARTNER * spacing, FARTHEST_PARTNER * spacing
+        good = [v for v, b in zip(others, base, strict=True) if near <= b <= far]
         picked = np.unique(np.linspace(0, len(good) - 1, self._partners).round().astype(int))
         return [good[i] for i in picked] if good else []
 
