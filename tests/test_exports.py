@@ -134,6 +134,20 @@ def test_dsm_by_rasterio(scan_dir: Path, house: HouseFlight) -> None:
     assert clear.sum() * 0.25 > 1300
 
 
+def test_dsm_says_what_is_filled(scan_dir: Path, tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio", exc_type=ImportError)
+    bands = []
+    for strict in (True, False):
+        path = written(scan_dir, "dsm", ExportOptions(cell_m=0.2, strict=strict))
+        with rasterio.open(path) as image:
+            assert image.descriptions[2] == "filled"
+            bands.append(image.read())
+    strict_m, (height, sigma, is_filled) = bands[0][0], bands[1]
+    assert not (bands[0][2] == 1.0).any()
+    assert ((strict_m == -9999.0) & (height != -9999.0) == (is_filled == 1.0)).all()
+    assert (is_filled == 1.0).sum() > 100 and (sigma[is_filled == 1.0] > 0.0).all()
+
+
 def test_ortho_by_rasterio(scan_dir: Path, house: HouseFlight) -> None:
     rasterio = pytest.importorskip("rasterio", exc_type=ImportError)
     with rasterio.open(written(scan_dir, "ortho")) as image:

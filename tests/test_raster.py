@@ -16,7 +16,6 @@ from recon.surface.raster import (
     rasterise,
     reliable,
     standing_height,
-    surface_model,
 )
 from recon.types import F32, F64, PointCloud
 
@@ -164,26 +163,6 @@ def test_of_cells_above_a_step_the_uncertain_are_left_out() -> None:
     assert left.known[:, 23:].all() and left.known[:, :20].all()
     sigma[:, 20:22] = 0.02  # an edge that is well seen
     assert reliable(step_raster(sigma)).known[:, 20:22].all()
-
-
-def test_holes_next_to_a_step_stay_holes() -> None:
-    raster = step_raster(np.full((40, 40), 0.05, np.float32))
-    raster.height_m[10:12, 19:21] = np.nan
-    raster.height_m[10:12, 5:7] = np.nan
-    assert fill_holes(raster).known.all()
-    filled = fill_holes(raster, level_m=0.4)
-    assert not filled.known[10:12, 19:21].any()
-    assert filled.known[10:12, 5:7].all()
-
-
-def test_the_surface_model_of_a_plain_cloud_is_its_upper_surface() -> None:
-    rng = np.random.default_rng(5)
-    xyz = np.column_stack([rng.uniform(0, 10, (20_000, 2)), rng.normal(2.0, 0.02, 20_000)])
-    points = cloud(xyz, 0.02)
-    grid = grid_over(xyz[:, :2], 0.25)
-    model = surface_model(points.xyz_m, points.rgb, points.sigma_m, grid)
-    assert model.known.mean() > 0.99
-    assert np.nanmax(np.abs(model.height_m - 2.0)) < 0.06
 
 
 def test_crumbs_high_above_the_ground_are_left_out_and_a_roof_stays() -> None:

@@ -165,18 +165,6 @@ def _top_surface(
     return height, spread, colour
 
 
-def surface_model(xyz_m: F64 | F32, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:
-    """The surface model that is delivered: the upper surface where it is certain.
-
-    Cells next to a step that may as well be roof as ground stay unknown (:func:`reliable`);
-    holes are filled on level ground only.
-    """
-    all_cells = rasterise_points(xyz_m, rgb, sigma_m, grid)
-    certain = reliable(all_cells)
-    doubtful = all_cells.known & ~certain.known
-    return without_cells(fill_holes(certain, level_m=STEP_M / 2.0), doubtful)
-
-
 def reliable(raster: Raster) -> Raster:
     """``raster`` without the cells that stereo cannot place at a step of STEP_M or more.
 
@@ -241,12 +229,12 @@ def _highest_lowest(height_m: F32, reach_cells: int) -> tuple[F32, F32]:
     return np.asarray(high, np.float32), np.asarray(low, np.float32)
 
 
-def fill_holes(raster: Raster, largest_cells: int = 4, level_m: float | None = None) -> Raster:
-    """``raster`` with its holes up to ``largest_cells`` wide filled from their surroundings.
+def fill_holes(raster: Raster, largest_cells: int = 4) -> Raster:
+    """``raster`` with its holes up to ``largest_cells`` wide filled by the mean around them.
 
     Only holes are closed: the outline of the surveyed area does not grow into the unknown.
-    With ``level_m`` a hole stays where the heights around it differ by more. Filled cells
-    carry the sigma of their surroundings, doubled.
+    Filled cells carry the sigma of their surroundings, doubled. For what is looked at;
+    :mod:`recon.surface.hole_filling` is for what is measured.
     """
     known = raster.known
     if largest_cells < 1 or known.all() or not known.any():
@@ -262,9 +250,6 @@ def fill_holes(raster: Raster, largest_cells: int = 4, level_m: float | None = N
     ).astype(np.float32)
     smooth, reached = _normalised_blur(layers, known, largest_cells)
     fill = holes & reached
-    if level_m is not None:
-        high, low = _highest_lowest(raster.height_m, largest_cells)
-        fill &= high - low <= level_m
     height, sigma, rgb = raster.height_m.copy(), raster.sigma_m.copy(), raster.rgb.copy()
     height[fill] = smooth[fill, 0]
     sigma[fill] = 2.0 * smooth[fill, 1]

@@ -29,6 +29,9 @@ def export(
         float | None, typer.Option("--cell-m", help="cell of dsm, ortho, contours")
     ] = None,
     contour_m: Annotated[float, typer.Option("--contour-m", help="contour interval")] = 1.0,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="leave the holes of the surface model unknown")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
 ) -> None:
     """Write deliverables of a scan: clouds, surface model, orthophoto, tiles, mesh, flight."""
@@ -41,7 +44,7 @@ def export(
     if out is not None and len(to) > 1:
         raise InputError("--out names one file; give one --to with it")
     try:
-        options = ExportOptions(voxel_m, cell_m, contour_m)
+        options = ExportOptions(voxel_m, cell_m, contour_m, strict)
     except ValueError as error:
         raise InputError(f"export: {error}") from error
     written = {}

@@ -58,19 +58,32 @@ def score_files(folder: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, 
 
 
 def _dsm(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
-    """Heights of the cells less the truth's, straight below or above their middles."""
+    """Heights of the cells less the truth's, straight below or above their middles.
+
+    Band 3, where there is one, marks filled cells: they have figures of their own. ``inside`` is
+    the share of known cells within the outline of the known ones.
+    """
+    from scipy.ndimage import binary_fill_holes
+
     image = _Raster(path, truth.frame)
     height = image.bands[0].astype(np.float64)
     known = np.isfinite(height) & (height != image.nodata)
     rows, cols = np.nonzero(known)
     cells = image.places(cols, rows, height[known])
-    out: dict[str, Any] = image.facts | {"cells": len(cells)}
+    is_filled = image.bands[2][known] == 1.0 if len(image.bands) > 2 else np.zeros(len(rows), bool)
+    out: dict[str, Any] = image.facts | {
+        "cells": len(cells),
+        "inside": float(known.sum() / max(binary_fill_holes(known).sum(), 1)),
+        "filled_share": float(is_filled.mean()) if len(rows) else 0.0,
+    }
     for name, fit in fits.items():
         moved = fit.points(cells)
         error = moved[:, 2] - heights_below(truth.surface, moved[:, :2])
-        error = error[np.isfinite(error)]
+        on_truth = np.isfinite(error)
         share = _seen_in(seen, image, known, fit, truth)
-        out[name] = {"completeness": share} | _height_figures(error)
+        out[name] = {"completeness": share} | _height_figures(error[on_truth])
+        if is_filled.any():
+            out[name]["filled"] = _height_figures(error[on_truth & is_filled])
     return out
 
 

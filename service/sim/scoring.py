@@ -11,8 +11,9 @@ import numpy as np
 
 from recon import se3
 from recon.surface import metrics
+from recon.surface.hole_filling import surface_model
 from recon.surface.metrics import Fit
-from recon.surface.raster import Grid, grid_over, rasterise_points, surface_model
+from recon.surface.raster import Grid, grid_over, rasterise_points
 from recon.types import F32, F64
 from service.errors import InputError
 from service.georeference import LocalFrame

@@ -11,18 +11,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.mapping.free_space import open_above
-from recon.surface.raster import (
-    Grid,
-    Raster,
-    fill_holes,
-    standing_height,
-    surface_model,
-    without_cells,
-)
+from recon.surface.raster import Grid, Raster, fill_holes
 from recon.types import F64, Array
 from service.errors import InputError
 from service.georeference import LocalFrame
+from service.offline.exports.surface import surface_model
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.coverage import coverage_of
 from service.scans.writing import writing
@@ -31,53 +24,16 @@ NODATA_M = -9999.0
 SHORTEST_CONTOUR_CELLS = 12
 MAX_CONTOURS = 5000
 """Heights at which contours are drawn: every metre up to the highest mountains."""
-OPEN_STEP_M = 2
-SIDEWAYS_DEG = 15.0
-MAX_OPEN_M, MAX_OPEN_SIDEWAYS_M = 4, 6
-"""Free air above a cell that is asked for at most: trees and eaves overhang higher up as well,
-but every metre costs ground at the border of the survey. Looking sideways one sees more of
-the ground below them."""
 
 
 def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """Heights in AMSL metres (float32, -9999 where unknown); band 2 holds their sigma.
-
-    Unknown is also what cannot be placed next to a step
-    (:func:`recon.surface.raster.surface_model`), and ground above which something may stand that
-    no image shows.
-    """
-    cloud = scan.fused.cloud
-    raster = surface_model(scan.xyz_m, cloud.rgb, cloud.sigma_m, scan.grid(options.cell_m))
-    raster = _open_to_the_sky(scan, raster)
-    known = raster.known
-    bands = np.stack(
-        [np.where(known, raster.height_m, NODATA_M), np.where(known, raster.sigma_m, NODATA_M)]
-    ).astype(np.float32)
-    write_cog(scan, out, raster.grid, bands, ("height AMSL, m", "sigma, m"), nodata=NODATA_M)
-
-
-def _open_to_the_sky(scan: ScanView, raster: Raster) -> Raster:
-    """``raster`` where the air above was seen to be free, as high as things stand on this site."""
-    sideways = float(np.median(scan.off_nadir_deg)) > SIDEWAYS_DEG
-    highest = min(standing_height(raster), MAX_OPEN_SIDEWAYS_M if sideways else MAX_OPEN_M)
-    heights_m = [float(m) for m in range(OPEN_STEP_M, math.ceil(highest) + 1, OPEN_STEP_M)]
-    if not heights_m:
-        return raster
-    rows, cols = np.nonzero(raster.known)
-    grid = raster.grid
-    places = np.column_stack(
-        [
-            grid.west_m + (cols + 0.5) * grid.cell_m,
-            grid.north_m - (rows + 0.5) * grid.cell_m,
-            raster.height_m[rows, cols].astype(np.float64),
-        ]
-    )
-    if scan.frame is not None:
-        places = scan.frame.from_utm(places)
-    depths = (k.depth for k in scan.store.keyframes())
-    hidden = np.zeros(grid.shape, np.bool_)
-    hidden[rows, cols] = ~open_above(places, heights_m, depths)
-    return without_cells(raster, hidden)
+    """Heights in AMSL metres (float32, -9999 where unknown), their sigma, and 1 where filled."""
+    surface = surface_model(scan, options.cell_m, options.strict)
+    known = surface.raster.known
+    bands = [surface.raster.height_m, surface.raster.sigma_m, surface.is_filled]
+    image = np.where(known, np.stack(bands), NODATA_M).astype(np.float32)
+    names = ("height AMSL, m", "sigma, m", "filled")
+    write_cog(scan, out, surface.raster.grid, image, names, nodata=NODATA_M)
 
 
 def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:

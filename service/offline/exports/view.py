@@ -33,6 +33,7 @@ class ExportOptions:
     voxel_m: float | None = None
     cell_m: float | None = None
     contour_m: float = 1.0
+    strict: bool = False  # unknown cells of the surface model are not filled
     progress: Callable[[str], None] = field(default=lambda _: None)
 
     def __post_init__(self) -> None:

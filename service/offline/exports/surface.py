@@ -1,0 +1,66 @@
+"""The surface model of a scan, from which rasters are made."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon.mapping.free_space import open_above
+from recon.surface.hole_filling import filled
+from recon.surface.raster import Raster, reliable, standing_height, without_cells
+from recon.types import Bool
+from service.offline.exports.view import ScanView
+
+OPEN_STEP_M = 2
+SIDEWAYS_DEG = 15.0
+MAX_OPEN_M, MAX_OPEN_SIDEWAYS_M = 4, 6
+"""Free air above a cell that is asked for at most: trees and eaves overhang higher up as well,
+but every metre costs ground at the border of the survey. Looking sideways one sees more of
+the ground below them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """Heights of the upper surface, and (rows, cols) where a hole was filled."""
+
+    raster: Raster
+    is_filled: Bool
+
+
+def surface_model(scan: ScanView, cell_m: float | None, strict: bool = False) -> Surface:
+    """The surface where it is certain and the air above it was seen, its holes filled.
+
+    ``strict`` leaves the holes unknown. :func:`recon.surface.raster.reliable` says what is
+    uncertain, :func:`recon.surface.hole_filling.filled` which holes are filled.
+    """
+    measured = scan.raster(cell_m)
+    certain = _open_to_the_sky(scan, reliable(measured))
+    if strict:
+        return Surface(certain, np.zeros(certain.grid.shape, np.bool_))
+    return Surface(*filled(certain, measured))
+
+
+def _open_to_the_sky(scan: ScanView, raster: Raster) -> Raster:
+    """``raster`` where the air above was seen to be free, as high as things stand on this site."""
+    sideways = float(np.median(scan.off_nadir_deg)) > SIDEWAYS_DEG
+    highest = min(standing_height(raster), MAX_OPEN_SIDEWAYS_M if sideways else MAX_OPEN_M)
+    heights_m = [float(m) for m in range(OPEN_STEP_M, math.ceil(highest) + 1, OPEN_STEP_M)]
+    if not heights_m:
+        return raster
+    rows, cols = np.nonzero(raster.known)
+    grid = raster.grid
+    places = np.column_stack(
+        [
+            grid.west_m + (cols + 0.5) * grid.cell_m,
+            grid.north_m - (rows + 0.5) * grid.cell_m,
+            raster.height_m[rows, cols].astype(np.float64),
+        ]
+    )
+    if scan.frame is not None:
+        places = scan.frame.from_utm(places)
+    depths = (k.depth for k in scan.store.keyframes())
+    hidden = np.zeros(grid.shape, np.bool_)
+    hidden[rows, cols] = ~open_above(places, heights_m, depths)
+    return without_cells(raster, hidden)
