@@ -1,4 +1,4 @@
-// Where images were taken: a frustum per keyframe, the aircraft's with its latest image.
+// Where images were taken: a frustum per keyframe, and one image in its frustum.
 
 import * as THREE from "three";
 
@@ -9,6 +9,7 @@ const CORNERS: [number, number][] = [
 export class Cameras {
   readonly group = new THREE.Group();
   private readonly taken = new Map<number, THREE.Matrix4>();
+  private last = Infinity;
   private readonly all = new THREE.LineSegments(
     new THREE.BufferGeometry(),
     new THREE.LineBasicMaterial({ color: 0x6f8296, transparent: true, opacity: 0.55 }),
@@ -48,6 +49,29 @@ export class Cameras {
     this.stale = true;
   }
 
+  /** Shows the keyframes up to `seq` only. */
+  until(seq: number): void {
+    this.stale ||= seq !== this.last;
+    this.last = seq;
+  }
+
+  /** The keyframe whose camera or image centre is drawn nearest to a place (px), at most `near` away. */
+  at(place: THREE.Vector2, camera: THREE.Camera, size: THREE.Vector2, near: number): number | null {
+    if (!this.shown) return null;
+    camera.updateMatrixWorld();
+    let best: { seq: number; px: number } | null = null;
+    for (const [seq, T] of this.taken) {
+      if (seq > this.last) continue;
+      for (const z of [0, this.reach / 12]) {
+        const p = new THREE.Vector3(0, 0, z).applyMatrix4(T).project(camera);
+        const seen = new THREE.Vector2((size.x / 2) * (1 + p.x), (size.y / 2) * (1 - p.y));
+        const px = p.z < 1 ? seen.distanceTo(place) : Infinity;
+        if (px <= near && px < (best?.px ?? Infinity)) best = { seq, px };
+      }
+    }
+    return best?.seq ?? null;
+  }
+
   /** The aircraft's camera is at T and looks `reach` metres far. */
   aircraft(T: number[], reach: number): void {
     if (Math.abs(reach - this.reach) > 0.2 * this.reach) {
@@ -60,11 +84,11 @@ export class Cameras {
     this.now.visible = true;
   }
 
-  /** Shows the image of keyframe `seq` in its frustum. */
-  show(seq: number, image: HTMLImageElement): void {
+  /** Puts the image of keyframe `seq` into its frustum. */
+  show(seq: number, shown: HTMLImageElement): void {
     const T = this.taken.get(seq);
     if (!T) return;
-    const texture = new THREE.Texture(image);
+    const texture = new THREE.Texture(shown);
     texture.colorSpace = THREE.SRGBColorSpace;
     texture.needsUpdate = true;
     this.image.material.map?.dispose();
@@ -76,14 +100,15 @@ export class Cameras {
     this.image.visible = true;
   }
 
-  /** Draws the frusta again if keyframes were added; call periodically. True when it did. */
+  /** Draws the frusta again when keyframes came; call now and then. True when it did. */
   refresh(): boolean {
     if (!this.stale) return false;
     this.stale = false;
     const s = this.reach / 12;
     const lines = frustum().map((p) => p.multiplyScalar(s));
     const points: THREE.Vector3[] = [];
-    for (const T of this.taken.values()) for (const p of lines) points.push(p.clone().applyMatrix4(T));
+    for (const [seq, T] of this.taken)
+      if (seq <= this.last) for (const p of lines) points.push(p.clone().applyMatrix4(T));
     this.all.geometry.dispose();
     this.all.geometry = new THREE.BufferGeometry().setFromPoints(points);
     return true;

@@ -105,13 +105,13 @@ function importForm(again: () => void): HTMLElement {
 
 function card(s: api.Scan, again: () => void): HTMLElement {
   const open = `#/view/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`;
-  const thumbnail = s.preview
+  const image = s.preview
     ? el("img", { src: api.file(s, "preview.jpg"), alt: `preview of ${s.title}`, loading: "lazy" })
     : el("div", { className: "blank", textContent: "no preview yet" });
   return el(
     "article",
     {},
-    el("a", { href: open, className: "thumbnail" }, thumbnail),
+    el("a", { href: open, className: "thumbnail" }, image),
     el(
       "h2",
       {},

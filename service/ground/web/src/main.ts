@@ -12,10 +12,10 @@ async function show(): Promise<void> {
   const mine = ++turn;
   close();
   close = () => undefined;
-  const [page, drone, scan] = location.hash.replace(/^#\//, "").split("/").map(decodeURIComponent);
+  const [page, drone, scan, place] = location.hash.replace(/^#\//, "").split("/").map(decodeURIComponent);
   const isView = page === "view" && drone && scan;
   const end = isView
-    ? await (await import("./view")).showView(root, drone, scan)
+    ? await (await import("./view")).showView(root, drone, scan, place)
     : await showLibrary(root);
   if (mine === turn) close = end;
   else end(); // another page was asked for meanwhile

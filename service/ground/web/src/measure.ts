@@ -2,10 +2,11 @@
 
 import * as THREE from "three";
 import type { Origin } from "./api";
-import { count, el, notify, save, svg } from "./dom";
+import { copy, el, save, svg, notify } from "./dom";
 import { along, area, lastStep, profile, type Points, type Volume, volume } from "./figures";
 import { coordinates, placeOf } from "./globe";
 import { eachPoint, HOVER_POINTS, pick } from "./pick";
+import * as units from "./units";
 
 const CLICK_PX = 5; // a pointer that moved farther turned the view
 const HOVER_MS = 120;
@@ -77,12 +78,12 @@ export class Ruler {
       const [x1, y1, x2, y2] = [a.x, a.y, b.x, b.y].map((v) => v.toFixed(1));
       parts.push(svg("line", { x1: x1!, y1: y1!, x2: x2!, y2: y2!, class: i ? "" : "closing" }));
       const step = this.places[i]!.distanceTo(this.places[(i || n) - 1]!);
-      if (i) text((a.x + b.x) / 2, (a.y + b.y) / 2, `${step.toFixed(2)} m`);
+      if (i) text((a.x + b.x) / 2, (a.y + b.y) / 2, units.length(step));
     });
     for (const p of inFront) parts.push(svg("circle", { cx: p.x.toFixed(1), cy: p.y.toFixed(1), r: "4" }));
     const mean = (values: number[]): number => values.reduce((a, b) => a + b, 0) / n;
     if (n > 2 && inFront.length === n)
-      text(mean(inFront.map((p) => p.x)), mean(inFront.map((p) => p.y)), `${area(this.places).toFixed(1)} m²`);
+      text(mean(inFront.map((p) => p.x)), mean(inFront.map((p) => p.y)), units.area(area(this.places)));
     this.overlay.replaceChildren(...parts);
   };
 
@@ -126,6 +127,12 @@ export class Ruler {
     event.preventDefault();
   };
 
+  /** Writes the figures again, in the units of now. */
+  rewrite(): void {
+    this.panel.replaceChildren(...this.rows());
+    this.draw();
+  }
+
   private back(): void {
     this.places.pop();
     this.measure();
@@ -136,8 +143,7 @@ export class Ruler {
     const points: Points = (use) => eachPoint(this.scene.cloud, use);
     this.volume = places.length > 2 ? volume(places, points) : null;
     this.heights = places.length > 1 ? profile(places, points) : null;
-    this.panel.replaceChildren(...this.rows());
-    this.draw();
+    this.rewrite();
   }
 
   private rows(): HTMLElement[] {
@@ -169,18 +175,18 @@ export class Ruler {
   private words(): Record<string, string> {
     const step = lastStep(this.places);
     const words: Record<string, string> = {
-      Distance: `${step.distance_m.toFixed(2)} m`,
-      Level: `${step.level_m.toFixed(2)} m`,
-      Height: `${step.height_m >= 0 ? "+" : ""}${step.height_m.toFixed(2)} m`,
+      Distance: units.length(step.distance_m),
+      Level: units.length(step.level_m),
+      Height: `${step.height_m >= 0 ? "+" : ""}${units.length(step.height_m)}`,
       Slope: `${step.slope_deg.toFixed(1)}° (${((100 * step.height_m) / step.level_m).toFixed(0)} %)`,
     };
     if (this.places.length > 2) {
-      words["Along"] = `${along(this.places).toFixed(2)} m`;
-      words["Area"] = `${area(this.places).toFixed(1)} m²`;
+      words["Along"] = units.length(along(this.places));
+      words["Area"] = units.area(area(this.places));
     }
     if (this.volume) {
-      words["Volume above"] = `${count(this.volume.above_m3)} m³`;
-      words["Volume below"] = `${count(this.volume.below_m3)} m³`;
+      words["Volume above"] = units.volume(this.volume.above_m3);
+      words["Volume below"] = units.volume(this.volume.below_m3);
       words["Base"] = "plane through the points";
       words["Not seen"] = `${(100 * this.volume.unseen).toFixed(1)} % of the area`;
     }
@@ -217,17 +223,6 @@ export class Ruler {
   }
 }
 
-/** The clipboard; over plain HTTP only the older way works. */
-async function copy(text: string): Promise<void> {
-  if (navigator.clipboard) return navigator.clipboard.writeText(text);
-  const area = el("textarea", { value: text });
-  document.body.append(area);
-  area.select();
-  const done = document.execCommand("copy");
-  area.remove();
-  if (!done) throw new Error("this browser does not let the page copy; use GeoJSON");
-}
-
 /** The heights along the way as a line, with the lowest and highest value at its side. */
 function chart(heights: Float64Array, origin: Origin | null, length_m: number): HTMLElement {
   const known = heights.filter((z) => !Number.isNaN(z));
@@ -242,7 +237,7 @@ function chart(heights: Float64Array, origin: Origin | null, length_m: number): 
     pen = "L";
   });
   const datum = origin?.alt_amsl_m ?? 0;
-  const words = `${(low + datum).toFixed(2)} to ${(high + datum).toFixed(2)} m over ${length_m.toFixed(1)} m`;
+  const words = `${units.length(low + datum)} to ${units.length(high + datum)} over ${units.length(length_m, 1)}`;
   const drawing = svg("svg", { viewBox: "0 0 240 70", role: "img", "aria-label": `height profile: ${words}` });
   drawing.append(svg("path", { d: path }));
   const figure = el("figure", { className: "profile" }, el("figcaption", { textContent: `Profile ${words}` }));

@@ -3,6 +3,7 @@
 import * as THREE from "three";
 import type { Chunk } from "./live";
 import type { Gradual } from "./painter";
+import { length } from "./units";
 
 export const COLOURS = ["colour", "height", "sigma", "views", "age"] as const;
 export type Colour = (typeof COLOURS)[number];
@@ -19,6 +20,7 @@ const VERTEX = /* glsl */ `
   uniform vec2 range;
   uniform float age;
   varying vec3 shown;
+  #include <clipping_planes_pars_vertex>
 
   vec3 linear(vec3 s) {
     return mix(s / 12.92, pow((s + 0.055) / 1.055, vec3(2.4)), step(0.04045, s));
@@ -40,12 +42,16 @@ const VERTEX = /* glsl */ `
     if (mode > 2.5) s = ramp(views * 255.0 / 8.0);
     if (mode > 3.5) s = ramp(age);
     shown = linear(s);
+    vec4 mvPosition = seen;
+    #include <clipping_planes_vertex>
   }
 `;
 
 const FRAGMENT = /* glsl */ `
   varying vec3 shown;
+  #include <clipping_planes_pars_fragment>
   void main() {
+    #include <clipping_planes_fragment>
     vec2 c = gl_PointCoord - 0.5;
     if (dot(c, c) > 0.25) discard;
     gl_FragColor = vec4(shown, 1.0);
@@ -67,6 +73,7 @@ export class Cloud implements Gradual {
   /** What is added to heights that are shown: the origin's altitude above the sea. */
   datum_m = 0;
   private readonly chunks = new Map<number, Held>();
+  private last = Infinity;
   private readonly shared = {
     size: { value: 1.3 },
     thin: { value: 1 },
@@ -78,6 +85,13 @@ export class Cloud implements Gradual {
   get total(): number {
     let sum = 0;
     for (const held of this.chunks.values()) sum += held.points;
+    return sum;
+  }
+
+  /** Points of the keyframes that are shown. */
+  private get visible(): number {
+    let sum = 0;
+    for (const held of this.chunks.values()) if (held.object.visible) sum += held.points;
     return sum;
   }
 
@@ -96,14 +110,28 @@ export class Cloud implements Gradual {
     const material = new THREE.ShaderMaterial({
       vertexShader: VERTEX,
       fragmentShader: FRAGMENT,
+      clipping: true,
       uniforms: { ...this.shared, age: { value: 0 }, apart: { value: chunk.apart } },
     });
     const object = new THREE.Points(geometry, material);
     object.matrixAutoUpdate = false;
     const held = { object, unit_m: chunk.unit_m, points: chunk.points, time: chunk.time_unix_s };
     this.chunks.set(chunk.seq, held);
+    object.visible = chunk.seq <= this.last;
     this.place(held, chunk.T, 1);
     this.group.add(object);
+  }
+
+  /** The keyframes and when they were taken, in order. */
+  moments(): { seq: number; time: number }[] {
+    const all = [...this.chunks].map(([seq, held]) => ({ seq, time: held.time }));
+    return all.sort((a, b) => a.seq - b.seq);
+  }
+
+  /** Shows the keyframes up to `seq` only. */
+  until(seq: number): void {
+    this.last = seq;
+    for (const [own, { object }] of this.chunks) object.visible = own <= seq;
   }
 
   /** Moves a chunk to its corrected pose; its points stay as they are. */
@@ -123,7 +151,7 @@ export class Cloud implements Gradual {
     const { x, y } = this.shared.range.value;
     const words: Record<Colour, [string, string] | null> = {
       colour: null,
-      height: [x, y].map((z) => `${(z + this.datum_m).toFixed(1)} m`) as [string, string],
+      height: [x, y].map((z) => length(z + this.datum_m, 1)) as [string, string],
       sigma: ["0 m", "σ 1 m"],
       views: ["1 view", "8 views"],
       age: ["first", "last"],
@@ -143,7 +171,7 @@ export class Cloud implements Gradual {
 
   /** Points to draw: all, or the budget; none while they are hidden. */
   get wanted(): number {
-    return this.group.visible ? Math.min(this.total, this.budget) : 0;
+    return this.group.visible ? Math.min(this.visible, this.budget) : 0;
   }
 
   /**
@@ -151,13 +179,13 @@ export class Cloud implements Gradual {
    * any part of them is an even sample; drawn alone, a part has larger points.
    */
   range(from: number, to: number, whole: boolean): void {
-    const share = Math.min(1, this.budget / Math.max(1, this.total));
+    const share = Math.min(1, this.budget / Math.max(1, this.visible));
     this.shared.thin.value = 1 / Math.sqrt(Math.max(1e-6, share * (whole ? 1 : to)));
     this.drawn = 0;
     for (const { object, points } of this.chunks.values()) {
       const [start, end] = [Math.ceil(points * share * from), Math.ceil(points * share * to)];
       object.geometry.setDrawRange(start, end - start);
-      if (this.group.visible) this.drawn += end - start;
+      if (this.group.visible && object.visible) this.drawn += end - start;
     }
   }
 

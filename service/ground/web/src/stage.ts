@@ -7,6 +7,7 @@ import { VRButton } from "three/addons/webxr/VRButton.js";
 import { type Gradual, Painter } from "./painter";
 
 export const BACKGROUND = 0x171b20;
+export const LIGHT = 0xffffff;
 const INPUTS = ["pointerdown", "click", "input", "change", "keydown", "wheel"];
 const MOVING_MS = 250;
 const LIVELY_MS = 500;

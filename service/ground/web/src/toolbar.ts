@@ -4,9 +4,11 @@ import * as THREE from "three";
 import * as api from "./api";
 import type { Cameras } from "./cameras";
 import { el, notify } from "./dom";
+import { clipBox, linkButton } from "./explore";
 import type { Ruler } from "./measure";
 import { COLOURS, type Cloud, type Colour } from "./points";
-import type { Stage } from "./stage";
+import { BACKGROUND, LIGHT, type Stage } from "./stage";
+import * as units from "./units";
 
 export interface Parts {
   stage: Stage;
@@ -34,9 +36,10 @@ export function toolbar(parts: Parts): HTMLElement {
   });
   bar.append(
     group(colours(parts)),
-    group(follow, whole),
+    group(follow, whole, linkButton(parts)),
     group(measure(parts.ruler), cameraButton(parts.cameras), coverageButton(parts)),
     showGroup(parts),
+    clipBox(parts),
     settings(parts),
   );
   void stage.vr().then((button) => button && bar.append(button));
@@ -83,7 +86,7 @@ function pressed(button: HTMLElement, on: boolean): void {
 }
 
 function cameraButton(cameras: Cameras): HTMLElement {
-  const button = el("button", { textContent: "Cameras", className: "on", title: "where images were taken" });
+  const button = el("button", { textContent: "Cameras", className: "on", title: "where images were taken; click one to see it" });
   button.onclick = () => {
     cameras.toggle();
     pressed(button, cameras.shown);
@@ -175,7 +178,7 @@ async function made(id: { drone: string; scan: string }, kind: string, name: str
   return api.finished(scan, kind);
 }
 
-function settings({ stage, cloud }: Parts): HTMLElement {
+function settings({ stage, cloud, ruler }: Parts): HTMLElement {
   const panel = el("div", { className: "settings" });
   const slide = (text: string, min: number, max: number, step: number, value: number, set: (v: number) => void, words: (v: number) => string): void => {
     const shown = el("output", { textContent: words(value) });
@@ -208,7 +211,23 @@ function settings({ stage, cloud }: Parts): HTMLElement {
   bloom.onchange = blur.onchange = () => void looks(stage, bloom.checked, blur.checked).catch(notify);
   const full = el("input", { type: "checkbox" });
   full.onchange = () => (stage.painter.fullDetail = full.checked);
+  const feet = el("input", { type: "checkbox", checked: units.imperial() });
+  feet.onchange = () => {
+    try {
+      units.setImperial(feet.checked);
+    } catch (error) {
+      notify(error);
+    }
+    ruler.rewrite();
+  };
+  const light = el("input", { type: "checkbox" });
+  light.onchange = () => {
+    stage.scene.background = new THREE.Color(light.checked ? LIGHT : BACKGROUND);
+    stage.touch();
+  };
   panel.append(
+    el("label", { title: "feet, cubic yards and miles an hour" }, el("span", { textContent: "Imperial" }), feet),
+    el("label", {}, el("span", { textContent: "Light scene" }), light),
     el("label", { title: "draw all points also while the view moves" }, el("span", { textContent: "Full detail" }), full),
     el("label", {}, el("span", { textContent: "Bloom" }), bloom),
     el("label", {}, el("span", { textContent: "Depth of field" }), blur),

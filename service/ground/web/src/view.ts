@@ -1,23 +1,24 @@
-// One scan in 3D: live cloud, track, cameras, key figures, latest image.
+// One scan in 3D: live cloud, track, cameras, key figures, image of a keyframe.
 
 import * as api from "./api";
 import { Cameras } from "./cameras";
 import { count, el } from "./dom";
+import { Images, takeView, timeSlider } from "./explore";
 import { LinkState } from "./link";
 import { LiveView, type LastPose, type News } from "./live";
 import { Ruler } from "./measure";
 import { Cloud } from "./points";
 import { canDraw, Stage } from "./stage";
 import { toolbar } from "./toolbar";
+import * as units from "./units";
 import { vehicleStrip } from "./vehicle";
 
-const IMAGE_EVERY_MS = 1500;
 const ASK_EVERY_MS = 2000;
 
 /** Shows a scan, or why there is none; gives what closes it. */
-export async function showView(root: HTMLElement, drone: string, name: string): Promise<() => void> {
+export async function showView(root: HTMLElement, drone: string, name: string, place?: string): Promise<() => void> {
   try {
-    return view(root, await api.scan(drone, name));
+    return view(root, await api.scan(drone, name), place);
   } catch (error) {
     root.replaceChildren(nothing(error));
     return () => undefined;
@@ -37,7 +38,7 @@ function nothing(error: unknown): HTMLElement {
   );
 }
 
-function view(root: HTMLElement, scan: api.Scan): () => void {
+function view(root: HTMLElement, scan: api.Scan, place?: string): () => void {
   const id = { drone: scan.drone, scan: scan.scan };
   const figures = el("dl", { className: "panel figures" });
   const link = new LinkState();
@@ -47,8 +48,7 @@ function view(root: HTMLElement, scan: api.Scan): () => void {
   const host = el("main", { className: "stage" });
   const legend = el("div", { className: "panel legend", hidden: true });
   const coverage = el("div", { className: "panel coverage", hidden: true });
-  const latest = el("figure", { className: "panel latest", hidden: true });
-  const side = el("aside", { className: "side", tabIndex: 0 }, figures, legend, coverage, latest);
+  const side = el("aside", { className: "side", tabIndex: 0 }, figures, legend, coverage);
   side.setAttribute("aria-label", "figures");
   const page = el("div", { className: "view" }, bar, host, side);
   root.replaceChildren(page);
@@ -79,15 +79,19 @@ function view(root: HTMLElement, scan: api.Scan): () => void {
   });
   host.append(ruler.overlay, ruler.cursor);
   side.prepend(ruler.panel);
+  const site = { stage, cloud, cameras, id };
+  const images = new Images(site, () => !ruler.active);
+  const time = timeSlider(site);
+  side.append(images.element);
+  host.append(time.element);
   stage.before.push(ruler.draw, () => cloud.screen(stage.renderer.domElement.height / 2));
   stage.drawGradually(cloud);
   stage.add(cameras.group);
   stage.addAgain(cloud.group);
-  bar.append(toolbar({ stage, cloud, cameras, ruler, legend, coverage, id }));
+  bar.append(toolbar({ ...site, ruler, legend, coverage }));
 
   let last: LastPose | undefined;
-  let framed = false;
-  let newest = -1;
+  let framed = takeView(stage, place);
   const reach = (): number => Math.max(last?.agl_m ?? 40, 5);
   const news = (item: News): void => {
     if (item.type === "link") return link.news(item);
@@ -117,9 +121,10 @@ function view(root: HTMLElement, scan: api.Scan): () => void {
       cloud.add(chunk);
       stage.touch();
       cameras.put(chunk.seq, chunk.T);
-      newest = Math.max(newest, chunk.seq);
+      images.arrived(chunk.seq);
+      time.refresh();
       document.body.dataset["chunk"] = `${chunk.seq} ${Date.now()}`;
-      if (cloud.keyframes === 1) stage.frame();
+      if (cloud.keyframes === 1 && !framed) stage.frame();
     },
     news,
     (text) => (link.cut = text),
@@ -127,7 +132,6 @@ function view(root: HTMLElement, scan: api.Scan): () => void {
   const asking = setInterval(() => {
     if (link.finished && report.hidden) void api.scan(id.drone, id.scan).then(learn, () => undefined);
   }, ASK_EVERY_MS);
-  const stopImages = keepLatest(id, latest, cameras, stage, () => newest);
   const clock = setInterval(() => {
     link.draw();
     if (cameras.refresh()) stage.touch();
@@ -139,38 +143,11 @@ function view(root: HTMLElement, scan: api.Scan): () => void {
   return () => {
     clearInterval(clock);
     clearInterval(asking);
-    stopImages();
+    images.close();
     live.close();
     ruler.close();
     stage.close();
   };
-}
-
-/** Keeps the image of the newest keyframe in the corner and in its frustum. */
-function keepLatest(
-  id: { drone: string; scan: string },
-  place: HTMLElement,
-  cameras: Cameras,
-  stage: Stage,
-  newest: () => number,
-): () => void {
-  let shown = -1;
-  const timer = setInterval(() => {
-    const seq = newest();
-    if (seq === shown) return;
-    shown = seq;
-    const image = new Image();
-    image.alt = `keyframe ${seq}, seen from the aircraft`;
-    image.onload = () => {
-      cameras.show(seq, image);
-      stage.touch();
-      place.hidden = false;
-      place.replaceChildren(image, el("figcaption", { textContent: `latest keyframe, ${seq}` }));
-      document.body.dataset["image"] = String(seq);
-    };
-    image.src = `${api.scanAddress(id)}/keyframes/${seq}.jpg`;
-  }, IMAGE_EVERY_MS);
-  return () => clearInterval(timer);
 }
 
 function rows(cloud: Cloud, stage: Stage, last: LastPose | undefined, fused: number | undefined): HTMLElement[] {
@@ -181,12 +158,12 @@ function rows(cloud: Cloud, stage: Stage, last: LastPose | undefined, fused: num
     ["Keyframes", String(cloud.keyframes)],
   ];
   if (last) {
-    facts.push(["Speed", `${last.speed_m_s.toFixed(1)} m/s`]);
-    if (last.agl_m !== null) facts.push(["Height", `${last.agl_m.toFixed(1)} m`]);
-    if (last.alt_amsl_m !== null) facts.push(["AMSL", `${last.alt_amsl_m.toFixed(1)} m`]);
-    facts.push(["Flown", `${last.distance_m.toFixed(0)} m`]);
+    facts.push(["Speed", units.speed(last.speed_m_s)]);
+    if (last.agl_m !== null) facts.push(["Height", units.length(last.agl_m, 1)]);
+    if (last.alt_amsl_m !== null) facts.push(["AMSL", units.length(last.alt_amsl_m, 1)]);
+    facts.push(["Flown", units.length(last.distance_m, 0)]);
     facts.push(["Camera", `${last.roll_deg}° ${last.pitch_deg}° ${last.yaw_deg}°`]);
-    facts.push(["Absolute σ", `${last.sigma_m.toFixed(2)} m`]);
+    facts.push(["Absolute σ", units.length(last.sigma_m)]);
     facts.push(["From", last.sources.join(", ")]);
     if (last.lat_deg !== null && last.lon_deg !== null)
       facts.push(["At", `${last.lat_deg.toFixed(6)}, ${last.lon_deg.toFixed(6)}`]);

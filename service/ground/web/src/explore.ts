@@ -1,0 +1,168 @@
+// Looking around in a scan: its growth over time, a clip box, images of keyframes, links to a view.
+
+import * as THREE from "three";
+import * as api from "./api";
+import type { Cameras } from "./cameras";
+import { copy, el, notify } from "./dom";
+import type { Cloud } from "./points";
+import type { Stage } from "./stage";
+
+const IMAGE_EVERY_MS = 1500;
+const CLICK_PX = 5; // a pointer that moved farther turned the view
+const NEAR_PX = 14;
+
+export interface Site {
+  stage: Stage;
+  cloud: Cloud;
+  cameras: Cameras;
+  id: { drone: string; scan: string };
+}
+
+/** A slider over the keyframes: the cloud as it was when each was taken; at its end it follows. */
+export function timeSlider({ stage, cloud, cameras }: Site): { element: HTMLElement; refresh: () => void } {
+  const input = el("input", { type: "range", min: "1", value: "1", max: "1" });
+  input.setAttribute("aria-label", "time of the flight");
+  const shown = el("output", {});
+  const element = el("label", { className: "time", hidden: true }, input, shown);
+  const show = (): void => {
+    const moments = cloud.moments();
+    const k = Number(input.value) - 1;
+    const last = k >= moments.length - 1;
+    cloud.until(last ? Infinity : moments[k]!.seq);
+    cameras.until(last ? Infinity : moments[k]!.seq);
+    shown.value = `${(moments[k]!.time - moments[0]!.time).toFixed(0)} s`;
+    stage.touch();
+  };
+  input.oninput = show;
+  const refresh = (): void => {
+    const n = cloud.keyframes;
+    element.hidden = n < 2;
+    if (n < 2 || Number(input.max) === n) return;
+    const followed = input.value === input.max;
+    input.max = String(n);
+    if (followed) input.value = input.max;
+    show();
+  };
+  return { element, refresh };
+}
+
+/** Six sliders that cut the scene to a box, as shares of the cloud's extent. */
+export function clipBox({ stage, cloud }: Site): HTMLElement {
+  const panel = el("div", { className: "settings clip" });
+  const axes: [string, "x" | "y" | "z"][] = [["East", "x"], ["North", "y"], ["Height", "z"]];
+  const fields: { axis: "x" | "y" | "z"; low: HTMLInputElement; high: HTMLInputElement }[] = [];
+  const cut = (): void => {
+    const box = new THREE.Box3().setFromObject(cloud.group);
+    const size = box.getSize(new THREE.Vector3());
+    const planes: THREE.Plane[] = [];
+    for (const { axis, low, high } of fields) {
+      const at = (field: HTMLInputElement): number => box.min[axis] + (size[axis] * Number(field.value)) / 100;
+      const along = new THREE.Vector3();
+      along[axis] = 1;
+      if (low.value !== low.min) planes.push(new THREE.Plane(along.clone(), -at(low)));
+      if (high.value !== high.max) planes.push(new THREE.Plane(along.clone().negate(), at(high)));
+    }
+    stage.renderer.clippingPlanes = planes;
+    stage.touch();
+  };
+  for (const [name, axis] of axes) {
+    const slide = (which: string, value: string): HTMLInputElement => {
+      const input = el("input", { type: "range", min: "0", max: "100", value, oninput: cut });
+      input.setAttribute("aria-label", `${name}, ${which}`);
+      return input;
+    };
+    const field = { axis, low: slide("from", "0"), high: slide("to", "100") };
+    fields.push(field);
+    panel.append(el("div", { className: "axis" }, el("span", { textContent: name }), field.low, field.high));
+  }
+  const whole = (): void => {
+    for (const { low, high } of fields) [low.value, high.value] = ["0", "100"];
+    cut();
+  };
+  panel.append(el("button", { textContent: "Whole", onclick: whole }));
+  return el("details", { className: "group" }, el("summary", { textContent: "Clip" }), panel);
+}
+
+/** The address of this view of this scan. */
+function linkOf({ stage, id }: Site): string {
+  const numbers = [...stage.camera.position.toArray(), ...stage.controls.target.toArray()];
+  const view = numbers.map((v) => v.toFixed(2)).join(",");
+  return `#/view/${encodeURIComponent(id.drone)}/${encodeURIComponent(id.scan)}/${view}`;
+}
+
+/** Takes the view of an address; false when it holds none. */
+export function takeView(stage: Stage, text: string | undefined): boolean {
+  const numbers = (text ?? "").split(",").map(Number);
+  if (numbers.length !== 6 || !numbers.every(Number.isFinite)) return false;
+  stage.camera.position.fromArray(numbers);
+  stage.controls.target.fromArray(numbers, 3);
+  stage.follow = false;
+  return true;
+}
+
+export function linkButton(site: Site): HTMLElement {
+  const act = (): void => {
+    history.replaceState(null, "", linkOf(site));
+    void copy(location.href).then(() => notify("The link to this view is copied."), notify);
+  };
+  return el("button", { textContent: "Link", title: "copy a link to this view", onclick: act });
+}
+
+/** The image of the newest keyframe in the corner and in its frustum; a click on a frustum shows its own. */
+export class Images {
+  readonly element = el("figure", { className: "panel latest", hidden: true });
+  private readonly timer = setInterval(() => this.refresh(), IMAGE_EVERY_MS);
+  private newest = -1;
+  private chosen: number | null = null;
+  private shown = -1;
+  private down: { x: number; y: number } | null = null;
+
+  constructor(private readonly site: Site, free: () => boolean) {
+    const { canvas } = { canvas: site.stage.renderer.domElement };
+    canvas.addEventListener("pointerdown", (e) => (this.down = { x: e.clientX, y: e.clientY }));
+    canvas.addEventListener("click", (e) => {
+      if (free() && this.down && Math.hypot(e.clientX - this.down.x, e.clientY - this.down.y) <= CLICK_PX) this.click(e);
+    });
+  }
+
+  close(): void {
+    clearInterval(this.timer);
+  }
+
+  arrived(seq: number): void {
+    this.newest = Math.max(this.newest, seq);
+  }
+
+  private click(event: MouseEvent): void {
+    const { stage, cameras } = this.site;
+    const box = stage.renderer.domElement.getBoundingClientRect();
+    const place = new THREE.Vector2(event.clientX - box.left, event.clientY - box.top);
+    const seq = cameras.at(place, stage.camera, new THREE.Vector2(box.width, box.height), NEAR_PX);
+    if (seq === null) return;
+    this.chosen = seq;
+    this.refresh();
+  }
+
+  private refresh(): void {
+    const seq = this.chosen ?? this.newest;
+    if (seq === this.shown) return;
+    this.shown = seq;
+    const image = new Image();
+    image.alt = `keyframe ${seq}, seen from the aircraft`;
+    image.onload = () => this.show(seq, image);
+    image.src = `${api.scanAddress(this.site.id)}/keyframes/${seq}.jpg`;
+  }
+
+  private show(seq: number, image: HTMLImageElement): void {
+    if (seq !== this.shown) return; // another one was chosen meanwhile
+    const { cameras, stage } = this.site;
+    cameras.show(seq, image);
+    stage.touch();
+    const text = this.chosen === null ? `latest keyframe, ${seq}` : `keyframe ${seq}`;
+    const back = el("button", { textContent: "Latest", title: "the newest keyframe again" });
+    back.onclick = () => ((this.chosen = null), this.refresh());
+    this.element.hidden = false;
+    this.element.replaceChildren(image, el("figcaption", {}, text, this.chosen !== null && back));
+    document.body.dataset["image"] = String(seq);
+  }
+}

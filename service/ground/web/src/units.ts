@@ -1,0 +1,34 @@
+// Lengths as the operator reads them: metric or imperial, kept in the browser.
+
+const FOOT = 0.3048;
+const NAME = "skyrelief.units";
+
+/** True for feet; false for metres. */
+export function imperial(): boolean {
+  try {
+    return localStorage.getItem(NAME) === "imperial";
+  } catch {
+    return false; // storage is switched off
+  }
+}
+
+export function setImperial(on: boolean): void {
+  try {
+    localStorage.setItem(NAME, on ? "imperial" : "metric");
+  } catch {
+    throw new Error("this browser does not let the page keep the unit");
+  }
+}
+
+export const length = (m: number, digits = 2): string =>
+  imperial() ? `${(m / FOOT).toFixed(digits)} ft` : `${m.toFixed(digits)} m`;
+
+export const area = (m2: number): string =>
+  imperial() ? `${(m2 / FOOT ** 2).toFixed(1)} ft²` : `${m2.toFixed(1)} m²`;
+
+/** Imperial volumes of earth are cubic yards. */
+export const volume = (m3: number): string =>
+  imperial() ? `${Math.round(m3 / (3 * FOOT) ** 3).toLocaleString("en")} yd³` : `${Math.round(m3).toLocaleString("en")} m³`;
+
+export const speed = (m_s: number): string =>
+  imperial() ? `${((m_s * 3600) / 1609.344).toFixed(1)} mph` : `${m_s.toFixed(1)} m/s`;
