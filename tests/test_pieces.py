@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import cv2
 import laspy
 import numpy as np
+import pytest
+import rasterio
 from painted_ground import CAMERA, FOOTPRINT_M, HEIGHT_M, pose, still
 from typer.testing import CliRunner
 
+from recon.calibration.global_bundle import Sightings
 from recon.posegraph.alignment import Similarity
 from recon.posegraph.loop_book import Edge
 from recon.posegraph.pose_graph import PoseGraph
@@ -20,6 +23,16 @@ from recon.types import F64, PosePrior
 from service.cameras.camera_file import save_camera
 from service.cli import app
 from service.flight.chain import Pieces
+from service.offline.exports.mesh_tiles import footprints
+from service.offline.exports.view import ExportOptions, ScanView, export
+from service.offline.refine.by_images import MIN_COMMON, stretches_untied
+from service.scans.coverage import LiveCoverage, coverage_of
+from service.scans.folder import write_deliverables
+from service.scans.main_piece import main_poses, main_seqs
+from service.stream.store import ScanStore
+
+if TYPE_CHECKING:
+    from conftest import HouseFlight
 
 NOWHERE = PosePrior()
 PLACED = PosePrior(np.eye(3), 0.02, 0.1, np.zeros(3), np.ones(3))
@@ -108,3 +121,95 @@ def test_a_scan_finished_at_its_end_is_not_called_empty(tmp_path: Path) -> None:
     scan, xyz = replayed(tmp_path, [pose(0.25 * FOOTPRINT_M * i, seed=i) for i in range(3)])
     assert scan["counts"]["keyframes"] > 0 and len(xyz) > 1000
     assert not [w for w in scan["run"]["warnings"] if "nothing was reconstructed" in w]
+
+
+def finished(store: ScanStore, apart: list[list[int]]) -> ScanStore:
+    """The store, closed with these stretches apart."""
+    store.finish({"frames": 5, "frames_tracked": 5, "apart": apart})
+    return store
+
+
+def test_no_deliverable_shows_what_is_apart(tmp_path: Path, house: HouseFlight) -> None:
+    """The last two keyframes of five are tied to nothing: they lie 5 m further east each."""
+    with finished(house.flown(tmp_path), [[3, 4]]) as store:
+        summary = write_deliverables(tmp_path, store, {})
+        coverage = coverage_of(store)
+    assert coverage is not None and coverage.places["seq"].tolist() == [0, 1, 2]
+    assert any("2 of 5 keyframes" in note for note in summary["notes"])
+    assert "2 of 5 keyframes" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    with ScanView(tmp_path) as view:
+        assert [p.keyframe_seq for p in view.poses] == [0, 1, 2]
+        assert [p.seq for p in footprints(view.store)] == [0, 1, 2]
+        assert len(view.off_nadir_deg) == 3
+        east = [export(view, kind, None, ExportOptions(cell_m=1.0)) for kind in ("dsm", "geojson")]
+    with rasterio.open(east[0]) as dsm:
+        assert dsm.bounds.right - dsm.bounds.left < 160 / 140 * 40 + 10 + 4
+    features = json.loads(east[1].read_text())["features"]
+    assert [f["properties"].get("keyframe") for f in features[1:]] == [0, 1, 2]
+    assert len(features[0]["geometry"]["coordinates"]) == 3
+
+
+def test_the_preview_says_what_is_left_out(tmp_path: Path, house: HouseFlight) -> None:
+    sizes = []
+    for name, apart in (("whole", []), ("apart", [[3, 4]])):
+        with finished(house.flown(tmp_path / name), apart) as store:
+            write_deliverables(tmp_path / name, store, {})
+        image = cv2.imread(str(tmp_path / name / "preview.jpg"))
+        assert image is not None
+        sizes.append(image.shape)
+    assert sizes[1][1] < sizes[0][1] or sizes[1][0] > sizes[0][0]
+
+
+def test_coverage_begins_again_where_a_piece_leaves(tmp_path: Path, house: HouseFlight) -> None:
+    with house.flown(tmp_path) as store:
+        live = LiveCoverage(store)
+        before = live.refresh()
+        finished(store, [[0, 0]])
+        after = live.refresh()
+        assert before is not None and len(before.places) == 5
+        assert after is not None and after.places["seq"].tolist() == [1, 2, 3, 4]
+
+
+def set_refinement(store: ScanStore, figures: dict[str, Any]) -> None:
+    store._db.set("refinement", json.dumps({"figures": figures}))
+
+
+def test_a_refinement_that_ties_brings_back(tmp_path: Path, house: HouseFlight) -> None:
+    with finished(house.flown(tmp_path), [[3, 4]]) as store:
+        set_refinement(store, {"apart": []})
+        assert main_seqs(store) == [0, 1, 2, 3, 4]
+        set_refinement(store, {"undone": True})
+        assert main_seqs(store) == [0, 1, 2]
+
+
+def test_poses_follow_the_view_before_them(house: HouseFlight) -> None:
+    poses = [replace(house.record(i, 0.0), keyframe_seq=i if i % 2 == 0 else None)
+             for i in range(8)]  # fmt: skip
+    left = main_poses(poses, [(2, 4)])
+    assert [round((p.time_unix_ns - house.start_ns) / 1e9) for p in left] == [0, 1, 6, 7]
+
+
+@pytest.mark.parametrize(("common", "fixes", "expected"), [
+    (MIN_COMMON, (), []),
+    (MIN_COMMON - 1, (), [[13, 14]]),
+    (MIN_COMMON - 1, (3, 4), [[13, 14]]),
+    (0, (2, 3, 4), [[13, 14]]),
+])  # fmt: skip
+def test_images_tie_pieces_by_common_places(
+    common: int, fixes: tuple[int, ...], expected: list[list[int]]
+) -> None:
+    """Views 0 to 2 see places 0 to 19, views 3 and 4 ``common`` of them and as many others."""
+    lists = [np.arange(20)] * 3 + [np.r_[np.arange(common), np.arange(20, 40)]] * 2
+    view = np.repeat(np.arange(5), [len(a) for a in lists])
+    seen = Sightings(view, np.concatenate(lists), np.zeros((len(view), 2)))
+    fixed = np.isin(np.arange(5), fixes)
+    assert stretches_untied([10, 11, 12, 13, 14], seen, fixed) == expected
+
+
+def test_a_piece_with_fixes_is_tied() -> None:
+    view = np.repeat(np.arange(9), 20)
+    landmark = np.tile(np.arange(20), 9) + 20 * np.repeat([0, 1, 0], 60)
+    seen = Sightings(view, landmark, np.zeros((180, 2)))
+    seqs = list(range(9))
+    assert stretches_untied(seqs, seen, np.zeros(9, bool)) == [[3, 5]]
+    assert stretches_untied(seqs, seen, np.isin(seqs, (3, 4, 5))) == []

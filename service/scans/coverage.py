@@ -33,6 +33,7 @@ from recon.surface.coverage import (
 from recon.types import U8, Array, DepthMap
 from service.georeference import LocalFrame
 from service.scans.file_ledger import FileLedger
+from service.scans.main_piece import Stretch, main_seqs, stretches_apart
 from service.scans.track import local_frame
 from service.scans.writing import writing
 from service.stream.ranges import RangeSet
@@ -164,6 +165,12 @@ class LiveCoverage:
         """``ledger`` stores rows of :data:`recon.surface.coverage.PLACE`; in memory by default."""
         self._store = store
         self._cell_m, self._ledger = cell_m, ledger
+        self._begin([])
+
+    def _begin(self, apart: list[Stretch]) -> None:
+        """Start from nothing, without the keyframes of these stretches."""
+        self._apart = apart
+        self._ledger = None if apart else self._ledger  # it holds places of the stretches
         self._map: CoverageMap | None = None
         self._seqs = array("q")  # processed keyframes, in order; and for each:
         self._fine = array("b")  # whether its fine layer was available
@@ -173,11 +180,14 @@ class LiveCoverage:
     def refresh(self) -> Coverage | None:
         """The layer of the store's current content; None while it holds no surface."""
 
+        apart = stretches_apart(self._store)
+        if apart != self._apart:  # known once the scan is finished, or refined
+            self._begin(apart)
         numbers = self._store.numbers()
         fine, reposes = (numbers.get(kind, RangeSet()) for kind in ("k1", "repose"))
         is_moved = reposes != self._reposes
         self._reposes = reposes
-        for i, seq in enumerate(self._store.seqs()):
+        for i, seq in enumerate(main_seqs(self._store)):
             if i == len(self._seqs) or self._seqs[i] != seq:
                 self._seqs.insert(i, seq)
                 self._fine.insert(i, seq in fine)

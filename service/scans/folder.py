@@ -27,6 +27,7 @@ from service.scans.coverage import IMAGE as COVERAGE
 from service.scans.coverage import write_coverage_files
 from service.scans.drawing import blank_preview, draw_preview, middle_keyframe, stages
 from service.scans.fused_cloud import DEFAULT_VOXEL_M, FusedCloud, fused_cloud, write_laz
+from service.scans.main_piece import in_words, main_poses, main_seqs, stretches_apart
 from service.scans.report import report_html
 from service.scans.track import csv_table, latest, local_frame, tum_lines
 from service.scans.trust import slope_deg, trust_of
@@ -91,18 +92,21 @@ def write_deliverables(
         raster = surface(fused)
     run = (store.summary or {}) | extra
     summary = _summary(header, frame, poses, fused, raster, run, store.finished)
+    left_out = in_words(store)
+    summary["notes"] += [left_out] if left_out else []
     with failures.noted(COVERAGE):
         coverage = write_coverage_files(folder, store)
     summary["coverage"] = None if coverage is None else coverage.figures()
     summary["refinement"] = store.refinement
     preview = b""
+    shown_poses = main_poses(poses, stretches_apart(store))
     with failures.noted(PREVIEW):
-        preview = _preview(raster, poses, summary)
+        preview = _preview(raster, shown_poses, summary, left_out)
         with writing(folder / PREVIEW) as part:
             part.write_bytes(preview)
     with failures.noted(REPORT), writing(folder / REPORT) as part:
         shown = _stages(folder, store)
-        page = report_html(summary, poses, fused.cloud, raster, preview, coverage, shown)
+        page = report_html(summary, shown_poses, fused.cloud, raster, preview, coverage, shown)
         part.write_text(page, encoding="utf-8")
     summary["failed"], summary["files_due"] = failures.why, failures.of_the_disk is not None
     with writing(folder / SUMMARY) as part:
@@ -149,7 +153,7 @@ def files_due(folder: Path) -> bool:
 
 def _stages(folder: Path, store: ScanStore) -> bytes | None:
     """JPEG of a keyframe's stages for the report; None for a scan without keyframes."""
-    seq = middle_keyframe(folder, store.seqs())
+    seq = middle_keyframe(folder, main_seqs(store))
     keyframe = None if seq is None else store.keyframe(seq)
     if keyframe is None:
         return None
@@ -256,9 +260,11 @@ def _quality(
     }
 
 
-def _preview(raster: Raster | None, poses: Sequence[PoseRecord], summary: dict[str, Any]) -> bytes:
-    """preview.jpg."""
-    lines = _key_figures(summary)
+def _preview(
+    raster: Raster | None, poses: Sequence[PoseRecord], summary: dict[str, Any], left_out: str
+) -> bytes:
+    """preview.jpg; ``left_out`` says what is not in it."""
+    lines = _key_figures(summary) + ([left_out] if left_out else [])
     if raster is None:
         image = blank_preview(lines)
     else:

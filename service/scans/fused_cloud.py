@@ -19,6 +19,7 @@ from recon.mapping.free_space import seen_through, spread
 from recon.mapping.voxel_map import ground_sample_m
 from recon.types import F64, PointCloud
 from service.georeference import LocalFrame
+from service.scans.main_piece import main_keyframes
 from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ class _Extent:
 
 
 def fused_cloud(store: ScanStore, voxel_m: float | None = None) -> FusedCloud:
-    """All keyframes of ``store`` fused; voxels of the ground sample distance by default.
+    """The main piece of ``store`` fused; voxels of the ground sample distance by default.
 
     Points that other keyframes see through are removed. The store is read several times, so that
     memory holds only the fused points and the sums of one strip of the site at a time.
@@ -82,27 +83,15 @@ def fused_cloud(store: ScanStore, voxel_m: float | None = None) -> FusedCloud:
 
 
 def _extents(store: ScanStore) -> list[_Extent]:
-    """The keyframes with points."""
+    """The keyframes of the main piece with points."""
     out = []
-    apart = _apart(store.summary or {})
-    for keyframe in store.keyframes():
-        if any(first <= keyframe.seq <= last for first, last in apart):
-            continue
+    for keyframe in main_keyframes(store):
         sample = ground_sample_m(keyframe.depth)
         cloud = cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh)
         if sample is not None and len(cloud):
             x = cloud.xyz_m[:, 0]
             out.append(_Extent(keyframe.seq, len(cloud), sample, float(x.min()), float(x.max())))
     return out
-
-
-def _apart(summary: dict[str, Any]) -> list[tuple[int, int]]:
-    """First and last keyframe of each unconnected segment, by the scan's summary."""
-    rows = summary.get("apart")
-    if not isinstance(rows, list):
-        return []
-    pairs = [row for row in rows if isinstance(row, list) and len(row) == 2]
-    return [(a, b) for a, b in pairs if isinstance(a, int) and isinstance(b, int)]
 
 
 def strip_edges(extents: Iterable[_Extent], max_points: int) -> list[float]:

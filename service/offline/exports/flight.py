@@ -20,6 +20,7 @@ from recon import se3
 from recon.types import F64, Keyframe
 from service.errors import OutsideError
 from service.offline.exports.view import ExportOptions, ScanView
+from service.scans.main_piece import main_keyframes
 from service.scans.writing import writing
 
 
@@ -51,7 +52,7 @@ def write_geojson(scan: ScanView, out: Path, options: ExportOptions) -> None:
             }
         )
     frame = scan.needs_place("a map of the flight")
-    for one in scan.store.keyframes():
+    for one in main_keyframes(scan.store):
         lat, lon, alt = frame.to_geodetic(one.depth.T_world_camera[None, :3, 3])[0]
         features.append(
             {
@@ -101,7 +102,7 @@ def write_colmap(scan: ScanView, out: Path, options: ExportOptions) -> None:
         model.mkdir(parents=True)
         cameras: dict[tuple[float, ...], int] = {}
         with open(model / "images.txt", "w", encoding="ascii") as images:
-            for one in scan.store.keyframes():
+            for one in main_keyframes(scan.store):
                 number = cameras.setdefault(_pinhole(one), len(cameras) + 1)
                 images.write(_image_lines(one, number))
                 cv2.imwrite(str(part / "images" / _name(one)), one.bgr)

@@ -30,6 +30,7 @@ from service.errors import OutsideError, SkyreliefError
 from service.offline.exports.images import stored_images, video_images
 from service.packages import needing
 from service.scans.fused_cloud import fused_cloud
+from service.scans.main_piece import main_keyframes
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
@@ -80,7 +81,7 @@ class Footprint:
 def footprints(store: ScanStore) -> list[Footprint]:
     """The ground covered by each keyframe with points."""
     out = []
-    for k in store.keyframes():
+    for k in main_keyframes(store):
         sample = ground_sample_m(k.depth)
         xyz = cloud_of(k.depth, k.bgr, k.fresh).xyz_m
         if sample is not None and len(xyz):

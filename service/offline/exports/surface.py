@@ -12,6 +12,7 @@ from recon.surface.hole_filling import filled
 from recon.surface.raster import Raster, reliable, standing_height, without_cells
 from recon.types import Bool
 from service.offline.exports.view import ScanView
+from service.scans.main_piece import main_keyframes
 
 OPEN_STEP_M = 2
 SIDEWAYS_DEG = 15.0
@@ -60,7 +61,7 @@ def _open_to_the_sky(scan: ScanView, raster: Raster) -> Raster:
     )
     if scan.frame is not None:
         places = scan.frame.from_utm(places)
-    depths = (k.depth for k in scan.store.keyframes())
+    depths = (k.depth for k in main_keyframes(scan.store))
     hidden = np.zeros(grid.shape, np.bool_)
     hidden[rows, cols] = ~open_above(places, heights_m, depths)
     return without_cells(raster, hidden)

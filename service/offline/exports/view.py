@@ -18,6 +18,7 @@ from service.georeference import LocalFrame
 from service.offline.exports import EXPORTERS
 from service.packages import needing
 from service.scans.fused_cloud import FusedCloud, fused_cloud, placed
+from service.scans.main_piece import main_keyframes, main_poses, stretches_apart
 from service.scans.track import latest, local_frame
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
@@ -75,8 +76,8 @@ class ScanView:
 
     @cached_property
     def poses(self) -> list[PoseRecord]:
-        """The trajectory in order of time."""
-        return latest(self.store.poses())
+        """The main piece's trajectory in order of time."""
+        return main_poses(latest(self.store.poses()), stretches_apart(self.store))
 
     @cached_property
     def oblique(self) -> bool:
@@ -87,7 +88,7 @@ class ScanView:
     @cached_property
     def off_nadir_deg(self) -> F64:
         """(K,) how far each keyframe looks off straight down."""
-        down = [-k.depth.T_world_camera[2, 2] for k in self.store.keyframes()]
+        down = [-k.depth.T_world_camera[2, 2] for k in main_keyframes(self.store)]
         return np.asarray(np.degrees(np.arccos(np.clip(down, -1.0, 1.0))), np.float64)
 
     @cached_property

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from recon import se3
 from recon.calibration.flight import (
@@ -37,7 +39,7 @@ from recon.posegraph.ground_control import (
     Track,
     map_position,
 )
-from recon.types import F64, Camera, Keyframe
+from recon.types import F64, Bool, Camera, Keyframe
 from service.errors import InputError
 from service.offline.refine import own_camera
 from service.offline.refine.control_points import MARK_PX, Candidate
@@ -49,6 +51,12 @@ FREE = SelfCalibrationConfig()
 HELD = replace(
     FREE, sigma_focal=1e-5, sigma_aspect=1e-5, sigma_centre=1e-6, sigma_k=1e-6, sigma_p=1e-7
 )
+
+MIN_COMMON = 12
+"""Places in both of two images that tie them."""
+
+MIN_FIXES = 3
+"""Measured places that place a piece."""
 
 MIN_DEPTHS = 8
 """Places that a depth image has to show before it is scaled to them."""
@@ -80,6 +88,32 @@ class ImageNetwork:
             "centre_px": [round(float(v), 1) for v in self.camera.K[:2, 2]],
             "distortion": [round(float(v), 5) for v in self.camera.distortion],
         }
+
+
+def stretches_untied(seqs: Sequence[int], seen: Sightings, fixed: Bool) -> list[list[int]]:
+    """First and last keyframe of each run that no chain of images ties to the main piece.
+
+    Args:
+        seqs: numbers of the keyframes, the first views of ``seen``.
+        fixed: (N,) keyframes with a measured place. Pieces with :data:`MIN_FIXES` of them are tied.
+
+    The main piece is the one with most keyframes.
+    """
+    n = len(seqs)
+    shape = max(n, int(seen.view.max(initial=0)) + 1), int(seen.landmark.max(initial=0)) + 1
+    sees = coo_array((np.ones(len(seen.view)), (seen.view, seen.landmark)), shape).tocsr()
+    piece = connected_components(sees @ sees.T >= MIN_COMMON, directed=False)[1][:n]
+    main = np.bincount(piece).argmax()
+    out: list[list[int]] = []
+    before = main
+    for seq, its in zip(seqs, piece, strict=True):
+        is_tied = its == main or fixed[piece == its].sum() >= MIN_FIXES
+        if not is_tied and its == before:
+            out[-1][1] = seq
+        elif not is_tied:
+            out.append([seq, seq])
+        before = its
+    return out
 
 
 def network_of(

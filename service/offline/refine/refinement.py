@@ -48,6 +48,7 @@ from service.offline.refine.by_images import (
     in_world,
     marked_frames,
     network_of,
+    stretches_untied,
 )
 from service.offline.refine.control_points import (
     Candidate,
@@ -220,6 +221,8 @@ class _Refinement:
         figures = figures_of(seqs, track, found, candidates, verified, self._ahead_m(), places_m)
         if self.images is not None:
             figures["images"] = self.images.figures(self.header.camera["K"][0])
+            fixed = np.asarray(np.isfinite(fixes_of(track)[0]).all(axis=1))
+            figures["apart"] = stretches_untied(seqs, self.images.seen, fixed)
         alone = self._left_out(track, candidates)
         for point in figures["points"]:
             point["left_out_m"] = alone.get(point["name"])

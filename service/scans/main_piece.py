@@ -1,0 +1,63 @@
+"""The piece of a scan that its deliverables show, without stretches that nothing ties to it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from recon.types import Keyframe
+from service.stream.records import PoseRecord
+from service.stream.store import ScanStore
+
+Stretch = tuple[int, int]
+"""First and last keyframe."""
+
+
+def stretches_apart(store: ScanStore) -> list[Stretch]:
+    """The unconnected stretches by the refinement in force, else by the scan's summary."""
+    rows = (store.refinement or {}).get("apart", (store.summary or {}).get("apart"))
+    if not isinstance(rows, list):
+        return []
+    pairs = [row for row in rows if isinstance(row, list) and len(row) == 2]
+    return [(a, b) for a, b in pairs if isinstance(a, int) and isinstance(b, int)]
+
+
+def is_apart(seq: int, apart: Iterable[Stretch]) -> bool:
+    """True for a keyframe within one of the stretches."""
+    return any(first <= seq <= last for first, last in apart)
+
+
+def main_seqs(store: ScanStore) -> list[int]:
+    """Numbers of the main piece's keyframes."""
+    apart = stretches_apart(store)
+    return [seq for seq in store.seqs() if not is_apart(seq, apart)]
+
+
+def main_keyframes(store: ScanStore) -> Iterator[Keyframe]:
+    """The main piece's keyframes in order of their number."""
+    for seq in main_seqs(store):
+        found = store.keyframe(seq)
+        if found is not None:
+            yield found
+
+
+def main_poses(poses: Iterable[PoseRecord], apart: Iterable[Stretch]) -> list[PoseRecord]:
+    """The poses, in order of time, whose newest view is not within a stretch."""
+    out, left_out = [], False
+    for pose in poses:
+        if pose.keyframe_seq is not None:
+            left_out = is_apart(pose.keyframe_seq, apart)
+        if not left_out:
+            out.append(pose)
+    return out
+
+
+def in_words(store: ScanStore) -> str:
+    """What is left out, for the operator; empty where nothing is."""
+    apart = stretches_apart(store)
+    if not apart:
+        return ""
+    count = sum(is_apart(seq, apart) for seq in store.seqs())
+    return (
+        f"left out: {count} of {len(store.seqs())} keyframes in {len(apart)} stretch(es) that "
+        "neither fixes nor a place seen twice tie to the rest"
+    )
