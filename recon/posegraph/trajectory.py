@@ -35,6 +35,10 @@ AT_ONCE = 200
 next."""
 
 
+SIGMA_SHARE = 0.01
+"""A sigma that differs by more is published again at the end."""
+
+
 @dataclass(frozen=True, slots=True)
 class TrajectoryConfig:
     """When corrected poses are worth telling."""
@@ -252,9 +256,13 @@ class Trajectory:
         keys = published.keys
         T, scales = self.graph.pose_array()[keys], self.graph.scales()[keys]
         least = np.maximum(self.config.repose_m, self.config.repose_sigmas * published.sigma)
-        rows = np.flatnonzero(published.change(T, scales) > (1e-6 if final else least))
+        change, claimed = published.change(T, scales), published.sigma
         if final:
-            return [self.place(published.placed[i].seq) for i in rows]
+            now = [self.place(p.seq) for p in published.placed]
+            sigma = np.array([p.sigma_m for p in now])
+            stale = (change > 1e-6) | (np.abs(sigma - claimed) > SIGMA_SHARE * claimed)
+            return [now[i] for i in np.flatnonzero(stale)]
+        rows = np.flatnonzero(change > least)
         # In flight with the sigmas published before: newer readings have only made them smaller.
         before = [published.placed[i] for i in rows]
         self._owe([p.seq for p in before])
