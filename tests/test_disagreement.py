@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import toeplitz
 
 from recon import se3
-from recon.mapping import disagreement
-from recon.mapping.disagreement import Disagreement
+from recon.mapping.disagreement import NEIGHBOURS_CORRELATION, Disagreement
 from recon.types import F64, DepthMap
 
 SIZE = (160, 120)
@@ -32,46 +32,69 @@ def _seen(T: F64, sigma_m: float, seed: int, tilt: float = 0.0, noise: float = 1
 PLACES = [_pose(0.0, 0.0), _pose(8.0, 2.0), _pose(12.0, 8.0, 1.7), _pose(6.0, 10.0, 3.1)]
 
 
+def _independent(found: Disagreement, depth: DepthMap) -> float:
+    """The factor of an image that shares no frame with those before it: two lie in between."""
+    blank = _seen(depth.T_world_camera, 0.1, 0)
+    blank.depth_m[:] = np.nan
+    for _ in NEIGHBOURS_CORRELATION:
+        assert found.take(blank) == 1.0
+    return found.take(depth)
+
+
 def test_noise_as_the_sigmas_say_leaves_them() -> None:
     found = Disagreement()
-    assert found.take(_seen(PLACES[0], 0.1, 0)) == 1.0
-    factors = [found.take(_seen(T, 0.1, k)) for k, T in enumerate(PLACES[1:], 1)]
+    factors = [_independent(found, _seen(T, 0.1, k)) for k, T in enumerate(PLACES)]
     assert max(factors) < 1.05 and min(factors) >= 1.0
 
 
 def test_noise_of_twice_the_sigma_is_reported() -> None:
     found = Disagreement()
-    factors = [found.take(_seen(T, 0.1, k, noise=2.0)) for k, T in enumerate(PLACES)]
+    factors = [_independent(found, _seen(T, 0.1, k, noise=2.0)) for k, T in enumerate(PLACES)]
     assert factors[0] == 1.0 and factors[1:] == pytest.approx([2.0] * 3, rel=0.05)
 
 
-def test_images_tilted_their_own_way_disagree_once_the_camera_has_turned(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+@pytest.mark.parametrize("noise", [1.0, 1.5])
+def test_neighbours_disagree_by_less_than_they_err(noise: float) -> None:
+    """Noise with the correlation of images that share frames, at one place."""
+    correlation = toeplitz([1.0, *NEIGHBOURS_CORRELATION, 0.0, 0.0, 0.0])
+    w, h = SIZE
+    white = np.random.default_rng(1).normal(size=(6, h * w))
+    errors = noise * 0.1 * (np.linalg.cholesky(correlation) @ white).reshape(6, h, w)
+    found = Disagreement()
+    for k, error in enumerate(errors):
+        image = _seen(PLACES[0], 0.1, 0, noise=0.0)
+        image.depth_m[:] += error.astype(np.float32)
+        factor = found.take(image)
+        assert factor == pytest.approx(noise if k else 1.0, rel=0.06)
+
+
+def test_images_tilted_their_own_way_disagree_once_the_camera_has_turned() -> None:
     """A lens off its axis: along a leg the tilts look alike, and meet at the turn."""
     leg = [_pose(0.0, 4.0 * k) for k in range(3)]
     found = Disagreement()
-    assert max(found.take(_seen(T, 0.05, k, tilt=1.0)) for k, T in enumerate(leg)) < 1.1
-    turned = found.take(_seen(_pose(0.0, 4.0, np.pi), 0.05, 9, tilt=1.0))
-    assert turned == 5.0  # the largest
-    monkeypatch.setattr(disagreement, "MAX_FACTOR", 100.0)
-    loose = Disagreement()
-    for k, T in enumerate(leg):
-        loose.take(_seen(T, 0.05, k, tilt=1.0))
+    assert max(_independent(found, _seen(T, 0.05, k, tilt=1.0)) for k, T in enumerate(leg)) < 1.1
+    turned = _independent(found, _seen(_pose(0.0, 4.0, np.pi), 0.05, 9, tilt=1.0))
     # They differ by 2 m over the width: the median of |x| over an even spread of +-1 m is 0.5 m.
     expected = 0.5 / 0.6745 / np.hypot(0.05, 0.05)
-    assert loose.take(_seen(_pose(0.0, 4.0, np.pi), 0.05, 9, tilt=1.0)) == pytest.approx(
-        expected, rel=0.1
-    )
+    assert turned == pytest.approx(expected, rel=0.1)
 
 
-def test_other_ground_single_pairs_and_what_was_forgotten_say_nothing() -> None:
+def test_points_of_single_pairs_count_where_there_are_too_few_others() -> None:
+    found = Disagreement()
+    found.take(_seen(PLACES[0], 0.1, 0))
+    mixed = _seen(PLACES[0], 0.1, 1)
+    noisy = _seen(PLACES[0], 0.1, 2, noise=9.0)
+    mixed.depth_m[:, 40:], mixed.views[:, 40:] = noisy.depth_m[:, 40:], 1
+    assert _independent(found, mixed) < 1.1
+    alone = _seen(PLACES[0], 0.1, 3, noise=9.0)
+    alone.views[:] = 1
+    assert _independent(found, alone) > 4.0
+
+
+def test_other_ground_and_what_was_forgotten_say_nothing() -> None:
     found = Disagreement()
     found.take(_seen(PLACES[0], 0.1, 0))
     assert found.take(_seen(_pose(500.0, 0.0), 0.1, 1, noise=9.0)) == 1.0
-    alone = _seen(PLACES[0], 0.1, 2, noise=9.0)
-    alone.views[:] = 1
-    assert found.take(alone) == 1.0
     upward = se3.compose(np.eye(3), np.array([0.0, 0.0, 50.0]))
     assert found.take(_seen(upward, 0.1, 3, noise=9.0)) == 1.0
     found.forget()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.mapping.cloud_fusion import CORRELATED_SHARE, fuse, fuse_strips
+from recon.mapping.cloud_fusion import CORRELATION, fuse, fuse_strips
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, ground_sample_m
 from recon.types import F64, Bool, DepthMap, PointCloud
 
@@ -192,7 +192,9 @@ def test_fuse_is_the_inverse_variance_mean_of_a_dictionary() -> None:
         for (c, p), weight in zip(members, w, strict=True):
             best[c] = max(best.get(c, 0.0), float(weight))
             seen[c] = max(seen.get(c, 0), int(clouds[c].views[p]))
-        expected = max(sum(best.values()) ** -0.5, CORRELATED_SHARE * max(best.values()) ** -0.5)
+        expected = np.sqrt(
+            CORRELATION / max(best.values()) + (1.0 - CORRELATION) / sum(best.values())
+        )
         assert fused.sigma_m[i] == pytest.approx(expected, rel=1e-5)
         assert fused.views[i] == sum(seen.values())
 

@@ -13,9 +13,8 @@ from numba import njit
 from recon.mapping.voxel_map import I32, I64, find_slot, rehash, voxel_key
 from recon.types import F32, F64, U8, Bool, DepthMap, PointCloud
 
-CORRELATED_SHARE = 0.5
-"""Sigma of a mean over keyframes never falls below this share of its best member's: their
-errors share frames, poses and texture, so they do not average out any further."""
+CORRELATION = 0.55
+"""Of the errors of two keyframes at one place: they share frames, poses and texture."""
 
 LONE_NEIGHBOURS = 3
 """A point with fewer occupied voxels than this among the 26 around it stands alone."""
@@ -26,7 +25,7 @@ def fuse(clouds: Iterable[PointCloud], voxel_m: float) -> PointCloud:
 
     Points count by the inverse of their variance. Points of one cloud in one voxel are
     neighbours in one depth image, so together they count as the best of them for sigma and
-    views; clouds count as independent down to CORRELATED_SHARE. A single-view point that
+    views; errors of clouds have :data:`CORRELATION`. A single-view point that
     stands alone is left out when surface seen more often, above or below it, contradicts it.
     Order is that of the voxel keys (x first), whatever the order of points in a cloud.
     Raises ValueError for a voxel size that is not positive.
@@ -140,8 +139,8 @@ class _Sums:
         weight = self.xyzw[rows, 3]
         xyz = (self.xyzw[rows, :3] / weight[:, None]).astype(np.float32)
         rgb = np.clip(np.rint(self.rgb[rows] / weight[:, None]), 0, 255).astype(np.uint8)
-        best = 1.0 / np.sqrt(self.info[rows, 2])
-        sigma = np.maximum(1.0 / np.sqrt(self.info[rows, 0]), CORRELATED_SHARE * best)
+        best, independent = 1.0 / self.info[rows, 2], 1.0 / self.info[rows, 0]
+        sigma = np.sqrt(CORRELATION * best + (1.0 - CORRELATION) * independent)
         views = np.minimum(self.tags[rows, 1], 255).astype(np.uint8)
         return keys, PointCloud(xyz, rgb, sigma.astype(np.float32), views)
 

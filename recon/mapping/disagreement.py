@@ -15,7 +15,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import project, rays
-from recon.types import F32, F64, DepthMap
+from recon.types import F32, F64, Bool, DepthMap
 
 NORMAL_MEDIAN = 0.6745
 """Median of the absolute value of a normal variable of unit sigma."""
@@ -27,8 +27,14 @@ IMAGES, ROWS = 32, 24
 MIN_COMMON = 60
 """Samples of two images that show the same ground, at least."""
 
-MAX_FACTOR = 5.0
-"""More is a pose gone wrong and not a wider sigma."""
+NEIGHBOURS_CORRELATION = (0.55, 0.28)
+"""Correlation of the errors of an image and of the one before it, and the one before that.
+
+They share frames. Measured on simulated flights at three widths (docs/reports/accuracy.md); three
+images apart it is 0."""
+
+MAX_FACTOR = 30.0
+"""More is other ground."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +43,7 @@ class _Samples:
 
     points: F32  # (N, 3) m, world
     sigma_m: F32  # (N,) along its own z
+    is_sure: Bool  # (N,) seen by two pairs or more
 
 
 class Disagreement:
@@ -54,13 +61,17 @@ class Disagreement:
 
         1 where nothing earlier shows its ground. Sigmas of the image and of those before it
         count as equally short: it is the root mean square over the earlier images of the robust
-        normalised difference. Points that one pair alone saw take no part.
+        normalised difference, less what their errors have in common. Points that one pair alone
+        saw take part where there are too few others.
         """
-        found = [self._apart(depth, one) for one in self._earlier]
-        ratios = [ratio for ratio in found if ratio is not None]
+        common = (*NEIGHBOURS_CORRELATION, *[0.0] * IMAGES)
+        found = [
+            (self._apart(depth, one), np.sqrt(1.0 - rho))
+            for one, rho in zip(reversed(self._earlier), common, strict=False)
+        ]
+        ratios = [ratio / differing for ratio, differing in found if ratio is not None]
         samples = _samples(depth)
-        if len(samples.sigma_m):
-            self._earlier.append(samples)
+        self._earlier.append(samples)
         if not ratios:
             return 1.0
         factor = float(np.sqrt(np.mean(np.square(ratios))))
@@ -79,7 +90,9 @@ class Disagreement:
             return None
         u, v = uv[inside].astype(np.int64).T
         z = depth.depth_m[v, u]
-        known = np.isfinite(z) & (depth.views[v, u] >= 2)
+        known = np.isfinite(z)
+        sure = known & (depth.views[v, u] >= 2) & one.is_sure[ahead][inside]
+        known = sure if np.count_nonzero(sure) >= MIN_COMMON else known
         if np.count_nonzero(known) < MIN_COMMON:
             return None
         there, sigma = here[ahead][inside][known, 2], one.sigma_m[ahead][inside][known]
@@ -88,11 +101,12 @@ class Disagreement:
 
 
 def _samples(depth: DepthMap) -> _Samples:
-    """Surface that two pairs or more saw, every so many pixels."""
+    """The surface at every so many pixels."""
     step = max(1, depth.depth_m.shape[0] // ROWS)
     z, sigma = depth.depth_m[::step, ::step], depth.sigma_m[::step, ::step]
-    v, u = np.nonzero(np.isfinite(z) & (depth.views[::step, ::step] >= 2))
+    v, u = np.nonzero(np.isfinite(z))
     uv = np.column_stack([u, v]).astype(np.float64) * step
     camera: F64 = rays(depth.K, uv) * z[v, u, None].astype(np.float64)
     world = se3.transform(depth.T_world_camera, camera)
-    return _Samples(world.astype(np.float32), np.asarray(sigma[v, u], np.float32))
+    is_sure = depth.views[::step, ::step][v, u] >= 2
+    return _Samples(world.astype(np.float32), np.asarray(sigma[v, u], np.float32), is_sure)
