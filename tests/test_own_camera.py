@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal, cast
 
 import cv2
 import numpy as np
@@ -12,11 +14,24 @@ import yaml
 from typer.testing import CliRunner
 
 from recon import se3
+from recon.backends import Backend
 from recon.camera_model import rays
-from recon.types import F64, U8, Camera
+from recon.types import F64, U8, Camera, Shutter
+from service.cameras.camera_file import load_camera, save_camera
+from service.cameras.source import CameraSource
 from service.cli import app
+from service.config import Config
 from service.errors import InputError
-from service.offline.refine.own_camera import FILE, found_camera, images_at, sightings, write
+from service.flight.scan import ScanInputs, create_store
+from service.offline.refine.own_camera import (
+    FILE,
+    camera_of,
+    found_camera,
+    images_at,
+    sightings,
+    write,
+)
+from service.stream.store import ScanStore
 
 SIZE = (480, 270)
 TRUE = Camera(
@@ -139,3 +154,31 @@ def test_images_of_something_else_are_refused() -> None:
 def test_the_command_says_what_goes_together(tmp_path: Path, arguments: list[str]) -> None:
     refused = CliRunner().invoke(app, ["refine", str(tmp_path), *arguments])
     assert isinstance(refused.exception, InputError) and "takes" in str(refused.exception)
+
+
+@pytest.mark.parametrize("asked", ["model", 12.5])
+def test_a_refined_camera_keeps_the_readout(
+    tmp_path: Path, asked: float | Literal["model"]
+) -> None:
+    """Of the scan's own camera, through database and camera file."""
+    config = Config()
+    config = replace(config, camera=replace(config.camera, readout_ms=asked))
+    camera = replace(TRUE, shutter=Shutter(0.03, "up"))
+    inputs = ScanInputs(
+        cast(CameraSource, None), camera, config, cast(Backend, None), tmp_path, "scan-1", 0
+    )
+    create_store(inputs).close()
+    with ScanStore.open(tmp_path / "scan.db") as store:
+        found = camera_of(store.header)
+    assert found.shutter == (Shutter(0.03, "up") if asked == "model" else Shutter(0.0125, "down"))
+    save_camera(tmp_path / FILE, found)
+    assert load_camera(tmp_path / FILE).shutter == found.shutter
+
+
+def test_a_global_shutter_stays_one(tmp_path: Path) -> None:
+    inputs = ScanInputs(
+        cast(CameraSource, None), TRUE, Config(), cast(Backend, None), tmp_path, "scan-1", 0
+    )
+    with create_store(inputs) as store:
+        assert "readout_ms" not in store.header.camera
+        assert camera_of(store.header).shutter == Shutter()

@@ -73,6 +73,13 @@ def shutter_of(readout_ms: object, direction: object) -> Shutter:
     return Shutter(1e-3 * readout_ms, str(direction))
 
 
+def shutter_document(shutter: Shutter) -> dict[str, Any]:
+    """What :func:`shutter_of` reads; empty for a global shutter."""
+    if not shutter.readout_s:
+        return {}
+    return {"readout_ms": 1e3 * shutter.readout_s, "readout_direction": shutter.direction}
+
+
 def with_shutter(camera: Camera, config: CameraConfig) -> Camera:
     """The camera with the shutter that the configuration asks for, by default its own."""
     if config.readout_ms == "model":
@@ -112,9 +119,7 @@ def save_camera(
         "rectification_matrix": _matrix(np.eye(3)),
         "projection_matrix": _matrix(np.hstack([K, np.zeros((3, 1))])),
     }
-    if camera.shutter.readout_s:
-        document["readout_ms"] = 1e3 * camera.shutter.readout_s
-        document["readout_direction"] = camera.shutter.direction
+    document |= shutter_document(camera.shutter)
     clash = sorted(set(document) & set(extra or {}))
     if clash:
         raise ValueError(f"extra keys of the camera model already exist: {', '.join(clash)}")

@@ -17,7 +17,7 @@ from mavlink.telemetry.samples import VehicleState
 from recon.backends import Backend
 from recon.posegraph.between_keyframes import Odometer
 from recon.types import F64, Camera, Frame, Keyframe
-from service.cameras.camera_file import with_shutter
+from service.cameras.camera_file import shutter_document, with_shutter
 from service.cameras.rig import ASSUMED_AGL_M, Rig
 from service.cameras.source import CameraFrame, CameraSource, ahead
 from service.config import Config
@@ -101,6 +101,7 @@ def create_store(inputs: ScanInputs) -> ScanStore:
             "height": H,
             "K": inputs.camera.K.ravel().tolist(),
             "distortion": inputs.camera.distortion.tolist(),
+            **shutter_document(with_shutter(inputs.camera, inputs.config.camera).shutter),
         },
         configuration=public_configuration(inputs.config.to_dict()),
         software=software(),

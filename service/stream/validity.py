@@ -7,7 +7,7 @@ or read from a store. ``docs/wire.md`` lists them.
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -63,6 +63,8 @@ class _CameraJson(msgspec.Struct):
     height: _Side | None = None
     K: Annotated[list[float], Meta(min_length=9, max_length=9)] | None = None
     distortion: Annotated[list[float], Meta(max_length=14)] | None = None
+    readout_ms: Annotated[float, Meta(ge=0, le=200)] = 0.0
+    readout_direction: Literal["down", "up", "right", "left"] = "down"
 
 
 class _ScaleJson(msgspec.Struct):

@@ -40,7 +40,7 @@ from recon.calibration.tracks import (
 from recon.camera_model import Undistorter, project, rays
 from recon.tracking import matching
 from recon.types import F64, U8, Camera
-from service.cameras.camera_file import save_camera
+from service.cameras.camera_file import save_camera, shutter_of
 from service.cameras.images import open_images
 from service.cameras.video import open_file
 from service.errors import InputError
@@ -73,7 +73,8 @@ def camera_of(header: ScanHeader) -> Camera:
     c = header.camera
     K = np.array(c["K"], np.float64).reshape(3, 3)
     size = int(c["width"]), int(c["height"])
-    return Camera(K, np.array(c["distortion"], np.float64), size)
+    shutter = shutter_of(c.get("readout_ms", 0), c.get("readout_direction", "down"))
+    return Camera(K, np.array(c["distortion"], np.float64), size, shutter)
 
 
 def images_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dict[int, U8]:
