@@ -132,7 +132,7 @@ def test_a_scheduler_that_goes_away_is_said_and_the_rest_made_here(
             cluster.close()
 
     same(here, run_tiles(jobs(tmp_path), cluster.scheduler_address, say))
-    assert len([t for t in reported if "went away" in t]) == 1
+    assert len([t for t in reported if "disconnected" in t]) == 1
 
 
 def test_a_scheduler_that_is_not_there_ends_in_one_line(

@@ -99,7 +99,7 @@ HOSTILE_SUMMARIES = {
     "huge": '{"schema": 1, "times": {"started_unix_s": 1e999}}',
     "late": '{"schema": 1, "times": {"started_unix_s": 1e300}}',
     "digits": '{"schema": 1, "times": {"started_unix_s": ' + "9" * 5000 + "}}",
-    "half a letter": '{"schema": 1, "notes": ["\\ud800"]}',
+    "a lone surrogate": '{"schema": 1, "notes": ["\\ud800"]}',
     "deep": '{"schema": 1, "x": ' + "[" * 500_000 + "]" * 500_000 + "}",
     "deep origin": '{"schema": 1, "origin": ' + '{"a":' * 100_000 + "1" + "}" * 100_001,
     "nothing": "",

@@ -183,7 +183,7 @@ def test_vehicle_history_gives_the_true_attitude(frame: str, tmp_path: Path) -> 
 
 
 def test_a_boresight_and_a_leaning_rangefinder(tmp_path: Path) -> None:
-    """The gimbal's word is off by the angles asked for; the range is that along the body."""
+    """The reported gimbal is off by the angles asked for; the range is that along the body."""
     folder = tmp_path / "flight"
     simulate(folder, "--gnss-noise", "exact", "--no-video", "--boresight-deg", "2:-1",
              "--relief-m", "0", "--density", "0", "--duration-s", "20")  # fmt: skip

@@ -51,7 +51,9 @@ def _check(action: str, metres: float | None, timeout: float) -> None:
     if action not in ACTIONS:
         raise InputError(f"ctl {action}: there are {', '.join(ACTIONS)}")
     if (action == "baseline") != (metres is not None):
-        raise InputError("ctl baseline METRES takes metres (0 follows the altitude), no other does")
+        raise InputError(
+            "ctl baseline METRES takes metres (0 follows the altitude); no other action does"
+        )
     if metres is not None and not (math.isfinite(metres) and metres >= 0.0):
         raise InputError(f"ctl baseline {metres:g}: give 0 or more metres")
     if not timeout > 0.0:

@@ -174,7 +174,7 @@ def _replay(flight: Path, out: Path, endpoint: str, overrides: list[str]) -> Non
         command, stdin=subprocess.DEVNULL, stdout=sys.stderr, check=False
     ).returncode
     if code != 0:
-        raise OutsideError(f"the replay ended with exit code {code}; its message stands above")
+        raise OutsideError(f"the replay ended with exit code {code}; see its message above")
 
 
 def _wait_for_ground(ground: subprocess.Popen[str], out: Path) -> Path:

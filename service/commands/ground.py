@@ -240,7 +240,7 @@ def _watch(
     once: bool,
     idle_exit_s: float | None,
 ) -> None:
-    """Return on a signal, or when what the options name has come about."""
+    """Return on a signal, or when the options' condition is met."""
     shown: dict[str, str] = {}
     shown_at = beat_at = 0.0
     while not stop.wait(0.2):

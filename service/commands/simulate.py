@@ -57,7 +57,7 @@ def simulate(
         typer.Option(help="wander: slowly; white: from fix to fix; exact: no sensor errs."),
     ] = "wander",
     boresight_deg: Annotated[
-        str, typer.Option(help="RIGHT:UP degrees, where the camera looks off the gimbal's word.")
+        str, typer.Option(help="RIGHT:UP degrees of the camera off the reported gimbal.")
     ] = "0:0",
     baro_noise_m: Annotated[float, typer.Option(help="Wander of the altitude.")] = 0.5,
     attitude_noise_deg: Annotated[float, typer.Option(help="Wander of roll and pitch.")] = 0.3,

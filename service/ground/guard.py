@@ -141,7 +141,7 @@ NOTED = "skyrelief.change"
 class AuditLog:
     """Appends lines of JSON to ``audit.jsonl`` (mode 600); the file before it is ``.1``.
 
-    A disk that takes no line stops no order: it is logged.
+    A full disk stops no order; the line is logged instead.
     """
 
     def __init__(self, folder: Path, max_bytes: int = MAX_AUDIT_BYTES) -> None:
@@ -159,7 +159,7 @@ class AuditLog:
             with self._lock:
                 self._append(line.encode())
         except OSError as error:
-            log.warning("%s takes no line (%s): %s", self.path, error.strerror, line.strip())
+            log.warning("%s cannot be written (%s): %s", self.path, error.strerror, line.strip())
 
     def _append(self, line: bytes) -> None:
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC

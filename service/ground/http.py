@@ -57,7 +57,7 @@ NO_PAGE = (
 
 
 class JSONResponse(StarletteJSONResponse):
-    """JSON in ASCII: any text can be sent, also one with half a letter in it."""
+    """JSON in ASCII: any text can be sent, also one with a lone surrogate."""
 
     def render(self, content: Any) -> bytes:
         """The body."""
@@ -196,7 +196,7 @@ async def _body(request: Request, kind: type[T]) -> T:
     try:
         return msgspec.json.decode(await request.body(), type=kind)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"the request does not fit: {error}"[:300]) from error
+        raise InputError(f"the request is not valid: {error}"[:300]) from error
 
 
 def _page(request: Request) -> Response:

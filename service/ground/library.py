@@ -227,7 +227,7 @@ class Library:
                 with ScanStore.open(part / STORE_FILES[0]) as store:
                     header = store.header
             except (sqlite3.Error, ValueError) as error:
-                raise InputError(f"{str(source)[:200]} holds no sound scan ({error})") from error
+                raise InputError(f"{str(source)[:200]} holds no valid scan ({error})") from error
             self._check_new(header)
             copy_files(source, part, ({*FILES, *OTHER_FILES} - {*STORE_FILES}))
             return header
@@ -300,7 +300,7 @@ def _title(title: Any) -> str:
     if not isinstance(title, str) or len(title) > MAX_TITLE:
         raise InputError(f"a title is a text of at most {MAX_TITLE} letters")
     if any(0xD800 <= ord(letter) <= 0xDFFF for letter in title):
-        raise InputError("a title holds half a letter (a lone surrogate)")
+        raise InputError("a title holds an invalid character (a lone surrogate)")
     return " ".join(title.split())
 
 

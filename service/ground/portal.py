@@ -117,7 +117,7 @@ class Portal:
         self._listener = self._listen(config.port)
         self._port = int(self._listener.getsockname()[1])
         if not is_loopback(config.host) and not config.tls:
-            log.warning("portal on %s without TLS: the token can be read on the way", config.host)
+            log.warning("portal on %s without TLS: the token can be read in transit", config.host)
         self._server = self._new_server(self._listener)
         self._worker = self._workers.start("portal", self._run)
 

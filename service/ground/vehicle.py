@@ -72,7 +72,7 @@ class Vehicle:
         if action not in BUTTONS:
             raise InputError(f"action is one of {', '.join(BUTTONS)}")
         if (action == "baseline") != (metres is not None):
-            raise InputError("baseline takes metres (0 follows the altitude), no other does")
+            raise InputError("baseline takes metres (0 follows the altitude); no other action does")
         if metres is not None and not (math.isfinite(metres) and 0.0 <= metres <= 1000.0):
             raise InputError("metres are 0 to 1000")
         with self._lock:
@@ -109,7 +109,7 @@ class Vehicle:
                 operator = self._connect(self.endpoint)
             except (InputError, OutsideError) as error:
                 if self._trouble != str(error):
-                    log.warning("%s; looking on", error)
+                    log.warning("%s; still looking", error)
                 self._trouble = str(error)
                 worker.stop.wait(1.0)
                 continue

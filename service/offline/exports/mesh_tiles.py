@@ -303,6 +303,6 @@ def _on_cluster(
                 raise ConnectionError(future.status)
             yield n, future.result(timeout=60.0)
     except (OSError, TimeoutError) as error:
-        progress(f"the cluster at {scheduler} went away ({error}); the rest is made here")
+        progress(f"the cluster at {scheduler} disconnected ({error}); the rest is made here")
     finally:
         client.close(timeout=2.0)

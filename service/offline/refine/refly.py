@@ -96,12 +96,12 @@ def flown_swath(
 ) -> Swath:
     """Camera and flight by the keyframes' images. Raises InputError for one alone."""
     if len(places) < 2:
-        raise InputError("the scan holds a single keyframe: no line was flown to go by")
+        raise InputError("the scan holds a single keyframe: there is no flown line to plan from")
     cameras = np.array([p.camera_m for p in places])
     steps = np.gradient(cameras[:, :2], axis=0)
     length = np.linalg.norm(steps, axis=1)
     if length.max() < 0.1:
-        raise InputError("the camera never moved in this scan: no line was flown to go by")
+        raise InputError("the camera never moved in this scan: there is no flown line to plan from")
     ways = steps / np.maximum(length, 1e-6)[:, None]
     edges = np.array([[p.corners_m[1] - p.corners_m[0], p.corners_m[2] - p.corners_m[1]]
                       for p in places])  # fmt: skip
@@ -242,7 +242,7 @@ def suggest(
     if frame is None:
         raise InputError("the scan has no georeference; a mission needs one (fly with GNSS)")
     if relative and height_m is None:
-        raise InputError("the scan knows no height above ground; leave --relative out")
+        raise InputError("the scan has no height above ground; omit --relative")
     swath = flown_swath(coverage.footprints, frame, speed_m_s, height_m)
     patches = weak_patches(coverage.weak, coverage.layer.grid, swath)
     if not patches:
