@@ -12,7 +12,7 @@ from pathlib import Path
 from xml.sax.saxutils import escape
 
 HERE = Path(__file__).resolve().parent
-SVG = HERE / "pictures" / "architecture.svg"
+SVG = HERE / "images" / "architecture.svg"
 W, H, BOX_W, BOX_H = 980, 575, 150, 46
 
 BOXES: dict[str, tuple[int, int, str]] = {

@@ -9,7 +9,6 @@ Commands for hardware (CUDA, Jetson, systemd on a board) are only parsed.
 from __future__ import annotations
 
 import re
-import shlex
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -18,25 +17,12 @@ from typing import Any
 import msgspec
 import pytest
 import typer.main
+from doc_pages import FENCE, PAGES, ROOT, blocks, complete, text_of
 
 from service.cli import COMMANDS, app, load_command
 from service.config import keys, load_config
 from service.errors import InputError
 
-ROOT = Path(__file__).resolve().parents[1]
-LOGS = ("boot-log.md", "install-log.md")
-"""Transcripts of what ran once; their text is not written by hand."""
-PAGES = sorted(
-    page
-    for page in (
-        *ROOT.glob("*.md"),
-        *(ROOT / "docs").rglob("*.md"),
-        *(ROOT / "demo").rglob("*.md"),
-    )
-    if page.name not in LOGS
-)
-FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-INDENTED = re.compile(r"(?:^ {4,}\S.*\n)+", re.MULTILINE)
 INLINE = re.compile(r"`([^`\n]+)`")
 OTHERS = ("scan.json", "scan.db", "camera.yaml", "mavlink.troubles")
 """Files and a field of /status whose names look like a key of the configuration."""
@@ -64,40 +50,6 @@ RUN_BY = {
     "bench": "test_bench.py",
 }
 """Command to a test file that executes it."""
-
-
-def text_of(page: Path) -> str:
-    return page.read_text(encoding="utf-8")
-
-
-def blocks(page: Path) -> Iterator[str]:
-    """Shell code blocks: continuation lines joined, brackets around options removed."""
-    text = text_of(page)
-    found = [body for kind, body in FENCE.findall(text) if kind in ("", "sh", "bash", "console")]
-    found += INDENTED.findall(FENCE.sub("", text))
-    for body in found:
-        optional = re.sub(r"\[(--[^\]]*)\]", r"\1", body)
-        yield re.sub(r"\\\n\s*", " ", optional)
-
-
-def complete(page: Path) -> Iterator[list[str]]:
-    """Words after ``skyrelief`` of each command in the page's code blocks."""
-    for line in (line for block in blocks(page) for line in block.splitlines()):
-        if "skyrelief " not in line:
-            continue
-        lexer = shlex.shlex(line, posix=True, punctuation_chars=";|&")
-        lexer.whitespace_split = True
-        yield from _commands(list(lexer))
-
-
-def _commands(words: list[str]) -> Iterator[list[str]]:
-    while words:
-        end = next((k for k, word in enumerate(words) if set(word) <= set(";|&")), len(words))
-        command, words = words[:end], words[end + 1 :]
-        if command[:1] == ["sudo"]:
-            command = command[3:] if command[1:2] == ["-u"] else command[1:]
-        if command and Path(command[0]).name == "skyrelief":
-            yield command[1:]
 
 
 def mentions(page: Path) -> Iterator[str]:
