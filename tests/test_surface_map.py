@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -10,7 +12,9 @@ import pytest
 from recon import se3
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
 from recon.types import F64, DepthMap
-from service.flight.surface_map import MAX_OVER, PagedMap
+from service.compute.stopwatch import Stopwatch
+from service.flight.surface_map import MAX_OVER, PagedMap, SurfaceMap
+from service.flight.viewpoints import StereoCandidate
 
 K: F64 = np.array([[60.0, 0.0, 39.5], [0.0, 60.0, 29.5], [0.0, 0.0, 1.0]])
 NADIR: F64 = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
@@ -99,3 +103,16 @@ def test_tiles_under_a_view_hold_all_of_its_voxels() -> None:
 def test_nonsense_limits_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="max_voxels"):
         PagedMap(CONFIG, tmp_path, max_voxels=10)
+
+
+@pytest.mark.parametrize("is_lens_assumed", [False, True])
+def test_an_assumed_lens_widens_what_is_stored_and_not_the_choice(is_lens_assumed: bool) -> None:
+    """2 % of the depth; a better view still counts as better."""
+    surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), is_lens_assumed)
+    first, better = (view(0.0, sigma_m=sigma) for sigma in (0.2, 0.05))
+    candidate = cast(StereoCandidate, SimpleNamespace(segment=0))
+    sigma, fresh = surface(candidate, first, first.T_world_camera)
+    share = 0.02 if is_lens_assumed else 0.0
+    np.testing.assert_allclose(sigma, np.hypot(0.2, share * first.depth_m), rtol=1e-5)
+    assert fresh.all() and sigma.dtype == np.float32
+    assert surface(candidate, better, better.T_world_camera)[1].all()

@@ -119,7 +119,14 @@ class Scan:
         self.epoch_ns = inputs.epoch_ns
         config, live, pages = inputs.config, inputs.source.is_live, inputs.folder / PAGES
         self.pipeline = Pipeline(
-            build_stages(inputs.camera, config, inputs.backend, live=live, pages=pages)
+            build_stages(
+                inputs.camera,
+                config,
+                inputs.backend,
+                live=live,
+                pages=pages,
+                is_lens_assumed="lens" in inputs.assumed,
+            )
         )
         self._is_rolling = with_shutter(inputs.camera, config.camera).shutter.readout_s > 0
         self.rig, self._odometer = Rig(config.camera, config.scan, config.fusion), Odometer()

@@ -371,13 +371,14 @@ def build_stages(
     backend: Backend,
     live: bool = False,
     pages: Path | None = None,
+    is_lens_assumed: bool = False,
 ) -> Stages:
     """The stages that the configuration asks for. Raises ValueError for an unusable camera model.
 
     ``live`` lets old work give way when reconstruction cannot keep up; otherwise nothing is
     dropped. ``pages`` is a folder that the parts of the map flown long ago may go to; what
     is kept of every view lies there too, in files without a name. None: keep all in memory, and
-    drop the oldest parts of the map.
+    drop the oldest parts of the map. ``is_lens_assumed`` widens sigmas.
     """
     compute, stopwatch, resources = config.compute, Stopwatch(), ExitStack()
     refused: Counter[str] = Counter()
@@ -425,7 +426,9 @@ def build_stages(
         plausible=Plausible(rejected),
         register=Register(backend, stopwatch),
         chain=_chain(config, pages, track.is_settled, rejected, stopwatch, resources),
-        map=SurfaceMap(pages, compute.map_voxels, config.scan.resolution_m, stopwatch),
+        map=SurfaceMap(
+            pages, compute.map_voxels, config.scan.resolution_m, stopwatch, is_lens_assumed
+        ),
         keyframe=MakeKeyframe(debug),
         in_background=in_background,
         stopwatch=stopwatch,

@@ -21,6 +21,10 @@ from service.flight.viewpoints import StereoCandidate
 
 log = logging.getLogger(__name__)
 
+ASSUMED_LENS_SHARE = 0.02
+"""Sigma of depth over depth where a lens without distortion is assumed: lenses of action cameras
+bend surfaces by that much."""
+
 MAX_OVER = 4
 
 
@@ -120,18 +124,25 @@ class SurfaceMap:
     """
 
     def __init__(
-        self, pages: Path | None, max_voxels: int, resolution_m: float, stopwatch: Stopwatch
+        self,
+        pages: Path | None,
+        max_voxels: int,
+        resolution_m: float,
+        stopwatch: Stopwatch,
+        is_lens_assumed: bool = False,
     ) -> None:
         """``pages``: see :class:`PagedMap`; None: forget the oldest when memory is full."""
         self._pages, self._max_voxels, self._resolution_m = pages, max_voxels, resolution_m
         self._stopwatch = stopwatch
+        self._lens_share = ASSUMED_LENS_SHARE if is_lens_assumed else 0.0
         self._map: VoxelMap | PagedMap | None = None
         self._disagreement, self._segment = Disagreement(), -1
 
     def __call__(
         self, view: StereoCandidate, depth: DepthMap, T_map_camera: F64
     ) -> tuple[F32, Bool]:
-        """((h, w) sigma widened by what views disagree, (h, w) surface that is new or better)."""
+        """((h, w) sigma widened by what views disagree and by an assumed lens, (h, w) surface that
+        is new or better)."""
         with self._stopwatch("map"):
             if view.segment != self._segment:
                 self._disagreement.forget()
@@ -144,7 +155,7 @@ class SurfaceMap:
                 known = self._map = self._empty(depth)
             fresh = known.fresh(in_map)
             known.insert(in_map, fresh)
-            return in_map.sigma_m, fresh
+            return np.hypot(in_map.sigma_m, np.float32(self._lens_share) * depth.depth_m), fresh
 
     def _empty(self, depth: DepthMap) -> VoxelMap | PagedMap:
         """A map as fine as the first view."""
