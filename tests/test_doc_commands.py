@@ -1,9 +1,9 @@
 """Commands, options, settings and make targets in the documents exist.
 
-Nothing is executed here. Complete commands in code blocks go through the parser of their command
-(names, options, choices, numbers, missing arguments); mentions in prose and tables are checked for
-the command and its options. ``RUN_BY`` names, for each command, a test that really executes it.
-Commands for hardware (CUDA, Jetson, systemd on a board) are only parsed.
+Complete commands in code blocks go through the parser of their command (names, options, choices,
+numbers, missing arguments), and ``test_doc_commands_run.py`` runs them. Mentions in prose and
+tables are checked for the command and its options. ``RUN_BY`` names, for each command, a test that
+executes it.
 """
 
 from __future__ import annotations
