@@ -19,7 +19,9 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 pytest.importorskip("websockets")
 
-from service.bench.portal import Browser, chromium
+from person import Browser
+
+from service.bench.portal import chromium
 from service.ground.http import PAGE
 from service.ground.portal import Portal, PortalConfig
 from service.scans.folder import write_deliverables

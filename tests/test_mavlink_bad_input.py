@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 from loopback import until
+from rehearsal import RehearsalVehicle
 
 from mavlink.component.control import Phase
-from mavlink.component.rehearsal import RehearsalVehicle
 from mavlink.telemetry.clock import computer_offset_ns
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer

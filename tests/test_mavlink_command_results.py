@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rehearsal import RehearsalControl
 
 from mavlink.component.command_desk import CommandDesk
 from mavlink.component.commands import COMMANDS
 from mavlink.component.companion import Companion, CompanionConfig
 from mavlink.component.control import Answer, Phase, Result, Work
 from mavlink.component.presence import Presence, PresenceConfig
-from mavlink.component.rehearsal import RehearsalControl
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.wire.dialect import COMMAND_CANCEL, dialect, x25crc
 from mavlink.wire.first_beat import CAMERA, ONBOARD

@@ -11,6 +11,7 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
+from rehearsal import RehearsalControl
 
 from mavlink.component.camera import KeyframeReport
 from mavlink.component.command_desk import Command
@@ -19,7 +20,6 @@ from mavlink.component.companion import Companion, CompanionConfig
 from mavlink.component.control import Answer, Phase, Result, Work
 from mavlink.component.parameters import PARAMETERS
 from mavlink.component.presence import Health, Presence, PresenceConfig
-from mavlink.component.rehearsal import RehearsalControl
 from mavlink.component.status import ComputerLoad
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.wire.dialect import COMMAND_CANCEL, dialect, x25crc

@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 from loopback import free_port
+from rehearsal import RehearsalVehicle
 
 from mavlink.component.camera import KeyframeReport
-from mavlink.component.rehearsal import RehearsalVehicle
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from rehearsal import RehearsalControl
 
 from mavlink.component.companion import Companion, CompanionConfig
 from mavlink.component.ftp import (
@@ -40,7 +41,6 @@ from mavlink.component.metadata import (
 )
 from mavlink.component.parameters import PARAMETERS
 from mavlink.component.presence import Presence, PresenceConfig
-from mavlink.component.rehearsal import RehearsalControl
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.wire.dialect import dialect, x25crc
 from mavlink.wire.framing import Framer

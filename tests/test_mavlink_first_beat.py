@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 from loopback import free_port, until
+from rehearsal import RehearsalControl, RehearsalVehicle
 
 from mavlink.component.memory import Memory, remembered_system
-from mavlink.component.rehearsal import RehearsalControl, RehearsalVehicle
 from mavlink.component.vehicle import VehicleConfig, VehicleLink
 from mavlink.wire.dialect import dialect
 from mavlink.wire.first_beat import FirstBeats, heartbeat_packet

@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 from autopilot import beat, packed
 from loopback import free_port, until
+from rehearsal import RehearsalControl
 from vehicles_around import Net, Vehicle
 
 from mavlink.component.control import Phase
 from mavlink.component.link_watch import WatchConfig
 from mavlink.component.presence import Health
-from mavlink.component.rehearsal import RehearsalControl
 from mavlink.wire.dialect import dialect
 from service.config import load_config
 from service.daemon.diagnosis import BAD, NOTE, Finding, examine_links

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 from loopback import free_port, until
-
-from mavlink.component.rehearsal import RehearsalVehicle
+from rehearsal import RehearsalVehicle
 
 
 def test_mavproxy_drives_both_components(tmp_path: Path) -> None:

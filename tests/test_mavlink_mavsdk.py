@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 from forwarding_autopilot import ForwardingAutopilot
 from loopback import free_port, until
+from rehearsal import RehearsalVehicle
 
 from mavlink.component.camera import KeyframeReport
 from mavlink.component.control import Answer, Result, Work
-from mavlink.component.rehearsal import RehearsalVehicle
 from mavlink.telemetry import quaternion
 from mavlink.wire.framing import Framer
 from mavlink.wire.tlog import packets

@@ -10,6 +10,7 @@ import pytest
 from autopilot import attitude, beat, packed
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rehearsal import RehearsalControl
 
 from mavlink.component.autopilot_link import LOOK_NS, RateKeeper
 from mavlink.component.camera import KeyframeReport
@@ -17,7 +18,6 @@ from mavlink.component.companion import Companion, CompanionConfig
 from mavlink.component.control import Answer, Result
 from mavlink.component.parameters import Parameter
 from mavlink.component.presence import Health, Presence, PresenceConfig
-from mavlink.component.rehearsal import RehearsalControl
 from mavlink.telemetry.clock import BootClock, BootCounter, TimesyncFilter, fit_boot
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.wire.dialect import CRC_EXTRA, dialect, x25crc

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 from loopback import free_port, until
+from rehearsal import RehearsalVehicle
 
-from mavlink.component.rehearsal import RehearsalVehicle
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
 from mavlink.wire.signing import Signing

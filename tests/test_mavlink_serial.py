@@ -8,8 +8,8 @@ import tty
 from pathlib import Path
 
 from loopback import until
+from rehearsal import RehearsalVehicle
 
-from mavlink.component.rehearsal import RehearsalVehicle
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
 

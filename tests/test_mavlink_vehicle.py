@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 from loopback import free_port, until
+from rehearsal import RehearsalVehicle
 
 from mavlink.component.control import Answer
-from mavlink.component.rehearsal import RehearsalVehicle
 from mavlink.component.vehicle import VehicleConfig
 from mavlink.telemetry.logs import load_telemetry
 from mavlink.wire.dialect import dialect

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from person import Browser
 from portal_client import NEEDS, TOKEN, browser, flown_store
 
-from service.bench.portal import Browser
 from service.ground.http import PAGE
 from service.ground.portal import Portal, PortalConfig
 

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import pytest
 from loopback import free_port
+from person import Browser
 from portal_client import NEEDS, TOKEN, browser, flown_store
+from rehearsal import RehearsalVehicle
 
-from mavlink.component.rehearsal import RehearsalVehicle
-from service.bench.portal import Browser
 from service.ground.portal import Portal, PortalConfig
 from service.ground.vehicle import Vehicle
 from service.offline.exports.view import ExportOptions, ScanView, export

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import pytest
 from conftest import HouseFlight
+from person import Browser
 from portal_client import NEEDS, TOKEN, browser, flown_store
 
 from recon.types import F64, Keyframe
-from service.bench.portal import Browser
 from service.georeference import LocalFrame
 from service.ground.portal import Portal, PortalConfig
 

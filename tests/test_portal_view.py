@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 import pytest
 from loopback import free_port
+from person import Browser, Page
 from portal_client import NEEDS, TOKEN, browser
+from rehearsal import RehearsalVehicle
 
 from mavlink.component.control import Answer, Result
-from mavlink.component.rehearsal import RehearsalVehicle
 from recon.types import U8
-from service.bench.portal import Browser, Page
 from service.ground.portal import Portal, PortalConfig
 from service.ground.vehicle import Vehicle
 from service.scans.folder import write_deliverables

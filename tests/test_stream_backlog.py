@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from loopback import until
+from rehearsal import RehearsalControl
 
-from mavlink.component.rehearsal import RehearsalControl
 from mavlink.component.vehicle import VehicleConfig, VehicleLink
 from service.config import Config
 from service.flight.datalink import DaemonLink, open_backlog

@@ -15,9 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from loopback import until
+from rehearsal import RehearsalControl
 
 from mavlink.component.presence import Health
-from mavlink.component.rehearsal import RehearsalControl
 from mavlink.component.vehicle import VehicleConfig, VehicleLink
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 from loopback import until
+from rehearsal import RehearsalVehicle
 from scipy.spatial.transform import Rotation
 
-from mavlink.component.rehearsal import RehearsalVehicle
 from mavlink.component.status import Odometry
 from mavlink.telemetry.samples import VehicleState
 from mavlink.wire.dialect import dialect

@@ -7,8 +7,8 @@ import time
 
 import pytest
 from loopback import free_port, until
+from rehearsal import RehearsalVehicle
 
-from mavlink.component.rehearsal import RehearsalVehicle
 from mavlink.telemetry.clock import DIFFER_NS, WallTime, computer_offset_ns
 from mavlink.wire.dialect import dialect
 from service.daemon.scan_run import disagreement, set_since

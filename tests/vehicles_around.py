@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from autopilot import packed
+from rehearsal import RehearsalControl
 
 from mavlink.component.companion import Companion, CompanionConfig
 from mavlink.component.link_watch import WatchConfig
 from mavlink.component.presence import Presence, PresenceConfig
-from mavlink.component.rehearsal import RehearsalControl
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer

@@ -16,7 +16,11 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from unittest.mock import create_autospec
+
+if TYPE_CHECKING:
+    from mavlink.component.control import ScanControl
 
 BENCHMARKS: dict[str, str] = {
     "stereo": "service.bench.stereo:run",
@@ -161,6 +165,15 @@ def machine() -> str:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
         words.append(f"{memory:.0f} GiB")
     return ", ".join([*words, f"Python {platform.python_version()}"])
+
+
+def idle_control() -> ScanControl:
+    """What a vehicle link asks where nothing scans."""
+    from mavlink.component.control import ScanControl, ScanStatus
+
+    control: ScanControl = create_autospec(ScanControl, instance=True)
+    control.status.return_value = ScanStatus()  # type: ignore[attr-defined]
+    return control
 
 
 def _spread(values: list[float]) -> float:

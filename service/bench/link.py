@@ -219,7 +219,7 @@ def fly_plain(trial: Trial) -> Outcome:
     endpoints = f"tcp/127.0.0.1:{ground_port}", f"tcp/127.0.0.1:{port}"
     ground = zenoh.open(zenoh_config(SessionConfig(mode="router", listen=endpoints[:1])))
     ground.declare_subscriber("bench/*/*", on_sample)
-    emulator = LinkEmulator(trial.link, port, ground_port, udp=False)
+    emulator = LinkEmulator(trial.link, port, ground_port)
     emulator.start()
     emulator.take_off(time.monotonic())
     plain = zenoh.Config()
@@ -275,7 +275,7 @@ def _find(drone: _Drone) -> None:
 
 def _switch_on(trial: Trial, folder: Path, number: int, ground_port: int) -> _Drone:
     port = free_port()
-    emulator = LinkEmulator(replace(trial.link, seed=number), port, ground_port, udp=False)
+    emulator = LinkEmulator(replace(trial.link, seed=number), port, ground_port)
     emulator.start()
     name = f"drone-{number}"
     store = ScanStore.create(folder / name / "scan.db", ScanHeader("scan", name, 1))

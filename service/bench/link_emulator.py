@@ -2,8 +2,7 @@
 
 TCP is relayed as a stream; a lost segment holds the stream back for one retransmission, and a
 cut until the retransmission after it, whose waits double (RFC 6298), as TCP shows it to an
-application. UDP (QUIC) is relayed datagram by datagram and lost ones are
-gone, so the transport's own recovery is at work.
+application.
 """
 
 from __future__ import annotations
@@ -16,13 +15,12 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass, field
-from typing import cast
 
 SEGMENT_BYTES = 1400
 SEGMENT_HEADER_BYTES = 52
 CHUNK_BYTES = 1400
 QUEUE_BYTES = 32_768
-"""The radio's own buffer; TCP is held back and UDP dropped beyond it."""
+"""The radio's own buffer; TCP is held back beyond it."""
 SOCKET_BYTES = 4096
 """Receive buffer of the relay: what a sender's system holds is in the sender's buffer."""
 ESTABLISHED = 1
@@ -37,7 +35,7 @@ class LinkModel:
 
     rate_kbit_s: float = 1000.0
     delay_s: float = 0.05  # one way
-    loss: float = 0.0  # share of segments or datagrams
+    loss: float = 0.0  # share of segments
     cuts: tuple[tuple[float, float], ...] = ()  # (from, to) seconds after the start
     seed: int = 1
 
@@ -99,18 +97,13 @@ class _Pipe:
         """TCP's first wait for the acknowledgement of data."""
         return max(MIN_WAIT_S, 3 * self._model.delay_s)
 
-    def send(self, size: int, now: float, stream: bool) -> float | None:
-        """When ``size`` bytes come out at the far end; None for a datagram that is lost."""
+    def send(self, size: int, now: float) -> float:
+        """When ``size`` bytes come out at the far end."""
         wire = size + SEGMENT_HEADER_BYTES * -(-size // SEGMENT_BYTES)
         self.traffic.log.append((now, wire))
         begin = max(now, self._free_at)
-        lost = self._random.random() < self._model.loss
-        if not stream and (
-            lost or self.cut_end(begin) is not None or self.backlog_bytes(now) > QUEUE_BYTES
-        ):
-            return None
         self._free_at = begin + wire / (self._model.rate_kbit_s * 125)
-        if lost:  # the segment goes again a round trip later and holds back what follows
+        if self._random.random() < self._model.loss:  # again a round trip later; the rest waits
             self._free_at += wire / (self._model.rate_kbit_s * 125)
             return self._free_at + 3 * self._model.delay_s
         return self._free_at + self._model.delay_s
@@ -122,10 +115,9 @@ class LinkEmulator:
     :attr:`up` is what the calling side (the drone) sent, :attr:`down` what came back.
     """
 
-    def __init__(self, model: LinkModel, listen_port: int, target_port: int, udp: bool) -> None:
+    def __init__(self, model: LinkModel, listen_port: int, target_port: int) -> None:
         self._model = model
         self._ports = listen_port, target_port
-        self._udp = udp
         self.started = time.monotonic()
         self._up = _Pipe(model, self.started, model.seed)
         self._down = _Pipe(model, self.started, model.seed + 1)
@@ -172,14 +164,9 @@ class LinkEmulator:
         self._loop.close()
 
     async def _open(self) -> None:
-        if self._udp:
-            await self._loop.create_datagram_endpoint(
-                lambda: _UdpSide(self), local_addr=("127.0.0.1", self._ports[0])
-            )
-        else:
-            listener = socket.create_server(("127.0.0.1", self._ports[0]))
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SOCKET_BYTES)
-            await asyncio.start_server(self._accept, sock=listener, limit=CHUNK_BYTES)
+        listener = socket.create_server(("127.0.0.1", self._ports[0]))
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SOCKET_BYTES)
+        await asyncio.start_server(self._accept, sock=listener, limit=CHUNK_BYTES)
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         now = time.monotonic()
@@ -211,10 +198,10 @@ class LinkEmulator:
                 late = pipe.resumes(now, pipe.wait_s) - now
                 await asyncio.sleep(late)
                 now = time.monotonic()
-                out = pipe.send(len(data), now, stream=True)
+                out = pipe.send(len(data), now)
                 if late > 0 and _has_closed(writer):
                     break
-                latest = max(latest, out or 0.0)  # a stream keeps its order
+                latest = max(latest, out)  # a stream keeps its order
                 waiting.put_nowait((latest, data))
                 excess = pipe.backlog_bytes(now) - QUEUE_BYTES
                 if excess > 0:
@@ -243,50 +230,6 @@ def _has_closed(writer: asyncio.StreamWriter) -> bool:
     except OSError:
         return True
     return bool(state != ESTABLISHED)
-
-
-class _UdpSide(asyncio.DatagramProtocol):
-    """The calling side's socket; opens a socket to the target for each caller."""
-
-    def __init__(self, emulator: LinkEmulator) -> None:
-        self._emulator = emulator
-        self._far: dict[tuple[str, int], asyncio.DatagramTransport] = {}
-        self.transport: asyncio.DatagramTransport | None = None
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self.transport = cast(asyncio.DatagramTransport, transport)
-
-    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        emulator = self._emulator
-        at = emulator._up.send(len(data), time.monotonic(), stream=False)
-        if at is None:
-            return
-        task = emulator._loop.create_task(self._forward(at, data, addr))
-        emulator._tasks.add(task)
-        task.add_done_callback(emulator._tasks.discard)
-
-    async def _forward(self, at: float, data: bytes, addr: tuple[str, int]) -> None:
-        await asyncio.sleep(max(0.0, at - time.monotonic()))
-        if addr not in self._far:
-            transport, _ = await self._emulator._loop.create_datagram_endpoint(
-                lambda: _UdpBack(self._emulator, self, addr),
-                remote_addr=("127.0.0.1", self._emulator._ports[1]),
-            )
-            self._far[addr] = transport
-        self._far[addr].sendto(data)
-
-
-class _UdpBack(asyncio.DatagramProtocol):
-    """The way back to one caller."""
-
-    def __init__(self, emulator: LinkEmulator, near: _UdpSide, caller: tuple[str, int]) -> None:
-        self._emulator, self._near, self._caller = emulator, near, caller
-
-    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        at = self._emulator._down.send(len(data), time.monotonic(), stream=False)
-        if at is not None and self._near.transport is not None:
-            delay = max(0.0, at - time.monotonic())
-            self._emulator._loop.call_later(delay, self._near.transport.sendto, data, self._caller)
 
 
 def free_port() -> int:

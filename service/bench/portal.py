@@ -8,7 +8,6 @@ faster. The browser is driven over its DevTools protocol.
 
 from __future__ import annotations
 
-import base64
 import json
 import shutil
 import statistics
@@ -45,18 +44,21 @@ def chromium() -> str:
 
 
 class Page:
-    """One page; dialogs are accepted with :attr:`dialog` as the text."""
+    """One page of a browser."""
 
-    def __init__(self, process: subprocess.Popen[bytes], address: str) -> None:
+    def __init__(
+        self,
+        process: subprocess.Popen[bytes],
+        address: str,
+        domains: tuple[str, ...] = ("Page", "Runtime", "Network"),
+    ) -> None:
         """Take over the page whose DevTools answer at the WebSocket ``address``."""
         from websockets.sync.client import connect
 
         self.process = process
         self._socket = connect(address, max_size=None)
         self._number = 0
-        self.requests: list[str] = []
-        self.dialog = ""  # what the next prompt is answered with
-        for domain in ("Page", "Runtime", "Network"):
+        for domain in domains:
             self.call(f"{domain}.enable")
 
     def leave(self) -> None:
@@ -65,9 +67,7 @@ class Page:
 
     def call(self, method: str, **params: Any) -> Any:
         """The result of a DevTools method; RuntimeError when it fails."""
-        self._number += 1
-        self._socket.send(json.dumps({"id": self._number, "method": method, "params": params}))
-        wanted = self._number
+        wanted = self._send(method, params)
         while True:
             message = json.loads(self._socket.recv(timeout=ANSWER_S))
             if message.get("id") == wanted:
@@ -76,14 +76,13 @@ class Page:
                 return message["result"]
             self._note(message)
 
-    def _note(self, message: dict[str, Any]) -> None:
-        if message.get("method") == "Network.requestWillBeSent":
-            self.requests.append(message["params"]["request"]["url"])
-        if message.get("method") == "Page.javascriptDialogOpening":
-            self._number += 1
-            params = {"accept": True, "promptText": self.dialog}
-            answer = {"method": "Page.handleJavaScriptDialog", "params": params}
-            self._socket.send(json.dumps({"id": self._number, **answer}))
+    def _send(self, method: str, params: dict[str, Any]) -> int:
+        self._number += 1
+        self._socket.send(json.dumps({"id": self._number, "method": method, "params": params}))
+        return self._number
+
+    def _note(self, event: dict[str, Any]) -> None:
+        """Called with what the page says unasked."""
 
     def run(self, script: str) -> Any:
         """The value of ``script``, awaited; RuntimeError when it throws."""
@@ -102,43 +101,6 @@ class Page:
         """The first true value of ``script``; a page that is still loading has none."""
         quiet = f"(() => {{ try {{ return {script} }} catch {{ return null }} }})()"
         return self.until(lambda: self.run(quiet), timeout_s)
-
-    def click(self, text: str) -> None:
-        """Click the button with this text, as an event of its own."""
-        find = f"[...document.querySelectorAll('button')].find(b => b.textContent === '{text}')"
-        self.wait(f"!!{find} && !{find}.disabled")
-        self.run(f"setTimeout(() => {find}.click(), 0)")
-        self.run("new Promise(r => setTimeout(r, 50))")
-
-    def mouse(self, x: float, y: float, *, to: tuple[float, float] | None = None) -> None:
-        """Click at a place of the page, or press there and release at ``to``; CSS pixels."""
-        one = {"button": "left", "clickCount": 1}
-        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
-        self.call("Input.dispatchMouseEvent", type="mousePressed", x=x, y=y, **one)
-        if to is not None:
-            x, y = to
-            self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, **one)
-        self.call("Input.dispatchMouseEvent", type="mouseReleased", x=x, y=y, **one)
-
-    def key(self, name: str) -> None:
-        """Press and release a key that writes nothing, such as Escape."""
-        for kind in ("keyDown", "keyUp"):
-            self.call("Input.dispatchKeyEvent", type=kind, key=name, code=name)
-
-    def screen(self, width: int, height: int, mobile: bool = False) -> None:
-        """Show pages on a screen of this size, in CSS pixels."""
-        self.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=1,
-            mobile=mobile,
-        )
-
-    def image(self, path: Path) -> None:
-        """Write what the page shows as PNG."""
-        data = self.call("Page.captureScreenshot", format="png")["data"]
-        path.write_bytes(base64.b64decode(data))
 
     def until(self, true: Callable[[], Any], timeout_s: float = 60.0) -> Any:
         """The first true value of ``true()``; RuntimeError after ``timeout_s``."""
@@ -164,36 +126,14 @@ class Browser(Page):
         )
         port_file = profile / "DevToolsActivePort"
         self.until(lambda: port_file.is_file() and port_file.read_text().count("\n") > 0)
-        port, own = port_file.read_text().split()
-        self._host = f"127.0.0.1:{port}"
-        pages = json.load(urllib.request.urlopen(f"http://{self._host}/json"))
+        self.host = f"127.0.0.1:{port_file.read_text().split()[0]}"
+        pages = json.load(urllib.request.urlopen(f"http://{self.host}/json"))
         page = next(p for p in pages if p["type"] == "page")
         super().__init__(self.process, page["webSocketDebuggerUrl"])
-        self._own = f"ws://{self._host}{own}"
-        self._others: list[Page] = []
-
-    def other(self) -> Page:
-        """A page as of another person's browser: nothing is shared with the first."""
-        from websockets.sync.client import connect
-
-        def ask(number: int, method: str, **params: Any) -> Any:
-            whole.send(json.dumps({"id": number, "method": method, "params": params}))
-            while True:
-                message = json.loads(whole.recv(timeout=ANSWER_S))
-                if message.get("id") == number:
-                    return message["result"]
-
-        whole = self._whole = connect(self._own, max_size=None)  # the context lives as long
-        context = ask(1, "Target.createBrowserContext")["browserContextId"]
-        made = ask(2, "Target.createTarget", url="about:blank", browserContextId=context)
-        page = Page(self.process, f"ws://{self._host}/devtools/page/{made['targetId']}")
-        self._others.append(page)
-        return page
 
     def close(self) -> None:
         """End the browser."""
-        for page in (*self._others, self):
-            page.leave()
+        self.leave()
         self.process.terminate()
         self.process.wait(timeout=10)
 

@@ -21,12 +21,12 @@ from pathlib import Path
 import numpy as np
 
 from mavlink.component.presence import Health
-from mavlink.component.rehearsal import RehearsalControl
 from mavlink.component.vehicle import VehicleConfig, VehicleLink
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
 from recon import se3
 from recon.types import F64, DepthMap, Keyframe, Pose
+from service.bench import idle_control
 from service.bench.link_emulator import free_port
 from service.config import DatalinkConfig
 from service.ground.received import ReceivedScan
@@ -139,7 +139,7 @@ def fly() -> RadioOutcome:
 
 def _fly(folder: Path) -> RadioOutcome:
     radio, flight = _Radio(), _Flight()
-    vehicle = VehicleLink(VehicleConfig(links=(radio.names[0],)), RehearsalControl())
+    vehicle = VehicleLink(VehicleConfig(links=(radio.names[0],)), idle_control())
     vehicle.start()
     session = SessionConfig(mode="router", listen=(f"tcp/127.0.0.1:{free_port()}",))
     receiver = BareReceiver(ReceiverConfig(folder / "ground", session))
