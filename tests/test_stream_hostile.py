@@ -19,15 +19,13 @@ from service.stream.messages import (
     MAX_COUNTED,
     Ask,
     Assembler,
+    Head,
     Held,
     Part,
-    pack_ask,
-    pack_held,
+    pack,
     parse,
     split_in,
-    unpack_ask,
-    unpack_head,
-    unpack_held,
+    unpack,
 )
 from service.stream.outbox import MAX_STATIONS, PEER_TIMEOUT_S, Outbox
 from service.stream.ranges import RangeSet
@@ -66,8 +64,8 @@ def made(document: dict[str, Any], **changes: Any) -> bytes:
     ],
 )
 def test_a_head_says_only_what_can_be(changes: dict[str, Any]) -> None:
-    assert unpack_head(made(HEAD)) is not None
-    assert unpack_head(made(HEAD, **changes)) is None
+    assert unpack(made(HEAD), Head) is not None
+    assert unpack(made(HEAD, **changes), Head) is None
 
 
 @pytest.mark.parametrize(
@@ -80,8 +78,8 @@ def test_a_head_says_only_what_can_be(changes: dict[str, Any]) -> None:
     ],
 )
 def test_a_report_says_only_what_can_be(changes: dict[str, Any]) -> None:
-    assert unpack_held(made(HELD)) is not None
-    assert unpack_held(made(HELD, **changes)) is None
+    assert unpack(made(HELD), Held) is not None
+    assert unpack(made(HELD, **changes), Held) is None
 
 
 @pytest.mark.parametrize(
@@ -97,15 +95,15 @@ def test_a_report_says_only_what_can_be(changes: dict[str, Any]) -> None:
     ],
 )
 def test_a_request_says_only_what_can_be(changes: dict[str, Any]) -> None:
-    assert unpack_ask(made(ASK)) is not None
-    assert unpack_ask(made(ASK, **changes)) is None
+    assert unpack(made(ASK), Ask) is not None
+    assert unpack(made(ASK, **changes), Ask) is None
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-32", "utf-8-sig"])
 def test_json_is_strict_utf_8(encoding: str) -> None:
-    assert unpack_head(json.dumps(HEAD).encode(encoding)) is None
+    assert unpack(json.dumps(HEAD).encode(encoding), Head) is None
     broken = made(HEAD, more="x").replace(b'"x"', b'"\xff"')  # in a field nothing reads
-    assert unpack_head(broken) is None
+    assert unpack(broken, Head) is None
 
 
 def test_parts_are_cut_in_one_way_only() -> None:
@@ -218,15 +216,15 @@ def test_a_flood_of_reports_is_not_written_and_the_real_station_is_served(
         store.add_pose(PoseRecord(k, np.eye(4), np.eye(6)))
     store.finish({})
     link = DatalinkSender(store, DatalinkConfig(connect=(endpoint,)))
-    some = pack_held(Held({"pose": RangeSet([(1, 5)])}))
-    whole = pack_held(Held(store.numbers()))
+    some = pack(Held({"pose": RangeSet([(1, 5)])}))
+    whole = pack(Held(store.numbers()))
     try:
         until(lambda: _listens(router, link, some))
         for k in range(3000):
             router.put(f"skyrelief/drone/scan/held/invented-{k}", some)
         for kind in ("nothing", "kx"):
             key = f"skyrelief/drone/scan/item/{kind}/1"
-            list(router.get(key, payload=pack_ask(Ask("base")), timeout=5.0))
+            list(router.get(key, payload=pack(Ask("base")), timeout=5.0))
         until(lambda: _complete(router, link, whole))
     finally:
         link.close()

@@ -27,14 +27,10 @@ from service.stream.messages import (
     Assembler,
     Head,
     Held,
-    pack_ask,
-    pack_head,
-    pack_held,
+    pack,
     parse,
     split,
-    unpack_ask,
-    unpack_head,
-    unpack_held,
+    unpack,
 )
 from service.stream.outbox import COARSE, POSE, STATUS, Outbox, Outgoing
 from service.stream.outbox import FINE as LIVE_FINE
@@ -106,7 +102,7 @@ class World:
                 heapq.heappop(self._air)[2]()
             self._drone()
             if round(self.now * 100) % 100 == 0:
-                report = unpack_held(pack_held(self.ground.held()))
+                report = unpack(pack(self.ground.held()), Held)
                 assert report is not None
                 self.carry(self._later(self.outbox.held, "scan", "base", report))
             for slot in (SMALL, FINE):
@@ -117,7 +113,7 @@ class World:
         while isinstance(message := self.outbox.next(self.now), Outgoing):
             self.sent.append((self.now, message))
             if message.topic == "head":
-                head = unpack_head(message.payload)
+                head = unpack(message.payload, Head)
                 assert head is not None
                 self.carry(self._later(self.ground.on_head, head))
             else:
@@ -131,7 +127,7 @@ class World:
         if wanted is None:
             return
         kind, numbers, ask = wanted
-        again = unpack_ask(pack_ask(ask))
+        again = unpack(pack(ask), Ask)
         assert again is not None
         token = next(self._count)
         self._tokens[token] = slot, self.ground.progress.asked
@@ -345,9 +341,9 @@ def test_any_bytes_on_the_link_never_raise(data: bytes) -> None:
     for message in (data, b"SK\x01" + data):
         for part in parse(message):
             assembler.add(part, 0.0)
-    assert unpack_head(data) is None or isinstance(unpack_head(data), Head)
-    unpack_held(data)
-    unpack_ask(data)
+    assert unpack(data, Head) is None or isinstance(unpack(data, Head), Head)
+    unpack(data, Held)
+    unpack(data, Ask)
 
 
 JSON = st.recursive(
@@ -359,9 +355,9 @@ JSON = st.recursive(
 @given(JSON)
 def test_any_json_on_the_link_never_raises(value: object) -> None:
     data = json.dumps({"v": 1, "numbers": value, "live": value, "finished": True}).encode()
-    unpack_head(data)
-    unpack_held(data)
-    ask = unpack_ask(json.dumps({"v": 1, "peer": value}).encode())
+    unpack(data, Head)
+    unpack(data, Held)
+    ask = unpack(json.dumps({"v": 1, "peer": value}).encode(), Ask)
     assert ask is None or isinstance(value, str)
 
 
@@ -376,9 +372,9 @@ def test_unfinished_records_are_bounded() -> None:
 
 
 def test_messages_round_trip() -> None:
-    ask = unpack_ask(pack_ask(Ask("base", RangeSet([(1, 3)]), 9)))
+    ask = unpack(pack(Ask("base", RangeSet([(1, 3)]), 9)), Ask)
     assert ask is not None and ask.parts is not None
     assert (ask.peer, list(ask.parts), ask.parts_of) == ("base", [1, 2, 3], 9)
-    held = unpack_held(pack_held(Held({"k0": RangeSet([(0, 5)])}, 77)))
+    held = unpack(pack(Held({"k0": RangeSet([(0, 5)])}, 77)), Held)
     assert held is not None and held.received_bytes == 77 and len(held.numbers["k0"]) == 6
-    assert unpack_head(pack_head(Head({}, {}, True))) is not None
+    assert unpack(pack(Head({}, {}, True)), Head) is not None

@@ -16,15 +16,14 @@ from PIL import Image
 
 from service.stream import codec
 from service.stream.messages import (
+    Ask,
     Assembler,
-    pack_ask,
-    pack_head,
-    pack_held,
+    Head,
+    Held,
+    pack,
     parse,
     split,
-    unpack_ask,
-    unpack_head,
-    unpack_held,
+    unpack,
 )
 from service.stream.radio_messages import pack_announce, pack_tile, unpack_announce, unpack_tile
 from service.stream.radio_messages import pack_pose as pack_radio_pose
@@ -210,17 +209,18 @@ def test_other_versions_are_refused_although_the_checksum_holds() -> None:
         message[2] = version
         assert list(parse(bytes(message))) == []
         assert (
-            unpack_head(VECTORS["head"]["json"].replace('"v":1', f'"v":{version}').encode()) is None
+            unpack(VECTORS["head"]["json"].replace('"v":1', f'"v":{version}').encode(), Head)
+            is None
         )
 
 
 def test_what_stations_say() -> None:
     text = VECTORS["held"]["json"].encode()
-    said = unpack_held(text)
-    assert said is not None and pack_held(said) == text
+    said = unpack(text, Held)
+    assert said is not None and pack(said) == text
     text = VECTORS["ask"]["json"].encode()
-    wish = unpack_ask(text)
-    assert wish is not None and pack_ask(wish) == text
+    wish = unpack(text, Ask)
+    assert wish is not None and pack(wish) == text
     held = json.loads(VECTORS["held"]["json"])
     assert set(held) == {"v", "numbers", "received_bytes"}
     ask = json.loads(VECTORS["ask"]["json"])
@@ -301,8 +301,8 @@ def test_parts_and_head() -> None:
     whole = [assembler.add(part, 0.0) for part in reversed(list(parse(message)))]
     assert whole[:-1] == [None, None] and whole[-1] == record
     text = VECTORS["head"]["json"].encode()
-    head = unpack_head(text)
-    assert head is not None and pack_head(head) == text
+    head = unpack(text, Head)
+    assert head is not None and pack(head) == text
     assert list(head.numbers["k0"]) == [0, 1, 2, 3, 4, 6]
 
 

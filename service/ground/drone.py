@@ -19,7 +19,7 @@ from service.ground.inbox import Batch, Inbox
 from service.ground.intake import FINE, SILENCE_S, SMALL, Introduction, ScanIntake
 from service.ground.received import ReceivedScan
 from service.ground.storage import DiskShare
-from service.stream.messages import Ask, count, pack_ask, pack_held, unpack_head
+from service.stream.messages import Ask, Head, count, pack, unpack
 from service.stream.naming import ROOT
 from service.stream.radio_messages import RADIO_NOTE
 from service.stream.ranges import RangeSet
@@ -111,7 +111,7 @@ class DroneReceiver:
             event(time.monotonic())
 
     def _on_head(self, name: str, payload: bytes, now: float) -> None:
-        head = unpack_head(payload)
+        head = unpack(payload, Head)
         if head is None:
             self.dropped += 1
             return
@@ -328,7 +328,7 @@ class DroneReceiver:
         if now - scan.reported_at >= pause:
             scan.reported_at, scan.changed = now, False
             key = f"{scan.key}/held/{self._station.name}"
-            self._station.put(key, pack_held(scan.intake.held()))
+            self._station.put(key, pack(scan.intake.held()))
         if scan.unwritten and scan.intake.complete and not scan.is_writing:
             self._write(scan)
         if now < scan.rest_until:
@@ -355,7 +355,7 @@ class DroneReceiver:
                 self.inbox.put_event(answered)
 
         key = f"{ROOT}/{self.drone}/{name}/item/{kind}/{numbers.text()}"
-        self._station.get(key, pack_ask(ask), partial(self.inbox.put_item, name), ended)
+        self._station.get(key, pack(ask), partial(self.inbox.put_item, name), ended)
 
     def _publish(self, has_news: bool) -> None:
         """Show how it goes: at once when there is news, else every second."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from service.config import DatalinkConfig
 from service.errors import OutsideError, SkyreliefError
-from service.stream.messages import Ask, unpack_ask, unpack_held
+from service.stream.messages import Ask, Held, unpack
 from service.stream.naming import ROOT, check_name
 from service.stream.outbox import Outbox, Outgoing
 from service.stream.ranges import RangeSet, ranges_from_text
@@ -327,7 +327,7 @@ class DatalinkSender:
             self._outbox.publish_heads(now)
         reports = self._reports.take(now)
         for scan_id, peer, payload in reports:
-            held = unpack_held(payload)
+            held = unpack(payload, Held)
             if held is not None and self._outbox.held(scan_id, peer, held, now):
                 self._heard_at = now
         for store, _ in list(self._stores) if reports else ():
@@ -373,7 +373,7 @@ class DatalinkSender:
 
     def _on_query(self, query: zenoh.Query) -> None:
         parts = str(query.key_expr).split("/")
-        ask = unpack_ask(query.payload.to_bytes()) if query.payload is not None else None
+        ask = unpack(query.payload.to_bytes(), Ask) if query.payload is not None else None
         numbers = ranges_from_text(parts[5]) if len(parts) == 6 else None
         if ask is None or numbers is None or len(self._asks) >= MAX_WAITING_ASKS:
             query.drop()

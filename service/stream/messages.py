@@ -10,14 +10,14 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
-from typing import Annotated, Final, Literal, TypeVar
+from dataclasses import dataclass
+from typing import Annotated, TypeVar
 
 import msgspec
 from msgspec import Meta
 
 from service.stream.naming import MAX_NAME, NAME
-from service.stream.ranges import MAX_NUMBER, MAX_RANGES, Pairs, RangeSet, ranges_from_pairs
+from service.stream.ranges import RangeSet, ranges_from_pairs
 from service.stream.validity import MAX_HEADER_BYTES, MAX_SUMMARY_BYTES
 
 _HEAD = struct.Struct("<2sBBIHHIII")
@@ -149,9 +149,7 @@ class Assembler:
 
     def __init__(self) -> None:
         self._open: dict[tuple[str, int], _Open] = {}
-        self._bytes = 0
-        self.spoiled = 0  # records whose checksum failed
-        self.repeated = 0  # duplicate parts
+        self.held_bytes = 0  # memory used by unfinished records
 
     def add(self, part: Part, now: float) -> bytes | None:
         """The record that ``part`` completes, or None."""
@@ -162,25 +160,17 @@ class Assembler:
             entry = self._open[key] = _Open(part.count, part.total_bytes, part.crc, {})
         entry.touched = now
         if part.index in entry.pieces:
-            self.repeated += 1
             return None
         entry.pieces[part.index] = part.payload
         entry.held_bytes += len(part.payload) + PIECE_BYTES
-        self._bytes += len(part.payload) + PIECE_BYTES
+        self.held_bytes += len(part.payload) + PIECE_BYTES
         if len(entry.pieces) < entry.count:
             self._make_room(key)
             return None
         record = b"".join(entry.pieces[k] for k in range(entry.count))
         self.forget(*key)
-        if len(record) != entry.total_bytes or zlib.crc32(record) != entry.crc:
-            self.spoiled += 1
-            return None
-        return record
-
-    @property
-    def held_bytes(self) -> int:
-        """Memory used by unfinished records."""
-        return self._bytes
+        whole = len(record) == entry.total_bytes and zlib.crc32(record) == entry.crc
+        return record if whole else None
 
     def missing_parts(self, kind: str, number: int) -> list[int] | None:
         """The missing parts of a record in progress; None for any other."""
@@ -203,10 +193,10 @@ class Assembler:
         """Discard the parts of a record."""
         entry = self._open.pop((kind, number), None)
         if entry is not None:
-            self._bytes -= entry.held_bytes
+            self.held_bytes -= entry.held_bytes
 
     def _make_room(self, keep: tuple[str, int]) -> None:
-        while len(self._open) > MAX_OPEN_RECORDS or self._bytes > MAX_OPEN_BYTES:
+        while len(self._open) > MAX_OPEN_RECORDS or self.held_bytes > MAX_OPEN_BYTES:
             stalest: Iterable[tuple[str, int]] = (key for key in self._open if key != keep)
             key = min(stalest, key=lambda k: self._open[k].touched, default=keep)
             self.forget(*key)
@@ -215,150 +205,88 @@ class Assembler:
 
 
 MAX_MESSAGE_BYTES = 262_144
-VERSION: Final = 1
 MAX_KINDS = 64
 MAX_RECEIVED_BYTES = 1 << 53
 
 Numbers = dict[str, RangeSet]
 """Kind of item to the numbers of that kind."""
+_Numbers = Annotated[Numbers, Meta(max_length=MAX_KINDS)]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Head:
+class _Message(msgspec.Struct, frozen=True, eq=False, tag_field="v", tag=1):
+    """A message as JSON; a tag other than ours is another version."""
+
+
+class Head(_Message, frozen=True, eq=False):
     """The items of a scan that the drone has, and those it is about to send unrequested."""
 
-    numbers: Numbers
-    live: Numbers = field(default_factory=dict)
+    numbers: _Numbers
+    live: _Numbers = {}
     finished: bool = False
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Held:
+class Held(_Message, frozen=True, eq=False):
     """What a ground station holds of a scan."""
 
-    numbers: Numbers
-    received_bytes: int = 0  # of this scan, since the ground started
+    numbers: _Numbers
+    received_bytes: Annotated[int, Meta(ge=0, le=MAX_RECEIVED_BYTES)] = 0  # since it started
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Ask:
+class Ask(_Message, frozen=True, eq=False):
     """Details of a request for items: the sender and, for one record, its parts."""
 
-    peer: str
+    peer: Annotated[str, Meta(max_length=MAX_NAME, pattern=rf"^{NAME.pattern}\Z")]
     parts: RangeSet | None = None  # None for all
-    parts_of: int = 0  # the count of parts that ``parts`` refers to
+    parts_of: Annotated[int, Meta(ge=0, le=MAX_PARTS)] = 0  # the count that ``parts`` refers to
 
 
-_Pair = tuple[Annotated[int, Meta(ge=0, le=MAX_NUMBER)], Annotated[int, Meta(ge=0, le=MAX_NUMBER)]]
-_Ranges = Annotated[list[_Pair], Meta(max_length=MAX_RANGES)]
-_Numbers = Annotated[dict[str, _Ranges], Meta(max_length=MAX_KINDS)]
-_Name = Annotated[str, Meta(max_length=MAX_NAME, pattern=rf"^{NAME.pattern}\Z")]
+_Json = TypeVar("_Json", Head, Held, Ask)
 
 
-class _HeadJson(msgspec.Struct):
-    v: Literal[1]
-    numbers: _Numbers
-    live: _Numbers
-    finished: bool
+def pack(message: Head | Held | Ask) -> bytes:
+    """``message`` as JSON; kinds without any number are left out."""
+    return msgspec.json.encode(message, enc_hook=_plain)
 
 
-class _HeldJson(msgspec.Struct):
-    v: Literal[1]
-    numbers: _Numbers
-    received_bytes: Annotated[int, Meta(ge=0, le=MAX_RECEIVED_BYTES)]
+def unpack(data: bytes, kind: type[_Json]) -> _Json | None:
+    """The message in ``data``, strict UTF-8; None for anything else.
 
-
-class _AskJson(msgspec.Struct):
-    v: Literal[1]
-    peer: _Name
-    parts: _Ranges | None = None
-    parts_of: Annotated[int, Meta(ge=0, le=MAX_PARTS)] = 0
-
-
-_Json = TypeVar("_Json", _HeadJson, _HeldJson, _AskJson)
-
-
-def _decode(data: bytes, kind: type[_Json]) -> _Json | None:
-    """The message in ``data``, strict UTF-8; None for anything else."""
+    Unknown kinds of items are ignored. An implausible number makes the message invalid: a scan has
+    one header, one summary, and numbers the rest.
+    """
     if len(data) > MAX_MESSAGE_BYTES:
         return None
     try:
-        return msgspec.json.decode(data.decode("utf-8"), type=kind)
+        found = msgspec.json.decode(data.decode("utf-8"), type=kind, dec_hook=_ranges)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return None
+    if isinstance(found, Ask):
+        fits = found.parts is None or found.parts.last < MAX_PARTS
+        return found if fits else None
+    sets = (found.numbers, found.live) if isinstance(found, Head) else (found.numbers,)
+    return found if all(map(_are_plausible, sets)) else None
 
 
-def pack_head(head: Head) -> bytes:
-    """``head`` as JSON."""
-    return msgspec.json.encode(
-        _HeadJson(
-            VERSION,
-            pairs_of(head.numbers),
-            pairs_of(head.live),
-            head.finished,
-        )
+def _plain(value: object) -> object:
+    assert isinstance(value, RangeSet)
+    return value.pairs()
+
+
+def _ranges(kind: type, value: object) -> RangeSet:
+    found = ranges_from_pairs(value)
+    if found is None:
+        raise ValueError("not ranges")
+    return found
+
+
+def _are_plausible(numbers: Numbers) -> bool:
+    """Whether these sets may be; unknown kinds are removed."""
+    for kind in numbers.keys() - CODES.keys():
+        del numbers[kind]
+    return all(
+        len(ranges) <= 1 if kind in WHOLE else ranges.last <= MAX_COUNTED
+        for kind, ranges in numbers.items()
     )
-
-
-def unpack_head(data: bytes) -> Head | None:
-    """The head in ``data``; None for anything else."""
-    raw = _decode(data, _HeadJson)
-    if raw is None:
-        return None
-    numbers, live = numbers_from(raw.numbers), numbers_from(raw.live)
-    if numbers is None or live is None:
-        return None
-    return Head(numbers, live, raw.finished)
-
-
-def pack_held(held: Held) -> bytes:
-    """``held`` as JSON."""
-    return msgspec.json.encode(_HeldJson(VERSION, pairs_of(held.numbers), held.received_bytes))
-
-
-def unpack_held(data: bytes) -> Held | None:
-    """The report in ``data``; None for anything else."""
-    raw = _decode(data, _HeldJson)
-    numbers = None if raw is None else numbers_from(raw.numbers)
-    return None if raw is None or numbers is None else Held(numbers, raw.received_bytes)
-
-
-def pack_ask(ask: Ask) -> bytes:
-    """``ask`` as JSON."""
-    parts = None if ask.parts is None else ask.parts.pairs()
-    return msgspec.json.encode(_AskJson(VERSION, ask.peer, parts, ask.parts_of))
-
-
-def unpack_ask(data: bytes) -> Ask | None:
-    """The request in ``data``; None for anything else."""
-    raw = _decode(data, _AskJson)
-    if raw is None:
-        return None
-    if raw.parts is None:
-        return Ask(raw.peer, None, raw.parts_of)
-    parts = ranges_from_pairs(raw.parts, MAX_PARTS - 1)
-    return None if parts is None else Ask(raw.peer, parts, raw.parts_of)
-
-
-def pairs_of(numbers: Numbers) -> dict[str, Pairs]:
-    """``numbers`` as plain pairs, for JSON."""
-    return {kind: ranges.pairs() for kind, ranges in numbers.items() if ranges}
-
-
-def numbers_from(raw: dict[str, Pairs]) -> Numbers | None:
-    """The sets in decoded JSON; unknown kinds are ignored.
-
-    None for an implausible number: a scan has one header, one summary, and numbers the rest.
-    """
-    out: Numbers = {}
-    for kind, pairs in raw.items():
-        if kind not in CODES:
-            continue
-        ranges = ranges_from_pairs(pairs, MAX_NUMBER if kind in WHOLE else MAX_COUNTED)
-        if ranges is None or (kind in WHOLE and len(ranges) > 1):
-            return None
-        out[kind] = ranges
-    return out
 
 
 def missing(wanted: Numbers, held: Numbers) -> Numbers:

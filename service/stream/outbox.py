@@ -24,7 +24,7 @@ from service.stream.messages import (
     Part,
     count,
     missing,
-    pack_head,
+    pack,
     split,
     split_in,
 )
@@ -421,7 +421,7 @@ class Outbox:
                     feed.head_due = now + (
                         HEAD_COMPLETE_S if self.complete(scan_id) else HEAD_IDLE_S
                     )
-                    self._head = Outgoing(scan_id, "head", pack_head(self.head(scan_id)))
+                    self._head = Outgoing(scan_id, "head", pack(self.head(scan_id)))
                     break
         return self._head
 

@@ -127,6 +127,11 @@ class RangeSet:
         self._firsts.append(first)
         self._lasts.append(last)
 
+    @property
+    def last(self) -> int:
+        """The largest number; -1 for none."""
+        return self._lasts[-1] if self._lasts else -1
+
     def copy(self) -> RangeSet:
         """An independent copy."""
         same = RangeSet()

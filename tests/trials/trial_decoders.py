@@ -51,9 +51,9 @@ def _records(_: Path) -> Decoder:
     def decode(data: bytes) -> None:
         unpack_pose(data)
         unpack_corrected(data)
-        messages.unpack_head(data)
-        messages.unpack_held(data)
-        messages.unpack_ask(data)
+        messages.unpack(data, messages.Head)
+        messages.unpack(data, messages.Held)
+        messages.unpack(data, messages.Ask)
 
     return decode
 
