@@ -93,7 +93,7 @@ def test_a_loop_closure_reaches_store_and_ground_alike(tmp_path: Path) -> None:
             trajectory.publish(placed)
             scales[10 * i] = placed.scale
             keyframe = flat(10 * i, placed.T_world_camera)
-            layers = codec.encode(keyframe, keyframe.time_ns, codec.CodecConfig())
+            layers = codec.encode(keyframe, keyframe.time_ns)
             drone.add_keyframe(10 * i, layers)
         before = fused_cloud(drone).cloud.xyz_m[:, 2]
         assert any(close_loops(trajectory, truth))

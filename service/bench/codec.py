@@ -1,9 +1,7 @@
 """``skyrelief bench codec``: bits per point, time and error of the chunk codec and its peers.
 
 All code the same synthetic keyframes (depth 50 to 95 m, noise 2 cm white and 8 cm
-correlated). Ours carries mask, sigma, views and a coarse layer besides; the peers do not, but
-for the one row that compares whole keyframes with holes: there the peer's chunk differs from
-ours by its depth alone, which is a JPEG-LS image with every hole filled from before.
+correlated). Ours carries mask, sigma, views and a coarse layer besides; the peers do not.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ import numpy as np
 from recon.types import F32, U8, Bool, Keyframe
 from service.bench import BenchOptions, BenchResult
 from service.bench.keyframes import make_keyframe, strip
-from service.stream import codec, planes
+from service.stream import codec
 
 SIZE_PX = (320, 180)
 REPEATS = 30
@@ -76,19 +74,12 @@ def run(options: BenchOptions) -> list[BenchResult]:
         )
         for peer in peers
     ]
-    saved, bits, peer_bits = masking()
+    saved, bits = masking()
     results += [
         BenchResult("codec", "depth error at 60 m", ours.rms_at_60_m_m * 100, "cm rms"),
         BenchResult("codec", "colour", ours.psnr_db, "dB PSNR"),
         BenchResult("codec", "sent of a keyframe at 80 % overlap", 100 * (1 - saved), "%"),
-        BenchResult(
-            "codec",
-            "size of such keyframes",
-            bits,
-            "bits per point",
-            peer="the same with JPEG-LS depth",
-            peer_value=peer_bits,
-        ),
+        BenchResult("codec", "size of such keyframes", bits, "bits per point"),
         BenchResult("codec", "encode one of them", strip_ms(), "ms"),
         BenchResult("codec", "decode a whole keyframe", decode_ms(), "ms"),
         BenchResult("codec", "coarse layer of their bytes", 100 * coarse_share(), "%"),
@@ -97,16 +88,14 @@ def run(options: BenchOptions) -> list[BenchResult]:
     return results
 
 
-def masking() -> tuple[float, float, float]:
-    """Share of the bytes that sending only what is new saves at 80 % overlap, the bits per
-    point of such keyframes, and those with JPEG-LS depth."""
+def masking() -> tuple[float, float]:
+    """Share of the bytes that sending only what is new saves at 80 % overlap, and the bits per
+    point of such keyframes."""
     whole = sum(_size(make_keyframe(k, SIZE_PX, seed=1 + k)) for k in range(FRAMES))
     fresh = [strip(SIZE_PX, 20 + k) for k in range(FRAMES)]
     frames = [make_keyframe(k, SIZE_PX, f, seed=1 + k) for k, f in enumerate(fresh)]
-    peer = codec.CodecConfig(depth_method=planes.METHOD_JPEG_LS)
     part = sum(map(_size, frames))
-    per_byte = 8 / sum(int(f.sum()) for f in fresh)
-    return 1 - part / whole, part * per_byte, per_byte * sum(_size(f, peer) for f in frames)
+    return 1 - part / whole, part * 8 / sum(int(f.sum()) for f in fresh)
 
 
 def strip_ms() -> float:
@@ -132,8 +121,8 @@ def coarse_share(masked: bool = True) -> float:
     return sum(len(x[0]) for x in layers) / sum(len(x[0]) + len(x[1]) for x in layers)
 
 
-def _size(frame: Keyframe, config: codec.CodecConfig | None = None) -> int:
-    return sum(map(len, codec.encode(frame, 0, config)))
+def _size(frame: Keyframe) -> int:
+    return sum(map(len, codec.encode(frame, 0)))
 
 
 def _average(rows: list[CodecFigures]) -> CodecFigures:

@@ -17,7 +17,7 @@ from service.flight.graph_report import graph_figures
 from service.flight.pipeline import Pipeline, Step
 from service.flight.tracking_watch import FOUND
 from service.scans.drawing import save_debug
-from service.stream.codec import CodecConfig, encode
+from service.stream.codec import encode
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
@@ -45,7 +45,6 @@ class Recorder:
         self.distance_m = self.speed_m_s = self.turn_rate_rad_s = 0.0
         self.last: PoseRecord | None = None
         self._offset_ns = clock_offset_ns
-        self._codec = CodecConfig()
         self._frames = PublishedFrames(store.path.parent)
         self._last: tuple[int, F64] | None = None  # unix ns and T_world_camera of the last pose
         self._origin_written = False
@@ -146,7 +145,7 @@ class Recorder:
     def _write_keyframes(self, step: Step) -> None:
         for keyframe in step.keyframes:
             with self.pipeline.stages.stopwatch("encode"):
-                layers = encode(keyframe, keyframe.time_ns + self._offset_ns, self._codec)
+                layers = encode(keyframe, keyframe.time_ns + self._offset_ns)
             with self.pipeline.stages.stopwatch("store"):
                 self.store.add_keyframe(keyframe.seq, layers)
             self.keyframes += 1

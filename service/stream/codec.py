@@ -175,76 +175,44 @@ def _plausible(head: LayerHead) -> bool:
     return box_w == 0 or is_inverse_depth(head.inverse_min, head.inverse_step)
 
 
-@dataclass(frozen=True, slots=True)
-class CodecConfig:
-    """Quality of coded keyframes.
-
-    The step of inverse depth is uniform and set so that its rounding error is ``depth_rms_m`` at
-    ``reference_depth_m``; the error grows with the depth squared.
-    """
-
-    depth_rms_m: float = 0.00398
-    reference_depth_m: float = 60.0
-    colour_quality: int = 80  # JPEG, 1 to 100
-    coarse_width_px: int = 80
-    coarse_depth_rms_m: float = 0.1
-    coarse_colour_quality: int = 25
-    depth_method: int = planes.METHOD_PREDICTION  # or planes.METHOD_JPEG_LS
-
-    def __post_init__(self) -> None:
-        for name in ("depth_rms_m", "reference_depth_m", "coarse_depth_rms_m"):
-            if not 0 < getattr(self, name) < 1e6:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("colour_quality", "coarse_colour_quality"):
-            if not 1 <= getattr(self, name) <= 100:
-                raise ValueError(f"{name} must be 1 to 100, got {getattr(self, name)}")
-        if self.depth_method not in (planes.METHOD_JPEG_LS, planes.METHOD_PREDICTION):
-            raise ValueError(f"depth_method must be 1 or 2, got {self.depth_method}")
-        if not 8 <= self.coarse_width_px <= MAX_SIDE_PX:
-            raise ValueError(f"coarse_width_px must be 8 to 4096, got {self.coarse_width_px}")
-
-    @property
-    def fine_step(self) -> float:
-        """Step of inverse depth, 1/m, whose rounding error is ``depth_rms_m`` rms."""
-        return self.depth_rms_m * math.sqrt(12.0) / self.reference_depth_m**2
-
-    @property
-    def coarse_step(self) -> float:
-        """The same for ``coarse_depth_rms_m``."""
-        return self.coarse_depth_rms_m * math.sqrt(12.0) / self.reference_depth_m**2
+REFERENCE_DEPTH_M = 60.0
+FINE_RMS_M, COARSE_RMS_M = 0.00398, 0.1
+"""Rounding error of depth at the reference; the step of inverse depth is uniform, so that the error
+grows with the depth squared."""
+FINE_QUALITY, COARSE_QUALITY = 80, 25  # of JPEG, 1 to 100
+COARSE_WIDTH_PX = 80
 
 
-def encode(
-    keyframe: Keyframe, time_unix_ns: int, config: CodecConfig | None = None
-) -> tuple[bytes, ...]:
+def _step(rms_m: float) -> float:
+    """Step of inverse depth, 1/m, whose rounding error at the reference is ``rms_m``."""
+    return rms_m * math.sqrt(12.0) / REFERENCE_DEPTH_M**2
+
+
+def encode(keyframe: Keyframe, time_unix_ns: int) -> tuple[bytes, ...]:
     """The layers of ``keyframe``, coarse first; the last one holds everything.
 
-    A keyframe no wider than ``coarse_width_px`` is one layer. Raises ValueError when the
+    A keyframe no wider than COARSE_WIDTH_PX is one layer. Raises ValueError when the
     grid is empty, beyond MAX_SIDE_PX or MAX_PIXELS, or the arrays differ in size.
     """
-    config = config or CodecConfig()
     depth = keyframe.depth
     h, w = depth.depth_m.shape
     _check(keyframe, w, h)
     with np.errstate(invalid="ignore"):
         known = keyframe.fresh & (depth.depth_m > MIN_DEPTH_M) & (depth.depth_m < MAX_DEPTH_M)
     fine = planes.planes_of(depth, keyframe.bgr, known)
-    factor = -(-w // config.coarse_width_px)
-    fine_place = (0, 1, 1) if factor == 1 else (1, 2, 1)
+    factor = -(-w // COARSE_WIDTH_PX)
     pose = pack_place(depth.T_world_camera, keyframe.pose.covariance)
-    quality = config.colour_quality
-    fine_layer = _layer(
-        keyframe, time_unix_ns, fine_place, pose, fine, config.fine_step, quality, config
-    )
-    if factor == 1:
-        return (fine_layer,)
+
+    def layer(number: int, factor: int, full: planes.Planes, rms_m: float, quality: int) -> bytes:
+        place = (number, layers, factor)
+        return _layer(keyframe, time_unix_ns, place, pose, full, _step(rms_m), quality)
+
+    layers = 1 if factor == 1 else 2
+    finest = layer(layers - 1, 1, fine, FINE_RMS_M, FINE_QUALITY)
+    if layers == 1:
+        return (finest,)
     coarse = planes.reduce(fine, factor)
-    quality = config.coarse_colour_quality
-    place = (0, 2, factor)
-    return (
-        _layer(keyframe, time_unix_ns, place, pose, coarse, config.coarse_step, quality, config),
-        fine_layer,
-    )
+    return layer(0, factor, coarse, COARSE_RMS_M, COARSE_QUALITY), finest
 
 
 def _check(keyframe: Keyframe, w: int, h: int) -> None:
@@ -269,7 +237,6 @@ def _layer(
     full: planes.Planes,
     step: float,
     quality: int,
-    config: CodecConfig,
 ) -> bytes:
     """One coded layer; ``place`` is its number, how many there are, and its factor; ``pose``
     is that of the keyframe, packed."""
@@ -282,7 +249,7 @@ def _layer(
         codes, low, step = planes.quantise(cut, step)
         sections = (
             planes.encode_mask(cut.known),
-            planes.encode_depth(codes, cut.known, config.depth_method),
+            planes.encode_depth(codes, cut.known),
             planes.encode_sigma(cut),
             planes.encode_views(cut) if layer == layers - 1 else b"",
             planes.encode_colour(cut, quality),
@@ -295,7 +262,7 @@ def _layer(
         time_unix_ns=time_unix_ns,
         full_px=(w, h),
         factor=factor,
-        method=config.depth_method,
+        method=planes.METHOD_PREDICTION,
         box=box,
         inverse_min=low,
         inverse_step=step,

@@ -199,7 +199,7 @@ def _guess(c: I64, k: I64, i: int, row: int, base: int, w: I64) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _normal_equations(c: F64, k: F64, size: tuple[int, int], step: int) -> tuple[F64, F64]:
+def _normal_equations(c: I64, k: I64, size: tuple[int, int], step: int) -> tuple[F64, F64]:
     """Weighted sums of the fit over every ``step``-th pixel; smooth surroundings weigh more."""
     h, w = size
     row = w + 2 * MARGIN
@@ -209,7 +209,7 @@ def _normal_equations(c: F64, k: F64, size: tuple[int, int], step: int) -> tuple
     for v in range(h):
         for u in range((v * 7) % step, w, step):
             i = (v + MARGIN) * row + u + MARGIN
-            if k[i] == 0.0 or k[i - 1] == 0.0:
+            if k[i] == 0 or k[i - 1] == 0:
                 continue
             base = c[i - 1]
             for j in range(9):
@@ -225,55 +225,23 @@ def _normal_equations(c: F64, k: F64, size: tuple[int, int], step: int) -> tuple
 
 
 @numba.njit(cache=True, nogil=True)
-def _residuals(c: F64, k: F64, size: tuple[int, int], weights: I64) -> U16:
-    """Zigzag residuals of the known pixels in scan order.
-
-    The predictions of a row are computed at once in float64, where these integers are exact.
-    """
+def _residuals(c: I64, k: I64, size: tuple[int, int], weights: I64) -> U16:
+    """Zigzag residuals of the known pixels in scan order."""
     h, w = size
     row = w + 2 * MARGIN
-    f = weights.astype(np.float64)
-    base = np.zeros(w)
-    guess = np.zeros(w)
-    zigzag = np.zeros(w, np.uint16)
     out = np.empty(h * w, np.uint16)
-    last = 0.0
+    last = 0
     at = 0
     for v in range(h):
         start = (v + MARGIN) * row + MARGIN
-        if not k[start : start + w].any():
-            continue
-        # Slices keep the compiler from checking every index for being negative.
-        known, code = k[start : start + w], c[start : start + w]
-        west_known, west = k[start - 1 : start - 1 + w], c[start - 1 : start - 1 + w]
-        for u in range(w):
-            if known[u]:
-                base[u] = west[u] if west_known[u] else _base(c, k, start + u, row, last)
-                last = code[u]
-        _guess_row(c, k, start, row, base, f, guess)
-        for u in range(w):
-            r = ((np.int32(code[u] - guess[u]) + 32768) & 0xFFFF) - 32768
-            zigzag[u] = (r << 1) ^ (r >> 31)
-        for u in range(w):
-            if known[u]:
-                out[at] = zigzag[u]
+        for i in range(start, start + w):
+            if k[i]:
+                r = c[i] - _guess(c, k, i, row, _base(c, k, i, row, last), weights)
+                r = ((r + 32768) & 0xFFFF) - 32768
+                out[at] = (r << 1) ^ (r >> 63)
+                last = c[i]
                 at += 1
     return out[:at]
-
-
-@numba.njit(cache=True, nogil=True)
-def _guess_row(c: F64, k: F64, start: int, row: int, base: F64, f: F64, guess: F64) -> None:
-    """Fill ``guess`` for the row of pixels that begins at ``start``."""
-    w = base.size
-    total = np.full(w, 2048.0)
-    for j in range(9):
-        at = start + NEIGHBOURS[j + 1, 0] * row + NEIGHBOURS[j + 1, 1]
-        near, there = c[at : at + w], k[at : at + w]
-        weight = f[j]
-        for u in range(w):
-            total[u] += weight * (near[u] - base[u]) * there[u]
-    for u in range(w):
-        guess[u] = min(max(base[u] + np.floor(total[u] / 4096.0), 0.0), 65535.0)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -295,15 +263,12 @@ def _restore(residuals: U16, c: I64, k: I64, size: tuple[int, int], weights: I64
                 at += 1
 
 
-def _padded(plane: npt.NDArray[np.generic], kind: type[np.generic]) -> npt.NDArray[Any]:
+def _padded(plane: npt.NDArray[np.generic]) -> I64:
     """The plane in a margin of zeros, flat."""
-    h, w = plane.shape
-    out = np.zeros((h + 2 * MARGIN, w + 2 * MARGIN), kind)
-    out[MARGIN:-MARGIN, MARGIN:-MARGIN] = plane
-    return out.reshape(-1)
+    return np.pad(plane.astype(np.int64), MARGIN).reshape(-1)
 
 
-def fit(c: F64, k: F64, size: tuple[int, int]) -> I64:
+def fit(c: I64, k: I64, size: tuple[int, int]) -> I64:
     """(9,) weights, 4096 is one, that predict the padded codes best; least squares about a
     plane."""
     step = max(1, round(k.sum() / FIT_PIXELS))
@@ -316,7 +281,7 @@ def fit(c: F64, k: F64, size: tuple[int, int]) -> I64:
 def encode_codes(codes: U16, known: Bool) -> bytes:
     """The section for ``codes`` (h, w) at the ``known`` pixels."""
     size = known.shape[0], known.shape[1]
-    c, k = _padded(codes, np.float64), _padded(known, np.float64)
+    c, k = _padded(codes), _padded(known)
     weights = fit(c, k, size)
     residuals = _residuals(c, k, size, weights)
     symbols = np.minimum(residuals, ESCAPE).astype(np.uint8)
@@ -344,6 +309,6 @@ def decode_codes(data: bytes, known: Bool) -> U16 | None:
     weights = np.frombuffer(data[: 2 * WEIGHTS], "<i2").astype(np.int64)
     h, w = known.shape
     codes = np.zeros((h + 2 * MARGIN) * (w + 2 * MARGIN), np.int64)
-    _restore(residuals, codes, _padded(known, np.int64), (h, w), weights)
+    _restore(residuals, codes, _padded(known), (h, w), weights)
     plane = codes.reshape(h + 2 * MARGIN, w + 2 * MARGIN)[MARGIN:-MARGIN, MARGIN:-MARGIN]
     return plane.astype(np.uint16)

@@ -9,18 +9,6 @@ from recon.types import F32, U8, Bool
 
 
 @numba.njit(cache=True, nogil=True)
-def span(depth: F32, known: Bool) -> tuple[float, float]:
-    """The minimum and the maximum of the known depths."""
-    low, high = np.float32(np.inf), np.float32(0.0)
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            if known[v, u]:
-                low = min(low, depth[v, u])
-                high = max(high, depth[v, u])
-    return float(low), float(high)
-
-
-@numba.njit(cache=True, nogil=True)
 def reduce(
     depth: F32, sigma: F32, views: U8, bgr: U8, known: Bool, factor: int, spread: float
 ) -> tuple[F32, F32, U8, U8, Bool]:
@@ -69,45 +57,6 @@ def reduce(
             out_bgr[row, column, 1] = (green + count // 2) // count
             out_bgr[row, column, 2] = (red + count // 2) // count
     return out_depth, out_sigma, out_views, out_bgr, out_known
-
-
-@numba.njit(cache=True, nogil=True)
-def block_means(sigma: F32, block: int) -> F32:
-    """Mean of the positive values in each block; 0 for none."""
-    h, w = sigma.shape
-    rows, columns = -(-h // block), -(-w // block)
-    out = np.zeros((rows, columns), np.float32)
-    for row in range(rows):
-        for column in range(columns):
-            count, total = 0, np.float32(0.0)
-            for v in range(row * block, min(h, (row + 1) * block)):
-                for u in range(column * block, min(w, (column + 1) * block)):
-                    count += sigma[v, u] > 0
-                    total += sigma[v, u]
-            if count:
-                out[row, column] = total / np.float32(count)
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
-def block_min(views: U8, known: Bool, block: int, max_value: int) -> U8:
-    """The minimum known value in each block, 1 to ``max_value``; 255 where there is none."""
-    h, w = views.shape
-    rows, columns = -(-h // block), -(-w // block)
-    out = np.full((rows, columns), 255, np.uint8)
-    line = np.empty(w, np.uint8)
-    for row in range(rows):
-        line[:] = 255
-        for v in range(row * block, min(h, (row + 1) * block)):
-            for u in range(w):
-                value = views[v, u] if known[v, u] else np.uint8(255)
-                line[u] = min(line[u], value)
-        for column in range(columns):
-            low = np.uint8(255)
-            for u in range(column * block, min(w, (column + 1) * block)):
-                low = min(low, line[u])
-            out[row, column] = low if low == 255 else min(max(low, 1), max_value)
-    return out
 
 
 @numba.njit(cache=True, nogil=True)

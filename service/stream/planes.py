@@ -113,7 +113,7 @@ def quantise(planes: Planes, step: float) -> tuple[U16, float, float]:
     if known.all():
         near, far = float(depth.min()), float(depth.max())
     else:
-        near, far = plane_kernels.span(depth, known)
+        near, far = float(depth[known].min()), float(depth[known].max())
         depth = np.where(known, depth, np.float32(far))
     low = np.float32(1.0 / far)
     step32 = np.float32(max(step, (1.0 / near - float(low)) / (MAX_CODE - 1)))
@@ -122,13 +122,9 @@ def quantise(planes: Planes, step: float) -> tuple[U16, float, float]:
     return np.clip(codes, 0, MAX_CODE).astype(np.uint16), float(low), float(step32)
 
 
-def encode_depth(codes: U16, known: Bool, method: int) -> bytes:
-    """The codes by prediction, or as a JPEG-LS image (8 bits deep when they fit)."""
-    if method == METHOD_PREDICTION:
-        return plane_coders.encode_codes(codes, known)
-    codes = _fill_back(codes, known)
-    image = codes.astype(np.uint8) if codes.max() < 256 else codes
-    return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(image)))
+def encode_depth(codes: U16, known: Bool) -> bytes:
+    """The codes, by METHOD_PREDICTION."""
+    return plane_coders.encode_codes(codes, known)
 
 
 def decode_depth(data: bytes, known: Bool, method: int, low: float, step: float) -> F32 | None:
@@ -149,7 +145,8 @@ def decode_depth(data: bytes, known: Bool, method: int, low: float, step: float)
 
 def encode_sigma(planes: Planes) -> bytes:
     """The section of sigma: one code per block of SIGMA_BLOCK_PX."""
-    mean = plane_kernels.block_means(planes.sigma_m, SIGMA_BLOCK_PX)
+    blocks = _blocks(planes.sigma_m, SIGMA_BLOCK_PX, 0)
+    mean = blocks.sum(axis=0) / np.maximum(np.count_nonzero(blocks, axis=0), 1)
     has = mean > 0
     if not has.any():
         return b""
@@ -175,7 +172,8 @@ def decode_sigma(data: bytes, w: int, h: int) -> F32 | None:
 
 def encode_views(planes: Planes) -> bytes:
     """The section of views: one count per block of VIEWS_BLOCK_PX, at most MAX_VIEWS."""
-    low = plane_kernels.block_min(planes.views, planes.known, VIEWS_BLOCK_PX, MAX_VIEWS)
+    views = np.where(planes.known, np.clip(planes.views, 1, MAX_VIEWS), np.uint8(255))
+    low = _blocks(views, VIEWS_BLOCK_PX, 255).min(axis=0)
     return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(_fill_back(low, low != 255))))
 
 
@@ -217,6 +215,13 @@ def decode_colour(data: bytes, w: int, h: int) -> U8 | None:
     if image is None or image.shape != (h, w, 3):
         return None
     return np.asarray(image, np.uint8)
+
+
+def _blocks(plane: Array, size: int, outside: float) -> Array:
+    """(size x size, rows, columns) of the plane: the pixels of each square block."""
+    h, w = plane.shape
+    full = np.pad(plane, ((0, -h % size), (0, -w % size)), constant_values=outside)
+    return np.stack([full[i::size, j::size] for i in range(size) for j in range(size)])
 
 
 def _enlarge(blocks: Array, factor: int, w: int, h: int) -> Array:
