@@ -233,7 +233,7 @@ def test_a_live_layer_follows_new_keyframes_and_corrections(
         first = live.refresh()
         one = house.keyframe(5, 70.0)
         store.add_keyframe(5, encode(one, one.time_ns))
-        store.add_repose(Repose(1, 1, house.pose(5.0 + 30.0), 1.0, np.eye(6)))
+        store.add_reposes([Repose(1, 1, house.pose(5.0 + 30.0), 1.0, np.eye(6))])
         second, fresh = live.refresh(), coverage_of(store)
     assert first is not None and second is not None and fresh is not None
     assert second.figures() == fresh.figures()

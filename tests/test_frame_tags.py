@@ -18,8 +18,8 @@ STATE = VehicleState(
     sigma_yaw_rad=0.05,
     sigma_h_m=1.25,
     sigma_agl_m=0.5,
-    age_ms={"attitude": 7.25, "mount": 7.25, "gnss": 40.0, "terrain": 210.0},
-    sources=("attitude", "mount", "gnss", "terrain"),
+    age_ms={"attitude": 7.25, "gimbal": 7.25, "gnss": 40.0, "terrain": 210.0},
+    sources=("attitude", "gimbal", "gnss", "terrain"),
 )
 
 
@@ -34,7 +34,7 @@ def test_each_frame_has_a_line_and_what_is_unknown_stays_empty(tmp_path: Path) -
     assert lines[0] == ",".join(COLUMNS)
     (row,) = csv.DictReader(lines)
     assert row["time_unix_s"] == "1700000000.123456789"
-    assert row["sources"] == "attitude mount gnss terrain"
+    assert row["sources"] == "attitude gimbal gnss terrain"
     ages = [row[f"age_{name}_ms"] for name in ("attitude", "gimbal", "gnss", "agl")]
     assert ages == ["7.2", "7.2", "40.0", "210.0"]
     assert float(row["sigma_attitude_deg"]) == pytest.approx(0.573, abs=1e-3)

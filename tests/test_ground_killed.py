@@ -41,7 +41,7 @@ store = ScanStore.open(path) if path.exists() else ScanStore.create(path, header
 config = DatalinkConfig(connect=(endpoint,), budget_kbit_s=4000)
 link = DatalinkSender(store, config)
 print("up", flush=True)
-for seq in range(store.next_seq, last):
+for seq in range(max(store.seqs(), default=-1) + 1, last):
     rng = np.random.default_rng(seq)
     depth = DepthMap(rng.uniform(40, 60, (90, 160)).astype(np.float32),
         np.full((90, 160), 0.1, np.float32), np.full((90, 160), 3, np.uint8),

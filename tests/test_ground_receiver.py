@@ -133,7 +133,7 @@ def test_a_scan_arrives_whole_with_its_corrections(tmp_path: Path, written: list
     try:
         fly(onboard, 0, 12)
         onboard.update_header(epsg=32632)
-        onboard.add_repose(Repose(3, 1, se3.exp(np.full(6, 0.1)), 1.01, np.eye(6)))
+        onboard.add_reposes([Repose(3, 1, se3.exp(np.full(6, 0.1)), 1.01, np.eye(6))])
         onboard.finish({"points": 12})
         assert link.drain(20.0)
         folder = ground.folder("drone-a", "scan-1")
@@ -183,7 +183,7 @@ def test_both_ends_may_restart(tmp_path: Path) -> None:
     onboard = ScanStore.open(tmp_path / "air" / "scan.db")
     link = DatalinkSender(onboard, config)
     try:
-        fly(onboard, onboard.next_seq, 15)
+        fly(onboard, onboard.seqs()[-1] + 1, 15)
         onboard.finish({"points": 1})
         assert link.drain(30.0)
     finally:

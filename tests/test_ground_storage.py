@@ -46,7 +46,7 @@ def card(tmp_path: Path) -> Path:
     for seq in range(3):
         store.add_keyframe(seq, codec.encode(keyframe(seq), seq))
         store.add_pose(PoseRecord(seq, np.eye(4), np.eye(6)))
-    store.add_repose(Repose(1, 1, np.eye(4), 1.0, np.eye(6)))
+    store.add_reposes([Repose(1, 1, np.eye(4), 1.0, np.eye(6))])
     store.finish({"points": 1})
     (tmp_path / "card" / "scan-1").mkdir(parents=True)
     for name in ("scan.db", "scan.db-wal"):

@@ -12,7 +12,7 @@ import pytest
 from loopback import free_port, until
 from rehearsal import RehearsalControl, RehearsalVehicle
 
-from mavlink.component.memory import Memory, remembered_system
+from mavlink.component.memory import Memory
 from mavlink.component.vehicle import VehicleConfig, VehicleLink
 from mavlink.wire.dialect import dialect
 from mavlink.wire.first_beat import FirstBeats, heartbeat_packet
@@ -100,10 +100,10 @@ def test_the_vehicle_of_this_run_is_remembered(tmp_path: Path) -> None:
             until(
                 lambda: (
                     autopilot.sendto(bytes(beat.pack(mouth)), ("127.0.0.1", port)),
-                    remembered_system(tmp_path),
+                    Memory(tmp_path).system,
                 )[1]
             )
-    assert remembered_system(tmp_path) == 9
+    assert Memory(tmp_path).system == 9
     later = VehicleLink(VehicleConfig(state_dir=tmp_path), RehearsalControl())
     assert later.presence.system == 9 and later.presence.autopilot is None
 
@@ -112,7 +112,7 @@ def test_the_vehicle_of_this_run_is_remembered(tmp_path: Path) -> None:
 def test_a_system_that_cannot_be_is_not_remembered(tmp_path: Path, system: object) -> None:
     kept = {"parameters": {"SR_BASELINE_M": 2.0}, "signing_timestamp": 0, "system": system}
     (tmp_path / "mavlink.json").write_text(json.dumps(kept))
-    assert remembered_system(tmp_path) is None
+    assert Memory(tmp_path).system is None
     assert Memory(tmp_path).parameters == {"SR_BASELINE_M": 2.0}
 
 

@@ -360,8 +360,6 @@ def test_configuration_overrides_every_claim() -> None:
     assert angle(state.q_ned_gimbal_wxyz, wrong) < 1e-6
     with pytest.raises(ValueError, match="yaw_frame"):
         GimbalConfig(yaw_frame="north")
-    with pytest.raises(ValueError, match="mount_rpy_deg"):
-        GimbalConfig(mount_rpy_deg=(0.0, math.nan, 0.0))
 
 
 def test_too_little_sway_decides_nothing() -> None:
@@ -380,18 +378,6 @@ def test_the_gimbal_itself_is_accepted_before_its_relay_and_before_older_message
     assert state is not None and state.q_ned_gimbal_wxyz is not None
     truth = quaternion.from_rpy(0.0, -0.2, 0.0)
     assert angle(state.q_ned_gimbal_wxyz, truth) < 1e-7
-
-
-def test_a_fixed_mount_stands_in_when_no_gimbal_speaks() -> None:
-    config = HistoryConfig(gimbal=GimbalConfig(mount_rpy_deg=(0.0, -90.0, 0.0)))
-    history = VehicleHistory(config)
-    body = quaternion.from_rpy(0.1, 0.2, 0.3)
-    history.add(AttitudeSample(None, body), T0)
-    state = history.state_at(T0)
-    assert state is not None and state.q_ned_gimbal_wxyz is not None
-    truth = scipy_of(body) * Rotation.from_euler("Y", -math.pi / 2)
-    assert angle(state.q_ned_gimbal_wxyz, of_scipy(truth)) < 1e-7
-    assert "mount" in state.sources
 
 
 def test_the_images_decide_between_frames() -> None:

@@ -345,7 +345,7 @@ def test_the_live_view_grows_with_the_scan(client: Client, store: Path, house: H
         assert np.median(rgb[on_roof, 0]) > 150
         one = house.keyframe(5, 25.0)
         scan.add_keyframe(5, encode(one, one.time_ns))
-        scan.add_repose(Repose(2, 1, house.pose(60.0), 1.5, np.eye(6)))
+        scan.add_reposes([Repose(2, 1, house.pose(60.0), 1.5, np.eye(6))])
         seen: dict[str, Any] = {}
         while not {"chunk", "repose"} <= set(seen):
             message = socket.recv(timeout=5)
@@ -373,8 +373,8 @@ def test_the_feed_sends_each_thing_once(tmp_path: Path, house: HouseFlight) -> N
         first = [m for m in feed.news() if isinstance(m, bytes)]
         assert len(first) == 5
         assert list(feed.news()) == []
-        scan.add_repose(Repose(1, 1, house.pose(9.0), 1.0, np.eye(6)))
-        scan.add_repose(Repose(1, 2, house.pose(8.0), 1.0, np.eye(6)))
+        scan.add_reposes([Repose(1, 1, house.pose(9.0), 1.0, np.eye(6))])
+        scan.add_reposes([Repose(1, 2, house.pose(8.0), 1.0, np.eye(6))])
         moved = [json.loads(m) for m in feed.news()]
         assert [(m["type"], m["seq"], m["T"][12]) for m in moved] == [("repose", 1, 8.0)]
         scan.add_pose(house.record(9, 50.0))

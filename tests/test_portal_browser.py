@@ -82,7 +82,7 @@ def test_the_cloud_grows_and_moves_while_one_looks(
     with ScanStore.open(scans / "drone-1/test-1/scan.db") as scan:
         one = house.keyframe(5, 30.0)
         scan.add_keyframe(5, encode(one, one.time_ns))
-        scan.add_repose(Repose(1, 1, house.pose(7.0), 1.0, np.eye(6)))
+        scan.add_reposes([Repose(1, 1, house.pose(7.0), 1.0, np.eye(6))])
         scan.add_pose(house.record(5, 30.0))
     browser.wait(f"Number(document.body.dataset.points) > {before}")
     browser.wait("document.querySelector('.figures').textContent.includes('25 m')")

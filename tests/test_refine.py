@@ -237,7 +237,7 @@ def test_marks_by_time_and_points_of_the_cloud_count_too(flight: Flight) -> None
 def test_the_same_input_twice_changes_nothing_and_undo_brings_all_back(flight: Flight) -> None:
     gcp = write_csv(flight.folder / "points.csv", flight.survey(SPOTS))
     with ScanStore.open(flight.scan / "scan.db") as store:
-        store.add_repose(Repose(0, 1, wrong(flight.truth[0]), 1.0, np.eye(6) * 0.01))
+        store.add_reposes([Repose(0, 1, wrong(flight.truth[0]), 1.0, np.eye(6) * 0.01)])
         held = [(k.seq, k.depth.T_world_camera, k.depth.depth_m) for k in store.keyframes()]
         track = [p.T_world_camera for p in store.poses()]
     first = refine(flight.scan, RefineOptions(gcp))
@@ -280,7 +280,7 @@ def test_loops_of_the_flight_hold_both_legs_together(tmp_path: Path) -> None:
     with ScanStore.open(flight.scan / "scan.db") as store:
         for k in range(8, 16):
             T = se3.compose(np.eye(3), slip) @ wrong(flight.truth[k])
-            store.add_repose(Repose(10 * k, 1, T, 1.0, np.eye(6) * 0.01))
+            store.add_reposes([Repose(10 * k, 1, T, 1.0, np.eye(6) * 0.01)])
         store.finish({"graph": {"loops": {"motions": motions}}})
     figures = refine(flight.scan, RefineOptions())
     assert figures["loops"]["used"] == 3

@@ -135,7 +135,7 @@ def test_a_reposed_keyframe_moves_its_points(tmp_path: Path, house: HouseFlight)
     with house.flown(tmp_path) as store:
         for seq in range(5):
             T = se3.compose(house.nadir, np.array([5.0 * seq + 100.0, 0.0, house.height_m]))
-            store.add_repose(Repose(seq, 1, T, 1.0, np.eye(6)))
+            store.add_reposes([Repose(seq, 1, T, 1.0, np.eye(6))])
         write_deliverables(tmp_path, store, {})
     enu = enu_of(laspy.read(tmp_path / CLOUD), house)
     assert np.median(enu[enu[:, 2] > 5.5, 0]) == pytest.approx(110.0, abs=0.3)

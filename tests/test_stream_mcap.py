@@ -39,7 +39,7 @@ def new_store(path: Path) -> ScanStore:
         store.add_keyframe(seq, codec.encode(frame, time_ns))
         store.add_pose(PoseRecord(time_ns, T, np.eye(6), lat_deg=47.0, lon_deg=8.0))
     moved = se3.compose(T[:3, :3], np.array([7.0, 6.0, 50.0]))
-    store.add_repose(Repose(1, 1, moved, 1.0, np.eye(6)))
+    store.add_reposes([Repose(1, 1, moved, 1.0, np.eye(6))])
     store.finish({"points": 3})
     return store
 

@@ -161,7 +161,7 @@ def test_everything_arrives_over_a_bad_link_and_within_the_budget(
     for k in range(12):
         world.produce(k, k + 1)
         world.run(0.7)
-    world.onboard.add_repose(Repose(3, 1, np.eye(4), 1.0, np.eye(6)))
+    world.onboard.add_reposes([Repose(3, 1, np.eye(4), 1.0, np.eye(6))])
     world.onboard.finish({"points": 1})
     for _ in range(40):
         world.run(5.0)

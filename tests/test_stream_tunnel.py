@@ -221,7 +221,7 @@ def test_a_late_origin_and_corrections_reach_the_ground(tmp_path: Path) -> None:
         drain(sender, 0.0, 5.0)
         store.update_header(origin_lat_deg=47.5, origin_lon_deg=8.25)
         moved = se3.compose(R_DOWN, np.array([5.0, 20.0, 66.0]))
-        store.add_repose(Repose(0, 1, moved, 1.1, np.eye(6)))
+        store.add_reposes([Repose(0, 1, moved, 1.1, np.eye(6))])
         later = drain(sender, 5.0, 5.0)
         headers = [header for p in later if (header := unpack_announce(p)) is not None]
         tiles = [tile[1] for p in later if (tile := unpack_tile(p)) is not None]

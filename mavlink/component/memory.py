@@ -9,13 +9,7 @@ from pathlib import Path
 
 log = logging.getLogger(__name__)
 
-
 FILE = "mavlink.json"
-
-
-def remembered_system(folder: Path) -> int | None:
-    """The system id of the vehicle of the last run; None when unknown."""
-    return Memory(folder).system
 
 
 class Memory:

@@ -57,11 +57,6 @@ class StatusTexts:
             self._credit_ns -= SPACING_NS
             self._send(*self._waiting.popleft())
 
-    @property
-    def is_waiting(self) -> bool:
-        """True while texts are queued."""
-        return bool(self._waiting)
-
     def _send(self, severity: int, text: str) -> None:
         raw = text.encode("ascii", "replace")[:LONGEST]
         chunks = [raw[i : i + TEXT] for i in range(0, len(raw), TEXT)]
@@ -81,14 +76,11 @@ class ComputerLoad:
     """The companion's load as measured by the service; None where unknown."""
 
     cpu_percent: tuple[int, ...] = ()  # per core, the first eight are sent
-    gpu_percent: int | None = None
     temperature_c: int | None = None
     ram_used_mib: int | None = None
     ram_total_mib: int | None = None
     storage_used_mib: int | None = None
     storage_total_mib: int | None = None
-    link_tx_kib_s: int | None = None
-    link_max_kib_s: int | None = None
     throttled: bool = False
     disk_full: bool = False
 
@@ -97,8 +89,8 @@ def computer_status(load: ComputerLoad, unix_us: int, uptime_ms: int) -> Any:
     """The ONBOARD_COMPUTER_STATUS of a load."""
     u8, u32 = 255, 0xFFFFFFFF
 
-    def first(value: int | None, unknown: int, count: int) -> list[int]:
-        return [unknown if value is None else max(0, min(unknown, value))] + [unknown] * (count - 1)
+    def known(value: int | None) -> int:
+        return u32 if value is None else max(0, min(u32, value))
 
     cores = [max(0, min(100, c)) for c in load.cpu_percent[:8]]
     mean = round(sum(cores) / len(cores)) if cores else u8
@@ -110,21 +102,18 @@ def computer_status(load: ComputerLoad, unix_us: int, uptime_ms: int) -> Any:
         0,
         cores + [u8] * (8 - len(cores)),
         [mean] + [u8] * 9,
-        first(load.gpu_percent, u8, 4),
+        [u8] * 4,
         [u8] * 10,
         temperature,
         [127] * 8,
         [32767] * 4,
-        first(load.ram_used_mib, u32, 1)[0],
-        first(load.ram_total_mib, u32, 1)[0],
+        known(load.ram_used_mib),
+        known(load.ram_total_mib),
         [u32] * 4,
-        first(load.storage_used_mib, u32, 4),
-        first(load.storage_total_mib, u32, 4),
+        [known(load.storage_used_mib), u32, u32, u32],
+        [known(load.storage_total_mib), u32, u32, u32],
         [u32] * 6,
-        first(load.link_tx_kib_s, u32, 6),
-        [u32] * 6,
-        first(load.link_max_kib_s, u32, 6),
-        [u32] * 6,
+        *([u32] * 6,) * 4,
         flags,
     )
 

@@ -39,24 +39,12 @@ class GimbalConfig:
     """How gimbal messages are read."""
 
     yaw_frame: str = "auto"  # auto: as the flags declare, unless telemetry refutes them
-    mount_rpy_deg: tuple[float, float, float] | None = None  # fixed mount, used without messages
 
     def __post_init__(self) -> None:
         if self.yaw_frame not in YAW_FRAMES:
             raise ValueError(
                 f"gimbal yaw_frame is {self.yaw_frame!r}; use one of {', '.join(YAW_FRAMES)}"
             )
-        rpy = self.mount_rpy_deg
-        if rpy is not None and not (len(rpy) == 3 and all(map(math.isfinite, rpy))):
-            raise ValueError(f"mount_rpy_deg is {rpy!r}; give roll, pitch and yaw in degrees")
-
-    @property
-    def mount(self) -> Quaternion | None:
-        """``q_body_gimbal`` of the fixed mount."""
-        if self.mount_rpy_deg is None:
-            return None
-        roll, pitch, yaw = map(math.radians, self.mount_rpy_deg)
-        return from_rpy(roll, pitch, yaw)
 
 
 def frame_of_flags(flags: int) -> GimbalFrame:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mavlink.telemetry.gimbal import GimbalConfig, steadiest_frame, to_earth
-from mavlink.telemetry.quaternion import Quaternion, down_component, multiply, slerp
+from mavlink.telemetry.quaternion import Quaternion, down_component, slerp
 from mavlink.telemetry.samples import (
     RECEIVER_SIGMA_H_M,
     RECEIVER_SIGMA_V_M,
@@ -261,11 +261,6 @@ class VehicleHistory:
             sigma = math.hypot(self.config.sigma_gimbal_rad, bend)
             state.set("gimbal", at.age_ms, q_ned_gimbal_wxyz=np.array(q), sigma_gimbal_rad=sigma)
             return
-        mount = self.config.gimbal.mount
-        if mount is not None and q_body is not None:
-            head, sigma = np.array(multiply(q_body, mount)), state.fields["sigma_attitude_rad"]
-            age_ms = state.ages["attitude"]
-            state.set("mount", age_ms, q_ned_gimbal_wxyz=head, sigma_gimbal_rad=sigma)
 
     def _gimbal_at(
         self, key: tuple[int, int], at: Bracket, q_body: Quaternion | None

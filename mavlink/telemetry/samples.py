@@ -123,6 +123,4 @@ class VehicleState:
     sigma_gimbal_rad: float | None = None  # roll and pitch of the gimbal head
     receiver: ReceiverAltitude | None = None  # of the fix nearest in time
     age_ms: Mapping[str, float] = field(default_factory=dict)  # source to ms from its next sample
-    sources: tuple[
-        str, ...
-    ] = ()  # of attitude, gimbal, mount, gnss, rangefinder, terrain, relative
+    sources: tuple[str, ...] = ()  # of attitude, gimbal, gnss, rangefinder, terrain, relative

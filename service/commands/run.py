@@ -73,7 +73,7 @@ def _first_beats(config: Config) -> FirstBeats | None:
     """Heartbeats before everything else; None where they must be signed, or there is no link."""
     import random
 
-    from mavlink.component.memory import remembered_system
+    from mavlink.component.memory import Memory
     from mavlink.wire.first_beat import FirstBeats
 
     mavlink = config.mavlink
@@ -82,7 +82,7 @@ def _first_beats(config: Config) -> FirstBeats | None:
     try:
         token = random.getrandbits(32) or 1
         folder = Path(mavlink.memory or config.scan.folder)
-        system = mavlink.system_id or remembered_system(folder) or 1
+        system = mavlink.system_id or Memory(folder).system or 1
         first = FirstBeats(mavlink.links, system, token)
     except ValueError:
         return None  # said by the check of the whole configuration

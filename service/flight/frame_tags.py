@@ -61,7 +61,7 @@ def _line(time_unix_ns: int, state: VehicleState) -> str:
     age = state.age_ms
     ages = (
         age.get("attitude"),
-        age.get("gimbal", age.get("mount")),
+        age.get("gimbal"),
         age.get("gnss"),
         next((age[name] for name in HEIGHTS if name in age), None),
     )

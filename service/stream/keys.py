@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from cryptography import x509
     from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 
+    Authority = tuple[x509.Certificate, EllipticCurvePrivateKey]
+
 FLEET = "fleet.json"
 ROLES = ("drone", "ground", "viewer")
 
@@ -267,12 +269,10 @@ def _write_fleet(folder: Path, fleet: Fleet) -> list[Path]:
     return copies
 
 
-def _authority(
-    folder: Path, start: datetime.datetime
-) -> tuple[x509.Certificate, EllipticCurvePrivateKey]:
+def _authority(folder: Path, start: datetime.datetime) -> Authority:
     try:
         from cryptography import x509
-        from cryptography.hazmat.primitives import hashes, serialization
+        from cryptography.hazmat.primitives import serialization
         from cryptography.hazmat.primitives.asymmetric import ec
     except ImportError as error:
         raise OutsideError(
@@ -283,60 +283,70 @@ def _authority(
         if not isinstance(key, ec.EllipticCurvePrivateKey):
             raise InputError(f"{folder / KEY} is not a key of 'skyrelief keys'")
         return x509.load_pem_x509_certificate((folder / CA).read_bytes()), key
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "skyrelief fleet authority")])
-    certificate = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(EVER)
-        .not_valid_after(start + datetime.timedelta(days=CA_DAYS))
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .sign(key, hashes.SHA256())
-    )
-    folder.mkdir(parents=True, exist_ok=True)
-    _write_key(folder / KEY, key)
-    (folder / CA).write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
-    return certificate, key
+    name = "skyrelief fleet authority"
+    limits = [x509.BasicConstraints(ca=True, path_length=0)]
+    return _signed(folder, CA, name, start + datetime.timedelta(days=CA_DAYS), limits)
 
 
 def _member(
     home: Path,
     common_name: str,
     server: bool,
-    authority: tuple[x509.Certificate, EllipticCurvePrivateKey],
+    authority: Authority,
     start: datetime.datetime,
     days: int,
 ) -> None:
     from cryptography import x509
-    from cryptography.hazmat.primitives import hashes, serialization
-    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.hazmat.primitives import serialization
     from cryptography.x509.oid import ExtendedKeyUsageOID
 
     usages = [ExtendedKeyUsageOID.CLIENT_AUTH]
     if server:
         usages.append(ExtendedKeyUsageOID.SERVER_AUTH)
+    extensions = [
+        x509.BasicConstraints(ca=False, path_length=None),
+        x509.SubjectAlternativeName([x509.DNSName(common_name)]),
+        x509.ExtendedKeyUsage(usages),
+    ]
+    end = start + datetime.timedelta(days=days)
+    _signed(home, CERTIFICATE, common_name, end, extensions, authority)
+    (home / CA).write_bytes(authority[0].public_bytes(serialization.Encoding.PEM))
+
+
+def _signed(
+    home: Path,
+    file: str,
+    common_name: str,
+    end: datetime.datetime,
+    extensions: Sequence[x509.ExtensionType],
+    authority: Authority | None = None,
+) -> Authority:
+    """A new certificate and its key, written into ``home``; the first extension is critical.
+
+    Without an ``authority`` it is one, signed by its own key.
+    """
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+
     key = ec.generate_private_key(ec.SECP256R1())
-    certificate = (
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, common_name)])
+    builder = (
         x509.CertificateBuilder()
-        .subject_name(x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, common_name)]))
-        .issuer_name(authority[0].subject)
+        .subject_name(name)
+        .issuer_name(authority[0].subject if authority else name)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(EVER)
-        .not_valid_after(start + datetime.timedelta(days=days))
-        .add_extension(x509.SubjectAlternativeName([x509.DNSName(common_name)]), critical=False)
-        .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .sign(authority[1], hashes.SHA256())
+        .not_valid_after(end)
     )
+    for extension in extensions:
+        builder = builder.add_extension(extension, critical=extension is extensions[0])
+    certificate = builder.sign(authority[1] if authority else key, hashes.SHA256())
     home.mkdir(parents=True, exist_ok=True)
     _write_key(home / KEY, key)
-    pem = serialization.Encoding.PEM
-    (home / CERTIFICATE).write_bytes(certificate.public_bytes(pem))
-    (home / CA).write_bytes(authority[0].public_bytes(pem))
+    (home / file).write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+    return certificate, key
 
 
 def _write_key(path: Path, key: EllipticCurvePrivateKey) -> None:

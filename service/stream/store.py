@@ -247,12 +247,6 @@ class ScanStore:
         stored = {row[0] for row in self._db.all(sql)}
         return sorted(stored | self._radio.seqs())
 
-    @property
-    def next_seq(self) -> int:
-        """The number for the next keyframe, also after a restart."""
-        row = self._db.one(f"SELECT MAX(seq) FROM chunks WHERE {is_number('seq')}")
-        return 0 if row is None or row[0] is None else int(row[0]) + 1
-
     # Poses and re-poses
 
     def add_pose(self, pose: PoseRecord) -> int:
@@ -286,13 +280,6 @@ class ScanStore:
                 yield pose
         if not self._inventory.of("pose"):
             yield from self._radio.poses()
-
-    def add_repose(self, repose: Repose) -> int:
-        """Store a re-pose under the next number; returns it."""
-        with self._lock:
-            number = self._next_id("reposes")
-            self.put_repose(number, pack_repose(repose))
-            return number
 
     def add_reposes(self, reposes: Sequence[Repose]) -> None:
         """Store several re-poses in one transaction, under the next numbers."""

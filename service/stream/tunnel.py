@@ -229,11 +229,6 @@ class RadioSender:
         self._worker = (workers or Workers()).start("radio", self._run)
 
     @property
-    def sent_bytes(self) -> int:
-        """Bytes handed to the radio."""
-        return self._tunnel.sent_bytes
-
-    @property
     def all_sent(self) -> bool:
         """Whether everything has been sent at least once; the radio has no acknowledgement."""
         return not self._events and self._tunnel.all_sent

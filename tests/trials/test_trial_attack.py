@@ -64,7 +64,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sound scan folder, closed."""
     house, folder = HouseFlight(), tmp_path_factory.mktemp("flown") / "sound"
     with house.flown(folder) as store:
-        store.add_repose(Repose(1, 1, house.pose(5.1), 1.0, np.eye(6) * 1e-4))
+        store.add_reposes([Repose(1, 1, house.pose(5.1), 1.0, np.eye(6) * 1e-4)])
         store.finish({"keyframes": 5, "points": 1})
     return folder
 

@@ -64,7 +64,7 @@ while not sys.stdin.buffer.read(1):
         ]
         store.add_keyframe(seq, layers)
         if seq % 10 == 9:
-            store.add_repose(Repose(seq - 5, seq, T, 1.0, np.eye(6) * 1e-4))
+            store.add_reposes([Repose(seq - 5, seq, T, 1.0, np.eye(6) * 1e-4)])
         seq += 1
     store.add_pose(PoseRecord(time.time_ns(), np.eye(4), np.eye(6) * 1e-4, keyframe_seq=seq - 1))
     at += 1
