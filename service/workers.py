@@ -74,7 +74,6 @@ ROWS: tuple[Row, ...] = (
     Row("housekeeping", "watches the machine, its memory and its disk", 5),
     Row("first beats", "heartbeats while the rest loads", 6, starts_itself=_BELOW),
     Row("mavlink", "vehicle, heartbeat, reader and writer of each link", 6, starts_itself=_BELOW),
-    Row("rehearsal", "confirms a restart", 6, starts_itself=_BELOW),
     Row("health", "/healthz, /status and /metrics; a thread a request", 7, 32, "refuse"),
     Row("simulated flight", "process: camera and autopilot of sim:", 8, restarts=True),
     # The ground.

@@ -23,9 +23,9 @@ import cv2
 import pytest
 from doc_pages import PAGES, ROOT, lines, words_of
 from loopback import free_port, until
+from rehearsal import RehearsalVehicle
 from typer.testing import CliRunner
 
-from mavlink.component.rehearsal import RehearsalVehicle
 from service.cli import app
 from service.daemon.frame_gate import image_name
 from service.offline.exports.view import ScanView

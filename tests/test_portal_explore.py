@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import HouseFlight
+from person import Browser
 from portal_client import NEEDS, TOKEN, browser, flown_store
 
 from recon.types import F64
-from service.bench.portal import Browser
 from service.ground.portal import Portal, PortalConfig
 
 pytestmark = NEEDS

@@ -167,7 +167,6 @@ OUTSIDE = {
     "service/commands/demo.py": "it starts the other commands, as a person would",
     "mavlink/component/vehicle.py": "mavlink knows nothing of service; rows by name",
     "mavlink/wire/link.py": "the same",
-    "mavlink/component/rehearsal.py": "the same",
     "mavlink/wire/first_beat.py": "the same",
 }
 """Where a thread or process starts without the table, and why."""
