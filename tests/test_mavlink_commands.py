@@ -721,17 +721,17 @@ def test_speed_and_distance_without_gps_are_reported() -> None:
 def test_the_companions_load_is_reported_once_it_is_known(ends: Ends) -> None:
     assert ends.command(512, 191, 390) == [UNSUPPORTED]
     ends.companion.load = ComputerLoad(
-        (50, 100), 30, 71, 900, 4000, 2000, 64_000, 12, 125, throttled=True, disk_full=True
+        (50, 100), 71, 900, 4000, 2000, 64_000, throttled=True, disk_full=True
     )
     assert ends.command(512, 191, 390) == [ACCEPTED]
     reported = [m for m in ends.pass_time(4.0) if m.get_type() == "ONBOARD_COMPUTER_STATUS"]
     assert len(reported) in (2, 3)
     m = reported[-1]
     assert list(m.cpu_cores[:3]) == [50, 100, 255] and m.cpu_combined[0] == 75
-    assert (m.gpu_cores[0], m.temperature_board) == (30, 71)
+    assert (m.gpu_cores[0], m.temperature_board) == (255, 71)
     assert (m.ram_usage, m.ram_total) == (900, 4000)
     assert (m.storage_usage[0], m.storage_total[0]) == (2000, 64_000)
-    assert (m.link_tx_rate[0], m.link_tx_max[0], m.status_flags) == (12, 125, 4 | 8)
+    assert (m.link_tx_rate[0], m.status_flags) == (0xFFFFFFFF, 4 | 8)
     ends.companion.load = ComputerLoad((900,) * 20, temperature_c=5000, ram_used_mib=-5)
     m = [m for m in ends.pass_time(3.0) if m.get_type() == "ONBOARD_COMPUTER_STATUS"][-1]
     assert set(m.cpu_cores) == {100} and m.temperature_board == 126 and m.ram_usage == 0
