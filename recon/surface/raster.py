@@ -90,6 +90,21 @@ class Raster:
         return float(self.known.sum()) * self.grid.cell_m**2
 
 
+ROUND = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+
+
+def round_cell(cell_m: float, up: bool = False) -> float:
+    """The nearest round length at or below ``cell_m`` (m), with ``up`` at or above.
+
+    Grids lie on multiples of their cell, so those of scans with the same cell align.
+    """
+    power = 10.0 ** math.floor(math.log10(cell_m) + 1e-9)
+    ratio = cell_m / power
+    if up:
+        return round(power * next(n for n in ROUND if n >= ratio - 1e-6), 9)
+    return round(power * max(n for n in ROUND if n <= ratio + 1e-6), 9)
+
+
 def grid_over(xy_m: F64, cell_m: float, margin_cells: int = 0) -> Grid:
     """The grid of ``cell_m`` that covers (N, 2) points, its edges on multiples of the cell."""
     xy = np.asarray(xy_m, np.float64)

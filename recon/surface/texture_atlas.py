@@ -151,7 +151,7 @@ def paint(mesh: Mesh, layout: Layout, found: Sightings, label: I32, palette: Pal
     image = np.zeros((h, w, 3), np.uint8)
     done = np.zeros((h, w), np.bool_)
     views = palette.views
-    pixels, start, sides = _flat(views)
+    pixels, start, sides = flat(views)
     empty = np.zeros((0, 3, 3))
     _paint(
         np.ascontiguousarray(mesh.vertices_m, np.float64), mesh.faces, layout.uv_px, label,
@@ -164,7 +164,7 @@ def paint(mesh: Mesh, layout: Layout, found: Sightings, label: I32, palette: Pal
     return _bordered(image, done)
 
 
-def _flat(views: Sequence[TextureView]) -> tuple[U8, I64, I64]:
+def flat(views: Sequence[TextureView]) -> tuple[U8, I64, I64]:
     """All images in one array, where each begins, and their (h, w)."""
     sides = np.array([v.bgra.shape[:2] for v in views], np.int64).reshape(-1, 2)
     start = np.concatenate([[0], np.cumsum(4 * sides[:, 0] * sides[:, 1])]).astype(np.int64)
@@ -189,7 +189,7 @@ def _bordered(image: U8, done: Bool) -> U8:
 
 
 @njit(cache=True, nogil=True)
-def _sample(
+def sample(
     pixels: U8, start: int, h: int, w: int, u: float, v: float, out: F64
 ) -> float:  # pragma: no cover - compiled
     """Bilinear colour into ``out`` (3,), weighted by alpha; the alpha 0 to 1 found there."""
@@ -234,7 +234,7 @@ def _mix(
         cx = T[v, 0, 0] * x + T[v, 0, 1] * y + T[v, 0, 2] * z + T[v, 0, 3]
         cy = T[v, 1, 0] * x + T[v, 1, 1] * y + T[v, 1, 2] * z + T[v, 1, 3]
         px, py = K[v, 0, 0] * cx / cz + K[v, 0, 2], K[v, 1, 1] * cy / cz + K[v, 1, 2]
-        alpha = _sample(pixels, start[v], sides[v, 0], sides[v, 1], px, py, colour)
+        alpha = sample(pixels, start[v], sides[v, 0], sides[v, 1], px, py, colour)
         weight = shares[n] * alpha
         total += weight
         for c in range(3):

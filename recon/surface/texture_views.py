@@ -96,7 +96,7 @@ def look(
         places = np.concatenate([px[mesh.faces[faces]], middle_px[:, None]], axis=1)
         colour, seen = _mean_colour(view.bgra, places)
         good = seen & np.isfinite(resolution)
-        _insert(
+        insert(
             out.view, out.px_per_m, out.bgr, faces[good], number,
             resolution[good].astype(np.float32), colour[good],
         )  # fmt: skip
@@ -204,7 +204,7 @@ def _mean_colour(bgra: U8, px: F64) -> tuple[F32, Bool]:
 
 
 @njit(cache=True, nogil=True)
-def _insert(
+def insert(
     view: I32, px: F32, bgr: F32, faces: I64, number: int, resolution: F32, colour: F32
 ) -> None:
     """Put one view's sightings into the rows, which stay sorted from fine to coarse."""

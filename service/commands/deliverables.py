@@ -32,6 +32,16 @@ def export(
     strict: Annotated[
         bool, typer.Option("--strict", help="leave the holes of the surface model unknown")
     ] = False,
+    video: Annotated[
+        Path | None,
+        typer.Option(help="of the flight, for ortho and glb; default: as scan.json names"),
+    ] = None,
+    stored: Annotated[
+        bool, typer.Option("--stored", help="ortho and glb from the scan's own small images")
+    ] = False,
+    video_epoch: Annotated[
+        float | None, typer.Option(help="unix seconds of its start; default: the scan's start")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
 ) -> None:
     """Write deliverables of a scan: clouds, surface model, orthophoto, tiles, mesh, flight."""
@@ -44,7 +54,9 @@ def export(
     if out is not None and len(to) > 1:
         raise InputError("--out names one file; give one --to with it")
     try:
-        options = ExportOptions(voxel_m, cell_m, contour_m, strict)
+        options = ExportOptions(
+            voxel_m, cell_m, contour_m, strict, video, stored, _epoch_ns(video_epoch)
+        )
     except ValueError as error:
         raise InputError(f"export: {error}") from error
     written = {}
@@ -55,6 +67,10 @@ def export(
                 print(written[kind])
     if as_json:
         print(json.dumps({"scan": str(scan_dir), "written": written}))
+
+
+def _epoch_ns(seconds: float | None) -> int | None:
+    return None if seconds is None else round(seconds * 1e9)
 
 
 def mesh(
@@ -96,10 +112,11 @@ def mesh(
         )
     except ValueError as error:
         raise InputError(f"mesh: {error}") from error
-    epoch_ns = None if video_epoch is None else round(video_epoch * 1e9)
     if stored and video is not None:
         raise InputError("mesh: give either --video or --stored")
-    how = MeshOptions(method, faces, tile_points, scheduler, video, not stored, epoch_ns)
+    how = MeshOptions(
+        method, faces, tile_points, scheduler, video, not stored, _epoch_ns(video_epoch)
+    )
     path = out or scan_dir / "mesh.glb"
     started = time.monotonic()
     with ScanView(scan_dir, voxel_m) as scan:

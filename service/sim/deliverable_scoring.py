@@ -139,6 +139,7 @@ def _ortho(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
         off = (fit.points(here) - there)[:, :2]
         length = np.hypot(*off.T)
         out[name] = {
+            "rms_m": float(np.sqrt(np.mean(length**2))),
             "median_m": float(np.median(length)),
             "p95_m": float(np.percentile(length, 95)),
             "within_50cm": float(np.mean(length < 0.5)),

@@ -16,6 +16,7 @@ from recon.types import U8, Camera, Keyframe
 from service.cameras import open_camera
 from service.cameras.source import CameraSource
 from service.errors import InputError, SkyreliefError
+from service.offline.exports.view import ExportOptions
 from service.scans.folder import SUMMARY
 from service.stream.records import ScanHeader
 
@@ -70,6 +71,29 @@ def recording_of(folder: Path, header: ScanHeader) -> Recording:
     if size_px != camera.size_px:
         return Recording(None, f"{stored}: {found} is another recording; give the flight's --video")
     return Recording(found, f"textures from {found}, which the scan was made from")
+
+
+def scan_images(
+    keyframes: Sequence[Keyframe],
+    folder: Path,
+    header: ScanHeader,
+    options: ExportOptions,
+) -> list[TextureView]:
+    """A view per keyframe: of the recording that the options name or the scan knows, else stored.
+
+    Raises InputError or OutsideError when the named recording cannot be used.
+    """
+    if options.video is not None:
+        return video_images(keyframes, header, options.video, options.video_epoch_ns)
+    recording = Recording(None, "") if options.stored else recording_of(folder, header)
+    options.progress(recording.words)
+    if recording.path is None:
+        return stored_images(keyframes)
+    try:
+        return video_images(keyframes, header, recording.path, options.video_epoch_ns)
+    except SkyreliefError as error:
+        options.progress(f"the scan's own images after all: {error}")
+        return stored_images(keyframes)
 
 
 def check_video(header: ScanHeader, video: Path) -> None:

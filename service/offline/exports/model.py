@@ -40,7 +40,10 @@ class MeshOptions:
 
 def write_glb(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """The mesh that ``skyrelief mesh`` makes by default."""
-    write_mesh(scan, out, MeshOptions(), options)
+    how = MeshOptions(
+        video=options.video, recording=not options.stored, video_epoch_ns=options.video_epoch_ns
+    )
+    write_mesh(scan, out, how, options)
 
 
 def write_mesh(

@@ -4,23 +4,30 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from recon.surface.raster import Grid, Raster, fill_holes
+from recon.mapping.voxel_map import ground_sample_m
+from recon.surface.orthophoto import Terrain, orthophoto
+from recon.surface.raster import Grid, Raster, fill_holes, round_cell
+from recon.surface.texture_views import TextureView
 from recon.types import F64, Array
 from service.errors import InputError
 from service.georeference import LocalFrame
+from service.offline.exports.images import scan_images
 from service.offline.exports.surface import surface_model
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.coverage import coverage_of
+from service.scans.main_piece import main_keyframes
 from service.scans.writing import writing
 
 NODATA_M = -9999.0
+ORTHO_HOLE_CELLS = 8
 SHORTEST_CONTOUR_CELLS = 12
 MAX_CONTOURS = 5000
 """Heights at which contours are drawn: every metre up to the highest mountains."""
@@ -37,11 +44,53 @@ def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
 
 def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """Red, green, blue and opacity, one byte each; seen from straight above everywhere."""
-    raster = fill_holes(scan.raster(options.cell_m))
-    opacity = np.where(raster.known, 255, 0).astype(np.uint8)
-    bands = np.concatenate([raster.rgb.transpose(2, 0, 1), opacity[None]])
-    write_cog(scan, out, raster.grid, bands, ("red", "green", "blue", "opacity"))
+    """Red, green, blue and opacity, one byte each; seen from straight above everywhere.
+
+    Cells are as large as pixels of the recording on the ground, rounded down to a round length;
+    as those of the stored images where there is no recording.
+    """
+    keyframes = [k for k in main_keyframes(scan.store) if np.isfinite(k.depth.depth_m).any()]
+    views = scan_images(keyframes, scan.folder, scan.store.header, options)
+    terrain = _terrain(scan, views)
+    sample_m = [
+        (ground_sample_m(k.depth) or np.nan) * k.depth.K[0, 0] / v.K[0, 0]
+        for k, v in zip(keyframes, views, strict=True)
+    ]
+    cell_m = options.cell_m or round_cell(float(np.nanmedian(sample_m)))
+    grid = _over(terrain.raster.grid, cell_m)
+    options.progress("orthophoto of {1} x {0} cells of {2:g} m".format(*grid.shape, cell_m))
+    rgb, known = orthophoto(terrain, views, grid)
+    opacity = np.where(known, 255, 0).astype(np.uint8)
+    bands = np.concatenate([rgb.transpose(2, 0, 1), opacity[None]])
+    write_cog(scan, out, grid, bands, ("red", "green", "blue", "opacity"))
+
+
+def _terrain(scan: ScanView, views: Sequence[TextureView]) -> Terrain:
+    """The surface model with all its holes closed, as an orthophoto needs it."""
+    measured = scan.raster(None)
+    certain = surface_model(scan, None).raster
+    height = np.where(certain.known, certain.height_m, measured.height_m)
+    raster = fill_holes(replace(measured, height_m=height.astype(np.float32)), ORTHO_HOLE_CELLS)
+    grid, (rows, cols) = raster.grid, np.indices(raster.grid.shape)
+    x = grid.west_m + (cols + 0.5) * grid.cell_m
+    y = grid.north_m - (rows + 0.5) * grid.cell_m
+    z = np.where(raster.known, raster.height_m, np.nanmedian(raster.height_m))
+    places = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    eyes = np.array([v.T_world_camera[:3, 3] for v in views])
+    if scan.frame is not None:
+        places, eyes = scan.frame.from_utm(places), scan.frame.to_utm(eyes)
+    return Terrain(raster, places.reshape(*grid.shape, 3), eyes)
+
+
+def _over(grid: Grid, cell_m: float) -> Grid:
+    """The grid of ``cell_m`` over the same ground, its edges on multiples of the cell."""
+    west, south, east, north = grid.bounds
+    low = math.floor(west / cell_m + 1e-6), math.floor(south / cell_m + 1e-6)
+    high = math.ceil(east / cell_m - 1e-6), math.ceil(north / cell_m - 1e-6)
+    try:
+        return Grid(low[0] * cell_m, high[1] * cell_m, cell_m, (high[1] - low[1], high[0] - low[0]))
+    except ValueError as error:
+        raise InputError(f"orthophoto: {error} with --cell-m") from error
 
 
 def write_cog(

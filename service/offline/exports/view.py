@@ -11,7 +11,7 @@ from types import TracebackType
 
 import numpy as np
 
-from recon.surface.raster import Grid, Raster, grid_over, rasterise_points
+from recon.surface.raster import Grid, Raster, grid_over, rasterise_points, round_cell
 from recon.types import F64
 from service.errors import InputError
 from service.georeference import LocalFrame
@@ -35,6 +35,9 @@ class ExportOptions:
     cell_m: float | None = None
     contour_m: float = 1.0
     strict: bool = False  # unknown cells of the surface model are not filled
+    video: Path | None = None  # None: the scan's recording, when it is still there
+    stored: bool = False  # never look for the recording
+    video_epoch_ns: int | None = None
     progress: Callable[[str], None] = field(default=lambda _: None)
 
     def __post_init__(self) -> None:
@@ -105,8 +108,8 @@ class ScanView:
         return placed(self.fused.cloud, self.frame)
 
     def grid(self, cell_m: float | None) -> Grid:
-        """A grid over ``xyz_m``, by default of cells as large as the voxels."""
-        cell = cell_m or self.fused.voxel_m
+        """A grid over ``xyz_m``, by default of round cells as large as the voxels at least."""
+        cell = cell_m or round_cell(self.fused.voxel_m, up=True)
         try:
             return grid_over(self.xyz_m[:, :2], cell, margin_cells=1)
         except ValueError as error:

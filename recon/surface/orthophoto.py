@@ -1,0 +1,249 @@
+"""True orthophoto: each place of a surface model from the view that looks at it most steeply.
+
+Views that a higher part of the surface hides are left out, and so are those whose colour differs
+from most others (:func:`recon.surface.texture_views.consistent`). The views' exposures are
+levelled, and neighbouring views blend across one cell of the surface model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from recon.image_quality import sharpness
+from recon.surface.raster import Grid, Raster
+from recon.surface.texture_atlas import flat, sample
+from recon.surface.texture_views import CANDIDATES, Sightings, TextureView, consistent, insert
+from recon.surface.texturing import levels
+from recon.types import F32, F64, U8, Bool
+
+I32 = npt.NDArray[np.int32]
+I64 = npt.NDArray[np.int64]
+
+CLEAR_M = 0.3
+"""A surface this much above the line to a camera hides a place."""
+
+STEP_M = 0.5
+"""Cells whose heights differ by more from the nearest one's are not interpolated."""
+
+EDGE_PX = 1.0
+SHARP_REACH = 3
+"""Views before and after whose sharpness a view's is compared with."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Terrain:
+    """A surface model with its cells' places in the frame of the views."""
+
+    raster: Raster
+    places_m: F64  # (rows, cols, 3) world; NaN heights are unknown
+    eyes_m: F64  # (V, 3) the views' centres in the raster's own coordinates
+
+
+def orthophoto(terrain: Terrain, views: Sequence[TextureView], grid: Grid) -> tuple[U8, Bool]:
+    """(rows, cols, 3) RGB on ``grid``, and the cells with a height.
+
+    Cells that no view shows take the colour of the surface model.
+    """
+    found = consistent(_sightings(terrain, views))
+    label = found.view[:, 0].reshape(terrain.raster.grid.shape)
+    pixels, start, sides = flat(views)
+    rgb = np.zeros((*grid.shape, 3), np.uint8)
+    known = np.zeros(grid.shape, np.bool_)
+    old = terrain.raster.grid
+    to_cell = (
+        (grid.west_m - old.west_m + 0.5 * grid.cell_m) / old.cell_m - 0.5,
+        (old.north_m - grid.north_m + 0.5 * grid.cell_m) / old.cell_m - 0.5,
+        grid.cell_m / old.cell_m,
+    )
+    _paint(
+        np.ascontiguousarray(terrain.places_m), terrain.raster.height_m, terrain.raster.rgb,
+        np.ascontiguousarray(label), *_cameras(views), levels(found, len(views)), pixels, start,
+        sides, to_cell, rgb, known,
+    )  # fmt: skip
+    return rgb, known
+
+
+def _cameras(views: Sequence[TextureView]) -> tuple[F64, F64]:
+    """(V, 3, 3) intrinsics and (V, 3, 4) world to camera."""
+    K = np.array([v.K for v in views], np.float64).reshape(-1, 3, 3)
+    T = np.array([np.linalg.inv(v.T_world_camera)[:3] for v in views]).reshape(-1, 3, 4)
+    return K, T
+
+
+def _sightings(terrain: Terrain, views: Sequence[TextureView]) -> Sightings:
+    """The views of each cell, the best first: pixels per metre times the cosine to the vertical,
+    less where an image is blurred."""
+    height = terrain.raster.height_m
+    count = height.size
+    out = Sightings(
+        np.full((count, CANDIDATES), -1, np.int32),
+        np.zeros((count, CANDIDATES), np.float32),
+        np.zeros((count, CANDIDATES, 3), np.float32),
+    )
+    highest = float(np.nanmax(height, initial=-np.inf))
+    sharp = _sharpness(views)
+    K, T = _cameras(views)
+    for number, view in enumerate(views):
+        score, bgr = np.zeros(count, np.float32), np.zeros((count, 3), np.float32)
+        eye = terrain.raster.grid.pixels(terrain.eyes_m[number : number + 1, :2])[0]
+        at = (float(eye[0]), float(eye[1]), float(terrain.eyes_m[number, 2]))
+        centre = np.ascontiguousarray(view.T_world_camera[:3, 3])
+        _look(
+            np.ascontiguousarray(terrain.places_m), height, highest, at, centre, K[number],
+            T[number], view.bgra, score, bgr,
+        )  # fmt: skip
+        cells = np.flatnonzero(score > 0.0)
+        insert(
+            out.view, out.px_per_m, out.bgr, cells, number,
+            score[cells] * np.float32(sharp[number]), bgr[cells],
+        )  # fmt: skip
+    return out
+
+
+def _sharpness(views: Sequence[TextureView]) -> F64:
+    """(V,) at most 1: each view's sharpness over the median of those before and after."""
+    own = np.array(
+        [sharpness(np.asarray(cv2.cvtColor(v.bgra, cv2.COLOR_BGRA2GRAY), np.uint8)) for v in views]
+    )
+    around = [
+        np.nanmedian(own[max(0, n - SHARP_REACH) : n + SHARP_REACH + 1])
+        if np.isfinite(own[n]) else np.nan for n in range(len(own))
+    ]  # fmt: skip
+    return np.asarray(np.nan_to_num(np.minimum(own / np.array(around), 1.0), nan=1.0))
+
+
+@njit(cache=True, nogil=True)
+def _look(
+    places: F64, height: F32, highest: float, eye: tuple[float, float, float], centre: F64, K: F64,
+    T: F64, bgra: U8, score: F32, bgr: F32,
+) -> None:  # fmt: skip
+    """Score and colour of each cell in one view; the score stays 0 where it is not seen."""
+    rows, cols = height.shape
+    colour = np.empty(3)
+    flat_pixels = bgra.reshape(-1)
+    h, w = bgra.shape[0], bgra.shape[1]
+    for r in range(rows):
+        for c in range(cols):
+            if np.isnan(height[r, c]):
+                continue
+            u, v, z = _project(K, T, places[r, c, 0], places[r, c, 1], places[r, c, 2])
+            if not (EDGE_PX <= u <= w - 1 - EDGE_PX and EDGE_PX <= v <= h - 1 - EDGE_PX):
+                continue
+            if sample(flat_pixels, 0, h, w, u, v, colour) < 0.99:
+                continue
+            if _is_hidden(height, highest, r, c, eye):
+                continue
+            n = r * cols + c
+            ray = centre - places[r, c]
+            score[n] = K[0, 0] / z * abs(ray[2]) / np.sqrt(np.sum(ray * ray))
+            for k in range(3):
+                bgr[n, k] = colour[k]
+
+
+@njit(cache=True, nogil=True)
+def _project(K: F64, T: F64, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Pixel and depth of a place; the pixel is NaN behind the camera."""
+    depth = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+    if depth <= 1e-6:
+        return np.nan, np.nan, depth
+    u = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+    v = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+    return K[0, 0] * u / depth + K[0, 2], K[1, 1] * v / depth + K[1, 2], depth
+
+
+@njit(cache=True, nogil=True)
+def _is_hidden(
+    height: F32, highest: float, r: int, c: int, eye: tuple[float, float, float]
+) -> bool:
+    """Whether a surface stands between a cell and the eye (column, row, height)."""
+    dc, dr = eye[0] - c, eye[1] - r
+    steps = int(max(abs(dc), abs(dr)))
+    for s in range(1, steps + 1):
+        share = s / max(abs(dc), abs(dr))
+        z = height[r, c] + share * (eye[2] - height[r, c])
+        row, col = round(r + share * dr), round(c + share * dc)
+        if z > highest or not (0 <= row < height.shape[0] and 0 <= col < height.shape[1]):
+            return False
+        if height[row, col] > z + CLEAR_M:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _paint(
+    places: F64, height: F32, fallback: U8, label: I32, K: F64, T: F64, levels: F32, pixels: U8,
+    start: I64, sides: I64, to_cell: tuple[float, float, float], rgb: U8, known: Bool,
+) -> None:  # fmt: skip
+    """Fill ``rgb`` and ``known``, whose cells are those of the model by offset and scale."""
+    rows, cols = height.shape
+    share, place, colour, mixed = np.empty(4), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(rgb.shape[0]):
+        y = min(max(to_cell[1] + i * to_cell[2], 0.0), rows - 1.0)
+        r = min(int(y), rows - 2)
+        for j in range(rgb.shape[1]):
+            x = min(max(to_cell[0] + j * to_cell[2], 0.0), cols - 1.0)
+            c = min(int(x), cols - 2)
+            near_r, near_c = r + round(y - r), c + round(x - c)
+            if np.isnan(height[near_r, near_c]):
+                continue
+            known[i, j] = True
+            a, b = y - r, x - c
+            share[0], share[1] = (1.0 - a) * (1.0 - b), (1.0 - a) * b
+            share[2], share[3] = a * (1.0 - b), a * b
+            _place(places, height, r, c, share, height[near_r, near_c], place)
+            total = _mix(
+                place, label, r, c, share, K, T, levels, pixels, start, sides, colour, mixed
+            )
+            for k in range(3):
+                value = float(fallback[near_r, near_c, k])
+                if total > 1e-3:
+                    value = mixed[2 - k] / total
+                rgb[i, j, k] = np.uint8(min(max(value + 0.5, 0.0), 255.0))
+
+
+@njit(cache=True, nogil=True)
+def _place(places: F64, height: F32, r: int, c: int, share: F64, near_m: float, out: F64) -> None:
+    """World place between four cells; their heights count where they are of one surface."""
+    out[:] = 0.0
+    total = 0.0
+    for n in range(4):
+        row, col = r + n // 2, c + n % 2
+        out[0] += share[n] * places[row, col, 0]
+        out[1] += share[n] * places[row, col, 1]
+        if abs(height[row, col] - near_m) <= STEP_M:
+            total += share[n]
+            out[2] += share[n] * places[row, col, 2]
+    out[2] /= total
+
+
+@njit(cache=True, nogil=True)
+def _mix(
+    place: F64, label: I32, r: int, c: int, share: F64, K: F64, T: F64, levels: F32, pixels: U8,
+    start: I64, sides: I64, colour: F64, mixed: F64,
+) -> float:  # fmt: skip
+    """Mean colour (times its weight) of a place in the views of four cells; the weight."""
+    mixed[:] = 0.0
+    total = 0.0
+    for n in range(4):
+        view = label[r + n // 2, c + n % 2]
+        weight = share[n]
+        is_repeated = False
+        for m in range(4):
+            if m != n and label[r + m // 2, c + m % 2] == view:
+                is_repeated |= m < n
+                weight += share[m]
+        if view < 0 or is_repeated or weight < 1e-3:
+            continue
+        u, v, _ = _project(K[view], T[view], place[0], place[1], place[2])
+        alpha = sample(pixels, start[view], sides[view, 0], sides[view, 1], u, v, colour)
+        weight *= alpha
+        total += weight
+        for k in range(3):
+            mixed[k] += weight * (levels[view, k, 0] * colour[k] + levels[view, k, 1])
+    return total

@@ -1,0 +1,126 @@
+"""The orthophoto of a block on level ground, drawn by exact ray casting, against its true map."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon.surface.orthophoto import Terrain, orthophoto
+from recon.surface.raster import Grid, Raster, round_cell
+from recon.surface.texture_views import TextureView
+from recon.types import F64, U8, Bool
+
+CELL_M = 0.5
+SIDE = 48
+TOP_M = 6.0
+BLOCK = (9.0, 9.0, 15.0, 15.0)  # west, south, east, north
+FINE_M = 0.1
+
+
+def on_block(x: F64, y: F64) -> Bool:
+    west, south, east, north = BLOCK
+    return np.asarray((x > west) & (x < east) & (y > south) & (y < north))
+
+
+def colour(x: F64, y: F64, is_top: Bool) -> F64:
+    """(N, 3) BGR: waves of 3 m on the ground, red on the block."""
+    waves = 110.0 + 40.0 * np.sin(2.1 * x) * np.cos(2.1 * y)
+    ground = np.stack([waves, waves + 20.0, waves - 20.0], axis=-1)
+    return np.where(is_top[..., None], np.array([30.0, 30.0, 200.0]), ground)
+
+
+def view(x: float, y: float, gain: float = 1.0) -> TextureView:
+    """An image straight down from 30 m, by the exact intersection of every ray."""
+    w, h, focal = 400, 300, 320.0
+    K = np.array([[focal, 0.0, (w - 1) / 2], [0.0, focal, (h - 1) / 2], [0.0, 0.0, 1.0]])
+    T = np.eye(4)
+    T[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    T[:3, 3] = x, y, 30.0
+    v, u = np.indices((h, w)).astype(float)
+    east, north = (u - K[0, 2]) / focal, -(v - K[1, 2]) / focal
+    top_x, top_y = x + east * (30.0 - TOP_M), y + north * (30.0 - TOP_M)
+    is_top = on_block(top_x, top_y)
+    wall = np.zeros_like(is_top)
+    for share in np.linspace(0.0, 1.0, 60):
+        reach = 30.0 - TOP_M * share
+        wall |= on_block(x + east * reach, y + north * reach)
+    ground = colour(x + east * 30.0, y + north * 30.0, np.zeros_like(is_top))
+    bgr = np.where(wall[..., None], 10.0, ground)
+    bgr = np.where(is_top[..., None], np.array([30.0, 30.0, 200.0]), bgr) * gain
+    alpha = np.full((h, w, 1), 255.0)
+    return TextureView(np.dstack([bgr, alpha]).clip(0, 255).astype(np.uint8), K, T)
+
+
+def terrain(views: list[TextureView]) -> Terrain:
+    grid = Grid(0.0, SIDE * CELL_M, CELL_M, (SIDE, SIDE))
+    rows, cols = np.indices(grid.shape)
+    x, y = (cols + 0.5) * CELL_M, grid.north_m - (rows + 0.5) * CELL_M
+    height = np.where(on_block(x, y), TOP_M, 0.0).astype(np.float32)
+    height[:2] = np.nan
+    sigma = np.full(grid.shape, 0.1, np.float32)
+    raster = Raster(grid, height, sigma, np.full((*grid.shape, 3), 77, np.uint8))
+    places = np.stack([x, y, np.nan_to_num(height).astype(float)], axis=-1)
+    return Terrain(raster, places, np.array([v.T_world_camera[:3, 3] for v in views]))
+
+
+FINE = Grid(0.0, SIDE * CELL_M, FINE_M, (240, 240))
+
+
+def true_map() -> U8:
+    rows, cols = np.indices(FINE.shape)
+    x, y = (cols + 0.5) * FINE_M, FINE.north_m - (rows + 0.5) * FINE_M
+    return colour(x, y, on_block(x, y))[..., ::-1].clip(0, 255).astype(np.uint8)
+
+
+def away_from_walls(metres: float) -> Bool:
+    rows, cols = np.indices(FINE.shape)
+    x, y = (cols + 0.5) * FINE_M, FINE.north_m - (rows + 0.5) * FINE_M
+    west, south, east, north = BLOCK
+    to_wall = np.maximum(np.abs(x - (west + east) / 2), np.abs(y - (south + north) / 2)) - 3.0
+    return np.asarray(np.abs(to_wall) > metres)
+
+
+def test_every_place_shows_what_stands_there_and_no_wall() -> None:
+    views = [view(x, y) for x in (5.0, 12.0, 19.0) for y in (5.0, 12.0, 19.0)]
+    rgb, known = orthophoto(terrain(views), views, FINE)
+    assert not known[:10].any() and known[11:].all()
+    off = np.abs(rgb.astype(int) - true_map().astype(int)).max(axis=2)
+    checked = known & away_from_walls(0.6)
+    assert (off[checked] < 16).mean() > 0.995
+    # A roof that leans away from the middle of an image would cover ground beside the block.
+    red = (rgb[..., 0] > 150) & (rgb[..., 1] < 60) & away_from_walls(0.6)
+    assert red.sum() == pytest.approx(
+        away_from_walls(0.6)[(true_map()[..., 1] == 30)].sum(), rel=0.02
+    )
+
+
+def test_ground_that_no_view_sees_takes_the_colour_of_the_model() -> None:
+    views = [view(-2.0, 12.0)]
+    rgb, known = orthophoto(terrain(views), views, FINE)
+    hidden = np.s_[110:130, 152:156]  # 15.2 to 15.6 m east, right behind the block
+    assert known[hidden].all() and (np.abs(rgb[hidden].astype(int) - 77) < 12).mean() > 0.9
+
+
+def test_exposures_are_levelled() -> None:
+    plain = [view(x, 12.0) for x in (6.0, 12.0, 18.0)]
+    uneven = [view(x, 12.0, gain) for x, gain in ((6.0, 0.8), (12.0, 1.0), (18.0, 1.2))]
+    ground = away_from_walls(2.0)
+    ground[:12] = False
+    ground &= true_map()[..., 1] != 30
+    want, _ = orthophoto(terrain(plain), plain, FINE)
+    found, _ = orthophoto(terrain(uneven), uneven, FINE)
+    ratio = found[ground].astype(float).mean(axis=1) / want[ground].astype(float).mean(axis=1)
+    columns = np.broadcast_to(np.arange(240), (240, 240))[ground]
+    west, east = ratio[columns < 80].mean(), ratio[columns > 160].mean()
+    assert abs(west / east - 1.0) < 0.1  # 0.67 without
+
+
+@pytest.mark.parametrize(
+    ("cell", "down", "up"),
+    [(0.0627, 0.06, 0.08), (0.05, 0.05, 0.05), (0.225, 0.2, 0.25), (0.99, 0.8, 1.0),
+     (1.0, 1.0, 1.0), (13.0, 12.0, 15.0)],
+)  # fmt: skip
+def test_cells_are_round(cell: float, down: float, up: float) -> None:
+    assert round_cell(cell) == pytest.approx(down) and round_cell(cell, up=True) == pytest.approx(
+        up
+    )
