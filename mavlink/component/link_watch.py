@@ -68,7 +68,7 @@ class Trouble:
 
 @dataclass(frozen=True)
 class WatchConfig:
-    """What is expected on the links, and how long to wait for it."""
+    """The messages expected on the links, and how long to wait for them."""
 
     gimbal: bool | None = None  # True: its angles are required; None: optional
     wait_s: float = 10.0
@@ -106,7 +106,7 @@ class LinkWatch:
             self._asked_ns = now_ns if is_ours else self._asked_ns
 
     def troubles(self, now_ns: int) -> tuple[Trouble, ...]:
-        """What is missing now, the most severe first."""
+        """Whatever is missing now, the most severe first."""
         found = (self._autopilot(now_ns) or self._telemetry(now_ns), self._ground(now_ns))
         return tuple(trouble for trouble in found if trouble is not None)
 
@@ -130,7 +130,7 @@ class LinkWatch:
         return Trouble("autopilot", text)
 
     def _telemetry(self, now_ns: int) -> Trouble | None:
-        """What the autopilot does not send."""
+        """Messages that the autopilot does not send."""
         first_ns, wait_s = self._first_autopilot_ns, self._config.wait_s
         if first_ns is None or not self._is_stale(first_ns, wait_s, now_ns):
             return None

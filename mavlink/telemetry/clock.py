@@ -170,7 +170,7 @@ class BootClock:
 
     @property
     def reboots(self) -> int:
-        """How many times the sender has rebooted."""
+        """Number of reboots of the sender."""
         return self._counter.session
 
     def time_of(self, boot_ms: float, received_ns: int) -> int:

@@ -36,7 +36,7 @@ YAW_FRAMES = ("auto", "vehicle", "earth", "body", "servo")
 
 @dataclass(frozen=True, slots=True)
 class GimbalConfig:
-    """How gimbal messages are read."""
+    """Options for reading gimbal messages."""
 
     yaw_frame: str = "auto"  # auto: as the flags declare, unless telemetry refutes them
 

@@ -40,7 +40,7 @@ PATIENCE_S = 0.3  # live: a little more than the 3.5 Hz of a slow telemetry radi
 
 @dataclass(frozen=True, slots=True)
 class HistoryConfig:
-    """How long samples are kept and how far they are trusted (1 sigma)."""
+    """How long samples are kept, and their sigmas."""
 
     keep_s: float = math.inf
     gimbal: GimbalConfig = field(default_factory=GimbalConfig)

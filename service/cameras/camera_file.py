@@ -74,7 +74,7 @@ def shutter_of(readout_ms: object, direction: object) -> Shutter:
 
 
 def shutter_document(shutter: Shutter) -> dict[str, Any]:
-    """What :func:`shutter_of` reads; empty for a global shutter."""
+    """Keys that :func:`shutter_of` reads; empty for a global shutter."""
     if not shutter.readout_s:
         return {}
     return {"readout_ms": 1e3 * shutter.readout_s, "readout_direction": shutter.direction}

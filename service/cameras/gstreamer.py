@@ -32,7 +32,7 @@ buffers into the stream (GStreamer 1.22), which then cannot be read."""
 
 
 def open_gst(rest: str, options: Mapping[str, str]) -> CameraSource:
-    """What the GStreamer pipeline ``rest`` puts out.
+    """Output of the GStreamer pipeline ``rest``.
 
     The pipeline ends in raw video in system memory. Time stamps are those of arrival.
     """
@@ -49,7 +49,7 @@ def open_gst(rest: str, options: Mapping[str, str]) -> CameraSource:
 
 
 class _Complaints:
-    """What a command says on standard error: to the log, the first complaint kept."""
+    """Standard error of a command: logged, the first complaint kept."""
 
     def __init__(self, pipe: IO[bytes]) -> None:
         self.first = ""

@@ -355,7 +355,7 @@ def other_than_profile(config: Config, path: Path) -> list[str]:
 def examine_links(
     config: Config, listen_s: float, running: dict[str, Any] | None
 ) -> Iterator[Finding]:
-    """What each link receives and lacks, by listening or from the running service."""
+    """Messages that each link receives and lacks, by listening or from the running service."""
     if not config.mavlink.links:
         yield Finding("mavlink", NOTE, "mavlink.links is empty: no telemetry, no commands")
     elif running is not None:

@@ -101,7 +101,7 @@ class Intent:
 
 
 class Left(Enum):
-    """What the last run of the service left unfinished."""
+    """Work that the last run of the service left unfinished."""
 
     NOTHING = "nothing"
     BY_SERVICE = "the service ended while scanning"

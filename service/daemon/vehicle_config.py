@@ -50,7 +50,7 @@ def watch_config(
     wait_s: float = WatchConfig.wait_s,
     ground_wait_s: float = WatchConfig.ground_wait_s,
 ) -> WatchConfig:
-    """What the links must carry for this camera, and how long to wait for it."""
+    """Messages that the links must carry for this camera, and how long to wait for them."""
     gimbal = {"auto": None, "gimbal": True, "fixed": False}[config.camera.mount]
     return WatchConfig(gimbal, wait_s, ground_wait_s)
 

@@ -54,7 +54,7 @@ UNREADABLE_REST_S, MAX_UNREADABLE = 60.0, 64
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What one drone may take of the ground station."""
+    """Limits of one drone at the ground station."""
 
     scan_bytes: int | None = None  # of one scan's chunks; beyond it only coarse layers
     drone_share: float = 0.5  # of the disk

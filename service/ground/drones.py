@@ -162,5 +162,5 @@ class Drones:
 
 
 def _brought(drone: DroneReceiver) -> int:
-    """How much came of a drone."""
+    """Amount received from a drone."""
     return sum(entry["received_bytes"] + entry["radio_messages"] for entry in drone.entries)

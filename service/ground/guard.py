@@ -1,4 +1,4 @@
-"""Who may use the portal, how much of it one request may hold, and the audit log of changes.
+"""Access to the portal, limits of one request, and the audit log of changes.
 
 This machine may read, holders of a token may do the rest. Every change, and every refused one,
 leaves a line in the audit log.
@@ -48,7 +48,7 @@ class Tokens:
         self._by_name = {name: token.encode() for name, token in by_name.items()}
 
     def name_of(self, token: str) -> str | None:
-        """Who holds ``token``; None for a wrong one."""
+        """Name of the holder of ``token``; None for a wrong one."""
         given = token.encode(errors="replace")
         found = [n for n, known in self._by_name.items() if hmac.compare_digest(given, known)]
         return found[0] if found else None
@@ -135,7 +135,7 @@ AUDIT_FILE = "audit.jsonl"
 MAX_AUDIT_BYTES = 8_000_000
 MAX_TEXT = 200
 NOTED = "skyrelief.change"
-"""Where a request's scope holds what its endpoint has noted."""
+"""Key of a request's scope for the notes of its endpoint."""
 
 
 class AuditLog:
@@ -286,7 +286,7 @@ async def _gone(receive: Receive) -> None:
 
 COOKIE = "skyrelief"
 WHO = "skyrelief.who"
-"""Where a request's scope holds who sent it; None without a token."""
+"""Key of a request's scope for its sender; None without a token."""
 
 CHANGING = {"POST", "PATCH", "DELETE", "PUT"}
 HEADERS = (

@@ -45,7 +45,7 @@ PAGE = Path(__file__).parent / "web" / "dist"
 MAX_LIVE_VIEWS = 16
 MAX_VIEWS_WITHOUT_TOKEN = 8
 ORDERS_HZ, ORDERS_AT_ONCE = 1.0, 10
-"""How fast orders go to the vehicle; a stop always does."""
+"""Rate limit of orders to the vehicle; a stop always passes."""
 
 NO_PAGE = (
     "<!doctype html><meta charset=utf-8><title>skyrelief</title><h1>skyrelief</h1>"
@@ -281,7 +281,7 @@ async def _import(request: Request) -> Response:
 
 
 def _status(request: Request) -> Response:
-    """What is being received."""
+    """Scans that are being received."""
     state = state_of(request)
     return JSONResponse(
         {
@@ -359,4 +359,4 @@ BODIES: dict[Callable[..., Any], type[msgspec.Struct]] = {
     _import: ImportOrder,
     _order: VehicleOrder,
 }
-"""What is sent to the endpoints that take a body."""
+"""Bodies of the requests that take one."""

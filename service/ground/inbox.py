@@ -1,4 +1,4 @@
-"""What comes from the drones and waits: bounded, so that none takes another's memory."""
+"""Queues of messages from the drones, bounded so that none takes another's memory."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ MAX_HEADS = 256
 """Scans of one drone whose newest head may wait."""
 MAX_EVENTS = 2048
 ITEM_BYTES = 200
-"""What keeping a message takes beyond its payload."""
+"""Bytes that a kept message takes beyond its payload."""
 
 Event = Callable[[float], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Batch:
-    """What came since the last look, in order."""
+    """Messages since the last call, in order."""
 
     heads: dict[str, bytes] = field(default_factory=dict)  # scan to its newest head
     items: list[tuple[str, bytes]] = field(default_factory=list)  # scan and message of parts
@@ -144,7 +144,7 @@ class Replies:
 
 
 def _take(pending: _Pending) -> tuple[int, bool]:
-    """How many replies there were, and whether that is all."""
+    """Number of replies, and whether that is all."""
     import zenoh
 
     for count in range(MAX_AT_ONCE):

@@ -84,12 +84,12 @@ STALL_S = 4.0
 SILENCE_S = 4.0
 """A drone silent for so long was away, or the link was; it knows no requests."""
 TIMED, MAX_TIMED = 64, 4096
-"""How many new layers of one kind in a head are timed, the newest, and how many in all."""
+"""Number of new layers of one kind in a head that are timed, the newest, and of all."""
 REST_S = 2.0
 """Pause after a request that brought nothing."""
 
 BATCH = {"header": 1, "summary": 1, "repose": 64, "pose": 64, "k0": 8}
-"""How many items of a kind one request names; the order is that of asking."""
+"""Items of a kind that one request names, in the order of asking."""
 MAX_FINE = 16
 BRIEF_S, LONG_S = 1.5, 4.0
 """Requests for fine layers name more of them when they are answered sooner, fewer when later,
@@ -98,7 +98,7 @@ so that neither the round trip nor what is newer waits long."""
 
 @dataclass(slots=True)
 class Progress:
-    """How a scan's reception goes."""
+    """State of a scan's reception."""
 
     received_bytes: int = 0
     duplicates: int = 0  # records that came although held
@@ -202,7 +202,7 @@ class ScanIntake:
         given_up.add(number)
 
     def _note_lag(self, kind: str, number: int, now: float) -> None:
-        """How long after the drone named it an item came; nothing for one that was not timed."""
+        """Note how long after the drone named it an item came, if that was timed."""
         seen = self._seen.pop((kind, number), None)
         is_named = self.head is not None and number in self.head.numbers.get(kind, RangeSet())
         if seen is None and is_named:
@@ -217,7 +217,7 @@ class ScanIntake:
         return Held(self.store.numbers(), self.progress.received_bytes)
 
     def missing(self) -> Numbers:
-        """What the drone has and this side lacks, as far as it can be had."""
+        """Items that the drone has and this side lacks, as far as they can be had."""
         if self.head is None:
             return {}
         return missing(missing(self.head.numbers, self.store.numbers()), self._given_up)
@@ -237,7 +237,7 @@ class ScanIntake:
         return self.head is not None and self.head.finished and not self.missing()
 
     def next_ask(self, slot: int, now: float) -> tuple[str, RangeSet, Ask] | None:
-        """What to ask for in a slot that is free: kind, numbers, and what goes with it."""
+        """The next request for a free slot: kind, numbers, and payload."""
         if not self._free(slot, now):
             return None
         due = self._due(now)

@@ -32,7 +32,7 @@ from service.stream.store import ScanStore
 BIN = ".bin"
 LABELS = "library.json"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-"""What a drone's and a scan's folder may be called."""
+"""Valid names of a drone's and a scan's folder."""
 
 MAX_TITLE = 200
 MAX_TAGS = 20
@@ -40,7 +40,7 @@ IMPORTING = ".importing-"
 """Begins the name of a folder in the store that an import fills."""
 
 UNREADABLE = (SkyreliefError, sqlite3.Error, OSError, ValueError, OverflowError, RecursionError)
-"""What a broken scan may raise; the list shows it with the reason."""
+"""Errors of a broken scan; the list shows it with the reason."""
 
 FILES: dict[str, str] = {
     "cloud.laz": "fused cloud",
@@ -101,7 +101,7 @@ class Library:
         return folder
 
     def entry(self, drone: str, scan: str) -> dict[str, Any]:
-        """What the list shows of a scan."""
+        """A scan's entry in the list."""
         folder = self.folder(drone, scan)
         labels = read_labels(folder)
         entry: dict[str, Any] = {
@@ -253,7 +253,7 @@ class Library:
         return target.parent.name, target.name
 
     def _check_new(self, header: ScanHeader) -> Path:
-        """Where a scan belongs; InputError when the library has it already."""
+        """The folder for a scan; InputError when the library has it already."""
         drone, scan = _safe(header.drone, "drone"), _safe(header.scan_id, "scan")
         target = run_folder(self.store / drone, scan, header.identity)
         if target.exists():

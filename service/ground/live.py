@@ -1,4 +1,4 @@
-"""What a browser is sent of a scan, as it grows: chunks of points, corrections, the track.
+"""Live data of a growing scan for a browser: chunks of points, corrections, the track.
 
 A message is either JSON text or a binary chunk (little-endian):
 
@@ -92,7 +92,7 @@ def columns(T: F64) -> list[float]:
 
 
 class StoreIndex:
-    """What is in a store's file, also when another process writes it. Use from one thread."""
+    """Contents of a store's file, also when another process writes it. Use from one thread."""
 
     RADIO = -1
     """The layer that stands for what came by the narrow radio only."""
@@ -120,7 +120,7 @@ class StoreIndex:
         return dict(self._db.execute(f"{sql} GROUP BY seq ORDER BY seq").fetchall())
 
     def counts(self) -> tuple[int, int]:
-        """How many poses and how many re-poses there are."""
+        """Number of poses and of re-poses."""
         poses, radio, reposes = (
             int(self._db.execute(f"SELECT COUNT(*) FROM {source}").fetchone()[0])
             for source in ("poses", "radio WHERE kind = 'pose'", "reposes")
@@ -228,7 +228,7 @@ def track_message(poses: list[PoseRecord]) -> str:
 
 
 def link_message(entry: dict[str, Any], heard_unix_s: float) -> str:
-    """How a scan comes in: seconds of silence, bytes, lag and what is missing.
+    """Reception of a scan: seconds of silence, bytes, lag and missing items.
 
     ``entry`` is the receiver's; it is empty for a scan that another process writes, which was
     heard at ``heard_unix_s``.

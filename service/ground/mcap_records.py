@@ -155,7 +155,7 @@ def _in_chunk(chunk: Any) -> Iterator[Any]:
 
 
 def _unpacked(chunk: Any) -> bytes:
-    """What a chunk holds. Raises ValueError when that is not of the size it says, or too much."""
+    """Contents of a chunk. Raises ValueError when its size is wrong or too large."""
     if not chunk.compression:
         return bytes(chunk.data)
     size = chunk.uncompressed_size

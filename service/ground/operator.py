@@ -24,7 +24,7 @@ POLL_S = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """What an action of ``ctl`` sends."""
+    """The command that an action of ``ctl`` sends."""
 
     number: int
     component: int
@@ -69,7 +69,7 @@ def _quieten() -> None:
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """Who answered a command, and what."""
+    """The answer to a command, and its sender."""
 
     system: int
     component: int

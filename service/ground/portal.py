@@ -40,7 +40,7 @@ BACKLOG = 64
 
 @dataclass(frozen=True, slots=True)
 class PortalConfig:
-    """Where the portal listens, which scans it shows, and its secrets."""
+    """The portal's address, scans and secrets."""
 
     store: Path
     host: str = "127.0.0.1"

@@ -87,7 +87,7 @@ class ReceivedScan:
 
     @property
     def key(self) -> str:
-        """Where its messages are."""
+        """File of its messages."""
         return f"{ROOT}/{self.drone}/{self.name}"
 
     def grew(self) -> None:

@@ -54,7 +54,7 @@ TURN_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class ReceiverConfig:
-    """Where a ground station listens and what it keeps."""
+    """A ground station's endpoints, store and limits."""
 
     store: Path
     session: SessionConfig = field(default_factory=lambda: SessionConfig(mode="router"))
@@ -123,7 +123,7 @@ class Receiver:
             scan.intake.store.close()
 
     def folder(self, drone: str, name: str) -> Path:
-        """Where a scan is kept that the datalink calls so."""
+        """Folder of a scan by its name on the datalink."""
         return scan_folder(self._config.store, drone, name)
 
     def add_radio(self, payload: bytes) -> None:

@@ -1,4 +1,4 @@
-"""What the library shows of a scan, read from files that may come from a stranger.
+"""Facts about a scan for the library, read from files that may come from a stranger.
 
 Strict JSON into typed records with bounds: what does not fit raises ValueError or RecursionError
 here, and nothing odd (no NaN, no half letter) reaches the list.
@@ -27,7 +27,7 @@ Note = Annotated[str, msgspec.Meta(max_length=4000)]
 
 
 class Origin(msgspec.Struct):
-    """Where a scan's own coordinates begin."""
+    """Origin of a scan's own coordinates."""
 
     lat_deg: Annotated[float, msgspec.Meta(ge=-90, le=90)]
     lon_deg: Annotated[float, msgspec.Meta(ge=-180, le=180)]
@@ -41,7 +41,7 @@ class Times(msgspec.Struct):
 
 
 class TrustFacts(msgspec.Struct):
-    """How far a scan can be trusted, and why not further."""
+    """Trust in a scan, with the reasons."""
 
     level: Annotated[str, msgspec.Meta(max_length=40)]
     reasons: Annotated[list[Note], msgspec.Meta(max_length=100)]
@@ -73,7 +73,7 @@ class _Schema(msgspec.Struct):
 
 
 class Labels(msgspec.Struct, frozen=True):
-    """What people wrote about a scan; ``library.json`` holds it."""
+    """Title and tags of a scan, kept in ``library.json``."""
 
     title: str = ""
     tags: tuple[str, ...] = ()
@@ -86,7 +86,7 @@ def labels_in(path: Path) -> Labels:
 
 
 def facts_of(source: Path | ScanStore) -> dict[str, Any]:
-    """What the list shows of a scan, from its ``scan.json`` or its open store.
+    """A scan's entry in the list, from its ``scan.json`` or its open store.
 
     Raises InputError, ValueError, RecursionError or OSError for what cannot be read.
     """

@@ -1,4 +1,4 @@
-"""What can be fetched of a scan: deliverables, 3D Tiles, keyframes' images, coverage."""
+"""Files of a scan over HTTP: deliverables, 3D Tiles, keyframes' images, coverage."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from service.ground.storage import is_regular
 from service.stream.store import ScanStore
 
 TILE = re.compile(r"[A-Za-z0-9_]{1,80}\.(json|pnts|b3dm|glb)")
-"""What py3dtiles names its files; all lie in one folder."""
+"""Names that py3dtiles gives its files; all lie in one folder."""
 
 DEEPEST_TILE = 8
 SEQ = re.compile(r"[0-9]{1,9}")
@@ -68,7 +68,7 @@ def _tile(request: Request) -> Response:
 
 
 def _image(request: Request) -> Response:
-    """What a keyframe's camera saw, as JPEG: its own colours, the rest from keyframes before it."""
+    """A keyframe's image as JPEG: its own colours, the rest from keyframes before it."""
     folder = state_of(request).library.folder(*names_of(request))
     if not SEQ.fullmatch(request.path_params["seq"]):
         raise InputError("no such keyframe")

@@ -1,4 +1,4 @@
-"""What the portal's endpoints share: the library, the exports in the background, the vehicle."""
+"""Shared state of the portal's endpoints: library, exports in the background, vehicle."""
 
 from __future__ import annotations
 

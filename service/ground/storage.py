@@ -27,7 +27,7 @@ from service.stream.store import ScanStore, header_of
 log = logging.getLogger(__name__)
 
 RESERVE_SHARE, MAX_RESERVE_BYTES = 0.05, 2 << 30
-"""What stays free by default: this share of the disk, at most so much."""
+"""Free space kept by default: this share of the disk, at most so much."""
 MEASURE_S = 60.0
 LOOK_S = 1.0
 
@@ -37,7 +37,7 @@ class QuotaError(OutsideError):
 
 
 class DiskShare:
-    """What one drone may still write; use from one thread.
+    """Space that one drone may still use; use from one thread.
 
     Everything in the drone's folder counts: coarse layers, poses and deliverables too.
     """

@@ -162,7 +162,7 @@ class DatalinkSender:
 
     @property
     def progress(self) -> LinkProgress:
-        """Where things stand."""
+        """The present state."""
         with self._lock:
             items = 0
             lacking: dict[str, int] = {}
@@ -311,7 +311,7 @@ class DatalinkSender:
                 return
 
     def _take_in(self, now: float) -> None:
-        """What happened since the last turn, here and at the ground stations."""
+        """Events since the last turn, here and at the ground stations."""
         while self._events:
             self._events.popleft()(now)
         while self._asks:

@@ -226,7 +226,7 @@ class Head(_Message, frozen=True, eq=False):
 
 
 class Held(_Message, frozen=True, eq=False):
-    """What a ground station holds of a scan."""
+    """Items of a scan that a ground station holds."""
 
     numbers: _Numbers
     received_bytes: Annotated[int, Meta(ge=0, le=MAX_RECEIVED_BYTES)] = 0  # since it started

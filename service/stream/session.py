@@ -29,7 +29,7 @@ MAX_MESSAGE_BYTES = 1 << 19
 
 @dataclass(frozen=True, slots=True)
 class SessionConfig:
-    """How one end connects; the TLS files are PEM."""
+    """Connection of one end; the TLS files are PEM."""
 
     mode: str = "client"  # "client" or "router"
     connect: tuple[str, ...] = ()

@@ -38,7 +38,7 @@ BROKEN = (
     MemoryError,
     struct.error,
 )
-"""What pyulog raises on damaged logs."""
+"""Errors that pyulog raises on damaged logs."""
 
 Columns = dict[str, Any]
 """Field name to array (N,)."""
