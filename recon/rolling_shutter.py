@@ -8,6 +8,7 @@ A free velocity per frame would be degenerate over flat ground (arXiv:2209.08503
 from __future__ import annotations
 
 from collections import deque
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,14 +36,24 @@ class RowClock:
     """When a camera with a rolling shutter exposes what it sees."""
 
     def __init__(self, camera: Camera) -> None:
-        """``camera`` is the one with distortion, at any size of its images."""
+        """``camera`` is the one with distortion, at any size of its images.
+
+        ``readout_s`` may be set; it is negative against the shutter's direction.
+        """
         W, H = camera.size_px
+        self.readout_s = camera.shutter.readout_s
         self._sideways = camera.shutter.direction in ("right", "left")
         axis, n = (0, W) if self._sideways else (1, H)
         sign = -1.0 if camera.shutter.direction in ("up", "left") else 1.0
         self._distortion = camera.distortion
-        self._scale_s = sign * camera.shutter.readout_s * camera.K[axis, axis] / n
-        self._offset_s = sign * camera.shutter.readout_s * ((camera.K[axis, 2] + 0.5) / n - 0.5)
+        self._scale = sign * camera.K[axis, axis] / n
+        self._offset = sign * ((camera.K[axis, 2] + 0.5) / n - 0.5)
+
+    def reading(self, readout_s: float) -> RowClock:
+        """The same rows, read in another time."""
+        out = copy(self)
+        out.readout_s = readout_s
+        return out
 
     def seconds(self, ray: F64) -> F64:
         """(N,) seconds from the middle row of undistorted rays (N, 3) with z = 1."""
@@ -54,7 +65,7 @@ class RowClock:
             distorted = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
         else:
             distorted = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        return np.asarray(self._scale_s * distorted + self._offset_s)
+        return np.asarray(self.readout_s * (self._scale * distorted + self._offset))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,6 +115,7 @@ class FrameRows:
     T_camera_odom: F64  # (4, 4)
     rows: Rows | None = None  # None: a global shutter
     is_settled: bool = True  # no frame to come changes it
+    is_measured: bool = False  # by neighbouring frames
 
     def at_middle(self, K: F64, uv: F64, inverse_depth: F64) -> F64:
         """(N, 2) where the frame's pixels (N, 2) would be at the middle row's time."""
@@ -113,10 +125,18 @@ class FrameRows:
 class RowTrack:
     """The motion of each frame's rows, from its neighbours' poses in the odometry."""
 
-    def __init__(self, camera: Camera) -> None:
-        """``camera`` is the one with distortion, at any size of its images."""
-        self._clock = RowClock(camera) if camera.shutter.readout_s else None
+    def __init__(self, camera: Camera, is_sought: bool = False) -> None:
+        """``camera`` is the one with distortion, at any size of its images.
+
+        ``is_sought``: its readout may yet be found.
+        """
+        self._clock = RowClock(camera) if camera.shutter.readout_s or is_sought else None
         self._frames: deque[FrameRows] = deque(maxlen=32)
+
+    @property
+    def clock(self) -> RowClock | None:
+        """Of all frames; None for a global shutter."""
+        return self._clock
 
     @property
     def is_rolling(self) -> bool:
@@ -163,6 +183,7 @@ class RowTrack:
             after = int((times[near] > 0).sum())
         since_s = float(times[-1]) if times.size else 0.0
         frame.is_settled = since_s >= NEAR_S or (after >= 2 and since_s >= STEADY_S)
+        frame.is_measured = near.size >= 2
         if near.size < (1 if frame.prior.turn_rad_s is None else 2):
             frame.rows = Rows(self._clock, _by_telemetry(frame), np.zeros(6))
             return

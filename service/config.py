@@ -54,9 +54,10 @@ class CameraConfig:
         "fixed: latency_ms; auto: measured in flight, latency_ms until then",
         live=True,
     )
-    readout_ms: float | Literal["model"] = key(
+    readout_ms: float | Literal["model", "auto"] = key(
         "model",
-        "rolling shutter, first to last row; 0: global shutter; model: as the camera model says",
+        "rolling shutter, first to last row; 0: global shutter; model: as the camera model says; "
+        "auto: found in flight",
     )
     readout_direction: Literal["down", "up", "right", "left"] = key(
         "down", "readout order of the rows or columns, used if readout_ms is a number"
@@ -70,7 +71,7 @@ class CameraConfig:
         for axis in ("forward", "right", "down"):
             _within(f"camera.lever_{axis}_m", getattr(self, f"lever_{axis}_m"), -100, 100)
         _within("camera.latency_ms", self.latency_ms, -10_000, 10_000)
-        if self.readout_ms != "model":
+        if not isinstance(self.readout_ms, str):
             _within("camera.readout_ms", self.readout_ms, 0, 200)
 
 

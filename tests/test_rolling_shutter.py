@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import cv2
 import numpy as np
@@ -14,7 +16,10 @@ from recon.rolling_shutter import RowClock, Rows, RowTrack, row_times_s
 from recon.stereo.virtual_stereo import View, VirtualStereoConfig, at_middle_row, rectify
 from recon.tracking.localisation import OdometryConfig
 from recon.tracking.odometry import Odometry
+from recon.tracking.readout_search import ReadoutEstimate
 from recon.types import DIRECTIONS, F64, U8, Camera, PosePrior, Shutter, StereoPair
+from service.config import Config
+from service.flight.scan import Scan
 
 K = np.array([[400.0, 0, 239.5], [0, 400.0, 179.5], [0, 0, 1]])
 W, H = 480, 360
@@ -234,3 +239,49 @@ def test_the_image_becomes_that_of_the_middle_row() -> None:
     off = [np.abs(i - images[2]).mean() for i in images[:2]]
     assert off[0] < 0.2 * off[1]
     assert at_middle_row(replace(view, rows=None), image) is image
+
+
+@pytest.mark.parametrize(("readout_s", "way", "expected"), [
+    (0.02, "down", Shutter(0.02, "down")),
+    (-0.02, "right", Shutter(0.02, "left")),
+])  # fmt: skip
+def test_a_sure_readout_names_a_shutter(readout_s: float, way: str, expected: Shutter) -> None:
+    def found(sigma_s: float) -> Shutter | None:
+        search = SimpleNamespace(estimate=ReadoutEstimate(readout_s, sigma_s, 3))
+        stages = SimpleNamespace(track=SimpleNamespace(odometry=SimpleNamespace(readout=search)))
+        config = Config()
+        config = replace(config, camera=replace(config.camera, readout_ms="auto"))
+        inputs = SimpleNamespace(camera=replace(PLAIN, shutter=Shutter(0.0, way)), config=config)
+        scan = SimpleNamespace(pipeline=SimpleNamespace(stages=stages), inputs=inputs)
+        return Scan.found_shutter(cast(Scan, scan))
+
+    assert found(0.001) == expected
+    assert found(0.01) is None
+
+
+def searched(readout_s: float, frames: int) -> tuple[ReadoutEstimate, float]:
+    """What the odometry finds, from nothing, and the readout it uses then."""
+    ground = texture()
+    odometry = Odometry(PLAIN, OdometryConfig(), lens=PLAIN, seeks_readout=True)
+    for i in range(frames):
+        T = se3.inverse(swinging(i / 15))
+        prior = PosePrior(T[:3, :3], 0.01, 0.03, T[:3, 3], np.full(3, 0.5), 60.0, 1.0)
+        odometry.track(photograph(ground, i / 15, readout_s), i, int(i * 1e9 / 15), prior)
+    assert odometry.readout is not None and odometry.readout.estimate is not None
+    clock = odometry.keyframes[-1].moving.rows
+    assert clock is not None
+    return odometry.readout.estimate, clock.clock.readout_s
+
+
+@pytest.mark.parametrize(("readout_s", "frames"), [(0.03, 252), (-0.015, 150)])
+def test_the_readout_is_found_from_the_images(readout_s: float, frames: int) -> None:
+    found, used = searched(readout_s, frames)
+    assert found.is_sure and used == found.readout_s
+    assert found.readout_s == pytest.approx(readout_s, abs=5e-4)
+    assert found.sigma_s < 5e-4
+
+
+def test_a_global_shutter_is_not_taken_for_a_rolling_one() -> None:
+    found, used = searched(0.0, 110)
+    assert not found.is_sure and used == 0.0
+    assert abs(found.readout_s) < 3e-4

@@ -31,6 +31,7 @@ from recon.tracking.keyframe_window import (
 from recon.tracking.localisation import Bridge, FirstViews, Localiser, Located, OdometryConfig
 from recon.tracking.matching import Pyramid, harris_grid
 from recon.tracking.prediction import Motion
+from recon.tracking.readout_search import ReadoutSearch
 from recon.types import F64, U8, Bool, Camera, PosePrior
 
 OVERDUE = 1.3
@@ -61,10 +62,12 @@ class Odometry:
         camera: Camera,
         config: OdometryConfig | None = None,
         lens: Camera | None = None,
+        seeks_readout: bool = False,
     ) -> None:
         """``camera`` has no distortion and the size of the frames to come.
 
         ``lens`` is the camera with its distortion and shutter; None: a global shutter.
+        ``seeks_readout``: its readout is a start, to be found by the images.
         """
         self.camera = camera
         self.K = camera.K
@@ -76,7 +79,9 @@ class Odometry:
         self._missed_still: TrackingFrame | None = None  # the last frame, when it has no pose
         self._motion: Motion | None = None
         features = FeatureCache()
-        self._row_track = RowTrack(lens or camera)
+        self._row_track = RowTrack(lens or camera, seeks_readout)
+        clock = self._row_track.clock
+        self.readout = ReadoutSearch(clock, self.K) if seeks_readout and clock else None
         self._unsettled: OdometryKeyframe | None = None  # its rows' motion will be known better
         self._localiser = Localiser(camera, self.config, features, self._row_track)
         self._first_views = FirstViews(
@@ -337,6 +342,8 @@ class Odometry:
         if self._unsettled is not None and self._unsettled.moving.is_settled:
             adjust_window(self.keyframes, self.K)
             self._unsettled = None
+            if self.readout is not None:
+                self.readout.look(self.keyframes)
 
     def _forget(self) -> None:
         """Drop what left the window: images, corners, and landmarks out of sight."""

@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -159,6 +160,8 @@ class ScanRun:
 
         host, vehicle = self._host, self._host.vehicle
         camera, backend = host.equipment()
+        if host.shutter is not None:
+            camera = replace(camera, shutter=host.shutter)
         check_size(camera, source.size_px, source.description)
         zero_ns, offset_ns = _zero_ns(source), vehicle.unix_offset_ns()
         unix_s = 1e-9 * (time.monotonic_ns() + offset_ns)
@@ -203,6 +206,7 @@ class ScanRun:
             on_fault.pop_all()
         if scan.check.latency is not None and scan.check.latency.is_settled:
             self._host.latency_ms = scan.check.latency.latency_ms
+        self._host.shutter = scan.found_shutter() or self._host.shutter
         self._host.vehicle.statustext(
             f"Scan {scan.inputs.scan_id}: {summary['clouds']} clouds, {summary['distance_m']:.0f} m"
         )

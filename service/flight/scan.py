@@ -16,7 +16,7 @@ from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import VehicleState
 from recon.backends import Backend
 from recon.posegraph.between_keyframes import Odometer
-from recon.types import F64, Camera, Frame, Keyframe
+from recon.types import F64, Camera, Frame, Keyframe, Shutter
 from service.cameras.camera_file import shutter_document, with_shutter
 from service.cameras.rig import ASSUMED_AGL_M, Rig
 from service.cameras.source import CameraFrame, CameraSource, ahead
@@ -128,7 +128,10 @@ class Scan:
                 is_lens_assumed="lens" in inputs.assumed,
             )
         )
-        self._is_rolling = with_shutter(inputs.camera, config.camera).shutter.readout_s > 0
+        self._is_rolling = (
+            config.camera.readout_ms == "auto"
+            or with_shutter(inputs.camera, config.camera).shutter.readout_s > 0
+        )
         self.rig, self._odometer = Rig(config.camera, config.scan, config.fusion), Odometer()
         self.recorder = Recorder(
             store, self.pipeline, self.rig, inputs.unix_offset_ns, inputs.on_keyframe
@@ -217,11 +220,40 @@ class Scan:
             "warnings": [*self.inputs.notes, *self.inputs.source.warnings, *self._doubts()],
         }
         extra["assumed"] = self._assumed()
+        extra["camera_readout"] = self._readout()
+        shutter = self.found_shutter()
+        if shutter is not None:
+            camera = self.store.header.camera | shutter_document(shutter)
+            self.store.update_header(camera=camera)
         summary = self.recorder.close(redacted(extra | self.inputs.extra))
         self.pipeline.close()
         summary["clouds_per_second"] = round(summary["clouds"] / elapsed, 2)
         self.store.finish(summary)
         return summary
+
+    def found_shutter(self) -> Shutter | None:
+        """The shutter by the images; None where it was not sought or is not sure."""
+        search = self.pipeline.stages.track.odometry.readout
+        found = None if search is None else search.estimate
+        if found is None or not found.is_sure:
+            return None
+        way = with_shutter(self.inputs.camera, self.inputs.config.camera).shutter.direction
+        if found.readout_s < 0:
+            way = {"down": "up", "up": "down", "right": "left", "left": "right"}[way]
+        return Shutter(abs(found.readout_s), way)
+
+    def _readout(self) -> dict[str, Any] | None:
+        """What the images say of the shutter; None where it was not sought or does not show."""
+        search = self.pipeline.stages.track.odometry.readout
+        found = None if search is None else search.estimate
+        if found is None:
+            return None
+        return {
+            "estimate_ms": round(1e3 * found.readout_s, 2),
+            "sigma_ms": round(1e3 * found.sigma_s, 2),
+            "windows": found.windows,
+            "is_sure": found.is_sure,
+        }
 
     def _assumed(self) -> list[str]:
         """What nothing measured in this scan, of "lens", "view" and "height"."""
@@ -240,6 +272,12 @@ class Scan:
             out.append(f"{self.odd_sized} frames were not {W}x{H} like the camera model: left out")
         if self.inputs.history is not None and self.tagged == 0 and self.recorder.frames:
             out.append("no frame lies inside the telemetry: poses rest on vision alone")
+        shutter = self.found_shutter()
+        if shutter is not None:
+            out.append(
+                f"the images show a readout of {1e3 * shutter.readout_s:.1f} ms, "
+                f"{shutter.direction}: set camera.readout_ms and camera.readout_direction"
+            )
         frames = self.recorder.frames
         if frames and "height" in self._assumed():
             out.append(

@@ -390,6 +390,7 @@ def build_stages(
         undistort.tracking_camera,
         OdometryConfig(base_to_height=config.scan.base_to_height),
         camera,
+        seeks_readout=config.camera.readout_ms == "auto",
     )
     selection = Viewpoints(config.scan, compute.pairs)
     track = Track(odometry, selection, refused, stopwatch)

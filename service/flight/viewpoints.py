@@ -352,7 +352,7 @@ class StereoViews:
         """The view with its pose; ``points`` (N, 3) of the odometry are the ground before it."""
         posed = View(view.bgr, view.gray, self._K, view.T_odom_camera, self._seen)
         rows = None if view.moving is None else view.moving.rows
-        if rows is None:
+        if rows is None or not rows.clock.readout_s:
             return posed
         ground = se3.transform(se3.inverse(view.T_odom_camera), points)
         scene = inverse_depth_plane(ground[ground[:, 2] > 0])

@@ -1,0 +1,135 @@
+"""The readout of a rolling shutter, found by the residuals of windows of keyframes.
+
+Each window is adjusted at several readouts; a parabola through the costs about the best has its
+minimum at the window's own readout. The motion of the rows comes from the poses of
+neighbouring frames, which a wrong readout bends, so the search repeats from window to window.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon import se3
+from recon.rolling_shutter import RowClock, Rows
+from recon.tracking import bundle
+from recon.tracking.keyframe_window import OdometryKeyframe
+from recon.types import F64
+
+KEYFRAMES = 5
+"""Of a window; the next one begins at its last."""
+
+COARSE_S = 1e-3 * np.arange(-40.0, 41.0, 10.0)
+"""Readouts that are tried while none is sure."""
+
+STEP_S = 5e-3
+"""About the one in use, once it is sure."""
+
+NEAR_S = 3e-3
+"""Windows adjusted further from the readout in use than this no longer count."""
+
+MAX_READOUT_S = 0.05
+
+MIN_SIGMAS = 5.0
+"""A readout is taken over when it differs from none by so many sigmas."""
+
+FLOOR_S = 1e-4
+"""Sigma of the row motion's own errors."""
+
+BENT = 0.1
+"""Of the way from the readout in use, by which the rows' motion was bent: a sigma."""
+
+HUBER_PX = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class ReadoutEstimate:
+    """A readout in s, negative against the shutter's direction, its sigma, and of how many windows.
+
+    It ``is_sure`` where two windows or more agree that it is not zero.
+    """
+
+    readout_s: float
+    sigma_s: float
+    windows: int
+
+    @property
+    def is_sure(self) -> bool:
+        return self.windows >= 2 and abs(self.readout_s) > MIN_SIGMAS * self.sigma_s
+
+
+class ReadoutSearch:
+    """Looks at keyframes as they settle, and sets the clock of their rows."""
+
+    def __init__(self, clock: RowClock, K: F64) -> None:
+        self.estimate: ReadoutEstimate | None = None
+        self._clock, self._K = clock, K
+        self._last_seq = -1
+        self._found: deque[tuple[float, float]] = deque(maxlen=16)  # readout, weight
+
+    def look(self, keyframes: list[OdometryKeyframe]) -> None:
+        """Search once the newest of the ``keyframes``, all settled, ends a further window."""
+        window = keyframes[-KEYFRAMES:]
+        if len(window) < KEYFRAMES or window[0].seq < self._last_seq:
+            return
+        if all(key.moving.is_measured for key in window):
+            self._last_seq = window[-1].seq
+            self._take(window)
+
+    def _take(self, window: list[OdometryKeyframe]) -> None:
+        now = self._clock.readout_s
+        is_sure = self.estimate is not None and self.estimate.is_sure
+        tried = now + STEP_S * np.arange(-1.0, 2.0) if is_sure else COARSE_S
+        costs = [_cost(window, self._clock.reading(readout_s), self._K) for readout_s in tried]
+        k = int(np.clip(np.argmin([cost for cost, _ in costs]), 1, len(tried) - 2))
+        (below, _), (here, redundancy), (above, _) = costs[k - 1 : k + 2]
+        spacing = tried[1] - tried[0]
+        curvature = (below - 2.0 * here + above) / spacing**2
+        if curvature <= 0.0 or redundancy <= 0 or here <= 0.0:
+            return
+        step = np.clip((below - above) / (2.0 * spacing * curvature), -spacing, spacing)
+        best = float(tried[k] + step)
+        if abs(best - now) > NEAR_S:
+            self._found.clear()
+        self._found.append((best, float(0.5 * curvature * redundancy / here)))
+        self._combine(max(BENT * abs(best - now), FLOOR_S))
+
+    def _combine(self, floor_s: float) -> None:
+        readouts, weights = np.array(self._found).T
+        mean = float(weights @ readouts / weights.sum())
+        spread = weights @ (readouts - mean) ** 2 / weights.sum() / max(len(weights) - 1, 1)
+        sigma = float(np.sqrt(max(1.0 / weights.sum(), spread, floor_s**2)))
+        self.estimate = ReadoutEstimate(mean, sigma, len(weights))
+        if self._clock.readout_s or abs(mean) > MIN_SIGMAS * sigma:
+            self._clock.readout_s = float(np.clip(mean, -MAX_READOUT_S, MAX_READOUT_S))
+
+
+def _cost(window: list[OdometryKeyframe], clock: RowClock, K: F64) -> tuple[float, int]:
+    """Huber cost, px^2, of the adjusted window, and its redundancy."""
+    view, landmark, uv = [], [], []
+    for c, key in enumerate(window):
+        assert key.moving.rows is not None
+        at = np.flatnonzero(key.map.known(key.landmark))
+        depth = se3.transform(key.T_camera_odom, key.map[key.landmark[at]])[:, 2]
+        rows = Rows(clock, key.moving.rows.rate, key.moving.rows.change)
+        view.append(np.full(at.size, c, np.int64))
+        landmark.append(key.landmark[at])
+        uv.append(rows.at_middle(K, key.uv[at], 1.0 / depth))
+    point = np.concatenate(landmark)
+    _, index, counts = np.unique(point, return_inverse=True, return_counts=True)
+    use = counts[index] >= 3  # two views give way to any readout
+    ids, index = np.unique(point[use], return_inverse=True)
+    found = bundle.adjust(
+        np.stack([key.T_camera_odom for key in window]),
+        window[0].map[ids],
+        np.concatenate(view)[use],
+        index.astype(np.int64),
+        np.concatenate(uv)[use],
+        K,
+        np.arange(len(window)) > 0,
+    )
+    error = np.minimum(found.residual_px, 1e3)
+    cost = np.where(error < HUBER_PX, error**2, 2.0 * HUBER_PX * error - HUBER_PX**2)
+    return float(cost.sum()), 2 * len(error) - 3 * len(ids) - 6 * (len(window) - 1)
