@@ -74,7 +74,7 @@ def loads(library: str) -> bool:
 
 
 def remedy(error: ImportError) -> str | None:
-    """What an import needs and what to install; None when the fault is in our own code."""
+    """The missing import and the package to install; None when the fault is in our own code."""
     package = _package(error)
     found = NOT_LOADED.match(str(error))
     if found is not None:

@@ -29,7 +29,7 @@ MAX_FAILED = 100
 PAUSE_S = 0.5
 """Pause between a fault and the restart."""
 DROP, WAIT = "drop oldest", "wait"
-"""What a full queue does: drop its oldest entry, or make the filling thread wait."""
+"""Policy of a full queue: drop its oldest entry, or make the filling thread wait."""
 
 
 @dataclass(frozen=True, slots=True)

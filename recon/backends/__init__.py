@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Backend(Protocol):
-    """What a backend offers to the pipeline."""
+    """Operations that a backend offers to the pipeline."""
 
     @property
     def name(self) -> str:

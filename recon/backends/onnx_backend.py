@@ -32,7 +32,7 @@ ORT_ERRORS: tuple[type[Exception], ...] = (
         if isinstance(kind, type) and issubclass(kind, Exception)
     ),
 )
-"""What ONNX Runtime raises; its own exceptions share no base class."""
+"""Errors of ONNX Runtime; its own exceptions share no base class."""
 
 ENGINE_NAME_DIGITS = 16
 

@@ -120,7 +120,7 @@ class PairDepthStage(torch.nn.Module):
 
 
 def _inputs(pair: StereoPair, K: F64) -> list[Array]:
-    """What goes up: images, masks, guide, true sizes and geometry."""
+    """Inputs on the device: images, masks, guide, true sizes and geometry."""
     h, w = pair.left.shape
     everywhere = np.ones((h, w), np.uint8)
     seen = [

@@ -44,7 +44,7 @@ BENCHMARKS: dict[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class BenchOptions:
-    """What a run of benchmarks is given."""
+    """Options of a run of benchmarks."""
 
     rounds: int = 30
     warm_up: int = 3
@@ -131,7 +131,7 @@ def table(results: list[BenchResult]) -> str:
 
 
 def record(results: list[BenchResult], options: BenchOptions) -> dict[str, Any]:
-    """What a kept result file holds: figures, commit, date and the machine in general words."""
+    """Contents of a kept result file: figures, commit, date and the machine in general words."""
     return {
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "commit": commit(),
@@ -168,7 +168,7 @@ def machine() -> str:
 
 
 def idle_control() -> ScanControl:
-    """What a vehicle link asks where nothing scans."""
+    """A vehicle link's requests where nothing scans."""
     from mavlink.component.control import ScanControl, ScanStatus
 
     control: ScanControl = create_autospec(ScanControl, instance=True)

@@ -26,7 +26,7 @@ FRAMES = 3
 
 @dataclass(frozen=True, slots=True)
 class CodecFigures:
-    """What a codec makes of a keyframe; NaN where it does not apply."""
+    """A codec's result on a keyframe; NaN where a figure does not apply."""
 
     name: str
     bits_per_point: float

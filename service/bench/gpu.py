@@ -153,7 +153,7 @@ class Stage:
 
 @dataclass(frozen=True, slots=True)
 class Floor:
-    """What the device can do at best."""
+    """The device's bandwidth and arithmetic rate at best."""
 
     bytes_per_s: float
     operations_per_s: float

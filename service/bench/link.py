@@ -39,7 +39,7 @@ PATIENCE_S = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What is flown over which link."""
+    """A trial: scan and link."""
 
     link: LinkModel
     flight_s: float = 45.0
@@ -67,7 +67,7 @@ class _Drone:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of a trial; latencies in seconds, per kind, while the link was up."""
+    """Result of a trial; latencies in seconds, per kind, while the link was up."""
 
     delivered: int
     made: int

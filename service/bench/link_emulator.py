@@ -31,7 +31,7 @@ FIRST_WAIT_S, MIN_WAIT_S = 1.0, 0.2
 
 @dataclass(frozen=True, slots=True)
 class LinkModel:
-    """What the link does to each direction."""
+    """Impairments of the link in each direction."""
 
     rate_kbit_s: float = 1000.0
     delay_s: float = 0.05  # one way
@@ -42,7 +42,7 @@ class LinkModel:
 
 @dataclass(slots=True, eq=False)
 class Traffic:
-    """What went one way: (time, bytes on the wire) as handed to the link."""
+    """Traffic of one direction: (time, bytes on the wire) as handed to the link."""
 
     log: list[tuple[float, int]] = field(default_factory=list)
 

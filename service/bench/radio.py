@@ -52,7 +52,7 @@ CELL_M = 4.0
 
 @dataclass(frozen=True, slots=True)
 class RadioOutcome:
-    """What was at the ground when the flight ended."""
+    """State of the ground at the end of the flight."""
 
     share: float  # of the radio, by our tunnel
     all_share: float  # of the radio, by everything that our component sent
@@ -195,7 +195,7 @@ def _ground_m(x: F64, y: F64) -> F64:
 
 
 def _keyframe(seq: int) -> Keyframe:
-    """What a camera looking down sees; all but the first show a strip of new surface."""
+    """Depth images of a camera looking down; all but the first show a strip of new surface."""
     w, h = SIZE_PX
     x0, step_m = seq * FLIGHT_M / (KEYFRAMES - 1), FLIGHT_M / (KEYFRAMES - 1)
     T = se3.compose(np.diag([1.0, -1.0, -1.0]), np.array([x0, 0.0, HEIGHT_M]))

@@ -50,7 +50,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
 
 
 def shared(a: U8, b: U8) -> CommonView | None:
-    """What two images have in common, their features included."""
+    """Correspondences of two images, their features included."""
     return common_view(features(a), features(b))
 
 

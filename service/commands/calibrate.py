@@ -73,7 +73,7 @@ def _board(pattern: str, square_m: float) -> Board:
 
 
 def _record(result: Calibration, boards: BoardSet, board: Board) -> dict[str, Any]:
-    """What is worth keeping of a calibration, in plain values."""
+    """A calibration's results, in plain values."""
     return {
         "rms_px": round(result.rms_px, 4),
         "pattern": f"{board.columns}x{board.rows}",

@@ -150,7 +150,7 @@ def ground(
 
 
 def _limits(quota_mb: float | None, drone_share: float, reserve_mb: float | None) -> Limits:
-    """What one drone may take; InputError for what cannot be."""
+    """Limits of one drone; InputError for impossible ones."""
     from service.ground.drone import Limits
 
     if not 0.0 < drone_share <= 100.0:
@@ -224,7 +224,7 @@ def _check(workers: Workers, notifier: Notifier) -> None:
 
 
 def _stop_by_signal() -> Event:
-    """What the signals to end set; from now on they do not end the process themselves."""
+    """An event that TERM and INT set; from now on they do not end the process themselves."""
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())

@@ -161,7 +161,7 @@ _ROW = struct.Struct("<qqqi?16d3dd")
 
 
 class PublishedFrames:
-    """What was written of every frame, in order; on the disk but for the newest.
+    """Published poses of every frame, in order; on the disk but for the newest.
 
     The file has no name and is gone with the process.
     """

@@ -37,7 +37,7 @@ class KeyframeStep(NamedTuple):
 
 
 class News(NamedTuple):
-    """What the graph says once a view is in it."""
+    """The graph's answer once a view is in it."""
 
     placed: Placed  # the view in the world
     is_aligned: bool  # its segment has a frame in the world
@@ -156,7 +156,7 @@ class Chain:
         return out
 
     def new_doubts(self) -> list[str]:
-        """What the operator must know of the telemetry, each once."""
+        """Warnings about the telemetry, each once."""
         out, self._doubts = self._doubts, []
         return out
 

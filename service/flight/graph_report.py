@@ -1,4 +1,4 @@
-"""What the pose graph of a flight says: doubts for the operator, figures for the summary."""
+"""Reports of a flight's pose graph: doubts for the operator, figures for the summary."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class GraphWatch:
         self._reported: set[str] = set()
 
     def look(self) -> list[str]:
-        """What is newly found, once for each kind; looks when the keyframes have grown enough."""
+        """New findings, once for each kind; looks when the keyframes have grown enough."""
         if self._graph.entered < max(LEAST, LOOK_GROWTH * self._seen):
             return []
         self._seen = self._graph.entered

@@ -23,7 +23,7 @@ from service.stream.records import Repose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """What one frame brought."""
+    """Results of one frame."""
 
     tracked: Tracked
     placed: Placed | None = None  # the frame in the world; by telemetry alone when vision fails
@@ -95,7 +95,7 @@ class Pipeline:
         return Step(tracked, keyframes=keyframes)
 
     def finish(self) -> Step:
-        """What :meth:`drain` has left, and the last corrections. Raises what work raised."""
+        """The remaining results, and the last corrections. Raises what work raised."""
         try:
             step = self.drain()
         finally:
@@ -160,7 +160,7 @@ class Pipeline:
 
     @property
     def held(self) -> dict[str, int]:
-        """What memory holds of this scan: the map's voxels, its tiles on disk, views for loops,
+        """Memory that this scan takes: the map's voxels, its tiles on disk, views for loops,
         and keyframes in the pose graph."""
         return self.stages.map.held | self.stages.chain.held
 

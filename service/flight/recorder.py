@@ -1,4 +1,4 @@
-"""What the pipeline finds, written into the scan's store and summed up."""
+"""Results of the pipeline, written into the scan's store and summed up."""
 
 from __future__ import annotations
 
@@ -114,12 +114,12 @@ class Recorder:
         }
 
     def _drops(self) -> dict[str, int]:
-        """What was not used, by reason."""
+        """Unused frames and views, by reason."""
         late = {"newer views came faster": self.pipeline.dropped} if self.pipeline.dropped else {}
         return dict(self.pipeline.refusals()) | late
 
     def _scale(self) -> dict[str, Any]:
-        """What the metric scale rests on, and its relative sigma."""
+        """Source of the metric scale, and its relative sigma."""
         found = self._chain.trajectory.similarity(max(self.pipeline.segments - 1, 0))
         if found is None:
             return {"from": "first telemetry", "sigma": None}

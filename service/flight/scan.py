@@ -64,7 +64,7 @@ class Datalink(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanInputs:
-    """What a scan is made from."""
+    """Inputs of a scan."""
 
     source: CameraSource
     camera: Camera
@@ -256,7 +256,7 @@ class Scan:
         }
 
     def _assumed(self) -> list[str]:
-        """What nothing measured in this scan, of "lens", "view" and "height"."""
+        """Quantities that were assumed in this scan, of "lens", "view" and "height"."""
         out = list(self.inputs.assumed)
         if self.attitudes == 0:
             out.append("view")
@@ -265,7 +265,7 @@ class Scan:
         return out
 
     def _doubts(self) -> list[str]:
-        """What the reader of this scan must know."""
+        """Notes for the reader of this scan."""
         out = [*self.check.reported.values(), *self.pipeline.stages.chain.watch.sentences()]
         if self.odd_sized:
             W, H = self.inputs.camera.size_px

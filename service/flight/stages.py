@@ -314,7 +314,7 @@ class Register:
 
 
 class MakeKeyframe:
-    """What leaves the pipeline: metric depth in colour, its pose, and what of it is new."""
+    """The pipeline's output: metric depth in colour, its pose, and the new part of it."""
 
     def __init__(self, debug: dict[str, Array] | None) -> None:
         self._debug = debug

@@ -150,7 +150,7 @@ class TelemetryCheck:
             self._warn(text)
 
     def summary(self) -> dict[str, Any]:
-        """What was found, fit for JSON; empty without telemetry."""
+        """Findings, fit for JSON; empty without telemetry."""
         if self._history is None:
             return {}
         found, frame, used = self.latency, self.frame, self._history.gimbal_frame()

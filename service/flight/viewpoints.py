@@ -286,7 +286,7 @@ class StereoViews:
         self._latest: Viewpoint | None = None  # the last tracked frame, unless it is a view
 
     def take(self, image: UndistortedFrame, tracked: Tracked) -> tuple[Anchorage | None, bool]:
-        """What gives the frame's place again, None without a pose, and whether it is a view."""
+        """The frame's anchor, None without a pose, and whether it is a view."""
         if tracked.segment != self._segment:
             self.end_stretch()
             self._segment = tracked.segment

@@ -1,1 +1,1 @@
-"""What is made of a finished scan: refinement and exports."""
+"""Refinement and exports of a finished scan."""

@@ -21,7 +21,7 @@ MIN_PLACED_SHARE = 0.5
 
 
 class Trust(Enum):
-    """What may be measured in a scan, from the most to the least."""
+    """Quantities that may be measured in a scan, from the most to the least."""
 
     GEOREFERENCED = "georeferenced"  # positions and distances
     SCALED = "scaled"  # distances, without georeference

@@ -23,7 +23,7 @@ SWING_HZ = np.array([1.0, 0.9, 0.0])
 
 @dataclass(frozen=True, slots=True)
 class FlightPlan:
-    """What is flown. ``height_m`` counts above the ground at the world's origin."""
+    """Plan of a flight. ``height_m`` counts above the ground at the world's origin."""
 
     pattern: str = "nadir"
     duration_s: float = 30.0

@@ -45,7 +45,7 @@ REPEATABLE = "bframes=0:mbtree=0:scenecut=0"
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """What goes wrong on purpose."""
+    """Injected faults."""
 
     blank: tuple[tuple[int, int], ...] = ()  # (first frame, count) black images
     exposure: tuple[tuple[float, float], ...] = ()  # (from second, gain)
@@ -255,7 +255,7 @@ def _dry(simulation: Simulation) -> npt.NDArray[np.int32]:
 
 
 def _parameters(simulation: Simulation, packet_count: int) -> dict[str, Any]:
-    """What made the flight, for people and for ``score``."""
+    """The flight's parameters, for people and for ``score``."""
     options = simulation.options
     t = simulation.times_s
     at = simulation.poses[:, :3, 3]

@@ -57,7 +57,7 @@ def camera_rays(camera: Camera) -> F64:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What happens to the light on its way to the file."""
+    """Effects between the scene and the file: noise, exposure, water."""
 
     noise: float = 1.5  # sensor noise, gray levels, 1 sigma
     vignette: float = 0.12  # share of light lost in the corners

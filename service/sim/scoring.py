@@ -40,7 +40,7 @@ MAX_POINTS = 300_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanResult:
-    """What a scan folder claims, in the truth's frame when the scan is georeferenced."""
+    """A scan folder's results, in the truth's frame when the scan is georeferenced."""
 
     points: F64  # (N, 3)
     sigma_m: F32 | None  # (N,)

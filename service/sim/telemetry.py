@@ -30,7 +30,7 @@ Timed = tuple[Any, int, float]
 
 @dataclass(frozen=True, slots=True)
 class TelemetryOptions:
-    """What is sent and how."""
+    """Options of the simulated telemetry."""
 
     gimbal_frame: str = "earth"  # or "vehicle": the frame of the gimbal's yaw
     rangefinder: bool = True

@@ -1,4 +1,4 @@
-"""What ``simulate`` wrote into ``truth/``, read back: place, surface, poses, and what was seen."""
+"""The folder ``truth/`` of ``simulate``, read back: place, surface, poses and visibility."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ VIEWS_TO_COUNT = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What ``simulate`` wrote into ``truth/``."""
+    """Contents of ``truth/`` as ``simulate`` wrote them."""
 
     folder: Path
     frame: LocalFrame
@@ -76,7 +76,7 @@ def heights_below(surface: TriangleGrid, xy_m: F64) -> F64:
 
 
 def seen_surface(truth: Truth) -> SeenSurface:
-    """What at least VIEWS_TO_COUNT of the flight's frames see; InputError when that is nothing."""
+    """Surface that at least VIEWS_TO_COUNT of the frames see; InputError when that is none."""
     samples, normals = metrics.sample_surface(truth.surface, SAMPLE_SPACING_M)
     frames = np.unique(np.linspace(0, len(truth.poses) - 1, FRAMES_FOR_VISIBILITY).astype(int))
     views = np.zeros(len(samples), np.int64)

@@ -29,7 +29,7 @@ OBLIQUE_SHARE = 0.25
 
 @dataclass(frozen=True, slots=True)
 class ExportOptions:
-    """What the operator may choose; None takes the scan's own ground sample distance."""
+    """Options of an export; None takes the scan's own ground sample distance."""
 
     voxel_m: float | None = None
     cell_m: float | None = None

@@ -79,7 +79,7 @@ class ImageNetwork:
     doubt: str  # why the camera is held; empty when it is found
 
     def figures(self, given_focal_px: float) -> dict[str, Any]:
-        """What is reported of the network."""
+        """Figures of the network."""
         return {
             "sightings": len(self.seen.view),
             "places": len(np.unique(self.seen.landmark)),

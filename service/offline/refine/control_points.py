@@ -86,7 +86,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanImages:
-    """What marks need to know of the scan."""
+    """Parts of a scan that marks refer to."""
 
     states: Sequence[KeyframeState]
     frames: Sequence[PoseRecord]

@@ -88,7 +88,7 @@ MAX_REFUSALS = 0.4
 
 @dataclass(frozen=True, slots=True)
 class RefineOptions:
-    """What the operator chose."""
+    """Options of a refinement."""
 
     gcp: Path | None = None
     telemetry: Path | None = None

@@ -1,4 +1,4 @@
-"""What a refinement did, as figures for JSON and in words."""
+"""Results of a refinement, as figures for JSON and in words."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def figures_of(
     ahead_m: float,
     places_m: F64,
 ) -> dict[str, Any]:
-    """What the adjustment of the keyframes ``seqs``, at ``places_m`` (N, 3) before, did.
+    """Figures of the adjustment of the keyframes ``seqs``, at ``places_m`` (N, 3) before.
 
     ``verified``: loops of the flight and loops that matching confirmed; of these the track
     has those with support. ``ahead_m`` is the usual distance of the ground.
