@@ -11,8 +11,7 @@ import pytest
 from recon.backends import Backend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from service.compute import backend_choice
-from service.compute.backend_choice import choose_backend, engine_folder
-from service.compute.opening import open_backend
+from service.compute.backend_choice import choose_backend, engine_folder, open_backend
 from service.config import ComputeConfig, load_config
 from service.daemon.diagnosis import examine
 from service.errors import InputError, OutsideError

@@ -112,7 +112,7 @@ def test_what_a_killed_process_left_is_deleted_at_the_start(tmp_path: Path, card
     ended = subprocess.run([sys.executable, "-c", script, str(ground), str(card)])
     assert ended.returncode == -9
     assert [path.name[:8] for path in ground.iterdir()] == [".taking-"]
-    with storage._workplace(ground) as busy:
+    with storage.workplace(ground) as busy:
         assert storage.clear_leftovers(ground) == 1
         assert list(ground.iterdir()) == [busy]
     assert list(ground.iterdir()) == []

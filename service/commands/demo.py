@@ -43,9 +43,9 @@ def demo(
     portal = f"127.0.0.1:{_free_port()}" if _has_portal() else ""
     ground = _start_ground(out, endpoint, portal)
     try:
-        _wait_until_listening(ground, endpoint, out)
+        _said(ground, out, "ground station at ")
         if portal:
-            _say(1, f"open this page and see the map grow: {_live_page(ground, out)}")
+            _say(1, f"open this page and see the map grow: {_said(ground, out, 'portal: ')}")
         images = sum(1 for _ in (source / "frames").iterdir())
         _say(2, f"flight: {images} images of {source}")
         if not _are_kernels_compiled():
@@ -131,28 +131,15 @@ def _start_ground(out: Path, endpoint: str, portal: str) -> subprocess.Popen[str
         )
 
 
-def _wait_until_listening(ground: subprocess.Popen[str], endpoint: str, out: Path) -> None:
-    host, _, port = endpoint.partition("/")[2].partition(":")
-    deadline = time.monotonic() + READY_S
-    while time.monotonic() < deadline and ground.poll() is None:
-        try:
-            socket.create_connection((host, int(port)), timeout=1.0).close()
-        except OSError:
-            time.sleep(0.1)
-        else:
-            return
-    raise OutsideError(f"the ground receiver did not start; see {out / 'ground.log'}")
-
-
-def _live_page(ground: subprocess.Popen[str], out: Path) -> str:
-    """The portal's address with its token, once the receiver's log names it."""
+def _said(ground: subprocess.Popen[str], out: Path, start: str) -> str:
+    """What follows ``start`` in a line of the receiver's log, once it is there."""
     deadline = time.monotonic() + READY_S
     while time.monotonic() < deadline and ground.poll() is None:
         for line in (out / "ground.log").read_text(encoding="utf-8").splitlines():
-            if line.startswith("portal: "):
-                return line.partition(" ")[2]
+            if line.startswith(start):
+                return line.removeprefix(start)
         time.sleep(0.1)
-    raise OutsideError(f"the portal did not start; see {out / 'ground.log'}")
+    raise OutsideError(f"the ground receiver did not start; see {out / 'ground.log'}")
 
 
 def _replay(flight: Path, out: Path, endpoint: str, overrides: list[str]) -> None:

@@ -118,9 +118,7 @@ def ground(
     limits = _limits(quota_mb, drone_share, reserve_mb)
     refresh = refresh_s if refresh_s is not None else RADIO_REFRESH_S if mavlink else 0.0
     notifier = Notifier()
-    _clear(store)
-    for folder in take or ():
-        _take_in(store, folder)
+    _take_in(store, take or [])
     stop, workers = _stop_by_signal(), Workers()
     name = member_name(Path(certificate)) if certificate else ""
     receiver = Receiver(ReceiverConfig(store, session, limits, name, refresh), workers)
@@ -164,18 +162,12 @@ def _limits(quota_mb: float | None, drone_share: float, reserve_mb: float | None
     return Limits(quota, drone_share / 100.0, reserve)
 
 
-def _clear(store: Path) -> None:
-    """Delete what a process that was killed left unfinished in the store."""
-    from service.ground.storage import clear_leftovers
+def _take_in(store: Path, folders: list[Path]) -> None:
+    """Delete what a process that was killed left unfinished; take the folders' scans in."""
+    from service.ground.storage import clear_leftovers, take_in
 
     clear_leftovers(store)
-
-
-def _take_in(store: Path, folder: Path) -> None:
-    """Take a folder's scans into the store."""
-    from service.ground.storage import take_in
-
-    for taken in take_in(store, folder):
+    for taken in (path for folder in folders for path in take_in(store, folder)):
         print(f"taken in: {taken}", file=sys.stderr, flush=True)
 
 

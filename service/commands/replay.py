@@ -112,7 +112,7 @@ def _replay(
     as_json: bool,
 ) -> dict[str, Any]:
     from service.cameras.source import Paced
-    from service.compute.opening import open_backend
+    from service.compute.backend_choice import open_backend
     from service.flight.datalink import open_datalink
     from service.flight.scan import Scan, ScanInputs, create_store
     from service.scans.folder import write_deliverables

@@ -70,13 +70,9 @@ def stereo(
 
 def open_matcher(backend: str, model: Path | None) -> Backend:
     """The backend of that name, or the operator's learned model."""
-    if model is not None:
-        from service.compute.opening import load_learned_model
+    from service.compute.backend_choice import choose_backend, load_learned_model
 
-        return load_learned_model(model)
-    from service.compute.backend_choice import choose_backend
-
-    return choose_backend(backend)
+    return choose_backend(backend) if model is None else load_learned_model(model)
 
 
 def check_output(path: Path, suffix: str) -> None:

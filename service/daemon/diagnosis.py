@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import http.client
 import json
 import os
 import platform
@@ -11,12 +10,13 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from dataclasses import dataclass
+from http.client import HTTPException
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.request import urlopen
 
 from mavlink.telemetry.clock import EARLIEST_UNIX_S
 from service.compute.threading_layer import REMEDY, kernels_may_overlap
@@ -139,7 +139,6 @@ def _machine(config: Config) -> Iterator[Finding]:
 
 
 def _board(config: Config, model: str) -> Iterator[Finding]:
-
     name = board_of(model)
     path = profile_path(name)
     if path is None:
@@ -191,7 +190,7 @@ def _folder(folder: Path) -> Iterator[Finding]:
 
 
 def _compute(config: Config) -> Iterator[Finding]:
-    from service.compute.opening import open_backend
+    from service.compute.backend_choice import open_backend
 
     start = time.monotonic()
     try:
@@ -313,12 +312,10 @@ def _datalink(config: Config) -> Iterator[Finding]:
 
 def running_service(address: str) -> dict[str, Any] | None:
     """The ``/status`` at ``address`` (HOST:PORT); None when no skyrelief answers there."""
-    host, _, port = address.rpartition(":")
     try:
-        with closing(http.client.HTTPConnection(host.strip("[]"), int(port), WAIT_S)) as page:
-            page.request("GET", "/status")
-            status = json.loads(page.getresponse().read(LARGEST_BYTES))
-    except (OSError, ValueError, http.client.HTTPException):
+        with urlopen(f"http://{address}/status", timeout=WAIT_S) as page:
+            status = json.loads(page.read(LARGEST_BYTES))
+    except (OSError, ValueError, HTTPException):
         return None
     is_ours = isinstance(status, dict) and str(status.get("software", "")).startswith("skyrelief")
     return status if is_ours else None

@@ -69,7 +69,7 @@ class Scanning:
     def load(self) -> None:
         """Load camera model and backend, which takes long; InputError if they are unusable."""
         from service.cameras.camera_file import load_camera
-        from service.compute.opening import open_backend
+        from service.compute.backend_choice import open_backend
 
         if not self.config.camera.source:
             raise InputError("camera.source is not set; give it in the configuration file")

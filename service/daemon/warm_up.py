@@ -71,7 +71,7 @@ def warm_up(config: Config) -> tuple[float, int]:
     """
     from recon.backends.cpu import warm_up as warm_up_backend
     from recon.types import Camera
-    from service.compute.opening import open_backend
+    from service.compute.backend_choice import open_backend
     from service.flight.scan import Scan, ScanInputs, create_store
     from service.scans.folder import write_deliverables
 

@@ -9,9 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import shutil
 import sqlite3
-import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -23,7 +21,15 @@ import msgspec
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.ground.mcap_import import header_in, store_from_mcap
 from service.ground.scan_facts import Labels, facts_of, labels_in
-from service.ground.storage import OTHER_FILES, STORE_FILES, copy_files, is_regular, run_folder
+from service.ground.storage import (
+    OTHER_FILES,
+    STORE_FILES,
+    clear_leftovers,
+    copy_files,
+    is_regular,
+    run_folder,
+    workplace,
+)
 from service.scans.folder import SUMMARY, write_deliverables
 from service.scans.writing import writing
 from service.stream.records import ScanHeader
@@ -36,9 +42,6 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 MAX_TITLE = 200
 MAX_TAGS = 20
-IMPORTING = ".importing-"
-"""Begins the name of a folder in the store that an import fills."""
-
 UNREADABLE = (SkyreliefError, sqlite3.Error, OSError, ValueError, OverflowError, RecursionError)
 """Errors of a broken scan; the list shows it with the reason."""
 
@@ -80,8 +83,7 @@ class Library:
         self.store = store
         self._lock = threading.Lock()
         self._import_lock = threading.Lock()
-        for left in store.glob(f"{IMPORTING}*"):  # by a process that was killed
-            shutil.rmtree(left, ignore_errors=True)
+        clear_leftovers(store)
 
     def scans(self) -> list[dict[str, Any]]:
         """One entry per scan, the newest first; a broken scan is listed with what is wrong."""
@@ -236,20 +238,13 @@ class Library:
 
     def _take(self, fill: Callable[[Path], ScanHeader]) -> tuple[str, str]:
         """Have ``fill`` make a scan folder, then give it its place, under the lock."""
-        try:
-            part = Path(tempfile.mkdtemp(prefix=IMPORTING, dir=self.store))
-        except OSError as error:
-            raise OutsideError(f"cannot write in {self.store} ({error})") from error
-        try:
+        with workplace(self.store) as place:
+            part = place / "scan"
+            part.mkdir(0o750)
             header = fill(part)
-            part.chmod(0o750)
             with self._lock:
                 target = self._check_new(header)
                 _move(part, target)
-        except OSError as error:
-            raise OutsideError(f"cannot write in {part} ({error})") from error
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
         return target.parent.name, target.name
 
     def _check_new(self, header: ScanHeader) -> Path:

@@ -226,7 +226,7 @@ def _short(path: Path) -> str:
 
 
 TAKING = ".taking-"
-"""Begins the name of a folder that a card's scan is copied to."""
+"""Begins the name of a folder that a scan is copied to, from a card or into the library."""
 
 
 def take_in(store: Path, folder: Path) -> list[Path]:
@@ -244,7 +244,7 @@ def take_in(store: Path, folder: Path) -> list[Path]:
 
 
 def _take(store: Path, folder: Path) -> Path:
-    with _workplace(store) as place:
+    with workplace(store) as place:
         for name in STORE_FILES:
             if is_regular(folder / name):
                 shutil.copyfile(folder / name, place / name, follow_symlinks=False)
@@ -260,7 +260,7 @@ def _take(store: Path, folder: Path) -> Path:
 
 
 @contextmanager
-def _workplace(store: Path) -> Iterator[Path]:
+def workplace(store: Path) -> Iterator[Path]:
     """A folder in the store to copy to, gone afterwards. Raises OutsideError when the disk is
     full, there and for what is done in it."""
     try:

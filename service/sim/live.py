@@ -10,9 +10,9 @@ import heapq
 import logging
 import select
 import socket
-import struct
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +20,7 @@ from typing import Any
 
 import av
 
+from mavlink.wire.tlog import packets
 from service.errors import InputError, OutsideError
 from service.sim.recording import EPOCH_UNIX_S
 from service.sim.telemetry import BOOT_BEFORE_VIDEO_S
@@ -188,10 +189,7 @@ def _packets(source: Any) -> Iterator[tuple[float, int, Any]]:
 
 def _telemetry(tlog: Path) -> Iterator[tuple[float, int, bytes]]:
     """(seconds, TELEMETRY, packet) of the log; nothing when there is none."""
-    data = tlog.read_bytes() if tlog.exists() else b""
-    at = 0
-    while at + 20 <= len(data):
-        (unix_us,) = struct.unpack_from(">Q", data, at)
-        size = data[at + 9] + 12  # MAVLink 2 without a signature
-        yield unix_us / 1e6 - EPOCH_UNIX_S, TELEMETRY, data[at + 8 : at + 8 + size]
-        at += 8 + size
+    if tlog.exists():
+        with tlog.open("rb") as file:
+            for unix_ns, packet in packets(file, Counter()):
+                yield unix_ns * 1e-9 - EPOCH_UNIX_S, TELEMETRY, packet.data
