@@ -11,8 +11,14 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from mavlink.telemetry import quaternion
-from mavlink.telemetry.frame_watch import FrameWatch, judge_frame
-from mavlink.telemetry.gimbal import GimbalConfig, frame_of_flags, steadiest_frame, to_earth
+from mavlink.telemetry.gimbal import (
+    FrameWatch,
+    GimbalConfig,
+    frame_of_flags,
+    judge_frame,
+    steadiest_frame,
+    to_earth,
+)
 from mavlink.telemetry.history import M_PER_DEG, HistoryConfig, VehicleHistory
 from mavlink.telemetry.quaternion import Quaternion
 from mavlink.telemetry.samples import (

@@ -367,8 +367,8 @@ def test_unfinished_records_are_bounded() -> None:
         part = split("k1", number, bytes(4000), 2000)[0]
         assembler.add(part, float(number))
     assert len(assembler._open) <= 65
-    assert assembler.missing_parts("k1", 999) == [1]
-    assert assembler.missing_parts("k1", 0) is None
+    assert assembler.missing_parts("k1", 999) == ([1], 2)
+    assert assembler.missing_parts("k1", 0) == ([], 0)
 
 
 def test_messages_round_trip() -> None:

@@ -28,6 +28,7 @@ MAX_SIGMA_MS = 25.0  # maximum sigma of an estimate that is reported
 RIVAL = 1.3  # a second solution, further away than RIVAL_APART_S, must fit worse by this factor
 RIVAL_APART_S = 0.15
 KEPT = 2000
+RANGE_S = (-0.2, 0.8)
 COARSE_S, FINE_S, FINE_STEPS = 0.02, 0.004, 8
 OUTLIER = 4.0  # times the median misfit
 
@@ -67,10 +68,7 @@ class _Turns:
 class LatencyWatch:
     """Collects rotations between frames and estimates the latency."""
 
-    def __init__(self, range_ms: tuple[float, float] = (-200.0, 800.0)) -> None:
-        if not range_ms[0] < range_ms[1]:
-            raise ValueError(f"latency range {range_ms} must go upwards")
-        self._range_s = (range_ms[0] * 1e-3, range_ms[1] * 1e-3)
+    def __init__(self) -> None:
         self._frames: deque[tuple[int, int, Quaternion]] = deque(maxlen=KEPT)  # run, time, turned
         self._run = 0
 
@@ -96,7 +94,7 @@ class LatencyWatch:
         if len(attitudes) < MIN_WINDOWS or len(self._frames) < MIN_WINDOWS:
             return None
         track = Attitudes(attitudes)
-        low, high = self._range_s
+        low, high = RANGE_S
         seen = self._turns(track.base_ns, max(WINDOW_S, 2.0 * track.spacing_s))
         inside = (seen.start_s - high > track.first_s) & (seen.end_s - low < track.last_s)
         seen = seen.only(inside)

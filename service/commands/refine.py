@@ -162,12 +162,9 @@ def refly(
         found = coverage_of(scan.store)
         if found is None:
             raise InputError(f"{scan_dir} holds no surface; there is nothing to compare with")
-        limits = found.limits
-        if views is not None:
-            limits = replace(limits, min_views=views)
-        if sigma_m is not None:
-            limits = replace(limits, max_sigma_m=sigma_m)
-        found = replace(found, limits=limits)
+        given: dict[str, Any] = {"min_views": views, "max_sigma_m": sigma_m}
+        limits = {name: value for name, value in given.items() if value is not None}
+        found = replace(found, limits=replace(found.limits, **limits))
         heights = [p.agl_m for p in scan.poses if p.agl_m is not None]
         height = float(np.median(heights)) if heights else None
         moving = [p.speed_m_s for p in scan.poses if p.speed_m_s > 0.2]

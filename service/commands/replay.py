@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from service.commands import ConfigFile, Overrides
+
 if TYPE_CHECKING:
     from mavlink.telemetry.logs import TelemetryLog
     from recon.types import Camera
@@ -40,10 +42,8 @@ def replay(
     realtime: Annotated[
         bool, typer.Option("--realtime", help="at the video's pace, dropping what comes too fast")
     ] = False,
-    config: Annotated[Path | None, typer.Option(help="configuration file (TOML)")] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="section.key=value, may be repeated")
-    ] = None,
+    config: ConfigFile = None,
+    set_: Overrides = None,
     as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
 ) -> None:
     """Recorded video, a folder of images or a pipe through the onboard path into a scan."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 import signal
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
+from service.commands import ConfigFile, Overrides
 
 if TYPE_CHECKING:
     from mavlink.wire.first_beat import FirstBeats
@@ -20,10 +20,8 @@ log = logging.getLogger(__name__)
 
 
 def run(
-    config: Annotated[Path | None, typer.Option(help="configuration file (TOML)")] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="section.key=value, may be repeated")
-    ] = None,
+    config: ConfigFile = None,
+    set_: Overrides = None,
 ) -> None:
     """Wait for the operator's commands and scan; ends on Ctrl-C or a TERM signal.
 

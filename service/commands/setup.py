@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from service.commands import ConfigFile, Overrides
 from service.config import keys as configuration_keys
 from service.config import load_config
 from service.errors import InputError, OutsideError
@@ -21,9 +22,7 @@ ACTIONS = ("check", "show", "default")
 def config(
     action: Annotated[str, typer.Argument(help="check, show or default")],
     file: Annotated[Path | None, typer.Argument(help="configuration file (TOML)")] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="section.key=value, may be repeated")
-    ] = None,
+    set_: Overrides = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
     """Check a configuration file, show what is in force, or print the documented default.
@@ -79,9 +78,7 @@ def doctor(
     config: Annotated[
         Path | None, typer.Option(help=f"configuration file; else {INSTALLED} if it is there")
     ] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="section.key=value, may be repeated")
-    ] = None,
+    set_: Overrides = None,
     listen_s: Annotated[float, typer.Option(help="seconds to listen on the MAVLink links")] = 3.0,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
@@ -154,10 +151,8 @@ def _say_revoked(member: str, paths: list[Path], as_json: bool) -> None:
 
 
 def warm_up(
-    config: Annotated[Path | None, typer.Option(help="configuration file (TOML)")] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="section.key=value, may be repeated")
-    ] = None,
+    config: ConfigFile = None,
+    set_: Overrides = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
     """Scan a made-up ground once, so that no flight waits for the compilers.

@@ -299,16 +299,11 @@ class LoadControl:
             return fixed
         made, dropped = made - before[1], dropped - before[2]
         taken, late = gate.frames - before[3], gate.late - before[4]
-        return Readings(
-            made + dropped,
-            dropped,
-            taken + late,
-            late,
-            gate.age_s if taken else 0.0,
-            machine.temperature_c,
-            machine.throttled,
-            machine.memory_left_mib,
-        )
+        age_s = gate.age_s if taken else 0.0
+        return replace(
+            fixed, views=made + dropped, late_views=dropped, frames=taken + late, late_frames=late,
+            age_s=age_s,
+        )  # fmt: skip
 
     def _report_failure(self) -> None:
         """Report once that the device has failed and the CPU has replaced it."""

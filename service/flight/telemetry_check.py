@@ -10,7 +10,7 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from mavlink.telemetry.frame_watch import FrameVerdict, FrameWatch
+from mavlink.telemetry.gimbal import FrameVerdict, FrameWatch
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.latency import LatencyEstimate, LatencyWatch
 from mavlink.telemetry.quaternion import Quaternion

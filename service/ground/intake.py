@@ -247,11 +247,11 @@ class ScanIntake:
             if not numbers:
                 continue
             first = next(iter(numbers.newest_first()))
-            parts = self._assembler.missing_parts(kind, first)
+            parts, count = self._assembler.missing_parts(kind, first)
             ask = Ask(self._peer)
             if parts:
                 numbers = RangeSet([(first, first)])
-                ask = Ask(self._peer, RangeSet.of(parts), self._assembler.count(kind, first))
+                ask = Ask(self._peer, RangeSet.of(parts), count)
             self.progress.asked += 1
             self._requests[slot] = _Request(kind, numbers, self.progress.asked, now, now)
             return kind, numbers, ask
@@ -297,8 +297,7 @@ class ScanIntake:
         out = RangeSet()
         room = BATCH.get(kind, self._fine_batch)
         for number in due.newest_first():
-            touched = self._assembler.touched(kind, number)
-            if touched is None or now - touched >= GRACE_S:
+            if now - self._assembler.touched(kind, number) >= GRACE_S:
                 out.add(number)
             if len(out) >= room:
                 break

@@ -13,6 +13,7 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -128,11 +129,11 @@ def unpack(data: bytes) -> tuple[LayerHead, tuple[bytes, ...]] | None:
     return (head, tuple(sections)) if offset == len(data) else None
 
 
-def _head(fields: list[tuple[object, ...]]) -> LayerHead | None:
-    _, _, layer, layers, bits, seq, time_unix_ns = _ints(fields[0])
-    w, h, factor, method, x, y, box_w, box_h = _ints(fields[1])
+def _head(fields: list[tuple[Any, ...]]) -> LayerHead | None:
+    _, _, layer, layers, bits, seq, time_unix_ns = fields[0]
+    w, h, factor, method, x, y, box_w, box_h = fields[1]
     optics = np.array(fields[2], np.float64)
-    place = unpack_place(fields[3][0]) if isinstance(fields[3][0], bytes) else None
+    place = unpack_place(fields[3][0])
     if place is None or not np.isfinite(optics).all():
         return None
     fx, fy, cx, cy = optics[2:]
@@ -152,10 +153,6 @@ def _head(fields: list[tuple[object, ...]]) -> LayerHead | None:
         covariance=place[1],
         sources=sources_of(bits),
     )
-
-
-def _ints(values: tuple[object, ...]) -> list[int]:
-    return [v if isinstance(v, int) else 0 for v in values]
 
 
 def _plausible(head: LayerHead) -> bool:

@@ -7,6 +7,7 @@ in the JSON messages has a plausible range; a message that violates one is inval
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
@@ -172,22 +173,17 @@ class Assembler:
         whole = len(record) == entry.total_bytes and zlib.crc32(record) == entry.crc
         return record if whole else None
 
-    def missing_parts(self, kind: str, number: int) -> list[int] | None:
-        """The missing parts of a record in progress; None for any other."""
+    def missing_parts(self, kind: str, number: int) -> tuple[list[int], int]:
+        """The missing parts of a record in progress, and its count of parts; ([], 0) for others."""
         entry = self._open.get((kind, number))
         if entry is None:
-            return None
-        return [k for k in range(entry.count) if k not in entry.pieces]
+            return [], 0
+        return [k for k in range(entry.count) if k not in entry.pieces], entry.count
 
-    def count(self, kind: str, number: int) -> int:
-        """Number of parts of a record in progress; 0 for any other."""
+    def touched(self, kind: str, number: int) -> float:
+        """Time of the last part of a record in progress; -inf for any other."""
         entry = self._open.get((kind, number))
-        return 0 if entry is None else entry.count
-
-    def touched(self, kind: str, number: int) -> float | None:
-        """Time of the last part of a record in progress; None for any other."""
-        entry = self._open.get((kind, number))
-        return None if entry is None else entry.touched
+        return -math.inf if entry is None else entry.touched
 
     def forget(self, kind: str, number: int) -> None:
         """Discard the parts of a record."""

@@ -167,16 +167,13 @@ def ranges_from_text(text: str) -> RangeSet | None:
     return ranges_from_pairs(pairs)
 
 
-def ranges_from_pairs(pairs: Any, max_number: int = MAX_NUMBER) -> RangeSet | None:
-    """The set of decoded JSON ``[[first, last], …]``; None for anything else.
-
-    A number above ``max_number`` is invalid.
-    """
+def ranges_from_pairs(pairs: Any) -> RangeSet | None:
+    """The set of decoded JSON ``[[first, last], …]``; None for anything else."""
     if not isinstance(pairs, list) or len(pairs) > MAX_RANGES:
         return None
     for pair in pairs:
         if not (isinstance(pair, (list, tuple)) and len(pair) == 2):
             return None
-        if not all(type(n) is int and 0 <= n <= max_number for n in pair) or pair[0] > pair[1]:
+        if not all(type(n) is int and 0 <= n <= MAX_NUMBER for n in pair) or pair[0] > pair[1]:
             return None
     return RangeSet((a, b) for a, b in pairs)

@@ -26,19 +26,16 @@ def delivered(store: ScanStore) -> bool:
     return any(not missing(numbers, held) for held in store.held().values())
 
 
-def open_undelivered(scans: Path, but: Path | None = None) -> list[ScanStore]:
+def open_undelivered(scans: Path) -> list[ScanStore]:
     """The newest undelivered scans under ``scans`` (a folder of scan folders).
 
-    ``but`` is a database to leave out, such as that of the scan in progress. A scan that a crash
-    cut short is closed with ``{"interrupted": true}``, so that the ground knows that it is
-    complete. Unreadable scans are skipped with a warning.
+    A scan that a crash cut short is closed with ``{"interrupted": true}``, so that the ground knows
+    that it is complete. Unreadable scans are skipped with a warning.
     """
     out: list[ScanStore] = []
     for path in sorted(scans.glob("*/scan.db"), key=_changed, reverse=True):
         if len(out) >= MAX_OFFERED:
             break
-        if but is not None and path.resolve() == but.resolve():
-            continue
         try:
             if _was_delivered(path):
                 continue
