@@ -380,43 +380,32 @@ def patchwork(folder: Path, size: tuple[int, int], seed: int) -> U8:
         raise InputError(f"photos {folder}: no such folder")
     paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
     rng = np.random.default_rng(seed + 2)
-    photos = _Photos([paths[i] for i in rng.permutation(len(paths))], folder)
+    photos = _photos([paths[i] for i in rng.permutation(len(paths))], folder)
     W, H = size
     out = np.zeros((H, W, 3), np.uint8)
-    step = [int(s * (1 - FEATHER)) for s in photos.size]
+    step = [int(s * (1 - FEATHER)) for s in photos[0].shape[1::-1]]
     count = 0
     for y in range(0, H, step[1]):
         for x in range(0, W, step[0]):
             flips = rng.integers(0, 2, 2)
-            photo = photos.get(count)[:: 1 - 2 * int(flips[0]), :: 1 - 2 * int(flips[1])]
+            photo = photos[count % len(photos)][:: 1 - 2 * int(flips[0]), :: 1 - 2 * int(flips[1])]
             _lay(out, photo, x, y)
             count += 1
     return out
 
 
-class _Photos:
+def _photos(paths: list[Path], folder: Path) -> list[U8]:
     """The readable photographs of a folder, all cut to one size and mean brightness."""
-
-    def __init__(self, paths: list[Path], folder: Path) -> None:
-        self.paths = paths
-        self.images: list[U8] = []
-        for path in paths[:24]:
-            image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-            if image is not None and min(image.shape[:2]) >= 64:
-                self.images.append(np.asarray(image, np.uint8))
-        if not self.images:
-            raise InputError(f"photos {folder}: no readable photograph (jpg, png or tif)")
-        h = min(i.shape[0] for i in self.images)
-        w = min(i.shape[1] for i in self.images)
-        mean = float(np.mean([i.mean() for i in self.images]))
-        self.size = (w, h)
-        self.images = [
-            np.asarray(cv2.convertScaleAbs(i[:h, :w], alpha=mean / max(float(i.mean()), 1.0)))
-            for i in self.images
-        ]
-
-    def get(self, index: int) -> U8:
-        return self.images[index % len(self.images)]
+    read = (cv2.imread(str(path), cv2.IMREAD_COLOR) for path in paths[:24])
+    found = [i for i in read if i is not None and min(i.shape[:2]) >= 64]
+    if not found:
+        raise InputError(f"photos {folder}: no readable photograph (jpg, png or tif)")
+    h, w = (min(i.shape[axis] for i in found) for axis in (0, 1))
+    mean = float(np.mean([i.mean() for i in found]))
+    return [
+        np.asarray(cv2.convertScaleAbs(i[:h, :w], alpha=mean / max(float(i.mean()), 1.0)), np.uint8)
+        for i in found
+    ]
 
 
 def _ramp(length: int, fade: int) -> F32:
