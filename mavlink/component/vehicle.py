@@ -98,7 +98,7 @@ class VehicleLink:
         self._signing = self._make_signing()
         self.presence = Presence(
             config.presence,
-            new_token() if first is None else first.token,
+            secrets.randbits(32) or 1 if first is None else first.token,
             now_ns,
             None if first is None else round(first.next_s * S),
             self._memory.system,
@@ -320,8 +320,3 @@ class VehicleLink:
         timestamp = 0 if self._signing is None else self._signing.timestamp
         system = self.presence.proven_system
         self._memory.save(parameters.kept(), parameters.revision, timestamp, system)
-
-
-def new_token() -> int:
-    """A token that distinguishes our own echoed heartbeats from another companion's."""
-    return secrets.randbits(32) or 1

@@ -345,7 +345,8 @@ def _outcome(
             made_s = at - drone.emulator.started
             if _is_up(trial.link, made_s):
                 latency.setdefault(kind, []).append(came - at)
-            ended = _cut_before(trial.link, made_s)
+            cuts = (last for _, last in trial.link.cuts if last <= made_s < last + SETTLE_S)
+            ended = next(cuts, None)  # when the cut ended that it came soon after
             if kind == "k0" and ended is not None:
                 settling.append(came - at)
                 back.append(came - drone.emulator.started - ended)
@@ -371,8 +372,3 @@ def _outcome(
 def _is_up(link: LinkModel, at_s: float) -> bool:
     """Whether something captured then could travel: no cut just before or soon after."""
     return not any(first - 1.0 <= at_s < last + SETTLE_S for first, last in link.cuts)
-
-
-def _cut_before(link: LinkModel, at_s: float) -> float | None:
-    """When the cut ended that something captured then came soon after; None for none."""
-    return next((last for _, last in link.cuts if last <= at_s < last + SETTLE_S), None)

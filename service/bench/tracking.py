@@ -34,7 +34,8 @@ def run(options: BenchOptions) -> list[BenchResult]:
     timed = [
         compare(
             "matching", "corners, 1280x720, 30x30 grid", partial(harris_grid, a, config), options,
-            "OpenCV goodFeaturesToTrack", partial(features_by_opencv, a),
+            "OpenCV goodFeaturesToTrack",
+            partial(cv2.goodFeaturesToTrack, a, 900, 0.001, 15, useHarrisDetector=True, k=0.04),
         ),
         compare(
             "matching", f"match {len(corners)} corners, radius {RADIUS_PX:.0f} px",
@@ -76,11 +77,6 @@ def noisy(scene: F64, rng: np.random.Generator) -> U8:
     view = scene[64 : 64 + SIZE[0], 64 : 64 + SIZE[1]]
     seen = view + rng.normal(size=SIZE) * NOISE
     return np.asarray(np.clip(np.round(seen), 0, 255), np.uint8)
-
-
-def features_by_opencv(image: U8) -> object:
-    """900 Harris corners by OpenCV."""
-    return cv2.goodFeaturesToTrack(image, 900, 0.001, 15, useHarrisDetector=True, k=0.04)
 
 
 def matched(a: U8, b: U8, corners: Corners, config: MatchingConfig) -> tuple[F32, F32]:

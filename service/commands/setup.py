@@ -62,13 +62,8 @@ def to_toml(values: Mapping[str, Mapping[str, Any]], documented: bool = False) -
         if value is None:
             lines.append(f"# {field.name} = (not set)")
         else:
-            lines.append(f"{field.name} = {_toml_value(value)}")
+            lines.append(f"{field.name} = {json.dumps(value, ensure_ascii=False)}")
     return "\n".join(lines) + "\n"
-
-
-def _toml_value(value: Any) -> str:
-    """``value`` in TOML: its strings, numbers, booleans and arrays of them match JSON's."""
-    return json.dumps(value, ensure_ascii=False)
 
 
 INSTALLED = Path("/etc/skyrelief/skyrelief.toml")

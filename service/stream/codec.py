@@ -19,7 +19,7 @@ import numpy as np
 
 from recon.camera_model import scaled_K
 from recon.types import F64, DepthMap, Keyframe, Pose
-from service.stream import planes
+from service.stream import plane_coders, planes
 from service.stream.records import PLACE_BYTES, pack_place, source_bits, sources_of, unpack_place
 from service.stream.validity import MAX_DEPTH_M, MIN_DEPTH_M, is_inverse_depth, is_pinhole, is_time
 
@@ -246,7 +246,7 @@ def _layer(
         codes, low, step = planes.quantise(cut, step)
         sections = (
             planes.encode_mask(cut.known),
-            planes.encode_depth(codes, cut.known),
+            plane_coders.encode_codes(codes, cut.known),
             planes.encode_sigma(cut),
             planes.encode_views(cut) if layer == layers - 1 else b"",
             planes.encode_colour(cut, quality),

@@ -122,11 +122,6 @@ def quantise(planes: Planes, step: float) -> tuple[U16, float, float]:
     return np.clip(codes, 0, MAX_CODE).astype(np.uint16), float(low), float(step32)
 
 
-def encode_depth(codes: U16, known: Bool) -> bytes:
-    """The codes, by METHOD_PREDICTION."""
-    return plane_coders.encode_codes(codes, known)
-
-
 def decode_depth(data: bytes, known: Bool, method: int, low: float, step: float) -> F32 | None:
     """(h, w) depth in metres; arbitrary where unknown."""
     h, w = known.shape

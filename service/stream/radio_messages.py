@@ -17,7 +17,14 @@ import numpy.typing as npt
 from recon import se3
 from recon.types import F32, F64, U8, Bool
 from service.stream.naming import NAME, split_scan_name
-from service.stream.records import PoseRecord, ScanHeader, source_bits, sources_of
+from service.stream.records import (
+    PoseRecord,
+    ScanHeader,
+    or_nan,
+    or_none,
+    source_bits,
+    sources_of,
+)
 from service.stream.validity import is_on_globe, is_pinhole, is_time
 
 U16 = npt.NDArray[np.uint16]
@@ -64,15 +71,14 @@ def pack_announce(header: ScanHeader) -> bytes:
     drone, scan = header.drone.encode(), header.name.encode()
     if _ANNOUNCE.size + len(drone) + len(scan) > MAX_BYTES:
         raise ValueError(f"{header.drone}/{header.name} is too long for the radio")
-    nan = math.nan
     return (
         _ANNOUNCE.pack(
             ANNOUNCE,
             tag_of(header.drone, header.name),
             header.started_unix_ns,
-            nan if header.origin_lat_deg is None else header.origin_lat_deg,
-            nan if header.origin_lon_deg is None else header.origin_lon_deg,
-            nan if header.origin_alt_amsl_m is None else header.origin_alt_amsl_m,
+            or_nan(header.origin_lat_deg),
+            or_nan(header.origin_lon_deg),
+            or_nan(header.origin_alt_amsl_m),
             header.epsg or 0,
             len(drone),
         )
@@ -93,20 +99,15 @@ def unpack_announce(data: bytes) -> ScanHeader | None:
     drone, scan = names[:length], names[length:]
     if not (NAME.fullmatch(drone) and NAME.fullmatch(scan)) or tag_of(drone, scan) != tag:
         return None
-    if (
-        started < 0
-        or not is_time(started)
-        or not is_on_globe(_finite(lat), _finite(lon), _finite(alt))
-    ):
+    place = (or_none(lat), or_none(lon), or_none(alt))
+    if started < 0 or not is_time(started) or not is_on_globe(*place):
         return None
     scan_id, run_id = split_scan_name(scan)
     return ScanHeader(
         scan_id,
         drone,
         started,
-        origin_lat_deg=_finite(lat),
-        origin_lon_deg=_finite(lon),
-        origin_alt_amsl_m=_finite(alt),
+        *place,
         epsg=epsg or None,
         georeference="none" if math.isnan(lat) else "gnss",
         notes=(RADIO_NOTE,),
@@ -114,14 +115,9 @@ def unpack_announce(data: bytes) -> ScanHeader | None:
     )
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 def pack_pose(tag: int, number: int, pose: PoseRecord) -> bytes:
     """A pose, rounded to a centimetre and 3e-5."""
-    lat = math.nan if pose.lat_deg is None else pose.lat_deg
-    lon = math.nan if pose.lon_deg is None else pose.lon_deg
+    lat, lon = or_nan(pose.lat_deg), or_nan(pose.lon_deg)
     no_fix = math.isnan(lat) or math.isnan(lon)
     return _POSE.pack(
         POSE,
@@ -132,7 +128,7 @@ def pack_pose(tag: int, number: int, pose: PoseRecord) -> bytes:
         *_rotation(pose.T_world_camera),
         -(1 << 31) if no_fix else round(lat * 1e7),
         -(1 << 31) if no_fix else round(lon * 1e7),
-        math.nan if pose.alt_amsl_m is None else pose.alt_amsl_m,
+        or_nan(pose.alt_amsl_m),
         min(65535, round(pose.sigma_m * _METRE_CM)),
         source_bits(pose.sources),
         min(65535, round(pose.speed_m_s * _METRE_CM)),
@@ -152,7 +148,7 @@ def unpack_pose(data: bytes) -> tuple[int, int, PoseRecord] | None:
     sigma = f[14] / _METRE_CM
     if not is_time(f[3]):
         return None
-    if not no_fix and not is_on_globe(f[11] * 1e-7, f[12] * 1e-7, _finite(f[13])):
+    if not no_fix and not is_on_globe(f[11] * 1e-7, f[12] * 1e-7, or_none(f[13])):
         return None
     pose = PoseRecord(
         f[3],
@@ -160,7 +156,7 @@ def unpack_pose(data: bytes) -> tuple[int, int, PoseRecord] | None:
         np.diag([1e-4] * 3 + [sigma**2] * 3),
         lat_deg=None if no_fix else f[11] * 1e-7,
         lon_deg=None if no_fix else f[12] * 1e-7,
-        alt_amsl_m=_finite(f[13]),
+        alt_amsl_m=or_none(f[13]),
         sources=sources_of(f[15]),
         sigma_m=sigma,
         speed_m_s=f[16] / _METRE_CM,

@@ -224,11 +224,13 @@ _POSE = _Placed(b"SP", first="Bqi", last="3d8f")
 _REPOSE = _Placed(b"SR", first="BII", last="f")
 
 
-def _or_nan(value: float | None) -> float:
+def or_nan(value: float | None) -> float:
+    """NaN for None, as on the wire."""
     return math.nan if value is None else value
 
 
-def _or_none(value: float) -> float | None:
+def or_none(value: float) -> float | None:
+    """None for NaN and infinity."""
     return value if math.isfinite(value) else None
 
 
@@ -241,7 +243,7 @@ def pack_pose(pose: PoseRecord) -> bytes:
         pose.T_world_camera,
         pose.covariance,
         (
-            *map(_or_nan, place),
+            *map(or_nan, place),
             pose.roll_rad,
             pose.pitch_rad,
             pose.yaw_rad,
@@ -259,7 +261,7 @@ def unpack_pose(data: bytes) -> PoseRecord | None:
     if found is None:
         return None
     (bits, time_unix_ns, seq), motion, covariance, last = found
-    lat, lon, alt, agl = map(_or_none, last[:4])
+    lat, lon, alt, agl = map(or_none, last[:4])
     roll, pitch, yaw, speed, distance, turn, sigma = last[4:]
     if not (validity.is_time(time_unix_ns) and validity.is_on_globe(lat, lon, alt, agl)):
         return None
