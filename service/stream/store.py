@@ -178,13 +178,12 @@ class ScanStore:
         Over the quota only the coarse layer is kept. Raises ValueError for bytes that are no
         layer of this keyframe, OutsideError when the disk is full.
         """
-        heads = [codec.peek(data) for data in layers]
-        if any(head is None or head.seq != seq for head in heads):
+        found = [(head, data) for data in layers if (head := codec.peek(data)) is not None]
+        if len(found) < len(layers) or any(head.seq != seq for head, _ in found):
             raise ValueError(f"not the layers of keyframe {seq}")
         with self._lock:
-            room = self._room(sum(map(len, layers)))
-            kept = layers if room else layers[:1]
-            self.refused += len(layers) - len(kept)
+            kept = found if self._room(sum(map(len, layers))) else found[:1]
+            self.refused += len(found) - len(kept)
             return self._put_chunks(kept)
 
     def add_chunk(self, data: bytes) -> bool:
@@ -196,22 +195,20 @@ class ScanStore:
             if head.layer > 0 and not self._room(len(data)):
                 self.refused += 1
                 return False
-            return self._put_chunks([data]) > 0
+            return self._put_chunks([(head, data)]) > 0
 
-    def _put_chunks(self, layers: Sequence[bytes]) -> int:
-        heads = [head for data in layers if (head := codec.peek(data)) is not None]
+    def _put_chunks(self, layers: Sequence[tuple[codec.LayerHead, bytes]]) -> int:
         sql = "INSERT OR IGNORE INTO chunks VALUES (?, ?, ?, ?, ?, ?, ?)"
-        with self._lock:
-            fresh = [
-                (head, data)
-                for head, data in zip(heads, layers, strict=True)
-                if head.seq not in self._inventory.of(f"k{head.layer}")
-            ]
-            self._db.write([(sql, _chunk_row(head, data)) for head, data in fresh])
-            for head, data in fresh:
-                self.chunk_bytes += len(data)
-                self._inventory.note(f"k{head.layer}", head.seq)
-            return len(fresh)
+        fresh = [
+            (head, data)
+            for head, data in layers
+            if head.seq not in self._inventory.of(f"k{head.layer}")
+        ]
+        self._db.write([(sql, _chunk_row(head, data)) for head, data in fresh])
+        for head, data in fresh:
+            self.chunk_bytes += len(data)
+            self._inventory.note(f"k{head.layer}", head.seq)
+        return len(fresh)
 
     def chunk(self, seq: int, number: int) -> bytes | None:
         """The coded layer ``number`` of keyframe ``seq``."""
