@@ -44,7 +44,7 @@ def test_an_import_takes_regular_files_of_known_names_only(
     assert client.ask("/api/import", "POST", {"folder": str(card)})[0] == 201
     assert {p.name for p in (store / "drone-1/test-1").iterdir()} == {"scan.db", "scan.json"}
     assert sorted(path.name for path in card.iterdir()) == before
-    assert not list(store.glob(".importing-*"))
+    assert not list(store.glob(".taking-*"))
 
 
 @pytest.mark.parametrize("what", ["link", "link to a folder", "fifo", "nothing", "junk"])
@@ -66,7 +66,7 @@ def test_a_card_without_a_sound_scan_is_refused(
         (card / "scan.db").write_bytes(b"no database" * 1000)
     status, answer, _ = client.ask("/api/import", "POST", {"folder": str(folder)})
     assert status == 400 and "\n" not in answer["error"]
-    assert client.ask("/api/scans")[1] == [] and not list(store.glob(".importing-*"))
+    assert client.ask("/api/scans")[1] == [] and not list(store.glob(".taking-*"))
 
 
 def test_a_recording_that_is_a_link_or_a_pipe_is_refused(client: Client, tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_an_import_holds_no_lock_of_the_library(
 
 
 def test_what_a_killed_import_left_goes_at_the_next_start(store: Path) -> None:
-    (store / ".importing-x").mkdir()
-    (store / ".importing-x/scan.db").write_bytes(b"half")
+    (store / ".taking-x").mkdir()
+    (store / ".taking-x/scan.db").write_bytes(b"half")
     Library(store)
-    assert not (store / ".importing-x").exists()
+    assert not (store / ".taking-x").exists()
