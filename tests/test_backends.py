@@ -24,7 +24,7 @@ from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F64, U8, DepthMap, DisparityMap
 
 NEEDS = {"cpu": "numba", "torch": "torch", "onnx": "onnxruntime"}
-BELIEVE_ALL = BeliefPropagationConfig(
+ACCEPT_ALL = BeliefPropagationConfig(
     min_evidence=0, min_contrast=0, occlusion_tolerance=-1, speckle_px=0
 )
 
@@ -133,7 +133,7 @@ def test_pairs_of_nearly_one_size_share_what_is_built(backend: Backend) -> None:
     for height, width, labels in ((60, 100, 17), (57, 97, 20), (64, 127, 24), (58, 110, 18)):
         image = rng.integers(0, 256, (height, width), np.uint8)
         guide = rng.integers(0, 256, (round(1.5 * height), round(1.5 * width), 3), np.uint8)
-        found = backend.belief_propagation(image, image, labels, BELIEVE_ALL)
+        found = backend.belief_propagation(image, image, labels, ACCEPT_ALL)
         assert found.px.shape == (height, width)
         assert backend.upsample(found, guide, UpsamplingConfig()).px.shape == guide.shape[:2]
     assert len(built) <= 3  # the guide of the widest has a larger array
@@ -209,7 +209,7 @@ def test_icp_finds_the_motion_and_agrees_with_the_compiled_one(backend: Backend)
 def test_bad_input_is_named(backend: Backend) -> None:
     image = np.zeros((20, 30), np.uint8)
     with pytest.raises(ValueError, match="one size"):
-        backend.belief_propagation(image, image[:, :-1], 16, BELIEVE_ALL)
+        backend.belief_propagation(image, image[:, :-1], 16, ACCEPT_ALL)
     given = DisparityMap(np.zeros((20, 30), np.float32), np.ones((20, 30), np.float32))
     with pytest.raises(ValueError, match="smaller"):
         backend.upsample(given, np.zeros((10, 10, 3), np.uint8), UpsamplingConfig())

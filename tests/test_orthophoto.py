@@ -87,7 +87,7 @@ def test_every_place_shows_what_stands_there_and_no_wall() -> None:
     off = np.abs(rgb.astype(int) - true_map().astype(int)).max(axis=2)
     checked = known & away_from_walls(0.6)
     assert (off[checked] < 16).mean() > 0.995
-    # A roof that leans away from the middle of an image would cover ground beside the block.
+    # A roof that leans away from the middle of an image would cover ground next to the block.
     red = (rgb[..., 0] > 150) & (rgb[..., 1] < 60) & away_from_walls(0.6)
     assert red.sum() == pytest.approx(
         away_from_walls(0.6)[(true_map()[..., 1] == 30)].sum(), rel=0.02

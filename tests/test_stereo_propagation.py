@@ -14,7 +14,7 @@ from recon.stereo.matching_cost import COST_UNIT, MatchingCostConfig, census, ma
 from recon.stereo.message_passing import propagate
 from recon.types import F64, U8, Array
 
-BELIEVE_ALL = BeliefPropagationConfig(
+ACCEPT_ALL = BeliefPropagationConfig(
     min_evidence=0, min_contrast=0, occlusion_tolerance=-1, speckle_px=0
 )
 
@@ -156,7 +156,7 @@ def test_slanted_plane_to_a_tenth_of_a_pixel(labels: int, top: float) -> None:
 def test_offset_between_labels_has_little_bias() -> None:
     for fraction in (0.0, 0.2, 0.4, 0.5, 0.6, 0.8):
         truth = np.full((60, 120), 6 + fraction)
-        px = belief_propagation(*shifted_pair(truth, blur=1.5), 16, BELIEVE_ALL).px
+        px = belief_propagation(*shifted_pair(truth, blur=1.5), 16, ACCEPT_ALL).px
         assert abs(np.median(px[:, 30:]) - 6 - fraction) < 0.07
 
 
@@ -164,10 +164,10 @@ def test_min_disparity_moves_the_window_only() -> None:
     truth = np.full((60, 140), 23.3)
     left, right = shifted_pair(truth)
     for first in (0, 10, 20):
-        config = replace(BELIEVE_ALL, min_disparity=first)
+        config = replace(ACCEPT_ALL, min_disparity=first)
         px = belief_propagation(left, right, 26 - first, config).px[:, 40:]
         assert abs(np.nanmedian(px) + first - 23.3) < 0.1
-    px = belief_propagation(right, left, 8, replace(BELIEVE_ALL, min_disparity=-27)).px[:, :90]
+    px = belief_propagation(right, left, 8, replace(ACCEPT_ALL, min_disparity=-27)).px[:, :90]
     assert abs(np.nanmedian(px) - 27 + 23.3) < 0.1  # the views exchanged
 
 
@@ -238,7 +238,7 @@ def test_confidence_tells_right_from_wrong() -> None:
     patch = gray(texture(120, 200, 9))
     left = left.copy()
     left[30:80, 80:150] = patch[30:80, 80:150]  # moved between the exposures
-    found = belief_propagation(left, right, 16, BELIEVE_ALL)
+    found = belief_propagation(left, right, 16, ACCEPT_ALL)
     wrong = np.abs(found.px - truth) > 1
     inside = np.zeros(truth.shape, np.bool_)
     inside[34:76, 84:146] = True
@@ -327,11 +327,11 @@ def test_small_images_do_not_fail(shape: tuple[int, int]) -> None:
 def test_bad_input_is_named() -> None:
     image = np.zeros((20, 30), np.uint8)
     with pytest.raises(ValueError, match="one size"):
-        belief_propagation(image, image[:, :-1], 16, BELIEVE_ALL)
+        belief_propagation(image, image[:, :-1], 16, ACCEPT_ALL)
     with pytest.raises(ValueError, match="labels"):
-        belief_propagation(image, image, 1, BELIEVE_ALL)
+        belief_propagation(image, image, 1, ACCEPT_ALL)
     with pytest.raises(ValueError, match="gray"):
-        belief_propagation(image.astype(np.float32), image, 16, BELIEVE_ALL)
+        belief_propagation(image.astype(np.float32), image, 16, ACCEPT_ALL)
     for wrong in (
         {"iterations": 0}, {"levels": 0}, {"smoothness_truncation": 0.0},
         {"smoothness_truncation": 99.0}, {"edge_floor": 0.0}, {"edge_contrast": 0},

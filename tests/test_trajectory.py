@@ -162,18 +162,18 @@ def test_a_frame_rides_on_its_keyframe() -> None:
     assert here[0, 3] == pytest.approx(0.5 * key.scale)
 
 
-def test_the_end_tells_each_sigma_as_it_is() -> None:
-    """The first keyframes are told before their segment has a frame, with a sigma of 1 m each."""
+def test_the_end_publishes_each_sigma_as_it_is() -> None:
+    """The first keyframes are published before their segment is placed, with sigmas of 1 m."""
     truth = legs()
-    trajectory, told = Trajectory(), {}
+    trajectory, published = Trajectory(), {}
     for i, T in enumerate(truth):
         trajectory.add(10 * i, 0, T, prior(T), (HEIGHT_M, 0.0), i * 10**9, COVARIANCE)
-        told[10 * i] = trajectory.place(10 * i)
-        trajectory.publish(told[10 * i])
-    assert told[0].sigma_m == pytest.approx(np.sqrt(3.0))
-    for p in trajectory.moved(final=True):  # the poses settle, as told in flight
-        trajectory.publish(replace(p, covariance=told[p.seq].covariance))
+        published[10 * i] = trajectory.place(10 * i)
+        trajectory.publish(published[10 * i])
+    assert published[0].sigma_m == pytest.approx(np.sqrt(3.0))
+    for p in trajectory.moved(final=True):  # the poses settle, as published in flight
+        trajectory.publish(replace(p, covariance=published[p.seq].covariance))
     for p in trajectory.moved(final=True):
-        told[p.seq] = p
-    for seq, p in told.items():
+        published[p.seq] = p
+    for seq, p in published.items():
         assert p.sigma_m == pytest.approx(trajectory.place(seq).sigma_m, rel=0.02), seq

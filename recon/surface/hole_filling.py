@@ -1,7 +1,7 @@
 """Unknown cells of a surface model filled from the known ones around them.
 
 A hole has known cells on nearly all sides, within a few metres. On level ground it takes their
-heights. Beside a step it takes the lower surface, because a roof hides the ground beside it;
+heights. Next to a step it takes the lower surface, because a roof hides the ground there;
 next to the step, where matching makes roofs too wide, it stays unknown.
 """
 
@@ -24,7 +24,7 @@ SLOPE = 0.3
 surfaces."""
 
 EDGE_CELLS = 2
-"""As close as this to something higher a cell beside a step may be roof or ground."""
+"""As close as this to something higher a cell next to a step may be roof or ground."""
 
 
 def surface_model(xyz_m: F64 | F32, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:
@@ -84,7 +84,7 @@ def _around(
     Writes ``near`` (height, distance in cells, row, column) and ``above`` (height, distance);
     returns how many. None are near where too many neighbouring directions are open.
     """
-    count, doubts, is_open, most_open = 0, 0, 0, 0
+    count, doubts, is_open, max_open = 0, 0, 0, 0
     for k in range(2 * DIRECTIONS):  # twice around, so that a run of open ones has no border
         angle = 2.0 * np.pi * k / DIRECTIONS
         is_open += 1
@@ -104,8 +104,8 @@ def _around(
                 above[doubts, 0], above[doubts, 1] = doubtful[row, col], step
                 doubts += 1
                 doubted = True
-        most_open = max(most_open, is_open)
-    return (0, 0) if most_open > MAX_OPEN_DIRECTIONS else (count, doubts)
+        max_open = max(max_open, is_open)
+    return (0, 0) if max_open > MAX_OPEN_DIRECTIONS else (count, doubts)
 
 
 @njit(cache=True, nogil=True)

@@ -1,7 +1,7 @@
 """``skyrelief bench codec``: bits per point, time and error of the chunk codec and its peers.
 
 All code the same synthetic keyframes (depth 50 to 95 m, noise 2 cm white and 8 cm
-correlated). Ours carries mask, sigma, views and a coarse layer besides; the peers do not.
+correlated). Ours carries mask, sigma, views and a coarse layer too; the peers do not.
 """
 
 from __future__ import annotations

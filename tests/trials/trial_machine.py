@@ -1,4 +1,4 @@
-"""A bare Debian that is booted by its own systemd, beside ours, for the trials of the installation.
+"""A bare Debian that its own systemd boots, next to ours, for the trials of the installation.
 
 The processes in it share our kernel and our network, and nothing else. Ending its first process
 ends all of them at once, which is what a power cut looks like from inside.
