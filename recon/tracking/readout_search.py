@@ -27,8 +27,8 @@ COARSE_S = 1e-3 * np.arange(-40.0, 41.0, 10.0)
 STEP_S = 5e-3
 """About the one in use, once it is sure."""
 
-NEAR_S = 3e-3
-"""Windows adjusted further from the readout in use than this no longer count."""
+NEAR_S = 1e-3
+"""A readout further from the one in use begins anew."""
 
 MAX_READOUT_S = 0.05
 
@@ -67,7 +67,7 @@ class ReadoutSearch:
         self.estimate: ReadoutEstimate | None = None
         self._clock, self._K = clock, K
         self._last_seq = -1
-        self._found: deque[tuple[float, float]] = deque(maxlen=16)  # readout, weight
+        self._found: deque[tuple[float, float]] = deque(maxlen=4)  # readout, weight
 
     def look(self, keyframes: list[OdometryKeyframe]) -> None:
         """Search once the newest of the ``keyframes``, all settled, ends a further window."""
@@ -93,6 +93,7 @@ class ReadoutSearch:
         best = float(tried[k] + step)
         if abs(best - now) > NEAR_S:
             self._found.clear()
+            self._last_seq += 1  # its keyframe takes no part in the next window
         self._found.append((best, float(0.5 * curvature * redundancy / here)))
         self._combine(max(BENT * abs(best - now), FLOOR_S))
 
