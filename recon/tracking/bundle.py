@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from recon.small_matrices import invert_3x3, solve_symmetric
 from recon.types import F64, Bool
 
 I64 = npt.NDArray[np.int64]
@@ -44,14 +45,24 @@ def _se3_exp(d: F64, out: F64) -> None:
     else:
         s, c, e = np.sin(a) / a, (1 - np.cos(a)) / a2, (a - np.sin(a)) / (a2 * a)
     W = np.array([[0.0, -wz, wy], [wz, 0.0, -wx], [-wy, wx, 0.0]])
-    W2 = W @ W
     out[:, :] = 0.0
     out[3, 3] = 1.0
     for i in range(3):
         for j in range(3):
             eye = 1.0 if i == j else 0.0
-            out[i, j] = eye + s * W[i, j] + c * W2[i, j]
-            out[i, 3] += (eye + c * W[i, j] + e * W2[i, j]) * d[3 + j]
+            squared = d[i] * d[j] - eye * a2
+            out[i, j] = eye + s * W[i, j] + c * squared
+            out[i, 3] += (eye + c * W[i, j] + e * squared) * d[3 + j]
+
+
+@njit(cache=True, nogil=True)
+def _compose(A: F64, B: F64, out: F64) -> None:
+    """``out`` = A B, (4, 4) each."""
+    for i in range(4):
+        for j in range(4):
+            out[i, j] = 0.0
+            for n in range(4):
+                out[i, j] += A[i, n] * B[n, j]
 
 
 @njit(cache=True, nogil=True)
@@ -122,6 +133,7 @@ def _normal_equations(
     Jc = np.zeros((2, 6))
     Jp = np.zeros((2, 3))
     r = np.zeros(2)
+    A = np.zeros((6, 3))
     for p in range(X.shape[0]):
         H = np.zeros((3, 3))
         b = np.zeros(3)
@@ -146,9 +158,13 @@ def _normal_equations(
         ridge = 1e-9 * (H[0, 0] + H[1, 1] + H[2, 2]) + 1e-9  # far points have no depth
         for i in range(3):
             H[i, i] += damping * H[i, i] + ridge
-        Hpp_inv[p] = np.linalg.inv(H)
-        bp[p] = b
-    ridge = 1e-10 * np.trace(S) / (6 * n_free) + 1e-9
+        invert_3x3(H, Hpp_inv[p])
+        for i in range(3):
+            bp[p, i] = b[i]
+    trace = 0.0
+    for i in range(6 * n_free):
+        trace += S[i, i]
+    ridge = 1e-10 * trace / (6 * n_free) + 1e-9
     for i in range(6 * n_free):
         S[i, i] += damping * S[i, i] + ridge
     for p in range(X.shape[0]):
@@ -156,10 +172,12 @@ def _normal_equations(
             s = slot[cam[m]]
             if s < 0:
                 continue
-            A = W[m] @ Hpp_inv[p]
-            Ab = A @ bp[p]
             for i in range(6):
-                g[6 * s + i] -= Ab[i]
+                for j in range(3):
+                    A[i, j] = 0.0
+                    for n in range(3):
+                        A[i, j] += W[m, i, n] * Hpp_inv[p, n, j]
+                    g[6 * s + i] -= A[i, j] * bp[p, j]
             for n in range(start[p], start[p + 1]):
                 t = slot[cam[n]]
                 if t < 0:
@@ -195,6 +213,7 @@ def _adjust(
     W = np.zeros((M, 6, 3))
     res = np.zeros(M)
     step = np.zeros((4, 4))
+    dc = np.zeros((6 * n_free, 1))
     cost = _cost(T, X, cam, pt, uv, k, huber, res)
     damping = 1e-4
     improved = False
@@ -202,20 +221,27 @@ def _adjust(
         _normal_equations(
             T, X, cam, start, uv, k, huber, slot, n_free, damping, S, g, Hpp_inv, bp, W
         )
-        dc = np.linalg.solve(S, g)
-        T_new = T.copy()
+        for i in range(6 * n_free):
+            dc[i, 0] = g[i]
+        if not solve_symmetric(S, dc):
+            damping *= 10.0
+            continue
+        T_new, X_new = T.copy(), X.copy()
         for c in range(T.shape[0]):
             if slot[c] >= 0:
-                _se3_exp(dc[6 * slot[c] : 6 * slot[c] + 6], step)
-                T_new[c] = step @ T[c]
-        X_new = X.copy()
+                _se3_exp(dc[6 * slot[c] : 6 * slot[c] + 6, 0], step)
+                _compose(step, T[c], T_new[c])
         for p in range(N):
-            b = bp[p].copy()
             for m in range(start[p], start[p + 1]):
                 s = slot[cam[m]]
-                if s >= 0:
-                    b -= W[m].T @ dc[6 * s : 6 * s + 6]
-            X_new[p] += Hpp_inv[p] @ b
+                if s < 0:
+                    continue
+                for i in range(6):
+                    for j in range(3):
+                        bp[p, j] -= W[m, i, j] * dc[6 * s + i, 0]
+            for i in range(3):
+                for j in range(3):
+                    X_new[p, i] += Hpp_inv[p, i, j] * bp[p, j]
         cost_new = _cost(T_new, X_new, cam, pt, uv, k, huber, res)
         if cost_new < cost:
             gain = (cost - cost_new) / max(cost, 1e-12)

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
+from recon.small_matrices import solve_symmetric
 from recon.tracking import patch_search
 from recon.types import F32, F64, U8, Bool
 
@@ -29,7 +30,9 @@ def affine_trend(uv: Any, moves: Any, first: Any, tolerance: float, trend: Any) 
     trend[0, 0], trend[0, 1] = first[0], first[1]
     row = np.empty(3)
     for sharpness in (0.125, 0.25, 0.5, 1.0, 1.0):
-        H, g = 1e-6 * np.eye(3), np.zeros((3, 2))
+        H, g = np.zeros((3, 3)), np.zeros((3, 2))
+        for k in range(3):
+            H[k, k] = 1e-6
         for p in range(uv.shape[0]):
             row[0], row[1], row[2] = 1.0, uv[p, 0] / 1000, uv[p, 1] / 1000
             du, dv = moves[p, 0], moves[p, 1]
@@ -43,7 +46,9 @@ def affine_trend(uv: Any, moves: Any, first: Any, tolerance: float, trend: Any) 
                 g[k, 1] += weight * row[k] * moves[p, 1]
                 for m in range(3):
                     H[k, m] += weight * row[k] * row[m]
-        trend[:] = np.linalg.solve(H, g)
+        solve_symmetric(H, g)
+        for k in range(3):
+            trend[k, 0], trend[k, 1] = g[k, 0], g[k, 1]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
