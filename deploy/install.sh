@@ -62,17 +62,6 @@ check_python() {
   "$python" -c 'import ensurepip' 2>/dev/null || die "no venv module; apt install python3-venv"
 }
 
-# Without OpenMP numba cannot run tracking and stereo in parallel.
-check_openmp() {
-  [[ -z $root ]] || return 0
-  "$python" -c 'import ctypes; ctypes.CDLL("libgomp.so.1")' 2>/dev/null && return 0
-  if [[ -z $bundle ]] && command -v apt-get >/dev/null; then
-    say "installing libgomp1 (OpenMP)"
-    apt-get install -y -q libgomp1 >/dev/null && return 0
-  fi
-  say "libgomp1 (OpenMP) is missing: it will run at half the speed; apt install libgomp1"
-}
-
 # What the packages of version folder $1 load from the system (service/packages.py has the list).
 check_libraries() {
   [[ -z $root ]] || return 0
@@ -294,7 +283,6 @@ do_install() {
   [[ -z $profile || -r ${bundle:-$here}/deploy/profiles/$profile.toml ]] ||
     die "no profile $profile; there are $(cd "${bundle:-$here}/deploy/profiles" && echo ./*.toml)"
   check_python
-  check_openmp
   local new old before
   new=$(version_to_install)
   old=$(version_now)

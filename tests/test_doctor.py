@@ -28,7 +28,6 @@ def findings(*overrides: str, listen_s: float = 0.1) -> dict[str, tuple[str, str
 
 
 def test_everything_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.daemon.diagnosis.kernels_may_overlap", lambda: True)
     port = free_port()
     ended = threading.Event()
 
@@ -150,15 +149,9 @@ def test_the_boards_settings_are_compared() -> None:
     assert reported[0] == NOTE
 
 
-def test_threads_and_kernels_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.daemon.diagnosis.kernels_may_overlap", lambda: False)
+def test_kernels_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.daemon.diagnosis.is_warm", lambda: True)
-    found = findings()
-    assert found["threads"] == (
-        BAD,
-        "no OpenMP: half the speed, one core idle; apt install libgomp1",
-    )
-    assert found["kernels"][0] == GOOD
+    assert findings()["kernels"][0] == GOOD
 
 
 def test_what_a_running_service_holds_is_asked_of_it(tmp_path: Path) -> None:

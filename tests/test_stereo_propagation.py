@@ -9,6 +9,7 @@ import dense_reference as reference
 import numpy as np
 import pytest
 
+from recon import bands
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.matching_cost import COST_UNIT, MatchingCostConfig, census, matching_cost
 from recon.stereo.message_passing import propagate
@@ -256,17 +257,14 @@ def test_exposure_change_is_survived() -> None:
 
 
 def test_result_does_not_depend_on_the_number_of_threads() -> None:
-    import numba
-
     _, *views = box_scene()
     left, right = (np.tile(view, (4, 1)) for view in views)  # tall enough for several bands
     many = belief_propagation(left, right, 20, BeliefPropagationConfig())
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
+    bands.limit_threads(1)
     try:
         one = belief_propagation(left, right, 20, BeliefPropagationConfig())
     finally:
-        numba.set_num_threads(threads)
+        bands.limit_threads(0)
     np.testing.assert_array_equal(many.px, one.px)
     np.testing.assert_array_equal(many.confidence, one.confidence)
 
@@ -279,7 +277,7 @@ def test_read_only_and_strided_images_compile_nothing_new() -> None:
     image = np.random.default_rng(0).integers(0, 256, (40, 60), np.uint8)
     guide = np.random.default_rng(1).integers(0, 256, (80, 120, 3), np.uint8)
     kernels = (
-        message_passing._sweeps, message_passing._weights, labels._select,
+        message_passing._sweep_band, message_passing._weights, labels._select,
         labels._check_visibility, upsampling._bilateral, upsampling._fill_taps,
     )  # fmt: skip
 

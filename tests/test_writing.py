@@ -9,7 +9,6 @@ import pytest
 from loopback import until
 
 from mavlink.component.control import Result, Work
-from service.daemon import writing
 from service.daemon.writing import Writings
 from service.errors import OutsideError
 from service.stream.records import ScanHeader
@@ -70,7 +69,6 @@ class Landing:
 def slow(monkeypatch: pytest.MonkeyPatch) -> Slow:
     files = Slow()
     monkeypatch.setattr("service.scans.folder.write_deliverables", files)
-    monkeypatch.setattr(writing, "kernels_may_overlap", lambda: True)
     return files
 
 
@@ -130,17 +128,3 @@ def test_a_fault_during_another_scan_is_reported(slow: Slow, landing: Landing) -
     assert landing.reported == ["Scan s is stored, its files are not written: the disk is full"]
     assert landing.work.answer is not None and landing.work.answer.result is Result.FAILED
     assert not landing.is_open
-
-
-def test_kernels_that_may_not_overlap_make_it_wait(
-    slow: Slow, landing: Landing, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(writing, "kernels_may_overlap", lambda: False)
-    landing.in_haste.set()
-    waiting = threading.Thread(target=landing.write)
-    waiting.start()
-    waiting.join(0.5)
-    assert waiting.is_alive()
-    slow.may_end.set()
-    waiting.join()
-    assert landing.asked == ["land"]

@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 REACH = 2  # the window is (2 REACH + 1) squared
 MIN_PIXELS = 12  # of the 25, next to holes
@@ -84,21 +84,20 @@ def _full_fits(inverse: Any, v: int, column: Any, fits: Any) -> None:
         rest[u] = (s2 - s0 * s0 * (1 / 25) - (sx * sx + s1 * s1) * (1 / 50)) * (1 / 22)
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def surface_elements(
-    depth: Any, sigma: Any, fx: float, fy: float, cx: float, cy: float, edge: float, elements: Any
-) -> None:
-    """Fill ``elements`` from ``depth`` and ``sigma`` (h, w); NaN is unknown.
+    begin: int, end: int, depth: Any, inverse: Any, sigma: Any, fx: float, fy: float, cx: float,
+    cy: float, edge: float, elements: Any,
+) -> None:  # fmt: skip
+    """Fill ``elements`` from ``depth``, its ``inverse`` and ``sigma`` (h, w); NaN is unknown.
+
+    ``begin`` to ``end`` count chunks of rows.
 
     No element where the fit misses by more than ``edge`` (share of the depth) and 3 sigma: a
     depth edge runs through the window.
     """
     h, w = depth.shape
-    inverse = np.empty((h, w), np.float64)
-    for v in prange(h):
-        for u in range(w):
-            inverse[v, u] = 1.0 / depth[v, u] if depth[v, u] > 0 else np.nan
-    for chunk in prange((h + CHUNK - 1) // CHUNK):
+    for chunk in range(begin, end):
         column, fits, fit = np.empty((3, w)), np.empty((4, w)), np.empty(4)
         for v in range(chunk * CHUNK, min((chunk + 1) * CHUNK, h)):
             _full_fits(inverse, v, column, fits)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon import se3
+from recon.bands import in_bands
 from recon.camera_model import rays
 from recon.mapping import icp_kernels
 from recon.types import F32, F64, Bool, DepthMap, Registration
@@ -87,7 +88,12 @@ class Surface:
         sigma = np.ascontiguousarray(depth.sigma_m, np.float32)
         intrinsics = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
         elements = np.zeros((h, w, 6), np.float32)
-        icp_kernels.surface_elements(z, sigma, *intrinsics, config.edge_share, elements)
+        inverse = 1.0 / np.where(z > 0, z, np.float32(np.nan)).astype(np.float64)
+        chunks = -(-h // icp_kernels.CHUNK)
+        in_bands(
+            icp_kernels.surface_elements, chunks, z, inverse, sigma, *intrinsics,
+            config.edge_share, elements,
+        )  # fmt: skip
         v, u = np.nonzero(elements[::4, ::4, 4])
         some = z[4 * v, 4 * u].astype(np.float64)
         points = some[:, None] * rays(K, np.column_stack([4.0 * u, 4.0 * v]))

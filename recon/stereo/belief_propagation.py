@@ -19,8 +19,9 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import njit
 
+from recon.bands import in_bands
 from recon.stereo.matching_cost import (
     COST_UNIT,
     MatchingCostConfig,
@@ -167,7 +168,10 @@ def select(
     height, _, width = cost.shape
     px = np.empty((height, width), np.float32)
     confidence = np.empty((height, width), np.float32)
-    _select(data, messages, cost, min_disparity, truncation, float(min_evidence), px, confidence)
+    in_bands(
+        _select, -(-cost.shape[0] // _CHUNK), data, messages, cost, min_disparity, truncation,
+        float(min_evidence), px, confidence,
+    )  # fmt: skip
     return px, confidence
 
 
@@ -267,8 +271,10 @@ def _offset(box: Any, label: int, u: int) -> Any:  # pragma: no cover - compiled
     return min(max((a - b) / (np.float32(2) * steep), np.float32(-0.5)), np.float32(0.5))
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _select(
+    begin: int,
+    end: int,
     data: Any,
     messages: Any,
     cost: Any,
@@ -281,7 +287,7 @@ def _select(
     height, labels, width = cost.shape
     cells = data.shape[3]
     window = np.float32((2 * RADIUS + 1) ** 2)
-    for chunk in prange((height + _CHUNK - 1) // _CHUNK):
+    for chunk in range(begin, end):
         first = chunk * _CHUNK
         sums = np.zeros((labels, width + 2 * RADIUS), np.int16)
         box = np.empty((labels, width), np.int32)

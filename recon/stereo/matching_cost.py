@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import njit
 
+from recon.bands import in_bands
 from recon.types import U8
 
 I16 = npt.NDArray[np.int16]
@@ -81,7 +82,9 @@ def matching_cost(
     left, right = plain(left), plain(right)
     height, width = left.shape
     cost = np.empty((height, labels, width), np.int16) if out is None else out
-    _cost_volume(
+    in_bands(
+        _cost_volume,
+        height,
         left,
         right,
         census(left),
@@ -153,8 +156,10 @@ def _popcount(word: Any) -> Any:  # pragma: no cover - compiled
     return (word * np.uint64(0x0101010101010101)) >> np.uint64(56)
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _cost_volume(
+    begin: int,
+    end: int,
     left: Any,
     right: Any,
     census_left: Any,
@@ -167,8 +172,8 @@ def _cost_volume(
     unseen: int,
     cost: Any,
 ) -> None:  # pragma: no cover - compiled
-    height, labels, width = cost.shape
-    for v in prange(height):
+    _, labels, width = cost.shape
+    for v in range(begin, end):
         best = np.full(width, np.int16(32767), np.int16)
         for label in range(labels):
             shift = label + min_disparity

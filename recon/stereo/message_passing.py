@@ -21,10 +21,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from llvmlite import ir
-from numba import get_num_threads, njit, prange, types
+from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from recon.bands import in_bands, threads
 from recon.stereo.matching_cost import Workspace
 from recon.types import U8
 
@@ -240,11 +241,7 @@ def propagate(
         _start(messages, w, finer)
         messages = finer
         edges = _edges(weight, cells, smoothness.slope, truncation)
-        bands = min(get_num_threads(), h // max(BAND_ROWS, 2 * iterations))
-        if bands > 1:
-            _sweeps(data, messages, edges, w, iterations, bands)
-        else:
-            _sweep_band(data, messages, edges, w, iterations, 0, 1)
+        _sweeps(data, messages, edges, w, iterations)
     return pyramid[0], messages
 
 
@@ -425,13 +422,19 @@ def _sweep_gap(
             _update_row(data, messages, v, t & 1, edges, masks, scratch)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _sweeps(
-    data: Any, messages: Any, edges: Any, width: int, iterations: int, bands: int
-) -> None:  # pragma: no cover - compiled
-    """All iterations of a level, the bands in parallel."""
-    for band in prange(bands):
-        _sweep_band(data, messages, edges, width, iterations, band, bands)
-    for band in prange(1, bands):
-        edge = data.shape[0] * band // bands
-        _sweep_gap(data, messages, edges, width, iterations, edge)
+def _sweeps(data: I16, messages: I16, edges: Any, width: int, iterations: int) -> None:
+    """All iterations of a level, in bands of rows; then what the bands left out between them."""
+    height = data.shape[0]
+    bands = max(1, min(threads(), height // max(BAND_ROWS, 2 * iterations)))
+
+    def sweep(begin: int, end: int) -> None:
+        for band in range(begin, end):
+            _sweep_band(data, messages, edges, width, iterations, band, bands)
+
+    def close(begin: int, end: int) -> None:
+        for band in range(begin, end):
+            edge = height * (band + 1) // bands
+            _sweep_gap(data, messages, edges, width, iterations, edge)
+
+    in_bands(sweep, bands)
+    in_bands(close, bands - 1)

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from recon import se3
+from recon.bands import in_bands
 from recon.image_quality import halved, stretch
 from recon.stereo.reprojection import LABEL_SIGMA_PX, MIN_CONFIDENCE, PairDepth, label_at
 from recon.types import F32, F64, U8, Bool, DisparityMap, PolarPair
@@ -318,7 +319,9 @@ def reproject_polar(
         pair.px_per_rad, pair.rows_per_rad, pair.first_rad, pair.first_row_rad,
         pair.first_label, pair.baseline_m, *pair.relief,
     ]  # fmt: skip
-    _reproject(
+    in_bands(
+        _reproject,
+        h,
         disparity.px,
         disparity.confidence,
         np.ascontiguousarray(pair.R_left_keyframe @ np.linalg.inv(K)),
@@ -331,8 +334,10 @@ def reproject_polar(
     return out
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _reproject(
+    begin: int,
+    end: int,
     px: Any,
     confidence: Any,
     to_polar: Any,
@@ -342,9 +347,9 @@ def _reproject(
     depth_m: Any,
     sigma_m: Any,
 ) -> None:  # pragma: no cover - compiled
-    height, width = depth_m.shape
+    width = depth_m.shape[1]
     f, rows_per_rad, first, first_row, lowest, base, low, high = sampling
-    for v in prange(height):
+    for v in range(begin, end):
         for u in range(width):
             depth_m[v, u] = np.nan
             sigma_m[v, u] = np.nan

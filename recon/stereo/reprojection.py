@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
+from recon.bands import in_bands
 from recon.types import F32, F64, DepthMap, DisparityMap, StereoPair
 
 LABEL_SIGMA_PX = 0.075
@@ -50,7 +51,9 @@ def reproject(
     out = PairDepth(np.empty((h, w), np.float32), np.empty((h, w), np.float32))
     to_left = pair.K @ pair.R_left_keyframe @ np.linalg.inv(K)
     finer = np.array(disparity.px.shape, np.float64) / pair.left.shape
-    _reproject(
+    in_bands(
+        _reproject,
+        h,
         disparity.px,
         disparity.confidence,
         np.ascontiguousarray(to_left),
@@ -83,8 +86,10 @@ def label_at(px: Any, x: Any, y: Any) -> Any:  # pragma: no cover - compiled
     return nearest if np.isnan(mixed) else mixed
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _reproject(
+    begin: int,
+    end: int,
     px: Any,
     confidence: Any,
     to_left: Any,
@@ -95,8 +100,8 @@ def _reproject(
     depth_m: Any,
     sigma_m: Any,
 ) -> None:  # pragma: no cover - compiled
-    height, width = depth_m.shape
-    for v in prange(height):
+    width = depth_m.shape[1]
+    for v in range(begin, end):
         for u in range(width):
             depth_m[v, u] = np.nan
             sigma_m[v, u] = np.nan
@@ -147,9 +152,9 @@ def fuse(pairs: Sequence[PairDepth], K: F64, T_world_camera: F64, config: Fusion
         np.empty(shape, np.float32), np.empty(shape, np.float32), np.zeros(shape, np.uint8), K,
         T_world_camera,
     )  # fmt: skip
-    _fuse(
-        depth, sigma, config.agree_sigmas, config.single_view_sigma, config.max_sigma_share,
-        config.min_sigma_share, out.depth_m, out.sigma_m, out.views,
+    in_bands(
+        _fuse, shape[0], depth, sigma, config.agree_sigmas, config.single_view_sigma,
+        config.max_sigma_share, config.min_sigma_share, out.depth_m, out.sigma_m, out.views,
     )  # fmt: skip
     contradicted = np.isnan(out.depth_m) & (out.views > 0)
     refuted = np.count_nonzero(contradicted) > np.count_nonzero(out.views >= 2)
@@ -176,8 +181,10 @@ def _largest_group(
     return best
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _fuse(
+    begin: int,
+    end: int,
     depth: Any,
     sigma: Any,
     agree_sigmas: float,
@@ -188,8 +195,8 @@ def _fuse(
     out_sigma: Any,
     out_views: Any,
 ) -> None:  # pragma: no cover - compiled
-    P, height, width = depth.shape
-    for v in prange(height):
+    P, _, width = depth.shape
+    for v in range(begin, end):
         w = np.empty(P)
         s = np.empty(P)
         for u in range(width):

@@ -12,9 +12,10 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange, types
+from numba import njit, types
 from numba.extending import intrinsic
 
+from recon.bands import in_bands
 from recon.stereo.matching_cost import plain
 from recon.types import F32, U8, DisparityMap
 
@@ -87,7 +88,9 @@ def upsample(coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> Dispa
     pad = -shape[1] % TILE
     padded = -config.diameter_px % GROUP
     out, sure = np.empty((2, *shape), np.float32)
-    _bilateral(
+    in_bands(
+        _bilateral,
+        -(-shape[1] // TILE),
         _taps(coarse, guide, scale),
         plain(guide),
         np.pad(base_x, (0, pad), mode="edge"),
@@ -267,8 +270,10 @@ def _finish(sums: Any, support: Any, out: Any, sure: Any) -> None:  # pragma: no
         sure[x] = weight / everything if good else np.float32(0)
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _bilateral(
+    begin: int,
+    end: int,
     taps: Any,
     guide: Any,
     base_x: Any,
@@ -285,8 +290,7 @@ def _bilateral(
     height, width = out.shape
     reach = spatial_y.shape[0]
     groups = spatial_x.shape[1] // GROUP
-    tiles = (width + TILE - 1) // TILE
-    for tile in prange(tiles):
+    for tile in range(begin, end):
         ring = _aligned(reach * groups * TAP_RUN).reshape((reach, groups, TAP_RUN))
         ready = np.full(reach, -1, np.int64)
         first = tile * TILE

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import njit
 
+from recon.bands import in_bands
 from recon.types import F64
 
 I32 = npt.NDArray[np.int32]
@@ -59,7 +60,7 @@ class TriangleGrid:
         )
         t = np.empty(len(directions))
         hit = np.empty(len(directions), np.int32)
-        _cast_all(*self.arrays(), origins, directions, t, hit)
+        in_bands(_cast_all, len(directions), *self.arrays(), origins, directions, t, hit)
         return t, hit
 
     def closest(self, points: F64, max_m: float) -> tuple[F64, F64, I32]:
@@ -71,7 +72,8 @@ class TriangleGrid:
         distance = np.empty(len(points))
         nearest = np.empty((len(points), 3))
         hit = np.empty(len(points), np.int32)
-        _closest_all(*self.arrays(), points, float(max_m), distance, nearest, hit)
+        found = distance, nearest, hit
+        in_bands(_closest_all, len(points), *self.arrays(), points, float(max_m), *found)
         return distance, nearest, hit
 
     def arrays(self) -> tuple[Any, ...]:
@@ -276,11 +278,23 @@ def first_hit(  # type: ignore[no-untyped-def]
     return best, found
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _cast_all(  # type: ignore[no-untyped-def]
-    corners, start, items, column_z, block_z, bounds, cell_m, origins, directions, t, hit
+    begin,
+    end,
+    corners,
+    start,
+    items,
+    column_z,
+    block_z,
+    bounds,
+    cell_m,
+    origins,
+    directions,
+    t,
+    hit,
 ):
-    for n in prange(len(directions)):
+    for n in range(begin, end):
         o, d = origins[n], directions[n]
         tn, m = first_hit(
             corners, start, items, column_z, block_z, bounds, cell_m,
@@ -335,12 +349,25 @@ def _column_distance2(column_z, bounds, cell_m, i, j, px, py, pz):  # type: igno
     return dx * dx + dy * dy + dz * dz
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _closest_all(  # type: ignore[no-untyped-def]
-    corners, start, items, column_z, block_z, bounds, cell_m, points, max_m, distance, nearest, hit
+    begin,
+    end,
+    corners,
+    start,
+    items,
+    column_z,
+    block_z,
+    bounds,
+    cell_m,
+    points,
+    max_m,
+    distance,
+    nearest,
+    hit,
 ):
     ny, nx = column_z.shape[0], column_z.shape[1]
-    for n in prange(len(points)):
+    for n in range(begin, end):
         px, py, pz = points[n, 0], points[n, 1], points[n, 2]
         best2, found = max_m * max_m, -1
         bx, by, bz = np.nan, np.nan, np.nan

@@ -13,8 +13,9 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import njit
 
+from recon.bands import in_bands
 from recon.small_matrices import solve_symmetric
 from recon.tracking import patch_search
 from recon.types import F32, F64, U8, Bool
@@ -95,9 +96,17 @@ def _window_products(image: Any, row0: int, row1: int, sums: Any) -> None:
                 )
 
 
-@njit(cache=True, nogil=True, fastmath=True, parallel=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def harris_cells(
-    image: Any, mask: Any, columns: int, rows: int, margin: int, k: float, found: Any
+    begin: int,
+    end: int,
+    image: Any,
+    mask: Any,
+    columns: int,
+    rows: int,
+    margin: int,
+    k: float,
+    found: Any,
 ) -> None:
     """Fill ``found`` (rows, columns, 3) with u, v and R of each cell's best local maximum.
 
@@ -106,7 +115,7 @@ def harris_cells(
     H, W = image.shape
     masked = mask.shape[0] == H
     kk = np.float32(k)
-    for j in prange(rows):
+    for j in range(begin, end):
         y0, y1 = max(H * j // rows, margin), min(H * (j + 1) // rows, H - margin)
         if y1 <= y0:
             continue
@@ -226,7 +235,9 @@ def harris_grid(gray: U8, config: MatchingConfig, mask: U8 | None = None) -> Cor
             side = 2 * margin + 1
             allowed = np.asarray(cv2.erode(mask, np.ones((side, side), np.uint8)), np.uint8)
     cells = np.zeros((config.grid, config.grid, 3), np.float32)
-    harris_cells(
+    in_bands(
+        harris_cells,
+        config.grid,
         np.ascontiguousarray(gray),
         allowed,
         config.grid,
@@ -301,8 +312,9 @@ class _Search:
         """Best places in b within ``reach`` px of ``level`` about ``uv_b`` (full-size px)."""
         N = len(uv_b)
         uv, score, second, contrast = uv_b / 2.0**level, np.empty(N), np.empty(N), np.empty(N)
-        patch_search.search(
-            self.a[level], self.b[level], self.uv_a / 2.0**level, uv.copy(),
+        in_bands(
+            patch_search.search, -(-N // patch_search.CHUNK), self.a[level], self.b[level],
+            self.uv_a / 2.0**level, uv.copy(),
             self.inverse_warp, active, reach, self.config.patch_radius_px,
             self.config.min_contrast, uv, score, second, contrast,
         )  # fmt: skip
@@ -312,8 +324,9 @@ class _Search:
         """Sub-pixel places in b from starts within about a pixel."""
         N = len(uv_b)
         uv, score, contrast_a, contrast_b = uv_b.copy(), np.empty(N), np.empty(N), np.empty(N)
-        patch_search.refine(
-            self.a[0], self.b[0], self.uv_a, self.inverse_warp, active,
+        in_bands(
+            patch_search.refine, -(-N // patch_search.CHUNK), self.a[0], self.b[0], self.uv_a,
+            self.inverse_warp, active,
             self.config.patch_radius_px, self.config.refine_iterations, uv, score, contrast_a,
             contrast_b,
         )  # fmt: skip

@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 CHUNK = 32  # points per parallel work item
 NO_SCORE = -2.0
@@ -188,9 +188,10 @@ def _vertex(line: Any, i: int, count: int) -> float:
     return float(min(max(0.5 * (line[i - 1] - line[i + 1]) / bend, -0.5), 0.5))
 
 
-@njit(cache=True, nogil=True, fastmath=True, parallel=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def search(
-    image_a: Any, image_b: Any, uv_a: Any, uv_b: Any, inverse_warp: Any, active: Any,
+    begin: int, end: int, image_a: Any, image_b: Any, uv_a: Any, uv_b: Any,
+    inverse_warp: Any, active: Any,
     reach: int, radius: int, min_contrast: float, uv_found: Any, score: Any, second: Any,
     contrast: Any,
 ) -> None:  # fmt: skip
@@ -205,7 +206,7 @@ def search(
     n, S = 2 * radius + 1, 2 * reach + 1
     padded = (n + 3) // 4 * 4
     pitch = S + n - 1
-    for chunk in prange((N + CHUNK - 1) // CHUNK):
+    for chunk in range(begin, end):
         patch = np.zeros((n, padded), np.float32)
         window = np.zeros((S + n) * pitch + 4, np.float32)
         scores = np.zeros((S, pitch), np.float32)
@@ -340,9 +341,10 @@ def _compare(kernels: Any, other: Any, n: int, sums: Any) -> None:
     sums[3] = length / n
 
 
-@njit(cache=True, nogil=True, fastmath=True, parallel=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def refine(
-    image_a: Any, image_b: Any, uv_a: Any, inverse_warp: Any, active: Any, radius: int,
+    begin: int, end: int, image_a: Any, image_b: Any, uv_a: Any, inverse_warp: Any, active: Any,
+    radius: int,
     iterations: int, uv_b: Any, score: Any, contrast_a: Any, contrast_b: Any,
 ) -> None:  # fmt: skip
     """Move ``uv_b`` (N, 2) to the sub-pixel minimum of the normalised zero-mean SSD, in place.
@@ -354,7 +356,7 @@ def refine(
     N = uv_a.shape[0]
     n = 2 * radius + 1
     pitch = n + 3
-    for chunk in prange((N + CHUNK - 1) // CHUNK):
+    for chunk in range(begin, end):
         large = np.zeros((n + 2, pitch), np.float32)
         kernels = np.zeros((4, n * pitch), np.float32)
         for y in range(n):

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 from urllib.request import urlopen
 
 from mavlink.telemetry.clock import EARLIEST_UNIX_S
-from service.compute.threading_layer import REMEDY, kernels_may_overlap
 from service.config import Config, keys, load_config
 from service.daemon.machine import existing, read_machine
 from service.daemon.simulated import is_simulated
@@ -200,10 +199,6 @@ def _compute(config: Config) -> Iterator[Finding]:
         return
     seconds = time.monotonic() - start
     yield Finding("compute", GOOD, f"{backend.name} on {backend.device}, up in {seconds:.1f} s")
-    if kernels_may_overlap():
-        yield Finding("threads", GOOD, "OpenMP or TBB: tracking and stereo run in parallel")
-    else:
-        yield Finding("threads", BAD, f"no OpenMP: half the speed, one core idle; {REMEDY}")
     if is_warm():
         yield Finding("kernels", GOOD, "compiled for this version")
     else:

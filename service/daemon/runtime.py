@@ -19,7 +19,6 @@ from mavlink.component.presence import Health
 from mavlink.component.status import CRITICAL, NOTICE, WARNING
 from mavlink.component.vehicle import VehicleLink
 from mavlink.wire.first_beat import FirstBeats
-from service.compute.threading_layer import kernels_may_overlap
 from service.config import Config, reload
 from service.daemon.control_actions import ControlActions
 from service.daemon.health import HealthServer
@@ -96,10 +95,7 @@ class Daemon:
             self.actions.is_ready = True
             notifier.ready()
             PROCESS.every("housekeeping", HOUSEKEEPING_S, self._housekeeping)
-            if kernels_may_overlap():
-                PROCESS.start("recover", lambda _: self._recover())
-            else:
-                self._recover()
+            PROCESS.start("recover", lambda _: self._recover())
             self._watch(notifier)
         finally:
             notifier.stopping()

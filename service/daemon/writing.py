@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mavlink.component.control import ACCEPTED, Answer, Result, Work
-from service.compute.threading_layer import kernels_may_overlap
 from service.errors import OutsideError
 from service.workers import PROCESS, guarded
 
@@ -101,14 +100,14 @@ class Writings:
     ) -> None:  # fmt: skip
         """Write a scan's files, then ``land`` its sender and close its store.
 
-        While ``in_haste`` reports that another scan is wanted, and kernels may run on two threads
-        at once, no scan waits for the files: ``hand_over`` ends the sender, and the work that it
-        returns is finished with the files. Raises OutsideError when they cannot be written.
+        While ``in_haste`` reports that another scan is wanted, no scan waits for the files:
+        ``hand_over`` ends the sender, and the work that it returns is finished with the files.
+        Raises OutsideError when they cannot be written.
         """
         writing = Writing(folder, store, self._written)
         self._all.append(writing)
         while not writing.wait(0.1):
-            if in_haste() and kernels_may_overlap() and writing.leave(hand_over):
+            if in_haste() and writing.leave(hand_over):
                 return
         self._all.remove(writing)
         land()

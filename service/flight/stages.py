@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from recon import se3
 from recon.backends import Backend, DenseStages, PathBackend
+from recon.bands import cores, limit_threads
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
 from recon.mapping.plausibility import plausible
@@ -54,7 +56,6 @@ from recon.types import (
 from service.background import BackgroundWorker
 from service.cameras.camera_file import with_shutter
 from service.compute.stopwatch import Stopwatch
-from service.compute.threading_layer import kernels_may_overlap, share_cores
 from service.config import ComputeConfig, Config
 from service.flight.anchorage import VIEW, Carriers, Key
 from service.flight.chain import Chain, KeyframeStep
@@ -365,6 +366,17 @@ class Stages:
     resources: ExitStack  # what to close in the end
 
 
+def _share_cores(threads: int) -> Callable[[], None]:
+    """Limit kernels of this thread to half of ``threads`` (0: one per core).
+
+    Returns what gives the other half to its calling thread: two threads that each use all cores
+    only wait for each other.
+    """
+    half = max(1, min(threads or cores(), cores()) // 2)
+    limit_threads(half)
+    return partial(limit_threads, half)
+
+
 def build_stages(
     camera: Camera,
     config: Config,
@@ -410,9 +422,9 @@ def build_stages(
     def in_background(
         work: Callable[[StereoCandidate], Keyframe | None],
     ) -> BackgroundWorker[StereoCandidate, Keyframe | None]:
-        if debug is not None or not kernels_may_overlap():
+        if debug is not None:
             return BackgroundWorker(None, work, MAX_WAITING, live)
-        return BackgroundWorker("dense", work, MAX_WAITING, live, share_cores(compute.threads))
+        return BackgroundWorker("dense", work, MAX_WAITING, live, _share_cores(compute.threads))
 
     return Stages(
         undistort=undistort,

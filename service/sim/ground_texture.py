@@ -13,8 +13,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import njit
 
+from recon.bands import in_bands
 from recon.surface.triangle_grid import first_hit
 from recon.types import F32, F64, U8
 from service.errors import InputError
@@ -73,8 +74,8 @@ def make(scene: Scene, texel_m: float, mosaic: U8 | None = None) -> GroundTextur
     out = np.empty((size[1], size[0], 3), np.uint8)
     base = np.zeros((1, 1, 3), np.uint8) if mosaic is None else _fit(mosaic, size)
     blocks = scene.blocks if len(scene.blocks) else np.zeros((1, shapes.COLUMNS))
-    _colour(
-        out, base, cover, which, blocks, light, scene.terrain.z_m,
+    in_bands(
+        _colour, len(out), out, base, cover, which, blocks, light, scene.terrain.z_m,
         scene.area.x0, scene.area.y0, texel_m, scene.terrain.step_m, sun, scene.seed,
     )  # fmt: skip
     flat, levels = _pyramid(out)
@@ -129,7 +130,7 @@ def _light(scene: Scene, sun: F64) -> F32:
     z = scene.terrain.height(gx.ravel(), gy.ravel()).reshape(gx.shape)
     out = np.empty(gx.shape, np.float32)
     blocks = scene.blocks if len(scene.blocks) else np.zeros((1, shapes.COLUMNS))
-    _shadow(*scene.grid.arrays(), gx, gy, z, which, blocks, sun, out)
+    in_bands(_shadow, len(gx), *scene.grid.arrays(), gx, gy, z, which, blocks, sun, out)
     return np.asarray(cv2.GaussianBlur(out, (0, 0), 0.7), np.float32)
 
 
@@ -154,11 +155,26 @@ def _local(block, x, y):  # type: ignore[no-untyped-def]
     return dx * block[COS] + dy * block[SIN], -dx * block[SIN] + dy * block[COS]
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _shadow(  # type: ignore[no-untyped-def]
-    corners, start, items, column_z, block_z, bounds, cell_m, gx, gy, z, which, blocks, sun, out
+    begin,
+    end,
+    corners,
+    start,
+    items,
+    column_z,
+    block_z,
+    bounds,
+    cell_m,
+    gx,
+    gy,
+    z,
+    which,
+    blocks,
+    sun,
+    out,
 ):
-    for j in prange(gx.shape[0]):
+    for j in range(begin, end):
         for i in range(gx.shape[1]):
             x, y, top = gx[j, i], gy[j, i], z[j, i]
             if which[j, i] > 0:
@@ -301,13 +317,13 @@ def _roof_facing(block, v, sun):  # type: ignore[no-untyped-def]
     return max(0.0, (sun[2] + side * rise * across) / np.sqrt(1.0 + rise * rise))
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _colour(  # type: ignore[no-untyped-def]
-    out, base, cover, which, blocks, light, z, x0, y0, texel_m, step_m, sun, seed
+    begin, end, out, base, cover, which, blocks, light, z, x0, y0, texel_m, step_m, sun, seed
 ):
     """Fill ``out`` (H, W, 3), texel by texel."""
     photo = base.shape[0] > 1
-    for row in prange(out.shape[0]):
+    for row in range(begin, end):
         for col in range(out.shape[1]):
             x, y = x0 + (col + 0.5) * texel_m, y0 + (row + 0.5) * texel_m
             lit = _height(light, (x - x0) / LIGHT_STEP_M - 0.5, (y - y0) / LIGHT_STEP_M - 0.5)

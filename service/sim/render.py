@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
+from recon.bands import in_bands
 from recon.camera_model import check_camera
 from recon.surface.triangle_grid import first_hit
 from recon.types import F32, F64, U8, Camera
@@ -94,12 +95,14 @@ class Renderer:
         R, c = np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
         focal = float(0.5 * (self.camera.K[0, 0] + self.camera.K[1, 1]))
         scene = (*self.scene.grid.arrays(), *tables, self.rays, R, c, sideways, focal)
-        _render(*scene, colour, depth, body)
-        _smooth_edges(*scene, colour, depth, body)
+        in_bands(_render, H, *scene, colour, depth, body)
+        in_bands(_smooth_edges, H, *scene, colour, depth, body)
         if look.water_m is not None:
-            flood(colour, depth, self.rays, R, c, sideways, focal, look.water_m, time_s)
+            seen = colour, depth, self.rays, R, c, sideways, focal
+            in_bands(flood, H, *seen, look.water_m, time_s)
         out = np.empty((H, W, 3), np.uint8)
-        _develop(colour, self.rays, look.noise, look.vignette, look.exposure, index, out)
+        camera = look.noise, look.vignette, look.exposure
+        in_bands(_develop, H, colour, self.rays, *camera, index, out)
         return out
 
     def depth(self, T_world_camera: F64, water_m: float | None = None) -> F32:
@@ -180,13 +183,13 @@ def _seen(  # type: ignore[no-untyped-def]
     return b + f * (b2 - b), g + f * (g2 - g), r + f * (r2 - r), t, 1 + owner[m]
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _render(  # type: ignore[no-untyped-def]
-    corners, start, items, column_z, block_z, bounds, cell_m,
+    begin, end, corners, start, items, column_z, block_z, bounds, cell_m,
     normals, material, owner, blocks, trees, bgr, levels, x0, y0, texel_m, sun,
     rays, poses_R, poses_c, sideways, focal, colour, depth, body,
 ):  # fmt: skip
-    for v in prange(rays.shape[0]):
+    for v in range(begin, end):
         for u in range(rays.shape[1]):
             R, c = (poses_R[u], poses_c[u]) if sideways else (poses_R[v], poses_c[v])
             a, b = rays[v, u, 0], rays[v, u, 1]
@@ -213,15 +216,15 @@ def _is_edge(depth, body, u, v):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _smooth_edges(  # type: ignore[no-untyped-def]
-    corners, start, items, column_z, block_z, bounds, cell_m,
+    begin, end, corners, start, items, column_z, block_z, bounds, cell_m,
     normals, material, owner, blocks, trees, bgr, levels, x0, y0, texel_m, sun,
     rays, poses_R, poses_c, sideways, focal, colour, depth, body,
 ):  # fmt: skip
     """Average a rotated square of four rays wherever an outline crosses the pixel."""
     H, W = rays.shape[0], rays.shape[1]
-    for v in prange(H):
+    for v in range(begin, end):
         for u in range(W):
             if not _is_edge(depth, body, u, v):
                 continue
@@ -247,12 +250,12 @@ def _smooth_edges(  # type: ignore[no-untyped-def]
             colour[v, u, 0], colour[v, u, 1], colour[v, u, 2] = 0.25 * tb, 0.25 * tg, 0.25 * tr
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _develop(colour, rays, noise, vignette, exposure, index, out):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, error_model="numpy")
+def _develop(begin, end, colour, rays, noise, vignette, exposure, index, out):  # type: ignore[no-untyped-def]
     """Vignetting, exposure and sensor noise."""
-    H, W = colour.shape[0], colour.shape[1]
+    W = colour.shape[1]
     corner = rays[0, 0, 0] ** 2 + rays[0, 0, 1] ** 2
-    for v in prange(H):
+    for v in range(begin, end):
         for u in range(W):
             r2 = (rays[v, u, 0] ** 2 + rays[v, u, 1] ** 2) / corner
             gain = exposure * (1.0 - vignette * r2)
@@ -270,10 +273,10 @@ LONGEST_M, OCTAVES = 24.0, 7
 CLOUDS_ABOVE_M, CLOUD_M, CLOUD_SPEED_M_S = 600.0, 500.0, 9.0
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def flood(
-    colour: F32, depth: F64, rays: F64, poses_R: F64, poses_c: F64, sideways: bool, focal: float,
-    level_m: float, time_s: float,
+    begin: int, end: int, colour: F32, depth: F64, rays: F64, poses_R: F64, poses_c: F64,
+    sideways: bool, focal: float, level_m: float, time_s: float,
 ) -> None:  # fmt: skip
     """Draw water at ``level_m`` where it is nearer than what is seen, and clouds behind all.
 
@@ -285,7 +288,7 @@ def flood(
             of each column with ``sideways``.
         focal: px.
     """
-    for v in prange(rays.shape[0]):
+    for v in range(begin, end):
         for u in range(rays.shape[1]):
             R, c = (poses_R[u], poses_c[u]) if sideways else (poses_R[v], poses_c[v])
             a, b = rays[v, u, 0], rays[v, u, 1]

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import njit
 
+from recon.bands import in_bands
 from recon.surface import triangle_grid
 from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F64, U8
@@ -340,15 +341,15 @@ def make_terrain(area: Area, relief_m: float, step_m: float, seed: int) -> Terra
     nx = int(np.ceil(area.size_m[0] / step_m)) + 1
     ny = int(np.ceil(area.size_m[1] / step_m)) + 1
     z = np.empty((ny, nx))
-    _heights(z, area.x0, area.y0, step_m, relief_m, seed)
+    in_bands(_heights, ny, z, area.x0, area.y0, step_m, relief_m, seed)
     terrain = Terrain(area, step_m, z)
     zero = terrain.height(np.zeros(1), np.zeros(1))[0]
     return Terrain(area, step_m, z - zero)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _heights(z, x0, y0, step_m, relief_m, seed):  # type: ignore[no-untyped-def]
-    for j in prange(z.shape[0]):
+@njit(cache=True, nogil=True)
+def _heights(begin, end, z, x0, y0, step_m, relief_m, seed):  # type: ignore[no-untyped-def]
+    for j in range(begin, end):
         for i in range(z.shape[1]):
             x, y = x0 + i * step_m, y0 + j * step_m
             hills = 0.30 * relief_m * fractal2(x, y, 130.0, 2, 0.45, seed + 11)

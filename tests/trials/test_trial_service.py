@@ -233,15 +233,6 @@ def test_disk_full_then_room_again(small_disk: Path, tmp_path: Path, record: Row
     assert back_s < BACK_S
 
 
-def test_without_openmp_it_scans_in_turns(tmp_path: Path, record: Row) -> None:
-    """Numba's work queue ends the process when two threads use it; a bare system has no other."""
-    with Service(tmp_path, environment={"NUMBA_THREADING_LAYER": "workqueue"}) as service:
-        service.until(lambda: len(stored(service.scans)) >= 2, "chunks")
-        assert service.said("take turns") == 1
-        assert service.stop() == 0
-    record("no OpenMP on the machine", 1, "tracking and stereo take turns", "nothing")
-
-
 CLOCK = """
 import os, time
 _file, _time, _time_ns = os.environ["TRIAL_CLOCK"], time.time, time.time_ns

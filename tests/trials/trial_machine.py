@@ -17,7 +17,7 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = "python3,python3-venv,systemd,systemd-sysv,udev,dbus,libgl1,libglib2.0-0,libgomp1"
+PACKAGES = "python3,python3-venv,systemd,systemd-sysv,udev,dbus,libgl1,libglib2.0-0"
 NEEDED = ("systemd-nspawn", "debootstrap", "nsenter")
 VERSION = "3.11"
 """Of Python in Debian 12."""

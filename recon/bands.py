@@ -1,0 +1,70 @@
+"""Compiled kernels on several cores: the rows of one call, shared out to threads.
+
+A kernel releases the interpreter's lock, so plain threads are enough. Numba's own parallel loops
+need OpenMP or TBB, abort the process when two threads enter them without, and take seconds to
+compile each.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cache
+from itertools import pairwise
+from typing import Any
+
+
+class _Limit(threading.local):
+    """How many threads a call from this thread may use."""
+
+    threads = 0  # one per core
+
+
+_limit = _Limit()
+
+
+def cores() -> int:
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def limit_threads(threads: int) -> None:
+    """Let calls from this thread use so many threads, at most one per core; 0: one per core."""
+    _limit.threads = max(threads, 0)
+
+
+def threads() -> int:
+    """How many threads a call from this thread uses."""
+    return min(_limit.threads or cores(), cores())
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    """The threads that all callers share; none is started before it is needed."""
+    return ThreadPoolExecutor(max(cores(), 1), thread_name_prefix="bands")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
+def in_bands(kernel: Callable[..., None], count: int, *arguments: Any) -> None:
+    """Call ``kernel(first, end, *arguments)`` so that 0 to ``count`` is covered once.
+
+    The bands run at the same time, so none may write what another reads. An exception of the
+    kernel is raised after all bands have ended.
+    """
+    bands = min(threads(), count)
+    if bands <= 1:
+        kernel(0, count, *arguments)
+        return
+    edges = [count * k // bands for k in range(bands + 1)]
+    others = [_pool().submit(kernel, first, end, *arguments) for first, end in pairwise(edges[1:])]
+    try:
+        kernel(edges[0], edges[1], *arguments)
+    finally:
+        wait(others)
+    for one in others:
+        one.result()

@@ -1,0 +1,100 @@
+"""Rows of a call, shared out to threads."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numba import njit
+
+from recon import bands
+from recon.types import F64
+
+
+@pytest.fixture
+def four(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A machine of four cores."""
+    monkeypatch.setattr(bands, "cores", lambda: 4)
+    bands._pool.cache_clear()
+    yield
+    bands._pool.cache_clear()
+
+
+@given(st.integers(0, 50), st.integers(1, 6))
+def test_every_row_is_in_one_band(count: int, threads: int) -> None:
+    seen = np.zeros(count, int)
+
+    def note(begin: int, end: int) -> None:
+        seen[begin:end] += 1
+
+    bands.limit_threads(threads)
+    try:
+        bands.in_bands(note, count)
+    finally:
+        bands.limit_threads(0)
+    assert (seen == 1).all()
+
+
+def test_bands_run_at_the_same_time(four: None) -> None:
+    together = threading.Barrier(4, timeout=20.0)
+
+    def meet(begin: int, end: int) -> None:
+        together.wait()
+
+    bands.in_bands(meet, 4)
+
+
+def test_a_thread_keeps_to_its_own_limit(four: None) -> None:
+    calls: list[tuple[int, int]] = []
+    bands.limit_threads(1)
+    try:
+        bands.in_bands(lambda begin, end: calls.append((begin, end)), 8)
+        assert calls == [(0, 8)]
+        other: list[int] = []
+        thread = threading.Thread(target=lambda: other.append(bands.threads()))
+        thread.start()
+        thread.join()
+        assert other == [4]
+    finally:
+        bands.limit_threads(0)
+
+
+def test_a_fault_is_raised_after_all_bands_have_ended(four: None) -> None:
+    ended: list[int] = []
+
+    def fail(begin: int, end: int) -> None:
+        if begin in (0, 4):
+            raise ValueError(f"row {begin}")
+        threading.Event().wait(0.1)
+        ended.append(begin)
+
+    with pytest.raises(ValueError, match="row 0"):
+        bands.in_bands(fail, 8)
+    assert sorted(ended) == [2, 6]
+
+
+@njit(nogil=True)
+def _square(begin: int, end: int, values: F64, out: F64) -> None:
+    for i in range(begin, end):
+        out[i] = values[i] * values[i]
+
+
+def test_two_threads_may_call_a_kernel_at_once(four: None) -> None:
+    values = np.arange(100_000, dtype=np.float64)
+    outs = [np.zeros_like(values) for _ in range(2)]
+
+    def work(out: F64) -> None:
+        for _ in range(20):
+            bands.in_bands(_square, len(values), values, out)
+
+    workers = [threading.Thread(target=work, args=(out,)) for out in outs]
+    for one in workers:
+        one.start()
+    for one in workers:
+        one.join()
+    for out in outs:
+        np.testing.assert_array_equal(out, values**2)
