@@ -440,7 +440,12 @@ def build_stages(
         register=Register(backend, stopwatch),
         chain=_chain(config, pages, track.is_settled, rejected, stopwatch, resources),
         map=SurfaceMap(
-            pages, compute.map_voxels, config.scan.resolution_m, stopwatch, is_lens_assumed
+            pages,
+            compute.map_voxels,
+            config.scan.resolution_m,
+            stopwatch,
+            float(camera.K[0, 0]),
+            is_lens_assumed,
         ),
         keyframe=MakeKeyframe(debug),
         in_background=in_background,

@@ -15,11 +15,16 @@ import numpy as np
 
 from recon.mapping.disagreement import Disagreement
 from recon.mapping.voxel_map import I64, VoxelMap, VoxelMapConfig, Voxels, tile_of, tiles_under
+from recon.stereo.reprojection import LABEL_SIGMA_PX
 from recon.types import F32, F64, Bool, DepthMap
 from service.compute.stopwatch import Stopwatch
 from service.flight.viewpoints import StereoCandidate
 
 log = logging.getLogger(__name__)
+
+RECORDED_SIGMA_PX = 0.11
+"""Of a match, in pixels of the recording: where stereo's pixels are as small, its labels are no
+better (docs/reports/accuracy.md)."""
 
 ASSUMED_LENS_SHARE = 0.02
 """Sigma of depth over depth where a lens without distortion is assumed: lenses of action cameras
@@ -129,11 +134,16 @@ class SurfaceMap:
         max_voxels: int,
         resolution_m: float,
         stopwatch: Stopwatch,
+        focal_px: float,
         is_lens_assumed: bool = False,
     ) -> None:
-        """``pages``: see :class:`PagedMap`; None: forget the oldest when memory is full."""
+        """``pages``: see :class:`PagedMap`; None: forget the oldest when memory is full.
+
+        ``focal_px`` is of the recorded images.
+        """
         self._pages, self._max_voxels, self._resolution_m = pages, max_voxels, resolution_m
         self._stopwatch = stopwatch
+        self._focal_px = focal_px
         self._lens_share = ASSUMED_LENS_SHARE if is_lens_assumed else 0.0
         self._map: VoxelMap | PagedMap | None = None
         self._disagreement, self._segment = Disagreement(), -1
@@ -147,7 +157,9 @@ class SurfaceMap:
             if view.segment != self._segment:
                 self._disagreement.forget()
                 self._segment = view.segment
-            in_map = replace(depth, T_world_camera=T_map_camera)
+            reduced = self._focal_px / float(depth.K[0, 0])
+            noise = np.float32(max(1.0, RECORDED_SIGMA_PX / LABEL_SIGMA_PX / reduced))
+            in_map = replace(depth, sigma_m=depth.sigma_m * noise, T_world_camera=T_map_camera)
             wider = np.float32(self._disagreement.take(in_map))
             in_map = replace(in_map, sigma_m=in_map.sigma_m * wider)
             known = self._map
