@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from service.commands import AsJson
 from service.errors import InputError, OutsideError
 
 
@@ -18,7 +19,7 @@ def bench(
     device: Annotated[str, typer.Option(help="of 'gpu': cuda or cpu; default: what is there")] = "",
     data: Annotated[Path | None, typer.Option(help="folder of sets to score on")] = None,
     keep: Annotated[Path | None, typer.Option(help="folder for a result file (JSON)")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Print our figure, the peer's in the same run, and the ratio."""
     from service.bench import BENCHMARKS, BenchOptions, record, run_benchmarks, table

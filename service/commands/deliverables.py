@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from service.commands import AsJson, ScanDir, Voxel
 from service.errors import InputError
 from service.offline.exports import EXPORTERS
 
@@ -17,14 +18,12 @@ KINDS = "|".join(EXPORTERS)
 
 
 def export(
-    scan_dir: Annotated[Path, typer.Argument(help="scan folder (holds scan.db)")],
+    scan_dir: ScanDir,
     to: Annotated[list[str], typer.Option("--to", help=f"{KINDS}; may be repeated")],
     out: Annotated[
         Path | None, typer.Option("--out", help="file to write; default: in the scan folder")
     ] = None,
-    voxel_m: Annotated[
-        float | None, typer.Option("--voxel-m", help="fused voxel size; default: pixel on ground")
-    ] = None,
+    voxel_m: Voxel = None,
     cell_m: Annotated[
         float | None, typer.Option("--cell-m", help="cell of dsm, ortho, contours")
     ] = None,
@@ -42,7 +41,7 @@ def export(
     video_epoch: Annotated[
         float | None, typer.Option(help="unix seconds of its start; default: the scan's start")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write deliverables of a scan: clouds, surface model, orthophoto, tiles, mesh, flight."""
     from service.offline.exports.view import ExportOptions, ScanView
@@ -74,12 +73,10 @@ def _epoch_ns(seconds: float | None) -> int | None:
 
 
 def mesh(
-    scan_dir: Annotated[Path, typer.Argument(help="scan folder (holds scan.db)")],
+    scan_dir: ScanDir,
     method: Annotated[str, typer.Option("--method", help="auto, height or poisson")] = "auto",
     faces: Annotated[int, typer.Option("--faces", min=100, help="triangles at most")] = 400_000,
-    voxel_m: Annotated[
-        float | None, typer.Option("--voxel-m", help="fused voxel size; default: pixel on ground")
-    ] = None,
+    voxel_m: Voxel = None,
     video: Annotated[
         Path | None,
         typer.Option(help="the flight's video or folder of images; default: as scan.json names"),
@@ -99,7 +96,7 @@ def mesh(
     out: Annotated[
         Path | None, typer.Option("--out", help="file to write; default: mesh.glb in the folder")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Mesh and texture a scan into one binary glTF file."""
     from service.errors import InputError
@@ -133,14 +130,14 @@ def mesh(
 
 
 def inspect(
-    scan_dir: Annotated[Path, typer.Argument(help="scan folder (holds scan.db)")],
+    scan_dir: ScanDir,
     keyframe: Annotated[
         int | None, typer.Option("--keyframe", help="number of the keyframe; default: a middle one")
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="PNG to write; default: in the scan folder")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Raw and rectified frames, anaglyph, disparity, depth and sigma of a keyframe.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 import sys
 import time
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from service.commands import stop_by_signals
 from service.errors import InputError, SkyreliefError
 from service.packages import needing
 
@@ -119,7 +119,7 @@ def ground(
     refresh = refresh_s if refresh_s is not None else RADIO_REFRESH_S if mavlink else 0.0
     notifier = Notifier()
     _take_in(store, take or [])
-    stop, workers = _stop_by_signal(), Workers()
+    stop, workers = stop_by_signals(), Workers()
     name = member_name(Path(certificate)) if certificate else ""
     receiver = Receiver(ReceiverConfig(store, session, limits, name, refresh), workers)
     radios = [RadioLink(endpoint, GROUND, receiver.add_radio) for endpoint in mavlink or ()]
@@ -213,14 +213,6 @@ def _check(workers: Workers, notifier: Notifier) -> None:
         notifier.status(f"no progress: {stalled}")
     else:
         notifier.alive()
-
-
-def _stop_by_signal() -> Event:
-    """An event that TERM and INT set; from now on they do not end the process themselves."""
-    stop = Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    return stop
 
 
 def _watch(

@@ -8,9 +8,11 @@ from typing import Annotated, Any
 
 import typer
 
+from service.commands import AsJson, ScanDir
+
 
 def refine(
-    scan_dir: Annotated[Path, typer.Argument(help="scan folder (holds scan.db)")],
+    scan_dir: ScanDir,
     gcp: Annotated[
         Path | None, typer.Option(help="CSV of ground control and check points (docs/refine.md)")
     ] = None,
@@ -31,7 +33,7 @@ def refine(
     undo: Annotated[
         bool, typer.Option("--undo", help="bring back the scan as it was flown")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """All keyframes adjusted at once with loops, telemetry and ground control points.
 
@@ -122,7 +124,7 @@ def _lines(figures: dict[str, Any]) -> list[str]:
 
 
 def refly(
-    scan_dir: Annotated[Path, typer.Argument(help="scan folder (holds scan.db)")],
+    scan_dir: ScanDir,
     out: Annotated[
         Path | None,
         typer.Option(help=".plan (QGroundControl) or .waypoints; default: refly.plan in the scan"),
@@ -140,7 +142,7 @@ def refly(
     photos: Annotated[
         bool, typer.Option("--photos", help="photographs at intervals instead of video")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Lines over gaps, places seen too seldom and places of large sigma, as a mission file."""
     from dataclasses import replace

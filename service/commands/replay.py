@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-import signal
 import sys
 import time
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands import ConfigFile, Overrides
+from service.commands import ConfigFile, Overrides, stop_by_signals
 
 if TYPE_CHECKING:
     from mavlink.telemetry.logs import TelemetryLog
@@ -143,7 +141,7 @@ def _replay(
     store = create_store(inputs)
     link = open_datalink(store, config)
     scan = Scan(inputs, store)
-    stop = _stop_on_signals()
+    stop = stop_by_signals()
     try:
         scan.run(stop, None if as_json or not sys.stderr.isatty() else _progress)
     finally:
@@ -230,14 +228,6 @@ def _epoch(
 
 def _utc(time_ns: int) -> str:
     return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(time_ns / 1e9))
-
-
-def _stop_on_signals() -> Event:
-    """An event that Ctrl-C or a TERM signal sets, so that the scan is closed properly."""
-    stop = Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    return stop
 
 
 def _progress(scan: Scan) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from service.commands import AsJson
 from service.compute.rectified_pair import matching_config, read_gray
 from service.errors import InputError, OutsideError
 
@@ -32,7 +33,7 @@ def stereo(
         bool, typer.Option("--checked", help="unknown where the pair does not prove it")
     ] = False,
     picture: Annotated[Path | None, typer.Option(help="also write it in colour (.png)")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Disparity of a rectified pair: left pixel (u, v) matches right pixel (u - d, v).
 
