@@ -12,6 +12,7 @@ import pytest
 from loopback import free_port, until
 
 from service.config import DatalinkConfig
+from service.stream import messages
 from service.stream.link import DatalinkSender
 from service.stream.messages import (
     HEAD_BYTES,
@@ -124,12 +125,16 @@ def test_parts_are_cut_in_one_way_only() -> None:
     assert list(parse(Part("header", MAX_COUNTED + 1, 0, 1, 0, 0, b"").pack()))
 
 
-def test_small_parts_do_not_take_more_memory_than_they_say() -> None:
+def test_small_parts_do_not_take_more_memory_than_they_say(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(messages, "MAX_OPEN_BYTES", 1 << 22)
     assembler = Assembler()
     for number in range(6):
-        for part in split_in("k1", number, bytes(40_000), 40_000)[:-1]:
+        for part in split_in("k1", number, bytes(5_000), 5_000)[:-1]:
             assembler.add(part, float(number))
-    assert assembler.held_bytes <= 1 << 25
+            assert assembler.held_bytes <= 1 << 22
+    assert assembler.held_bytes > 1 << 21
 
 
 @pytest.mark.parametrize("kind", ["header", "summary", "pose", "repose", "k0"])
