@@ -11,7 +11,14 @@ import pytest
 
 from recon import bands
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
-from recon.stereo.matching_cost import COST_UNIT, MatchingCostConfig, census, matching_cost
+from recon.stereo.matching_cost import (
+    COST_UNIT,
+    I16,
+    MatchingCostConfig,
+    Workspace,
+    census,
+    matching_cost,
+)
 from recon.stereo.message_passing import propagate
 from recon.types import F64, U8, Array
 
@@ -313,6 +320,38 @@ def test_memory_that_is_used_again_leaves_no_trace() -> None:
         jobs = [pool.submit(belief_propagation, left, right, 20, config) for _ in range(9)]
     for job in jobs:
         np.testing.assert_array_equal(job.result().px, kept)
+
+
+def test_memory_need_not_be_cleared_and_grows_no_further_than_needed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _, left, right = box_scene()
+    config = BeliefPropagationConfig()
+    for iterations in (1, 5):
+        config = replace(config, iterations=iterations)
+        want = belief_propagation(left, right, 20, config)
+        take = Workspace.take
+
+        def dirty(space: Workspace, name: str, shape: tuple[int, ...]) -> I16:
+            array = take(space, name, shape)
+            array[...] = -12345
+            return array
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Workspace, "take", dirty)
+            got = belief_propagation(left, right, 20, config)
+        np.testing.assert_array_equal(got.px, want.px)
+        np.testing.assert_array_equal(got.confidence, want.confidence)
+
+
+def test_one_piece_of_memory_serves_sizes_that_are_alike() -> None:
+    space = Workspace()
+    first = space.take("a", (10, 20, 30))
+    assert np.shares_memory(first, space.take("a", (11, 20, 29)))
+    assert not np.shares_memory(first, space.take("b", (10, 20, 30)))
+    large = space.take("a", (1000, 20, 30))
+    assert large.shape == (1000, 20, 30) and not np.shares_memory(first, large)
+    assert not np.shares_memory(large, space.take("a", (2, 3))), "no memory is held in vain"
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (3, 5), (7, 64), (8, 63)])

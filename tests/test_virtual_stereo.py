@@ -121,6 +121,13 @@ def test_relief_widens_the_window() -> None:
     assert roof_d < tall.plane[2] + tall.slope * (tall.labels - 1)
 
 
+def test_no_more_labels_than_the_relief_needs() -> None:
+    config = VirtualStereoConfig(labels=16)
+    for need in np.linspace(0.0, 90.0, 181):
+        labels = config.labels_for(float(need))
+        assert labels >= max(16, need) and (labels == 16 or labels < need + 4)
+
+
 def test_labels_on_nothing_are_dropped() -> None:
     a = view(0, (0.0, 0.0, 60.0), (0.0, 0.0, 0.0))
     b = view(1, (6.0, 0.0, 60.0), (0.0, 0.0, 0.0))

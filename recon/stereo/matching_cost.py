@@ -7,6 +7,7 @@ propagation runs on SIMD lanes of 16 bits; ``COST_UNIT`` of them are one label o
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import dataclass
 from typing import Any
@@ -28,6 +29,9 @@ CENSUS_RADIUS = 3
 """The census window is 7x7: 48 comparisons in one 64-bit word."""
 
 _WINDOW = 2 * CENSUS_RADIUS + 1
+
+MAX_SPARE = 8
+"""Memory this many times larger than what is asked for is given back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,15 +207,16 @@ def _cost_volume(
 
 
 class Workspace(threading.local):
-    """One set of int16 arrays per thread, by name; each keeps the shape it was last taken in."""
+    """Memory for int16 arrays per thread, by name: pairs differ in size, and fresh pages cost as
+    much as the messages."""
 
     def __init__(self) -> None:
         self._kept: dict[str, I16] = {}
 
     def take(self, name: str, shape: tuple[int, ...]) -> I16:
-        """The array of that name: zeros when its shape is new, else as the last user left it."""
-        array = self._kept.get(name)
-        if array is None or array.shape != shape:
-            array = np.zeros(shape, np.int16)
-            self._kept[name] = array
-        return array
+        """An array whose values are undefined; it holds until the name is taken again."""
+        size = math.prod(shape)
+        memory = self._kept.get(name)
+        if memory is None or not size <= memory.size <= MAX_SPARE * size:
+            memory = self._kept[name] = np.empty(size + size // 8, np.int16)
+        return memory[:size].reshape(shape)

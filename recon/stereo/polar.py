@@ -211,7 +211,7 @@ def rectify_polar(
     reached, accepted = relief_of(points, plane, relief, config.margin_share)
     low, high = label_window(points, plane, baseline, f, reached)
     need = (high - low) + 2 * config.margin_labels
-    labels = max(config.labels, int(np.ceil(need / 16) * 16))
+    labels = config.labels_for(need)
     if labels > config.max_labels:
         return "relief too large for the baseline"
     lowest = 0.5 * (low + high) - 0.5 * (labels - 1)

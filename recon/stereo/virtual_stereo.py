@@ -61,6 +61,10 @@ class VirtualStereoConfig:
         if self.width_px < 32 or self.guide_width_px < self.width_px:
             raise ValueError("32 <= width_px <= guide_width_px must hold")
 
+    def labels_for(self, need: float) -> int:
+        """Labels that cover ``need`` of them, by fours: every one costs time."""
+        return max(self.labels, 4 * int(np.ceil(need / 4)))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
@@ -301,7 +305,7 @@ def _disparity_window(
     near = relief_m[1] if relief_m[1] < 0.7 * depth else 0.7 * depth
     high = max(float(high), near * per_metre * depth / (depth - near))
     need = (high - low) / (1.0 - plane[0]) + 2 * config.margin_labels
-    labels = int(np.ceil(need / 16) * 16) if need > config.labels else config.labels
+    labels = config.labels_for(need)
     if labels > config.max_labels:
         return PairRejection("relief too large for the baseline")
     spare = 0.5 * (labels - 1 - need) * (1.0 - plane[0])
