@@ -62,23 +62,6 @@ def project(K: F64, xyz_m: F64) -> F64:
     )
 
 
-def inverse_depth_plane(P: F64) -> F64:
-    """(3,) q with ``1 / z = q . ray`` for the plane through camera points (N, 3)."""
-    if len(P) < 3:
-        return np.array([0.0, 0.0, 1.0 / max(float(np.median(P[:, 2])) if len(P) else 1.0, 1e-6)])
-    ray = P / P[:, 2:]
-    target = 1.0 / P[:, 2]
-    weights = np.ones(len(P))
-    q = np.zeros(3)
-    for _ in range(5):
-        A = ray * weights[:, None]
-        q = np.linalg.solve(A.T @ ray + 1e-9 * np.eye(3), A.T @ target)
-        error = np.abs(ray @ q - target)
-        scale = max(1.4826 * float(np.median(error)), 1e-9)
-        weights = 1.0 / (1.0 + (error / (2 * scale)) ** 2)
-    return np.asarray(q)
-
-
 class Undistorter:
     """Takes images of a distorted camera to the same camera without distortion.
 

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.camera_model import inverse_depth_plane, project, rays
+from recon.camera_model import project, rays
 from recon.rolling_shutter import RowClock, Rows, RowTrack, row_times_s
 from recon.stereo.virtual_stereo import View, VirtualStereoConfig, at_middle_row, rectify
 from recon.tracking.localisation import OdometryConfig
 from recon.tracking.odometry import Odometry
 from recon.tracking.readout_search import ReadoutEstimate
+from recon.tracking.prediction import inverse_depth_plane
 from recon.types import DIRECTIONS, F64, U8, Camera, PosePrior, Shutter, StereoPair
 from service.config import Config
 from service.flight.scan import Scan

@@ -35,7 +35,7 @@ class BundleResult:
 
 
 @njit(cache=True, nogil=True)
-def _se3_exp(d: F64, out: F64) -> None:
+def se3_exp(d: F64, out: F64) -> None:
     """``out`` (4, 4) motion of the twist ``d`` (rotation, translation)."""
     wx, wy, wz = d[0], d[1], d[2]
     a2 = wx * wx + wy * wy + wz * wz
@@ -56,7 +56,7 @@ def _se3_exp(d: F64, out: F64) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _compose(A: F64, B: F64, out: F64) -> None:
+def compose(A: F64, B: F64, out: F64) -> None:
     """``out`` = A B, (4, 4) each."""
     for i in range(4):
         for j in range(4):
@@ -86,7 +86,7 @@ def _cost(T: F64, X: F64, cam: I64, pt: I64, uv: F64, k: F64, huber: float, res:
 
 
 @njit(cache=True, nogil=True)
-def _linearise(P: F64, x: F64, uv: F64, k: F64, huber: float, Jc: F64, Jp: F64, r: F64) -> float:
+def linearise(P: F64, x: F64, uv: F64, k: F64, huber: float, Jc: F64, Jp: F64, r: F64) -> float:
     """Fill the (2, 6) and (2, 3) Jacobians and the error ``r``; return the Huber weight."""
     X0 = P[0, 0] * x[0] + P[0, 1] * x[1] + P[0, 2] * x[2] + P[0, 3]
     X1 = P[1, 0] * x[0] + P[1, 1] * x[1] + P[1, 2] * x[2] + P[1, 3]
@@ -139,7 +139,7 @@ def _normal_equations(
         b = np.zeros(3)
         for m in range(start[p], start[p + 1]):
             W[m] = 0.0
-            w = _linearise(T[cam[m]], X[p], uv[m], k, huber, Jc, Jp, r)
+            w = linearise(T[cam[m]], X[p], uv[m], k, huber, Jc, Jp, r)
             if w == 0.0:
                 continue
             s = slot[cam[m]]
@@ -229,8 +229,8 @@ def _adjust(
         T_new, X_new = T.copy(), X.copy()
         for c in range(T.shape[0]):
             if slot[c] >= 0:
-                _se3_exp(dc[6 * slot[c] : 6 * slot[c] + 6, 0], step)
-                _compose(step, T[c], T_new[c])
+                se3_exp(dc[6 * slot[c] : 6 * slot[c] + 6, 0], step)
+                compose(step, T[c], T_new[c])
         for p in range(N):
             for m in range(start[p], start[p + 1]):
                 s = slot[cam[m]]

@@ -1,7 +1,8 @@
 """Where a frame was taken: a keyframe's corners found again in it, and EPnP on their landmarks.
 
-Section 2.3 of the paper: each of the two views of the virtual stereo camera gives a pose of the
-new frame (Eq. 6-7), and the two are averaged.
+Section 2.3 of the paper: the two views of the virtual stereo camera give the pose of the new frame
+(Eq. 6-7). DEVIATION: the paper averages a pose by each; here the landmarks of both, each searched
+once, give one, which is the average weighted by what each landmark says.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from recon import se3
 from recon.rolling_shutter import FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, robust_geometry, two_view
 from recon.tracking.common_view import CommonView, FeatureCache, common_view
-from recon.tracking.keyframe_window import OdometryKeyframe, TrackingFrame, landmarks
+from recon.tracking.keyframe_window import I64, OdometryKeyframe, TrackingFrame, landmarks
 from recon.tracking.prediction import Motion
 from recon.types import F64, Bool, Camera, PosePrior
 
@@ -32,7 +33,7 @@ class OdometryConfig:
     wide_search_share: float = 0.09  # and around a poor one
     min_tracks: int = 40  # fewer inliers: lost
     min_track_share: float = 0.25  # of the corners that should be visible
-    tracked_landmarks: int = 300  # enough for a pose; keyframes match all their corners
+    tracked_landmarks: int = 300  # of both keyframes; new keyframes match all their corners
     max_tilt_error_rad: float = 0.35  # vision against attitude: more is a false solution
     loose_px: float = 6.0  # gate of a second try: a rolling shutter bends images that much
     lost_after: int = 8  # frames in a row without a pose before a new segment starts
@@ -80,6 +81,28 @@ class Located:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Search:
+    """A keyframe's corners looked for in a frame."""
+
+    key: OdometryKeyframe
+    uv: F64  # (N, 2) of its corners
+    ok: Bool  # (N,) found
+    searched: Bool  # (N,)
+    mapped: Bool  # (N,) with a landmark
+    in_view: float  # share of its corners that should be visible
+
+    @property
+    def known(self) -> I64:
+        """Rows of the corners that are found and have a landmark."""
+        return np.flatnonzero(self.ok & self.mapped)
+
+    @property
+    def points(self) -> F64:
+        """(M, 3) landmarks of the rows :attr:`known`."""
+        return self.key.map[self.key.landmark[self.known]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Bridge:
     """A frame's pose by what it and one keyframe see, and its scale by that keyframe's depths."""
 
@@ -115,7 +138,8 @@ class Localiser:
         most = None if still else self.config.tracked_landmarks
         for start in self._starts(new, keyframes, motion, lost):
             key, T_camera_odom = start.key, start.T_camera_odom
-            found = self.pose_from(key, new, T_camera_odom, start.share, least, most)
+            left = keyframes[-2] if len(keyframes) > 1 and key is keyframes[-1] else None
+            found = self.pose_from(key, new, T_camera_odom, start.share, least, most, left)
             if isinstance(found, str):
                 reason = found
                 continue
@@ -126,7 +150,7 @@ class Localiser:
                 best = found
             if not still or found.found_share > CLEAR_SHARE:
                 break
-        return reason if best is None else self._with_left(new, keyframes, best)
+        return reason if best is None else best
 
     def others(
         self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], found: Located
@@ -183,19 +207,6 @@ class Localiser:
         good = np.zeros(len(ok), np.bool_)
         good[rows] = True
         return Bridge(key, step @ key.T_camera_odom, uv, good)
-
-    def _with_left(
-        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], found: Located
-    ) -> Located:
-        """The pose averaged with the one that the keyframe before gives, as the paper does."""
-        if len(keyframes) < 2 or found.key is not keyframes[-1]:
-            return found
-        T, share = found.pose.T_camera_points, 0.5 * self.config.search_share
-        least, most = self.config.min_tracks // 3, self.config.tracked_landmarks // 2
-        left = self.pose_from(keyframes[-2], new, T, share, least, most)
-        if isinstance(left, str):
-            return found
-        return replace(found, pose=pnp.average_left_right(left.pose, found.pose))
 
     def _starts(
         self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], motion: Motion, lost: bool
@@ -254,25 +265,58 @@ class Localiser:
         share: float,
         least: int,
         most: int | None = None,
+        left: OdometryKeyframe | None = None,
     ) -> Located | str:
-        """EPnP pose of the frame from one keyframe's landmarks, or why there is none.
+        """Pose of the frame by a keyframe's landmarks, or why there is none.
 
         ``least`` matches it takes; with ``most`` only about so many landmarks are searched and
-        no corner that has none, spread over the image.
+        no corner that has none, spread over the image, a third of them in the image of ``left``.
         """
         radius_px = share * self.camera.size_px[0]
+        amount = most if most is None or left is None else most * 2 // 3
+        right = self._search(key, new, T_camera_odom, radius_px, amount)
+        if np.count_nonzero(right.searched) < least:
+            return "the view left the map"
+        parts = [right]
+        if most is not None and left is not None:
+            taken = key.landmark[right.searched]
+            parts.append(self._search(left, new, T_camera_odom, radius_px, most // 3, taken))
+        points = np.vstack([part.points for part in parts])
+        uv = np.vstack([part.uv[part.known] for part in parts])
+        expected = sum(int((part.searched & part.mapped).sum()) for part in parts)
+        if len(points) < max(least, self.config.min_track_share * expected):
+            return "too few matches"
+        solved = self._solve(points, uv, T_camera_odom, max(least, len(points) // 2), new.moving)
+        if solved is None:
+            return "no pose fits the matches"
+        known = right.known
+        right.ok[known[~solved.inliers[: known.size]]] = False
+        found_share = float(right.ok[right.searched].mean())
+        return Located(key, solved, right.uv, right.ok, right.in_view * found_share, found_share)
+
+    def _search(
+        self,
+        key: OdometryKeyframe,
+        new: TrackingFrame,
+        T_camera_odom: F64,
+        radius_px: float,
+        most: int | None,
+        taken: I64 | None = None,
+    ) -> Search:
+        """The keyframe's corners in the frame, without the landmarks ``taken`` (M,) elsewhere."""
         guess, visible = prediction.on_landmarks(
             key, self.camera.K, self.camera.size_px, T_camera_odom, radius_px
         )
         mapped = key.map.known(key.landmark)
-        in_view = float(visible.mean())
+        in_view, config = float(visible.mean()), self.config.matching
+        if taken is not None:
+            visible &= ~np.isin(key.landmark, taken)
         if most is not None:
             rows = np.flatnonzero(visible & mapped)
             visible[:] = False
             visible[rows[:: max(1, len(rows) // most)]] = True
+            config = replace(config, max_return_px=np.inf)  # the pose refutes what is wrong
         index = np.flatnonzero(visible)
-        if index.size < least:
-            return "the view left the map"
         found = matching.match(
             key.pyramid,
             key.uv[index].astype(np.float32),
@@ -280,24 +324,11 @@ class Localiser:
             guess.uv[index].astype(np.float32),
             guess.radius_px,
             guess.warp[index].astype(np.float32),
-            self.config.matching,
+            config,
         )
-        ok = np.zeros(len(key.uv), np.bool_)
-        ok[index] = found.ok
-        uv = guess.uv.copy()
-        uv[index] = found.uv_px
-        known = np.flatnonzero(ok & mapped)
-        expected = int((visible & mapped).sum())
-        if known.size < max(least, self.config.min_track_share * expected):
-            return "too few matches"
-        points = key.map[key.landmark[known]]
-        enough = max(least, int(0.5 * known.size))
-        solved = self._solve(points, uv[known], T_camera_odom, enough, new.moving)
-        if solved is None:
-            return "no pose fits the matches"
-        ok[known[~solved.inliers]] = False
-        share = float(ok[index].mean())
-        return Located(key, solved, uv, ok, in_view * share, share)
+        ok, uv = np.zeros(len(key.uv), np.bool_), guess.uv.copy()
+        ok[index], uv[index] = found.ok, found.uv_px
+        return Search(key, uv, ok, visible, mapped, in_view)
 
     def _solve(
         self, points: F64, uv: F64, start: F64, least: int, moving: FrameRows

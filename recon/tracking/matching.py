@@ -162,7 +162,7 @@ class MatchingConfig:
     min_contrast: float = 2.0  # standard deviation of a patch, gray levels
     max_zssd: float = 0.4  # of patches made unit: 2 (1 - correlation)
     ambiguity: float = 0.8  # best zssd over that of the next separate peak, at most
-    max_return_px: float = 0.5  # forward and backward match may differ by this
+    max_return_px: float = 0.5  # forward and backward match may differ by this; inf: not matched
     refine_iterations: int = 6
 
     def __post_init__(self) -> None:
@@ -408,9 +408,10 @@ def match(
     if start > 0:
         ok &= ~_repeats(forward, uv, ok, coarse.contrast, fine.contrast_a)
 
-    back = _Search(pyramid_b.levels, pyramid_a.levels, uv, forward_warp, config)
-    home = back.refined(a, ok)
-    ok &= (home.score > 0) & (np.linalg.norm(home.uv - a, axis=1) <= config.max_return_px)
+    if np.isfinite(config.max_return_px):
+        back = _Search(pyramid_b.levels, pyramid_a.levels, uv, forward_warp, config)
+        home = back.refined(a, ok)
+        ok &= (home.score > 0) & (np.linalg.norm(home.uv - a, axis=1) <= config.max_return_px)
     score = fine.score
     uv = np.where(ok[:, None], uv, predicted)
     zssd = np.where(score > patch_search.NO_SCORE, 2.0 * (1.0 - score), 4.0)

@@ -1,19 +1,23 @@
 """Pose of a camera from known points that it sees (paper section 2.3, Eq. 6-7).
 
-EPnP (Lepetit et al. 2009, doi:10.1007/s11263-008-0152-6) inside RANSAC, then
-Levenberg-Marquardt on the inliers, through OpenCV. The covariance comes from the Jacobian of
-the reprojection and the residuals that remain.
+EPnP (Lepetit et al. 2009, doi:10.1007/s11263-008-0152-6) inside RANSAC, through OpenCV, then
+Gauss-Newton on the inliers. The covariance comes from the Jacobian of the reprojection and the
+residuals that remain.
+
+DEVIATION: where a prior explains most points, Gauss-Newton starts there and EPnP is not asked.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
+from numba import njit
 
 from recon import se3
+from recon.small_matrices import solve_symmetric
 from recon.tracking import robust_geometry
+from recon.tracking.bundle import compose, linearise, se3_exp
 from recon.types import F64, Bool
 
 
@@ -56,6 +60,19 @@ class PnpResult:
         return float(np.mean(self.inliers))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """The lowest reprojection error, before anyone judges it."""
+
+    T_camera_points: F64  # (4, 4) m
+    inliers: Bool  # (N,)
+    error: F64  # (M,) px, of the points that are finite
+
+
+STEPS = 10
+"""Of Gauss-Newton, at most."""
+
+
 def solve(
     points_m: F64,
     uv_px: F64,
@@ -85,68 +102,114 @@ def solve(
     local, pixels = points[finite] - middle, uv[finite]
     shift = se3.compose(np.eye(3), middle)
     prior = None if prior_T_camera_points is None else prior_T_camera_points @ shift
-    starts = _starts(local, pixels, K, prior, config)
-    T = _best(starts, local, pixels, K, config)
+    k = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+    T = _best(_starts(local, pixels, K, k, prior, config), local, pixels, k, config)
     if T is None:
         return None
-    error = _errors(T, local, pixels, K)
-    inliers = np.zeros(len(points), bool)
-    inliers[finite] = error <= config.threshold_px
-    return _judge(T @ se3.inverse(shift), points, uv, K, inliers, prior_T_camera_points, config)
+    fit = Fit(T @ se3.inverse(shift), np.zeros(len(points), np.bool_), _errors(T, local, pixels, k))
+    fit.inliers[finite] = fit.error <= config.threshold_px
+    return _judge(fit, points, uv, k, prior_T_camera_points, config)
 
 
-def _starts(points: F64, uv: F64, K: F64, prior: F64 | None, config: PnpConfig) -> list[F64]:
-    """Poses to start from: the prior, and EPnP's.
-
-    Where the prior already explains most points to a few pixels, EPnP takes those; a random
-    draw could find nothing larger. Else RANSAC draws. Eq. (6), (7).
-    """
+def _starts(
+    points: F64, uv: F64, K: F64, k: F64, prior: F64 | None, config: PnpConfig
+) -> list[F64]:
+    """Poses to start from: the prior where it explains most points to a few pixels, else also
+    EPnP's on the largest consensus of RANSAC. Eq. (6), (7)."""
     if prior is not None:
-        near = _errors(prior, points, uv, K) <= 3.0 * config.threshold_px
+        near = _errors(prior, points, uv, k) <= 3.0 * config.threshold_px
         if np.mean(near) >= config.prior_share:
-            direct = robust_geometry.pose_from_points(points[near], uv[near], K, cv2.SOLVEPNP_EPNP)
-            return [prior] if direct is None else [prior, direct]
+            return [prior]
     drawn = robust_geometry.consensus_pose(
         points, uv, K, config.threshold_px, config.iterations, config.confidence
     )
     return [T for T in (prior, drawn) if T is not None]
 
 
-def _errors(T: F64, points: F64, uv: F64, K: F64) -> F64:
+@njit(cache=True, nogil=True)
+def _errors(T: F64, points: F64, uv: F64, k: F64) -> F64:  # pragma: no cover - compiled
     """(N,) reprojection errors in px; infinite behind the camera."""
-    p = se3.transform(T, points)
-    z = np.where(p[:, 2] > 1e-6, p[:, 2], np.nan)
-    u = K[0, 0] * p[:, 0] / z + K[0, 2] - uv[:, 0]
-    v = K[1, 1] * p[:, 1] / z + K[1, 2] - uv[:, 1]
-    return np.asarray(np.nan_to_num(np.hypot(u, v), nan=np.inf), np.float64)
+    error = np.full(len(points), np.inf)
+    for m in range(len(points)):
+        x = points[m]
+        z = T[2, 0] * x[0] + T[2, 1] * x[1] + T[2, 2] * x[2] + T[2, 3]
+        if z > 1e-6:
+            u = k[0] * (T[0, 0] * x[0] + T[0, 1] * x[1] + T[0, 2] * x[2] + T[0, 3]) / z + k[2]
+            v = k[1] * (T[1, 0] * x[0] + T[1, 1] * x[1] + T[1, 2] * x[2] + T[1, 3]) / z + k[3]
+            error[m] = np.hypot(u - uv[m, 0], v - uv[m, 1])
+    return error
 
 
-def _best(starts: list[F64], points: F64, uv: F64, K: F64, config: PnpConfig) -> F64 | None:
+@njit(cache=True, nogil=True)
+def _normal_equations(
+    T: F64, points: F64, uv: F64, k: F64, used: Bool
+) -> tuple[F64, F64]:  # pragma: no cover - compiled
+    """(6, 6) matrix and (6,) right side of the reprojection errors of the points ``used`` (N,)."""
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    Jc, Jp, r = np.zeros((2, 6)), np.zeros((2, 3)), np.zeros(2)
+    for m in range(len(points)):
+        if not used[m] or linearise(T, points[m], uv[m], k, np.inf, Jc, Jp, r) == 0.0:
+            continue
+        for i in range(6):
+            g[i] -= Jc[0, i] * r[0] + Jc[1, i] * r[1]
+            for j in range(6):
+                H[i, j] += Jc[0, i] * Jc[0, j] + Jc[1, i] * Jc[1, j]
+    return H, g
+
+
+@njit(cache=True, nogil=True)
+def _descend(
+    T: F64, points: F64, uv: F64, k: F64, used: Bool
+) -> tuple[F64, bool]:  # pragma: no cover - compiled
+    """Pose (4, 4) at the least squared error of the points ``used``; False where it is open."""
+    step, moved, here = np.empty((4, 4)), np.empty((6, 1)), T.copy()
+    for _ in range(STEPS):
+        H, g = _normal_equations(here, points, uv, k, used)
+        scale = np.empty(6)
+        for i in range(6):
+            scale[i] = np.sqrt(H[i, i])
+            if not (scale[i] > 0 and scale[i] < np.inf):
+                return here, False
+        for i in range(6):
+            moved[i, 0] = g[i] / scale[i]
+            for j in range(6):
+                H[i, j] /= scale[i] * scale[j]
+            H[i, i] += 1e-12
+        if not solve_symmetric(H, moved):
+            return here, False
+        se3_exp(moved[:, 0] / scale, step)
+        before = here.copy()
+        compose(step, before, here)
+        if np.abs(moved).max() < 1e-7:
+            break
+    return here, True
+
+
+def _best(starts: list[F64], points: F64, uv: F64, k: F64, config: PnpConfig) -> F64 | None:
     """The start with the lowest truncated error, refined on its inliers."""
     best, lowest = None, np.inf
     for T in starts:
-        cost = float(np.minimum(_errors(T, points, uv, K), 2 * config.threshold_px).sum())
+        cost = float(np.minimum(_errors(T, points, uv, k), 2 * config.threshold_px).sum())
         if cost < lowest:
             best, lowest = T, cost
     if best is None:
         return None
-    # A start is rougher than the answer: its inliers are gathered with a wider gate first.
-    for gate in (1.5, 1.0):
-        error = _errors(best, points, uv, K)
-        inliers = error <= gate * config.threshold_px
-        if np.count_nonzero(inliers) < config.min_inliers:
+    # A start is rougher than the answer: its inliers are gathered with wider gates first.
+    for gate in (3.0, 1.5, 1.0):
+        used = _errors(best, points, uv, k) <= gate * config.threshold_px
+        if np.count_nonzero(used) < config.min_inliers:
             return None
-        refined = robust_geometry.refined_pose(best, points[inliers], uv[inliers], K)
-        if refined is None:
+        best, is_closed = _descend(best, points, uv, k, used)
+        if not is_closed or not np.isfinite(best).all():
             return None
-        best = refined
     return best
 
 
 def _judge(
-    T: F64, points: F64, uv: F64, K: F64, inliers: Bool, prior: F64 | None, config: PnpConfig
+    fit: Fit, points: F64, uv: F64, k: F64, prior: F64 | None, config: PnpConfig
 ) -> PnpResult | None:
     """The result with its covariance, or None when it cannot be trusted."""
+    T, inliers = fit.T_camera_points, fit.inliers
     count = int(np.count_nonzero(inliers))
     share = count / len(points)
     if count < config.min_inliers or share < config.min_inlier_share:
@@ -155,56 +218,27 @@ def _judge(
         turn = float(np.linalg.norm(se3.so3_log(T[:3, :3] @ prior[:3, :3].T)))
         if turn > config.max_prior_rotation_rad:
             return None
-    error = _errors(T, points[inliers], uv[inliers], K)
+    error = fit.error[fit.error <= config.threshold_px]
     variance = max(float(error @ error) / (2 * count - 6), config.floor_px**2)
-    p = se3.transform(T, points[inliers])
-    covariance = reprojection_covariance(p, K, variance)
+    H, _ = _normal_equations(T, points, uv, k, inliers)
+    covariance = _inverse(H)
     if covariance is None:
         return None
+    covariance = covariance * variance
     # Uncertainty of where the camera is, seen from the points.
-    position = se3.adjoint(se3.inverse(T)) @ covariance @ se3.adjoint(se3.inverse(T)).T
-    centre = -T[:3, :3].T @ T[:3, 3]
-    lever = np.hstack([-se3.hat(centre), np.eye(3)])
-    sigma = float(np.sqrt(np.linalg.eigvalsh(lever @ position @ lever.T)[-1]))
-    if not sigma <= config.max_sigma_share * float(np.median(p[:, 2])):
+    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
+    depth = points[inliers] @ T[2, :3] + T[2, 3]
+    if not sigma <= config.max_sigma_share * float(np.median(depth)):
         return None
     return PnpResult(T, covariance, inliers, float(np.sqrt(np.mean(error**2))))
 
 
-def reprojection_covariance(xyz_m: F64, K: F64, variance_px2: float) -> F64 | None:
-    """(6, 6) covariance of a left perturbation in the camera frame, None when open.
-
-    ``xyz_m`` (N, 3) are the points in the camera frame; ``variance_px2`` is of one coordinate.
-    """
-    x, y, z = xyz_m.T
-    J = np.zeros((len(x), 2, 6))
-    fx, fy = K[0, 0], K[1, 1]
-    # d(u, v) / d(point) times [-hat(point), I]
-    J[:, 0, 0], J[:, 0, 1], J[:, 0, 2] = -fx * x * y / z**2, fx * (1 + (x / z) ** 2), -fx * y / z
-    J[:, 1, 0], J[:, 1, 1], J[:, 1, 2] = -fy * (1 + (y / z) ** 2), fy * x * y / z**2, fy * x / z
-    J[:, 0, 3], J[:, 0, 5] = fx / z, -fx * x / z**2
-    J[:, 1, 4], J[:, 1, 5] = fy / z, -fy * y / z**2
-    rows = J.reshape(-1, 6)
-    H = rows.T @ rows
+def _inverse(H: F64) -> F64 | None:
+    """(6, 6) inverse of a normal matrix, None where a direction is open."""
     scale = np.sqrt(np.diag(H))
     if not np.all(scale > 0):
         return None
     normal = H / np.outer(scale, scale)
     if np.linalg.eigvalsh(normal)[0] < 1e-10:
         return None
-    return np.asarray(np.linalg.inv(normal) / np.outer(scale, scale) * variance_px2)
-
-
-def average_left_right(left: PnpResult, right: PnpResult) -> PnpResult:
-    """The right result with its pose averaged with the left's (paper: they are averaged).
-
-    Both are poses of one image by the points of another view each. When the two disagree by
-    more than their covariances allow, the covariance of the mean grows with the disagreement.
-    """
-    T, covariance = se3.average(
-        left.T_camera_points, left.covariance, right.T_camera_points, right.covariance
-    )
-    difference = se3.log(right.T_camera_points @ se3.inverse(left.T_camera_points))
-    spread = left.covariance + right.covariance
-    disagreement = float(difference @ np.linalg.solve(spread, difference)) / 6.0
-    return replace(right, T_camera_points=T, covariance=covariance * max(1.0, disagreement))
+    return np.asarray(np.linalg.inv(normal) / np.outer(scale, scale))

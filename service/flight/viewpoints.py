@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from recon import se3
-from recon.camera_model import inverse_depth_plane
 from recon.posegraph.between_keyframes import FixAverage
 from recon.rolling_shutter import FrameRows
 from recon.stereo.virtual_stereo import View
 from recon.tracking.keyframe_window import OdometryKeyframe, landmarks
 from recon.tracking.odometry import Odometry, Tracked
+from recon.tracking.prediction import inverse_depth_plane
 from recon.types import F64, U8, Camera, PosePrior
 from service.config import ScanConfig, parse_baseline
 from service.flight.anchorage import Anchorage
