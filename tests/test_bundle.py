@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.optimize
 
 from recon import se3
 from recon.tracking import bundle
@@ -50,6 +51,36 @@ def test_exact_pixels_bring_the_poses_back() -> None:
     assert result.converged
     np.testing.assert_allclose(result.T_camera_world, T, atol=1e-4)
     assert np.median(result.residual_px) < 1e-3
+
+
+def test_the_least_squared_error_is_found_whatever_the_order() -> None:
+    """SciPy's answer, with fixed cameras between free ones and points seen twice by a camera."""
+    T, X, cam, pt, uv = flight(3, cameras=5, points=60)
+    rng = np.random.default_rng(3)
+    often = np.flatnonzero(np.bincount(pt) >= 3)
+    kept = np.isin(pt, often)
+    X, cam, pt, uv = X[often], cam[kept], np.searchsorted(often, pt[kept]), uv[kept]
+    twice = rng.choice(len(cam), 15, replace=False)
+    cam, pt = (np.concatenate([a, a[twice]]) for a in (cam, pt))
+    uv = np.vstack([uv, uv[twice]]) + rng.normal(0, 0.5, (len(cam), 2))
+    mixed = rng.permutation(len(cam))
+    cam, pt, uv = cam[mixed], pt[mixed], uv[mixed]
+    free = np.array([False, True, False, True, True])
+    found = bundle.adjust(T, X, cam, pt, uv, K, free, huber_px=1e6, iterations=60)
+
+    def residual(x: F64) -> F64:
+        poses, moved = T.copy(), X + x[18:].reshape(-1, 3)
+        for c, twist in zip(np.flatnonzero(free), x[:18].reshape(3, 6), strict=True):
+            poses[c] = se3.exp(twist) @ T[c]
+        P = np.einsum("nij,nj->ni", poses[cam][:, :3, :3], moved[pt]) + poses[cam][:, :3, 3]
+        return np.asarray((P[:, :2] / P[:, 2:] * 1000 + [640, 360] - uv).ravel())
+
+    best = scipy.optimize.least_squares(residual, np.zeros(18 + X.size), xtol=1e-12, ftol=1e-12)
+    np.testing.assert_allclose(np.sum(found.residual_px**2), 2 * best.cost, rtol=1e-5)
+    inverse = np.linalg.inv(best.jac.T @ best.jac)[:18, :18]
+    for block, c in enumerate(np.flatnonzero(free)):
+        part = inverse[6 * block : 6 * block + 6, 6 * block : 6 * block + 6]
+        np.testing.assert_allclose(np.diag(found.covariance[c]), 0.3**2 * np.diag(part), rtol=2e-2)
 
 
 def test_outliers_hardly_move_the_poses() -> None:

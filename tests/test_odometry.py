@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from recon import se3
-from recon.tracking.localisation import OdometryConfig
+from recon.tracking.keyframe_window import OdometryKeyframe
+from recon.tracking.localisation import Localiser, OdometryConfig, Search
 from recon.tracking.odometry import Odometry, Tracked
 from recon.types import F64, U8, Camera, PosePrior, Shutter
 
@@ -191,3 +194,24 @@ def test_a_rolling_shutter_skips_less(ground: U8) -> None:
     found = skipping(ground, poses(60, step_m=0.2, wobble=0.001), 30.0, lens)
     followed = [i for i, f in enumerate(found) if f.state in ("tracked", "keyframe")]
     assert max(np.diff(followed)) == 2
+
+
+def test_each_landmark_is_searched_once(ground: U8, monkeypatch: pytest.MonkeyPatch) -> None:
+    searched: list[tuple[int, bool, set[int]]] = []
+    search = Localiser._search
+
+    def spy(self: Localiser, key: OdometryKeyframe, *rest: Any) -> Search:
+        found = search(self, key, *rest)
+        is_tracked = rest[3] is not None
+        searched.append((key.seq, is_tracked, set(key.landmark[found.searched].tolist())))
+        return found
+
+    monkeypatch.setattr(Localiser, "_search", spy)
+    fly(ground, poses(24, step_m=0.8), telemetry=True)
+    pairs = 0
+    for (right, first, a), (left, second, b) in pairwise(searched):
+        if first and second and left < right:
+            pairs += 1
+            assert a and b and not a & b
+            assert len(a | b) <= 1.5 * OdometryConfig().tracked_landmarks
+    assert pairs > 5

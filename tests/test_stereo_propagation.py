@@ -327,16 +327,16 @@ def test_memory_need_not_be_cleared_and_grows_no_further_than_needed(
 ) -> None:
     _, left, right = box_scene()
     config = BeliefPropagationConfig()
+    take = Workspace.take
+
+    def dirty(space: Workspace, name: str, shape: tuple[int, ...]) -> I16:
+        array = take(space, name, shape)
+        array[...] = -12345
+        return array
+
     for iterations in (1, 5):
         config = replace(config, iterations=iterations)
         want = belief_propagation(left, right, 20, config)
-        take = Workspace.take
-
-        def dirty(space: Workspace, name: str, shape: tuple[int, ...]) -> I16:
-            array = take(space, name, shape)
-            array[...] = -12345
-            return array
-
         with monkeypatch.context() as patch:
             patch.setattr(Workspace, "take", dirty)
             got = belief_propagation(left, right, 20, config)

@@ -85,17 +85,6 @@ def consensus_pose(
     return None if found is None or not found[0] else _motion(found[1], found[2])
 
 
-def refined_pose(T_camera_points: F64, points_m: F64, uv_px: F64, K: F64) -> F64 | None:
-    """(4, 4) pose at the least squared reprojection error near the given one."""
-    if len(points_m) < 3 or not span_a_plane(points_m, uv_px):
-        return None
-    rvec = se3.so3_log(T_camera_points[:3, :3]).reshape(3, 1)
-    tvec = T_camera_points[:3, 3].reshape(3, 1).copy()
-    until = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 1e-9)
-    found = attempt(lambda: cv2.solvePnPRefineLM(points_m, uv_px, K, None, rvec, tvec, until))
-    return None if found is None else _motion(*found)
-
-
 def relative_pose(
     uv_a: F64, uv_b: F64, K: F64, threshold_px: float = 1.0
 ) -> tuple[F64, F64, int] | None:
