@@ -16,8 +16,8 @@ from recon.rolling_shutter import RowClock, Rows, RowTrack, row_times_s
 from recon.stereo.virtual_stereo import View, VirtualStereoConfig, at_middle_row, rectify
 from recon.tracking.localisation import OdometryConfig
 from recon.tracking.odometry import Odometry
-from recon.tracking.readout_search import ReadoutEstimate
 from recon.tracking.prediction import inverse_depth_plane
+from recon.tracking.readout_search import ReadoutEstimate
 from recon.types import DIRECTIONS, F64, U8, Camera, PosePrior, Shutter, StereoPair
 from service.config import Config
 from service.flight.scan import Scan

@@ -33,7 +33,7 @@ class OdometryConfig:
     wide_search_share: float = 0.09  # and around a poor one
     min_tracks: int = 40  # fewer inliers: lost
     min_track_share: float = 0.25  # of the corners that should be visible
-    tracked_landmarks: int = 300  # of both keyframes; new keyframes match all their corners
+    tracked_landmarks: int = 450  # of both keyframes; new keyframes match all their corners
     max_tilt_error_rad: float = 0.35  # vision against attitude: more is a false solution
     loose_px: float = 6.0  # gate of a second try: a rolling shutter bends images that much
     lost_after: int = 8  # frames in a row without a pose before a new segment starts
