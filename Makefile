@@ -43,7 +43,7 @@ bench: $(STAMP)
 MINUTES ?= 60
 SOAK := tests/trials/test_trial_soak.py
 trials: $(STAMP)
-	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[$(EXTRAS),trials]'
+	$(BIN)/python -m pip install --no-compile --disable-pip-version-check -q -c constraints.txt -e '.[$(EXTRAS),trials]'
 	@export SKYRELIEF_TRIALS=whole SKYRELIEF_SOAK_MINUTES=$(MINUTES); \
 	  export SKYRELIEF_TRIALS_TABLE=docs/reports/trials.md SKYRELIEF_BOOT_LOG=docs/reports/boot-log.md; \
 	  $(BIN)/python -m pytest -m trial $(SOAK) -k flights $(ARGS) & flights=$$!; \
@@ -74,17 +74,18 @@ notices:
 clean:
 	rm -rf demo-output build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
 
-# Installed again only when what is installed changes.
+# Installed again only when what is installed changes. Python compiles a module when it is first
+# imported: to compile all of them takes longer than to download them.
 $(CORE): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' || \
 	  { echo "skyrelief needs Python 3.10 to 3.13; say which with: make $(MAKECMDGOALS) PYTHON=python3.12" >&2; exit 2; }
 	@echo "installing skyrelief into $(VENV): once, a minute or two"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[portal]'
+	@$(BIN)/python -m pip install --no-compile --disable-pip-version-check -q -c constraints.txt -e '.[portal]'
 	@touch $(CORE)
 
 $(STAMP): $(CORE)
-	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt $(PIP_FLAGS) -e '.[$(EXTRAS)]'
+	$(BIN)/python -m pip install --no-compile --disable-pip-version-check -q -c constraints.txt $(PIP_FLAGS) -e '.[$(EXTRAS)]'
 	@touch $(STAMP)
 
 # MAVProxy, a ground station for the tests, in an environment of its own without its graphical
