@@ -50,6 +50,17 @@ def simulate(
         float | None, typer.Option(help="Level of a sea with waves, above the origin's ground.")
     ] = None,
     density: Annotated[float, typer.Option(help="Houses and trees; 0 is open country.")] = 1.0,
+    site_m: Annotated[
+        float | None,
+        typer.Option(help="Side of the place, the flight in its middle: for several flights."),
+    ] = None,
+    flight_seed: Annotated[
+        int | None, typer.Option(help="Seed of motion and sensors; default: --seed.")
+    ] = None,
+    changes: Annotated[
+        int, typer.Option(help="Boxes of which half stand at --date 1, half at --date 2.")
+    ] = 0,
+    date: Annotated[int, typer.Option(help="1 or 2: which of the changes stand.")] = 1,
     photos: Annotated[Path | None, typer.Option(help="Aerial photos as the ground.")] = None,
     gps_noise_m: Annotated[float, typer.Option(help="Wander of the GPS.")] = 1.0,
     gnss_noise: Annotated[
@@ -104,6 +115,7 @@ def simulate(
             FlightPlan(
                 pattern, duration_s, height_m, speed_m_s, heading_deg, camera_pitch_deg, legs,
                 spacing_m, wobble_deg, sway_m, climb_m, swing_deg,
+                centred=site_m is not None,
             ),
             SensorNoise.of(
                 gnss_noise,
@@ -125,7 +137,7 @@ def simulate(
             seed, _size(size), fps, focal,
             recording.DISTORTION if distortion else (0.0, 0.0, 0.0, 0.0, 0.0),
             relief_m, density, photos, depth_frames, crf, telemetry, video,
-            shutter_of(readout_ms, readout_direction),
+            shutter_of(readout_ms, readout_direction), flight_seed, site_m, changes, date,
         )  # fmt: skip
         simulation = recording.prepare(options)
     except ValueError as error:

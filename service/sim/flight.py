@@ -37,6 +37,7 @@ class FlightPlan:
     sway_m: float = 0.15  # of the position about the path, 1 sigma per axis
     climb_m: float = 0.0  # higher at the end than at the start, evenly
     swing_deg: float = 0.0  # amplitude of the head's swing about two axes, at SWING_HZ
+    centred: bool = False  # the middle of the path lies above the origin, else its start
 
     def __post_init__(self) -> None:
         if self.pattern not in PATTERNS:
@@ -177,6 +178,8 @@ def _waypoints(plan: FlightPlan, heading: float) -> F64:
     for k in range(legs):
         ends = (0.0, length) if k % 2 == 0 else (length, 0.0)
         points += [k * spacing * right + s * ahead for s in ends]
+    if plan.centred:
+        points = list(np.array(points) - np.mean(points, axis=0))
     points[0] = points[0] - spare * ahead
     points[-1] = points[-1] + spare * ahead * (1.0 if legs % 2 else -1.0)
     return np.array(points)

@@ -73,6 +73,10 @@ class SimulationOptions:
     with_telemetry: bool = True
     with_video: bool = True
     shutter: Shutter = GLOBAL_SHUTTER
+    flight_seed: int | None = None  # of the motion and the sensors; None: ``seed``
+    site_m: float | None = None  # side of the place about the origin; None: what the flight sees
+    changes: int = 0  # boxes that stand at one of two dates only
+    date: int = 1  # of the flight: 1 or 2
 
     def __post_init__(self) -> None:
         W, H = self.size_px
@@ -86,6 +90,10 @@ class SimulationOptions:
             raise ValueError("relief must be 0 to 200 m and density 0 to 3")
         if not (0 <= self.depth_frames <= 10000 and 0 <= self.crf <= 51):
             raise ValueError("depth frames must be 0 to 10000 and crf 0 to 51")
+        if not 0 <= self.changes <= 1000 or self.date not in (1, 2):
+            raise ValueError("changes must be 0 to 1000, the date 1 or 2")
+        if self.site_m is not None and not 20.0 <= self.site_m <= 5000.0:
+            raise ValueError(f"a site of {self.site_m:g} m is not within 20 to 5000 m")
         if not 0 <= self.shutter.readout_s <= 1 / self.fps:
             raise ValueError(
                 f"readout of {1e3 * self.shutter.readout_s:g} ms is not within 0 and the "
@@ -100,6 +108,11 @@ class SimulationOptions:
         cx, cy = 0.5 * (W - 1) + 0.003 * W, 0.5 * (H - 1) - 0.004 * H
         K = np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
         return Camera(K, np.array(self.distortion), (W, H), self.shutter)
+
+    @property
+    def own_seed(self) -> int:
+        """What decides the motion and the sensors."""
+        return self.seed if self.flight_seed is None else self.flight_seed
 
     @property
     def frames(self) -> int:
@@ -152,13 +165,13 @@ class Simulation:
 
     def sensors(self) -> Sensors:
         """The drone's sensors, fresh from their seed."""
-        rng = np.random.default_rng(self.options.seed + 3)
+        rng = np.random.default_rng(self.options.own_seed + 3)
         return Sensors(self.flight, self.options.noise, rng)
 
 
 def prepare(options: SimulationOptions) -> Simulation:
     """Lay out the place under the flight and colour it; ValueError for a flight too large."""
-    flight = flights.fly(options.plan, options.seed)
+    flight = flights.fly(options.plan, options.own_seed)
     times = np.arange(options.frames) / options.fps
     poses = flight.T_world_camera(times)
     area = _area(flight, options)
@@ -169,7 +182,9 @@ def prepare(options: SimulationOptions) -> Simulation:
             f"the flight would cover {area.size_m[0]:.0f} x {area.size_m[1]:.0f} m; "
             "make it shorter, slower or lower"
         )
-    place = scene.make(area, options.relief_m, options.density, options.seed)
+    place = scene.make(
+        area, options.relief_m, options.density, options.seed, options.changes, options.date
+    )
     mosaic = None
     if options.photos is not None:
         size = [max(4, int(np.ceil(s / texel))) for s in area.size_m]
@@ -181,6 +196,9 @@ def prepare(options: SimulationOptions) -> Simulation:
 def _area(flight: Flight, options: SimulationOptions) -> Area:
     """The ground that the camera can see, with a rim; the horizon itself stays empty."""
     plan = options.plan
+    if options.site_m is not None:
+        half = 0.5 * options.site_m
+        return Area(-half, -half, half, half)
     t = np.linspace(0.0, plan.duration_s, 200)
     xy = flight.position(t)[:, :2]
     W, H = options.size_px
@@ -229,6 +247,9 @@ def _write_truth(simulation: Simulation, truth: Path) -> None:
     origin = {"lat_deg": ORIGIN.lat_deg, "lon_deg": ORIGIN.lon_deg, "alt_amsl_m": ORIGIN.alt_amsl_m}
     (truth / "origin.json").write_text(json.dumps(origin) + "\n")
     write_surface(truth / "surface.ply", simulation.scene.vertices, _dry(simulation))
+    if simulation.scene.changes:
+        boxes = [asdict(change) for change in simulation.scene.changes]
+        (truth / "changes.json").write_text(json.dumps(boxes, indent=1) + "\n")
     with (truth / "trajectory.tum").open("w") as out:
         for t, T in zip(simulation.times_s, simulation.poses, strict=True):
             q = quaternion_from_rotation(T[:3, :3])

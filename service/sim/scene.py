@@ -20,6 +20,8 @@ from service.sim.shapes import FLAT, GABLED, PLAIN, VEHICLE, MeshParts
 ASPHALT, DIRT = 1, 2
 ROOFS = ((50, 62, 128), (58, 80, 140), (72, 72, 78), (62, 68, 96), (96, 92, 90))
 WALLS = ((196, 206, 212), (150, 182, 206), (120, 150, 190), (205, 205, 200), (110, 120, 160))
+CHANGE_M, CHANGE_HEIGHT_M = (1.0, 4.0), (0.3, 2.5)
+"""Sides and height of a box that stands at one date only."""
 PAINTS = ((40, 40, 160), (150, 90, 40), (210, 210, 210), (60, 60, 60), (40, 120, 180))
 
 
@@ -47,10 +49,26 @@ class Scene:
     owner: npt.NDArray[np.int32]  # (M,) row of the block or tree table, -1 ground
     grid: TriangleGrid
     seed: int
+    changes: tuple[Change, ...] = ()
 
 
-def make(area: Area, relief_m: float, density: float, seed: int) -> Scene:
-    """The place of ``seed`` over ``area``; ``density`` 1 is a village, 0 is open country."""
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A box that stands on the ground at one of two dates only."""
+
+    outline_m: tuple[tuple[float, float], ...]  # corners, ENU
+    height_m: float  # above the highest ground below it
+    volume_m3: float  # above the ground
+    date: int  # at which it stands: 1 was removed, 2 was added
+
+
+def make(
+    area: Area, relief_m: float, density: float, seed: int, changes: int = 0, date: int = 1
+) -> Scene:
+    """The place of ``seed`` over ``area``; ``density`` 1 is a village, 0 is open country.
+
+    Of ``changes`` boxes the first half stands at ``date`` 1 only, the others at ``date`` 2.
+    """
     rng = np.random.default_rng(seed)
     ground = make_terrain(area, relief_m, 1.0, seed)
     roads = _roads(area, rng)
@@ -58,6 +76,8 @@ def make(area: Area, relief_m: float, density: float, seed: int) -> Scene:
     blocks = _houses(roads, ground, free, density, rng)
     blocks += _cars(area, roads, ground, density, rng)
     trees, heights, trunks = _trees(area, ground, free, density, rng)
+    boxes, changed = _changes(area, ground, free, changes, seed)
+    blocks += [box for box, change in zip(boxes, changed, strict=True) if change.date == date]
     table = np.array(blocks + trunks) if blocks or trunks else np.zeros((0, shapes.COLUMNS))
     parts = MeshParts()
     _add_ground(parts, ground, table)
@@ -68,8 +88,9 @@ def make(area: Area, relief_m: float, density: float, seed: int) -> Scene:
     vertices, triangles, material, owner = parts.joined()
     grid = triangle_grid.build(vertices, triangles, 1.0)
     return Scene(
-        area, ground, roads, table, trees, vertices, triangles, material, owner, grid, seed
-    )
+        area, ground, roads, table, trees, vertices, triangles, material, owner, grid, seed,
+        tuple(changed),
+    )  # fmt: skip
 
 
 class _FreeGround:
@@ -250,6 +271,35 @@ def _cars(
             cabin[shapes.BASE], cabin[shapes.EAVE] = body[shapes.EAVE], body[shapes.EAVE] + 0.6
             out += [body, cabin]
     return out
+
+
+def _changes(
+    area: Area, ground: Terrain, free: _FreeGround, count: int, seed: int
+) -> tuple[list[F64], list[Change]]:
+    """Boxes on free ground in the inner two thirds of the area, for one of two dates each."""
+    rng = np.random.default_rng(seed + 77)
+    middle = np.array([0.5 * (area.x0 + area.x1), 0.5 * (area.y0 + area.y1)])
+    rows: list[F64] = []
+    found: list[Change] = []
+    for _ in range(1000 * count):
+        if len(rows) == count:
+            break
+        x, y = middle + rng.uniform(-1 / 3, 1 / 3, 2) * area.size_m
+        size = rng.uniform(*CHANGE_M), rng.uniform(*CHANGE_M)
+        row = _block(FLAT, float(x), float(y), rng.uniform(0, np.pi), size)
+        height = float(rng.uniform(*CHANGE_HEIGHT_M))
+        if not free.take(shapes.footprint(row, 2.0)):
+            continue
+        _stand(row, ground, height, 0.0)
+        _paint(row, _pick(ROOFS, rng), _pick(WALLS, rng), rng)
+        gx, gy = np.meshgrid(*(np.arange(c - 4.0, c + 4.0, 0.05) for c in (x, y)))
+        under = shapes.inside(row, gx, gy)
+        level = ground.height(gx[under], gy[under])
+        volume = float((row[shapes.EAVE] - level).mean() * size[0] * size[1])
+        outline = tuple((float(a), float(b)) for a, b in shapes.footprint(row))
+        rows.append(row)
+        found.append(Change(outline, height, volume, 1 if len(rows) <= count // 2 else 2))
+    return rows, found
 
 
 def _trees(
