@@ -40,6 +40,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "mesh": ("service.commands.deliverables:mesh", "Make a textured mesh of a scan folder."),
     "refine": ("service.commands.refine:refine", "Adjust a finished scan as a whole."),
     "refly": ("service.commands.refine:refly", "Plan a mission over poorly covered areas."),
+    "site": ("service.commands.site:site", "Join scans into one site; measure what changed."),
     "inspect": (
         "service.commands.deliverables:inspect",
         "Draw every stage of a keyframe as one image.",

@@ -40,6 +40,7 @@ RUN_BY = {
     "mesh": "test_meshing.py",
     "refine": "test_refine.py",
     "refly": "test_refly.py",
+    "site": "test_site.py",
     "inspect": "test_inspection.py",
     "calibrate": "test_calibration.py",
     "stereo": "test_stereo_command.py",

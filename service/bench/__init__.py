@@ -38,6 +38,7 @@ BENCHMARKS: dict[str, str] = {
     "link": "service.bench.link:run",
     "portal": "service.bench.portal:run",
     "real": "service.bench.real:run",
+    "site": "service.bench.site:run",
 }
 """Name to ``module:function``; imported when it runs."""
 

@@ -32,7 +32,8 @@ def bench(
     if device not in ("", "cuda", "cpu"):
         raise InputError(f"--device {device}: give cuda or cpu")
     options = BenchOptions(rounds=rounds, backend=backend, device=device, data=data)
-    chosen = names or [name for name in BENCHMARKS if data is not None or name != "real"]
+    slow = {"site"} if data is not None else {"site", "real"}
+    chosen = names or [name for name in BENCHMARKS if name not in slow]
     results = run_benchmarks(chosen, options)
     print(table(results))
     report = record(results, options)

@@ -19,8 +19,7 @@ from recon.mapping.free_space import seen_through, spread
 from recon.mapping.voxel_map import ground_sample_m
 from recon.types import F64, PointCloud
 from service.georeference import LocalFrame
-from service.scans.main_piece import main_keyframes
-from service.stream.store import ScanStore
+from service.scans.main_piece import Keyframes, main_keyframes
 
 if TYPE_CHECKING:
     import laspy
@@ -58,7 +57,7 @@ class _Extent:
     east_m: float
 
 
-def fused_cloud(store: ScanStore, voxel_m: float | None = None) -> FusedCloud:
+def fused_cloud(store: Keyframes, voxel_m: float | None = None) -> FusedCloud:
     """The main piece of ``store`` fused; voxels of the ground sample distance by default.
 
     Points that other keyframes see through are removed. The store is read several times, so that
@@ -82,7 +81,7 @@ def fused_cloud(store: ScanStore, voxel_m: float | None = None) -> FusedCloud:
     return FusedCloud(cloud, size, sample, len(extents), points, notes)
 
 
-def _extents(store: ScanStore) -> list[_Extent]:
+def _extents(store: Keyframes) -> list[_Extent]:
     """The keyframes of the main piece with points."""
     out = []
     for keyframe in main_keyframes(store):
@@ -112,7 +111,7 @@ def strip_edges(extents: Iterable[_Extent], max_points: int) -> list[float]:
 
 
 def _strip(
-    store: ScanStore, extents: list[_Extent], low_m: float, high_m: float
+    store: Keyframes, extents: list[_Extent], low_m: float, high_m: float
 ) -> Callable[[], Iterator[PointCloud]]:
     """The clouds of the keyframes that overlap a strip, read on demand."""
     margin = 1.0  # edges are moved by up to a voxel

@@ -3,16 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from typing import Any, Protocol
 
 from recon.types import Keyframe
 from service.stream.records import PoseRecord
-from service.stream.store import ScanStore
 
 Stretch = tuple[int, int]
 """First and last keyframe."""
 
 
-def stretches_apart(store: ScanStore) -> list[Stretch]:
+class Keyframes(Protocol):
+    """A store, or part of one."""
+
+    @property
+    def summary(self) -> dict[str, Any] | None:
+        """The scan's."""
+        ...
+
+    @property
+    def refinement(self) -> dict[str, Any] | None:
+        """The figures of the refinement in force, or None."""
+        ...
+
+    def seqs(self) -> list[int]:
+        """Numbers of its keyframes."""
+        ...
+
+    def keyframe(self, seq: int) -> Keyframe | None:
+        """One of them."""
+        ...
+
+
+def stretches_apart(store: Keyframes) -> list[Stretch]:
     """The unconnected stretches by the refinement in force, else by the scan's summary."""
     rows = (store.refinement or {}).get("apart", (store.summary or {}).get("apart"))
     if not isinstance(rows, list):
@@ -26,13 +48,13 @@ def is_apart(seq: int, apart: Iterable[Stretch]) -> bool:
     return any(first <= seq <= last for first, last in apart)
 
 
-def main_seqs(store: ScanStore) -> list[int]:
+def main_seqs(store: Keyframes) -> list[int]:
     """Numbers of the main piece's keyframes."""
     apart = stretches_apart(store)
     return [seq for seq in store.seqs() if not is_apart(seq, apart)]
 
 
-def main_keyframes(store: ScanStore) -> Iterator[Keyframe]:
+def main_keyframes(store: Keyframes) -> Iterator[Keyframe]:
     """The main piece's keyframes in order of their number."""
     for seq in main_seqs(store):
         found = store.keyframe(seq)
@@ -51,7 +73,7 @@ def main_poses(poses: Iterable[PoseRecord], apart: Iterable[Stretch]) -> list[Po
     return out
 
 
-def in_words(store: ScanStore) -> str:
+def in_words(store: Keyframes) -> str:
     """What is left out, for the operator; empty where nothing is."""
     apart = stretches_apart(store)
     if not apart:

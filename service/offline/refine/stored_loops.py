@@ -41,10 +41,18 @@ class StoredLoops:
     """Finds loops; keyframes are numbered by their place on the track."""
 
     def __init__(
-        self, track: Track, keyframe: Callable[[int], Keyframe | None], config: SubmapLoopConfig
+        self,
+        track: Track,
+        keyframe: Callable[[int], Keyframe | None],
+        config: SubmapLoopConfig,
+        scans: Sequence[int] | None = None,
     ) -> None:
-        """``keyframe`` gives each one with its depth at its pose on the track."""
+        """``keyframe`` gives each one with its depth at its pose on the track.
+
+        With ``scans``, the number of each keyframe's scan, only loops between scans are sought.
+        """
         self._track, self._keyframe, self._config = track, keyframe, config
+        self._scans = scans
         self._breaks = np.cumsum(np.diff(track.times_s, prepend=track.times_s[0]) > BREAK_S)
         self._view = lru_cache(maxsize=96)(self._filled)
 
@@ -71,7 +79,7 @@ class StoredLoops:
             return []
         depth_m = float(np.nanmedian(own.depth.depth_m))
         near = tree.query_ball_point(poses[b, :2, 3], 2.0 * depth_m)
-        earlier = sorted(a for a in near if a <= b - self._config.min_gap)
+        earlier = sorted(a for a in near if a <= b - self._config.min_gap and self._wanted(a, b))
         view = self._view(b, NEIGHBOURS) if earlier else None
         if view is None:
             return []
@@ -80,6 +88,9 @@ class StoredLoops:
         options = LoopConfig(min_gap=1, min_overlap=self._config.min_overlap)
         ground = ground_seen(view.depth)
         return [a for a, _ in candidates(some, b, view.K, (w, h), ground, options)]
+
+    def _wanted(self, a: int, b: int) -> bool:
+        return self._scans is None or self._scans[a] != self._scans[b]
 
     def _verified(self, a: int, b: int) -> Closure | None:
         reach = self._reach(a, b)

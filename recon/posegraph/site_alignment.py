@@ -1,0 +1,173 @@
+"""Several scans of one site moved onto each other: one similarity each, all at once.
+
+The errors of one flight's receiver, heading and scale are nearly the same all along it, so one
+motion and one scale per scan is the cause of most of what two scans disagree by. Ties are places
+that both scans have; what the receivers claim of themselves is the prior, so the mean of several
+flights is better placed than each. Gauss-Newton with Cauchy weights (Barfoot 2017, ch. 5.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon import se3
+from recon.types import F64, Bool
+
+STEPS = 12
+CAUCHY_SIGMAS = 2.0
+"""Of a tie's error, per number in it: beyond it a tie loses weight."""
+
+UNKNOWNS = 7
+"""Of a scan: rotation vector, shift of its centre, logarithm of the scale."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tie:
+    """Places of the ground as two scans have them, each in site coordinates before alignment."""
+
+    a: int  # number of a scan
+    b: int
+    at_a: F64  # (P, 3) m
+    at_b: F64  # (P, 3) m
+    covariance: F64  # (P, 3, 3) m2, of at_a - at_b
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanPrior:
+    """What a scan knows of its own placing."""
+
+    centre_m: F64  # (3,) about which it turns and grows
+    sigma: F64  # (7,) rad, m, share
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Similarity:
+    """``p -> growth * R @ p + t``."""
+
+    R: F64  # (3, 3)
+    t: F64  # (3,) m
+    growth: float
+
+    def points(self, xyz_m: F64) -> F64:
+        """(N, 3) moved."""
+        return np.asarray(self.growth * xyz_m @ self.R.T + self.t)
+
+    def pose(self, T: F64) -> F64:
+        """(4, 4) pose of a camera moved along; its depths grow by ``growth``."""
+        return se3.compose(self.R @ T[:3, :3], self.points(T[None, :3, 3])[0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SiteAlignment:
+    """Where all scans go, and how sure that is."""
+
+    moves: list[Similarity]
+    covariance: F64  # (7 S, 7 S) of the unknowns
+    before_m: F64  # (T,) distance of the two ends of each tie
+    after_m: F64  # (T,)
+    used: Bool  # (T,) ties within five sigmas afterwards
+    factor: float  # errors of the used ties over their sigmas, rms, at least 1
+    groups: list[int]  # (S,) scans that ties join have one number
+
+    def sigma_m(self, a: int, b: int, place_m: F64, priors: Sequence[ScanPrior]) -> F64:
+        """(3,) sigma of the motion between two scans at a place, by the ties and priors."""
+        J = np.zeros((3, len(self.covariance)))
+        for scan, sign in ((a, 1.0), (b, -1.0)):
+            centre = self.moves[scan].points(priors[scan].centre_m[None])[0]
+            rows = slice(UNKNOWNS * scan, UNKNOWNS * (scan + 1))
+            J[:, rows] = sign * _lever((place_m - centre)[None])
+        return np.asarray(np.sqrt(np.diag(J @ self.covariance @ J.T)))
+
+
+def align(ties: Sequence[Tie], priors: Sequence[ScanPrior]) -> SiteAlignment:
+    """The alignment of as many scans as there are ``priors``. A scan without ties stays.
+
+    Raises ValueError for ties of scans that there are not.
+    """
+    n = len(priors)
+    if any(not (0 <= t.a < n and 0 <= t.b < n) or t.a == t.b for t in ties):
+        raise ValueError(f"a tie joins two of {n} different scans")
+    moves = [Similarity(np.eye(3), np.zeros(3), 1.0) for _ in priors]
+    before = _errors(ties, moves)
+    state = np.zeros((n, UNKNOWNS))
+    for _ in range(STEPS):
+        H, g = _equations(ties, priors, state)
+        step = -np.linalg.solve(H, g).reshape(n, UNKNOWNS)
+        state = np.array([_moved(x, d) for x, d in zip(state, step, strict=True)])
+        if np.abs(step).max() < 1e-9:
+            break
+    moves = [_similarity(x, p) for x, p in zip(state, priors, strict=True)]
+    after = _errors(ties, moves)
+    size = np.array([_size(e, t) for e, t in zip(after, ties, strict=True)])
+    used = size < 5.0
+    factor = max(1.0, float(np.sqrt(np.mean(size[used] ** 2)))) if used.any() else 1.0
+    H, _ = _equations(ties, priors, state)
+    return SiteAlignment(
+        moves, factor**2 * np.linalg.inv(H), _lengths(before), _lengths(after), used, factor,
+        _groups(n, [t for t, ok in zip(ties, used, strict=True) if ok]),
+    )  # fmt: skip
+
+
+def _equations(ties: Sequence[Tie], priors: Sequence[ScanPrior], state: F64) -> tuple[F64, F64]:
+    """Normal equations (7 S, 7 S) and gradient (7 S,) at ``state`` (S, 7)."""
+    information = np.array([1.0 / p.sigma**2 for p in priors]).ravel()
+    H, g = np.diag(information), information * state.ravel()
+    moves = [_similarity(x, p) for x, p in zip(state, priors, strict=True)]
+    for tie, error in zip(ties, _errors(ties, moves), strict=True):
+        weight = 1.0 / (1.0 + (_size(error, tie) / CAUCHY_SIGMAS) ** 2)
+        W = weight * np.linalg.inv(tie.covariance)
+        J = np.zeros((len(error), 3, 2, UNKNOWNS))
+        ends = ((tie.a, tie.at_a, 1.0), (tie.b, tie.at_b, -1.0))
+        for side, (scan, points, sign) in enumerate(ends):
+            centre = priors[scan].centre_m + state[scan, 3:6]
+            J[:, :, side] = sign * _lever(moves[scan].points(points) - centre).reshape(-1, 3, 7)
+        J = J.reshape(len(error), 3, 2 * UNKNOWNS)
+        rows = np.concatenate([UNKNOWNS * s + np.arange(UNKNOWNS) for s in (tie.a, tie.b)])
+        H[np.ix_(rows, rows)] += np.einsum("pki,pkl,plj->ij", J, W, J)
+        g[rows] += np.einsum("pki,pkl,pl->i", J, W, error)
+    return H, g
+
+
+def _lever(from_centre: F64) -> F64:
+    """(3 P, 7) motion of points (P, 3), counted from the centre, by the unknowns."""
+    out = np.zeros((len(from_centre), 3, UNKNOWNS))
+    out[:, :, :3] = -se3.hat(from_centre)
+    out[:, :, 3:6] = np.eye(3)
+    out[:, :, 6] = from_centre
+    return out.reshape(-1, UNKNOWNS)
+
+
+def _moved(x: F64, step: F64) -> F64:
+    turn = se3.so3_log(se3.so3_exp(step[:3]) @ se3.so3_exp(x[:3]))
+    return np.concatenate([turn, x[3:] + step[3:]])
+
+
+def _similarity(x: F64, prior: ScanPrior) -> Similarity:
+    R, growth = se3.so3_exp(x[:3]), float(np.exp(x[6]))
+    return Similarity(R, prior.centre_m + x[3:6] - growth * R @ prior.centre_m, growth)
+
+
+def _errors(ties: Sequence[Tie], moves: Sequence[Similarity]) -> list[F64]:
+    return [moves[t.a].points(t.at_a) - moves[t.b].points(t.at_b) for t in ties]
+
+
+def _lengths(errors: Sequence[F64]) -> F64:
+    return np.array([float(np.median(np.linalg.norm(e, axis=1))) for e in errors])
+
+
+def _size(error: F64, tie: Tie) -> float:
+    """Rms of the numbers of an error, in sigmas."""
+    whitened = np.einsum("pi,pij,pj->p", error, np.linalg.inv(tie.covariance), error)
+    return float(np.sqrt(np.mean(whitened) / 3.0))
+
+
+def _groups(n: int, ties: Sequence[Tie]) -> list[int]:
+    """(n,) the smallest scan number that ties lead to."""
+    out = list(range(n))
+    for _ in range(n):
+        for tie in ties:
+            out[tie.a] = out[tie.b] = min(out[tie.a], out[tie.b])
+    return out

@@ -1,0 +1,284 @@
+"""Sites against the truth of simulated flights: seams, bias, changes, volumes; and a real set.
+
+Two flights cross one place. For each seed their receivers and attitudes wander on their own; the
+images stay. ``--rounds`` is the number of seeds. With ``--data`` the real nadir set is cut
+into even and odd images, as two flights.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recon import se3
+from recon.camera_model import rays
+from recon.types import F64, Keyframe
+from service.bench import BenchOptions, BenchResult
+from service.bench.real import _skyrelief as skyrelief
+from service.sim.flight import FlightPlan, Sensors
+from service.sim.recording import (
+    EPOCH_UNIX_S,
+    ORIGIN,
+    Simulation,
+    SimulationOptions,
+    prepare,
+    write,
+)
+from service.sim.telemetry import packets, write_tlog
+from service.sim.truth import Truth, read_truth
+from service.stream.store import ScanStore
+
+MAX_SEEDS = 10
+SITE_M, CHANGES = 220.0, 24
+NEAR_M = 12.0
+"""Between the ground of two keyframes whose errors are compared."""
+
+FOUND_M = 1.5
+"""Between the middle of a box and the object that is it."""
+
+REAL = "caliterra_nadir/frames"
+
+
+def run(options: BenchOptions) -> list[BenchResult]:
+    """Every figure; flights are rendered once and replayed for each seed."""
+    with tempfile.TemporaryDirectory(prefix="skyrelief-site-") as folder:
+        results = _simulated(Path(folder), options)
+        if options.data is not None and (options.data / REAL).is_dir():
+            results += _real(Path(folder) / "real", options.data / REAL, options)
+    return results
+
+
+def flight_options(heading_deg: float, date: int) -> SimulationOptions:
+    """A flight of three legs over the middle of the place."""
+    plan = FlightPlan("legs", 40.0, heading_deg=heading_deg, spacing_m=25.0, centred=True)
+    return SimulationOptions(
+        plan, seed=3, flight_seed=round(heading_deg), size_px=(640, 360), fps=5.0,
+        site_m=SITE_M, changes=CHANGES, date=date, depth_frames=2,
+    )  # fmt: skip
+
+
+def _simulated(folder: Path, options: BenchOptions) -> list[BenchResult]:
+    flown = {}
+    for name, heading, date in (("one", 0.0, 1), ("two", 90.0, 1), ("later", 90.0, 2)):
+        flown[name] = prepare(flight_options(heading, date))
+        write(flown[name], folder / name)
+    truths = [read_truth(folder / name) for name in ("one", "two")]
+    seams, unchanged = [], 0
+    seeds = min(options.rounds, MAX_SEEDS)
+    for seed in range(seeds):
+        scans = [_replayed(folder, flown, name, seed, options) for name in ("one", "two")]
+        out = folder / f"site-{seed}"
+        skyrelief("site", "compare", *map(str, scans), "--out", str(out))
+        seams.append(seam_of(out, truths))
+        unchanged += not json.loads((out / "change.json").read_text())["objects"]
+    later = _replayed(folder, flown, "later", 99, options)
+    skyrelief("site", "compare", str(folder / "one-0"), str(later), "--out", str(folder / "change"))
+    change = json.loads((folder / "change" / "change.json").read_text())
+    results = _seam_results(seams, truths[0].agl_m)
+    results.append(
+        BenchResult("site", "flights without change that show none", 100.0 * unchanged / seeds, "%",
+                    note=f"{seeds} pairs; goal 95 %")
+    )  # fmt: skip
+    return results + change_results(change, folder / "one", folder / "change" / "change.tif")
+
+
+def _replayed(
+    folder: Path, flown: dict[str, Simulation], name: str, seed: int, options: BenchOptions
+) -> Path:
+    """The scan of a flight whose sensors err by ``seed``."""
+    simulation, out = flown[name], folder / f"{name}-{seed}"
+    sensors = Sensors(
+        simulation.flight, simulation.options.noise, np.random.default_rng([seed, len(name)])
+    )
+    stream = packets(
+        sensors, ORIGIN, EPOCH_UNIX_S, simulation.surface_range, simulation.options.telemetry
+    )
+    log = folder / f"{name}-{seed}.tlog"
+    write_tlog(log, EPOCH_UNIX_S, stream)
+    skyrelief(
+        "replay", str(folder / name / "flight.mp4"), "--telemetry", str(log), "--camera-model",
+        str(folder / name / "camera.yaml"), "--out", str(out), "--backend", options.backend,
+    )  # fmt: skip
+    return out
+
+
+# ---- seams and bias --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seam:
+    """How two scans of a site lie to each other and to the truth."""
+
+    before_m: float  # median distance between the two where both see the ground
+    after_m: float
+    alone_m: F64  # (2, 3) mean error of each scan by its own fixes
+    site_m: F64  # (3,) mean error of the site
+
+
+def seam_of(site: Path, truths: Sequence[Truth]) -> Seam:
+    """The seam of a site of two scans, against the truths of their flights."""
+    document = json.loads((site / "site.json").read_text())
+    before: list[list[tuple[F64, F64]]] = [[], []]
+    after: list[list[tuple[F64, F64]]] = [[], []]
+    with ScanStore.open(site / "scan.db", read_only=True) as store:
+        for k, (scan, truth) in enumerate(zip(document["scans"], truths, strict=True)):
+            first, last = scan["keyframes"]
+            moved = np.array(scan["T_site_scan"])  # of a scan whose own origin is the site's
+            for seq in range(first, last + 1):
+                one = store.keyframe(seq)
+                found = None if one is None else _ground_error(one, truth)
+                if one is None or found is None:
+                    continue
+                place, error = found
+                after[k].append((place, error))
+                undone = _undone(place + error, moved, scan["scale"])
+                before[k].append((place, undone - place))
+    return Seam(
+        _between(*before), _between(*after),
+        np.array([np.mean([e for _, e in rows], axis=0) for rows in before]),
+        np.mean([np.mean([e for _, e in rows], axis=0) for rows in after], axis=0),
+    )  # fmt: skip
+
+
+def _undone(place: F64, T_site_scan: F64, scale: float) -> F64:
+    R, t = T_site_scan[:3, :3], T_site_scan[:3, 3]
+    return np.asarray(R.T @ (place - t) / scale)
+
+
+def _ground_error(one: Keyframe, truth: Truth) -> tuple[F64, F64] | None:
+    """(3,) true place of what the keyframe sees, and (3,) median error of where it has that."""
+    k = int(np.argmin(np.abs(truth.times_s - one.time_ns * 1e-9)))
+    h, w = one.depth.depth_m.shape
+    v, u = (x.ravel() for x in np.mgrid[4 : h - 4 : 9j, 4 : w - 4 : 13j].astype(np.int64))
+    z = one.depth.depth_m[v, u].astype(np.float64)
+    ways = rays(one.depth.K, np.column_stack([u, v]).astype(np.float64))[np.isfinite(z)]
+    if len(ways) < 20:
+        return None
+    there = se3.transform(one.depth.T_world_camera, ways * z[np.isfinite(z), None])
+    T = truth.poses[k]
+    turned = ways @ T[:3, :3].T
+    far, _ = truth.surface.cast(np.tile(T[:3, 3], (len(ways), 1)), turned)
+    true = T[:3, 3] + turned * far[:, None]
+    good = np.isfinite(true).all(axis=1)
+    return np.median(true[good], axis=0), np.median((there - true)[good], axis=0)
+
+
+def _between(one: Sequence[tuple[F64, F64]], two: Sequence[tuple[F64, F64]]) -> float:
+    """Median distance between the errors of keyframes that see the same ground."""
+    apart = [
+        float(np.linalg.norm(e - f))
+        for p, e in one
+        for q, f in two
+        if np.linalg.norm((p - q)[:2]) < NEAR_M
+    ]
+    return float(np.median(apart)) if apart else float("nan")
+
+
+def _seam_results(seams: Sequence[Seam], height_m: float) -> list[BenchResult]:
+    after = np.array([s.after_m for s in seams])
+    before = float(np.median([s.before_m for s in seams]))
+    alone = float(np.sqrt(np.mean([np.sum(s.alone_m**2, axis=1).mean() for s in seams])))
+    site = float(np.sqrt(np.mean([np.sum(s.site_m**2) for s in seams])))
+    many = f"{len(seams)} pairs of flights, GNSS wanders by 1 m"
+    return [
+        BenchResult("site", "seam, median", float(np.median(after)), "m", peer="by fixes",
+                    peer_value=before, note=many),
+        BenchResult("site", "seam over the height, median", 100.0 * float(np.median(after))
+                    / height_m, "%", note="goal 0.1 %"),
+        BenchResult("site", "bias of the site, rms", site, "m", peer="one flight",
+                    peer_value=alone, note="goal 0.75 of one flight's"),
+    ]  # fmt: skip
+
+
+# ---- changes ---------------------------------------------------------------------------------
+
+
+def change_results(change: dict[str, Any], flight: Path, map_: Path) -> list[BenchResult]:
+    """Boxes found, false objects and volumes, of a comparison of date 1 with date 2.
+
+    A box counts where both flights have surface all around it, by ``map_``, the change.tif.
+    """
+    boxes = json.loads((flight / "truth" / "changes.json").read_text())
+    middles = ORIGIN.to_utm(np.array([[*np.mean(b["outline_m"], axis=0), 0.0] for b in boxes]))[
+        :, :2
+    ]
+    places = np.array([[o["east_m"], o["north_m"]] for o in change["objects"]]).reshape(-1, 2)
+    seen = [k for k, m in enumerate(middles) if _is_compared(map_, m)]
+    found, used = [], set()
+    for k in seen:
+        off = np.linalg.norm(places - middles[k], axis=1) if len(places) else np.array([np.inf])
+        near = int(np.argmin(off))
+        sign = 1.0 if boxes[k]["date"] == 2 else -1.0
+        if off[near] < FOUND_M and sign * change["objects"][near]["volume_m3"] > 0:
+            found.append((k, near))
+            used.add(near)
+    all_near = {
+        n for n, p in enumerate(places) if np.linalg.norm(middles - p, axis=1).min() < 2 * FOUND_M
+    }
+    wrong = len(places) - len(used | all_near)
+    true = sum(boxes[k]["volume_m3"] for k, _ in found)
+    measured = sum(abs(change["objects"][n]["volume_m3"]) for _, n in found)
+    hectares = change["compared_m2"] / 1e4
+    share = 100.0 * len(found) / max(len(seen), 1)
+    off = 100.0 * abs(measured / true - 1.0) if true else float("nan")
+    return [
+        BenchResult("site", "boxes found", share, "%", note=f"of {len(seen)}; goal 95 %"),
+        BenchResult("site", "false objects", wrong / hectares, "/ha", note="goal 1"),
+        BenchResult("site", "volume of the boxes found, error", off, "%",
+                    note=f"{true:.0f} m3; goal 2 %"),
+    ]  # fmt: skip
+
+
+def _is_compared(map_: Path, middle: F64) -> bool:
+    """True where the map knows the difference all around a place."""
+    import rasterio
+
+    with rasterio.open(map_) as image:
+        row, col = image.index(*middle)
+        if not (3 <= row < image.height - 3 and 3 <= col < image.width - 3):
+            return False
+        part = image.read(1, window=((row - 3, row + 4), (col - 3, col + 4)))
+        return bool((part != image.nodata).mean() > 0.8)
+
+
+# ---- a real set ------------------------------------------------------------------------------
+
+
+def _real(folder: Path, frames: Path, options: BenchOptions) -> list[BenchResult]:
+    """Even and odd images of one flight as two: nothing may differ."""
+    images = sorted(p for p in frames.iterdir() if p.suffix.lower() in (".jpg", ".jpeg"))
+    scans = []
+    for k, name in enumerate(("even", "odd")):
+        (folder / name).mkdir(parents=True)
+        for path in images[k::2]:
+            shutil.copy(path, folder / name / path.name)
+        scans.append(folder / f"{name}-scan")
+        skyrelief("replay", str(folder / name), "--out", str(scans[-1]),
+                  "--backend", options.backend)  # fmt: skip
+    out = folder / "site"
+    skyrelief("site", "compare", *map(str, scans), "--out", str(out))
+    return real_results(out)
+
+
+def real_results(out: Path) -> list[BenchResult]:
+    """Seam over sigma and objects of a comparison that should show nothing."""
+    import rasterio
+
+    with rasterio.open(out / "change.tif") as image:
+        height, sigma = image.read(1, masked=True), image.read(2, masked=True)
+    change = json.loads((out / "change.json").read_text())
+    seam = float(np.ma.median(np.abs(height)))
+    usual = float(np.ma.median(sigma))
+    return [
+        BenchResult("site", "real, even and odd images: seam", seam, "m", peer="sigma",
+                    peer_value=usual, note="goal: at most sigma"),
+        BenchResult("site", "real, even and odd images: objects", float(len(change["objects"])), "",
+                    note="goal 0"),
+    ]  # fmt: skip

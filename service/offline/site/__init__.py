@@ -1,0 +1,1 @@
+"""Several scans as one site: gathered into one store, aligned, compared."""

@@ -1,0 +1,278 @@
+"""``skyrelief site align``: several scans moved onto each other, in a folder of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recon import se3
+from recon.camera_model import rays
+from recon.posegraph.ground_control import Closure, Track, supported
+from recon.posegraph.site_alignment import ScanPrior, SiteAlignment, Tie, align
+from recon.posegraph.submap_loops import SubmapLoopConfig
+from recon.types import Bool, Keyframe
+from service.errors import InputError
+from service.offline.refine.stored_loops import BREAK_S, StoredLoops
+from service.offline.site.gather import Member, gather
+from service.scans.folder import write_deliverables
+from service.scans.track import local_frame
+from service.scans.writing import writing
+from service.stream.records import Repose
+from service.stream.store import ScanStore
+
+SITE = "site.json"
+ALIGNED = 1
+"""Revision of the poses by the alignment; 0 are the scans' own."""
+
+MIN_TIES = 3
+"""Between two scans; fewer may be chance."""
+
+MIN_SIGMA = np.array([0.003] * 3 + [0.05] * 3 + [0.003])
+"""Of what a scan knows of its placing: rad, m, share."""
+
+SIGMA_SCALE = 0.01
+"""Of a scan that does not say how sure its scale is."""
+
+KEPT = 128
+"""Keyframes held in memory while ties are sought."""
+
+CORNERS = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
+"""Places of a view, in shares of it, that a tie holds."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AlignedSite:
+    """A site's folder and what is known of its parts."""
+
+    folder: Path
+    members: list[Member]
+    alignment: SiteAlignment
+    priors: list[ScanPrior]
+    document: dict[str, Any]  # the content of site.json
+
+
+def align_site(folders: Sequence[Path], out: Path, deliver: bool = True) -> AlignedSite:
+    """Gather the scans into the folder ``out``, align them, and write the site's files.
+
+    The scans of a site that lies there already come first; its earlier alignments stay listed.
+    Raises InputError for scans that make no site, and when ``out`` holds anything else.
+    """
+    known = _known(out)
+    folders = [*(Path(s["folder"]) for s in known.get("scans", [])), *folders]
+    unique = list(dict.fromkeys(f.resolve() for f in folders))
+    out.mkdir(parents=True, exist_ok=True)
+    fresh = out / ".scan.db.new"
+    _remove(fresh)
+    try:
+        members, notes = gather(unique, fresh, out.resolve().name)
+        with ScanStore.open(fresh) as store:
+            found, priors, ties = _aligned(store, members)
+            store.add_reposes(_reposes(store, members, found))
+            document = _document(store, members, found, priors, ties, notes, known)
+            store.update_header(notes=tuple(document["notes"]))
+        _replace(fresh, out / "scan.db")
+    finally:
+        _remove(fresh)
+    with writing(out / SITE) as part:
+        part.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    if deliver:
+        with ScanStore.open(out / "scan.db") as store:
+            write_deliverables(out, store, {})
+    return AlignedSite(out, members, found, priors, document)
+
+
+def _known(out: Path) -> dict[str, Any]:
+    """What an earlier alignment left in ``out``; InputError when it is another folder."""
+    if not out.exists():
+        return {}
+    if not (out / SITE).is_file():
+        if out.is_dir() and not any(out.iterdir()):
+            return {}
+        raise InputError(f"{out} exists and is no site; choose another folder")
+    try:
+        document = json.loads((out / SITE).read_text(encoding="utf-8"))
+        scans = [Path(s["folder"]) for s in document["scans"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{out / SITE} cannot be read; remove the folder") from error
+    return dict(document) if scans else {}
+
+
+def _remove(path: Path) -> None:
+    for suffix in ("", "-wal", "-shm"):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)
+
+
+def _replace(fresh: Path, path: Path) -> None:
+    _remove(path)
+    os.replace(fresh, path)
+
+
+# ---- alignment ---------------------------------------------------------------------------------
+
+
+def _aligned(
+    store: ScanStore, members: Sequence[Member]
+) -> tuple[SiteAlignment, list[ScanPrior], list[Tie]]:
+    track, seqs, scans = _joined(store, members)
+    keyframe = lru_cache(maxsize=KEPT)(lambda k: store.keyframe(seqs[k]))
+    ties = []
+    if len(members) > 1:
+        loops = StoredLoops(track, keyframe, SubmapLoopConfig(min_gap=1), scans).find()
+        for loop in supported(loops, track.poses):
+            one = keyframe(loop.b)
+            assert one is not None
+            ties.append(_tie(loop, track, one, scans))
+    priors = [_prior(track, np.array(scans) == k) for k in range(len(members))]
+    return align(ties, priors), priors, ties
+
+
+def _joined(store: ScanStore, members: Sequence[Member]) -> tuple[Track, list[int], list[int]]:
+    """All keyframes one scan after the other, their numbers in the store, and their scans."""
+    poses, spread, times, seqs, scans = [], [], [], [], []
+    for k, member in enumerate(members):
+        begun = max(times, default=0.0) + 10.0 * BREAK_S  # scans may have been flown at once
+        first = None
+        for seq in member.seqs:
+            one = store.keyframe(seq)
+            if one is None:
+                continue
+            first = one.time_ns if first is None else first
+            poses.append(one.depth.T_world_camera)
+            spread.append(one.pose.covariance)
+            times.append(begun + (one.time_ns - first) * 1e-9)
+            seqs.append(seq)
+            scans.append(k)
+    return Track(np.array(poses), np.array(times), np.array(spread)), seqs, scans
+
+
+def _tie(loop: Closure, track: Track, one: Keyframe, scans: Sequence[int]) -> Tie:
+    """Four places of the later view's ground, as the loop has them in both scans."""
+    h, w = one.depth.depth_m.shape
+    here = rays(one.depth.K, CORNERS * [w, h]) * float(np.nanmedian(one.depth.depth_m))
+    there = se3.transform(loop.T_a_b, here)
+    R = track.poses[loop.a][:3, :3]
+    J = np.concatenate([-se3.hat(there), np.tile(np.eye(3), (len(there), 1, 1))], axis=2)
+    spread = R @ (J @ loop.covariance @ J.transpose(0, 2, 1)) @ R.T
+    count = len(there) * 3 / 6.0  # a motion has six numbers, four places twelve
+    return Tie(
+        scans[loop.a], scans[loop.b],
+        se3.transform(track.poses[loop.a], there), se3.transform(track.poses[loop.b], here),
+        count * spread,
+    )  # fmt: skip
+
+
+def _prior(track: Track, own: Bool) -> ScanPrior:
+    """What a scan's own poses (those of the track that are ``own``) say of its placing."""
+    centre = track.poses[own, :3, 3].mean(axis=0)
+    A = se3.adjoint(se3.compose(np.eye(3), -centre))
+    spread = A @ track.covariances[own].mean(axis=0) @ A.T
+    sigma = np.append(np.sqrt(np.maximum(np.diag(spread), 0.0)), SIGMA_SCALE)
+    return ScanPrior(centre, np.maximum(sigma, MIN_SIGMA))
+
+
+def _reposes(store: ScanStore, members: Sequence[Member], found: SiteAlignment) -> list[Repose]:
+    """The keyframes' poses after the alignment."""
+    out = []
+    for k, (member, move) in enumerate(zip(members, found.moves, strict=True)):
+        rows = slice(7 * k, 7 * k + 6)
+        spread = found.covariance[rows, rows]
+        for seq in member.seqs:
+            one, now = store.keyframe(seq), store.repose(seq)
+            if one is None:
+                continue
+            scale = move.growth * (1.0 if now is None else now.scale)
+            T = move.pose(one.depth.T_world_camera)
+            lever = se3.adjoint(se3.compose(np.eye(3), T[:3, 3]))
+            out.append(Repose(seq, ALIGNED, T, scale, lever @ spread @ lever.T))
+    return out
+
+
+# ---- what is said of it ------------------------------------------------------------------------
+
+
+def _document(
+    store: ScanStore, members: Sequence[Member], found: SiteAlignment,
+    priors: Sequence[ScanPrior], ties: Sequence[Tie], notes: Sequence[str], known: dict[str, Any],
+) -> dict[str, Any]:  # fmt: skip
+    """The content of site.json."""
+    frame = local_frame(store.header)
+    assert frame is not None
+    pairs = _pairs(members, found, ties)
+    notes = list(notes)
+    for k, member in enumerate(members):
+        if len(members) > 1 and not any(member.name in (p["a"], p["b"]) for p in pairs):
+            notes.append(f"{member.name} is tied to no other scan: it stays where its fixes put it")
+        elif found.groups[k] != found.groups[0]:
+            notes.append(f"{member.name} is not tied to {members[0].name}, also not by others")
+    for pair in pairs:
+        if pair["ties"] < MIN_TIES:
+            notes.append(
+                f"{pair['a']} and {pair['b']} share only {pair['ties']} tie(s): their alignment "
+                "is not sure (little overlap, another season or light)"
+            )
+    revision = int(known.get("revision", 0)) + 1
+    scans = [_scan(m, found, priors, k) for k, m in enumerate(members)]
+    moves = {s["name"]: s["T_site_scan"] for s in scans}
+    return {
+        "schema": 1,
+        "site": store.header.scan_id,
+        "revision": revision,
+        "origin": asdict(frame),
+        "epsg": frame.epsg,
+        "scans": scans,
+        "pairs": pairs,
+        "notes": notes,
+        "history": [*known.get("history", []), {"revision": revision, "T_site_scan": moves}],
+    }
+
+
+def _scan(
+    member: Member, found: SiteAlignment, priors: Sequence[ScanPrior], k: int
+) -> dict[str, Any]:
+    move = found.moves[k]
+    sigma = np.sqrt(np.diag(found.covariance)[7 * k : 7 * k + 7])
+    tied = sum(g == found.groups[k] for g in found.groups) > 1
+    centre = priors[k].centre_m
+    moved = move.points(centre[None])[0] - centre
+    return {
+        "name": member.name,
+        "folder": str(member.folder.resolve()),
+        "drone": member.header.drone,
+        "scan": member.header.scan_id,
+        "started_unix_s": member.header.started_unix_ns / 1e9,
+        "keyframes": [member.first, member.last],
+        "placed": "aligned" if tied else "by its fixes",
+        "T_site_scan": np.round(move.pose(member.T_site_scan), 9).tolist(),
+        "scale": round(move.growth, 6),
+        "moved_m": [round(float(v), 3) for v in moved],
+        "turned_deg": round(float(np.degrees(np.linalg.norm(se3.so3_log(move.R)))), 4),
+        "sigma_m": [round(float(v), 3) for v in sigma[3:6]],
+    }
+
+
+def _pairs(
+    members: Sequence[Member], found: SiteAlignment, ties: Sequence[Tie]
+) -> list[dict[str, Any]]:
+    """One entry for each two scans that ties join."""
+    out = []
+    for a, b in sorted({(t.a, t.b) for t in ties}):
+        mine = np.array([(t.a, t.b) == (a, b) for t in ties]) & found.used
+        if not mine.any():
+            continue
+        out.append(
+            {
+                "a": members[a].name,
+                "b": members[b].name,
+                "ties": int(mine.sum()),
+                "apart_before_m": round(float(np.median(found.before_m[mine])), 3),
+                "apart_after_m": round(float(np.median(found.after_m[mine])), 3),
+            }
+        )
+    return out

@@ -1,0 +1,233 @@
+"""The keyframes of several scans in one store, in one frame of reference.
+
+A site's folder is a scan folder: its ``scan.db`` holds every keyframe of its scans under a new
+number, so whatever works on a scan works on a site. The scans themselves are only read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recon import se3
+from recon.types import F64, Keyframe
+from service.errors import InputError
+from service.georeference import LocalFrame
+from service.scans.main_piece import main_seqs
+from service.scans.track import latest, local_frame
+from service.stream import codec
+from service.stream.records import PoseRecord, Repose, ScanHeader
+from service.stream.store import ScanStore
+from service.version import software
+
+DRONE = "site"
+"""Of a site's header: the folder between the library and its sites."""
+
+MAX_DISTANCE_M = 20_000.0
+"""Between the origins of two scans of one site: their tangent planes still agree there."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Member:
+    """One scan of a site and its place in the site's store."""
+
+    name: str
+    folder: Path
+    header: ScanHeader
+    T_site_scan: F64  # (4, 4) by the two origins alone
+    first: int  # its keyframes' numbers in the site's store
+    last: int
+    notes: tuple[str, ...] = ()
+
+    @property
+    def seqs(self) -> range:
+        """Its keyframes' numbers in the site's store."""
+        return range(self.first, self.last + 1)
+
+
+class Part:
+    """The keyframes of one member, read as a store's."""
+
+    def __init__(self, store: ScanStore, member: Member) -> None:
+        self._store, self._member = store, member
+        self.summary: dict[str, Any] | None = None
+        self.refinement: dict[str, Any] | None = None
+
+    def seqs(self) -> list[int]:
+        """The member's."""
+        return list(self._member.seqs)
+
+    def keyframe(self, seq: int) -> Keyframe | None:
+        """One of them, where the site has it."""
+        return self._store.keyframe(seq)
+
+
+def gather(folders: Sequence[Path], path: Path, name: str) -> tuple[list[Member], list[str]]:
+    """Copy the keyframes of the scans in ``folders`` into a new store; its members, and notes.
+
+    A scan without georeference or surface is left out with a note, and so is one given twice.
+    Raises InputError for a folder without a finished scan, for scans too far apart, and where
+    nothing is left.
+    """
+    with ExitStack() as stack:
+        stores = [stack.enter_context(_opened(folder)) for folder in folders]
+        chosen, notes = _chosen(folders, stores)
+        frames = [_frame(s.header) for _, s in chosen]
+        origin = frames[0]
+        header = _site_header(name, [s.header for _, s in chosen], origin)
+        members = []
+        with ScanStore.create(path, header) as site:
+            names = _names([folder for folder, _ in chosen])
+            for (folder, store), frame, title in zip(chosen, frames, names, strict=True):
+                T = between_frames(origin, frame)
+                member = Member(title, folder, store.header, T, site.next_seq, 0)
+                members.append(_copied(store, site, member))
+            _copy_poses([s for _, s in chosen], site, members, origin)
+            assumed = {w for _, s in chosen for w in (s.summary or {}).get("assumed") or []}
+            summary = {"assumed": sorted(assumed), "scans": list(names)}
+            site.finish(summary)
+    return members, notes
+
+
+def _opened(folder: Path) -> ScanStore:
+    if not (folder / "scan.db").is_file():
+        raise InputError(f"{folder} holds no scan.db; give scan folders")
+    store = ScanStore.open(folder / "scan.db", read_only=True)
+    if store.finished:
+        return store
+    store.close()
+    raise InputError(f"{folder} is not finished; align it when its flight is over")
+
+
+def _chosen(
+    folders: Sequence[Path], stores: Sequence[ScanStore]
+) -> tuple[list[tuple[Path, ScanStore]], list[str]]:
+    """The scans that can be part of a site, and why others cannot."""
+    chosen: list[tuple[Path, ScanStore]] = []
+    notes: list[str] = []
+    for folder, store in zip(folders, stores, strict=True):
+        twin = next((f for f, s in chosen if _is_same_flight(s, store)), None)
+        if twin is not None:
+            notes.append(f"{folder.name} is the same flight as {twin.name}: counted once")
+        elif local_frame(store.header) is None:
+            notes.append(f"{folder.name} has no georeference: left out; refine it with --gcp")
+        elif not main_seqs(store):
+            notes.append(f"{folder.name} holds no surface: left out")
+        else:
+            chosen.append((folder, store))
+    if not chosen:
+        raise InputError("no scan is left to make a site of: " + "; ".join(notes))
+    origin = _frame(chosen[0][1].header)
+    for folder, store in chosen:
+        away = float(np.linalg.norm(between_frames(origin, _frame(store.header))[:3, 3]))
+        if away > MAX_DISTANCE_M:
+            raise InputError(f"{folder} lies {away / 1e3:.0f} km from {chosen[0][0]}: not one site")
+    zones = {_frame(s.header).epsg for _, s in chosen}
+    if len(zones) > 1:
+        notes.append(f"scans of several zones {sorted(zones)}: the site takes EPSG {origin.epsg}")
+    return chosen, notes
+
+
+def _is_same_flight(a: ScanStore, b: ScanStore) -> bool:
+    """True for one scan, or for two replays of one recording."""
+    if a.header.identity == b.header.identity:
+        return True
+    if a.header.started_unix_ns != b.header.started_unix_ns:
+        return False
+    one, two = (latest(s.poses())[:1] for s in (a, b))
+    if not one or not two or one[0].time_unix_ns != two[0].time_unix_ns:
+        return False
+    T = between_frames(_frame(a.header), _frame(b.header)) if a.header.origin_lat_deg else np.eye(4)
+    apart = se3.inverse(one[0].T_world_camera) @ T @ two[0].T_world_camera
+    return float(np.linalg.norm(apart[:3, 3])) < 5.0 and bool(np.trace(apart[:3, :3]) > 2.97)
+
+
+def _frame(header: ScanHeader) -> LocalFrame:
+    frame = local_frame(header)
+    if frame is None:
+        raise ValueError(f"{header.scan_id} has no georeference")
+    return frame
+
+
+def between_frames(site: LocalFrame, scan: LocalFrame) -> F64:
+    """(4, 4) motion from the ENU metres of ``scan`` to those of ``site``; both are rigid."""
+    axes = np.vstack([np.zeros(3), 100.0 * np.eye(3)])
+    there = site.to_enu(scan.to_geodetic(axes))
+    return se3.project_to_so3(se3.compose((there[1:] - there[0]).T / 100.0, there[0]))
+
+
+def _site_header(name: str, headers: Sequence[ScanHeader], origin: LocalFrame) -> ScanHeader:
+    first = headers[0]
+    identities = repr(sorted(h.identity for h in headers)).encode()
+    return replace(
+        first, scan_id=name, drone=DRONE, software=software(), notes=(),
+        started_unix_ns=min(h.started_unix_ns for h in headers),
+        origin_lat_deg=origin.lat_deg, origin_lon_deg=origin.lon_deg,
+        origin_alt_amsl_m=origin.alt_amsl_m, epsg=origin.epsg,
+        run_id=hashlib.sha256(identities).hexdigest()[:32],
+    )  # fmt: skip
+
+
+def _names(folders: Sequence[Path]) -> list[str]:
+    """A name for each scan: its folder's, with its drone's where several are called alike."""
+    names = [f.resolve().name for f in folders]
+    return [
+        n if names.count(n) == 1 else f"{f.resolve().parent.name}-{n}-{k + 1}"
+        for k, (n, f) in enumerate(zip(names, folders, strict=True))
+    ]
+
+
+def _copied(store: ScanStore, site: ScanStore, member: Member) -> Member:
+    """Copy the layers of one scan's main piece under new numbers."""
+    reposes, new = [], member.first
+    for seq in main_seqs(store):
+        repose = store.repose(seq)
+        layers = []
+        for layer in range(codec.MAX_LAYERS):
+            opened = codec.unpack(store.chunk(seq, layer) or b"")
+            if opened is not None:
+                head, sections = opened
+                T = head.T_world_camera if repose is None else repose.T_world_camera
+                head = replace(head, seq=new, T_world_camera=member.T_site_scan @ T)
+                layers.append(codec.pack(head, sections))
+        if not layers:
+            continue  # only tiles of the narrow radio
+        site.add_keyframe(new, layers)
+        if repose is not None:
+            T = member.T_site_scan @ repose.T_world_camera
+            reposes.append(Repose(new, 0, T, repose.scale, repose.covariance))
+        new += 1
+    site.add_reposes(reposes)
+    return replace(member, last=new - 1)
+
+
+def _copy_poses(
+    stores: Sequence[ScanStore], site: ScanStore, members: Sequence[Member], origin: LocalFrame
+) -> None:
+    """The trajectories one after the other; none where drones flew at once: one line is no path."""
+    tracks = [(latest(s.poses()), k) for k, s in enumerate(stores)]
+    tracks = sorted((t for t in tracks if t[0]), key=lambda t: t[0][0].time_unix_ns)
+    ends = [(t[0][0].time_unix_ns, t[0][-1].time_unix_ns) for t in tracks]
+    if any(after[0] <= before[1] for before, after in pairwise(ends)):
+        return
+    for track, k in tracks:
+        for pose in track:
+            site.add_pose(placed_pose(pose, members[k].T_site_scan @ pose.T_world_camera, origin))
+
+
+def placed_pose(pose: PoseRecord, T: F64, origin: LocalFrame) -> PoseRecord:
+    """The record at another pose, with its place on the globe."""
+    lat, lon, alt = (float(v) for v in origin.to_geodetic(T[None, :3, 3])[0])
+    good = all(math.isfinite(v) for v in (lat, lon, alt))
+    return replace(
+        pose, T_world_camera=T, lat_deg=lat if good else None, lon_deg=lon if good else None,
+        alt_amsl_m=alt if good else None,
+    )  # fmt: skip

@@ -1,0 +1,115 @@
+"""Change between two surfaces: objects, volumes and their sigmas against drawn truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.ndimage as ndi
+
+from recon.surface.change import ChangeConfig, change_between, left_over_m, outlines, volumes
+from recon.surface.raster import Grid, Raster
+from recon.types import F32
+
+CELL_M, SIGMA_M = 0.2, 0.06
+GRID = Grid(1000.0, 2000.0, CELL_M, (250, 250))  # a quarter of a hectare
+
+
+def surface(
+    seed: int, boxes: list[tuple[int, int, int, int, float]], lift_m: float = 0.0
+) -> Raster:
+    """Gentle ground with noise that neighbours share, and boxes (row, col, rows, cols, m)."""
+    rng = np.random.default_rng(seed)
+    r, c = np.indices(GRID.shape)
+    z = 2.0 * np.sin(r / 60.0) * np.cos(c / 45.0) + lift_m
+    noise = ndi.gaussian_filter(rng.normal(size=GRID.shape), 0.7)
+    z = z + SIGMA_M * noise / noise.std()
+    for row, col, rows, cols, tall in boxes:
+        z[row : row + rows, col : col + cols] += tall
+    sigma = np.full(GRID.shape, SIGMA_M, np.float32)
+    rgb = np.full((*GRID.shape, 3), 128, np.uint8)
+    return Raster(GRID, z.astype(np.float32), sigma, rgb)
+
+
+def test_surfaces_without_change_show_none_in_nineteen_of_twenty() -> None:
+    house = [(60, 60, 40, 50, 6.0)]
+    shown = 0
+    for seed in range(20):
+        before, after = surface(seed, house), surface(100 + seed, [(61, 60, 40, 50, 6.0)], 0.02)
+        shown += bool(change_between(before, after, 0.02).bodies)
+    assert shown <= 1
+
+
+def test_boxes_of_a_metre_and_thirty_centimetres_are_found() -> None:
+    boxes = [(20 + 40 * (k // 5), 20 + 40 * (k % 5), 5, 5, 0.3 + 0.02 * k) for k in range(25)]
+    found = change_between(surface(1, []), surface(2, boxes), 0.02)
+    centres = {(int(np.mean(np.nonzero(found.labels == b.label)[0])) // 40,
+                int(np.mean(np.nonzero(found.labels == b.label)[1])) // 40)
+               for b in found.bodies}  # fmt: skip
+    assert len(centres) >= 24 and len(found.bodies) <= 26
+    assert all(b.volume_m3 > 0 for b in found.bodies)
+
+
+def test_volumes_are_right_within_their_sigma() -> None:
+    boxes = [(30, 30, 20, 25, 1.2), (120, 120, 15, 15, 0.8)]
+    true = (20 * 25 * 1.2, -15 * 15 * 0.8)
+    ratios = []
+    for seed in range(12):
+        before, after = surface(seed, boxes[1:]), surface(50 + seed, boxes[:1])
+        found = change_between(before, after, 0.01)
+        by_sign = sorted(found.bodies, key=lambda b: -b.volume_m3)
+        assert len(by_sign) == 2
+        for body, cells in zip(by_sign, true, strict=True):
+            volume = cells * CELL_M**2
+            assert body.volume_m3 == pytest.approx(volume, rel=0.05)
+            ratios.append((body.volume_m3 - volume) / body.sigma_m3)
+        total = volumes(found)
+        assert total.fill[0] - total.cut[0] == pytest.approx(total.net[0])
+        assert total.fill[0] == pytest.approx(true[0] * CELL_M**2, rel=0.05)
+        assert total.fill[1] >= 0.01 * by_sign[0].area_m2
+    assert float(np.sqrt(np.mean(np.square(ratios)))) < 1.5
+
+
+def test_an_alignment_that_is_off_is_no_change() -> None:
+    found = change_between(surface(1, []), surface(2, [], lift_m=0.4), 0.01)
+    assert found.alignment_m > 0.3 and not found.bodies
+
+
+def test_unknown_ground_is_not_compared() -> None:
+    before, after = surface(1, []), surface(2, [(20, 20, 10, 10, 2.0)])
+    before.height_m[:100] = np.nan
+    found = change_between(before, after, 0.02)
+    assert not found.bodies and np.isnan(found.height_m[:100]).all()
+    assert found.compared_m2 == pytest.approx(150 * 250 * CELL_M**2)
+
+
+def test_left_over_needs_ground_to_tell() -> None:
+    assert left_over_m(np.full((20, 20), np.nan, np.float32), 0.2, 8.0) == 0.0
+    tilted: F32 = np.tile(np.linspace(-0.3, 0.3, 250, dtype=np.float32), (250, 1))
+    assert 0.1 < left_over_m(tilted, 0.2, 8.0) < 0.4
+
+
+def test_outlines_enclose_the_area_and_leave_holes_out() -> None:
+    ring = [(50, 50, 30, 30, 1.5)]
+    after = surface(2, ring)
+    after.height_m[58:72, 58:72] -= 1.5
+    found = change_between(surface(1, []), after, 0.01)
+    (body,) = found.bodies
+    ((outer, *holes),) = outlines(found, body.label)
+    assert len(holes) == 1 and np.array_equal(outer[0], outer[-1])
+
+    def area(xy: np.ndarray) -> float:
+        x, y = xy.T
+        return float(abs(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])) / 2)
+
+    assert area(outer) - area(holes[0]) == pytest.approx(body.area_m2, rel=0.12)
+    assert outer[:, 0].min() == pytest.approx(1000.0 + 50 * CELL_M, abs=CELL_M)
+    assert outer[:, 1].max() == pytest.approx(2000.0 - 50 * CELL_M, abs=CELL_M)
+
+
+def test_bad_parameters_are_refused() -> None:
+    with pytest.raises(ValueError, match="odd"):
+        ChangeConfig(window=4)
+    other = Grid(0.0, 0.0, 0.2, (250, 250))
+    a = surface(1, [])
+    with pytest.raises(ValueError, match="one grid"):
+        change_between(a, Raster(other, a.height_m, a.sigma_m, a.rgb), 0.0)

@@ -1,0 +1,210 @@
+"""Sites: scans gathered, aligned and compared; what cannot be part of a site says why."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from site_scans import ELSEWHERE, FRAME, HEIGHT_M, Box, Errors, height, leg, write_scan
+from typer.testing import CliRunner
+
+from recon import se3
+from recon.types import F64
+from service.cli import app
+from service.errors import InputError
+from service.offline.site.alignment import align_site
+from service.offline.site.compare import compare
+from service.offline.site.gather import between_frames
+from service.stream.store import ScanStore
+
+NORTH, EAST = leg(0.0), leg(np.pi / 2)
+WRONG = Errors((1.1, -0.7, 0.9), (0.002, -0.001, 0.004), 1.002)
+
+
+def errors_m(site: Path, truth: list[F64]) -> F64:
+    """(N, 3) how far the ground below each camera lies off the truth, of the site's keyframes."""
+    with ScanStore.open(site / "scan.db") as store:
+        found = list(store.keyframes())
+    assert len(found) == len(truth)
+    out = []
+    for one, T in zip(found, truth, strict=True):
+        z = float(np.nanmedian(one.depth.depth_m))
+        spot = se3.transform(one.depth.T_world_camera, np.array([[0.0, 0.0, z]]))[0]
+        near = T[:3, 3] + T[:3, 2] * HEIGHT_M
+        out.append(spot[:2] - near[:2])
+    return np.array(out)
+
+
+@pytest.fixture(scope="module")
+def merged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Path]]:
+    """Two crossing scans with errors of opposite sign and origins apart, as one site."""
+    folder = tmp_path_factory.mktemp("site")
+    shift = tuple(-v for v in WRONG.shift_m)
+    other = Errors((shift[0], shift[1], shift[2]), (0.0, 0.002, -0.003), 0.998)
+    one = write_scan(folder / "one", NORTH, WRONG)
+    two = write_scan(folder / "two", EAST, other, frame=ELSEWHERE)
+    align_site([one, two], folder / "site")
+    return folder / "site", [one, two]
+
+
+def test_origins_apart_are_joined_by_a_rigid_motion() -> None:
+    T = between_frames(FRAME, ELSEWHERE)
+    points = np.random.default_rng(1).normal(size=(5, 3)) * 200.0
+    np.testing.assert_allclose(
+        se3.transform(T, points), FRAME.to_enu(ELSEWHERE.to_geodetic(points)), atol=1e-6
+    )
+
+
+def test_crossing_scans_meet_between_their_fixes(merged: tuple[Path, list[Path]]) -> None:
+    site, _ = merged
+    document = json.loads((site / "site.json").read_text())
+    (pair,) = document["pairs"]
+    assert pair["ties"] >= 3 and pair["apart_before_m"] > 2.0
+    off = errors_m(site, [*NORTH, *EAST])
+    one, two = off[:6].mean(axis=0), off[6:].mean(axis=0)
+    assert np.linalg.norm(one - two) < 0.1  # 0.1 % of the height is 0.04 m; keyframes are coarse
+    assert np.linalg.norm(0.5 * (one + two)) < 0.25  # of 1.3 m each had: they cancel
+    assert [s["placed"] for s in document["scans"]] == ["aligned", "aligned"]
+
+
+def test_scans_themselves_stay_as_they_are(merged: tuple[Path, list[Path]]) -> None:
+    site, (one, _) = merged
+    with ScanStore.open(one / "scan.db") as store, ScanStore.open(site / "scan.db") as joined:
+        assert all(store.repose(seq) is None for seq in store.seqs())
+        chunk = joined.keyframe(0)
+        assert chunk is not None and (repose := joined.repose(0)) is not None
+        assert repose.revision == 1
+
+
+def test_a_site_is_a_scan_folder_for_every_export(merged: tuple[Path, list[Path]]) -> None:
+    site, _ = merged
+    assert (site / "cloud.laz").is_file() and (site / "report.html").is_file()
+    done = CliRunner().invoke(app, ["export", str(site), "--to", "dsm", "--to", "ortho"])
+    assert done.exit_code == 0, done.output
+    assert (site / "dsm.tif").is_file()
+
+
+def test_aligning_again_keeps_the_history_and_adds_scans(
+    merged: tuple[Path, list[Path]], tmp_path: Path
+) -> None:
+    site, _ = merged
+    third = write_scan(tmp_path / "three", leg(np.pi / 4, 4), Errors((0.5, 0.5, 0.0)))
+    document = align_site([third], site, deliver=False).document
+    assert document["revision"] == 2 and len(document["history"]) == 2
+    assert [s["name"] for s in document["scans"]] == ["one", "two", "three"]
+    assert len(document["pairs"]) >= 2
+
+
+def test_what_cannot_be_tied_stays_and_is_named(tmp_path: Path) -> None:
+    one = write_scan(tmp_path / "one", NORTH[:3])
+    winter = write_scan(tmp_path / "winter", EAST[:3], Errors((0.8, 0.0, 0.0)), ground=2)
+    document = align_site([one, winter], tmp_path / "site", deliver=False).document
+    assert any("winter" in n and "stays" in n for n in document["notes"])
+    assert document["scans"][1]["placed"] == "by its fixes"
+    assert document["scans"][1]["moved_m"] == [0.0, 0.0, 0.0]
+    with pytest.raises(InputError, match="could not be tied"):
+        compare(one, winter, tmp_path / "change")
+
+
+def test_bad_scans_are_named(tmp_path: Path) -> None:
+    one = write_scan(tmp_path / "one", NORTH[:2])
+    nowhere = write_scan(tmp_path / "nowhere", EAST[:2], frame=None)
+    flying = write_scan(tmp_path / "flying", EAST[:2], finished=False)
+    document = align_site([one, nowhere, one], tmp_path / "site", deliver=False).document
+    assert [s["name"] for s in document["scans"]] == ["one"]
+    assert any("nowhere has no georeference" in n for n in document["notes"])
+    with pytest.raises(InputError, match="not finished"):
+        align_site([one, flying], tmp_path / "other")
+    with pytest.raises(InputError, match="no scan is left"):
+        align_site([nowhere], tmp_path / "third")
+    with pytest.raises(InputError, match="holds no scan"):
+        align_site([tmp_path], tmp_path / "fourth")
+    with pytest.raises(InputError, match="is no site"):
+        align_site([one], one)
+    with pytest.raises(InputError, match=r"same flight"):
+        compare(one, one, tmp_path / "fifth")
+
+
+def test_the_same_recording_twice_counts_once(tmp_path: Path) -> None:
+    one = write_scan(tmp_path / "one", NORTH[:2])
+    again = write_scan(tmp_path / "again" / "one", NORTH[:2])
+    document = align_site([one, again], tmp_path / "site", deliver=False).document
+    assert len(document["scans"]) == 1 and "counted once" in document["notes"][0]
+
+
+BOXES: list[Box] = [(2.0, 3.0, 5.0, 5.0, 1.0), (-8.0, -6.0, -5.0, -3.0, 0.8)]
+
+
+@pytest.fixture(scope="module")
+def changed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One box removed and one added between two crossing flights."""
+    folder = tmp_path_factory.mktemp("change")
+    one = write_scan(folder / "may", NORTH, Errors((0.6, 0.2, -0.8)), BOXES[:1])
+    two = write_scan(folder / "june", EAST, Errors((-0.4, 0.5, 0.6)), BOXES[1:], day=30)
+    done = CliRunner().invoke(
+        app, ["site", "compare", str(one), str(two), "--out", str(folder / "out"), "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    return folder / "out"
+
+
+def test_a_box_removed_and_one_added_are_found(changed: Path) -> None:
+    document = json.loads((changed / "change.json").read_text())
+    kinds = sorted(o["kind"] for o in document["objects"])
+    assert kinds == ["added", "removed"]
+    for one in document["objects"]:
+        box = BOXES[0] if one["kind"] == "removed" else BOXES[1]
+        true = (box[2] - box[0]) * (box[3] - box[1]) * box[4]
+        sign = -1.0 if one["kind"] == "removed" else 1.0
+        assert one["volume_m3"] * sign == pytest.approx(true, rel=0.15)
+    assert "2 object(s)" in (changed / "report.html").read_text()
+    page = (changed / "change.html").read_text()
+    assert 'type="range"' in page and "http" not in page
+
+
+def test_the_joined_surface_is_that_of_the_later_date(changed: Path) -> None:
+    import laspy
+
+    cloud = laspy.read(str(changed / "cloud.laz"))
+    xyz = FRAME.from_utm(np.column_stack([cloud.x, cloud.y, cloud.z]))
+    for box, stands in zip(BOXES, (False, True), strict=True):
+        west, south, east, north, tall = box
+        x, y = xyz[:, 0], xyz[:, 1]
+        on = (x > west + 0.6) & (x < east - 0.6) & (y > south + 0.6) & (y < north - 0.6)
+        above = xyz[on, 2] - height(x[on], y[on])
+        level = float(np.median(above)) - float(np.median(xyz[:, 2] - height(x, y, BOXES[1:])))
+        assert len(above) > 20
+        assert level == pytest.approx(tall if stands else 0.0, abs=0.12)
+
+
+def test_change_files_open_elsewhere(changed: Path) -> None:
+    import rasterio
+
+    with rasterio.open(changed / "change.tif") as image:
+        assert image.crs.to_epsg() == FRAME.epsg and image.count == 3
+        height = image.read(1, masked=True)
+        assert float(height.max()) > 0.5 and float(height.min()) < -0.5
+    db = sqlite3.connect(changed / "change.gpkg")
+    assert db.execute("PRAGMA application_id").fetchone()[0] == 0x47504B47
+    rows = db.execute("SELECT geom, kind, area_m2 FROM changes").fetchall()
+    db.close()
+    for blob, _, area in rows:
+        assert blob[:4] == b"GP\x00\x01" and struct.unpack("<i", blob[4:8])[0] == FRAME.epsg
+        polygon = struct.unpack_from("<BIIBIII", blob, 8)
+        assert polygon[1] == 6 and polygon[4] == 3
+        ring = np.frombuffer(blob, "<f8", 2 * polygon[6], 8 + struct.calcsize("<BIIBIII"))
+        x, y = ring.reshape(-1, 2).T
+        assert abs(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])) / 2 == pytest.approx(area, rel=0.3)
+
+
+def test_flights_without_change_show_none(tmp_path: Path) -> None:
+    one = write_scan(tmp_path / "one", NORTH, Errors((0.6, 0.2, -0.8)), BOXES)
+    two = write_scan(tmp_path / "two", EAST, Errors((-0.4, 0.5, 0.6)), BOXES, day=30)
+    document = compare(one, two, tmp_path / "out")
+    assert document["objects"] == []
+    net = document["volumes_m3"]["net"]
+    assert net["value"] == 0.0

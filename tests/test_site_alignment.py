@@ -1,0 +1,108 @@
+"""Alignment of scans by ties and priors, against closed forms and drawn errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.posegraph.site_alignment import ScanPrior, Similarity, Tie, align
+from recon.types import F64
+
+SIGMA = np.array([0.005] * 3 + [1.0, 1.0, 1.5, 0.005])
+CENTRE = np.array([0.0, 0.0, 60.0])
+
+
+def priors(count: int) -> list[ScanPrior]:
+    return [ScanPrior(CENTRE, SIGMA) for _ in range(count)]
+
+
+def drawn(rng: np.random.Generator) -> Similarity:
+    """How wrongly a scan is placed, by the sigmas of its prior."""
+    x = rng.normal(size=7) * SIGMA
+    R, growth = se3.so3_exp(x[:3]), float(np.exp(x[6]))
+    return Similarity(R, CENTRE + x[3:6] - growth * R @ CENTRE, growth)
+
+
+def ties_between(
+    a: int, b: int, wrong: list[Similarity], rng: np.random.Generator, count: int = 8
+) -> list[Tie]:
+    """Ties of places on the ground with noise of 3 cm."""
+    out = []
+    for _ in range(count):
+        places = rng.uniform(-40, 40, (4, 3)) * [1, 1, 0.05]
+        noise = rng.normal(size=(4, 3)) * 0.03
+        spread = np.tile(np.eye(3) * 0.03**2, (4, 1, 1))
+        out.append(Tie(a, b, wrong[a].points(places) + noise, wrong[b].points(places), spread))
+    return out
+
+
+def placed(move: Similarity, wrong: Similarity, places: F64) -> F64:
+    return move.points(wrong.points(places)) - places
+
+
+def test_two_scans_meet_and_share_their_error() -> None:
+    rng = np.random.default_rng(1)
+    places = rng.uniform(-40, 40, (50, 3)) * [1, 1, 0.05]
+    alone, together = [], []
+    for _ in range(60):
+        wrong = [drawn(rng), drawn(rng)]
+        found = align(ties_between(0, 1, wrong, rng), priors(2))
+        off = [placed(m, w, places) for m, w in zip(found.moves, wrong, strict=True)]
+        assert np.abs(off[0] - off[1]).max() < 0.1
+        alone.append(np.linalg.norm(wrong[0].points(places).mean(0) - places.mean(0)))
+        together.append(np.linalg.norm(off[0].mean(axis=0)))
+    ratio = np.sqrt(np.mean(np.square(together)) / np.mean(np.square(alone)))
+    assert 0.55 < ratio < 0.85  # one over the root of two is 0.71
+
+
+def test_the_motion_between_scans_is_as_sure_as_it_says() -> None:
+    rng = np.random.default_rng(2)
+    ratios = []
+    for _ in range(40):
+        wrong = [drawn(rng), drawn(rng)]
+        own = priors(2)
+        found = align(ties_between(0, 1, wrong, rng), own)
+        place = np.zeros((1, 3))
+        off = [placed(m, w, place)[0] for m, w in zip(found.moves, wrong, strict=True)]
+        ratios.append((off[0] - off[1]) / found.sigma_m(0, 1, place[0], own))
+    rms = float(np.sqrt(np.mean(np.square(ratios))))
+    assert 0.6 < rms < 1.4
+
+
+def test_a_scan_without_ties_stays() -> None:
+    rng = np.random.default_rng(3)
+    wrong = [drawn(rng) for _ in range(3)]
+    found = align(ties_between(0, 1, wrong, rng), priors(3))
+    np.testing.assert_allclose(found.moves[2].R, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(found.moves[2].t, 0.0, atol=1e-9)
+    assert found.groups == [0, 0, 2]
+
+
+def test_a_chain_of_scans_is_one_group() -> None:
+    rng = np.random.default_rng(4)
+    wrong = [drawn(rng) for _ in range(4)]
+    ties = [t for a in (2, 1, 0) for t in ties_between(a, a + 1, wrong, rng)]
+    found = align(ties, priors(4))
+    assert found.groups == [0, 0, 0, 0]
+    places = rng.uniform(-40, 40, (20, 3)) * [1, 1, 0.05]
+    off = [placed(m, w, places) for m, w in zip(found.moves, wrong, strict=True)]
+    assert max(np.abs(one - off[0]).max() for one in off) < 0.15
+
+
+def test_a_wrong_tie_is_left_out() -> None:
+    rng = np.random.default_rng(5)
+    wrong = [drawn(rng), drawn(rng)]
+    ties = ties_between(0, 1, wrong, rng)
+    bad = ties[0]
+    ties[0] = Tie(0, 1, bad.at_a + np.array([6.0, 0.0, 0.0]), bad.at_b, bad.covariance)
+    found = align(ties, priors(2))
+    assert not found.used[0] and found.used[1:].all()
+    off = [placed(m, w, np.zeros((1, 3)))[0] for m, w in zip(found.moves, wrong, strict=True)]
+    assert np.abs(off[0] - off[1]).max() < 0.1
+
+
+def test_a_tie_of_a_scan_that_is_not_there_is_refused() -> None:
+    tie = Tie(0, 2, np.zeros((4, 3)), np.zeros((4, 3)), np.tile(np.eye(3), (4, 1, 1)))
+    with pytest.raises(ValueError, match="2 different scans"):
+        align([tie], priors(2))
