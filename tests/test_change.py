@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 import scipy.ndimage as ndi
 
-from recon.surface.change import ChangeConfig, change_between, left_over_m, outlines, volumes
+from recon.surface.change import (
+    ChangeConfig,
+    change_between,
+    left_over_m,
+    mean_surface,
+    outlines,
+    volumes,
+)
 from recon.surface.raster import Grid, Raster
-from recon.types import F32
+from recon.types import F32, F64
 
 CELL_M, SIGMA_M = 0.2, 0.06
 GRID = Grid(1000.0, 2000.0, CELL_M, (250, 250))  # a quarter of a hectare
@@ -97,13 +104,31 @@ def test_outlines_enclose_the_area_and_leave_holes_out() -> None:
     ((outer, *holes),) = outlines(found, body.label)
     assert len(holes) == 1 and np.array_equal(outer[0], outer[-1])
 
-    def area(xy: np.ndarray) -> float:
+    def area(xy: F64) -> float:
         x, y = xy.T
         return float(abs(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])) / 2)
 
     assert area(outer) - area(holes[0]) == pytest.approx(body.area_m2, rel=0.12)
     assert outer[:, 0].min() == pytest.approx(1000.0 + 50 * CELL_M, abs=CELL_M)
     assert outer[:, 1].max() == pytest.approx(2000.0 - 50 * CELL_M, abs=CELL_M)
+
+
+def test_a_mean_surface_keeps_the_volume_at_the_rim() -> None:
+    rng = np.random.default_rng(1)
+    xy = rng.uniform(0.0, 10.0, (200_000, 2))
+    grid = Grid(0.0, 10.0, 0.25, (40, 40))
+    on = (np.abs(xy - [5.11, 4.93]) < 0.53).all(axis=1)
+    xyz = np.column_stack([xy, 100.0 + 0.8 * on])
+    rgb = np.full((len(xyz), 3), 77, np.uint8)
+    found = mean_surface(xyz, rgb, np.full(len(xyz), 0.05, np.float32), grid)
+    volume = float(np.sum(found.height_m.astype(np.float64) - 100.0)) * 0.25**2
+    assert volume == pytest.approx(1.06**2 * 0.8, rel=0.02)
+    assert found.known.all() and (found.rgb == 77).all()
+    assert float(found.sigma_m.max()) > 0.3 > 0.05 > float(np.median(found.sigma_m))
+    outside = mean_surface(
+        xyz + np.array([100.0, 0.0, 0.0]), rgb, np.ones(len(xyz), np.float32), grid
+    )
+    assert not outside.known.any()
 
 
 def test_bad_parameters_are_refused() -> None:

@@ -42,6 +42,7 @@ ELSEWHERE = {
     "sudo ": "root: trials/test_trial_boot.py",
     "pip install ": "packages: trials/test_trial_boot.py",
     "skyrelief ground --mavlink serial:": "a telemetry radio",
+    "skyrelief site ": "test_site.py",
     "skyrelief replay flight.mp4 --backend onnx --set compute.model": "test_backend_choice.py",
 }
 """Start of a line: what it needs, or the test that runs it."""

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.surface.raster import Grid, Raster
-from recon.types import F32, F64, Bool
+from recon.types import F32, F64, U8, Bool
 
 I32 = npt.NDArray[np.int32]
 
@@ -69,6 +69,35 @@ class Change:
     def compared_m2(self) -> float:
         """Ground that both surfaces have."""
         return float(np.isfinite(self.height_m).sum()) * self.grid.cell_m**2
+
+
+def mean_surface(xyz_m: F64, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:
+    """Mean height of the points (N, 3) in each cell, each by the inverse of its variance.
+
+    Unlike the upper surface it has no bias at the rim of an object: a cell that a roof covers by
+    half counts half. Its sigma holds the scatter of its points as well.
+    """
+    rows, cols = grid.shape
+    at = np.rint(grid.pixels(xyz_m[:, :2])).astype(np.int64)
+    inside = (at >= 0).all(axis=1) & (at[:, 0] < cols) & (at[:, 1] < rows)
+    cell = at[inside, 1] * cols + at[inside, 0]
+    weight = 1.0 / np.maximum(sigma_m[inside].astype(np.float64), 1e-6) ** 2
+    z = xyz_m[inside, 2].astype(np.float64)
+    middle = float(np.median(z)) if len(z) else 0.0
+
+    def total(values: F64) -> F64:
+        return np.bincount(cell, weight * values, rows * cols)
+
+    sums = np.maximum(total(np.ones(len(z))), 1e-300)
+    mean = total(z - middle) / sums
+    scatter = np.maximum(total((z - middle) ** 2) / sums - mean**2, 0.0)
+    known = np.bincount(cell, minlength=rows * cols) > 0
+    layers = (mean + middle, np.sqrt(1.0 / sums + scatter))
+    height, sigma = (np.where(known, x, np.nan).astype(np.float32) for x in layers)
+    colour = np.stack([total(rgb[inside, k].astype(np.float64)) / sums for k in range(3)], axis=1)
+    shown = np.where(known[:, None], np.clip(np.rint(colour), 0, 255), 0).astype(np.uint8)
+    shape = grid.shape
+    return Raster(grid, height.reshape(shape), sigma.reshape(shape), shown.reshape(*shape, 3))
 
 
 def change_between(

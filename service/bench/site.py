@@ -227,11 +227,11 @@ def change_results(change: dict[str, Any], flight: Path, map_: Path) -> list[Ben
     measured = sum(abs(change["objects"][n]["volume_m3"]) for _, n in found)
     hectares = change["compared_m2"] / 1e4
     share = 100.0 * len(found) / max(len(seen), 1)
-    off = 100.0 * abs(measured / true - 1.0) if true else float("nan")
+    error = 100.0 * abs(measured / true - 1.0) if true else float("nan")
     return [
         BenchResult("site", "boxes found", share, "%", note=f"of {len(seen)}; goal 95 %"),
         BenchResult("site", "false objects", wrong / hectares, "/ha", note="goal 1"),
-        BenchResult("site", "volume of the boxes found, error", off, "%",
+        BenchResult("site", "volume of the boxes found, error", error, "%",
                     note=f"{true:.0f} m3; goal 2 %"),
     ]  # fmt: skip
 

@@ -51,7 +51,7 @@ def _file(request: Request) -> Response:
     path = state_of(request).library.file(*names_of(request), request.path_params["name"])
     if path.name in ("preview.jpg", "mesh.glb"):
         return FileResponse(path)
-    if path.name == "report.html":
+    if path.name in ("report.html", "change.html"):
         return FileResponse(path, headers=SANDBOX)
     return FileResponse(path, filename=f"{request.path_params['scan']}-{path.name}")
 

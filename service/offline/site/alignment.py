@@ -80,6 +80,8 @@ def align_site(folders: Sequence[Path], out: Path, deliver: bool = True) -> Alig
         _replace(fresh, out / "scan.db")
     finally:
         _remove(fresh)
+        if not any(out.iterdir()):
+            out.rmdir()
     with writing(out / SITE) as part:
         part.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     if deliver:
@@ -135,7 +137,8 @@ def _aligned(
 
 def _joined(store: ScanStore, members: Sequence[Member]) -> tuple[Track, list[int], list[int]]:
     """All keyframes one scan after the other, their numbers in the store, and their scans."""
-    poses, spread, times, seqs, scans = [], [], [], [], []
+    poses, spread, seqs, scans = [], [], [], []
+    times: list[float] = []
     for k, member in enumerate(members):
         begun = max(times, default=0.0) + 10.0 * BREAK_S  # scans may have been flown at once
         first = None

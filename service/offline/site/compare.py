@@ -13,8 +13,15 @@ import cv2
 import numpy as np
 
 from recon.posegraph.submap_loops import points_of
-from recon.surface.change import Body, Change, change_between, outlines, volumes
-from recon.surface.raster import Grid, Raster, grid_over, hillshade, rasterise_points
+from recon.surface.change import (
+    Body,
+    Change,
+    change_between,
+    mean_surface,
+    outlines,
+    volumes,
+)
+from recon.surface.raster import Grid, Raster, fill_holes, grid_over, hillshade
 from recon.types import F64, U8, Bool, DepthMap
 from service.errors import InputError
 from service.georeference import LocalFrame
@@ -33,6 +40,9 @@ from service.stream.store import ScanStore
 
 CHANGE_TIF, CHANGE_GPKG = "change.tif", "change.gpkg"
 CHANGE_JSON, CHANGE_PAGE = "change.json", "change.html"
+HOLE_CELLS = 2
+"""Voxels and cells of one size leave lines of cells without a point."""
+
 ADDED, REMOVED = (40, 90, 230), (220, 120, 30)  # BGR
 
 
@@ -81,7 +91,7 @@ def _pair(site: AlignedSite, before: Path, after: Path) -> tuple[int, int]:
 
 
 def surfaces(view: ScanView, members: list[Member], cell_m: float | None) -> list[Raster]:
-    """The upper surface of each member where the site has it, on one grid of the site's CRS."""
+    """The mean surface of each member where the site has it, on one grid of the site's CRS."""
     clouds = [fused_cloud(Part(view.store, member)) for member in members]
     for member, fused in zip(members, clouds, strict=True):
         if not len(fused.cloud):
@@ -93,7 +103,7 @@ def surfaces(view: ScanView, members: list[Member], cell_m: float | None) -> lis
     except ValueError as error:
         raise InputError(f"{view.folder}: {error} with --cell-m") from error
     return [
-        rasterise_points(xyz, fused.cloud.rgb, fused.cloud.sigma_m, grid)
+        fill_holes(mean_surface(xyz, fused.cloud.rgb, fused.cloud.sigma_m, grid), HOLE_CELLS)
         for xyz, fused in zip(places, clouds, strict=True)
     ]
 
@@ -218,20 +228,21 @@ def _write_polygons(view: ScanView, path: Path, change: Change) -> None:
 PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>
 <meta name="viewport" content="width=device-width">
 <style>body{{font:15px/1.5 system-ui,sans-serif;margin:1.5em;max-width:70em}}
-#map{{position:relative;line-height:0;max-width:100%}}#map img{{width:100%}}
-#map img+img{{position:absolute;left:0;top:0;clip-path:inset(0 0 0 var(--at,50%))}}
-input{{width:100%}}td,th{{padding:.1em .8em;text-align:right}}</style>
-<h1>{title}</h1><p>{words}</p><p>Left: {before}. Right: {after}. Red: added; blue: removed.</p>
-<div id="map"><img alt="before" src="{one}"><img alt="after" src="{two}"></div>
-<input type="range" min="0" max="100" value="50" aria-label="from one date to the other"
- oninput="document.getElementById('map').style.setProperty('--at',this.value+'%')">
+#map{{position:relative;line-height:0;width:1000px}}img{{width:1000px}}
+#over{{position:absolute;left:0;top:0;height:100%;width:50%;min-width:2em;max-width:100%;
+overflow:hidden;resize:horizontal;border-right:3px solid #fff;box-shadow:1px 0 3px #000}}
+td,th{{padding:.1em .8em;text-align:right}}</style>
+<h1>{title}</h1><p>{words}</p>
+<p>Left: {before}. Right: {after}. Red: added; blue: removed. Drag the corner at the lower
+end of the white line.</p>
+<div id="map"><img alt="after" src="{two}"><div id="over"><img alt="before" src="{one}"></div></div>
 <table><tr><th>object<th>kind<th>area, m2<th>volume, m3<th>95 %, m3<th>highest, m</tr>{rows}</table>
 {notes}</html>
 """
 
 
 def page(document: dict[str, Any], before: Raster, after: Raster, change: Change) -> str:
-    """A page without scripts from elsewhere: both dates under a slider, and the objects."""
+    """A page without scripts, as the portal allows none: both dates under a slider, the objects."""
     from html import escape
 
     rows = "".join(

@@ -140,12 +140,12 @@ def _is_same_flight(a: ScanStore, b: ScanStore) -> bool:
     """True for one scan, or for two replays of one recording."""
     if a.header.identity == b.header.identity:
         return True
-    if a.header.started_unix_ns != b.header.started_unix_ns:
+    if a.header.started_unix_ns != b.header.started_unix_ns or local_frame(b.header) is None:
         return False
     one, two = (latest(s.poses())[:1] for s in (a, b))
     if not one or not two or one[0].time_unix_ns != two[0].time_unix_ns:
         return False
-    T = between_frames(_frame(a.header), _frame(b.header)) if a.header.origin_lat_deg else np.eye(4)
+    T = between_frames(_frame(a.header), _frame(b.header))
     apart = se3.inverse(one[0].T_world_camera) @ T @ two[0].T_world_camera
     return float(np.linalg.norm(apart[:3, 3])) < 5.0 and bool(np.trace(apart[:3, :3]) > 2.97)
 
