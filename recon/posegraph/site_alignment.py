@@ -95,7 +95,7 @@ def align(ties: Sequence[Tie], priors: Sequence[ScanPrior]) -> SiteAlignment:
     state = np.zeros((n, UNKNOWNS))
     for _ in range(STEPS):
         H, g = _equations(ties, priors, state)
-        step = -np.linalg.solve(H, g).reshape(n, UNKNOWNS)
+        step: F64 = np.asarray(-np.linalg.solve(H, g).reshape(n, UNKNOWNS), np.float64)
         state = np.array([_moved(x, d) for x, d in zip(state, step, strict=True)])
         if np.abs(step).max() < 1e-9:
             break
@@ -105,8 +105,9 @@ def align(ties: Sequence[Tie], priors: Sequence[ScanPrior]) -> SiteAlignment:
     used = size < 5.0
     factor = max(1.0, float(np.sqrt(np.mean(size[used] ** 2)))) if used.any() else 1.0
     H, _ = _equations(ties, priors, state)
+    covariance = np.asarray(factor**2 * np.linalg.inv(H), np.float64)
     return SiteAlignment(
-        moves, factor**2 * np.linalg.inv(H), _lengths(before), _lengths(after), used, factor,
+        moves, covariance, _lengths(before), _lengths(after), used, factor,
         _groups(n, [t for t, ok in zip(ties, used, strict=True) if ok]),
     )  # fmt: skip
 
@@ -119,12 +120,12 @@ def _equations(ties: Sequence[Tie], priors: Sequence[ScanPrior], state: F64) -> 
     for tie, error in zip(ties, _errors(ties, moves), strict=True):
         weight = 1.0 / (1.0 + (_size(error, tie) / CAUCHY_SIGMAS) ** 2)
         W = weight * np.linalg.inv(tie.covariance)
-        J = np.zeros((len(error), 3, 2, UNKNOWNS))
+        sides = np.zeros((len(error), 3, 2, UNKNOWNS))
         ends = ((tie.a, tie.at_a, 1.0), (tie.b, tie.at_b, -1.0))
         for side, (scan, points, sign) in enumerate(ends):
             centre = priors[scan].centre_m + state[scan, 3:6]
-            J[:, :, side] = sign * _lever(moves[scan].points(points) - centre).reshape(-1, 3, 7)
-        J = J.reshape(len(error), 3, 2 * UNKNOWNS)
+            sides[:, :, side] = sign * _lever(moves[scan].points(points) - centre).reshape(-1, 3, 7)
+        J = sides.reshape(len(error), 3, 2 * UNKNOWNS)
         rows = np.concatenate([UNKNOWNS * s + np.arange(UNKNOWNS) for s in (tie.a, tie.b)])
         H[np.ix_(rows, rows)] += np.einsum("pki,pkl,plj->ij", J, W, J)
         g[rows] += np.einsum("pki,pkl,pl->i", J, W, error)

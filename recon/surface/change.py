@@ -86,7 +86,7 @@ def mean_surface(xyz_m: F64, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:
     middle = float(np.median(z)) if len(z) else 0.0
 
     def total(values: F64) -> F64:
-        return np.bincount(cell, weight * values, rows * cols)
+        return np.asarray(np.bincount(cell, weight * values, rows * cols), np.float64)
 
     sums = np.maximum(total(np.ones(len(z))), 1e-300)
     mean = total(z - middle) / sums

@@ -55,15 +55,15 @@ def compare(before: Path, after: Path, out: Path, cell_m: float | None = None) -
     site = align_site([before, after], out, deliver=False)
     one, two = _pair(site, before, after)
     with ScanView(out) as view:
-        rasters = surfaces(view, [site.members[one], site.members[two]], cell_m)
-        change = change_between(*rasters, vertical_sigma_m(site, one, two))
+        older, newer = surfaces(view, [site.members[one], site.members[two]], cell_m)
+        change = change_between(older, newer, vertical_sigma_m(site, one, two))
         if change.compared_m2 == 0.0:
             raise InputError(f"{before} and {after} share no ground")
         document = _document(site, change, one, two)
         _write_map(view, out / CHANGE_TIF, change)
         _write_polygons(view, out / CHANGE_GPKG, change)
         with writing(out / CHANGE_PAGE) as part:
-            part.write_text(page(document, *rasters, change), encoding="utf-8")
+            part.write_text(page(document, older, newer, change), encoding="utf-8")
         with writing(out / CHANGE_JSON) as part:
             part.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     hide_changed(out / "scan.db", site.members[one], change)

@@ -83,12 +83,13 @@ def gather(folders: Sequence[Path], path: Path, name: str) -> tuple[list[Member]
         frames = [_frame(s.header) for _, s in chosen]
         origin = frames[0]
         header = _site_header(name, [s.header for _, s in chosen], origin)
-        members = []
+        members: list[Member] = []
         with ScanStore.create(path, header) as site:
             names = _names([folder for folder, _ in chosen])
             for (folder, store), frame, title in zip(chosen, frames, names, strict=True):
                 T = between_frames(origin, frame)
-                member = Member(title, folder, store.header, T, site.next_seq, 0)
+                first = members[-1].last + 1 if members else 0
+                member = Member(title, folder, store.header, T, first, 0)
                 members.append(_copied(store, site, member))
             _copy_poses([s for _, s in chosen], site, members, origin)
             assumed = {w for _, s in chosen for w in (s.summary or {}).get("assumed") or []}
