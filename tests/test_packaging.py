@@ -77,6 +77,9 @@ def test_wheel_holds_the_packages_and_nothing_else(tmp_path: Path) -> None:
         for path in (ROOT / package).rglob("*.py"):
             assert str(path.relative_to(ROOT)) in names
     assert any(name.endswith("licenses/LICENSE") for name in names)
+    brought = {name.partition("/share/skyrelief/")[2] for name in names}
+    flight = [p for p in (ROOT / "demo").rglob("*") if p.is_file()]
+    assert flight and {p.relative_to(ROOT).as_posix() for p in flight} <= brought
     entry = zipfile.ZipFile(wheel).read(f"{info}.dist-info/entry_points.txt").decode()
     assert "skyrelief = service.cli:main" in entry
 

@@ -83,14 +83,13 @@ def _are_kernels_compiled() -> bool:
 
 
 def _flight(flight: Path | None) -> Path:
-    """The folder with the images and the camera model."""
-    folder = flight or Path(__file__).resolve().parents[2] / FLIGHT
-    if not (folder / "frames").is_dir() or not (folder / "camera.yaml").is_file():
-        raise InputError(
-            f"{folder} holds no frames/ and camera.yaml; run the demo from a clone of the "
-            "repository or name a flight with --flight"
-        )
-    return folder
+    """The folder with the images and the camera model: of a clone, or as the wheel brings it."""
+    homes = (Path(__file__).resolve().parents[2], Path(sys.prefix) / "share" / "skyrelief")
+    folders = [flight] if flight else [home / FLIGHT for home in homes]
+    for folder in folders:
+        if (folder / "frames").is_dir() and (folder / "camera.yaml").is_file():
+            return folder
+    raise InputError(f"{folders[0]} holds no frames/ and camera.yaml; name a flight with --flight")
 
 
 def _prepare(out: Path) -> None:

@@ -1,0 +1,38 @@
+"""Where ``skyrelief demo`` finds its flight."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from service.commands import demo
+from service.errors import InputError
+
+
+def make_flight(home: Path) -> Path:
+    folder = home / demo.FLIGHT
+    (folder / "frames").mkdir(parents=True)
+    (folder / "camera.yaml").touch()
+    return folder
+
+
+def test_an_installed_wheel_brings_the_flight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        demo, "__file__", str(tmp_path / "site" / "service" / "commands" / "demo.py")
+    )
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / "venv"))
+    with pytest.raises(InputError, match="--flight"):
+        demo._flight(None)
+    brought = make_flight(tmp_path / "venv" / "share" / "skyrelief")
+    assert demo._flight(None) == brought
+    clone = make_flight(tmp_path / "site")
+    assert demo._flight(None) == clone
+
+
+def test_a_named_flight_alone_counts(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="nothing-here holds no frames"):
+        demo._flight(tmp_path / "nothing-here")
