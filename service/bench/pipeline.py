@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from threading import Event
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -41,13 +41,20 @@ def run(options: BenchOptions) -> list[BenchResult]:
         for upsample, words in ((False, "320x180"), (True, "320x180, JBU to 720p")):
             ours = _path(video, Path(folder) / f"ours{upsample}", upsample, sgbm=False)
             theirs = _path(video, Path(folder) / f"theirs{upsample}", upsample, sgbm=True)
-            note = f"{ours['fps']:.1f} frames/s, {ours['rss_mib']:.0f} MiB"
+            note = f"{ours.fps:.1f} frames/s, {ours.rss_mib:.0f} MiB"
             results.append(
                 BenchResult(
-                    "pipeline", f"whole path, {words}", ours["clouds"], "clouds/s",
-                    peer="with OpenCV SGBM", peer_value=theirs["clouds"], note=note,
+                    "pipeline", f"whole path, {words}", ours.clouds, "clouds/s",
+                    peer="with OpenCV SGBM", peer_value=theirs.clouds, note=note,
                 )
             )  # fmt: skip
+            results += [
+                BenchResult(
+                    "pipeline", f"a call of {stage} in it", ms, "ms",
+                    peer="with OpenCV SGBM", peer_value=theirs.stage_ms.get(stage),
+                )
+                for stage, ms in ours.stage_ms.items()
+            ]  # fmt: skip
     return results
 
 
@@ -93,15 +100,22 @@ def _photograph(ground: U8, T_world_camera: F64) -> U8:
     return np.asarray(cv2.warpPerspective(ground, H, SIZE, flags=cv2.INTER_AREA), np.uint8)
 
 
-def _path(video: Path, folder: Path, upsample: bool, sgbm: bool) -> dict[str, float]:
-    """Clouds and frames a second of one run, and the process's memory at its end."""
+class _Flown(NamedTuple):
+    """One run over the video."""
+
+    clouds: float  # a second
+    fps: float
+    rss_mib: float  # of the process at its end
+    stage_ms: dict[str, float]  # wall time of a call, among all the threads
+
+
+def _path(video: Path, folder: Path, upsample: bool, sgbm: bool) -> _Flown:
     flags = [f"compute.upsample={str(upsample).lower()}", "compute.pairs=30"]
     summary, elapsed = _fly(video, folder, flags, SgbmBackend() if sgbm else CpuBackend())
-    return {
-        "clouds": summary["clouds"] / elapsed,
-        "fps": summary["frames"] / elapsed,
-        "rss_mib": resident_mib(),
-    }
+    return _Flown(
+        summary["clouds"] / elapsed, summary["frames"] / elapsed, resident_mib(),
+        summary["stage_ms"],
+    )  # fmt: skip
 
 
 def _fly(
