@@ -7,13 +7,14 @@ compile each.
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from itertools import pairwise
 from typing import Any
+
+from numba import config
 
 
 class _Limit(threading.local):
@@ -26,8 +27,8 @@ _limit = _Limit()
 
 
 def cores() -> int:
-    """The cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """The cores that this process may use, or NUMBA_NUM_THREADS."""
+    return int(config.NUMBA_NUM_THREADS)
 
 
 def limit_threads(threads: int) -> None:
@@ -44,10 +45,6 @@ def threads() -> int:
 def _pool() -> ThreadPoolExecutor:
     """The threads that all callers share; none is started before it is needed."""
     return ThreadPoolExecutor(max(cores(), 1), thread_name_prefix="bands")
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def in_bands(kernel: Callable[..., None], count: int, *arguments: Any) -> None:
