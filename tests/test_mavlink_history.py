@@ -19,7 +19,7 @@ from mavlink.telemetry.gimbal import (
     steadiest_frame,
     to_earth,
 )
-from mavlink.telemetry.history import M_PER_DEG, HistoryConfig, VehicleHistory
+from mavlink.telemetry.history import M_PER_DEG, SIGMA_TILT_RAD, HistoryConfig, VehicleHistory
 from mavlink.telemetry.quaternion import Quaternion
 from mavlink.telemetry.samples import (
     F64,
@@ -176,7 +176,7 @@ def test_attitude_sigma_grows_with_the_gap() -> None:
         sigmas.append(state.sigma_attitude_rad)
         assert state.sigma_yaw_rad > state.sigma_attitude_rad
         assert state.age_ms["attitude"] == pytest.approx(gap_ms / 2)
-    assert sigmas[0] == pytest.approx(HistoryConfig().sigma_tilt_rad, rel=0.01)
+    assert sigmas[0] == pytest.approx(SIGMA_TILT_RAD, rel=0.01)
     assert sigmas == sorted(sigmas) and sigmas[4] > 5 * sigmas[1]
 
 

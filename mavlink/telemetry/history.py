@@ -44,18 +44,15 @@ class HistoryConfig:
 
     keep_s: float = math.inf
     gimbal: GimbalConfig = field(default_factory=GimbalConfig)
-    sigma_tilt_rad: float = 0.01
-    sigma_yaw_rad: float = 0.05
-    sigma_gimbal_rad: float = 0.01
-    sigma_h_m: float = RECEIVER_SIGMA_H_M  # without an accuracy from the GNSS receiver
-    sigma_v_m: float = RECEIVER_SIGMA_V_M
-    angular_acceleration_rad_s2: float = 1.5  # angular acceleration assumed between samples
-    acceleration_m_s2: float = 1.0  # acceleration assumed between two positions with velocity
 
     def __post_init__(self) -> None:
-        for name in ("keep_s", "sigma_tilt_rad", "sigma_yaw_rad", "sigma_gimbal_rad"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"history {name} is {getattr(self, name)}; it must be positive")
+        if not self.keep_s > 0.0:
+            raise ValueError(f"history keep_s is {self.keep_s}; it must be positive")
+
+
+SIGMA_TILT_RAD, SIGMA_YAW_RAD, SIGMA_GIMBAL_RAD = 0.01, 0.05, 0.01
+TURN_RAD_S2, ACCELERATION_M_S2 = 1.5, 1.0
+"""Accelerations assumed between two samples: of the angles, and of positions with velocity."""
 
 
 class VehicleHistory:
@@ -241,13 +238,13 @@ class VehicleHistory:
         if at is None:
             return None
         q = _slerp(at)
-        bend = self.config.angular_acceleration_rad_s2 * at.curvature_s2
+        bend = TURN_RAD_S2 * at.curvature_s2
         state.set(
             "attitude",
             at.age_ms,
             q_ned_body_wxyz=np.array(q),
-            sigma_attitude_rad=math.hypot(self.config.sigma_tilt_rad, bend),
-            sigma_yaw_rad=math.hypot(self.config.sigma_yaw_rad, bend),
+            sigma_attitude_rad=math.hypot(SIGMA_TILT_RAD, bend),
+            sigma_yaw_rad=math.hypot(SIGMA_YAW_RAD, bend),
         )
         return q
 
@@ -257,8 +254,8 @@ class VehicleHistory:
             q = None if at is None else self._gimbal_at(key, at, q_body)
             if at is None or q is None:
                 continue
-            bend = self.config.angular_acceleration_rad_s2 * at.curvature_s2
-            sigma = math.hypot(self.config.sigma_gimbal_rad, bend)
+            bend = TURN_RAD_S2 * at.curvature_s2
+            sigma = math.hypot(SIGMA_GIMBAL_RAD, bend)
             state.set("gimbal", at.age_ms, q_ned_gimbal_wxyz=np.array(q), sigma_gimbal_rad=sigma)
             return
 
@@ -323,10 +320,10 @@ class VehicleHistory:
         nearest = None if accuracy is None else accuracy.nearer
         if nearest is not None and not nearest[0]:
             return at  # no fix: the estimated position is too uncertain for a tag
-        sigma_h, sigma_v = self.config.sigma_h_m, self.config.sigma_v_m
+        sigma_h, sigma_v = RECEIVER_SIGMA_H_M, RECEIVER_SIGMA_V_M
         if nearest is not None:
             sigma_h, sigma_v = nearest[1], nearest[2]
-        bend = self.config.acceleration_m_s2 * at.curvature_s2
+        bend = ACCELERATION_M_S2 * at.curvature_s2
         lat, lon, alt, velocity = _position_at(at)
         state.set(
             "gnss",
