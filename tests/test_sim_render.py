@@ -61,11 +61,13 @@ def test_depth_agrees_with_brute_force() -> None:
     p, e1, e2 = (place().grid.corners[:, i : i + 3] for i in (0, 3, 6))
     for u, v in zip(rng.integers(0, 320, 40), rng.integers(0, 180, 40), strict=True):
         ray = T[:3, :3] @ np.array([(u - 161.0) / 240.0, (v - 88.0) / 241.0, 1.0])
-        M = np.stack([e1, e2, np.broadcast_to(-ray, e1.shape)], axis=2)
-        solvable = np.abs(np.linalg.det(M)) > 1e-12
-        solved = np.linalg.solve(M[solvable], (T[:3, 3] - p[solvable])[..., None])[..., 0]
-        hit = (solved[:, :2].min(axis=1) >= -1e-9) & (solved[:, :2].sum(axis=1) <= 1 + 1e-9)
-        want = solved[hit & (solved[:, 2] > 0), 2].min()  # t counts camera z, as the ray's z is 1
+        h, from_p = np.cross(ray, e2), T[:3, 3] - p  # Cramer's rule: a e1 + b e2 - t ray = from_p
+        q, det = np.cross(from_p, e1), (e1 * h).sum(axis=1)
+        solvable = np.abs(det) > 1e-12
+        sides = np.stack([(from_p * h).sum(axis=1), q @ ray, (e2 * q).sum(axis=1)])
+        a, b, t = sides[:, solvable] / det[solvable]
+        hit = (np.minimum(a, b) >= -1e-9) & (a + b <= 1 + 1e-9) & (t > 0)
+        want = t[hit].min()  # t counts camera z, as the ray's z is 1
         assert depth[v, u] == pytest.approx(want, rel=1e-5)
 
 
