@@ -54,7 +54,14 @@ def export(
         raise InputError("--out names one file; give one --to with it")
     try:
         options = ExportOptions(
-            voxel_m, cell_m, contour_m, strict, video, stored, _epoch_ns(video_epoch)
+            voxel_m,
+            cell_m,
+            contour_m,
+            strict,
+            video,
+            stored,
+            _epoch_ns(video_epoch),
+            lambda text: print(f"export: {text}", file=sys.stderr),
         )
     except ValueError as error:
         raise InputError(f"export: {error}") from error

@@ -17,7 +17,7 @@ import numpy as np
 from recon.mapping.cloud_fusion import cloud_of, fuse_strips, without
 from recon.mapping.free_space import seen_through, spread
 from recon.mapping.voxel_map import ground_sample_m
-from recon.types import F64, PointCloud
+from recon.types import F64, U8, PointCloud
 from service.georeference import LocalFrame
 from service.scans.main_piece import Keyframes, main_keyframes
 
@@ -161,11 +161,17 @@ def las_header(xyz_m: F64, frame: LocalFrame | None, started_unix_ns: int) -> la
 
 
 def write_laz(
-    path: Path, cloud: PointCloud, frame: LocalFrame | None, started_unix_ns: int, laz: bool = True
+    path: Path,
+    cloud: PointCloud,
+    frame: LocalFrame | None,
+    started_unix_ns: int,
+    laz: bool = True,
+    classes: U8 | None = None,
 ) -> None:
     """Write ``cloud`` (ENU metres) to ``path``, in UTM with AMSL heights when there is a frame.
 
-    RGB are 16 bits as the format requires (8-bit value times 257).
+    RGB are 16 bits as the format requires (8-bit value times 257). ``classes`` (N,) are codes of
+    LAS 1.4; without them points were never classified.
     """
     import laspy
 
@@ -173,8 +179,12 @@ def write_laz(
     kind: dict[str, Any] = {"do_compress": laz, "closefd": False}
     with open(path, "wb") as file, laspy.open(file, "w", header=header, **kind) as out:
         for at in range(0, len(cloud), CHUNK_POINTS):
-            part = _cut(cloud, slice(at, at + CHUNK_POINTS))
-            out.write_points(point_record(header, placed(part, frame), part))
+            cut = slice(at, at + CHUNK_POINTS)
+            part = _cut(cloud, cut)
+            record = point_record(header, placed(part, frame), part)
+            if classes is not None:
+                record["classification"] = classes[cut]
+            out.write_points(record)
 
 
 def _cut(cloud: PointCloud, cut: slice) -> PointCloud:

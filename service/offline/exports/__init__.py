@@ -11,18 +11,23 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
     "laz": ("clouds:write_laz_file", "cloud.laz", "Fused cloud, LAZ 1.4."),
     "copc": ("clouds:write_copc", "cloud.copc.laz", "Cloud-optimised LAZ."),
     "dsm": ("rasters:write_dsm", "dsm.tif", "Surface model, GeoTIFF (COG)."),
+    "dtm": ("rasters:write_dtm", "dtm.tif", "Bare ground, GeoTIFF (COG)."),
     "ortho": ("rasters:write_ortho", "ortho.tif", "Orthophoto, GeoTIFF (COG)."),
     "contours": (
         "rasters:write_contours",
         "contours.geojson",
         "Height contours, GeoJSON.",
     ),
+    "gpkg": ("maps:write_contours_gpkg", "contours.gpkg", "Contours, GeoPackage, UTM."),
+    "dxf": ("maps:write_contours_dxf", "contours.dxf", "Contours, DXF, UTM."),
     "coverage": (
         "rasters:write_coverage",
         "coverage.tif",
         "Views, sigma, height, COG.",
     ),
     "geojson": ("flight:write_geojson", "flight.geojson", "The flight, GeoJSON."),
+    "kmz": ("maps:write_kmz", "ortho.kmz", "Orthophoto for Google Earth."),
+    "stac": ("maps:write_stac", "stac.json", "STAC item of the rasters."),
     "kml": ("flight:write_kml", "flight.kml", "The flight, KML."),
     "colmap": (
         "flight:write_colmap",
@@ -31,6 +36,7 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
     ),
     "3dtiles": ("clouds:write_tiles", "3dtiles", "Point tiles for Cesium."),
     "glb": ("model:write_glb", "mesh.glb", "Textured mesh, binary glTF."),
+    "all": ("bundle:write_all", "maps", "Clouds and maps with a manifest, one folder."),
     "mcap": ("recording:write_mcap", "flight.mcap", "Recording for Foxglove."),
 }
 """Name to (``module:function`` of this package, usual name in the folder, one line of help)."""

@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from recon.types import F64
+from recon.surface.ground import everywhere, ground_cells
+from recon.types import F64, U8
 from service.offline.exports.flight import writing_folder
+from service.offline.exports.surface import surface_model
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.fused_cloud import SCALE_M, las_header, point_record, write_laz
 from service.scans.writing import writing
@@ -54,10 +56,26 @@ def write_ply(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
 
 def write_laz_file(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """LAZ, or plain LAS where the name ends so."""
+    """LAZ, or plain LAS where the name ends so; points of the bare ground have class 2."""
     laz = out.suffix.lower() != ".las"
+    started_ns = scan.store.header.started_unix_ns
     with writing(out) as part:
-        write_laz(part, scan.fused.cloud, scan.frame, scan.store.header.started_unix_ns, laz)
+        write_laz(part, scan.fused.cloud, scan.frame, started_ns, laz, classes(scan))
+
+
+UNCLASSIFIED, GROUND = 1, 2
+GROUND_WITHIN_M = 0.3
+
+
+def classes(scan: ScanView) -> U8:
+    """(N,) class of each point of the fused cloud after LAS 1.4: bare ground, or unclassified."""
+    raster = surface_model(scan, None).raster
+    height = everywhere(raster, ground_cells(raster))
+    col, row = np.rint(raster.grid.pixels(scan.xyz_m[:, :2])).astype(np.int64).T
+    rows, cols = raster.grid.shape
+    below = height[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)]
+    is_ground = np.abs(scan.xyz_m[:, 2] - below) <= GROUND_WITHIN_M
+    return np.where(is_ground, GROUND, UNCLASSIFIED).astype(np.uint8)
 
 
 I64 = npt.NDArray[np.int64]

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from recon.mapping.voxel_map import ground_sample_m
+from recon.surface.ground import terrain
 from recon.surface.orthophoto import Terrain, orthophoto
 from recon.surface.raster import Grid, Raster, fill_holes, round_cell
 from recon.surface.texture_views import TextureView
@@ -41,6 +42,15 @@ def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
     image = np.where(known, np.stack(bands), NODATA_M).astype(np.float32)
     names = ("height AMSL, m", "sigma, m", "filled")
     write_cog(scan, out, surface.raster.grid, image, names, nodata=NODATA_M)
+
+
+def write_dtm(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """Heights of the bare ground (float32, -9999 where unknown), and 1 where they are bridged."""
+    raster = surface_model(scan, options.cell_m).raster
+    height, is_bridged = terrain(raster)
+    image = np.where(np.isfinite(height), np.stack([height, is_bridged]), NODATA_M)
+    names = ("ground AMSL, m", "bridged")
+    write_cog(scan, out, raster.grid, image.astype(np.float32), names, nodata=NODATA_M)
 
 
 def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
@@ -140,9 +150,8 @@ def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
     and left out.
     """
     frame = scan.needs_place("a contour map")
-    raster = fill_holes(scan.raster(options.cell_m))
     features = []
-    for height_m, line in contour_lines(raster, options.contour_m):
+    for height_m, line in contours_of(scan, options):
         geodetic = frame.to_geodetic(
             frame.from_utm(np.column_stack([line, np.full(len(line), height_m)]))
         )
@@ -158,6 +167,12 @@ def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
         )
     with writing(out) as part:
         part.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+
+
+def contours_of(scan: ScanView, options: ExportOptions) -> Iterator[tuple[float, F64]]:
+    """(height, (N, 2) UTM metres) of the contours; InputError without a georeference."""
+    scan.needs_place("a contour map")
+    yield from contour_lines(fill_holes(scan.raster(options.cell_m)), options.contour_m)
 
 
 def contour_lines(raster: Raster, step_m: float) -> Iterator[tuple[float, F64]]:

@@ -36,6 +36,14 @@ def surface_model(scan: ScanView, cell_m: float | None, strict: bool = False) ->
     ``strict`` leaves the holes unknown. :func:`recon.surface.raster.reliable` says what is
     uncertain, :func:`recon.surface.hole_filling.filled` which holes are filled.
     """
+    key = ("surface", cell_m, strict)
+    if key not in scan.memo:
+        scan.memo[key] = _surface_model(scan, cell_m, strict)
+    found: Surface = scan.memo[key]
+    return found
+
+
+def _surface_model(scan: ScanView, cell_m: float | None, strict: bool) -> Surface:
     measured = scan.raster(cell_m)
     certain = _open_to_the_sky(scan, reliable(measured))
     if strict:

@@ -8,6 +8,7 @@ from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 
@@ -60,6 +61,7 @@ class ScanView:
         self.folder = folder
         self.store = ScanStore.open(folder / "scan.db")
         self._voxel_m = voxel_m
+        self.memo: dict[Any, Any] = {}  # what several deliverables are made from
 
     def __enter__(self) -> ScanView:
         return self

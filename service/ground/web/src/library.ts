@@ -5,7 +5,7 @@ import { count, date, el, notify, size } from "./dom";
 import { vehicleStrip } from "./vehicle";
 
 const KINDS = [
-  "laz", "copc", "ply", "dsm", "ortho", "contours", "glb", "3dtiles", "geojson", "kml", "mcap",
+  "laz", "copc", "ply", "dsm", "dtm", "ortho", "contours", "gpkg", "dxf", "kmz", "stac", "glb", "3dtiles", "geojson", "kml", "mcap",
 ];
 
 const REFRESH_MS = 3000;

@@ -1,0 +1,100 @@
+"""The bare ground below a surface model: what stands on it is found and bridged.
+
+Simple morphological filter (Pingel, Clarke and McBride 2013,
+doi:10.1016/j.isprsjprs.2012.12.002): openings with growing windows lower the surface; what one of
+them lowers by more than the slope allows stands on the ground.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy import ndimage
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+
+from recon.surface.raster import Raster
+from recon.types import F32, Bool
+
+LARGEST_OBJECT_M = 36.0
+"""Width of the widest building that is taken off the ground."""
+
+SLOPE = 0.2
+STEP_M = 0.25
+MARGIN_M = 0.75
+"""Around what stands on the ground: matching makes it wider than it is."""
+
+WORKING_CELL_M = 0.5
+
+
+def ground_cells(surface: Raster) -> Bool:
+    """(rows, cols) known cells of the surface model that are bare ground."""
+    cell_m = surface.grid.cell_m
+    shrink = max(1, round(WORKING_CELL_M / cell_m))
+    low = _lowest(surface.height_m, shrink)
+    objects = np.zeros(low.shape, np.bool_)
+    coarse_m = cell_m * shrink
+    last = whole = _bridged(low, np.isfinite(low))
+    radius = 1
+    while (2 * radius + 1) * coarse_m <= LARGEST_OBJECT_M + 2 * coarse_m:
+        window = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+        opened = cv2.morphologyEx(whole, cv2.MORPH_OPEN, window, borderType=cv2.BORDER_REPLICATE)
+        objects |= last - opened > STEP_M + SLOPE * coarse_m * _steps(radius)
+        last, radius = np.asarray(opened, np.float32), max(radius + 1, round(1.5 * radius))
+    reach = 2 * max(1, round(MARGIN_M / coarse_m)) + 1
+    wide = cv2.dilate(objects.astype(np.uint8), np.ones((reach, reach), np.uint8))
+    full = np.repeat(np.repeat(wide, shrink, 0), shrink, 1)
+    rows, cols = surface.grid.shape
+    return np.asarray(surface.known & (full[:rows, :cols] == 0))
+
+
+def _steps(radius: int) -> int:
+    """Cells by which a window is wider than the one before it."""
+    return max(1, radius - round(radius / 1.5))
+
+
+def terrain(surface: Raster) -> tuple[F32, Bool]:
+    """Heights of the bare ground (NaN = unknown), and which known cells of it are bridged.
+
+    Ground is bridged by triangles below what stands on it and in holes of the surface model; the
+    outline does not grow.
+    """
+    ground = ground_cells(surface)
+    inside = np.asarray(ndimage.binary_fill_holes(surface.known)) & ground.any()
+    height = np.where(inside, everywhere(surface, ground), np.float32(np.nan)).astype(np.float32)
+    return height, inside & ~ground
+
+
+def everywhere(surface: Raster, ground: Bool) -> F32:
+    """Heights of the bare ground in all cells, beyond its outline those of the nearest.
+
+    ``ground`` (rows, cols) are the cells that show it; without any all heights are NaN.
+    """
+    height = np.where(ground, surface.height_m, np.float32(np.nan)).astype(np.float32)
+    return _bridged(height, ground)
+
+
+def _lowest(height_m: F32, shrink: int) -> F32:
+    """The lowest known height of each block of cells; NaN where none is known."""
+    rows, cols = height_m.shape
+    pad = (-rows % shrink, -cols % shrink)
+    padded = np.pad(height_m, ((0, pad[0]), (0, pad[1])), constant_values=np.nan)
+    blocks = np.where(np.isfinite(padded), padded, np.float32(np.inf))
+    blocks = blocks.reshape(padded.shape[0] // shrink, shrink, -1, shrink).min(axis=(1, 3))
+    return np.where(np.isfinite(blocks), blocks, np.float32(np.nan)).astype(np.float32)
+
+
+def _bridged(height_m: F32, known: Bool) -> F32:
+    """All cells: the known as they are, the others by triangles between the borders of the known,
+    beyond those by the nearest."""
+    rim = known & ~ndimage.binary_erosion(known, np.ones((3, 3)), border_value=1)
+    if not known.any() or known.all() or not rim.any():
+        return height_m
+    at = np.argwhere(rim)
+    unknown = np.argwhere(~known)
+    nearest = NearestNDInterpolator(at, height_m[rim])(unknown)
+    if len(at) > 3 and (np.ptp(at, axis=0) > 0).all():
+        linear = LinearNDInterpolator(at, height_m[rim])(unknown)
+        nearest = np.where(np.isfinite(linear), linear, nearest)
+    out: F32 = height_m.copy()
+    out[~known] = nearest
+    return out

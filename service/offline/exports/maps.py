@@ -1,0 +1,211 @@
+"""Contours for GIS and CAD, the orthophoto for Google Earth, and the STAC item of the rasters."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+import sqlite3
+import struct
+import zipfile
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from recon.types import F64
+from service.errors import InputError
+from service.offline.exports.rasters import contours_of, write_ortho
+from service.offline.exports.view import ExportOptions, ScanView
+from service.scans.writing import writing
+
+MAX_OVERLAY_PX = 4096
+JPEG_QUALITY = 85
+
+
+def write_contours_dxf(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """Contours as 3D polylines of DXF R12 in UTM metres; a layer per height."""
+    rows = ["0", "SECTION", "2", "ENTITIES"]
+    for height_m, line in contours_of(scan, options):
+        layer = f"CONTOUR_{height_m:g}".replace("-", "M").replace(".", "_")
+        rows += ["0", "POLYLINE", "8", layer, "66", "1", "70", "8", "10", "0", "20", "0", "30", "0"]
+        for x, y in line.tolist():
+            place = ["10", f"{x:.3f}", "20", f"{y:.3f}", "30", f"{height_m:.3f}"]
+            rows += ["0", "VERTEX", "8", layer, *place, "70", "32"]
+        rows += ["0", "SEQEND", "8", layer]
+    with writing(out) as part:
+        part.write_text("\n".join([*rows, "0", "ENDSEC", "0", "EOF", ""]), encoding="ascii")
+
+
+GPKG_TABLES = """
+CREATE TABLE gpkg_spatial_ref_sys (srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY,
+  organization TEXT NOT NULL, organization_coordsys_id INTEGER NOT NULL, definition TEXT NOT NULL,
+  description TEXT);
+CREATE TABLE gpkg_contents (table_name TEXT PRIMARY KEY, data_type TEXT NOT NULL,
+  identifier TEXT UNIQUE, description TEXT DEFAULT '',
+  last_change DATETIME NOT NULL DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ','now')),
+  min_x DOUBLE, min_y DOUBLE, max_x DOUBLE, max_y DOUBLE, srs_id INTEGER,
+  CONSTRAINT fk_gc FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys(srs_id));
+CREATE TABLE gpkg_geometry_columns (table_name TEXT NOT NULL, column_name TEXT NOT NULL,
+  geometry_type_name TEXT NOT NULL, srs_id INTEGER NOT NULL, z TINYINT NOT NULL,
+  m TINYINT NOT NULL, CONSTRAINT pk PRIMARY KEY (table_name, column_name));
+CREATE TABLE contours (fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom LINESTRING,
+  height_amsl_m DOUBLE);
+PRAGMA application_id = 1196444487;
+PRAGMA user_version = 10300;
+"""
+
+
+def write_contours_gpkg(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """Contours as a GeoPackage 1.3: layer ``contours`` in the scan's UTM zone (OGC 12-128r18)."""
+    from pyproj import CRS
+
+    epsg = scan.needs_place("a contour map").epsg
+    crs = CRS.from_epsg(epsg)
+    systems = [
+        ("Undefined cartesian SRS", -1, "NONE", -1, "undefined"),
+        ("Undefined geographic SRS", 0, "NONE", 0, "undefined"),
+        ("WGS 84", 4326, "EPSG", 4326, CRS.from_epsg(4326).to_wkt("WKT1_GDAL")),
+        (crs.name, epsg, "EPSG", epsg, crs.to_wkt("WKT1_GDAL")),
+    ]
+    lines = list(contours_of(scan, options))
+    ends = np.concatenate([line for _, line in lines]) if lines else np.zeros((1, 2))
+    box = (*ends.min(axis=0).tolist(), *ends.max(axis=0).tolist())
+    with writing(out) as part:
+        part.unlink(missing_ok=True)
+        with closing(sqlite3.connect(part)) as file, file:
+            file.executescript(GPKG_TABLES)
+            file.executemany(
+                "INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, NULL)", systems
+            )
+            file.execute(
+                "INSERT INTO gpkg_contents (table_name, data_type, identifier, min_x, min_y,"
+                " max_x, max_y, srs_id) VALUES ('contours', 'features', 'contours', ?, ?, ?, ?, ?)",
+                (*box, epsg),
+            )
+            file.execute(
+                "INSERT INTO gpkg_geometry_columns VALUES"
+                " ('contours', 'geom', 'LINESTRING', ?, 0, 0)", (epsg,),
+            )  # fmt: skip
+            file.executemany(
+                "INSERT INTO contours (geom, height_amsl_m) VALUES (?, ?)",
+                ((_gpkg_line(line, epsg), height_m) for height_m, line in lines),
+            )
+
+
+def _gpkg_line(line: F64, epsg: int) -> bytes:
+    """A LineString as GeoPackage binary: header without an envelope, then WKB."""
+    head = b"GP" + struct.pack("<BBi", 0, 1, epsg)
+    return head + struct.pack("<BII", 1, 2, len(line)) + np.asarray(line, "<f8").tobytes()
+
+
+def write_kmz(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """The orthophoto beside it as a ground overlay for Google Earth: doc.kml and a PNG in a zip."""
+    scan.needs_place("a KMZ")
+    path = out.parent / "ortho.tif"
+    if not path.is_file():
+        write_ortho(scan, path, options)
+    image, (west, south, east, north) = _in_degrees(path)
+    ok, data = cv2.imencode(".png", image)
+    if not ok:
+        raise InputError("OpenCV cannot write PNG on this machine")
+    name = scan.store.header.scan_id
+    kml = (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2">'
+        f"<GroundOverlay><name>{name}</name><Icon><href>ortho.png</href></Icon><LatLonBox>"
+        f"<north>{north:.9f}</north><south>{south:.9f}</south>"
+        f"<east>{east:.9f}</east><west>{west:.9f}</west></LatLonBox></GroundOverlay></kml>\n"
+    )
+    with writing(out) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as file:
+        file.writestr("doc.kml", kml)
+        file.writestr("ortho.png", data.tobytes())
+
+
+def _in_degrees(path: Path) -> tuple[Any, tuple[float, float, float, float]]:
+    """(h, w, 4) BGRA of a raster in longitude and latitude, and its bounds in degrees."""
+    import rasterio
+    from rasterio.enums import Resampling
+    from rasterio.transform import array_bounds
+    from rasterio.warp import calculate_default_transform, reproject
+
+    with rasterio.open(path) as image:
+        to, w, h = calculate_default_transform(
+            image.crs, "EPSG:4326", image.width, image.height, *image.bounds
+        )
+        shrink = max(1.0, max(w, h) / MAX_OVERLAY_PX)
+        w, h = round(w / shrink), round(h / shrink)
+        to = to * to.scale(shrink)
+        bands = np.zeros((4, h, w), np.uint8)
+        reproject(
+            rasterio.band(image, [1, 2, 3, 4]), bands, dst_transform=to, dst_crs="EPSG:4326",
+            resampling=Resampling.average if shrink > 1.0 else Resampling.bilinear,
+        )  # fmt: skip
+    west, south, east, north = array_bounds(h, w, to)
+    return bands[[2, 1, 0, 3]].transpose(1, 2, 0), (west, south, east, north)
+
+
+RASTERS = {"ortho.tif": "visual", "dsm.tif": "data", "dtm.tif": "data", "coverage.tif": "data"}
+
+
+def write_stac(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """A STAC 1.0 item of the rasters that lie beside it, with the projection extension."""
+    frame = scan.needs_place("a STAC item")
+    folder = out.parent
+    found = {name: _asset(folder / name, role) for name, role in RASTERS.items()
+             if (folder / name).is_file()}  # fmt: skip
+    if not found:
+        raise InputError(f"{folder} holds no raster; export dsm or ortho first")
+    corners = np.concatenate([a.pop("corners") for a in found.values()])
+    geodetic = frame.to_geodetic(frame.from_utm(corners))
+    south, west = geodetic[:, :2].min(axis=0).tolist()
+    north, east = geodetic[:, :2].max(axis=0).tolist()
+    ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
+    start, end = _times(scan)
+    item = {
+        "type": "Feature",
+        "stac_version": "1.0.0",
+        "stac_extensions": [
+            "https://stac-extensions.github.io/projection/v1.1.0/schema.json",
+        ],
+        "id": scan.store.header.scan_id,
+        "bbox": [west, south, east, north],
+        "geometry": {"type": "Polygon", "coordinates": [ring]},
+        "properties": {
+            "datetime": start,
+            "start_datetime": start,
+            "end_datetime": end,
+            "proj:epsg": frame.epsg,
+            "platform": scan.store.header.drone,
+        },
+        "links": [],
+        "assets": {Path(name).stem: asset for name, asset in found.items()},
+    }
+    with writing(out) as part:
+        part.write_text(json.dumps(item, indent=1), encoding="utf-8")
+
+
+def _asset(path: Path, role: str) -> dict[str, Any]:
+    import rasterio
+
+    with rasterio.open(path) as image:
+        west, south, east, north = image.bounds
+        return {
+            "href": f"./{path.name}",
+            "type": "image/tiff; application=geotiff; profile=cloud-optimized",
+            "roles": [role],
+            "proj:shape": list(image.shape),
+            "proj:transform": list(image.transform)[:6],
+            "corners": np.array(
+                [[west, south, 0.0], [west, north, 0.0], [east, south, 0.0], [east, north, 0.0]]
+            ),
+        }
+
+
+def _times(scan: ScanView) -> Iterator[str]:
+    """The first and the last time of the flight, as RFC 3339."""
+    times = [p.time_unix_ns for p in scan.poses] or [scan.store.header.started_unix_ns]
+    for time_ns in (min(times), max(times)):
+        when = dt.datetime.fromtimestamp(time_ns / 1e9, dt.timezone.utc)
+        yield when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
