@@ -102,7 +102,7 @@ def _gpkg_line(line: F64, epsg: int) -> bytes:
 
 
 def write_kmz(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """The orthophoto beside it as a ground overlay for Google Earth: doc.kml and a PNG in a zip."""
+    """The orthophoto as a ground overlay for Google Earth: doc.kml and a PNG in a zip."""
     scan.needs_place("a KMZ")
     path = out.parent / "ortho.tif"
     if not path.is_file():
@@ -150,7 +150,7 @@ RASTERS = {"ortho.tif": "visual", "dsm.tif": "data", "dtm.tif": "data", "coverag
 
 
 def write_stac(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """A STAC 1.0 item of the rasters that lie beside it, with the projection extension."""
+    """A STAC 1.0 item of the rasters that lie next to it, with the projection extension."""
     frame = scan.needs_place("a STAC item")
     folder = out.parent
     found = {name: _asset(folder / name, role) for name, role in RASTERS.items()
