@@ -202,3 +202,15 @@ def test_corners_on_a_line_give_no_motion_instead_of_a_fault() -> None:
     line = degenerate("collinear", 2, 40, 7)
     assert prediction.base_to_height(line, line, K, None) == 0.0
     np.testing.assert_array_equal(prediction.common_affine(line, line), np.eye(3))
+
+
+@pytest.mark.parametrize(("near", "expected"), [(0.3, 0.1), (1.0, 0.1), (0.05, 0.0)])
+def test_motion_counts_where_near_ground_shows_it(near: float, expected: float) -> None:
+    """Of matches ahead most are far; a few wrong ones are not near ground."""
+    K = np.array([[400.0, 0, 320], [0, 400.0, 180], [0, 0, 1]])
+    R = se3.so3_exp(np.array([0.02, -0.03, 0.01]))
+    uv = np.random.default_rng(0).uniform([0, 0], [640, 360], (200, 2))
+    ray = rays(K, uv) @ R.T
+    ray /= ray[:, 2:]
+    ray[: int(near * 200), 1] += 0.1
+    assert prediction.base_to_height(uv, project(K, ray), K, R) == pytest.approx(expected, abs=1e-6)

@@ -120,8 +120,12 @@ def relative_rotation(a: PosePrior, b: PosePrior) -> F64 | None:
     return np.asarray(b.R_world_camera.T @ a.R_world_camera)
 
 
+NEAR_QUANTILE = 0.85
+"""Of the matches' motion: where a camera looks at the horizon most of what it sees is far."""
+
+
 def base_to_height(uv_a: F64, uv_b: F64, K: F64, R_b_a: F64 | None) -> float:
-    """Median motion of the matches in focal lengths, with the turn taken out when known.
+    """Motion of the nearer matches in focal lengths, with the turn taken out when known.
 
     Without an attitude the turn about the optical axis and the mean shift that a tilt would
     give cannot be distinguished from motion; the shift is then counted as motion.
@@ -130,7 +134,7 @@ def base_to_height(uv_a: F64, uv_b: F64, K: F64, R_b_a: F64 | None) -> float:
     if R_b_a is not None:
         a = a @ R_b_a.T
         a = a / a[:, 2:]
-        return float(np.median(np.linalg.norm(b - a, axis=1)))
+        return float(np.quantile(np.linalg.norm(b - a, axis=1), NEAR_QUANTILE))
     A = robust_geometry.affine(
         np.ascontiguousarray(a[:, :2]), np.ascontiguousarray(b[:, :2]), 0.01, is_similarity=True
     )
