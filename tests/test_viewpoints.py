@@ -143,5 +143,5 @@ def test_all_frames_count_where_the_operator_chose_the_baseline_or_wants_the_nex
 def test_as_many_frames_are_needed_as_pair_up() -> None:
     few, many = Viewpoints(ScanConfig(), partners=4), Viewpoints(ScanConfig(), partners=30)
     assert np.isfinite(few.frames_per_step)
-    steps_with_partners = 2 * (2.2 - 0.6)
+    steps_with_partners = 2.2 - 0.6  # ahead of the first view
     assert many.frames_per_step * steps_with_partners >= 30

@@ -29,8 +29,9 @@ MIN_FRAMES_PER_STEP = 6.0
 """A keyframe comes up to one part in so many late."""
 
 NEAREST_PARTNER, FARTHEST_PARTNER = 0.6, 2.2
-PARTNER_SPAN = 2 * (FARTHEST_PARTNER - NEAREST_PARTNER)
-"""Steps away that partners between the views are, and over how many steps they spread."""
+PARTNER_SPAN = FARTHEST_PARTNER - NEAREST_PARTNER
+"""Steps away that partners between the views are, and over how many they spread on one side: the
+first and the last view have no other."""
 
 LAST_VIEW_SHARE = 0.1
 """A stretch's last frame becomes a view when it is this share of a usual step further on."""
