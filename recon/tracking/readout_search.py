@@ -28,7 +28,7 @@ STEP_S = 5e-3
 """About the one in use, once it is sure."""
 
 NEAR_S = 1e-3
-"""A readout further from the one in use begins anew."""
+"""A readout further from the one in use starts the search again."""
 
 MAX_READOUT_S = 0.05
 

@@ -243,7 +243,7 @@ class Scan:
         return Shutter(abs(found.readout_s), way)
 
     def _readout(self) -> dict[str, Any] | None:
-        """What the images say of the shutter; None where it was not sought or does not show."""
+        """The readout by the images; None where it was not sought or does not show."""
         search = self.pipeline.stages.track.odometry.readout
         found = None if search is None else search.estimate
         if found is None:
