@@ -225,23 +225,55 @@ def _normal_equations(c: I64, k: I64, size: tuple[int, int], step: int) -> tuple
 
 
 @numba.njit(cache=True, nogil=True)
-def _residuals(c: I64, k: I64, size: tuple[int, int], weights: I64) -> U16:
-    """Zigzag residuals of the known pixels in scan order."""
+def _residuals(c: F64, k: F64, size: tuple[int, int], weights: I64) -> U16:
+    """Zigzag residuals of the known pixels in scan order.
+
+    The predictions of a row are computed at once in float64, where these integers are exact.
+    """
     h, w = size
     row = w + 2 * MARGIN
+    f = weights.astype(np.float64)
+    base = np.zeros(w)
+    guess = np.zeros(w)
+    zigzag = np.zeros(w, np.uint16)
     out = np.empty(h * w, np.uint16)
-    last = 0
+    last = 0.0
     at = 0
     for v in range(h):
         start = (v + MARGIN) * row + MARGIN
-        for i in range(start, start + w):
-            if k[i]:
-                r = c[i] - _guess(c, k, i, row, _base(c, k, i, row, last), weights)
-                r = ((r + 32768) & 0xFFFF) - 32768
-                out[at] = (r << 1) ^ (r >> 63)
-                last = c[i]
+        if not k[start : start + w].any():
+            continue
+        # Slices keep the compiler from checking every index for being negative.
+        known, code = k[start : start + w], c[start : start + w]
+        west_known, west = k[start - 1 : start - 1 + w], c[start - 1 : start - 1 + w]
+        for u in range(w):
+            if known[u]:
+                base[u] = west[u] if west_known[u] else _base(c, k, start + u, row, last)
+                last = code[u]
+        _guess_row(c, k, start, row, base, f, guess)
+        for u in range(w):
+            r = ((np.int32(code[u] - guess[u]) + 32768) & 0xFFFF) - 32768
+            zigzag[u] = (r << 1) ^ (r >> 31)
+        for u in range(w):
+            if known[u]:
+                out[at] = zigzag[u]
                 at += 1
     return out[:at]
+
+
+@numba.njit(cache=True, nogil=True)
+def _guess_row(c: F64, k: F64, start: int, row: int, base: F64, f: F64, guess: F64) -> None:
+    """Fill ``guess`` for the row of pixels that begins at ``start``."""
+    w = base.size
+    total = np.full(w, 2048.0)
+    for j in range(9):
+        at = start + NEIGHBOURS[j + 1, 0] * row + NEIGHBOURS[j + 1, 1]
+        near, there = c[at : at + w], k[at : at + w]
+        weight = f[j]
+        for u in range(w):
+            total[u] += weight * (near[u] - base[u]) * there[u]
+    for u in range(w):
+        guess[u] = min(max(base[u] + np.floor(total[u] / 4096.0), 0.0), 65535.0)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -283,7 +315,7 @@ def encode_codes(codes: U16, known: Bool) -> bytes:
     size = known.shape[0], known.shape[1]
     c, k = _padded(codes), _padded(known)
     weights = fit(c, k, size)
-    residuals = _residuals(c, k, size, weights)
+    residuals = _residuals(c.astype(np.float64), k.astype(np.float64), size, weights)
     symbols = np.minimum(residuals, ESCAPE).astype(np.uint8)
     escaped = residuals[residuals >= ESCAPE].astype("<u2")
     packer = zlib.compressobj(1, zlib.DEFLATED, 15, 9, zlib.Z_HUFFMAN_ONLY)
