@@ -65,7 +65,7 @@ class LocalFrame:
         return self.to_enu(out[:, [1, 0, 2]])
 
     def _geodetic_enu(self) -> Transformer:
-        return _topocentric(self.lat_deg, self.lon_deg, self.alt_amsl_m)
+        return _topocentric(float(self.lat_deg), float(self.lon_deg), float(self.alt_amsl_m))
 
 
 def utm_epsg(lat_deg: float, lon_deg: float) -> int:

@@ -126,6 +126,12 @@ def test_an_origin_off_the_globe_is_refused(bad: tuple[float, float, float]) -> 
         LocalFrame(*bad)
 
 
+def test_an_origin_of_numpys_numbers_is_the_same_place() -> None:
+    lat, lon, alt = 12.3456, -65.4321, 78.9  # of no other test: the transformer is kept
+    frame = LocalFrame(*(np.float64(value) for value in (lat, lon, alt)))
+    assert np.abs(frame.to_enu(np.array([[lat, lon, alt]]))).max() < 1e-6
+
+
 def test_wrong_shape_is_refused() -> None:
     with pytest.raises(ValueError, match=r"\(N, 3\)"):
         LocalFrame(0.0, 0.0, 0.0).to_enu(np.zeros(3))
