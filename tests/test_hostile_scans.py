@@ -135,9 +135,7 @@ def test_extreme_records_within_bounds_give_files_or_one_line(
             assert "\n" not in str(error)
 
 
-def test_poses_far_apart_are_adjusted_and_stay(
-    tmp_path: Path, house: HouseFlight
-) -> None:
+def test_poses_far_apart_are_adjusted_and_stay(tmp_path: Path, house: HouseFlight) -> None:
     """Two keyframes a million metres above and below the others."""
     with house.flown(tmp_path) as store:
         for seq, up_m in ((9, 9e5), (10, -9e5)):
