@@ -6,8 +6,24 @@ import importlib.util
 import re
 from pathlib import Path
 
+from service.workers import ROWS
+
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
+
+
+def row(stop: str, name: str, queue: str, deadline: str, restarts: str, does: str) -> str:
+    return f"{stop:<4}  {name:<17} {queue:<14} {deadline:<8}  {restarts:<8}  {does}".rstrip()
+
+
+def test_the_table_of_workers_is_the_code_s() -> None:
+    table = [row("stop", "worker", "queue", "deadline", "restarts", "does")]
+    for worker in ROWS:
+        queue = " ".join(filter(None, (str(worker.bound or ""), worker.full)))
+        deadline = "" if worker.deadline_s is None else f"{worker.deadline_s:g} s"
+        restarts = "yes" if worker.restarts else ""
+        table.append(row(str(worker.stop), worker.name, queue, deadline, restarts, worker.does))
+    assert "```text\n" + "\n".join(table) + "\n```" in TEXT
 
 
 def test_every_path_in_it_exists() -> None:
