@@ -1,7 +1,9 @@
 """Small symmetric systems inside compiled kernels.
 
 NumPy's own ``solve``, ``inv`` and ``@`` in a kernel call LAPACK and BLAS, and make the compiler
-build their error messages as well: seconds at the first start, for matrices of a few rows.
+build their error messages as well: seconds at the first start, for matrices of a few rows. A kernel
+without a ``fastmath`` of its own takes that of the kernel that is the first to call it, and NaN goes
+unseen then: these have one.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from typing import Any
 from numba import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False)
 def solve_symmetric(A: Any, b: Any) -> bool:
     """Solve A x = b in place; True where A is positive definite.
 
@@ -41,7 +43,7 @@ def solve_symmetric(A: Any, b: Any) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False)
 def invert_3x3(A: Any, out: Any) -> None:
     """Fill ``out`` with the inverse of the symmetric ``A`` (3, 3), by its cofactors."""
     a, b, c = A[0, 0], A[0, 1], A[0, 2]

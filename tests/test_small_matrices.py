@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import njit
 
 from recon.small_matrices import invert_3x3, solve_symmetric
 from recon.types import F64
@@ -30,6 +33,18 @@ def test_solutions_are_those_of_lapack(seed: int, n: int, m: int) -> None:
 @pytest.mark.parametrize("A", [np.diag([1.0, -1.0]), np.zeros((2, 2)), np.full((2, 2), np.nan)])
 def test_what_is_not_positive_definite_is_refused(A: F64) -> None:
     assert not solve_symmetric(A.copy(), np.ones((2, 1)))
+
+
+@njit(fastmath=True)
+def _relaxed(A: F64, b: F64) -> bool:
+    return bool(solve_symmetric(A, b))
+
+
+@pytest.mark.parametrize("solve", [_relaxed, solve_symmetric])
+def test_nan_is_refused_also_below_a_kernel_that_ignores_it(
+    solve: Callable[[F64, F64], bool],
+) -> None:
+    assert not solve(np.full((2, 2), np.nan), np.ones((2, 1)))
 
 
 @settings(deadline=None, max_examples=30)
