@@ -274,7 +274,7 @@ def searched(readout_s: float, frames: int) -> tuple[ReadoutEstimate, float]:
     return odometry.readout.estimate, clock.clock.readout_s
 
 
-@pytest.mark.parametrize(("readout_s", "frames"), [(0.02, 200), (-0.015, 140)])
+@pytest.mark.parametrize(("readout_s", "frames"), [(0.02, 260), (-0.015, 140)])
 def test_the_readout_is_found_from_the_images(readout_s: float, frames: int) -> None:
     found, used = searched(readout_s, frames)
     assert found.is_sure and used == found.readout_s
