@@ -22,6 +22,8 @@ from recon.camera_model import rays
 from recon.types import F64, Keyframe
 from service.bench import BenchOptions, BenchResult
 from service.bench.real import _skyrelief as skyrelief
+from service.georeference import LocalFrame
+from service.scans.track import local_frame
 from service.sim.flight import FlightPlan, Sensors
 from service.sim.recording import (
     EPOCH_UNIX_S,
@@ -76,7 +78,7 @@ def _simulated(folder: Path, options: BenchOptions) -> list[BenchResult]:
         scans = [_replayed(folder, flown, name, seed, options) for name in ("one", "two")]
         out = folder / f"site-{seed}"
         skyrelief("site", "compare", *map(str, scans), "--out", str(out))
-        seams.append(seam_of(out, truths))
+        seams.append(seam_of(out, scans, truths))
         unchanged += not json.loads((out / "change.json").read_text())["objects"]
     later = _replayed(folder, flown, "later", 99, options)
     skyrelief("site", "compare", str(folder / "one-0"), str(later), "--out", str(folder / "change"))
@@ -122,24 +124,12 @@ class Seam:
     site_m: F64  # (3,) mean error of the site
 
 
-def seam_of(site: Path, truths: Sequence[Truth]) -> Seam:
+def seam_of(site: Path, scans: Sequence[Path], truths: Sequence[Truth]) -> Seam:
     """The seam of a site of two scans, against the truths of their flights."""
     document = json.loads((site / "site.json").read_text())
-    before: list[list[tuple[F64, F64]]] = [[], []]
-    after: list[list[tuple[F64, F64]]] = [[], []]
-    with ScanStore.open(site / "scan.db", read_only=True) as store:
-        for k, (scan, truth) in enumerate(zip(document["scans"], truths, strict=True)):
-            first, last = scan["keyframes"]
-            moved = np.array(scan["T_site_scan"])  # of a scan whose own origin is the site's
-            for seq in range(first, last + 1):
-                one = store.keyframe(seq)
-                found = None if one is None else _ground_error(one, truth)
-                if one is None or found is None:
-                    continue
-                place, error = found
-                after[k].append((place, error))
-                undone = _undone(place + error, moved, scan["scale"])
-                before[k].append((place, undone - place))
+    ranges = [range(s["keyframes"][0], s["keyframes"][1] + 1) for s in document["scans"]]
+    after = [_errors(site, r, truth) for r, truth in zip(ranges, truths, strict=True)]
+    before = [_errors(scan, None, truth) for scan, truth in zip(scans, truths, strict=True)]
     return Seam(
         _between(*before), _between(*after),
         np.array([np.mean([e for _, e in rows], axis=0) for rows in before]),
@@ -147,12 +137,20 @@ def seam_of(site: Path, truths: Sequence[Truth]) -> Seam:
     )  # fmt: skip
 
 
-def _undone(place: F64, T_site_scan: F64, scale: float) -> F64:
-    R, t = T_site_scan[:3, :3], T_site_scan[:3, 3]
-    return np.asarray(R.T @ (place - t) / scale)
+def _errors(folder: Path, seqs: Sequence[int] | None, truth: Truth) -> list[tuple[F64, F64]]:
+    """True places and errors, in the truth's frame, of what the keyframes of a scan see."""
+    with ScanStore.open(folder / "scan.db", read_only=True) as store:
+        frame = local_frame(store.header)
+        assert frame is not None  # the simulated flights have fixes
+        found = [
+            _ground_error(one, truth, frame)
+            for seq in (store.seqs() if seqs is None else seqs)
+            if (one := store.keyframe(seq)) is not None
+        ]
+    return [each for each in found if each is not None]
 
 
-def _ground_error(one: Keyframe, truth: Truth) -> tuple[F64, F64] | None:
+def _ground_error(one: Keyframe, truth: Truth, frame: LocalFrame) -> tuple[F64, F64] | None:
     """(3,) true place of what the keyframe sees, and (3,) median error of where it has that."""
     k = int(np.argmin(np.abs(truth.times_s - one.time_ns * 1e-9)))
     h, w = one.depth.depth_m.shape
@@ -162,6 +160,7 @@ def _ground_error(one: Keyframe, truth: Truth) -> tuple[F64, F64] | None:
     if len(ways) < 20:
         return None
     there = se3.transform(one.depth.T_world_camera, ways * z[np.isfinite(z), None])
+    there = ORIGIN.to_enu(frame.to_geodetic(there))
     T = truth.poses[k]
     turned = ways @ T[:3, :3].T
     far, _ = truth.surface.cast(np.tile(T[:3, 3], (len(ways), 1)), turned)
