@@ -1,9 +1,10 @@
 """Small symmetric systems inside compiled kernels.
 
 NumPy's own ``solve``, ``inv`` and ``@`` in a kernel call LAPACK and BLAS, and make the compiler
-build their error messages as well: seconds at the first start, for matrices of a few rows. A kernel
-without a ``fastmath`` of its own takes that of the kernel that is the first to call it, and NaN goes
-unseen then: these have one.
+build their error messages as well: seconds at the first start, for matrices of a few rows.
+
+A kernel without a ``fastmath`` of its own takes that of the kernel that is the first to call it,
+and then misses NaN: these have one.
 """
 
 from __future__ import annotations
