@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import datetime as dt
 import json
-import sqlite3
-import struct
 import zipfile
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from recon.types import F64
 from service.errors import InputError
 from service.offline.exports.rasters import contours_of, write_ortho
 from service.offline.exports.view import ExportOptions, ScanView
+from service.offline.geopackage import write_lines
 from service.scans.writing import writing
 
 MAX_OVERLAY_PX = 4096
@@ -39,66 +36,12 @@ def write_contours_dxf(scan: ScanView, out: Path, options: ExportOptions) -> Non
         part.write_text("\n".join([*rows, "0", "ENDSEC", "0", "EOF", ""]), encoding="ascii")
 
 
-GPKG_TABLES = """
-CREATE TABLE gpkg_spatial_ref_sys (srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY,
-  organization TEXT NOT NULL, organization_coordsys_id INTEGER NOT NULL, definition TEXT NOT NULL,
-  description TEXT);
-CREATE TABLE gpkg_contents (table_name TEXT PRIMARY KEY, data_type TEXT NOT NULL,
-  identifier TEXT UNIQUE, description TEXT DEFAULT '',
-  last_change DATETIME NOT NULL DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ','now')),
-  min_x DOUBLE, min_y DOUBLE, max_x DOUBLE, max_y DOUBLE, srs_id INTEGER,
-  CONSTRAINT fk_gc FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys(srs_id));
-CREATE TABLE gpkg_geometry_columns (table_name TEXT NOT NULL, column_name TEXT NOT NULL,
-  geometry_type_name TEXT NOT NULL, srs_id INTEGER NOT NULL, z TINYINT NOT NULL,
-  m TINYINT NOT NULL, CONSTRAINT pk PRIMARY KEY (table_name, column_name));
-CREATE TABLE contours (fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom LINESTRING,
-  height_amsl_m DOUBLE);
-PRAGMA application_id = 1196444487;
-PRAGMA user_version = 10300;
-"""
-
-
 def write_contours_gpkg(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """Contours as a GeoPackage 1.3: layer ``contours`` in the scan's UTM zone (OGC 12-128r18)."""
-    from pyproj import CRS
-
+    """Contours as a GeoPackage: layer ``contours`` in the scan's UTM zone."""
     epsg = scan.needs_place("a contour map").epsg
-    crs = CRS.from_epsg(epsg)
-    systems = [
-        ("Undefined cartesian SRS", -1, "NONE", -1, "undefined"),
-        ("Undefined geographic SRS", 0, "NONE", 0, "undefined"),
-        ("WGS 84", 4326, "EPSG", 4326, CRS.from_epsg(4326).to_wkt("WKT1_GDAL")),
-        (crs.name, epsg, "EPSG", epsg, crs.to_wkt("WKT1_GDAL")),
-    ]
-    lines = list(contours_of(scan, options))
-    ends = np.concatenate([line for _, line in lines]) if lines else np.zeros((1, 2))
-    box = (*ends.min(axis=0).tolist(), *ends.max(axis=0).tolist())
-    with writing(out) as part:
-        part.unlink(missing_ok=True)
-        with closing(sqlite3.connect(part)) as file, file:
-            file.executescript(GPKG_TABLES)
-            file.executemany(
-                "INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, NULL)", systems
-            )
-            file.execute(
-                "INSERT INTO gpkg_contents (table_name, data_type, identifier, min_x, min_y,"
-                " max_x, max_y, srs_id) VALUES ('contours', 'features', 'contours', ?, ?, ?, ?, ?)",
-                (*box, epsg),
-            )
-            file.execute(
-                "INSERT INTO gpkg_geometry_columns VALUES"
-                " ('contours', 'geom', 'LINESTRING', ?, 0, 0)", (epsg,),
-            )  # fmt: skip
-            file.executemany(
-                "INSERT INTO contours (geom, height_amsl_m) VALUES (?, ?)",
-                ((_gpkg_line(line, epsg), height_m) for height_m, line in lines),
-            )
-
-
-def _gpkg_line(line: F64, epsg: int) -> bytes:
-    """A LineString as GeoPackage binary: header without an envelope, then WKB."""
-    head = b"GP" + struct.pack("<BBi", 0, 1, epsg)
-    return head + struct.pack("<BII", 1, 2, len(line)) + np.asarray(line, "<f8").tobytes()
+    found = list(contours_of(scan, options))
+    heights = {"height_amsl_m": [height_m for height_m, _ in found]}
+    write_lines(out, "contours", epsg, [line for _, line in found], heights)
 
 
 def write_kmz(scan: ScanView, out: Path, options: ExportOptions) -> None:

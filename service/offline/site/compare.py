@@ -27,9 +27,9 @@ from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports.rasters import NODATA_M, write_cog
 from service.offline.exports.view import ScanView
+from service.offline.geopackage import write_polygons
 from service.offline.site.alignment import AlignedSite, align_site
 from service.offline.site.gather import Member, Part
-from service.offline.site.geopackage import write_polygons
 from service.scans.folder import write_deliverables
 from service.scans.fused_cloud import fused_cloud, placed
 from service.scans.track import local_frame

@@ -1,4 +1,4 @@
-"""Polygons as a GeoPackage (OGC 12-128r18): an SQLite file with geometries in WKB."""
+"""Polygons or lines as a GeoPackage (OGC 12-128r18): an SQLite file with geometries in WKB."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import sqlite3
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from recon.types import F64
 from service.scans.writing import writing
@@ -29,19 +31,36 @@ CREATE TABLE gpkg_geometry_columns (table_name TEXT NOT NULL, column_name TEXT N
 """
 
 
+Columns = Mapping[str, Sequence[float | str]]
+"""Values of each shape by name, real or text."""
+
+
 def write_polygons(
-    path: Path, table: str, epsg: int, shapes: Sequence[Sequence[Sequence[F64]]],
-    columns: Mapping[str, Sequence[float | str]],
-) -> None:  # fmt: skip
-    """Write multipolygons with their columns, real or text, as one layer.
+    path: Path, table: str, epsg: int, shapes: Sequence[Sequence[Sequence[F64]]], columns: Columns
+) -> None:
+    """Write multipolygons with their columns as one layer.
 
     ``shapes[n]`` are polygons, each an outer ring and its holes, (N, 2) map metres, closed.
     """
+    points = [ring for shape in shapes for rings in shape for ring in rings]
+    _write(path, table, epsg, "MULTIPOLYGON", [_polygons(s) for s in shapes], points, columns)
+
+
+def write_lines(path: Path, table: str, epsg: int, lines: Sequence[F64], columns: Columns) -> None:
+    """Write lines, (N, 2) map metres each, with their columns as one layer."""
+    _write(path, table, epsg, "LINESTRING", [_line(line) for line in lines], lines, columns)
+
+
+def _write(
+    path: Path, table: str, epsg: int, kind: str, shapes: Sequence[bytes], points: Sequence[F64],
+    columns: Columns,
+) -> None:  # fmt: skip
+    """Write one layer of shapes in WKB, all of one kind, that have these points."""
     from pyproj import CRS
 
     kinds = {n: "TEXT" if v and isinstance(v[0], str) else "DOUBLE" for n, v in columns.items()}
-    points = [p for shape in shapes for rings in shape for ring in rings for p in ring]
-    box = [f(p[k] for p in points) if points else None for f in (min, max) for k in (0, 1)]
+    ends = np.concatenate(points) if len(points) else np.full((1, 2), np.nan)  # SQLite: NULL
+    box = (*ends.min(axis=0).tolist(), *ends.max(axis=0).tolist())
     with writing(path) as part:
         part.unlink(missing_ok=True)
         db = sqlite3.connect(part)
@@ -63,18 +82,18 @@ def write_polygons(
                 (table, table, *box, epsg),
             )
             db.execute(
-                "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', 'MULTIPOLYGON', ?, 0, 0)",
-                (table, epsg),
+                "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)",
+                (table, kind, epsg),
             )
-            typed = "".join(f', "{n}" {kind}' for n, kind in kinds.items())
+            typed = "".join(f', "{n}" {of}' for n, of in kinds.items())
             db.execute(
                 f'CREATE TABLE "{table}" (fid INTEGER PRIMARY KEY AUTOINCREMENT, '
-                f"geom MULTIPOLYGON{typed})"
+                f"geom {kind}{typed})"
             )
             marks = ", ".join("?" * (1 + len(columns)))
             names = "".join(f', "{n}"' for n in columns)
             rows = [
-                (_blob(shape, epsg), *(v[n] for v in columns.values()))
+                (b"GP\x00\x01" + struct.pack("<i", epsg) + shape, *(v[n] for v in columns.values()))
                 for n, shape in enumerate(shapes)
             ]
             db.executemany(f'INSERT INTO "{table}" (geom{names}) VALUES ({marks})', rows)
@@ -83,12 +102,15 @@ def write_polygons(
             db.close()
 
 
-def _blob(polygons: Sequence[Sequence[F64]], epsg: int) -> bytes:
-    """The header without an envelope, then the multipolygon as little-endian WKB."""
-    parts = [b"GP\x00\x01", struct.pack("<i", epsg), struct.pack("<BII", 1, 6, len(polygons))]
+def _polygons(polygons: Sequence[Sequence[F64]]) -> bytes:
+    """A MultiPolygon as little-endian WKB."""
+    parts = [struct.pack("<BII", 1, 6, len(polygons))]
     for rings in polygons:
         parts.append(struct.pack("<BII", 1, 3, len(rings)))
-        for ring in rings:
-            parts.append(struct.pack("<I", len(ring)))
-            parts.append(ring.astype("<f8").tobytes())
+        parts += [struct.pack("<I", len(ring)) + ring.astype("<f8").tobytes() for ring in rings]
     return b"".join(parts)
+
+
+def _line(line: F64) -> bytes:
+    """A LineString as little-endian WKB."""
+    return struct.pack("<BII", 1, 2, len(line)) + np.asarray(line, "<f8").tobytes()
