@@ -12,9 +12,11 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 from numba import config
+
+T = TypeVar("T")
 
 
 class _Limit(threading.local):
@@ -43,8 +45,25 @@ def threads() -> int:
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    """The threads that all callers share; none is started before it is needed."""
-    return ThreadPoolExecutor(max(cores(), 1), thread_name_prefix="bands")
+    """The threads that all callers share; none is started before it is needed.
+
+    A call from one of them shares nothing out: it would wait for threads that wait themselves.
+    """
+    return ThreadPoolExecutor(
+        max(cores(), 1), thread_name_prefix="bands", initializer=limit_threads, initargs=(1,)
+    )
+
+
+def at_once(*calls: Callable[[], T]) -> list[T]:
+    """The results of independent calls that run at the same time."""
+    results: list[Any] = [None] * len(calls)
+
+    def run(first: int, end: int) -> None:
+        for n in range(first, end):
+            results[n] = calls[n]()
+
+    in_bands(run, len(calls))
+    return results
 
 
 def in_bands(kernel: Callable[..., None], count: int, *arguments: Any) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 import pytest
@@ -98,3 +100,28 @@ def test_two_threads_may_call_a_kernel_at_once(four: None) -> None:
         one.join()
     for out in outs:
         np.testing.assert_array_equal(out, values**2)
+
+
+def test_calls_at_once_keep_their_order_and_meet(four: None) -> None:
+    meet = threading.Barrier(2, timeout=20.0)
+    assert bands.at_once(lambda: meet.wait() >= 0, lambda: (meet.wait(), "second")[1]) == [
+        True,
+        "second",
+    ]
+
+
+def test_calls_within_calls_end(four: None) -> None:
+    """A call that shares out its own work does not wait for threads that wait for it."""
+
+    def inner() -> list[int]:
+        return bands.at_once(*(lambda n=n: n for n in range(5)))
+
+    callers = [partial(bands.at_once, inner, inner, inner) for _ in range(4)]
+    with ThreadPoolExecutor(4) as pool:
+        results = [f.result(timeout=30.0) for f in [pool.submit(call) for call in callers]]
+    assert results == [[[0, 1, 2, 3, 4]] * 3] * 4
+
+
+def test_an_exception_of_one_call_is_raised() -> None:
+    with pytest.raises(ZeroDivisionError):
+        bands.at_once(lambda: 1, lambda: 1 // 0)

@@ -6,15 +6,20 @@ The voxel keys are those of :mod:`recon.mapping.voxel_map`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 import numpy as np
 from numba import njit
 
+from recon.bands import at_once
 from recon.mapping.voxel_map import I32, I64, find_slot, rehash, voxel_key
 from recon.types import F32, F64, U8, Bool, DepthMap, PointCloud
 
 CORRELATION = 0.55
 """Of the errors of two keyframes at one place: they share frames, poses and texture."""
+
+_Means = tuple[I64, PointCloud]
+"""Keys of voxels, sorted, and the mean point of each."""
 
 LONE_NEIGHBOURS = 3
 """A point with fewer occupied voxels than this among the 26 around it stands alone."""
@@ -36,7 +41,7 @@ def fuse(clouds: Iterable[PointCloud], voxel_m: float) -> PointCloud:
 def fuse_strips(
     strips: Sequence[Callable[[], Iterable[PointCloud]]], edges_m: Sequence[float], voxel_m: float
 ) -> PointCloud:
-    """As :func:`fuse`, one strip of x after the other, so that the sums of one are held.
+    """As :func:`fuse`, in strips of x, so that the sums of one per core are held.
 
     ``strips[n]`` gives the clouds that reach into ``edges_m[n] <= x < edges_m[n + 1]``; their
     points outside are passed over. Finite edges are moved to the voxel border below them, so
@@ -45,14 +50,15 @@ def fuse_strips(
     if not (np.isfinite(voxel_m) and voxel_m > 0.0):
         raise ValueError(f"voxel_m is {voxel_m}, must be positive")
     borders = np.floor(np.asarray(edges_m, np.float64) / voxel_m)
-    keys, clouds = [], []
-    for strip, low, high in zip(strips, borders[:-1], borders[1:], strict=True):
+
+    def fused(strip: Callable[[], Iterable[PointCloud]], low: float, high: float) -> _Means:
         sums = _Sums()
         for number, cloud in enumerate(strip()):
             sums.add(_between(cloud, low, high, voxel_m), number, 1.0 / voxel_m)
-        key, mean = sums.means()
-        keys.append(key)
-        clouds.append(mean)
+        return sums.means()
+
+    rows = zip(strips, borders[:-1], borders[1:], strict=True)
+    keys, clouds = zip(*at_once(*(partial(fused, *row) for row in rows)), strict=True)
     whole = PointCloud(
         *(
             np.concatenate([getattr(cloud, name) for cloud in clouds])
@@ -131,7 +137,7 @@ class _Sums:
             self.tags,
         )
 
-    def means(self) -> tuple[I64, PointCloud]:
+    def means(self) -> _Means:
         """The voxel keys, sorted, and the mean point of each."""
         at = np.flatnonzero(self.keys != -1)
         at = at[np.argsort(self.keys[at])]

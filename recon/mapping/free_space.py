@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from recon.bands import in_bands
 from recon.types import F32, F64, U8, Bool, DepthMap, PointCloud
 
 I64 = npt.NDArray[np.int64]
@@ -151,7 +152,9 @@ def seen_through(cloud: PointCloud, views: Iterable[DepthMap]) -> Bool:
         slack_m = AGREES_SIGMAS * (largest_m + float(np.nanmax(depth.sigma_m, initial=0.0)))
         reached = tiles.in_view(depth, slack_m)
         if len(reached):
-            _vote(
+            in_bands(
+                _vote,
+                len(reached),
                 reached,
                 tiles.first,
                 tiles.xyz_m,
@@ -249,6 +252,8 @@ def _look_above(
 
 @njit(cache=True, nogil=True)
 def _vote(
+    begin: int,
+    end: int,
     tiles: I64,
     first: I64,
     xyz: F32,
@@ -262,10 +267,12 @@ def _vote(
     asked: U8,
     is_decided: Bool,
 ) -> None:
-    """Add one keyframe's votes on the points of ``tiles`` to ``seers``, pairs that see less pairs
-    that see through; ``T`` is T_camera_world."""
+    """Add one keyframe's votes on the points of ``tiles[begin:end]`` to ``seers``.
+
+    A vote is the pairs that see less the pairs that see through; ``T`` is T_camera_world.
+    """
     h, w = depth.shape
-    for tile in tiles:
+    for tile in tiles[begin:end]:
         left = 0
         for p in range(first[tile], first[tile + 1]):
             if asked[p] == MAX_VIEWS:

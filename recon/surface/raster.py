@@ -263,8 +263,7 @@ def fill_holes(raster: Raster, largest_cells: int = 4) -> Raster:
     layers = np.dstack(
         [np.nan_to_num(raster.height_m), np.nan_to_num(raster.sigma_m), raster.rgb]
     ).astype(np.float32)
-    smooth, reached = _normalised_blur(layers, known, largest_cells)
-    fill = holes & reached
+    smooth, fill = _normalised_blur(layers, known, holes, largest_cells)
     height, sigma, rgb = raster.height_m.copy(), raster.sigma_m.copy(), raster.rgb.copy()
     height[fill] = smooth[fill, 0]
     sigma[fill] = 2.0 * smooth[fill, 1]
@@ -272,23 +271,28 @@ def fill_holes(raster: Raster, largest_cells: int = 4) -> Raster:
     return Raster(raster.grid, height, sigma, rgb)
 
 
-def _normalised_blur(layers: F32, known: Bool, largest_cells: int) -> tuple[F32, Bool]:
-    """Mean of the known cells around each cell, from the smallest window that has any."""
+def _normalised_blur(layers: F32, known: Bool, holes: Bool, largest_cells: int) -> tuple[F32, Bool]:
+    """Mean of the known cells around each hole, from the smallest window that has any.
+
+    The mask says which holes have one.
+    """
     out = layers.copy()
-    reached = known.copy()
+    filled = np.zeros_like(holes)
     weight = known.astype(np.float32)
     weighted = layers * weight[..., None]
     for radius in range(1, largest_cells + 1):
+        if (filled == holes).all():
+            break
         window = (2 * radius + 1, 2 * radius + 1)
         total = cv2.boxFilter(weight, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        new = ~reached & (total > 0.5)
+        new = holes & ~filled & (total > 0.5)
         if new.any():
             sums = cv2.boxFilter(
                 weighted, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT
             )
             out[new] = sums[new] / total[new][:, None]
-            reached |= new
-    return out, reached
+            filled |= new
+    return out, filled
 
 
 def smoothed(raster: Raster, sigma_cells: float = 1.5) -> Raster:

@@ -12,19 +12,21 @@ import json
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from recon.bands import at_once
 from recon.surface.raster import Raster, grid_over, rasterise
 from recon.types import PointCloud
 from service.errors import OutsideError, SkyreliefError
 from service.georeference import LocalFrame
 from service.redaction import public_configuration, redacted
 from service.scans.coverage import IMAGE as COVERAGE
-from service.scans.coverage import write_coverage_files
+from service.scans.coverage import Coverage, write_coverage_files
 from service.scans.drawing import blank_preview, draw_preview, middle_keyframe, stages
 from service.scans.fused_cloud import DEFAULT_VOXEL_M, FusedCloud, fused_cloud, write_laz
 from service.scans.main_piece import in_words, main_poses, main_seqs, stretches_apart
@@ -75,45 +77,81 @@ def write_deliverables(
     A file that cannot be made is listed under ``failed``, with the reason, and logged; the others
     are written. Raises OutsideError, at the end, when the folder cannot be written.
     """
-    header = store.header
-    failures = Failures(folder)
-    frame = local_frame(header)
-    poses = latest(store.poses())
-    fused, raster, coverage = NOTHING, None, None
-    with failures.noted(CLOUD):
-        fused = fused_cloud(store, voxel_m or _resolution_m(header))
-        with writing(folder / CLOUD) as part:
-            write_laz(part, fused.cloud, frame, header.started_unix_ns)
-    with failures.noted(TUM), writing(folder / TUM) as part:
-        part.write_text(tum_lines(poses), encoding="ascii")
-    with failures.noted(CSV), writing(folder / CSV) as part:
-        part.write_text(csv_table(poses), encoding="utf-8")
-    with failures.noted(PREVIEW):
-        raster = surface(fused)
-    run = (store.summary or {}) | extra
-    summary = _summary(header, frame, poses, fused, raster, run, store.finished)
-    left_out = in_words(store)
-    summary["notes"] += [left_out] if left_out else []
-    with failures.noted(COVERAGE):
-        coverage = write_coverage_files(folder, store)
-    summary["coverage"] = None if coverage is None else coverage.figures()
-    summary["refinement"] = store.refinement
-    preview = b""
-    shown_poses = main_poses(poses, stretches_apart(store))
-    with failures.noted(PREVIEW):
-        preview = _preview(raster, shown_poses, summary, left_out)
-        with writing(folder / PREVIEW) as part:
-            part.write_bytes(preview)
-    with failures.noted(REPORT), writing(folder / REPORT) as part:
-        shown = _stages(folder, store)
-        page = report_html(summary, shown_poses, fused.cloud, raster, preview, coverage, shown)
-        part.write_text(page, encoding="utf-8")
+    files = _Files(folder, store, voxel_m)
+    files.write_trajectory()
+    at_once(files.fuse, files.cover)
+    summary = files.summary(extra)
+    at_once(partial(files.draw, summary), files.write_cloud)
+    failures = files.failures
     summary["failed"], summary["files_due"] = failures.why, failures.of_the_disk is not None
     with writing(folder / SUMMARY) as part:
         part.write_text(json.dumps(summary, indent=2, sort_keys=True) + "\n", encoding="utf-8")
     if failures.of_the_disk is not None:
         raise failures.of_the_disk
     return summary
+
+
+class _Files:
+    """The parts of a scan's files, while they are made."""
+
+    def __init__(self, folder: Path, store: ScanStore, voxel_m: float | None) -> None:
+        self._folder, self._store, self._voxel_m = folder, store, voxel_m
+        self.failures = Failures(folder)
+        self._frame, self._poses = local_frame(store.header), latest(store.poses())
+        self._left_out = in_words(store)
+        self._fused = NOTHING
+        self._raster: Raster | None = None
+        self._coverage: Coverage | None = None
+
+    def write_trajectory(self) -> None:
+        with self.failures.noted(TUM), writing(self._folder / TUM) as part:
+            part.write_text(tum_lines(self._poses), encoding="ascii")
+        with self.failures.noted(CSV), writing(self._folder / CSV) as part:
+            part.write_text(csv_table(self._poses), encoding="utf-8")
+
+    def fuse(self) -> None:
+        """Make the cloud and its surface."""
+        with self.failures.noted(CLOUD):
+            size = self._voxel_m or _resolution_m(self._store.header)
+            self._fused = fused_cloud(self._store, size)
+        with self.failures.noted(PREVIEW):
+            self._raster = surface(self._fused)
+
+    def cover(self) -> None:
+        with self.failures.noted(COVERAGE):
+            self._coverage = write_coverage_files(self._folder, self._store)
+
+    def summary(self, extra: dict[str, Any]) -> dict[str, Any]:
+        """The content of scan.json."""
+        store = self._store
+        run = (store.summary or {}) | extra
+        out = _summary(
+            store.header, self._frame, self._poses, self._fused, self._raster, run, store.finished
+        )
+        out["notes"] += [self._left_out] if self._left_out else []
+        out["coverage"] = None if self._coverage is None else self._coverage.figures()
+        out["refinement"] = store.refinement
+        return out
+
+    def write_cloud(self) -> None:
+        if self._fused is not NOTHING:
+            with self.failures.noted(CLOUD), writing(self._folder / CLOUD) as part:
+                started = self._store.header.started_unix_ns
+                write_laz(part, self._fused.cloud, self._frame, started)
+
+    def draw(self, summary: dict[str, Any]) -> None:
+        """Write the preview and the report."""
+        preview = b""
+        poses = main_poses(self._poses, stretches_apart(self._store))
+        with self.failures.noted(PREVIEW):
+            preview = _preview(self._raster, poses, summary, self._left_out)
+            with writing(self._folder / PREVIEW) as part:
+                part.write_bytes(preview)
+        with self.failures.noted(REPORT), writing(self._folder / REPORT) as part:
+            shown = _stages(self._folder, self._store)
+            cloud, coverage = self._fused.cloud, self._coverage
+            page = report_html(summary, poses, cloud, self._raster, preview, coverage, shown)
+            part.write_text(page, encoding="utf-8")
 
 
 class Failures:

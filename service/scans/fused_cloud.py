@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from recon.bands import threads
 from recon.mapping.cloud_fusion import cloud_of, fuse_strips, without
 from recon.mapping.free_space import seen_through, spread
 from recon.mapping.voxel_map import ground_sample_m
@@ -24,8 +25,8 @@ from service.scans.main_piece import Keyframes, main_keyframes
 if TYPE_CHECKING:
     import laspy
 
-STRIP_POINTS = 4_000_000
-"""Points fused at once; the sums of a strip take some hundred bytes each."""
+MIN_STRIP_POINTS, STRIP_POINTS = 100_000, 4_000_000
+"""Points that a core fuses at once; the sums of a strip take some hundred bytes each."""
 
 LARGEST_POINTS = 60_000_000
 """Maximum points before fusion; a scan with more gets larger voxels, and a note."""
@@ -60,10 +61,10 @@ class _Extent:
 def fused_cloud(store: Keyframes, voxel_m: float | None = None) -> FusedCloud:
     """The main piece of ``store`` fused; voxels of the ground sample distance by default.
 
-    Points that other keyframes see through are removed. The store is read several times, so that
-    memory holds only the fused points and the sums of one strip of the site at a time.
+    Points that other keyframes see through are removed. A long scan is read several times, so that
+    memory holds only the fused points and the sums of one strip of the site per core.
     """
-    extents = _extents(store)
+    extents, held = _extents(store)
     points = sum(e.points for e in extents)
     sample = float(np.median([e.ground_sample_m for e in extents])) if extents else None
     size = max(voxel_m or sample or DEFAULT_VOXEL_M, SMALLEST_VOXEL_M)
@@ -71,9 +72,10 @@ def fused_cloud(store: Keyframes, voxel_m: float | None = None) -> FusedCloud:
     if points > LARGEST_POINTS:
         size *= float(np.sqrt(points / LARGEST_POINTS))
         notes = (f"{points} points before fusion: voxels enlarged to {size:.3f} m",)
-    edges = strip_edges(extents, STRIP_POINTS)
-    strips = [_strip(store, extents, a, b) for a, b in pairwise(edges)]
+    edges = strip_edges(extents, min(STRIP_POINTS, max(points // threads(), MIN_STRIP_POINTS)))
+    strips = [_strip(store, extents, held, a, b) for a, b in pairwise(edges)]
     cloud = fuse_strips(strips, edges, size)
+    held.clear()
     if len(cloud):
         seqs = [e.seq for e in extents]
         depths = (k.depth for seq in spread(seqs) if (k := store.keyframe(seq)) is not None)
@@ -81,16 +83,21 @@ def fused_cloud(store: Keyframes, voxel_m: float | None = None) -> FusedCloud:
     return FusedCloud(cloud, size, sample, len(extents), points, notes)
 
 
-def _extents(store: Keyframes) -> list[_Extent]:
-    """The keyframes of the main piece with points."""
-    out = []
+def _extents(store: Keyframes) -> tuple[list[_Extent], dict[int, PointCloud]]:
+    """The keyframes of the main piece with points, and the clouds of the first of them."""
+    out: list[_Extent] = []
+    held: dict[int, PointCloud] = {}
+    room = STRIP_POINTS
     for keyframe in main_keyframes(store):
         sample = ground_sample_m(keyframe.depth)
         cloud = cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh)
         if sample is not None and len(cloud):
             x = cloud.xyz_m[:, 0]
             out.append(_Extent(keyframe.seq, len(cloud), sample, float(x.min()), float(x.max())))
-    return out
+            room -= len(cloud)
+            if room >= 0:
+                held[keyframe.seq] = cloud
+    return out, held
 
 
 def strip_edges(extents: Iterable[_Extent], max_points: int) -> list[float]:
@@ -111,16 +118,21 @@ def strip_edges(extents: Iterable[_Extent], max_points: int) -> list[float]:
 
 
 def _strip(
-    store: Keyframes, extents: list[_Extent], low_m: float, high_m: float
+    store: Keyframes,
+    extents: list[_Extent],
+    held: dict[int, PointCloud],
+    low_m: float,
+    high_m: float,
 ) -> Callable[[], Iterator[PointCloud]]:
-    """The clouds of the keyframes that overlap a strip, read on demand."""
+    """The clouds of the keyframes that overlap a strip, ``held`` or read on demand."""
     margin = 1.0  # edges are moved by up to a voxel
     seqs = [e.seq for e in extents if e.east_m >= low_m - margin and e.west_m <= high_m + margin]
 
     def clouds() -> Iterator[PointCloud]:
         for seq in seqs:
-            keyframe = store.keyframe(seq)
-            if keyframe is not None:
+            if seq in held:
+                yield held[seq]
+            elif (keyframe := store.keyframe(seq)) is not None:
                 yield cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh)
 
     return clouds
