@@ -103,6 +103,6 @@ def _text(report: dict[str, Any]) -> str:
         *(f"  not used   {view}: {reason}" for view, reason in report["not_used"].items()),
         *(f"warning: {warning}" for warning in report["warnings"]),
         "",
-        f"wrote {report['out']} and {report['coverage_image']}",
+        f"wrote {report['out']} and {report['coverage_picture']}",
     ]
     return "\n".join(lines)
