@@ -112,6 +112,26 @@ def test_covariance_covers_the_errors() -> None:
     assert 3.5 < np.mean(squared) < 9.5
 
 
+def test_the_motion_between_two_views_is_known_better_than_their_poses() -> None:
+    """Normalised squared errors of the last motion have the right mean (6), noise by residuals."""
+    squared, sharper = [], []
+    for seed in range(30):
+        T, X, cam, pt, uv = flight(seed, cameras=7, points=150)
+        noisy = uv + np.random.default_rng(200 + seed).normal(0, 0.1, uv.shape)
+        free = np.arange(len(T)) >= 2
+        found = bundle.adjust(
+            T, X, cam, pt, noisy, K, free, huber_px=10.0, sigma_px=None, iterations=20
+        )
+        before, last = found.T_camera_world[-2:]
+        error = se3.log((last @ se3.inverse(before)) @ se3.inverse(T[-1] @ se3.inverse(T[-2])))
+        covariance = found.step_covariance(5, 6)
+        squared.append(error @ np.linalg.solve(covariance, error))
+        sharper.append(np.trace(covariance[3:, 3:]) / np.trace(found.covariance[-1][3:, 3:]))
+    assert 3.5 < np.mean(squared) < 9.5
+    assert np.median(sharper) < 0.8
+    np.testing.assert_allclose(found.step_covariance(1, 2), found.covariance[2])  # 1 is fixed
+
+
 def test_fixed_cameras_stay() -> None:
     T, X, cam, pt, uv = flight(4)
     free = np.array([False, False, True, False, True, True])

@@ -215,3 +215,26 @@ def test_each_landmark_is_searched_once(ground: U8, monkeypatch: pytest.MonkeyPa
             assert a and not a & b
             assert len(a | b) <= 1.5 * OdometryConfig().tracked_landmarks
     assert pairs > 5
+
+
+def test_motions_between_keyframes_are_as_good_as_claimed(ground: U8) -> None:
+    """Their errors are about their sigmas, and the first baseline is the unit of length."""
+    track = poses(40)
+    odometry, _ = fly(ground, track[:8], True)
+    first, second = odometry.keyframes[:2]
+    along = (second.T_camera_odom @ first.T_odom_camera)[:3, 3]
+    along /= np.linalg.norm(along)
+    assert along @ second.covariance[3:, 3:] @ along < 1e-12 < np.trace(second.covariance[3:, 3:])
+    odometry, _ = fly(ground, track, True)
+    seen, true, sigmas = [], [], []
+    for a, b in pairwise(odometry.keyframes[2:]):
+        seen.append(b.T_camera_odom @ a.T_odom_camera)
+        true.append(se3.inverse(track[b.seq]) @ track[a.seq])
+        sigmas.append(np.sqrt(np.diag(b.covariance)))
+    scale = np.median([np.linalg.norm(t[:3, 3]) / np.linalg.norm(s[:3, 3])
+                       for s, t in zip(seen, true, strict=True)])  # fmt: skip
+    errors = []
+    for s, t, sigma in zip(seen, true, sigmas, strict=True):
+        s[:3, 3] *= scale
+        errors.append(se3.log(s @ se3.inverse(t)) / sigma)
+    assert 0.3 < np.sqrt(np.mean(np.square(errors))) < 3.0

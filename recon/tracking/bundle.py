@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from recon import se3
 from recon.small_matrices import invert_3x3, solve_symmetric
 from recon.types import F64, Bool
 
@@ -30,8 +31,19 @@ class BundleResult:
     T_camera_world: F64  # (C, 4, 4)
     points_m: F64  # (N, 3) world
     residual_px: F64  # (M,) length of the reprojection error, inf behind the camera
-    covariance: F64  # (C, 6, 6) left perturbation of T_camera_world; zero for fixed cameras
+    joint: F64  # (C, C, 6, 6) covariance, left perturbations of T_camera_world; zero where fixed
     converged: bool
+
+    @property
+    def covariance(self) -> F64:
+        """(C, 6, 6) of each pose."""
+        return np.asarray(np.einsum("ccij->cij", self.joint))
+
+    def step_covariance(self, a: int, b: int) -> F64:
+        """(6, 6) of the motion from camera ``a`` to ``b``, left perturbation of T_b_a."""
+        A = se3.adjoint(self.T_camera_world[b] @ se3.inverse(self.T_camera_world[a]))
+        both = self.joint[b, a] @ A.T
+        return np.asarray(self.joint[b, b] - both - both.T + A @ self.joint[a, a] @ A.T)
 
 
 @njit(cache=True, nogil=True)
@@ -269,7 +281,7 @@ def adjust(
     free: Bool,
     *,
     huber_px: float = 1.0,
-    sigma_px: float = 0.3,
+    sigma_px: float | None = 0.3,
     iterations: int = 8,
 ) -> BundleResult:
     """Poses and points that explain the pixels best.
@@ -282,7 +294,7 @@ def adjust(
         K: (3, 3) intrinsics shared by the cameras.
         free: (C,) True for the cameras that may move.
         huber_px: error at which the quadratic cost turns linear.
-        sigma_px: pixel noise that the covariances are scaled with.
+        sigma_px: pixel noise that the covariances are scaled with; None: as the residuals show.
         iterations: most Levenberg-Marquardt steps.
 
     Raises ValueError when the shapes do not match or no camera is free.
@@ -312,14 +324,24 @@ def adjust(
         n_free,
         iterations,
     )
-    covariance = np.zeros((T.shape[0], 6, 6))
+    if sigma_px is None:
+        sigma_px = noise_px(residual, 3 * len(X) + 6 * n_free)
+    C, moving = len(T), np.flatnonzero(free)
+    joint = np.zeros((C, C, 6, 6))
     full = np.linalg.pinv(S, hermitian=True) * sigma_px**2
-    for c in np.flatnonzero(free):
-        i = 6 * slot[c]
-        covariance[c] = full[i : i + 6, i : i + 6]
+    joint[np.ix_(moving, moving)] = full.reshape(n_free, 6, n_free, 6).swapaxes(1, 2)
     back = np.empty(M)
     back[order] = residual
-    return BundleResult(T, X, back, covariance, bool(improved))
+    return BundleResult(T, X, back, joint, bool(improved))
+
+
+def noise_px(residual_px: F64, unknowns: int) -> float:
+    """Noise of one coordinate by the median length of (M,) residuals, of a fit of so many unknowns.
+
+    Lengths of two normal coordinates are Rayleigh's; their median is 1.1774 sigma.
+    """
+    free = max(2 * len(residual_px) - unknowns, 1)
+    return float(np.median(residual_px)) / 1.1774 * float(np.sqrt(2 * len(residual_px) / free))
 
 
 def triangulate(T_a_world: F64, T_b_world: F64, K: F64, uv_a: F64, uv_b: F64) -> tuple[F64, F64]:

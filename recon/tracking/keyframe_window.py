@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,7 +79,7 @@ class OdometryKeyframe:
     time_ns: int
     segment: int
     T_camera_odom: F64  # (4, 4)
-    covariance: F64  # (6, 6) left perturbation of T_camera_odom
+    covariance: F64  # (6, 6) of the motion from the keyframe before, left of T_camera_before
     prior: PosePrior
     pyramid: matching.Pyramid
     uv: F64  # (N, 2) corners
@@ -170,14 +171,24 @@ def adjust_window(window: list[OdometryKeyframe], K: F64) -> None:
         np.concatenate(uv)[use],
         K,
         free,
+        sigma_px=None,
     )
     for c in np.flatnonzero(free):
         window[c].T_camera_odom = result.T_camera_world[c]
-        window[c].covariance = result.covariance[c]
+        window[c].covariance = result.step_covariance(c - 1, c)
     table[ids] = result.points_m
     _drop_outliers(window, ids, index, np.concatenate(cam)[use], result.residual_px)
     if len(window) == 2:
         _restore_baseline(window, base)
+
+
+def step_covariance(keys: Sequence[OdometryKeyframe], T_camera_odom: F64) -> F64:
+    """(6, 6) of a motion over consecutive keyframes, left perturbation at a camera."""
+    out = np.zeros((6, 6))
+    for key in keys:
+        A = se3.adjoint(T_camera_odom @ key.T_odom_camera)
+        out += A @ key.covariance @ A.T
+    return out
 
 
 def _baseline(window: list[OdometryKeyframe]) -> float:
@@ -193,6 +204,10 @@ def _restore_baseline(window: list[OdometryKeyframe], base: float) -> None:
     T = window[1].T_odom_camera
     T[:3, 3] = origin + (T[:3, 3] - origin) * factor
     window[1].T_camera_odom = se3.inverse(T)
+    along = window[1].T_camera_odom[:3, :3] @ (T[:3, 3] - origin)
+    across = np.eye(6)
+    across[3:, 3:] -= np.outer(along, along) / max(float(along @ along), 1e-18)
+    window[1].covariance = across @ window[1].covariance @ across.T  # the baseline is the unit
 
 
 def _drop_outliers(

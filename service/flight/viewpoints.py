@@ -17,7 +17,7 @@ from recon import se3
 from recon.posegraph.between_keyframes import FixAverage
 from recon.rolling_shutter import FrameRows
 from recon.stereo.virtual_stereo import View
-from recon.tracking.keyframe_window import OdometryKeyframe, landmarks
+from recon.tracking.keyframe_window import OdometryKeyframe, landmarks, step_covariance
 from recon.tracking.odometry import Odometry, Tracked
 from recon.tracking.prediction import inverse_depth_plane
 from recon.types import F64, U8, Camera, PosePrior
@@ -89,7 +89,7 @@ class StereoCandidate:
     partners: tuple[View, ...]
     anchor: Anchorage
     points: F64  # (N, 3) landmarks in the view's camera
-    covariance: F64  # (6, 6) of the view's pose, left perturbation of camera-from-odometry
+    covariance: F64  # (6, 6) of vision's motion from the view before, left, in the view's camera
     earlier: Mapping[int, F64]  # number to pose (4, 4) of the segment's last few views
 
 
@@ -345,9 +345,16 @@ class StereoViews:
             tuple(self._posed(partner, in_odom) for partner in self.selection.partners(view)),
             view.anchor,
             points,
-            view.key.covariance,
+            self._step_covariance(view),
             {v.seq: v.T_odom_camera for v in self._given if v.segment == view.segment},
         )
+
+    def _step_covariance(self, view: Viewpoint) -> F64:
+        """(6, 6) of the motion since the view given before."""
+        since = self._given[-1].key.seq if self._given else -1
+        T_camera_odom = se3.inverse(view.T_odom_camera)
+        keys = [k for k in self._odometry.keyframes if since < k.seq <= view.key.seq]
+        return step_covariance(keys or [view.key], T_camera_odom)
 
     def _posed(self, view: Viewpoint, points: F64) -> View:
         """The view with its pose; ``points`` (N, 3) of the odometry are the ground before it."""
