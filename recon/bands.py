@@ -7,7 +7,6 @@ compile each.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
@@ -18,14 +17,7 @@ from numba import config
 
 T = TypeVar("T")
 
-
-class _Limit(threading.local):
-    """How many threads a call from this thread may use."""
-
-    threads = 0  # one per core
-
-
-_limit = _Limit()
+_limit = 0  # threads that one call may use; 0: one per core
 
 
 def cores() -> int:
@@ -34,24 +26,20 @@ def cores() -> int:
 
 
 def limit_threads(threads: int) -> None:
-    """Let calls from this thread use so many threads, at most one per core; 0: one per core."""
-    _limit.threads = max(threads, 0)
+    """Let each call of this process use so many threads, at most one per core; 0: one per core."""
+    global _limit
+    _limit = max(threads, 0)
 
 
 def threads() -> int:
-    """How many threads a call from this thread uses."""
-    return min(_limit.threads or cores(), cores())
+    """How many threads a call may use."""
+    return min(_limit or cores(), cores())
 
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    """The threads that all callers share; none is started before it is needed.
-
-    A call from one of them shares nothing out: it would wait for threads that wait themselves.
-    """
-    return ThreadPoolExecutor(
-        max(cores(), 1), thread_name_prefix="bands", initializer=limit_threads, initargs=(1,)
-    )
+    """The threads that all callers share; none is started before it is needed."""
+    return ThreadPoolExecutor(max(cores(), 1), thread_name_prefix="bands")
 
 
 def at_once(*calls: Callable[[], T]) -> list[T]:
@@ -69,18 +57,29 @@ def at_once(*calls: Callable[[], T]) -> list[T]:
 def in_bands(kernel: Callable[..., None], count: int, *arguments: Any) -> None:
     """Call ``kernel(first, end, *arguments)`` so that 0 to ``count`` is covered once.
 
-    The bands run at the same time, so none may write what another reads. An exception of the
-    kernel is raised after all bands have ended.
+    The bands run at the same time, so none may write what another reads. A band that no thread has
+    begun when the caller is done with its own is the caller's too: nobody waits for the work of
+    others, and a band may share out rows itself. An exception of the kernel is raised after all
+    bands have ended.
     """
     bands = min(threads(), count)
     if bands <= 1:
         kernel(0, count, *arguments)
         return
     edges = [count * k // bands for k in range(bands + 1)]
-    others = [_pool().submit(kernel, first, end, *arguments) for first, end in pairwise(edges[1:])]
-    try:
-        kernel(edges[0], edges[1], *arguments)
-    finally:
-        wait(others)
-    for one in others:
-        one.result()
+    faults: dict[int, Exception] = {}
+
+    def run(first: int, end: int) -> None:
+        try:
+            kernel(first, end, *arguments)
+        except Exception as fault:
+            faults[first] = fault
+
+    others = {_pool().submit(run, *band): band for band in pairwise(edges[1:])}
+    run(edges[0], edges[1])
+    for one, band in others.items():
+        if one.cancel():
+            run(*band)
+    wait(one for one in others if not one.cancelled())
+    if faults:
+        raise faults[min(faults)]

@@ -100,12 +100,8 @@ class BackgroundWorker(Generic[In, Out]):
         work: Callable[[In], Out],
         bound: int,
         live: bool = False,
-        prepare: Callable[[], object] | None = None,
     ) -> None:
-        """``prepare`` is called once on the thread, with the first work; what it raises counts as
-        raised by that work, and it is called again with the next."""
         self._work, self._bound, self._live = work, bound, live
-        self._prepare = prepare if row is not None else None
         self._offered: dict[Future[Out], In] = {}  # in order; dropped items leave at once
         self.dropped = 0
         self._began_s: list[float] = []  # start of the current work, if any
@@ -169,9 +165,6 @@ class BackgroundWorker(Generic[In, Out]):
             return
         self._began_s.append(time.monotonic())
         try:
-            if self._prepare is not None:
-                self._prepare()
-                self._prepare = None
             result = self._work(self._offered[future])
         except Exception as error:  # raised where the result is taken
             self._began_s.clear()

@@ -92,24 +92,6 @@ def test_what_was_done_before_a_fault_is_not_lost() -> None:
     assert jobs.finished() == [(3, 3), (4, 4)]
 
 
-def test_a_fault_while_it_prepares_reaches_the_caller() -> None:
-    tried: list[int] = []
-
-    def prepare() -> None:
-        tried.append(1)
-        if len(tried) == 1:
-            raise RuntimeError("no device")
-
-    jobs = BackgroundWorker("dense", str, 2, prepare=prepare)
-    for n in range(3):
-        jobs.offer(n)
-    with pytest.raises(RuntimeError, match="no device"):
-        jobs.finished(everything=True)
-    assert jobs.finished(everything=True) == [(1, "1"), (2, "2")]
-    jobs.close()
-    assert len(tried) == 2
-
-
 def test_without_a_thread_the_work_is_done_at_once() -> None:
     seen: list[int] = []
     jobs: BackgroundWorker[int, None] = BackgroundWorker(None, seen.append, 2, live=True)

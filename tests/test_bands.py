@@ -50,19 +50,31 @@ def test_bands_run_at_the_same_time(four: None) -> None:
     bands.in_bands(meet, 4)
 
 
-def test_a_thread_keeps_to_its_own_limit(four: None) -> None:
+def test_no_call_uses_more_threads_than_the_limit(four: None) -> None:
     calls: list[tuple[int, int]] = []
     bands.limit_threads(1)
     try:
         bands.in_bands(lambda begin, end: calls.append((begin, end)), 8)
-        assert calls == [(0, 8)]
-        other: list[int] = []
-        thread = threading.Thread(target=lambda: other.append(bands.threads()))
-        thread.start()
-        thread.join()
-        assert other == [4]
     finally:
         bands.limit_threads(0)
+    assert calls == [(0, 8)]
+    assert bands.threads() == 4
+
+
+def test_a_caller_does_what_no_thread_has_begun(four: None) -> None:
+    """A short call ends while a long one of another thread occupies all threads."""
+    release, seen = threading.Event(), np.zeros(8, int)
+    busy = [bands._pool().submit(release.wait, 20.0) for _ in range(4)]
+
+    def note(begin: int, end: int) -> None:
+        seen[begin:end] += 1
+
+    try:
+        bands.in_bands(note, 8)
+        assert not any(one.done() for one in busy)
+    finally:
+        release.set()
+    assert (seen == 1).all()
 
 
 def test_a_fault_is_raised_after_all_bands_have_ended(four: None) -> None:

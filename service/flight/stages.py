@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from recon import se3
 from recon.backends import Backend, DenseStages, PathBackend
-from recon.bands import cores, limit_threads
+from recon.bands import limit_threads
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
 from recon.mapping.plausibility import plausible
@@ -366,17 +365,6 @@ class Stages:
     resources: ExitStack  # what to close in the end
 
 
-def _share_cores(threads: int) -> Callable[[], None]:
-    """Limit kernels of this thread to half of ``threads`` (0: one per core).
-
-    Returns what gives the other half to its calling thread: two threads that each use all cores
-    only wait for each other.
-    """
-    half = max(1, min(threads or cores(), cores()) // 2)
-    limit_threads(half)
-    return partial(limit_threads, half)
-
-
 def build_stages(
     camera: Camera,
     config: Config,
@@ -393,6 +381,7 @@ def build_stages(
     drop the oldest parts of the map. ``is_lens_assumed`` widens sigmas.
     """
     compute, stopwatch, resources = config.compute, Stopwatch(), ExitStack()
+    limit_threads(compute.threads)
     refused: Counter[str] = Counter()
     rejected: Counter[str] = Counter()
     debug: dict[str, Array] | None = {} if config.scan.keep_debug else None
@@ -424,7 +413,7 @@ def build_stages(
     ) -> BackgroundWorker[StereoCandidate, Keyframe | None]:
         if debug is not None:
             return BackgroundWorker(None, work, MAX_WAITING, live)
-        return BackgroundWorker("dense", work, MAX_WAITING, live, _share_cores(compute.threads))
+        return BackgroundWorker("dense", work, MAX_WAITING, live)
 
     return Stages(
         undistort=undistort,
