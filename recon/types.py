@@ -115,7 +115,7 @@ class StereoPair:
     plane: F64  # (3,) disparity of label 0 as an affine function of the left pixel
     slope: float  # d(disparity) / d(label)
     R_left_keyframe: F64  # (3, 3) keyframe camera to rectified left camera
-    guide: U8 | None = None  # (H, W, 3) rectified left in colour, at guidance resolution
+    guide: U8 | None = None  # (H, W, 3) rectified left in colour, as fine as (h, w) or finer
     left_seen: Bool | None = None  # (h, w) False where the left image has nothing
     right_seen: Bool | None = None  # (h, w) the same of the shifted right image
 
@@ -142,7 +142,7 @@ class PolarPair:
     first_label: float  # columns from the plane to label 0
     relief: tuple[float, float]  # of what is accepted: shares of the distance nearer than the plane
     R_left_keyframe: F64  # (3, 3) keyframe camera to polar axes
-    guide: U8 | None = None  # (H, W, 3) left in colour, at guidance resolution
+    guide: U8 | None = None  # (H, W, 3) left in colour, as fine as (h, w) or finer
     left_seen: Bool | None = None  # (h, w) False where the left view has nothing
     right_seen: Bool | None = None  # (h, w) the same of the shifted right view
 

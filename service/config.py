@@ -161,7 +161,11 @@ class ComputeConfig:
     )
     labels: int = key(16, "minimum number of disparity labels; the paper's is 16")
     iterations: int = key(5, "iterations of belief propagation per level; the paper's is 5")
-    guide_width: int = key(1280, "width of the image that guides the upsampling")
+    guide_width: int = key(
+        1280,
+        "width to which wider images are reduced, but for a third more; what guides the "
+        "upsampling is read from them",
+    )
     upsample: bool = key(True, "joint bilateral upsampling; without it depth is coarser and faster")
     pairs: int = key(4, "maximum number of stereo pairs fused into a keyframe")
     relief: bool = key(

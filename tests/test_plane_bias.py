@@ -29,7 +29,7 @@ def heights(width_px: int, upsampled: bool, east_m: float) -> F64:
     left, right = views
     w, h = width_px, round(width_px * SIZE[1] / SIZE[0])
     K_grid = scaled_K(CAMERA.K, w / SIZE[0], h / SIZE[1])
-    config = VirtualStereoConfig(width_px=w, guide_width_px=max(w, SIZE[0]), guided=upsampled)
+    config = VirtualStereoConfig(width_px=w, guided=upsampled)
     pair = rectify(left, right, on_plane(K_grid, (w, h), left.T_odom_camera)[::97], config)
     assert isinstance(pair, StereoPair)
     labels = belief_propagation(pair.left, pair.right, pair.labels, BeliefPropagationConfig())

@@ -17,7 +17,7 @@ W, H = 640, 360
 K = np.array([[480.0, 0, 321.0], [0, 480.0, 178.0], [0, 0, 1]])
 SIZE = (160, 90)
 GRID_K = np.array([[120.0, 0, 80.0], [0, 120.0, 44.2], [0, 0, 1]])
-CONFIG = VirtualStereoConfig(width_px=160, guide_width_px=320, guided=False)
+CONFIG = VirtualStereoConfig(width_px=160, guided=False)
 LEVEL = np.array(
     [[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]
 )  # looks east; columns are right, down, ahead

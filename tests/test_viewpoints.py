@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from recon import se3
+from recon.camera_model import Undistorter
 from recon.rolling_shutter import FrameRows
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
 from recon.tracking.matching import Pyramid
 from recon.tracking.odometry import Tracked
-from recon.types import PosePrior
+from recon.types import U8, Camera, PosePrior
 from service.config import ScanConfig
 from service.flight.anchorage import Anchorage
-from service.flight.viewpoints import Viewpoint, Viewpoints, frames_apart
+from service.flight.viewpoints import Colour, Viewpoint, Viewpoints, frames_apart
 
 
 def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> Viewpoint:
@@ -24,7 +25,8 @@ def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> View
     )  # fmt: skip
     image = np.zeros((32, 32, 3), np.uint8)
     anchor = Anchorage(seq, key, np.eye(4))
-    return Viewpoint(seq, seq, PosePrior(), image, image[..., 0], key, anchor, blurred)
+    colour = Colour(image, Undistorter(Camera(np.diag([30.0, 30.0, 1.0]), np.zeros(5), (32, 32))))
+    return Viewpoint(seq, seq, PosePrior(), colour, image[..., 0], key, anchor, blurred)
 
 
 def offer(
@@ -33,6 +35,24 @@ def offer(
     taken = frame(seq, x_m, segment, blurred)
     tracked = Tracked(state, segment, taken.T_odom_camera)
     return taken if views.offer(taken, tracked) else None
+
+
+def test_colour_is_undistorted_once_and_only_when_asked_for() -> None:
+    lens = Camera(np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]), np.full(5, 0.05), (32, 32))
+    undistorter, calls = Undistorter(lens), []
+    image = np.random.default_rng(0).integers(0, 255, (32, 32, 3), np.uint8)
+    want = undistorter.image(image)
+
+    class Counted(Undistorter):
+        def image(self, image: U8) -> U8:
+            calls.append(image.shape)
+            return super().image(image)
+
+    colour = Colour(image, Counted(lens))
+    assert not calls
+    for _ in range(2):
+        np.testing.assert_array_equal(colour.bgr, want)
+    assert len(calls) == 1
 
 
 def test_automatic_takes_the_odometrys_keyframes() -> None:

@@ -21,7 +21,7 @@ from recon.types import F64, U8, DepthMap, DisparityMap, StereoPair
 
 W, H = 640, 360
 K = np.array([[500.0, 0, 319.5], [0, 500.0, 179.5], [0, 0, 1]])
-CONFIG = VirtualStereoConfig(width_px=160, guide_width_px=320)
+CONFIG = VirtualStereoConfig(width_px=160)
 
 
 def view(seq: int, centre: tuple[float, float, float], turn: tuple[float, float, float]) -> View:
@@ -92,6 +92,18 @@ def test_true_labels_give_the_true_depth_on_the_keyframe_grid() -> None:
     known = np.isfinite(got.depth_m)
     assert known.mean() > 0.9
     assert np.abs(got.depth_m - truth)[known].max() < 1e-3
+
+
+def test_the_guide_lies_on_the_grid_of_the_pair() -> None:
+    """The keyframe has no finer pixels, so Eq. 2 is evaluated at none."""
+    left = view(0, (0.0, 0.0, 60.0), (0.0, 0.0, 0.0))
+    right = view(1, (4.0, 0.0, 60.0), (0.0, 0.0, 0.0))
+    points = se3.transform(se3.inverse(left.T_odom_camera), ground(np.random.default_rng(5)))
+    pair = rectify(left, right, points, CONFIG)
+    assert isinstance(pair, StereoPair) and pair.guide is not None
+    assert pair.guide.shape == (*pair.left.shape, 3)
+    of_guide = pair.guide[..., 0][10:-10, 10:-10].astype(float)
+    assert np.corrcoef(of_guide.ravel(), pair.left[10:-10, 10:-10].ravel())[0, 1] > 0.5
 
 
 def test_refusals_name_their_reason() -> None:

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+from numba import njit, types
+from numba.extending import intrinsic
 
 from recon.bands import in_bands
 from recon.types import U8
@@ -150,14 +151,14 @@ def _census(padded: Any, words: Any) -> None:  # pragma: no cover - compiled
                         row[u] = (row[u] << np.uint64(1)) | darker
 
 
-@njit(inline="always")
-def _popcount(word: Any) -> Any:  # pragma: no cover - compiled
-    word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
-    word = (word & np.uint64(0x3333333333333333)) + (
-        (word >> np.uint64(2)) & np.uint64(0x3333333333333333)
-    )
-    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return (word * np.uint64(0x0101010101010101)) >> np.uint64(56)
+@intrinsic
+def _popcount(typingctx: Any, word: Any) -> Any:
+    """How many bits of a 64-bit word are set: one instruction, or a few on vector registers."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.ctpop(args[0])
+
+    return types.uint64(types.uint64), codegen
 
 
 @njit(cache=True, nogil=True)

@@ -222,7 +222,7 @@ def rectify_polar(
     right_gray, right_seen = right_view.for_stereo()
     guide = None
     if config.guided and left.bgr is not None:
-        guide = left_view.warped(left.bgr, max(1.0, config.guide_width_px / config.width_px))
+        guide = left_view.warped(left.bgr, 1.0)
     return PolarPair(
         left=left_gray,
         right=right_gray,

@@ -43,7 +43,6 @@ class VirtualStereoConfig:
     max_base_to_height: float = 0.45
     min_overlap: float = 0.4  # share of the left view that the right one sees
     width_px: int = 320  # of the stereo views, along the image's width
-    guide_width_px: int = 1280  # of the image that guides the upsampling
     guided: bool = True  # make the image that guides the upsampling
     labels: int = 16  # the fewest; relief may widen it
     max_labels: int = 96
@@ -58,8 +57,8 @@ class VirtualStereoConfig:
             raise ValueError("0 < min_base_to_height < max_base_to_height must hold")
         if self.labels < 4 or self.max_labels < self.labels:
             raise ValueError("4 <= labels <= max_labels must hold")
-        if self.width_px < 32 or self.guide_width_px < self.width_px:
-            raise ValueError("32 <= width_px <= guide_width_px must hold")
+        if self.width_px < 32:
+            raise ValueError(f"width_px is at least 32, not {self.width_px}")
 
     def labels_for(self, need: float) -> int:
         """Labels that cover ``need`` of them, by fours: every one costs time."""
@@ -175,12 +174,11 @@ def rectify(
     plane, labels = window
     R_rect_right = R_rect_left @ T_left_right[:3, :3]
     shown, base = _row_baseline(left, right, T_left_right, points_m, R_rect_left, K, plane, base)
-    scale = max(1.0, config.guide_width_px / config.width_px)
     left_gray, left_seen = _stereo_view(left, R_rect_left, K, size, None)
     right_gray, right_seen = _stereo_view(right, R_rect_right, K, size, plane)
     guide = None
     if config.guided and left.bgr is not None:
-        guide = _warp(left.bgr, left, R_rect_left, K, size, scale)
+        guide = _warp(left.bgr, left, R_rect_left, K, size, 1.0)
     return StereoPair(
         left=left_gray,
         right=right_gray,

@@ -60,7 +60,13 @@ from service.flight.anchorage import VIEW, Carriers, Key
 from service.flight.chain import Chain, KeyframeStep
 from service.flight.loops import LoopSearch
 from service.flight.surface_map import SurfaceMap
-from service.flight.viewpoints import StereoCandidate, StereoViews, UndistortedFrame, Viewpoints
+from service.flight.viewpoints import (
+    Colour,
+    StereoCandidate,
+    StereoViews,
+    UndistortedFrame,
+    Viewpoints,
+)
 from service.scans.file_ledger import FileLedger
 
 MAX_TRACKING_WIDTH_PX = 1280
@@ -77,7 +83,7 @@ class Grid(NamedTuple):
 
 
 class Undistort:
-    """Images without distortion, in colour, in gray, and as the odometry takes them."""
+    """Images without distortion: in gray, as the odometry takes them, and views in colour."""
 
     def __init__(self, camera: Camera, guide_width_px: int, stopwatch: Stopwatch) -> None:
         """Raises ValueError for an unusable camera model."""
@@ -85,23 +91,27 @@ class Undistort:
         self._stopwatch, self._blur = stopwatch, BlurWatch()
         self.camera, self.valid = self._undistorter.camera, self._undistorter.valid
         self.tracking_camera = _within_width(self.camera, MAX_TRACKING_WIDTH_PX)
+        mask = self.valid
+        if self.tracking_camera.size_px != self.camera.size_px:
+            size = self.tracking_camera.size_px
+            mask = np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+        self._seen = mask > 0
+        self._mask = None if mask.all() else mask
 
     def __call__(self, frame: Frame) -> UndistortedFrame:
         """Raises ValueError when the image is not of the camera model's size."""
         with self._stopwatch("undistort"):
-            bgr = self._undistorter.image(_resized(frame.image, self.camera.size_px))
-            gray = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
-            small, mask = gray, self.valid
-            size = self.tracking_camera.size_px
+            image = _resized(frame.image, self.camera.size_px)
+            gray = self._undistorter.image(_gray(image))
+            small, size = gray, self.tracking_camera.size_px
             if size != self.camera.size_px:
                 small = np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
-                mask = np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST), np.uint8)
-            small = stretch(small, mask > 0)
+            small = stretch(small, self._seen)
             is_blurred = self._blur.blurred(small)
+            colour = Colour(image, self._undistorter)
             return UndistortedFrame(
-                frame.seq, frame.time_ns, frame.prior, bgr, gray, small,
-                None if mask.all() else mask, is_blurred,
-            )  # fmt: skip
+                frame.seq, frame.time_ns, frame.prior, colour, gray, small, self._mask, is_blurred
+            )
 
 
 class Track:
@@ -398,7 +408,6 @@ def build_stages(
     stereo = VirtualStereoConfig(
         min_base_to_height=selection.min_base_to_height,
         width_px=compute.stereo_width,
-        guide_width_px=compute.guide_width,
         guided=compute.upsample,
         labels=compute.labels,
     )
@@ -466,6 +475,11 @@ def _chain(
     if config.fusion.loops:
         chain.loops = LoopSearch(trajectory, max_views=config.fusion.loop_views)
     return chain
+
+
+def _gray(image: U8) -> U8:
+    """(H, W) of (H, W, 3)."""
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
 def _resized(image: U8, size_px: tuple[int, int]) -> U8:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from recon import se3
+from recon.camera_model import Undistorter
 from recon.posegraph.between_keyframes import FixAverage
 from recon.rolling_shutter import FrameRows
 from recon.stereo.virtual_stereo import View
@@ -37,6 +38,22 @@ LAST_VIEW_SHARE = 0.1
 """A stretch's last frame becomes a view when it is this share of a usual step further on."""
 
 
+class Colour:
+    """A frame's image in colour, without distortion once that is asked for."""
+
+    def __init__(self, image: U8, undistorter: Undistorter) -> None:
+        """``image`` (H, W, 3) is distorted."""
+        self._image, self._undistorter = image, undistorter
+        self._is_done = False
+
+    @property
+    def bgr(self) -> U8:
+        """(H, W, 3) without distortion."""
+        if not self._is_done:
+            self._image, self._is_done = self._undistorter.image(self._image), True
+        return self._image
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class UndistortedFrame:
     """A frame without distortion."""
@@ -44,7 +61,7 @@ class UndistortedFrame:
     seq: int
     time_ns: int
     prior: PosePrior
-    bgr: U8  # (H, W, 3)
+    colour: Colour
     gray: U8  # (H, W)
     small: U8  # (h, w) gray, as the odometry takes it
     mask: U8 | None  # (h, w) non-zero where the image is valid; None: everywhere
@@ -58,8 +75,8 @@ class Viewpoint:
     seq: int
     time_ns: int
     prior: PosePrior
-    bgr: U8 | None  # (H, W, 3) undistorted; None for one that is only a partner
-    gray: U8  # (H, W) the same
+    colour: Colour | None  # None for one that is only a partner
+    gray: U8  # (H, W) undistorted
     key: OdometryKeyframe  # the last one when it was tracked
     anchor: Anchorage
     is_blurred: bool = False  # takes no part in stereo, only in the track
@@ -145,9 +162,9 @@ class Viewpoints:
             self._keep(frame)
             return True
         if self._between.maxlen:
-            self._between.append(replace(frame, bgr=None))
+            self._between.append(replace(frame, colour=None))
         elif self._moved_on(frame):
-            self._recent.append(replace(frame, bgr=None))
+            self._recent.append(replace(frame, colour=None))
         return False
 
     def end_stretch(self, frame: Viewpoint | None) -> bool:
@@ -246,7 +263,7 @@ class Viewpoints:
     def _spread(self, view: Viewpoint, others: list[Viewpoint]) -> list[Viewpoint]:
         """Partners between half and twice the keyframes' spacing, evenly spread."""
         base = [_apart(v, view) for v in others]
-        steps = [b for v, b in zip(others, base, strict=True) if v.bgr is not None]
+        steps = [b for v, b in zip(others, base, strict=True) if v.colour is not None]
         spacing = steps[0] if steps else 0.0
         near, far = NEAREST_PARTNER * spacing, FARTHEST_PARTNER * spacing
         good = [v for v, b in zip(others, base, strict=True) if near <= b <= far]
@@ -296,7 +313,7 @@ class StereoViews:
         key = self._odometry.keyframes[-1]
         anchor = Anchorage(image.seq, key, se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera)
         frame = Viewpoint(
-            image.seq, image.time_ns, image.prior, image.bgr, image.gray, key, anchor,
+            image.seq, image.time_ns, image.prior, image.colour, image.gray, key, anchor,
             image.is_blurred, tracked.moving,
         )  # fmt: skip
         is_view = self.selection.offer(frame, tracked)
@@ -334,13 +351,13 @@ class StereoViews:
         points, _ = landmarks(view.key)
         points = se3.transform(se3.inverse(view.anchor.T_key_camera), points)
         in_odom = se3.transform(view.T_odom_camera, points)
-        assert view.bgr is not None
+        assert view.colour is not None
         return StereoCandidate(
             view.seq,
             view.time_ns,
             view.segment,
             prior,
-            view.bgr,
+            view.colour.bgr,
             self._posed(view, in_odom),
             tuple(self._posed(partner, in_odom) for partner in self.selection.partners(view)),
             view.anchor,
@@ -358,7 +375,8 @@ class StereoViews:
 
     def _posed(self, view: Viewpoint, points: F64) -> View:
         """The view with its pose; ``points`` (N, 3) of the odometry are the ground before it."""
-        posed = View(view.bgr, view.gray, self._K, view.T_odom_camera, self._seen)
+        bgr = None if view.colour is None else view.colour.bgr
+        posed = View(bgr, view.gray, self._K, view.T_odom_camera, self._seen)
         rows = None if view.moving is None else view.moving.rows
         if rows is None or not rows.clock.readout_s:
             return posed
