@@ -79,11 +79,12 @@ def made(folder: Path, truth: F64, placed: bool = True) -> Path:
     return folder / "scan"
 
 
-def survey(path: Path, truth: F64) -> Path:
-    """Each spot marked in up to three keyframes; names with C are check points."""
+def survey(path: Path, truth: F64, by_name: bool = False) -> Path:
+    """Each spot marked in up to three keyframes, or stills; names with C are check points."""
+    which = "image" if by_name else "keyframe_seq"
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
-        table.writerow(["name", "keyframe_seq", "u_px", "v_px", "lat", "lon", "alt_amsl_m", "role"])
+        table.writerow(["name", which, "u_px", "v_px", "lat", "lon", "alt_amsl_m", "role"])
         for name, (x, y) in SPOTS.items():
             spot = np.array([[x, y, 0.0]])
             place = FRAME.to_geodetic(spot)[0].tolist()
@@ -92,7 +93,7 @@ def survey(path: Path, truth: F64) -> Path:
             inside = [one for one in seen if 5 < one[1][0] < 474 and 5 < one[1][1] < 354]
             for k, uv in inside[:: max(1, len(inside) // 3)][:3]:
                 role = "check" if name.startswith("C") else "control"
-                table.writerow([name, k, *uv, *place, role])
+                table.writerow([name, f"{k}.png" if by_name else k, *uv, *place, role])
     return path
 
 
@@ -122,13 +123,25 @@ def test_images_and_control_points_bring_a_bent_scan_to_the_truth(tmp_path: Path
 
 
 def test_a_scan_without_a_place_takes_its_images_along(tmp_path: Path) -> None:
+    """Points marked in stills by their names; a mark in one that vision lost is left out."""
     truth = flown()
-    scan, points = made(tmp_path, truth, placed=False), survey(tmp_path / "points.csv", truth)
+    scan = made(tmp_path, truth, placed=False)
+    points = survey(tmp_path / "points.csv", truth, by_name=True)
+    lost = still(truth[9])
+    assert cv2.imwrite(str(tmp_path / "stills" / "10.png"), lost)
+    text = points.read_text(encoding="utf-8")
+    row = text.splitlines()[1].split(",")
+    points.write_text(text + ",".join([row[0], "10.png", "5", "5", *row[4:]]) + "\n")
     command = ["refine", str(scan), "--video", str(tmp_path / "stills"), "--gcp", str(points)]
     answer = CliRunner().invoke(app, [*command, "--json"])
     assert answer.exit_code == 0, answer.output
     figures = json.loads(answer.stdout.splitlines()[-1])
     assert figures["check"]["rms_h_after_m"] < 0.05 and figures["check"]["rms_v_after_m"] < 0.1
+    assert any("left out: 10.png" in note for note in figures["notes"])
+    points.write_text(text.replace("0.png", "IMG_0.jpg"), encoding="utf-8")
+    for video, why in (([], "needs --video"), (command[2:4], "IMG_0.jpg is not in the folder")):
+        refused = CliRunner().invoke(app, ["refine", str(scan), *video, "--gcp", str(points)])
+        assert isinstance(refused.exception, InputError) and why in str(refused.exception)
 
 
 def test_a_video_of_something_else_changes_nothing(tmp_path: Path) -> None:

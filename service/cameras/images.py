@@ -63,6 +63,11 @@ class ImagesSource:
             yield CameraFrame(image, time_ns, seq, tags.geotag, path.name)
             seq += 1
 
+    @property
+    def times(self) -> dict[str, int]:
+        """ns since the first still, by file name."""
+        return {path.name: time_ns for path, _, time_ns in self._stills}
+
     def close(self) -> None:
         """Nothing is open."""
 

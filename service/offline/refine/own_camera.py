@@ -99,6 +99,14 @@ def images_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dict[
     return found
 
 
+def times_of_stills(folder: Path, start_unix_ns: int) -> dict[str, float]:
+    """Unix seconds of each still of a folder, by file name; none for a recording."""
+    if not folder.is_dir():
+        return {}
+    with closing(open_images(str(folder), {})) as source:
+        return {name: (start_unix_ns + time_ns) / 1e9 for name, time_ns in source.times.items()}
+
+
 def sightings(
     images: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float
 ) -> tuple[F64, Sightings, F64]:

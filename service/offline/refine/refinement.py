@@ -61,7 +61,7 @@ from service.offline.refine.control_points import (
 from service.offline.refine.refinement_figures import figures_of, in_words, off_by
 from service.offline.refine.revisions import Revisions, copy_store, grown, moved_frames
 from service.offline.refine.stored_loops import StoredLoops, loose
-from service.offline.refine.survey_file import SurveyPoint, read_survey
+from service.offline.refine.survey_file import SurveyPoint, at_times, read_survey
 from service.scans.folder import write_deliverables
 from service.scans.track import local_frame
 from service.stream.records import (
@@ -192,7 +192,7 @@ class _Refinement:
 
     def run(self) -> dict[str, Any]:
         """Adjust and append; the figures."""
-        survey = read_survey(self.options.gcp) if self.options.gcp is not None else []
+        survey = self._survey()
         places_m = np.array([s.T_world_camera[:3, 3] for s in self.states])
         if self.options.video is not None:
             self._match_again(self.options.video, survey)
@@ -244,6 +244,33 @@ class _Refinement:
         return found, given
 
     # ---- what goes in ------------------------------------------------------------------------
+
+    def _survey(self) -> list[SurveyPoint]:
+        """The surveyed points, with the times of the stills that they name.
+
+        Marks in stills that vision did not place are left out.
+        """
+        path, video = self.options.gcp, self.options.video
+        if path is None:
+            return []
+        start = self.header.started_unix_ns
+        times = own_camera.times_of_stills(video, start) if video is not None else {}
+        survey = at_times(read_survey(path), times, path)
+        seen = [f.time_unix_ns for f in self.frames if "vision" in f.sources]
+        placed = {_ms(t) for t in [*seen, *(s.time_ns for s in self.states)]}
+        lost = {
+            mark.image
+            for point in survey
+            for mark in point.sightings
+            if mark.image and _ms(1e9 * (mark.time_unix_s or 0.0)) not in placed
+        }
+        if lost:
+            names = ", ".join(sorted(lost))
+            self.notes.append(f"images without a place, their marks are left out: {names}")
+        return [
+            replace(p, sightings=tuple(s for s in p.sightings if s.image not in lost))
+            for p in survey
+        ]
 
     def _match_again(self, video: Path, survey: Sequence[SurveyPoint]) -> None:
         """Tie the keyframes by their images, and take them as the images have them."""
@@ -482,6 +509,11 @@ def _section(kind: type[Section], kept: Any) -> Section:
     """A part of the configuration as it was kept, with defaults for what was not."""
     known = {f.name for f in fields(kind)} if is_dataclass(kind) else set()
     return kind(**{k: v for k, v in dict(kept or {}).items() if k in known})
+
+
+def _ms(time_ns: float) -> int:
+    """A time in whole milliseconds, as the times of stills are known."""
+    return round(time_ns / 1e6)
 
 
 def _rig(header: ScanHeader, frame: LocalFrame) -> Rig:

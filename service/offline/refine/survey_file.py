@@ -2,16 +2,16 @@
 
 A row without ``alt_amsl_m`` is of a point surveyed horizontally only.
 
-One row is one sighting: ``keyframe_seq`` or ``time`` with ``u_px,v_px`` in the camera's own
-image, or ``x,y,z`` in the delivered cloud's coordinates. Rows of one name are one point.
+One row is one sighting: ``keyframe_seq``, ``time`` or ``image`` with ``u_px,v_px`` in the camera's
+own image, or ``x,y,z`` in the delivered cloud's coordinates. Rows of one name are one point.
 """
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from service.errors import InputError
@@ -21,8 +21,9 @@ PLACE = ("lat", "lon")
 HEIGHT = "alt_amsl_m"
 IMAGE = ("u_px", "v_px")
 MAP = ("x", "y", "z")
+WHICH = ("keyframe_seq", "time", "image")
 COLUMNS = (
-    "name", "keyframe_seq", "time", *IMAGE, *MAP, *PLACE, HEIGHT, "sigma_h_m", "sigma_v_m",
+    "name", *WHICH, *IMAGE, *MAP, *PLACE, HEIGHT, "sigma_h_m", "sigma_v_m",
     "role",
 )  # fmt: skip
 ROLES = ("control", "check")
@@ -37,6 +38,7 @@ class Sighting:
     line: int
     keyframe_seq: int | None = None
     time_unix_s: float | None = None
+    image: str = ""  # file name of a still
     uv_px: tuple[float, float] | None = None
     xyz_m: tuple[float, float, float] | None = None
 
@@ -81,6 +83,26 @@ def read_survey(path: Path) -> list[SurveyPoint]:
     return list(points.values())
 
 
+def at_times(
+    survey: Sequence[SurveyPoint], times_unix_s: Mapping[str, float], path: Path
+) -> list[SurveyPoint]:
+    """The points with the time of each still that they name.
+
+    Raises InputError, with the line, for a name that is not among ``times_unix_s``.
+    """
+    return [
+        replace(point, sightings=tuple(_at_time(s, times_unix_s, path) for s in point.sightings))
+        for point in survey
+    ]
+
+
+def _at_time(seen: Sighting, times_unix_s: Mapping[str, float], path: Path) -> Sighting:
+    if not seen.image or seen.image in times_unix_s:
+        return replace(seen, time_unix_s=times_unix_s.get(seen.image, seen.time_unix_s))
+    why = "is not in the folder of --video" if times_unix_s else "needs --video with its folder"
+    raise InputError(f"{path} line {seen.line}: image {seen.image} {why}")
+
+
 def _said(p: SurveyPoint) -> tuple[str, float, float, float | None, float, float, bool]:
     return p.name, p.lat_deg, p.lon_deg, p.alt_amsl_m, p.sigma_h_m, p.sigma_v_m, p.is_check
 
@@ -120,7 +142,7 @@ def _check_header(path: Path, header: list[str]) -> None:
     if missing:
         raise InputError(
             f"{path} line 1: column {missing[0]} is missing; name, {', '.join(PLACE)} and either "
-            "u_px,v_px with keyframe_seq or time, or x,y,z are needed"
+            "u_px,v_px with keyframe_seq, time or image, or x,y,z are needed"
         )
     if not (set(IMAGE) <= set(header) or set(MAP) <= set(header)):
         raise InputError(f"{path} line 1: neither u_px,v_px nor x,y,z; where are the points seen?")
@@ -153,15 +175,19 @@ def _point(path: Path, line: int, row: Mapping[str, str]) -> SurveyPoint:
 
 def _sighting(where: str, line: int, row: Mapping[str, str]) -> Sighting:
     in_map = [key for key in MAP if key in row]
-    in_image = [key for key in (*IMAGE, "keyframe_seq", "time") if key in row]
+    in_image = [key for key in (*IMAGE, *WHICH) if key in row]
     if in_map and in_image:
         raise InputError(f"{where}: give {in_image[0]} or {in_map[0]}, not both in one row")
     if in_map:
         x, y, z = (_number(where, row, key) for key in MAP)
         return Sighting(line, xyz_m=(x, y, z))
     u, v = (_number(where, row, key) for key in IMAGE)
-    if ("keyframe_seq" in row) == ("time" in row):
-        raise InputError(f"{where}: give either keyframe_seq or time (unix seconds) of the image")
+    if sum(key in row for key in WHICH) != 1:
+        raise InputError(
+            f"{where}: give one of keyframe_seq, time (unix seconds), image (name of a still)"
+        )
+    if "image" in row:
+        return Sighting(line, image=row["image"], uv_px=(u, v))
     if "time" in row:
         return Sighting(line, time_unix_s=_number(where, row, "time"), uv_px=(u, v))
     seq = _number(where, row, "keyframe_seq")
