@@ -7,6 +7,7 @@ reference and the meaning of ``T_a_b`` are in :mod:`recon.frames`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -195,13 +196,21 @@ class PointCloud:
         return int(self.xyz_m.shape[0])
 
 
+class Verdict(str, Enum):
+    """How far a registration may be used."""
+
+    CONVERGED = "converged"
+    DEGENERATE = "degenerate"  # some directions are not observed
+    REJECTED = "rejected"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
     """The outcome of aligning a source cloud onto a target cloud."""
 
     T_target_source: F64  # (4, 4)
     covariance: F64  # (6, 6) left perturbation in the target frame: rotation rad, translation m
-    verdict: str  # "converged", "degenerate" (some directions not observed) or "rejected"
+    verdict: Verdict
     rms_m: float  # point-to-plane, inliers
     inlier_share: float  # of the source's valid points
     iterations: int = 0
@@ -210,4 +219,4 @@ class Registration:
     @property
     def converged(self) -> bool:
         """True when the alignment may be used, at least in its strong directions."""
-        return self.verdict != "rejected"
+        return self.verdict is not Verdict.REJECTED

@@ -13,7 +13,7 @@ import pytest
 from recon import se3
 from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.tracking.localisation import Localiser, OdometryConfig, Search
-from recon.tracking.odometry import Odometry, Tracked
+from recon.tracking.odometry import Odometry, Tracked, Tracking
 from recon.types import F64, U8, Camera, PosePrior, Shutter
 
 K = np.array([[400.0, 0, 239.5], [0, 400.0, 179.5], [0, 0, 1]])
@@ -163,7 +163,7 @@ def skipping(ground: U8, track: list[F64], fps: float, lens: Camera | None = Non
     for i, T in enumerate(track):
         time_ns, prior = round(i * 1e9 / fps), prior_of(T, np.random.default_rng(2))
         if odometry.can_skip(time_ns, prior, frames_per_step=6.0):
-            out.append(Tracked("skipped", odometry.segment))
+            out.append(Tracked(Tracking.SKIPPED, odometry.segment))
         else:
             out.append(odometry.track(photograph(ground, T), i, time_ns, prior))
     return out

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from recon import se3
 from recon.camera_model import rays
 from recon.mapping.registration import IcpConfig, register_projective
-from recon.types import F64, DepthMap, Registration
+from recon.types import F64, DepthMap, Registration, Verdict
 
 RGBD = Path(__file__).resolve().parents[2] / "shared" / "data" / "rgbd_five_poses"
 K = np.array([[190.7, 0, 159.5], [0, 190.7, 89.5], [0, 0, 1.0]])
@@ -159,7 +159,7 @@ def test_flat_ground_leaves_three_directions_open(sigma_m: float, blur_px: float
         assert abs(error[2]) < 0.03
         # What cannot be seen stays where the start had it, and is said to be unknown.
         begun = ground_error(
-            Registration(guess, np.eye(6), "", 0.0, 0.0), T_A_B
+            Registration(guess, np.eye(6), Verdict.CONVERGED, 0.0, 0.0), T_A_B
         )  # fmt: skip
         np.testing.assert_allclose(error[:2], begun[:2], atol=0.12)
         lever = np.hstack([-se3.hat(se3.transform(T_A_B, np.array([[0, 0, 60.0]]))[0]), np.eye(3)])
@@ -274,7 +274,7 @@ def test_both_ways_of_alignment_agree(kind: str) -> None:
         *clouds, start(2, T_A_B), registration_type="GICP", downsampling_resolution=0.5,
         max_correspondence_distance=2.0, max_iterations=40,
     )  # fmt: skip
-    theirs = Registration(np.asarray(found.T_target_source), np.eye(6), "", 0.0, 0.0)
+    theirs = Registration(np.asarray(found.T_target_source), np.eye(6), Verdict.CONVERGED, 0.0, 0.0)
     assert np.abs(ground_error(ours, T_A_B) - ground_error(theirs, T_A_B)).max() < 0.06
 
 
@@ -302,7 +302,11 @@ def test_closer_than_open3d_from_the_same_start(kind: str, sigma_m: float, blur_
             odometry.Method.PointToPlane, odometry.OdometryLossParams(1.5, 1.0, 0.3),
         )  # fmt: skip
         T = found.transformation.numpy()
-        theirs.append(np.linalg.norm(ground_error(Registration(T, np.eye(6), "", 0.0, 0.0), T_A_B)))
+        theirs.append(
+            np.linalg.norm(
+                ground_error(Registration(T, np.eye(6), Verdict.CONVERGED, 0.0, 0.0), T_A_B)
+            )
+        )
     assert np.mean(ours) <= np.mean(theirs)
 
 

@@ -14,7 +14,7 @@ from mavlink.telemetry.history import HistoryConfig, VehicleHistory
 from mavlink.telemetry.quaternion import Quaternion
 from mavlink.telemetry.samples import AttitudeSample, GimbalFrame, GimbalSample
 from recon.frames import R_GIMBAL_CAMERA
-from recon.tracking.odometry import Tracked
+from recon.tracking.odometry import Tracked, Tracking
 from service.config import CameraConfig
 from service.flight.telemetry_check import TelemetryCheck
 
@@ -68,7 +68,8 @@ def fly(
         lost = gap and 200 <= k < 205
         exposed.append(check.exposed_ns(stamp))
         segment = int(gap and k >= 205)
-        check.add(stamp, Tracked("lost" if lost else "tracked", segment, None if lost else T))
+        state = Tracking.LOST if lost else Tracking.TRACKED
+        check.add(stamp, Tracked(state, segment, None if lost else T))
     check.finish()
     return exposed
 
@@ -163,7 +164,7 @@ def test_skipped_frames_do_not_interrupt_the_turns_of_the_others() -> None:
     for k in range(40 * 30):
         T = np.eye(4)
         T[:3, :3] = (body(k / 30) * mount).as_matrix() @ R_GIMBAL_CAMERA
-        tracked = Tracked("skipped", 0) if k % 3 else Tracked("tracked", 0, T)
+        tracked = Tracked(Tracking.SKIPPED, 0) if k % 3 else Tracked(Tracking.TRACKED, 0, T)
         check.add(round(k * S / 30 + LATE_S * S), tracked)
     check.finish()
     assert check.latency is not None

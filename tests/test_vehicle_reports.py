@@ -21,7 +21,7 @@ from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
 from recon.posegraph.trajectory import Placed
 from recon.tracking.keyframe_window import OdometryKeyframe
-from recon.tracking.odometry import Tracked
+from recon.tracking.odometry import Tracked, Tracking
 from recon.types import F64
 from service.config import CameraConfig
 from service.flight.anchorage import Anchorage
@@ -41,7 +41,7 @@ def wxyz(R: Rotation) -> F64:
 def step_at(enu: tuple[float, float, float], head: Rotation = HEAD, segment: int = 0) -> Step:
     R = R_ENU_NED @ head.as_matrix() @ R_GIMBAL_CAMERA
     T = se3.compose(R, np.array(enu))
-    tracked = Tracked("tracked", segment, T, tracks=150)
+    tracked = Tracked(Tracking.TRACKED, segment, T, tracks=150)
     anchor = Anchorage(0, object.__new__(OdometryKeyframe), np.eye(4))
     return Step(tracked, Placed(0, T, 1.0, COVARIANCE, ("vision",)), False, anchor)
 
@@ -86,7 +86,7 @@ def test_resets_are_counted_and_lost_frames_left_out() -> None:
     assert sent[-1].velocity_frd_m_s == pytest.approx(BODY.inv().apply([0.0, 10.0, 0.0]))
     report.send(step_at((10.0, 0.0, 30.0)), state(), 7 * S // 10)
     assert report.resets == 1
-    lost = Step(Tracked("lost", 0))
+    lost = Step(Tracked(Tracking.LOST, 0))
     report.send(lost, state(), 8 * S // 10)
     assert len(sent) == 8
     report.send(step_at((11.0, 0.0, 30.0), segment=1), state(), 9 * S // 10)

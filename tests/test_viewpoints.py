@@ -10,7 +10,7 @@ from recon.camera_model import Undistorter
 from recon.rolling_shutter import FrameRows
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
 from recon.tracking.matching import Pyramid
-from recon.tracking.odometry import Tracked
+from recon.tracking.odometry import Tracked, Tracking
 from recon.types import U8, Camera, PosePrior
 from service.config import ScanConfig
 from service.flight.anchorage import Anchorage
@@ -33,7 +33,7 @@ def offer(
     views: Viewpoints, seq: int, x_m: float, state: str, segment: int = 0, blurred: bool = False
 ) -> Viewpoint | None:
     taken = frame(seq, x_m, segment, blurred)
-    tracked = Tracked(state, segment, taken.T_odom_camera)
+    tracked = Tracked(Tracking(state), segment, taken.T_odom_camera)
     return taken if views.offer(taken, tracked) else None
 
 

@@ -15,7 +15,7 @@ from recon import se3
 from recon.bands import in_bands
 from recon.camera_model import rays
 from recon.mapping import icp_kernels
-from recon.types import F32, F64, Bool, DepthMap, Registration
+from recon.types import F32, F64, Bool, DepthMap, Registration, Verdict
 
 __all__ = [
     "Equations",
@@ -221,7 +221,7 @@ def register_projective(
 
     The maps' own poses are not used. Directions that the surface does not determine (on flat
     ground: both horizontal shifts and the turn about the vertical) keep the start, get
-    ``unknown_sigma_m`` in the covariance and make the verdict "degenerate". "rejected": too
+    ``unknown_sigma_m`` in the covariance and make the verdict DEGENERATE. REJECTED: too
     little overlap, residuals too large, or a correction too large to be plausible.
     """
     config = config or IcpConfig()
@@ -260,7 +260,7 @@ def register_surfaces(
 
 def _no_overlap(T: F64, iterations: int) -> Registration:
     return Registration(
-        np.array(T, np.float64), np.eye(6) * 1e6, "rejected", float("nan"), 0.0, iterations
+        np.array(T, np.float64), np.eye(6) * 1e6, Verdict.REJECTED, float("nan"), 0.0, iterations
     )
 
 
@@ -282,8 +282,8 @@ def _judged(
         or turn > config.max_turn_rad
         or not problem.strong.any()
     )
-    good = "converged" if problem.strong.all() else "degenerate"
-    verdict = "rejected" if implausible else good
+    good = Verdict.CONVERGED if problem.strong.all() else Verdict.DEGENERATE
+    verdict = Verdict.REJECTED if implausible else good
     return Registration(T, covariance, verdict, rms, share, iterations, weak)
 
 

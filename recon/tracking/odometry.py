@@ -12,6 +12,7 @@ heading and position are corrected afterwards by :mod:`recon.posegraph.alignment
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 
@@ -42,11 +43,22 @@ MAX_GAP_S, ROLLING_GAP_S = 0.09, 0.05
 rows need neighbours closer by."""
 
 
+class Tracking(str, Enum):
+    """How the odometry took a frame."""
+
+    STARTED = "started"  # first of a segment
+    WAITING = "waiting"  # the camera has not moved enough for a second view
+    TRACKED = "tracked"
+    KEYFRAME = "keyframe"
+    SKIPPED = "skipped"  # too close to the last one
+    LOST = "lost"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracked:
-    """What one frame gave."""
+    """The outcome of one frame."""
 
-    state: str  # "started", "waiting", "tracked", "keyframe", "skipped" or "lost"
+    state: Tracking
     segment: int
     T_odom_camera: F64 | None = None  # (4, 4)
     tracks: int = 0
@@ -162,18 +174,18 @@ class Odometry:
         self._lost += 1
         if self._still and self._missed_still is not None and self._lost >= 2:
             first, self._missed_still = self._missed_still, None
-            if self._start(first).state == "started":
+            if self._start(first).state is Tracking.STARTED:
                 return self._second_view(new)
         elif not self._still and self._lost >= self.config.lost_after:
             self._start(new)
         self._missed_still = new if self._still else None
-        return Tracked("lost", self.segment, reason=reason)
+        return Tracked(Tracking.LOST, self.segment, reason=reason)
 
     def _start(self, new: TrackingFrame) -> Tracked:
         """Begin a segment at this frame."""
         uv = self._corners(new)
         if len(uv) < 2 * self.config.min_tracks:
-            return Tracked("lost", self.segment, reason="too little texture")
+            return Tracked(Tracking.LOST, self.segment, reason="too little texture")
         self.segment += 1
         self._metric, self._lost = False, 0
         self._first_views.begin()
@@ -203,7 +215,7 @@ class Odometry:
         ]
         self._row_track.add(new.moving, se3.inverse(T_odom_camera))
         self._motion = Motion(new.time_ns, T_odom_camera, new.prior)
-        return Tracked("started", self.segment, T_odom_camera, moving=new.moving)
+        return Tracked(Tracking.STARTED, self.segment, T_odom_camera, moving=new.moving)
 
     def _corners(self, new: TrackingFrame) -> F64:
         """(N, 2) Harris corners of the frame, Eq. 4-5."""
@@ -225,7 +237,7 @@ class Odometry:
             < 0.7 * self.config.base_to_height
         ):
             return Tracked(
-                "waiting", self.segment, tracks=int(ok.sum()), reason="too little motion"
+                Tracking.WAITING, self.segment, tracks=int(ok.sum()), reason="too little motion"
             )
         up_a = first.T_camera_odom[:3, 2]
         turn = 0.12 if R_b_a is not None else np.pi
@@ -246,7 +258,9 @@ class Odometry:
         self._add_keyframe(new, T_camera_odom, [(first, uv, ok)])
         T_odom_camera = self.keyframes[-1].T_odom_camera
         self._moving.update(new.time_ns, T_odom_camera, new.prior)
-        return Tracked("keyframe", self.segment, T_odom_camera, int(ok.sum()), moving=new.moving)
+        return Tracked(
+            Tracking.KEYFRAME, self.segment, T_odom_camera, int(ok.sum()), moving=new.moving
+        )
 
     def _first_landmarks(self, view: two_view.TwoView, rows: I64, prior: PosePrior) -> float:
         """Enter the two-view points into the table; return metres per unit of the baseline."""
@@ -275,7 +289,7 @@ class Odometry:
         if base < due and found.share > 0.45 and turned < 0.25:
             self._row_track.add(new.moving, T_camera_odom)
             self._settle()
-            return Tracked("tracked", self.segment, T_odom_camera, tracks, moving=new.moving)
+            return Tracked(Tracking.TRACKED, self.segment, T_odom_camera, tracks, moving=new.moving)
         share = 0.5 * self.config.search_share
         whole = self._localiser.pose_from(key, new, T_camera_odom, share, self.config.min_tracks)
         found = found if isinstance(whole, str) else whole
@@ -287,7 +301,9 @@ class Odometry:
         )
         last, tracks = self.keyframes[-1], int(found.ok.sum())
         self._moving.correct(last.T_odom_camera)
-        return Tracked("keyframe", self.segment, last.T_odom_camera, tracks, moving=new.moving)
+        return Tracked(
+            Tracking.KEYFRAME, self.segment, last.T_odom_camera, tracks, moving=new.moving
+        )
 
     def _cross(self, new: TrackingFrame, bridge: Bridge) -> Tracked:
         """Make a keyframe of a frame that two views alone place."""
@@ -296,7 +312,9 @@ class Odometry:
         last = self.keyframes[-1]
         self._moving.update(new.time_ns, last.T_odom_camera, new.prior)
         tracks = int(bridge.ok.sum())
-        return Tracked("keyframe", self.segment, last.T_odom_camera, tracks, moving=new.moving)
+        return Tracked(
+            Tracking.KEYFRAME, self.segment, last.T_odom_camera, tracks, moving=new.moving
+        )
 
     def _add_keyframe(
         self, new: TrackingFrame, T_camera_odom: F64, seen: list[tuple[OdometryKeyframe, F64, Bool]]

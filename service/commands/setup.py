@@ -85,8 +85,8 @@ def doctor(
     for finding in examine(load_config(chosen, set_ or []), listen_s):
         findings.append(finding)
         if not as_json:
-            print(f"{finding.verdict}  {finding.what:<13}{finding.text}", flush=True)
-    bad = [finding.what for finding in findings if finding.verdict == BAD]
+            print(f"{finding.verdict.value}  {finding.what:<13}{finding.text}", flush=True)
+    bad = [finding.what for finding in findings if finding.verdict is BAD]
     if as_json:
         print(json.dumps({"ok": not bad, "findings": [asdict(f) for f in findings]}))
     if bad:

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from enum import Enum
 from http.client import HTTPException
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
@@ -41,7 +42,16 @@ WARM_UP = (
 
 SOON_DAYS = 30  # a certificate that expires sooner gives a note
 
-GOOD, NOTE, BAD = "good", "note", "bad"
+
+class Grade(str, Enum):
+    """How grave a finding is."""
+
+    GOOD = "good"
+    NOTE = "note"  # can fly
+    BAD = "bad"
+
+
+GOOD, NOTE, BAD = Grade
 
 WAIT_S = 1.0
 
@@ -68,7 +78,7 @@ class Finding:
     """Result of one check."""
 
     what: str
-    verdict: str  # GOOD, NOTE (can fly) or BAD
+    verdict: Grade
     text: str
 
 

@@ -14,7 +14,7 @@ from recon.posegraph.alignment import height_above, height_below
 from recon.posegraph.between_keyframes import carried
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.trajectory import Placed, Trajectory
-from recon.tracking.odometry import Tracked
+from recon.tracking.odometry import Tracked, Tracking
 from recon.types import F64, DepthMap, Keyframe, PosePrior
 from service.compute.stopwatch import Stopwatch
 from service.flight.anchorage import Anchorage, Carriers, Key
@@ -190,7 +190,7 @@ class Chain:
         """
         prior = image.prior
         R, position, sigma = prior.R_world_camera, prior.position_m, prior.sigma_position_m
-        if tracked.state != "lost" or R is None or position is None or sigma is None:
+        if tracked.state is not Tracking.LOST or R is None or position is None or sigma is None:
             return None
         if prior.sigma_yaw_rad > 1.0:
             return None

@@ -12,7 +12,7 @@ from collections import Counter
 from dataclasses import dataclass, replace
 
 from recon.posegraph.trajectory import Placed
-from recon.tracking.odometry import Tracked
+from recon.tracking.odometry import Tracked, Tracking
 from recon.types import Frame, Keyframe
 from service.config import ComputeConfig, ScanConfig
 from service.flight.anchorage import Anchorage
@@ -49,7 +49,7 @@ class Pipeline:
         """
         s = self.stages
         if s.track.can_skip(frame):  # frames are followed as fast as the image moves
-            return Step(Tracked("skipped", s.track.segment))
+            return Step(Tracked(Tracking.SKIPPED, s.track.segment))
         image = s.undistort(frame)  # section 2.1
         tracked = s.track(image)  # Harris and ZSSD (Eq. 4-5), EPnP (Eq. 6-7)
         anchor, is_view = s.views.take(image, tracked)  # virtual stereo camera, section 2.3
@@ -91,7 +91,7 @@ class Pipeline:
         for view in s.views.ready(everything=True):
             self._background.offer(view)
         keyframes = self._finished(everything=True)
-        tracked = Tracked("lost", s.track.segment, reason="end of the recording")
+        tracked = Tracked(Tracking.LOST, s.track.segment, reason="end of the recording")
         return Step(tracked, keyframes=keyframes)
 
     def finish(self) -> Step:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from recon.posegraph.trajectory import Placed
+from recon.tracking.odometry import Tracking
 from recon.types import F64, Keyframe
 from service.cameras.rig import Rig, attitude_of
 from service.flight.anchorage import PublishedFrame, PublishedFrames
@@ -41,7 +42,7 @@ class Recorder:
         self.store, self.pipeline, self._rig = store, pipeline, rig
         self._chain, self._is_settled = pipeline.stages.chain, pipeline.stages.track.is_settled
         self.points = self.keyframes = self.frames = self.chunk_bytes = 0
-        self.states: Counter[str] = Counter()
+        self.states: Counter[Tracking] = Counter()
         self.distance_m = self.speed_m_s = self.turn_rate_rad_s = 0.0
         self.last: PoseRecord | None = None
         self._offset_ns = clock_offset_ns
@@ -97,7 +98,7 @@ class Recorder:
         return {
             "frames": self.frames,
             "frames_tracked": sum(self.states[state] for state in FOUND),
-            "frames_lost": self.states["lost"],
+            "frames_lost": self.states[Tracking.LOST],
             "segments": pipeline.segments,
             "pairs": pipeline.pairs,
             "clouds": pipeline.pairs,  # one per stereo pair, Eq. 3
@@ -110,7 +111,7 @@ class Recorder:
             "stage_ms": {k: round(v, 2) for k, v in pipeline.stages.stopwatch.mean_ms().items()},
             "refusals": dict(pipeline.refusals()),
             "drops": self._drops(),
-            "registrations": dict(pipeline.stages.register.verdicts),
+            "registrations": {v.value: n for v, n in pipeline.stages.register.verdicts.items()},
         }
 
     def _drops(self) -> dict[str, int]:

@@ -51,6 +51,7 @@ from recon.types import (
     Pose,
     RectifiedPair,
     StereoPair,
+    Verdict,
 )
 from service.background import BackgroundWorker
 from service.cameras.camera_file import with_shutter
@@ -301,7 +302,7 @@ class Register:
     def __init__(self, backend: Backend, stopwatch: Stopwatch) -> None:
         self._backend, self._config, self._stopwatch = backend, IcpConfig(), stopwatch
         self._before: tuple[int, DepthMap | None] | None = None  # number and depth
-        self.verdicts: Counter[str] = Counter()
+        self.verdicts: Counter[Verdict] = Counter()
 
     def __call__(self, view: StereoCandidate, depth: DepthMap | None) -> KeyframeStep:
         """The step from the keyframe before: vision's and ICP's, weighted by covariance."""

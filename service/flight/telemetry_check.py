@@ -17,7 +17,7 @@ from mavlink.telemetry.quaternion import Quaternion
 from mavlink.telemetry.samples import GimbalFrame
 from recon.frames import R_GIMBAL_CAMERA
 from recon.se3 import quaternion_from_rotation
-from recon.tracking.odometry import Tracked
+from recon.tracking.odometry import Tracked, Tracking
 from recon.types import F64
 from service.config import CameraConfig
 
@@ -81,7 +81,7 @@ class TelemetryCheck:
 
     def add(self, stamp_ns: int, tracked: Tracked) -> None:
         """Take in a frame's pose by vision, at its stamp, and look at all of them now and then."""
-        if self._history is None or tracked.state == "skipped":
+        if self._history is None or tracked.state is Tracking.SKIPPED:
             return
         T = tracked.T_odom_camera
         last, self._last = self._last, None

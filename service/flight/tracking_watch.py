@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 
-from recon.tracking.odometry import Tracked
+from recon.tracking.odometry import Tracked, Tracking
 
 LOST_S = 10.0
-FOUND = ("tracked", "keyframe", "skipped")
+FOUND = (Tracking.TRACKED, Tracking.KEYFRAME, Tracking.SKIPPED)
 """States with a pose that rests on more than the segment's first image."""
 
 
@@ -31,7 +31,7 @@ class TrackingWatch:
             return
         self._since_ns = time_ns if self._since_ns is None else self._since_ns
         self._frames += 1
-        self._reasons[tracked.reason] += tracked.state == "lost"
+        self._reasons[tracked.reason] += tracked.state is Tracking.LOST
         for_s = 1e-9 * (time_ns - self._since_ns)
         is_lost = 2 * self._reasons.total() > self._frames
         if for_s >= LOST_S and is_lost and not self._is_reported:

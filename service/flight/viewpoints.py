@@ -19,7 +19,7 @@ from recon.posegraph.between_keyframes import FixAverage
 from recon.rolling_shutter import FrameRows
 from recon.stereo.virtual_stereo import View
 from recon.tracking.keyframe_window import OdometryKeyframe, landmarks, step_covariance
-from recon.tracking.odometry import Odometry, Tracked
+from recon.tracking.odometry import Odometry, Tracked, Tracking
 from recon.tracking.prediction import inverse_depth_plane
 from recon.types import F64, U8, Camera, PosePrior
 from service.config import ScanConfig, parse_baseline
@@ -209,11 +209,11 @@ class Viewpoints:
         self._views_of[view.segment] += 1
 
     def _wants(self, seq: int, tracked: Tracked) -> bool:
-        if tracked.state == "started" or not self._kept:
-            return tracked.state in ("started", "keyframe")
+        if tracked.state is Tracking.STARTED or not self._kept:
+            return tracked.state in (Tracking.STARTED, Tracking.KEYFRAME)
         last = self._kept[-1]
         if self._mode == "auto" or last.segment != tracked.segment:
-            return tracked.state == "keyframe"
+            return tracked.state is Tracking.KEYFRAME
         if self._mode == "frames":
             return seq - last.seq >= self._stride
         assert tracked.T_odom_camera is not None
