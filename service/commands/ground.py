@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,9 +19,10 @@ from service.packages import needing
 if TYPE_CHECKING:
     from service.ground.drone import Limits
     from service.ground.portal import Portal
-    from service.ground.receiver import Receiver
+    from service.ground.receiver import Receiver, ReceiverConfig
     from service.init_system import Notifier
     from service.radio import RadioLink
+    from service.stream.session import SessionConfig
     from service.workers import Worker, Workers
 
 DEFAULT_PORT = 7447
@@ -54,8 +56,7 @@ def ground(
         float, typer.Option(help="percent of the disk that the scans of one drone may take")
     ] = 50.0,
     reserve_mb: Annotated[
-        float | None,
-        typer.Option(help="of the disk, kept free; default: 5 percent, at most 2 GiB"),
+        float | None, typer.Option(help="of the disk, kept free; default: 5 %, at most 2 GiB")
     ] = None,
     mavlink: Annotated[
         list[str] | None,
@@ -94,46 +95,85 @@ def ground(
     as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
 ) -> None:
     """Receive scans from drones; end with Ctrl-C. Scans lie in STORE/DRONE/SCAN."""
-    from service.ground.receiver import Receiver, ReceiverConfig
-    from service.init_system import Notifier
-    from service.radio import GROUND, RadioLink
+    from service.ground.receiver import ReceiverConfig
+
+    name, session = _session(connect or [], listen or [], keys, plain)
+    refresh = refresh_s if refresh_s is not None else RADIO_REFRESH_S if mavlink else 0.0
+    limits = _limits(quota_mb, drone_share, reserve_mb)
+    page = None if portal is None else PortalOptions(portal, portal_token, portal_tls, vehicle)
+    _receive(
+        ReceiverConfig(store, session, limits, name, refresh),
+        mavlink or [], page, take or [], Until(once, idle_exit_s), as_json,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class PortalOptions:
+    """Where the portal is served, and to whom."""
+
+    address: str  # HOST:PORT
+    token: Path | None
+    tls: tuple[Path, Path] | None  # certificate and key
+    vehicle: str | None  # MAVLink endpoint
+
+
+@dataclass(frozen=True, slots=True)
+class Until:
+    """When the station ends by itself."""
+
+    once: bool  # a scan is complete
+    idle_s: float | None  # nothing new came for so long
+
+
+def _session(
+    connect: list[str], listen: list[str], keys: Path | None, plain: bool
+) -> tuple[str, SessionConfig]:
+    """The station's name on its certificate, and how it is reached."""
     from service.stream.keys import member_name, tls_files
     from service.stream.session import SessionConfig
-    from service.workers import Workers
 
     ca, certificate, key = tls_files(keys) if keys is not None else ("", "", "")
     if not connect and not listen:
         host = "tls/0.0.0.0" if keys is not None else "tcp/127.0.0.1"
         listen = [f"{host}:{DEFAULT_PORT}"]
-    session = SessionConfig(
-        mode="router" if listen or len(connect or ()) > 1 else "client",
-        connect=tuple(connect or ()),
-        listen=tuple(listen or ()),
+    return member_name(Path(certificate)) if certificate else "", SessionConfig(
+        mode="router" if listen or len(connect) > 1 else "client",
+        connect=tuple(connect),
+        listen=tuple(listen),
         plain=plain,
         tls_ca=ca,
         tls_certificate=certificate,
         tls_key=key,
         fleet_rights=keys is not None and bool(listen),
     )
-    limits = _limits(quota_mb, drone_share, reserve_mb)
-    refresh = refresh_s if refresh_s is not None else RADIO_REFRESH_S if mavlink else 0.0
+
+
+def _receive(
+    config: ReceiverConfig, mavlink: list[str], portal: PortalOptions | None, take: list[Path],
+    until: Until, as_json: bool,
+) -> None:  # fmt: skip
+    """Receive until a signal, or as ``until`` says; then write what is due and report."""
+    from service.ground.receiver import Receiver
+    from service.init_system import Notifier
+    from service.radio import GROUND, RadioLink
+    from service.workers import Workers
+
     notifier = Notifier()
-    _take_in(store, take or [])
+    _take_in(config.store, take)
     stop, workers = stop_by_signals(), Workers()
-    name = member_name(Path(certificate)) if certificate else ""
-    receiver = Receiver(ReceiverConfig(store, session, limits, name, refresh), workers)
-    radios = [RadioLink(endpoint, GROUND, receiver.add_radio) for endpoint in mavlink or ()]
+    receiver = Receiver(config, workers)
+    radios = [RadioLink(endpoint, GROUND, receiver.add_radio) for endpoint in mavlink]
     receiver.start()
-    where = ", ".join((*session.listen, *session.connect))
-    print(f"ground station at {where}, scans in {store}", file=sys.stderr, flush=True)
+    where = ", ".join((*config.session.listen, *config.session.connect))
+    print(f"ground station at {where}, scans in {config.store}", file=sys.stderr, flush=True)
     for radio in radios:
         radio.start()
     page = None
     try:
         if portal is not None:
-            page = _open_portal(portal, receiver, workers, store, portal_token, portal_tls, vehicle)
+            page = _open_portal(portal, config.store, receiver, workers)
         notifier.ready()
-        _watch(stop, receiver, workers, notifier, radios, once, idle_exit_s)
+        _watch(stop, receiver, workers, notifier, radios, until)
         entries = receiver.progress()
     finally:
         notifier.stopping()
@@ -172,20 +212,17 @@ def _take_in(store: Path, folders: list[Path]) -> None:
 
 
 def _open_portal(
-    address: str,
-    receiver: Receiver,
-    workers: Workers,
-    store: Path,
-    token: Path | None,
-    tls: tuple[Path, Path] | None,
-    endpoint: str | None,
+    options: PortalOptions, store: Path, receiver: Receiver, workers: Workers
 ) -> Portal:
     """The portal, started; its address is printed."""
     with needing("the portal"):
         from service.ground.portal import open_portal
         from service.ground.vehicle import Vehicle
+    endpoint = options.vehicle
     vehicle = None if endpoint is None else Vehicle(endpoint, workers=workers)
-    page = open_portal(address, store, receiver.progress, token, tls, vehicle, workers)
+    page = open_portal(
+        options.address, store, receiver.progress, options.token, options.tls, vehicle, workers
+    )
     if vehicle is not None:
         vehicle.start()
     print(f"portal: {page.url}", file=sys.stderr, flush=True)
@@ -221,10 +258,9 @@ def _watch(
     workers: Workers,
     notifier: Notifier,
     radios: list[RadioLink],
-    once: bool,
-    idle_exit_s: float | None,
+    until: Until,
 ) -> None:
-    """Return on a signal, or when the options' condition is met."""
+    """Return on a signal, or when the condition of ``until`` is met."""
     shown: dict[str, str] = {}
     shown_at = beat_at = 0.0
     while not stop.wait(0.2):
@@ -234,10 +270,10 @@ def _watch(
             _check(workers, notifier)
             for radio in radios:
                 radio.beat(MAV_TYPE_GCS)
-        if once and any(entry["complete"] for entry in entries):
+        if until.once and any(entry["complete"] for entry in entries):
             stop.wait(1.5)  # let the report reach the drone
             return
-        if idle_exit_s is not None and time.monotonic() - receiver.last_news_at > idle_exit_s:
+        if until.idle_s is not None and time.monotonic() - receiver.last_news_at > until.idle_s:
             return
         if sys.stderr.isatty() and time.monotonic() - shown_at > SHOW_S:
             shown_at = time.monotonic()

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from service.commands import AsJson, ScanDir
+
+if TYPE_CHECKING:
+    from service.offline.refine.refly import Refly
 
 
 def refine(
@@ -145,42 +148,62 @@ def refly(
     as_json: AsJson = False,
 ) -> None:
     """Lines over gaps, places seen too seldom and places of large sigma, as a mission file."""
-    from dataclasses import replace
-
-    import numpy as np
-
     from service.errors import InputError
-    from service.offline.exports.view import ScanView
-    from service.offline.refine.refly import plan_json, suggest, waypoints_text
-    from service.scans.coverage import coverage_of
-    from service.scans.writing import writing
 
     path = out or scan_dir / "refly.plan"
     if path.suffix not in (".plan", ".waypoints"):
         raise InputError(f"--out {path}: name it .plan (QGroundControl) or .waypoints")
     if (views is not None and views < 1) or (sigma_m is not None and not sigma_m > 0):
         raise InputError("--views must be at least 1 and --sigma-m positive")
+    given: dict[str, Any] = {"min_views": views, "max_sigma_m": sigma_m}
+    limits = {name: value for name, value in given.items() if value is not None}
+    flight = _flight(scan_dir, limits, overlap, relative, photos)
+    if flight is None:
+        nothing = {"lines": 0, "weak_m2": 0.0, "plan": None}
+        print(json.dumps(nothing) if as_json else "nothing is weak; no flight is needed")
+        return
+    _write_plan(path, flight)
+    figures = _plan_figures(path, flight)
+    print(json.dumps(figures) if as_json else _plan_line(figures, flight.swath.speed_m_s))
+
+
+def _flight(
+    scan_dir: Path, limits: dict[str, Any], overlap: float, relative: bool, photos: bool
+) -> Refly | None:
+    """Lines over what is weak by ``limits``, flown as the scan was; None where nothing is."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from service.errors import InputError
+    from service.offline.exports.view import ScanView
+    from service.offline.refine.refly import suggest
+    from service.scans.coverage import coverage_of
+
     with ScanView(scan_dir) as scan:
         found = coverage_of(scan.store)
         if found is None:
             raise InputError(f"{scan_dir} holds no surface; there is nothing to compare with")
-        given: dict[str, Any] = {"min_views": views, "max_sigma_m": sigma_m}
-        limits = {name: value for name, value in given.items() if value is not None}
         found = replace(found, limits=replace(found.limits, **limits))
         heights = [p.agl_m for p in scan.poses if p.agl_m is not None]
         height = float(np.median(heights)) if heights else None
         moving = [p.speed_m_s for p in scan.poses if p.speed_m_s > 0.2]
         speed = float(np.median(moving)) if moving else 3.0
-        flight = suggest(found, speed, height, overlap, relative, photos)
-    if flight is None:
-        nothing = {"lines": 0, "weak_m2": 0.0, "plan": None}
-        print(json.dumps(nothing) if as_json else "nothing is weak; no flight is needed")
-        return
+        return suggest(found, speed, height, overlap, relative, photos)
+
+
+def _write_plan(path: Path, flight: Refly) -> None:
+    from service.offline.refine.refly import plan_json, waypoints_text
+    from service.scans.writing import writing
+
     text = waypoints_text(flight) if path.suffix == ".waypoints" else plan_json(flight)
     with writing(path) as part:
         part.write_text(text, encoding="utf-8")
+
+
+def _plan_figures(path: Path, flight: Refly) -> dict[str, Any]:
     swath = flight.swath
-    figures: dict[str, Any] = {
+    return {
         "plan": str(path),
         "lines": len(flight.lines),
         "patches": flight.patches,
@@ -191,11 +214,11 @@ def refly(
         "altitude_amsl_m": round(swath.altitude_amsl_m, 1),
         "picture_m": [round(swath.across_m, 1), round(swath.along_m, 1)],
     }
-    if as_json:
-        print(json.dumps(figures))
-        return
-    print(
-        f"{path}: {len(flight.lines)} line(s) over {flight.weak_m2:.0f} m2 in {flight.patches} "
-        f"place(s), {flight.length_m:.0f} m, {figures['seconds']} s at {swath.speed_m_s:.1f} m/s, "
-        f"{swath.altitude_amsl_m:.0f} m above sea level"
+
+
+def _plan_line(figures: dict[str, Any], speed_m_s: float) -> str:
+    return (
+        f"{figures['plan']}: {figures['lines']} line(s) over {figures['weak_m2']:.0f} m2 in "
+        f"{figures['patches']} place(s), {figures['length_m']:.0f} m, {figures['seconds']} s at "
+        f"{speed_m_s:.1f} m/s, {figures['altitude_amsl_m']:.0f} m above sea level"
     )

@@ -6,6 +6,7 @@ import json
 import re
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,6 +16,7 @@ from service.errors import InputError
 
 if TYPE_CHECKING:
     from service.sim.live import LiveOptions
+    from service.sim.recording import SimulationOptions
 
 VIDEO_TO = "udp://127.0.0.1:5600?pkt_size=1316"
 PAIR = re.compile(r"^(-?[0-9.]+):(-?[0-9.]+)$")
@@ -98,20 +100,15 @@ def simulate(
     With --live the flight is then played in real time, as a camera's stream and an autopilot's
     MAVLink; a folder that already holds a flight is played as it is.
     """
-    from service.sim.live import LiveOptions
-
-    if live and (out / "flight.mp4").exists():
-        _play(out, LiveOptions(video_to, mavlink_to, loop, until_stdin_ends), as_json)
-        return
     from service.cameras.camera_file import shutter_of
     from service.sim import recording
     from service.sim.flight import FlightPlan, SensorNoise
+    from service.sim.live import LiveOptions
     from service.sim.render import Look
     from service.sim.telemetry import TelemetryOptions
 
-    started = time.monotonic()
-    try:
-        options = recording.SimulationOptions(
+    def options() -> recording.SimulationOptions:
+        return recording.SimulationOptions(
             FlightPlan(
                 pattern, duration_s, height_m, speed_m_s, heading_deg, camera_pitch_deg, legs,
                 spacing_m, wobble_deg, sway_m, climb_m, swing_deg,
@@ -139,16 +136,31 @@ def simulate(
             relief_m, density, photos, depth_frames, crf, telemetry, video,
             shutter_of(readout_ms, readout_direction), flight_seed, site_m, changes, date,
         )  # fmt: skip
-        simulation = recording.prepare(options)
+
+    show = LiveOptions(video_to, mavlink_to, loop, until_stdin_ends) if live else None
+    _simulate(out, options, show, as_json)
+
+
+def _simulate(
+    out: Path, options: Callable[[], SimulationOptions], live: LiveOptions | None, as_json: bool
+) -> None:
+    """Render the flight and, with ``live``, play it; play the one that ``out`` holds already."""
+    from service.sim import recording
+
+    if live is not None and (out / "flight.mp4").exists():
+        _play(out, live, as_json)
+        return
+    started = time.monotonic()
+    try:
+        simulation = recording.prepare(options())
     except ValueError as error:
         raise InputError(f"simulate: {error}") from error
-    show = _progress if sys.stderr.isatty() else None
-    result = recording.write(simulation, out, show)
-    if live:
-        print(f"{out}: {result['frames']} frames rendered", file=sys.stderr)
-        _play(out, LiveOptions(video_to, mavlink_to, loop, until_stdin_ends), as_json)
+    result = recording.write(simulation, out, _progress if sys.stderr.isatty() else None)
+    if live is None:
+        _report(out, result, time.monotonic() - started, as_json)
         return
-    _report(out, result, time.monotonic() - started, as_json)
+    print(f"{out}: {result['frames']} frames rendered", file=sys.stderr)
+    _play(out, live, as_json)
 
 
 def _play(folder: Path, options: LiveOptions, as_json: bool) -> None:
