@@ -1,4 +1,4 @@
-"""What an autopilot says, packed by pymavlink."""
+"""Messages of an autopilot, packed by pymavlink."""
 
 from __future__ import annotations
 

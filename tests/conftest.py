@@ -34,7 +34,7 @@ class HouseFlight:
         return se3.compose(self.nadir, np.array([east_m, 0.0, self.height_m]))
 
     def keyframe(self, seq: int, east_m: float, sigma_m: float = 0.05) -> Keyframe:
-        """What the camera sees, without error."""
+        """The exact view of the camera."""
         h, w = 90, 160
         u, v = np.meshgrid(np.arange(w), np.arange(h))
         a, b = (u - self.K[0, 2]) / self.K[0, 0], (v - self.K[1, 2]) / self.K[1, 1]

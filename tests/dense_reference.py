@@ -43,7 +43,7 @@ def _cut(data: I64, smoothness: Smoothness) -> I64:
 
 
 def _arriving(messages: I64) -> list[I64]:
-    """What each pixel gets from below, above, right and left; nothing from beyond the border."""
+    """Messages to each pixel from below, above, right and left; none from beyond the border."""
     padded = np.pad(messages, ((0, 0), (1, 1), (1, 1), (0, 0)))
     return [padded[0, 2:, 1:-1], padded[1, :-2, 1:-1], padded[2, 1:-1, 2:], padded[3, 1:-1, :-2]]
 

@@ -1,4 +1,4 @@
-"""What the tests of peers on the loopback share."""
+"""Ports and waiting for tests of peers on the loopback."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the tests of the portal share: a client, a store with a scan, a vehicle's other end.
+"""Parts for the tests of the portal: a client, a store with a scan, a vehicle's other end.
 
 A test that imports it is skipped where the portal's packages are missing.
 """

@@ -1,4 +1,4 @@
-"""What a scan remembers of its frames: the same poses as ever, in memory that stays small."""
+"""A scan keeps the poses of its frames exactly, in memory that stays small."""
 
 from __future__ import annotations
 

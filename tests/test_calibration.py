@@ -161,7 +161,7 @@ def test_wrong_input_is_refused() -> None:
 
 
 def opencv_rms(paths: list[Path], pattern: tuple[int, int]) -> float:
-    """What OpenCV's sample does: classic corners, fixed window, all five coefficients."""
+    """Calibration as in OpenCV's sample: classic corners, fixed window, all five coefficients."""
     points, size = [], (0, 0)
     for path in paths:
         gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)

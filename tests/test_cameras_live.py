@@ -214,7 +214,7 @@ def test_an_ended_stream_is_released_at_once(
 
 @pytest.fixture
 def no_collector() -> Iterator[None]:
-    """What refers to itself is not freed meanwhile."""
+    """Switch off the collector, so that cycles are not freed meanwhile."""
     gc.disable()
     yield
     gc.enable()

@@ -113,7 +113,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def images_of_an_overload(scan: Path) -> None:
-    """What the step "record only" keeps: images named by their time, and the log of the links."""
+    """Files of the step "record only": images named by their time, and the log of the links."""
     (scan / "later").mkdir()
     shutil.copy("flight.tlog", scan / "link.tlog")
     with ScanView(scan) as view:

@@ -25,7 +25,7 @@ LOOP = np.diag([5e-4**2] * 3 + [0.03**2] * 3)
 
 @dataclass(frozen=True)
 class Hard:
-    """What a flight has to bear."""
+    """The faults of a flight."""
 
     seed: int
     leg: int  # keyframes

@@ -1,4 +1,4 @@
-"""What came by radio alone is completed from the aircraft's card after landing."""
+"""A scan that came by radio alone is completed from the aircraft's card after landing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is wanted wins: a stop ends every retry, a pause outlasts a fault, one scan at a time."""
+"""The last order wins: a stop ends every retry, a pause outlasts a fault, one scan at a time."""
 
 from __future__ import annotations
 
@@ -344,7 +344,7 @@ def test_a_scan_by_command_is_closed_after_landing(
 
 
 def landings(watch: LandingWatch, *steps: tuple[float, bool, bool], after_s: float = 60.0) -> str:
-    """What comes of (time, armed, disarmed) steps, one letter each."""
+    """The result of (time, armed, disarmed) steps, one letter each."""
     letters = {Landing.NOTHING: ".", Landing.LANDED: "L", Landing.CLOSE: "C"}
     return "".join(letters[watch.look(True, a, d, after_s, t)] for t, a, d in steps)
 

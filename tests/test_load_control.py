@@ -1,4 +1,4 @@
-"""What a level does to the frames of a camera, and what the operator hears of it."""
+"""Effect of a level on the frames of a camera, and the messages to the operator."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ def attitude(t: float, strength: float = 1.0) -> Quaternion:
 def watch_flight(
     latency_s: float, noise_rad: float, strength: float, hz: float, seconds: float = 40.0
 ) -> LatencyWatch:
-    """What a camera with a latency sees; its mount does not matter."""
+    """The view of a camera with a latency; its mount does not matter."""
     rng = np.random.default_rng(7)
     watch = LatencyWatch()
     mount = Rotation.from_euler("ZYX", [0.4, -1.3, 0.1])

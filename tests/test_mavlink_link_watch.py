@@ -1,4 +1,4 @@
-"""What is missing on open links is reported, each with the setting to change."""
+"""Messages missing on open links are reported, each with the setting to change."""
 
 from __future__ import annotations
 

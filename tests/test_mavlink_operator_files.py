@@ -1,4 +1,4 @@
-"""What operators are given agrees with what the service takes."""
+"""Files and pages for operators agree with what the service takes."""
 
 from __future__ import annotations
 

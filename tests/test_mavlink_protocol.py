@@ -80,7 +80,7 @@ def with_any_payload(message_id: int, payload: bytes, source: tuple[int, int]) -
 
 @pytest.mark.parametrize("seed", range(4))
 def test_right_checksums_around_any_payload_of_any_message(seed: int) -> None:
-    """What a hostile or confused sender can do: every message, random content."""
+    """A hostile or confused sender: every message, random content."""
     rng = random.Random(seed)
     station = Station()
     station.feed(packed(beat()))

@@ -35,7 +35,7 @@ def ground() -> U8:
 
 
 def photograph(ground: U8, T_world_camera: F64) -> U8:
-    """What the camera sees of the plane z = 0."""
+    """The image of the plane z = 0."""
     R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
     plane = np.array([[M_PER_PX, 0, -120.0], [0, M_PER_PX, -120.0], [0, 0, 1]])
     H = K @ R.T @ (np.c_[np.eye(3)[:, :2], -t] @ plane)

@@ -1,4 +1,4 @@
-"""What is installed: three plain packages side by side, layered, with the promised files."""
+"""The installation: three plain packages side by side, layered, with the promised files."""
 
 from __future__ import annotations
 

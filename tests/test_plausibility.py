@@ -1,4 +1,4 @@
-"""What a camera cannot have seen."""
+"""Depth that a camera cannot have seen is dropped."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ class Ruler:
 
     @property
     def figures(self) -> dict[str, str]:
-        """What the panel says."""
+        """The text of the panel."""
         script = (
             "Object.fromEntries([...document.querySelectorAll('.measure dt')]"
             ".map(t => [t.textContent, t.nextSibling.textContent]))"

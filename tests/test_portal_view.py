@@ -1,4 +1,4 @@
-"""What the portal's buttons and settings do in a real browser; skipped without one.
+"""The portal's buttons and settings in a real browser; skipped without one.
 
 One browser and one portal serve all tests of this file.
 """
@@ -99,7 +99,7 @@ def open_scan(page: Page, portal: Portal) -> None:
 
 
 def drawn(page: Page) -> U8:
-    """What the stage shows, once it stands still."""
+    """The image on the stage, once it stands still."""
     page.run("new Promise(r => setTimeout(r, 100))")
     page.wait("document.body.dataset.still === 'yes'")
     data = np.frombuffer(base64.b64decode(page.run(IMAGE)), np.uint8)

@@ -199,7 +199,7 @@ class Autopilot:
 
 
 def imported(path: Path) -> Any:
-    """What mavsdk's reader of QGroundControl plans makes of the file."""
+    """The file as mavsdk's reader of QGroundControl plans understands it."""
     mavsdk = pytest.importorskip("mavsdk")
     mission_raw = pytest.importorskip("mavsdk.plugins.mission_raw")
 

@@ -261,7 +261,7 @@ def test_a_sure_readout_names_a_shutter(readout_s: float, way: str, expected: Sh
 
 
 def searched(readout_s: float, frames: int) -> tuple[ReadoutEstimate, float]:
-    """What the odometry finds, from nothing, and the readout it uses then."""
+    """The readout that the odometry finds, from nothing, and the one it uses then."""
     ground = texture()
     odometry = Odometry(PLAIN, OdometryConfig(), lens=PLAIN, seeks_readout=True)
     for i in range(frames):

@@ -55,7 +55,7 @@ def test_outliers_do_not_count_as_noise() -> None:
 
 @pytest.mark.parametrize(("walk", "rate"), [(0.1, 0.0), (0.02, 0.05), (0.1, 0.05)])
 def test_a_drift_is_known_after_a_minute(walk: float, rate: float) -> None:
-    """What walk and rate add up to over 60 s, whichever of them it is counted as."""
+    """The sum of walk and rate over 60 s, whichever of them it is counted as."""
     after_m = []
     for seed in range(20):
         rng = np.random.default_rng(seed)

@@ -55,7 +55,7 @@ def test_writes_disparity_in_pixels(
     out, image = tmp_path / "d.npy", tmp_path / "d.png"
     code = run(
         monkeypatch, "stereo", *pair, "--labels", labels, "--min-disparity", first,
-        "--out", out, "--picture", image, "--backend", "cpu", "--json",
+        "--out", out, "--image", image, "--backend", "cpu", "--json",
     )  # fmt: skip
     assert code == 0
     report = json.loads(capsys.readouterr().out.splitlines()[-1])

@@ -149,7 +149,7 @@ def test_any_bytes_never_raise(data: bytes, kind: int) -> None:
 
 
 def fly(sender: TunnelSender, store: ScanStore, seconds: float) -> list[tuple[float, bytes]]:
-    """What the radio gets while 100 m are flown in that time, a keyframe every 8 m."""
+    """Messages of the radio while 100 m are flown in that time, a keyframe every 8 m."""
     sent: list[tuple[float, bytes]] = []
     next_frame, seq, now = 0.0, 0, 0.0
     while now < seconds:

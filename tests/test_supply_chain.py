@@ -1,4 +1,4 @@
-"""What is downloaded is pinned by hash, listed with its licence, and never run as root."""
+"""Downloads are pinned by hash, listed with its licence, and never run as root."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def bundle(tmp_path: Path) -> Path:
 
 
 def install(bundle: Path) -> subprocess.CompletedProcess[str]:
-    """What deploy/install.sh does with the wheels."""
+    """Install the wheels as deploy/install.sh does."""
     return subprocess.run(
         [
             *PIP, "install", "--no-index", "--find-links", str(bundle / "wheels"),

@@ -154,7 +154,7 @@ def rows(view: list[list[int]], px: list[list[float]]) -> Sightings:
 
 
 def energy(found: Sightings, neighbours: Array, slot: Array) -> float:
-    """What :func:`choose` makes small: data costs plus ``PENALTY`` per edge between views."""
+    """The energy of :func:`choose`: data costs plus ``PENALTY`` per edge between views."""
     seen = slot >= 0
     rows = np.flatnonzero(seen)
     best = found.px_per_m[rows, 0]

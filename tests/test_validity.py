@@ -1,4 +1,4 @@
-"""What no record may say, byte by byte from docs/wire.md, and grids that nothing can inflate."""
+"""Values that no record may hold, byte by byte from docs/wire.md; grids cannot be inflated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is new to the map, and fused clouds, against dictionaries and closed forms."""
+"""New surface of the map, and fused clouds, against dictionaries and closed forms."""
 
 from __future__ import annotations
 

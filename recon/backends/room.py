@@ -20,7 +20,7 @@ Built = TypeVar("Built")
 
 
 def kept(cache: dict[Key, Built], key: Key, limit: int, build: Callable[[], Built]) -> Built:
-    """What ``cache`` holds for ``key``, built when new; beyond ``limit`` the oldest go."""
+    """The entry of ``cache`` for ``key``, built when new; beyond ``limit`` the oldest go."""
     if key not in cache:
         while len(cache) >= limit:
             cache.pop(next(iter(cache)))

@@ -84,7 +84,7 @@ def _inputs(depth: DepthMap) -> list[Array]:
 
 
 def _descent(config: IcpConfig) -> Callable[..., tuple[Tensor, ...]]:
-    """What a plan runs: from two depth maps and a start to the numbers of :func:`_concluded`."""
+    """The function of a plan: two depth maps and a start to the numbers of :func:`_concluded`."""
 
     def run(
         z_a: Tensor, sigma_a: Tensor, K_a: Tensor, z_b: Tensor, sigma_b: Tensor, K_b: Tensor,

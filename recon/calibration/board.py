@@ -189,7 +189,7 @@ def _warnings(
     distortion: F64,
     size_px: tuple[int, int],
 ) -> tuple[str, ...]:
-    """What makes the result weak, in words for the operator."""
+    """Reasons why the result is weak, in words for the operator."""
     out = []
     if len(views) < 10:
         out.append(f"only {len(views)} views were used; 15 or more give a firmer result")

@@ -1,4 +1,4 @@
-"""What of a depth image its camera can have seen."""
+"""The part of a depth image that its camera can have seen."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ class Surface:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Equations:
-    """What an iteration sums up over all partners (:mod:`recon.mapping.icp_kernels`)."""
+    """Sums of one iteration over all partners (:mod:`recon.mapping.icp_kernels`)."""
 
     H: F64  # (6, 6)
     common: F64  # (6, 6)

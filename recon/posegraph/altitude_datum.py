@@ -32,7 +32,7 @@ WILD_STEPS = 36.0
 
 @dataclass(frozen=True, slots=True)
 class AltitudeDatum:
-    """What altitudes must be raised by, and what is then left of the constant, 1 sigma."""
+    """Correction to add to altitudes, and the sigma of what is then left of the constant."""
 
     shift_m: float = 0.0
     sigma_m: float = float("inf")

@@ -25,7 +25,7 @@ class Track(Protocol):
     """The track that loops are held against."""
 
     def node(self, seq: int) -> Node:
-        """What is known of a keyframe."""
+        """The record of a keyframe."""
         ...
 
     def place(self, seq: int) -> F64:

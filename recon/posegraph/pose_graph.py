@@ -166,11 +166,11 @@ class PoseGraph:
         return [loop.scaled(self.scale(loop.a)) for loop in self._book.taken]
 
     def similarity(self, segment: int) -> Similarity | None:
-        """What brings a segment's odometry to the world; None before telemetry or a loop does."""
+        """The motion from a segment's odometry to the world; None before telemetry or a loop."""
         return self._segments.known(segment)
 
     def constants(self) -> Constants:
-        """What the sensors are constantly off by, as known for the newest segment."""
+        """Constant errors of the sensors, as known for the newest segment."""
         return self._segments.constants(self._newest().segment) if self._nodes else Constants()
 
     def is_tied(self, segment: int) -> bool:
@@ -178,7 +178,7 @@ class PoseGraph:
         return self._segments.is_tied(segment)
 
     def node(self, seq: int) -> Node:
-        """What is known of keyframe ``seq``. Raises KeyError for an unknown one."""
+        """The record of keyframe ``seq``. Raises KeyError for an unknown one."""
         return self._nodes[seq]
 
     def __contains__(self, seq: int) -> bool:
@@ -221,7 +221,7 @@ class PoseGraph:
         return self._smoother.poses()
 
     def sources(self, seq: int) -> tuple[str, ...]:
-        """What keyframe ``seq`` rests on."""
+        """Names of the sources that keyframe ``seq`` rests on."""
         used = self._sources[self._nodes[seq].key]
         return tuple(name for name in SOURCES if name in used)
 

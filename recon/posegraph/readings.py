@@ -26,7 +26,7 @@ MIN_TURN_RAD = 1e-4
 """Sigma that no attitude is better than."""
 
 FRAME_SIGMA_RAD = (0.05, 0.05, 0.15)
-"""What a placed segment's tilt and heading are known to, at least."""
+"""Smallest sigma of a placed segment's tilt and heading."""
 
 BLOCK = 20
 """Keyframes that share one scale and one altitude bias."""

@@ -1,4 +1,4 @@
-"""What the pose graph keeps of keyframes and loops, and its parameters."""
+"""Records of the pose graph about keyframes and loops, and its parameters."""
 
 from __future__ import annotations
 

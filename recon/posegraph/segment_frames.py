@@ -82,7 +82,7 @@ class SegmentFrames:
         return at_camera(node.prior, frame.R @ node.T_odom_camera[:3, :3], frame.scale)
 
     def constants(self, segment: int) -> Constants:
-        """What the sensors are constantly off by, as the segment's frame was fitted with."""
+        """Constant errors of the sensors, as the segment's frame was fitted with."""
         return self._constants.get(segment, Constants())
 
     def noise(self, segment: int) -> ReadingNoise | None:

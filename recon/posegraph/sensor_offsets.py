@@ -1,4 +1,4 @@
-"""What each sensor constantly differs by from the similarity that places a segment.
+"""Constant difference of each sensor from the similarity that places a segment.
 
 The similarity weighs the sensors against each other over the whole segment. What then is left
 of each as a constant turn, stretch or shift has been decided; only what varies along the track
@@ -31,7 +31,7 @@ NOTABLE_M, NOTABLE_RAD = 0.1, 0.003
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Constants:
-    """What is constant over a whole flight, whatever becomes of the track."""
+    """Constants of a whole flight, whatever becomes of the track."""
 
     datum: AltitudeDatum = field(default_factory=AltitudeDatum)
     boresight: Boresight = field(default_factory=Boresight)

@@ -37,7 +37,7 @@ class Tie:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanPrior:
-    """What a scan knows of its own placing."""
+    """How well a scan is placed by its own poses."""
 
     centre_m: F64  # (3,) about which it turns and grows
     sigma: F64  # (7,) rad, m, share

@@ -367,7 +367,7 @@ class Trajectory:
         return self._ledger.read(row, row + 1)
 
     def _spans(self, ends: list[tuple[int, int]]) -> Spans:
-        """What lies between these pairs of nodes, as known now."""
+        """The spans between these pairs of nodes, as known now."""
         nodes = [[self.graph.node(seq) for seq in pair] for pair in ends]
         return Spans(
             np.array([[self._row(seq) for seq in pair] for pair in ends]),

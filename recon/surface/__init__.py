@@ -1,1 +1,1 @@
-"""What is made of a finished cloud: rasters, coverage, mesh, texture."""
+"""Products of a finished cloud: rasters, coverage, mesh, texture."""

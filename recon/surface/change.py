@@ -1,4 +1,4 @@
-"""What changed between two surface models of one place, and how sure that is.
+"""Changes between two surface models of one place, with their sigmas.
 
 The difference of each cell is a mean over its neighbourhood; its sigma follows from the scatter
 of the differences there, from the cells' own sigmas and from the alignment. That is M3C2 with the
@@ -23,7 +23,7 @@ I32 = npt.NDArray[np.int32]
 
 @dataclass(frozen=True, slots=True)
 class ChangeConfig:
-    """What counts as a change."""
+    """Limits of what counts as a change."""
 
     window: int = 3  # cells of a side, over which a difference is averaged
     correlated_cells: float = 6.0  # cells whose errors stereo makes alike

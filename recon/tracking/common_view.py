@@ -1,4 +1,4 @@
-"""What two images have in common, whatever turn, zoom or shift lies between them.
+"""Common features of two images, whatever turn, zoom or shift lies between them.
 
 SIFT features (Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94) with the square root of their
 descriptors (Arandjelovic and Zisserman 2012, doi:10.1109/CVPR.2012.6248018), found on a small
@@ -110,7 +110,7 @@ def features(gray: U8, width_px: int = WIDTH_PX, most: int = MOST) -> Features:
 
 
 def common_view(a: Features, b: Features) -> CommonView | None:
-    """What images ``a`` and ``b`` share, or None when they do not surely share anything."""
+    """The features that images ``a`` and ``b`` share, or None when none are certain."""
     rows_a, rows_b = mutual(a.descriptors, b.descriptors)
     if len(rows_a) < MIN_MATCHES:
         return None

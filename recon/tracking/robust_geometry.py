@@ -29,7 +29,7 @@ _T = TypeVar("_T")
 
 
 def attempt(call: Callable[[], _T]) -> _T | None:
-    """What ``call`` returns; None when OpenCV rejects its input."""
+    """The result of ``call``; None when OpenCV rejects its input."""
     try:
         return call()
     except (cv2.error, np.linalg.LinAlgError):

@@ -19,7 +19,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="one JSON object at the end
 
 
 def stop_by_signals() -> Event:
-    """What Ctrl-C or a TERM signal sets; from now on they do not end the process themselves."""
+    """An event that Ctrl-C or a TERM signal sets, instead of ending the process."""
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())

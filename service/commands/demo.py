@@ -131,7 +131,7 @@ def _start_ground(out: Path, endpoint: str, portal: str) -> subprocess.Popen[str
 
 
 def _said(ground: subprocess.Popen[str], out: Path, start: str) -> str:
-    """What follows ``start`` in a line of the receiver's log, once it is there."""
+    """The rest of the line of the receiver's log that begins with ``start``, once it is there."""
     deadline = time.monotonic() + READY_S
     while time.monotonic() < deadline and ground.poll() is None:
         for line in (out / "ground.log").read_text(encoding="utf-8").splitlines():

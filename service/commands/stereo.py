@@ -32,7 +32,9 @@ def stereo(
     checked: Annotated[
         bool, typer.Option("--checked", help="unknown where the pair does not prove it")
     ] = False,
-    picture: Annotated[Path | None, typer.Option(help="also write it in colour (.png)")] = None,
+    image: Annotated[
+        Path | None, typer.Option("--image", "--picture", help="also write it in colour (.png)")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Disparity of a rectified pair: left pixel (u, v) matches right pixel (u - d, v).
@@ -51,8 +53,8 @@ def stereo(
         raise InputError(f"--labels {labels}: give 2 to 1024")
     config = matching_config(iterations, min_disparity, checked)
     check_output(out, ".npy")
-    if picture is not None:
-        check_output(picture, ".png")
+    if image is not None:
+        check_output(image, ".png")
     chosen = open_matcher(backend, model)
     start = time.perf_counter()
     try:
@@ -60,7 +62,7 @@ def stereo(
     except ValueError as error:
         raise InputError(f"stereo: {error}") from error
     seconds = time.perf_counter() - start
-    write(out, picture, found.px + config.min_disparity, labels, min_disparity)
+    write(out, image, found.px + config.min_disparity, labels, min_disparity)
     known = float((found.px == found.px).mean())
     if as_json:
         report = {"out": str(out), "known_share": known, "backend": chosen.name}
@@ -84,19 +86,19 @@ def check_output(path: Path, suffix: str) -> None:
         raise InputError(f"{path}: there is no folder {path.parent}")
 
 
-def write(out: Path, picture: Path | None, px: F32, labels: int, min_disparity: int) -> None:
+def write(out: Path, image: Path | None, px: F32, labels: int, min_disparity: int) -> None:
     """The disparity as an array and, when asked, as an image (black = unknown)."""
     import cv2
     import numpy as np
 
     try:
         np.save(out, px.astype(np.float32))
-        if picture is not None:
+        if image is not None:
             known = np.isfinite(px)
             level = np.where(known, (px - min_disparity) * (255 / (labels - 1)), 0)
             colour = cv2.applyColorMap(level.astype(np.uint8), cv2.COLORMAP_TURBO)
             colour[~known] = 0
-            picture.write_bytes(cv2.imencode(".png", colour)[1].tobytes())
+            image.write_bytes(cv2.imencode(".png", colour)[1].tobytes())
     except OSError as error:
         raise OutsideError(f"{out}: cannot be written: {error.strerror}") from error
 

@@ -32,7 +32,7 @@ class Vehicle:
     """Looks for a companion on a MAVLink endpoint, on a thread of its own.
 
     ``connect`` makes the :class:`service.ground.operator.Operator`; it raises OutsideError
-    while no one is connected.
+    while none is connected.
     """
 
     def __init__(

@@ -74,7 +74,7 @@ def main_poses(poses: Iterable[PoseRecord], apart: Iterable[Stretch]) -> list[Po
 
 
 def in_words(store: Keyframes) -> str:
-    """What is left out, for the operator; empty where nothing is."""
+    """A note on the pieces that are left out, for the operator; empty where none is."""
     apart = stretches_apart(store)
     if not apart:
         return ""

@@ -111,7 +111,7 @@ class SimulationOptions:
 
     @property
     def own_seed(self) -> int:
-        """What decides the motion and the sensors."""
+        """The seed of the motion and the sensors."""
         return self.seed if self.flight_seed is None else self.flight_seed
 
     @property

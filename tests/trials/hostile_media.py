@@ -1,4 +1,4 @@
-"""What a stranger's video, log or settings file may hold: damaged, or made to harm."""
+"""Videos, logs and settings files that are damaged, or made to harm."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a hostile peer puts on the datalink: every kind of message, wrong in every way we know.
+"""Messages of a hostile peer on the datalink: every kind, wrong in every way we know.
 
 All of it is made from a seed. ``ATTACKER`` is a name of the peer's own; most records lie under a
 scan with a sound header, so that the receiver looks at what follows.
@@ -343,7 +343,7 @@ def hostile_puts() -> Iterator[Put]:
 
 
 def hostile_reports(station: str) -> Iterator[tuple[str, bytes]]:
-    """What comes to a drone as ``held``; ``station`` makes each differ."""
+    """A ``held`` message to a drone; ``station`` makes each differ."""
     sound = {"v": 1, "numbers": {"k0": [[0, 9]]}, "received_bytes": 5, "from": station}
     yield from hostile_json(sound)
     for value in (-1, 1 << 62, 1 << 70, 1e300):

@@ -1,4 +1,4 @@
-"""What a stranger's card may hold: a sound scan folder, mutated by bytes, by meaning, by schema."""
+"""Hostile scan folders: a sound one, mutated by bytes, by meaning, by schema."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ SPREADS: dict[str, Callable[[Any, int], Any]] = {
     "one instant": lambda head, _: replace(head, time_unix_ns=7),
     "backward in time": lambda head, seq: replace(head, time_unix_ns=(1 << 62) - seq * 10**18),
 }
-"""What a decoder that looks at one record takes, and no flight ever brought."""
+"""Records that a decoder takes one by one, and that no flight ever brought."""
 
 
 def _file(name: str, make: Callable[[Path], object]) -> Change:

@@ -162,7 +162,7 @@ def tunnelled(endpoint: str, count: int) -> int:
 
 
 def exported(cage: Cage, scans: list[Path]) -> list[str]:
-    """What goes wrong when deliverables of hostile ``scans`` are written."""
+    """Faults in writing the deliverables of hostile ``scans``."""
     faults = []
     for number, scan in enumerate(scans[:40] if WHOLE else scans[:4]):
         for kind in EXPORTS if WHOLE else EXPORTS[number % len(EXPORTS) :][:1]:
@@ -172,7 +172,7 @@ def exported(cage: Cage, scans: list[Path]) -> list[str]:
 
 
 def hostile_rate(stop: threading.Event, session: Any, seed: int, tally: Counter[str]) -> None:
-    """What the hostile drone puts: a steady stream, and a burst now and then."""
+    """Messages of the hostile drone: a steady stream, and a burst now and then."""
     known = list(hostile_puts())
     puts = itertools.chain(known, endless_puts(seed))
     began, count = time.monotonic(), 0
@@ -305,12 +305,12 @@ def test_hostile_stores_are_refused_or_read(
 
 
 def no_pipes(folder: str, names: list[str]) -> list[str]:
-    """What ``copytree`` cannot copy."""
+    """Files that ``copytree`` cannot copy."""
     return [name for name in names if (Path(folder) / name).is_fifo()]
 
 
 def shown(ground: Ground, made: list[str]) -> list[str]:
-    """What goes wrong when the portal shows hostile scans."""
+    """Faults of the portal with hostile scans."""
     from websockets.exceptions import WebSocketException
     from websockets.sync.client import connect
 

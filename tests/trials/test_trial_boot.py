@@ -70,7 +70,7 @@ class Aircraft:
         return self.machine.root / "var" / "lib" / "skyrelief" / "scans"
 
     def status(self) -> dict[str, Any]:
-        """What the service says; empty while nothing answers."""
+        """The answer of the service; empty while there is none."""
         return answer(self.health)
 
     def until_scanning(self, since_s: float, limit_s: float = 90.0) -> float:
@@ -90,7 +90,7 @@ class Aircraft:
         return self.machine.ask(f"systemctl show -p {name} --value skyrelief")
 
     def configure(self) -> None:
-        """What the aircraft's builder writes into the file that the installer made."""
+        """Edit the installer's file as the aircraft's builder does."""
         file = self.machine.root / CONFIGURATION[1:]
         text = file.read_text()
         for key, value in (

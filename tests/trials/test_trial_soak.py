@@ -81,7 +81,7 @@ LANDED = -1.0
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What was seen at one moment of one flight."""
+    """Figures of one moment of one flight."""
 
     flight: int
     flying_s: float  # LANDED: at rest after it
@@ -96,8 +96,9 @@ class Sample:
 
 
 class Held(NamedTuple):
-    """What a process and its children hold. ``own_mib`` leaves out pages of files (libraries),
-    which the kernel takes away and reads again as it likes.
+    """Memory and files of a process and its children.
+
+    ``own_mib`` leaves out pages of files (libraries), which the kernel drops and reads again.
     """
 
     mib: float
@@ -106,7 +107,7 @@ class Held(NamedTuple):
 
 
 def held(pid: int) -> Held:
-    """What it holds now."""
+    """Memory and files of the process now."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     kib = {line.split(":")[0]: float(line.split()[1]) for line in lines if line.endswith(" kB")}
     children: list[Held] = []

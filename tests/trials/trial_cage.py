@@ -30,7 +30,7 @@ MAX_MIB, MAX_MESH_MIB = 1536, 4096
 bounds of cells and triangles, which scans of square kilometres reach."""
 PRELOADED = ("offline", "scans", "stream", "cameras", "commands", "flight", "ground")
 LATE = ("torch", "onnx", "mesh_cluster")
-"""What a case imports itself: large, or with threads that a fork does not copy."""
+"""Packages that a case imports itself: large, or with threads that a fork does not copy."""
 FOREWARNED = {0: "done", 2: "refused in a line", 3: "outside world"}
 
 

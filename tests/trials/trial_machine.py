@@ -24,7 +24,7 @@ VERSION = "3.11"
 
 
 def lacking() -> str:
-    """What this machine lacks to boot another; empty when it can."""
+    """The reason why this machine cannot boot another; empty when it can."""
     missing = [name for name in NEEDED if shutil.which(name, path=_PATH) is None]
     if os.geteuid() != 0:
         missing.append("root")
@@ -87,7 +87,7 @@ class Machine:
         self._outside, self._first = None, 0
 
     def run(self, command: str, limit_s: float = 600.0) -> str:
-        """What a command typed in the machine printed, with an exit code that is not 0."""
+        """Output of a command typed in the machine, with an exit code that is not 0."""
         done = self._inside(command, limit_s)
         said = done.stdout + ("" if done.returncode == 0 else f"(exit code {done.returncode})\n")
         self.transcript += [f"# {command}", said.rstrip("\n")]
@@ -116,7 +116,7 @@ def _checked(command: list[str]) -> None:
 
 
 def make_bundle(target: Path) -> None:
-    """What ``make bundle`` makes, for the Python of the machine."""
+    """The folder that ``make bundle`` makes for the machine's Python."""
     bundle = ["bash", str(ROOT / "deploy" / "bundle.sh"), "--out", str(target)]
     _checked(["env", f"PYTHON={sys.executable}", *bundle])
 

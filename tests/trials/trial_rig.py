@@ -1,4 +1,4 @@
-"""What the trials share: the service as a process, its faults, and the table of outcomes."""
+"""Parts of the trials: the service as a process, its faults, and the table of outcomes."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ class TilePart:
 
 @dataclass(frozen=True, slots=True)
 class Footprint:
-    """What one keyframe covers, and how finely."""
+    """Ground that one keyframe covers, and how finely."""
 
     seq: int
     points: int

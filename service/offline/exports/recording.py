@@ -99,7 +99,7 @@ class _Recording:
         self._write(self._log, log, time_ns)
 
     def log_header(self, store: ScanStore) -> None:
-        """What the scan is, and its notes."""
+        """Write a line that names the scan, and its notes."""
         header = store.header
         origin = f"{header.origin_lat_deg}, {header.origin_lon_deg}, {header.origin_alt_amsl_m} m"
         text = f"scan {header.name} of {header.drone}, {header.software}, origin {origin}"

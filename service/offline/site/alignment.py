@@ -91,7 +91,7 @@ def align_site(folders: Sequence[Path], out: Path, deliver: bool = True) -> Alig
 
 
 def _known(out: Path) -> dict[str, Any]:
-    """What an earlier alignment left in ``out``; InputError when it is another folder."""
+    """The document of an earlier alignment in ``out``; InputError when it is another folder."""
     if not out.exists():
         return {}
     if not (out / SITE).is_file():
@@ -172,7 +172,7 @@ def _tie(loop: Closure, track: Track, one: Keyframe, scans: Sequence[int]) -> Ti
 
 
 def _prior(track: Track, own: Bool) -> ScanPrior:
-    """What a scan's own poses (those of the track that are ``own``) say of its placing."""
+    """The placing of a scan by its own poses, those of the track that are ``own``."""
     centre = track.poses[own, :3, 3].mean(axis=0)
     A = se3.adjoint(se3.compose(np.eye(3), -centre))
     spread = A @ track.covariances[own].mean(axis=0) @ A.T
@@ -197,7 +197,7 @@ def _reposes(store: ScanStore, members: Sequence[Member], found: SiteAlignment) 
     return out
 
 
-# ---- what is said of it ------------------------------------------------------------------------
+# ---- the document ------------------------------------------------------------------------------
 
 
 def _document(

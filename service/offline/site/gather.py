@@ -225,7 +225,7 @@ def _copy_poses(
 
 
 def placed_pose(pose: PoseRecord, T: F64, origin: LocalFrame) -> PoseRecord:
-    """The record at another pose, with its place on the globe."""
+    """The record at another pose, with its geographic position."""
     lat, lon, alt = (float(v) for v in origin.to_geodetic(T[None, :3, 3])[0])
     good = all(math.isfinite(v) for v in (lat, lon, alt))
     return replace(
