@@ -552,7 +552,7 @@ GOOD = "name,keyframe_seq,u_px,v_px,lat,lon,alt_amsl_m\n"
         (GOOD + "A,0,10,10,47.39,8.54,nan\n", "not a finite number"),
         (GOOD + "A,0,10,10,47.39,8.54,40800\n", "not metres above sea level"),
         (GOOD + ",0,10,10,47.39,8.54,408\n", "no name"),
-        (GOOD + "A,,10,10,47.39,8.54,408\n", "either keyframe_seq or time"),
+        (GOOD + "A,,10,10,47.39,8.54,408\n", "one of keyframe_seq"),
         (GOOD + "A,1.5,10,10,47.39,8.54,408\n", "not a whole number"),
         (GOOD + "A,0,1,1,47.39,8.54,408\nA,1,1,1,47.38,8.54,408\n", "differs from line 2"),
         (GOOD + "A,3,10,10,47.39,8.54,408\n", "no keyframe 3; the nearest is 0"),
