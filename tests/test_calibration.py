@@ -133,6 +133,22 @@ def test_sigma_covers_the_error_of_the_focal_length() -> None:
     assert hits >= 8
 
 
+def test_terms_that_the_corners_leave_open_do_not_fold_the_image() -> None:
+    """Boards in the middle alone: with k2 and k3 five of these six models fold over."""
+    lens = np.array([0.15, -0.2, 0.0, 0.0, 0.0])
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        views = []
+        for k, (turn, _) in enumerate(board_poses(10)):
+            place = np.array([-0.1, -0.0625, 0.45 + 0.01 * k])
+            uv, _ = cv2.projectPoints(BOARD.points_m().astype(float), 0.6 * turn, place, K, lens)
+            noisy = uv.reshape(-1, 2) + rng.normal(0, 0.3, (54, 2))
+            views.append(BoardView(f"v{k}", noisy.astype(np.float32)))
+        result = calibrate(views, BOARD, SIZE)
+        assert result is not None and not any("folds" in w for w in result.warnings)
+        assert result.camera.K[0, 0] == pytest.approx(500.0, abs=3.0 * result.sigma_focal_px)
+
+
 def test_weak_sets_are_warned_about() -> None:
     turn, shift = board_poses(1)[0]
     views = [

@@ -76,6 +76,10 @@ class Calibration:
     warnings: tuple[str, ...]
 
 
+AS_WELL = 1.02
+"""A model whose rms is no more than so many times another's fits as well."""
+
+
 def find_board(gray: U8, board: Board) -> F32 | None:
     """(N, 2) corners of the board in a gray image, sub-pixel, or None when it is not there.
 
@@ -152,8 +156,26 @@ def calibrate(
 def _fit(
     views: Sequence[BoardView], board: Board, size_px: tuple[int, int], tangential: bool
 ) -> tuple[float, F64, F64, float, F64] | None:
-    """(rms, K, distortion, sigma of the focal length, rms per view), or None."""
+    """(rms, K, distortion, sigma of the focal length, rms per view), or None.
+
+    Corners that stay away from the image's edge leave the highest radial terms open: of a model
+    that folds over within the image, those without which the corners fit as well are left out.
+    """
     flags = 0 if tangential else cv2.CALIB_ZERO_TANGENT_DIST
+    found = _fit_terms(views, board, size_px, flags)
+    for fewer in (cv2.CALIB_FIX_K3, cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3):
+        if found is None or _monotonic(found[2], found[1], size_px):
+            break
+        other = _fit_terms(views, board, size_px, flags | fewer)
+        if other is not None and other[0] < AS_WELL * found[0]:
+            found = other
+    return found
+
+
+def _fit_terms(
+    views: Sequence[BoardView], board: Board, size_px: tuple[int, int], flags: int
+) -> tuple[float, F64, F64, float, F64] | None:
+    """As :func:`_fit`, with OpenCV's ``flags``."""
     objects = [board.points_m()] * len(views)
     images = [view.corners_px.reshape(-1, 1, 2) for view in views]
     start, unbent = np.eye(3), np.zeros(5)
