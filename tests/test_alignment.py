@@ -181,6 +181,21 @@ def test_scales_by_fixes_and_by_heights_are_distinguished(wrong: float) -> None:
         assert (apart < 3 * spread) == (wrong == 1.0)
 
 
+def test_the_scale_by_fixes_is_that_of_those_that_agree() -> None:
+    """Most fixes jump aside and count for nothing: neither do their places."""
+    some = anchors(np.eye(3), 1.4, np.zeros(3), seed=1, gnss_m=0.2)
+    found = fit(some)
+    assert found is not None
+    off = [
+        replace(a, prior=replace(a.prior, position_m=a.prior.position_m + 40.0))
+        if i >= 8 and a.prior.position_m is not None
+        else a
+        for i, a in enumerate(some)
+    ]
+    by_fixes, _ = scales(off, found)
+    assert by_fixes is not None and by_fixes.metres == pytest.approx(1.4, rel=0.05)
+
+
 def test_the_height_exactly_below_is_read_from_the_depth_map() -> None:
     """A camera leaning over a slope: only the point below gives the height, and edges do not."""
     K = np.array([[300.0, 0, 159.5], [0, 300.0, 89.5], [0, 0, 1]])

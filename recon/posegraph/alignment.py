@@ -379,12 +379,14 @@ def scales(anchors: Sequence[Anchor], at: Similarity) -> tuple[Scale | None, Sca
     r = _Readings(anchors)
     by_fixes = by_heights = None
     if len(r.fix) >= 4:
-        x, y = (r.x - r.x.mean(0)) @ at.R.T, r.fix - np.median(r.fix, axis=0)
-        near = np.abs(at.scale * r.x @ at.R.T + at.t - r.fix) < 5.0 * r.claimed
+        x, y = r.x @ at.R.T, r.fix
+        near = np.abs(at.scale * x + at.t - y) < 5.0 * r.claimed
         w = (near.all(axis=1)[:, None]) / r.claimed**2
+        total = np.maximum(np.sum(w, axis=0), 1e-30)
+        x, y = (v - np.sum(w * v, axis=0) / total for v in (x, y))
         power = float(np.sum(w * x**2))
         if power > 0:
-            scale = float(np.sum(w * x * (y - np.sum(w * y, 0) / np.sum(w, 0)))) / power
+            scale = float(np.sum(w * x * y)) / power
             # Errors of fixes wander slowly: all of them together count as a few.
             sigma = np.sqrt(max(len(x) / INDEPENDENT_HEIGHTS, 1.0) / power) / max(scale, 1e-9)
             by_fixes = Scale(scale, float(sigma)) if scale > 0 else None
