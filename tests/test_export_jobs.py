@@ -9,25 +9,30 @@ from typing import Any
 import pytest
 from loopback import until
 
+from service.errors import InputError
 from service.ground import state
 from service.ground.state import Jobs
+from service.progress import Progress
 from service.workers import Workers
+
+
+class View:
+    """Stands in for a scan that is opened."""
+
+    def __init__(self, folder: Path, progress: Progress) -> None:
+        self.name, self.progress = folder.name, progress
+
+    def __enter__(self) -> View:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
 
 
 def test_a_fault_of_ours_does_not_stop_the_exports_that_wait(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     began, go_on = threading.Event(), threading.Event()
-
-    class View:
-        def __init__(self, folder: Path) -> None:
-            self.name = folder.name
-
-        def __enter__(self) -> View:
-            return self
-
-        def __exit__(self, *_: object) -> None:
-            pass
 
     def export(scan: View, *_: Any) -> Path:
         if scan.name == "bad":
@@ -46,3 +51,46 @@ def test_a_fault_of_ours_does_not_stop_the_exports_that_wait(
     assert until(lambda: not jobs.busy(tmp_path / "good"))
     assert [job["state"] for job in jobs.of(tmp_path / "good")] == ["done"]
     assert jobs.of(tmp_path / "bad")[0]["error"] == "failed; see the log"
+
+
+def test_jobs_say_how_far_they_are_and_can_be_cancelled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    halfway, go_on = threading.Event(), threading.Event()
+
+    def export(scan: View, *_: Any) -> Path:
+        for n in scan.progress.over(range(4), 4):
+            if n == 2:
+                scan.progress("halfway")
+                halfway.set()
+                go_on.wait(10.0)
+        return Path("scan.kml")
+
+    monkeypatch.setattr(state, "ScanView", View)
+    monkeypatch.setattr(state, "export", export)
+    jobs = Jobs(Workers())
+    folder = tmp_path / "drone-1" / "test-1"
+    first, second, third = (jobs.start(folder, kind)["number"] for kind in ("kml", "laz", "dsm"))
+    assert halfway.wait(10.0)
+    running = jobs.listed()[0]
+    assert (running["percent"], running["doing"], running["state"]) == (50, "halfway", "running")
+    assert (running["drone"], running["scan"], running["kind"]) == ("drone-1", "test-1", "kml")
+    assert jobs.cancel(second)["state"] == "cancelled"  # it waits: at once
+    jobs.cancel(first)
+    go_on.set()
+    assert until(lambda: not jobs.busy(folder))
+    assert [job["state"] for job in jobs.listed()] == ["cancelled", "cancelled", "done"]
+    for number in (first, third, 99):
+        with pytest.raises(InputError, match=f"no job {number}"):
+            jobs.cancel(number)
+
+
+def test_ended_jobs_leave_the_list_after_a_while(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(state, "carry_out", lambda _: "scan.kml")
+    jobs = Jobs(Workers())
+    jobs.start(tmp_path, "kml")
+    assert until(lambda: not jobs.busy(tmp_path)) and len(jobs.listed()) == 1
+    monkeypatch.setattr(state, "SHOWN_S", -1.0)
+    assert jobs.listed() == [] and len(jobs.of(tmp_path)) == 1

@@ -32,10 +32,16 @@ from service.offline.exports.mesh_tiles import (
     tile_boxes,
 )
 from service.offline.exports.view import ExportOptions, ScanView
+from service.progress import Progress
 from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
     from conftest import HouseFlight
+
+
+def noting(said: list[str]) -> Progress:
+    """Appends every text to ``said``."""
+    return Progress(lambda now: said.append(now.text))
 
 
 def jobs(folder: Path, tiles: int = 2) -> list[TileJob]:
@@ -77,8 +83,8 @@ def test_boxes_cover_the_site_once_and_hold_no_more_than_asked() -> None:
 
 def test_tiles_together_are_the_whole(tmp_path: Path, house: HouseFlight) -> None:
     house.flown(tmp_path).close()
-    (whole,) = run_tiles(jobs(tmp_path, 1), None, lambda _: None)
-    parts = run_tiles(jobs(tmp_path, 2), None, lambda _: None)
+    (whole,) = run_tiles(jobs(tmp_path, 1), None, Progress())
+    parts = run_tiles(jobs(tmp_path, 2), None, Progress())
     assert len(parts) == 2
     x, y = (a.ravel() for a in np.meshgrid(np.linspace(-15, 35, 60), np.linspace(-10, 10, 40)))
     origins = np.column_stack([x, y, np.full(len(x), 100.0)])
@@ -110,8 +116,8 @@ def test_the_same_mesh_comes_from_a_cluster(
 ) -> None:
     house.flown(tmp_path).close()
     reported: list[str] = []
-    here = run_tiles(jobs(tmp_path), None, lambda _: None)
-    there = run_tiles(jobs(tmp_path), cluster.scheduler_address, reported.append)
+    here = run_tiles(jobs(tmp_path), None, Progress())
+    there = run_tiles(jobs(tmp_path), cluster.scheduler_address, noting(reported))
     assert [t for t in reported if "came from the cluster" in t] == [
         "tile 1 of 2 came from the cluster",
         "tile 2 of 2 came from the cluster",
@@ -123,15 +129,15 @@ def test_a_scheduler_that_goes_away_is_said_and_the_rest_made_here(
     tmp_path: Path, house: HouseFlight, cluster: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     house.flown(tmp_path).close()
-    here = run_tiles(jobs(tmp_path), None, lambda _: None)
+    here = run_tiles(jobs(tmp_path), None, Progress())
     reported: list[str] = []
 
-    def say(text: str) -> None:
-        reported.append(text)
-        if text.startswith("tile 1"):
+    def say(now: Progress) -> None:
+        reported.append(now.text)
+        if now.text.startswith("tile 1 of 2 came"):
             cluster.close()
 
-    same(here, run_tiles(jobs(tmp_path), cluster.scheduler_address, say))
+    same(here, run_tiles(jobs(tmp_path), cluster.scheduler_address, Progress(say)))
     assert len([t for t in reported if "disconnected" in t]) == 1
 
 
@@ -142,7 +148,7 @@ def test_a_scheduler_that_is_not_there_ends_in_one_line(
     house.flown(tmp_path).close()
     monkeypatch.setattr(mesh_tiles, "CONNECT_S", 0.5)
     with pytest.raises(OutsideError, match="no Dask scheduler answers"):
-        run_tiles(jobs(tmp_path), "tcp://127.0.0.1:9", lambda _: None)
+        run_tiles(jobs(tmp_path), "tcp://127.0.0.1:9", Progress())
 
 
 def test_the_command_cuts_a_large_site(tmp_path: Path, house: HouseFlight) -> None:
@@ -269,7 +275,7 @@ def test_a_recording_found_by_itself_that_does_not_fit_is_left(
     house.flown(tmp_path).close()
     job = replace(jobs(tmp_path)[0], video=str(tmp_path / "none.mp4"))
     reported: list[str] = []
-    assert mesh_tile(replace(job, video_named=False), reported.append) is not None
+    assert mesh_tile(replace(job, video_named=False), noting(reported)) is not None
     assert any("after all" in text for text in reported)
     with pytest.raises(InputError, match="its video cannot be used"):
-        mesh_tile(job, reported.append)
+        mesh_tile(job, noting(reported))

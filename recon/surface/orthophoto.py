@@ -7,7 +7,7 @@ levelled, and neighbouring views blend across one cell of the surface model.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -45,12 +45,19 @@ class Terrain:
     eyes_m: F64  # (V, 3) the views' centres in the raster's own coordinates
 
 
-def orthophoto(terrain: Terrain, views: Sequence[TextureView], grid: Grid) -> tuple[U8, Bool]:
+def orthophoto(
+    terrain: Terrain,
+    views: Sequence[TextureView],
+    grid: Grid,
+    progress: Callable[[str], None] = lambda _: None,
+) -> tuple[U8, Bool]:
     """(rows, cols, 3) RGB on ``grid``, and the cells with a height.
 
-    Cells that no view shows take the colour of the surface model.
+    Cells that no view shows take the colour of the surface model. ``progress`` is called for each
+    view and once more.
     """
-    found = consistent(_sightings(terrain, views))
+    found = consistent(_sightings(terrain, views, progress))
+    progress("painting the orthophoto")
     label = found.view[:, 0].reshape(terrain.raster.grid.shape)
     pixels, start, sides = flat(views)
     rgb = np.zeros((*grid.shape, 3), np.uint8)
@@ -76,7 +83,9 @@ def _cameras(views: Sequence[TextureView]) -> tuple[F64, F64]:
     return K, T
 
 
-def _sightings(terrain: Terrain, views: Sequence[TextureView]) -> Sightings:
+def _sightings(
+    terrain: Terrain, views: Sequence[TextureView], progress: Callable[[str], None]
+) -> Sightings:
     """The views of each cell, the best first: pixels per metre times the cosine to the vertical,
     less where an image is blurred."""
     height = terrain.raster.height_m
@@ -90,6 +99,7 @@ def _sightings(terrain: Terrain, views: Sequence[TextureView]) -> Sightings:
     sharp = _sharpness(views)
     K, T = _cameras(views)
     for number, view in enumerate(views):
+        progress("choosing views for the orthophoto")
         score, bgr = np.zeros(count, np.float32), np.zeros((count, 3), np.float32)
         eye = terrain.raster.grid.pixels(terrain.eyes_m[number : number + 1, :2])[0]
         at = (float(eye[0]), float(eye[1]), float(terrain.eyes_m[number, 2]))

@@ -1,11 +1,16 @@
 """The subcommands, and the options that several of them take."""
 
 import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
 from typing import Annotated
 
 import typer
+
+from service.progress import Progress
 
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", help="section.key=value, may be repeated")
@@ -24,3 +29,31 @@ def stop_by_signals() -> Event:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     return stop
+
+
+@contextmanager
+def showing(name: str) -> Iterator[Progress]:
+    """Progress of long work on stderr: a bar in a terminal, else a line for each step."""
+    if not sys.stderr.isatty():
+        said = [""]
+
+        def say(now: Progress) -> None:
+            if now.text != said[-1]:
+                said[:] = [now.text]
+                print(f"{name}: {now.text}", file=sys.stderr)
+
+        yield Progress(say)
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
+
+    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn()
+    console = Console(stderr=True)
+    with Bars(*columns, TimeRemainingColumn(), console=console, transient=True) as bars:
+        bar = bars.add_task(name, total=1.0)
+
+        def show(now: Progress) -> None:
+            bars.update(bar, completed=now.share, description=f"{name}: {now.text}")
+
+        yield Progress(show)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from service.commands import AsJson, ScanDir, Voxel
+from service.commands import AsJson, ScanDir, Voxel, showing
 from service.errors import InputError
 from service.offline.exports import EXPORTERS
 
@@ -61,16 +60,18 @@ def export(
             video,
             stored,
             _epoch_ns(video_epoch),
-            lambda text: print(f"export: {text}", file=sys.stderr),
         )
     except ValueError as error:
         raise InputError(f"export: {error}") from error
     written = {}
-    with ScanView(scan_dir, voxel_m) as scan:
-        for kind in to:
-            written[kind] = str(write(scan, kind, out, options))
-            if not as_json:
-                print(written[kind])
+    try:
+        with showing("export") as progress, ScanView(scan_dir, voxel_m, progress) as scan:
+            for number, kind in enumerate(to):
+                with progress.part(kind, 1.0 / (len(to) - number)):
+                    written[kind] = str(write(scan, kind, out, options))
+    finally:
+        if not as_json:
+            print(*written.values(), sep="\n", end="\n" if written else "")
     if as_json:
         print(json.dumps({"scan": str(scan_dir), "written": written}))
 
@@ -111,9 +112,7 @@ def mesh(
     from service.offline.exports.view import ExportOptions, ScanView
 
     try:
-        options = ExportOptions(
-            voxel_m=voxel_m, progress=lambda text: print(f"mesh: {text}", file=sys.stderr)
-        )
+        options = ExportOptions(voxel_m=voxel_m)
     except ValueError as error:
         raise InputError(f"mesh: {error}") from error
     if stored and video is not None:
@@ -123,7 +122,7 @@ def mesh(
     )
     path = out or scan_dir / "mesh.glb"
     started = time.monotonic()
-    with ScanView(scan_dir, voxel_m) as scan:
+    with showing("mesh") as progress, ScanView(scan_dir, voxel_m, progress) as scan:
         figures = write_mesh(scan, path, how, options)
     figures["seconds"] = round(time.monotonic() - started, 1)
     if as_json:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands import AsJson, ScanDir
+from service.commands import AsJson, ScanDir, showing
 
 if TYPE_CHECKING:
     from service.offline.refine.refly import Refly
@@ -62,7 +62,8 @@ def refine(
             raise InputError("--undo takes nothing else")
         figures = run_undo(scan_dir)
     else:
-        figures = run(scan_dir, RefineOptions(gcp, telemetry, out, loops, video))
+        with showing("refine") as progress:
+            figures = run(scan_dir, RefineOptions(gcp, telemetry, out, loops, video), progress)
     print(json.dumps(figures) if as_json else "\n".join(_lines(figures)))
 
 

@@ -7,14 +7,17 @@ import re
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from service.commands import showing
 from service.errors import InputError
 
 if TYPE_CHECKING:
+    from service.progress import Progress
     from service.sim.live import LiveOptions
     from service.sim.recording import SimulationOptions
 
@@ -155,7 +158,8 @@ def _simulate(
         simulation = recording.prepare(options())
     except ValueError as error:
         raise InputError(f"simulate: {error}") from error
-    result = recording.write(simulation, out, _progress if sys.stderr.isatty() else None)
+    with showing("simulate") as progress:
+        result = recording.write(simulation, out, partial(_frames, progress))
     if live is None:
         _report(out, result, time.monotonic() - started, as_json)
         return
@@ -200,8 +204,9 @@ def _size(text: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def _progress(done: int, total: int) -> None:
-    print(f"\rframe {done} of {total}", end="\n" if done == total else "", file=sys.stderr)
+def _frames(progress: Progress, done: int, total: int) -> None:
+    progress.share = done / total
+    progress("rendering")
 
 
 def _report(out: Path, result: dict[str, Any], seconds: float, as_json: bool) -> None:

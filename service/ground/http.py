@@ -34,9 +34,8 @@ from service.ground.guard import CHANGING, WHO, AuditLog, Guard, Pace, Tokens, n
 from service.ground.library import ConflictError, Library
 from service.ground.live import serve_live
 from service.ground.scan_files import file_routes
-from service.ground.state import Jobs, PortalState, names_of, state_of
+from service.ground.state import KINDS, Jobs, PortalState, names_of, state_of
 from service.ground.vehicle import BUTTONS, Vehicle
-from service.offline.exports import EXPORTERS
 from service.workers import Workers
 
 T = TypeVar("T")
@@ -75,7 +74,7 @@ class LabelChange(msgspec.Struct, forbid_unknown_fields=True):
 class ExportOrder(msgspec.Struct, forbid_unknown_fields=True):
     """A deliverable to make."""
 
-    kind: Annotated[str, msgspec.Meta(extra_json_schema={"enum": list(EXPORTERS)})]
+    kind: Annotated[str, msgspec.Meta(extra_json_schema={"enum": list(KINDS)})]
 
 
 class ImportOrder(msgspec.Struct, forbid_unknown_fields=True):
@@ -114,6 +113,8 @@ def portal_app(
         *file_routes(one),
         Route(one + "/exports", _export, methods=["POST"]),
         WebSocketRoute(one + "/live", _live),
+        Route("/api/jobs", _jobs, methods=["GET"]),
+        Route("/api/jobs/{number:int}", _cancel, methods=["DELETE"]),
         Route("/api/bin", _bin),
         Route("/api/bin/{name}/restore", _restore, methods=["POST"]),
         Route("/api/import", _import, methods=["POST"]),
@@ -246,12 +247,24 @@ def _delete(request: Request) -> Response:
 
 
 async def _export(request: Request) -> Response:
-    """Make a deliverable in the background; the job."""
+    """Make a deliverable in the background, or refine the scan; the job."""
     state, (drone, scan) = state_of(request), names_of(request)
     note(request, "export", scan=f"{drone}/{scan}")
     kind = (await _body(request, ExportOrder)).kind
     note(request, "export", kind=kind)
     return JSONResponse(state.jobs.start(state.library.folder(drone, scan), kind), 202)
+
+
+def _jobs(request: Request) -> Response:
+    """Jobs that wait, run or have just ended: percent, what is being done, seconds left."""
+    return JSONResponse(state_of(request).jobs.listed())
+
+
+def _cancel(request: Request) -> Response:
+    """Cancel a job that waits or runs; the job."""
+    number = request.path_params["number"]
+    note(request, "cancel", job=number)
+    return JSONResponse(state_of(request).jobs.cancel(number))
 
 
 def _bin(request: Request) -> Response:

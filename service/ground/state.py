@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -19,6 +18,7 @@ from service.ground.library import Library
 from service.ground.vehicle import Vehicle
 from service.offline.exports import EXPORTERS
 from service.offline.exports.view import ExportOptions, ScanView, export
+from service.progress import CancelledError, Progress
 from service.scans.coverage import LiveCoverages
 from service.workers import Worker, Workers, guarded
 
@@ -26,63 +26,143 @@ log = logging.getLogger(__name__)
 
 MAX_WAITING_JOBS = 20
 KEPT = 100
+SHOWN_S = 60.0
+"""A job that has ended is listed for so long."""
+
+REFINE = "refine"
+KINDS = (*EXPORTERS, REFINE)
+"""What a job may make."""
+
+
+@dataclass(slots=True, eq=False)
+class Job:
+    """One deliverable that is asked for."""
+
+    number: int
+    folder: Path
+    kind: str
+    state: str = "waiting"  # then running; done, failed or cancelled
+    file: str | None = None
+    error: str | None = None
+    queued_unix_s: float = field(default_factory=time.time)
+    ended_unix_s: float | None = None
+    progress: Progress = field(default_factory=Progress)
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether nothing more happens."""
+        return self.state not in ("waiting", "running")
+
+    def end(self, state: str, error: str | None = None) -> None:
+        """It is done, failed or cancelled."""
+        self.state, self.error, self.ended_unix_s = state, error, time.time()
+
+    def shown(self) -> dict[str, Any]:
+        """For JSON."""
+        left_s = self.progress.left_s if self.state == "running" else None
+        return {
+            "number": self.number,
+            "drone": self.folder.parent.name,
+            "scan": self.folder.name,
+            "kind": self.kind,
+            "state": self.state,
+            "doing": self.progress.text if self.state == "running" else "",
+            "percent": round(100.0 * self.progress.share),
+            "left_s": None if left_s is None else round(left_s),
+            "queued_unix_s": self.queued_unix_s,
+            "file": self.file,
+            "error": self.error,
+        }
+
+
+def carry_out(job: Job) -> str:
+    """Make what the job asks for; the name of the file. Raises what that raises."""
+    if job.kind == REFINE:
+        from service.offline.refine.refinement import RefineOptions, refine
+
+        refine(job.folder, RefineOptions(), job.progress)
+        return "cloud.laz"
+    with ScanView(job.folder, progress=job.progress) as scan:
+        return export(scan, job.kind, None, ExportOptions()).name
 
 
 class Jobs:
-    """A queue of exports; each job is a dict of id, kind, state, file and error."""
+    """A queue of exports and refinements, made one after the other."""
 
     def __init__(self, workers: Workers) -> None:
         self._workers = workers
         self._worker: Worker | None = None  # while jobs wait
         self._lock = threading.Lock()
-        self._queue: deque[tuple[Path, dict[str, Any]]] = deque()
-        self._jobs: list[tuple[Path, dict[str, Any]]] = []
+        self._jobs: list[Job] = []
+        self._number = 0
 
     def start(self, folder: Path, kind: str) -> dict[str, Any]:
-        """Queue an export. InputError for an unknown kind or a full queue."""
-        if kind not in EXPORTERS:
-            raise InputError(f"kind is one of {', '.join(EXPORTERS)}")
+        """Queue a job. InputError for an unknown kind or a full queue."""
+        if kind not in KINDS:
+            raise InputError(f"kind is one of {', '.join(KINDS)}")
         with self._lock:
-            waiting = [j for _, j in self._jobs if j["state"] in ("waiting", "running")]
-            if len(waiting) >= MAX_WAITING_JOBS:
+            if sum(not job.has_ended for job in self._jobs) >= MAX_WAITING_JOBS:
                 raise InputError("too many deliverables are waiting; try again later")
-            job = {"kind": kind, "state": "waiting", "queued_unix_s": time.time(), "error": None}
-            self._jobs = [*self._jobs[-KEPT:], (folder, job)]
-            self._queue.append((folder, job))
+            self._number += 1
+            job = Job(self._number, folder, kind)
+            self._jobs = [*self._jobs[-KEPT:], job]
             if self._worker is None or self._worker.is_done:
                 self._worker = self._workers.start("exports", self._work)
-            return dict(job)
+            return job.shown()
 
     def of(self, folder: Path) -> list[dict[str, Any]]:
         """The jobs of a scan, the oldest first."""
         with self._lock:
-            return [dict(job) for place, job in self._jobs if place == folder]
+            return [job.shown() for job in self._jobs if job.folder == folder]
+
+    def listed(self) -> list[dict[str, Any]]:
+        """The jobs that wait, run or have just ended, the oldest first."""
+        since = time.time() - SHOWN_S
+        with self._lock:
+            return [j.shown() for j in self._jobs if (j.ended_unix_s or since) >= since]
 
     def busy(self, folder: Path) -> bool:
         """True while a deliverable of this scan is waiting or being made."""
-        return any(job["state"] in ("waiting", "running") for job in self.of(folder))
+        with self._lock:
+            return any(job.folder == folder and not job.has_ended for job in self._jobs)
+
+    def cancel(self, number: int) -> dict[str, Any]:
+        """Take a waiting job off the queue, or stop a running one at its next step.
+
+        InputError when there is none of this number, or it has ended.
+        """
+        with self._lock:
+            found = [j for j in self._jobs if j.number == number and not j.has_ended]
+            if not found:
+                raise InputError(f"no job {number} is waiting or running")
+            found[0].progress.cancel()
+            if found[0].state == "waiting":
+                found[0].end("cancelled")
+            return found[0].shown()
 
     def _work(self, _: Worker) -> None:
         """Make what waits, one after the other."""
         while True:
             with self._lock:
-                if not self._queue:
+                job = next((j for j in self._jobs if j.state == "waiting"), None)
+                if job is None:
                     self._worker = None
                     return
-                folder, job = self._queue.popleft()
-            guarded("exports", partial(self._run, folder, job))
+                job.state = "running"
+            job.progress.begin()
+            guarded("exports", partial(self._run, job))
 
-    def _run(self, folder: Path, job: dict[str, Any]) -> None:
-        job["state"] = "running"
+    def _run(self, job: Job) -> None:
         try:
-            with ScanView(folder) as scan:
-                job["file"] = export(scan, job["kind"], None, ExportOptions()).name
-            job["state"] = "done"
+            job.file = carry_out(job)
+            job.end("done")
+        except CancelledError:
+            job.end("cancelled")
         except SkyreliefError as error:
-            job |= {"state": "failed", "error": str(error)}
+            job.end("failed", str(error))
         finally:
-            if job["state"] == "running":  # our own fault, which the caller logs
-                job |= {"state": "failed", "error": "failed; see the log"}
+            if not job.has_ended:  # our own fault, which the caller logs
+                job.end("failed", "failed; see the log")
 
 
 @dataclass(slots=True, eq=False)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import datetime as dt
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ from recon.mapping.free_space import seen_through, spread
 from recon.mapping.voxel_map import ground_sample_m
 from recon.types import F64, U8, PointCloud
 from service.georeference import LocalFrame
+from service.progress import Progress
 from service.scans.main_piece import Keyframes, main_keyframes
 
 if TYPE_CHECKING:
@@ -58,13 +60,17 @@ class _Extent:
     east_m: float
 
 
-def fused_cloud(store: Keyframes, voxel_m: float | None = None) -> FusedCloud:
+def fused_cloud(
+    store: Keyframes, voxel_m: float | None = None, progress: Progress | None = None
+) -> FusedCloud:
     """The main piece of ``store`` fused; voxels of the ground sample distance by default.
 
     Points that other keyframes see through are removed. A long scan is read several times, so that
     memory holds only the fused points and the sums of one strip of the site per core.
     """
-    extents, held = _extents(store)
+    progress = progress or Progress()
+    with progress.part("reading the keyframes", 0.2):
+        extents, held = _extents(store, progress)
     points = sum(e.points for e in extents)
     sample = float(np.median([e.ground_sample_m for e in extents])) if extents else None
     size = max(voxel_m or sample or DEFAULT_VOXEL_M, SMALLEST_VOXEL_M)
@@ -73,22 +79,25 @@ def fused_cloud(store: Keyframes, voxel_m: float | None = None) -> FusedCloud:
         size *= float(np.sqrt(points / LARGEST_POINTS))
         notes = (f"{points} points before fusion: voxels enlarged to {size:.3f} m",)
     edges = strip_edges(extents, min(STRIP_POINTS, max(points // threads(), MIN_STRIP_POINTS)))
-    strips = [_strip(store, extents, held, a, b) for a, b in pairwise(edges)]
-    cloud = fuse_strips(strips, edges, size)
-    held.clear()
+    with progress.part("fusing the cloud", 0.5):
+        say = partial(progress.counting(len(extents)), progress.text)
+        strips = [_strip(store, extents, held, a, b, say) for a, b in pairwise(edges)]
+        cloud = fuse_strips(strips, edges, size)
+        held.clear()
     if len(cloud):
-        seqs = [e.seq for e in extents]
-        depths = (k.depth for seq in spread(seqs) if (k := store.keyframe(seq)) is not None)
-        cloud = without(cloud, seen_through(cloud, depths))
+        with progress.part("taking out what is seen through"):
+            seqs = spread([e.seq for e in extents])
+            keyframes = progress.over(map(store.keyframe, seqs), len(extents))
+            cloud = without(cloud, seen_through(cloud, (k.depth for k in keyframes if k)))
     return FusedCloud(cloud, size, sample, len(extents), points, notes)
 
 
-def _extents(store: Keyframes) -> tuple[list[_Extent], dict[int, PointCloud]]:
+def _extents(store: Keyframes, progress: Progress) -> tuple[list[_Extent], dict[int, PointCloud]]:
     """The keyframes of the main piece with points, and the clouds of the first of them."""
     out: list[_Extent] = []
     held: dict[int, PointCloud] = {}
     room = STRIP_POINTS
-    for keyframe in main_keyframes(store):
+    for keyframe in progress.over(main_keyframes(store), len(store.seqs())):
         sample = ground_sample_m(keyframe.depth)
         cloud = cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh)
         if sample is not None and len(cloud):
@@ -123,6 +132,7 @@ def _strip(
     held: dict[int, PointCloud],
     low_m: float,
     high_m: float,
+    say: Callable[[], None],
 ) -> Callable[[], Iterator[PointCloud]]:
     """The clouds of the keyframes that overlap a strip, ``held`` or read on demand."""
     margin = 1.0  # edges are moved by up to a voxel
@@ -130,6 +140,7 @@ def _strip(
 
     def clouds() -> Iterator[PointCloud]:
         for seq in seqs:
+            say()
             if seq in held:
                 yield held[seq]
             elif (keyframe := store.keyframe(seq)) is not None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +28,9 @@ def write_all(scan: ScanView, out: Path, options: ExportOptions) -> None:
     files, failed = [], {}
     trouble: SkyreliefError | None = None
     for number, kind in enumerate(MAPS):
-        options.progress(f"{kind} ({number + 1} of {len(MAPS)})")
         try:
-            path = export(scan, kind, out / EXPORTERS[kind][1], replace(options))
+            with scan.progress.part(kind, 1.0 / (len(MAPS) - number)):
+                path = export(scan, kind, out / EXPORTERS[kind][1], options)
             files.append(_entry(kind, path))
         except SkyreliefError as error:
             trouble = error

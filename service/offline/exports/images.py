@@ -17,6 +17,7 @@ from service.cameras import open_camera
 from service.cameras.source import CameraSource
 from service.errors import InputError, SkyreliefError
 from service.offline.exports.view import ExportOptions
+from service.progress import Progress
 from service.scans.folder import SUMMARY
 from service.stream.records import ScanHeader
 
@@ -24,6 +25,7 @@ MAX_BYTES = 1_500_000_000
 """All images of one tile together; more are made smaller."""
 
 SAME_TIME_NS = 5_000_000
+USUAL_FPS = 30.0
 
 
 def stored_images(keyframes: Sequence[Keyframe]) -> list[TextureView]:
@@ -78,21 +80,22 @@ def scan_images(
     folder: Path,
     header: ScanHeader,
     options: ExportOptions,
+    progress: Progress,
 ) -> list[TextureView]:
     """A view per keyframe: of the recording that the options name or the scan knows, else stored.
 
     Raises InputError or OutsideError when the named recording cannot be used.
     """
     if options.video is not None:
-        return video_images(keyframes, header, options.video, options.video_epoch_ns)
+        return video_images(keyframes, header, options.video, options.video_epoch_ns, progress)
     recording = Recording(None, "") if options.stored else recording_of(folder, header)
-    options.progress(recording.words)
+    progress(recording.words)
     if recording.path is None:
         return stored_images(keyframes)
     try:
-        return video_images(keyframes, header, recording.path, options.video_epoch_ns)
+        return video_images(keyframes, header, recording.path, options.video_epoch_ns, progress)
     except SkyreliefError as error:
-        options.progress(f"the scan's own images after all: {error}")
+        progress(f"the scan's own images after all: {error}")
         return stored_images(keyframes)
 
 
@@ -116,7 +119,11 @@ def _opened(header: ScanHeader, video: Path) -> CameraSource:
 
 
 def video_images(
-    keyframes: Sequence[Keyframe], header: ScanHeader, video: Path, epoch_ns: int | None
+    keyframes: Sequence[Keyframe],
+    header: ScanHeader,
+    video: Path,
+    epoch_ns: int | None,
+    progress: Progress | None = None,
 ) -> list[TextureView]:
     """A view per keyframe from the frame of ``video`` (file or folder) taken at its time.
 
@@ -130,8 +137,10 @@ def video_images(
     shrink = min(1.0, (MAX_BYTES / (4.0 * np.prod(camera.size_px) * len(keyframes))) ** 0.5)
     times = np.array([k.time_ns for k in keyframes], np.int64)
     found: dict[int, TextureView] = {}
+    span_s = float(times.max() - start) / 1e9
+    frames = (progress or Progress()).over(source, round(span_s * (source.fps or USUAL_FPS)))
     try:
-        for frame in source:
+        for frame in frames:
             time_ns = start + frame.time_ns
             nearest = int(np.abs(times - time_ns).argmin())
             if abs(int(times[nearest]) - time_ns) <= SAME_TIME_NS:

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -29,6 +28,7 @@ from recon.types import F64, U8, Keyframe, PointCloud
 from service.errors import OutsideError, SkyreliefError
 from service.offline.exports.images import stored_images, video_images
 from service.packages import needing
+from service.progress import Progress
 from service.scans.fused_cloud import fused_cloud
 from service.scans.main_piece import main_keyframes
 from service.stream.records import ScanHeader
@@ -39,6 +39,8 @@ log = logging.getLogger(__name__)
 MARGIN_VOXELS = 25
 CONNECT_S = 10.0
 POLL_S = 0.2
+TEXTURE_STEPS = 15
+"""Reports of :func:`recon.surface.texturing.texture`."""
 EVERYWHERE = (-np.inf, -np.inf, np.inf, np.inf)
 
 Box = tuple[float, float, float, float]
@@ -134,31 +136,34 @@ def _points_in(prints: Sequence[Footprint], tile: Box) -> float:
     return total
 
 
-def mesh_tile(job: TileJob, progress: Callable[[str], None] = lambda _: None) -> TilePart | None:
+def mesh_tile(job: TileJob, progress: Progress | None = None) -> TilePart | None:
     """The textured mesh of a tile; None when there is too little surface in it."""
+    progress = progress or Progress()
     store = ScanStore.open(Path(job.folder) / "scan.db")
     try:
         margin = MARGIN_VOXELS * job.voxel_m
         wide = tuple(np.add(job.box, (-margin, -margin, margin, margin)))
         seqs = [p.seq for p in footprints(store) if _overlap(p.box, wide)]
         keyframes = [k for seq in seqs if (k := store.keyframe(seq)) is not None]
-        progress("fusing the cloud")
-        if job.box == EVERYWHERE:
-            cloud = fused_cloud(store, job.voxel_m).cloud
-        else:
-            cloud = _fused(keyframes, wide, job.voxel_m)
+        with progress.part("fusing the cloud", 0.15):
+            if job.box == EVERYWHERE:
+                cloud = fused_cloud(store, job.voxel_m, progress).cloud
+            else:
+                cloud = _fused(keyframes, wide, job.voxel_m)
         try:
-            mesh = cut(_surface(job, cloud, keyframes, progress), job.box)
+            with progress.part("surface", 0.3):
+                mesh = cut(_surface(job, cloud, keyframes, progress), job.box)
         except ValueError as error:
             log.debug("tile %s: %s", job.box, error)
             return None
         if not len(mesh.faces):
             return None
-        progress(f"{len(mesh.faces)} triangles; reading images")
-        views = _images(job, keyframes, store.header, progress)
+        with progress.part(f"{len(mesh.faces)} triangles; reading images", 0.25):
+            views = _images(job, keyframes, store.header, progress)
     finally:
         store.close()
-    done = texture(mesh, views, job.largest_texture_px, progress)
+    with progress.part("texture"):
+        done = texture(mesh, views, job.largest_texture_px, progress.counting(TEXTURE_STEPS))
     figures = {
         "faces": len(done.mesh.faces),
         "vertices": len(done.mesh.vertices_m),
@@ -174,13 +179,13 @@ def _images(
     job: TileJob,
     keyframes: Sequence[Keyframe],
     header: ScanHeader,
-    progress: Callable[[str], None],
+    progress: Progress,
 ) -> list[TextureView]:
     """The views of the job's video, else of the store."""
     if job.video is None:
         return stored_images(keyframes)
     try:
-        return video_images(keyframes, header, Path(job.video), job.video_epoch_ns)
+        return video_images(keyframes, header, Path(job.video), job.video_epoch_ns, progress)
     except SkyreliefError as error:
         if job.video_named:
             raise
@@ -212,7 +217,7 @@ def _surface(
     job: TileJob,
     cloud: PointCloud,
     keyframes: Sequence[Keyframe],
-    progress: Callable[[str], None],
+    progress: Progress,
 ) -> Mesh:
     """The untextured mesh, with colours at its vertices."""
     if job.method == "poisson":
@@ -252,9 +257,7 @@ def _seen_from(cloud: PointCloud, keyframes: Sequence[Keyframe]) -> F64:
     return np.asarray(np.concatenate(cameras)[nearest])
 
 
-def run_tiles(
-    jobs: Sequence[TileJob], scheduler: str | None, progress: Callable[[str], None]
-) -> list[TilePart]:
+def run_tiles(jobs: Sequence[TileJob], scheduler: str | None, progress: Progress) -> list[TilePart]:
     """All tiles with surface, in their order.
 
     With ``scheduler`` (``tcp://HOST:8786``) they are made by a Dask cluster. OutsideError when
@@ -268,17 +271,13 @@ def run_tiles(
             progress(f"tile {len(done)} of {len(jobs)} came from the cluster")
     for n, job in enumerate(jobs):
         if n not in done:
-            name = f"tile {n + 1} of {len(jobs)}: " if len(jobs) > 1 else ""
-            done[n] = mesh_tile(job, partial(_report, progress, name))
+            with progress.part(f"tile {n + 1} of {len(jobs)}", 1.0 / (len(jobs) - n)):
+                done[n] = mesh_tile(job, progress)
     return [part for n in range(len(jobs)) if (part := done[n]) is not None]
 
 
-def _report(progress: Callable[[str], None], name: str, text: str) -> None:
-    progress(name + text)
-
-
 def _on_cluster(
-    jobs: Sequence[TileJob], scheduler: str, progress: Callable[[str], None]
+    jobs: Sequence[TileJob], scheduler: str, progress: Progress
 ) -> Iterator[tuple[int, TilePart | None]]:
     """(number, part) of the tiles that the cluster delivers; ends early when it goes away."""
     with needing("a cluster"):

@@ -72,7 +72,7 @@ def write_mesh(
     video = how.video
     if video is None and how.recording:
         recording = recording_of(scan.folder, scan.store.header)
-        options.progress(recording.words)
+        scan.progress(recording.words)
         video = recording.path
     boxes = tile_boxes(prints, how.tile_points)
     jobs = [
@@ -89,7 +89,7 @@ def write_mesh(
         )
         for box in boxes
     ]
-    parts = run_tiles(jobs, how.scheduler, options.progress)
+    parts = run_tiles(jobs, how.scheduler, scan.progress)
     if not parts:
         raise InputError(f"{scan.folder}: cannot be meshed, there is too little surface")
     figures = {
@@ -105,7 +105,7 @@ def write_mesh(
         "pictures": "store" if video is None else str(video),
         "texture_px": [p.figures["texture_px"] for p in parts],
     }
-    options.progress(f"writing {figures['faces']} triangles")
+    scan.progress(f"writing {figures['faces']} triangles")
     with writing(out) as part:
         extras = _extras(scan) | figures | {"pictures": "store" if video is None else "video"}
         part.write_bytes(glb([(p.mesh, p.image) for p in parts], extras))

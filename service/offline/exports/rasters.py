@@ -60,7 +60,8 @@ def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
     as those of the stored images where there is no recording.
     """
     keyframes = [k for k in main_keyframes(scan.store) if np.isfinite(k.depth.depth_m).any()]
-    views = scan_images(keyframes, scan.folder, scan.store.header, options)
+    with scan.progress.part("reading the images", 0.3):
+        views = scan_images(keyframes, scan.folder, scan.store.header, options, scan.progress)
     terrain = _terrain(scan, views)
     sample_m = [
         (ground_sample_m(k.depth) or np.nan) * k.depth.K[0, 0] / v.K[0, 0]
@@ -68,8 +69,8 @@ def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
     ]
     cell_m = options.cell_m or round_cell(float(np.nanmedian(sample_m)))
     grid = _over(terrain.raster.grid, cell_m)
-    options.progress("orthophoto of {1} x {0} cells of {2:g} m".format(*grid.shape, cell_m))
-    rgb, known = orthophoto(terrain, views, grid)
+    with scan.progress.part("orthophoto of {1} x {0} cells of {2:g} m".format(*grid.shape, cell_m)):
+        rgb, known = orthophoto(terrain, views, grid, scan.progress.counting(len(views) + 1))
     opacity = np.where(known, 255, 0).astype(np.uint8)
     bands = np.concatenate([rgb.transpose(2, 0, 1), opacity[None]])
     write_cog(scan, out, grid, bands, ("red", "green", "blue", "opacity"))

@@ -69,7 +69,8 @@ def _open_to_the_sky(scan: ScanView, raster: Raster) -> Raster:
     )
     if scan.frame is not None:
         places = scan.frame.from_utm(places)
-    depths = (k.depth for k in main_keyframes(scan.store))
+    keyframes = scan.progress.over(main_keyframes(scan.store), len(scan.store.seqs()))
     hidden = np.zeros(grid.shape, np.bool_)
-    hidden[rows, cols] = ~open_above(places, heights_m, depths)
+    with scan.progress.part("surface that is open to the sky", 0.5):
+        hidden[rows, cols] = ~open_above(places, heights_m, (k.depth for k in keyframes))
     return without_cells(raster, hidden)

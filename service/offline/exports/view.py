@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -18,6 +17,7 @@ from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports import EXPORTERS
 from service.packages import needing
+from service.progress import Progress
 from service.scans.fused_cloud import FusedCloud, fused_cloud, placed
 from service.scans.main_piece import main_keyframes, main_poses, stretches_apart
 from service.scans.track import latest, local_frame
@@ -26,6 +26,9 @@ from service.stream.store import ScanStore
 
 OBLIQUE_SHARE = 0.25
 """Share of the keyframes looking sideways above which a scan counts as oblique."""
+
+FUSING = 0.6
+"""Share of an export that fusing the cloud takes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +42,6 @@ class ExportOptions:
     video: Path | None = None  # None: the scan's recording, when it is still there
     stored: bool = False  # never look for the recording
     video_epoch_ns: int | None = None
-    progress: Callable[[str], None] = field(default=lambda _: None)
 
     def __post_init__(self) -> None:
         """Raise ValueError for sizes that are not positive."""
@@ -52,7 +54,9 @@ class ExportOptions:
 class ScanView:
     """An open scan folder; close it, or use it in a ``with``."""
 
-    def __init__(self, folder: Path, voxel_m: float | None = None) -> None:
+    def __init__(
+        self, folder: Path, voxel_m: float | None = None, progress: Progress | None = None
+    ) -> None:
         """Raises InputError when ``folder`` is no scan folder."""
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder; give a scan folder (it holds scan.db)")
@@ -61,6 +65,7 @@ class ScanView:
         self.folder = folder
         self.store = ScanStore.open(folder / "scan.db")
         self._voxel_m = voxel_m
+        self.progress = progress or Progress()
         self.memo: dict[Any, Any] = {}  # what several deliverables are made from
 
     def __enter__(self) -> ScanView:
@@ -99,7 +104,8 @@ class ScanView:
     @cached_property
     def fused(self) -> FusedCloud:
         """The fused cloud in ENU metres; InputError when there is not a single point."""
-        fused = fused_cloud(self.store, self._voxel_m)
+        with self.progress.part("fusing the cloud", FUSING):
+            fused = fused_cloud(self.store, self._voxel_m, self.progress)
         if not len(fused.cloud):
             raise InputError(f"{self.folder} holds no points yet; nothing to export")
         return fused

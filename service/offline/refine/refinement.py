@@ -62,6 +62,7 @@ from service.offline.refine.refinement_figures import figures_of, in_words, off_
 from service.offline.refine.revisions import Revisions, copy_store, grown, moved_frames
 from service.offline.refine.stored_loops import StoredLoops, loose
 from service.offline.refine.survey_file import SurveyPoint, at_times, read_survey
+from service.progress import Progress
 from service.scans.folder import write_deliverables
 from service.scans.track import local_frame
 from service.stream.records import (
@@ -76,6 +77,9 @@ log = logging.getLogger(__name__)
 
 LINK_LOG = "link.tlog"
 """The flight's telemetry that the daemon keeps next to a scan."""
+
+MATCHING, SEARCHING, ADJUSTING = 0.7, 0.7, 0.5
+"""Shares of what is left of a refinement that its steps take."""
 
 MIN_SIGMA_SCALE = 0.003
 BY_SURVEY = "control points"
@@ -97,7 +101,9 @@ class RefineOptions:
     video: Path | None = None
 
 
-def refine(folder: Path, options: RefineOptions) -> dict[str, Any]:
+def refine(
+    folder: Path, options: RefineOptions, progress: Progress | None = None
+) -> dict[str, Any]:
     """Adjust the scan in ``folder`` and write its deliverables again; the figures of it.
 
     Raises InputError, in one line, for a scan that is not finished or holds fewer than two
@@ -105,7 +111,8 @@ def refine(folder: Path, options: RefineOptions) -> dict[str, Any]:
     """
     target = _open_target(folder, options.out)
     with ScanStore.open(target / "scan.db") as store, Revisions(store) as revisions:
-        job = _Refinement(folder, store, revisions, options)
+        progress = progress or Progress()
+        job = _Refinement(folder, store, revisions, options, progress)
         figures = job.run()
     return _deliver(target, figures)
 
@@ -176,10 +183,16 @@ class _Refinement:
     """One adjustment of one scan."""
 
     def __init__(
-        self, folder: Path, store: ScanStore, revisions: Revisions, options: RefineOptions
+        self,
+        folder: Path,
+        store: ScanStore,
+        revisions: Revisions,
+        options: RefineOptions,
+        progress: Progress | None = None,
     ) -> None:
         self.folder, self.store, self.options = folder, store, options
         self.revisions = revisions
+        self.progress = progress or Progress()
         self.header = revisions.header
         self.frame = local_frame(self.header)
         states = (revisions.keyframe_state(seq) for seq in store.seqs())
@@ -195,7 +208,8 @@ class _Refinement:
         survey = self._survey()
         places_m = np.array([s.T_world_camera[:3, 3] for s in self.states])
         if self.options.video is not None:
-            self._match_again(self.options.video, survey)
+            with self.progress.part("matching the images again", MATCHING):
+                self._match_again(self.options.video, survey)
         images = ScanImages(self.states, self.frames, self.header.camera, self.keyframe, self.frame)
         candidates = candidates_of(survey, images, str(self.options.gcp))
         if self.images is not None:
@@ -211,8 +225,10 @@ class _Refinement:
         track = self._track()
         verified = 0
         if self.options.loops and self.images is None:
-            track, verified = self._with_loops(track)
-        found = self._adjusted(track, candidates)
+            with self.progress.part("searching for places seen twice", SEARCHING):
+                track, verified = self._with_loops(track)
+        with self.progress.part("adjusting all keyframes", ADJUSTING):
+            found = self._adjusted(track, candidates)
         warning = clustered(candidates, track.poses[:, :3, 3])
         self.notes += [warning] if warning else []
         seqs = [s.seq for s in self.states]
@@ -229,6 +245,7 @@ class _Refinement:
         figures["notes"] = self.notes
         header = replace(self.header, notes=(*self.header.notes, in_words(figures)))
         frames = moved_frames(self.frames, self.states, found, self.frame)
+        self.progress.commit("writing the files of the scan")
         changed = self.revisions.append(self._reposes(found), frames, header, figures)
         return figures | {"changed": changed}
 
@@ -401,7 +418,7 @@ class _Refinement:
                 return None
             return replace(found, depth=replace(found.depth, T_world_camera=track.poses[k]))
 
-        return StoredLoops(track, at, SubmapLoopConfig()).find()
+        return StoredLoops(track, at, SubmapLoopConfig()).find(self.progress)
 
     def _ahead_m(self) -> float:
         """Usual distance of the ground; 0 without any surface."""

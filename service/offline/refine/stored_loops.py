@@ -19,6 +19,7 @@ from recon.posegraph.ground_control import Closure, Track
 from recon.posegraph.loop_closure import LoopConfig, LoopView, candidates, ground_seen
 from recon.posegraph.submap_loops import SubmapLoopConfig, filled, verify_surfaces
 from recon.types import F64, Keyframe
+from service.progress import Progress
 
 NEIGHBOURS = 8
 """Keyframes before and after that fill a keyframe's view, at most. Those of the two ends of a
@@ -56,11 +57,12 @@ class StoredLoops:
         self._breaks = np.cumsum(np.diff(track.times_s, prepend=track.times_s[0]) > BREAK_S)
         self._view = lru_cache(maxsize=96)(self._filled)
 
-    def find(self) -> list[Closure]:
+    def find(self, progress: Progress | None = None) -> list[Closure]:
         """All pairs far apart in time that see the same place, verified."""
         tree = cKDTree(self._track.poses[:, :2, 3])
         out = []
-        for b in range(self._config.min_gap, len(self._track.poses)):
+        later = range(self._config.min_gap, len(self._track.poses))
+        for b in (progress or Progress()).over(later, len(later)):
             likely = self._likely(b, tree)
             found = 0
             for a in likely[:TRIES]:

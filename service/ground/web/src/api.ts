@@ -7,9 +7,15 @@ export interface Origin {
 }
 
 export interface Job {
+  number: number;
+  drone: string;
+  scan: string;
   kind: string;
-  state: "waiting" | "running" | "done" | "failed";
-  file?: string;
+  state: "waiting" | "running" | "done" | "failed" | "cancelled";
+  doing: string;
+  percent: number;
+  left_s: number | null;
+  file: string | null;
   error: string | null;
 }
 
@@ -75,11 +81,14 @@ export async function finished(s: Scan, kind: string): Promise<Scan> {
     const now = await scan(s.drone, s.scan);
     const job = (now.jobs ?? []).filter((j) => j.kind === kind).at(-1);
     if (job?.state === "failed") throw new Error(job.error ?? "failed");
+    if (job?.state === "cancelled") throw new Error(`${kind} is cancelled`);
     if (!job || job.state === "done") return now;
     await new Promise((resolve) => setTimeout(resolve, 500));
   }
 }
 
+export const jobs = (): Promise<Job[]> => ask("/api/jobs");
+export const cancel = (number: number): Promise<Job> => ask(`/api/jobs/${number}`, "DELETE");
 export const bin = (): Promise<string[]> => ask("/api/bin");
 export const restore = (name: string): Promise<unknown> =>
   ask(`/api/bin/${encodeURIComponent(name)}/restore`, "POST", {});

@@ -2,10 +2,12 @@
 
 import * as api from "./api";
 import { count, date, el, notify, size } from "./dom";
+import { jobList } from "./jobs";
 import { vehicleStrip } from "./vehicle";
 
 const KINDS = [
-  "laz", "copc", "ply", "dsm", "dtm", "ortho", "contours", "gpkg", "dxf", "kmz", "stac", "glb", "3dtiles", "geojson", "kml", "mcap",
+  "laz", "copc", "ply", "dsm", "dtm", "ortho", "contours", "gpkg", "dxf", "coverage", "kmz", "stac", "all", "glb", "3dtiles", "geojson", "kml",
+  "mcap", "refine",
 ];
 
 const REFRESH_MS = 3000;
@@ -18,12 +20,15 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
   const bin = el("section", { className: "bin" });
   bin.setAttribute("aria-label", "bin");
   const again = (): void => void load().catch(notify);
+  let scans: api.Scan[] = [];
+  const title = (job: api.Job): string =>
+    scans.find((s) => s.drone === job.drone && s.scan === job.scan)?.title ?? job.scan;
   root.replaceChildren(
     el("header", {}, el("h1", { textContent: "skyrelief" }), search, vehicleStrip(), importForm(again)),
+    jobList(title),
     list,
     bin,
   );
-  let scans: api.Scan[] = [];
   let cards = new Map<string, Card>();
   let seen = "";
   const draw = (): void => {
@@ -181,7 +186,6 @@ function makeMenu(s: api.Scan, again: () => void): HTMLElement {
 
 async function make(s: api.Scan, kind: string): Promise<void> {
   await api.make(s, kind);
-  notify(`making ${kind} of “${s.title}” …`);
   await api.finished(s, kind);
 }
 

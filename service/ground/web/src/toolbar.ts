@@ -173,7 +173,6 @@ async function made(id: { drone: string; scan: string }, kind: string, name: str
   const scan = await api.scan(id.drone, id.scan);
   if (has(scan)) return scan;
   if (!confirm(ask)) throw new Error("not made");
-  notify(`making ${kind} …`);
   await api.make(scan, kind);
   return api.finished(scan, kind);
 }

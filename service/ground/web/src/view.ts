@@ -4,6 +4,7 @@ import * as api from "./api";
 import { Cameras } from "./cameras";
 import { count, el } from "./dom";
 import { Images, takeView, timeSlider } from "./explore";
+import { jobList } from "./jobs";
 import { LinkState } from "./link";
 import { LiveView, type LastPose, type News } from "./live";
 import { Ruler } from "./measure";
@@ -48,7 +49,7 @@ function view(root: HTMLElement, scan: api.Scan, place?: string): () => void {
   const host = el("main", { className: "stage" });
   const legend = el("div", { className: "panel legend", hidden: true });
   const coverage = el("div", { className: "panel coverage", hidden: true });
-  const side = el("aside", { className: "side", tabIndex: 0 }, figures, legend, coverage);
+  const side = el("aside", { className: "side", tabIndex: 0 }, jobList(), figures, legend, coverage);
   side.setAttribute("aria-label", "figures");
   const page = el("div", { className: "view" }, bar, host, side);
   root.replaceChildren(page);

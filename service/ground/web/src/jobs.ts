@@ -1,0 +1,59 @@
+// Long work on scans: what is made, how far it is, how long it takes yet, and a button that stops it.
+
+import * as api from "./api";
+import { el, notify } from "./dom";
+
+const BUSY_MS = 500;
+const IDLE_MS = 2000;
+
+interface Row {
+  element: HTMLElement;
+  show: (job: api.Job) => void;
+}
+
+/** A list that keeps itself up to date while it is in the page; hidden while there is nothing. */
+export function jobList(title = (job: api.Job): string => job.scan): HTMLElement {
+  const list = el("ul", {});
+  const section = el("section", { className: "panel jobs", hidden: true }, list);
+  section.setAttribute("aria-label", "jobs");
+  let rows = new Map<number, Row>();
+  const refresh = async (): Promise<void> => {
+    const jobs = await api.jobs().catch(() => []);
+    rows = new Map(jobs.map((job) => [job.number, rows.get(job.number) ?? row(job, title(job))]));
+    for (const job of jobs) rows.get(job.number)!.show(job);
+    const shown = [...rows.values()].map((r) => r.element);
+    for (const old of [...list.children]) if (!shown.includes(old as HTMLElement)) old.remove();
+    list.append(...shown.filter((element) => !element.isConnected));
+    section.hidden = !jobs.length;
+    const busy = jobs.some((job) => job.state === "running");
+    setTimeout(() => section.isConnected && void refresh(), busy ? BUSY_MS : IDLE_MS);
+  };
+  setTimeout(() => void refresh());
+  return section;
+}
+
+function row(job: api.Job, title: string): Row {
+  const bar = el("progress", { max: 100 });
+  bar.setAttribute("aria-label", `${job.kind} of ${title}`);
+  const words = el("span", { className: "words" });
+  const stop = el("button", { textContent: "Cancel", onclick: () => void api.cancel(job.number).catch(notify) });
+  stop.setAttribute("aria-label", `Cancel ${job.kind} of ${title}`);
+  const element = el("li", {}, el("strong", { textContent: `${job.kind} of ${title}` }), bar, words, stop);
+  const show = (now: api.Job): void => {
+    const ended = now.state !== "waiting" && now.state !== "running";
+    element.className = now.state;
+    bar.hidden = stop.hidden = ended;
+    bar.value = now.percent;
+    words.textContent = wordsOf(now);
+  };
+  return { element, show };
+}
+
+function wordsOf(job: api.Job): string {
+  if (job.state === "failed") return job.error ?? "failed";
+  if (job.state !== "running") return job.state;
+  const left = job.left_s === null ? [] : [`${duration(job.left_s)} left`];
+  return [`${job.percent} %`, ...left, job.doing].filter(Boolean).join(" · ");
+}
+
+const duration = (s: number): string => (s < 90 ? `${s} s` : `${Math.round(s / 60)} min`);

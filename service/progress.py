@@ -1,0 +1,97 @@
+"""How far long work is, and whether it goes on: one object for the portal and the terminal.
+
+The work reports to it and is stopped by it: after :meth:`Progress.cancel` the next report raises
+:class:`CancelledError`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from itertools import count
+from typing import TypeVar
+
+T = TypeVar("T")
+
+MIN_SHARE, MIN_S = 0.02, 2.0
+"""Before this much is done the time left is a guess."""
+
+
+class CancelledError(Exception):
+    """The work was cancelled: no failure, so nothing that handles failures catches it."""
+
+
+class Progress:
+    """The share of some work that is done. One thread works; any thread may read and cancel."""
+
+    def __init__(self, show: Callable[[Progress], None] = lambda _: None) -> None:
+        """``show`` is called after every report."""
+        self.text, self.share = "", 0.0
+        self._end = 1.0  # of the part that is being done
+        self._show = show
+        self._is_cancelled = False
+        self._may_stop = True
+        self._started = time.monotonic()
+
+    def __call__(self, text: str) -> None:
+        """Say what is being done. Raises CancelledError after :meth:`cancel`."""
+        self.text = text
+        self._report()
+
+    def cancel(self) -> None:
+        """Stop the work at its next report, unless it is past :meth:`commit`."""
+        self._is_cancelled = True
+
+    def commit(self, text: str) -> None:
+        """Say what is being done; from here on the work cannot be cancelled."""
+        self.text = text
+        self._report()
+        self._may_stop = False
+
+    @contextmanager
+    def part(self, text: str, of_rest: float = 1.0) -> Iterator[None]:
+        """The work inside takes this share of what is left of the work around it."""
+        end = self._end
+        self._end = self.share + of_rest * (end - self.share)
+        try:
+            self(text)
+            yield
+            self.share = self._end
+        finally:
+            self._end = end
+
+    def over(self, items: Iterable[T], number: int) -> Iterator[T]:
+        """The ``items``, about ``number``, as equal shares of the current part."""
+        say = self.counting(number)
+        for item in items:
+            say(self.text)
+            yield item
+
+    def counting(self, calls: int) -> Callable[[str], None]:
+        """As the object itself; about so many calls are the current part."""
+        start, width = self.share, self._end - self.share
+        numbers = count()
+
+        def say(text: str) -> None:
+            self.share = start + width * min(next(numbers) / max(calls, 1), 1.0)
+            self(text)
+
+        return say
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds that the rest takes at the pace so far; None while that is unknown."""
+        spent = time.monotonic() - self._started
+        if spent < MIN_S or self.share < MIN_SHARE:
+            return None
+        return spent * (1.0 - self.share) / self.share
+
+    def begin(self) -> None:
+        """Count the time from now on: the work has waited."""
+        self._started = time.monotonic()
+
+    def _report(self) -> None:
+        if self._is_cancelled and self._may_stop:
+            raise CancelledError("cancelled")
+        self._show(self)

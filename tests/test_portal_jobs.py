@@ -1,0 +1,75 @@
+"""The list of jobs in a real browser: percent, cancelling, and a refinement."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from conftest import HouseFlight
+from loopback import until
+from person import Browser
+from portal_client import NEEDS, ONE, TOKEN, Client, browser, flown_store
+
+from service.ground import state
+from service.ground.portal import Portal, PortalConfig
+from service.ground.state import Job
+from service.stream.store import ScanStore
+
+__all__ = ["browser"]  # the fixture
+
+ROW = "document.querySelector('.jobs li')"
+
+
+@pytest.fixture
+def portal(tmp_path: Path, house: HouseFlight) -> Iterator[Portal]:
+    one = Portal(PortalConfig(flown_store(tmp_path, house), port=0, token=TOKEN))
+    one.start()
+    yield one
+    one.close()
+
+
+def test_a_scan_is_refined_from_the_portal(portal: Portal, tmp_path: Path) -> None:
+    client = Client(portal)
+    with ScanStore.open(tmp_path / "drone-1/test-1/scan.db") as store:
+        store.finish({"frames": 5})
+    status, job, _ = client.ask(ONE + "/exports", "POST", {"kind": "refine"})
+    assert status == 202
+    ended = until(
+        lambda: next((j for j in client.ask("/api/jobs")[1] if j["state"] == "done"), None),
+        progress=lambda: client.ask("/api/jobs")[1],
+    )
+    assert ended["number"] == job["number"] and ended["percent"] > 0
+    assert "refined" in " ".join(client.ask(ONE)[1]["notes"])
+    assert client.ask(f"/api/jobs/{job['number']}", "DELETE")[0] == 404
+    assert client.ask("/api/jobs/1", "DELETE", token="")[0] == 401
+
+
+@pytest.mark.parametrize("where", ["/", "/#/view/drone-1/test-1"])
+@pytest.mark.parametrize("needs", [pytest.param(None, marks=NEEDS)])
+def test_a_job_shows_its_percent_and_is_cancelled_by_its_button(
+    browser: Browser, portal: Portal, monkeypatch: pytest.MonkeyPatch, where: str, needs: None
+) -> None:
+    go_on = threading.Event()
+
+    def slow(job: Job) -> str:
+        for _ in job.progress.over(range(4), 4):
+            if job.progress.share >= 0.75:
+                job.progress("fusing the cloud")
+                go_on.wait(20.0)
+        return job.progress("after the last step") or "dsm.tif"
+
+    monkeypatch.setattr(state, "carry_out", slow)
+    browser.screen(1280, 800)
+    browser.open(portal.url)
+    browser.wait("document.querySelectorAll('article').length === 1")
+    browser.open(portal.url.split("/?")[0] + where)
+    assert Client(portal).ask(ONE + "/exports", "POST", {"kind": "dsm"})[0] == 202
+    browser.wait(f"{ROW} && {ROW}.textContent.includes('75 %')")
+    assert browser.run(f"{ROW}.querySelector('progress').value") == 75
+    assert "dsm of test-1" in browser.run(f"{ROW}.textContent")
+    browser.click("Cancel")
+    go_on.set()
+    browser.wait(f"{ROW}.className === 'cancelled'")
+    assert browser.run(f"{ROW}.querySelector('button').hidden")
