@@ -8,6 +8,7 @@ import pty
 import select
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service import progress as module
 from service.commands import showing
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.progress import CancelledError, Progress
@@ -54,7 +54,7 @@ def test_equal_parts_take_equal_shares() -> None:
 
 def test_the_rest_takes_as_long_as_the_pace_so_far_says(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
     progress = Progress()
     now[0] = 500.0  # it waited in a queue
     progress.begin()

@@ -80,6 +80,9 @@ def ground(
     portal_tls: Annotated[
         tuple[Path, Path] | None, typer.Option(help="the portal's certificate and key")
     ] = None,
+    basemap: Annotated[
+        Path | None, typer.Option(help="MBTiles or PMTiles file below the portal's maps")
+    ] = None,
     vehicle: Annotated[
         str | None,
         typer.Option(help="MAVLink of the vehicle for the portal: udpin://0.0.0.0:14550"),
@@ -100,7 +103,9 @@ def ground(
     name, session = _session(connect or [], listen or [], keys, plain)
     refresh = refresh_s if refresh_s is not None else RADIO_REFRESH_S if mavlink else 0.0
     limits = _limits(quota_mb, drone_share, reserve_mb)
-    page = None if portal is None else PortalOptions(portal, portal_token, portal_tls, vehicle)
+    page = None
+    if portal is not None:
+        page = PortalOptions(portal, portal_token, portal_tls, vehicle, basemap)
     _receive(
         ReceiverConfig(store, session, limits, name, refresh),
         mavlink or [], page, take or [], Until(once, idle_exit_s), as_json,
@@ -115,6 +120,7 @@ class PortalOptions:
     token: Path | None
     tls: tuple[Path, Path] | None  # certificate and key
     vehicle: str | None  # MAVLink endpoint
+    basemap: Path | None  # MBTiles or PMTiles
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +227,14 @@ def _open_portal(
     endpoint = options.vehicle
     vehicle = None if endpoint is None else Vehicle(endpoint, workers=workers)
     page = open_portal(
-        options.address, store, receiver.progress, options.token, options.tls, vehicle, workers
+        options.address,
+        store,
+        receiver.progress,
+        options.token,
+        options.tls,
+        vehicle,
+        workers,
+        options.basemap,
     )
     if vehicle is not None:
         vehicle.start()

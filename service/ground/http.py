@@ -30,9 +30,11 @@ from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
 from service.errors import InputError, OutsideError
+from service.ground.basemap import open_basemap
 from service.ground.guard import CHANGING, WHO, AuditLog, Guard, Pace, Tokens, note
 from service.ground.library import ConflictError, Library
 from service.ground.live import serve_live
+from service.ground.map_tiles import map_routes
 from service.ground.scan_files import file_routes
 from service.ground.state import KINDS, Jobs, PortalState, names_of, state_of
 from service.ground.vehicle import BUTTONS, Vehicle
@@ -100,9 +102,12 @@ def portal_app(
     progress: Callable[[], list[dict[str, Any]]] | None = None,
     vehicle: Vehicle | None = None,
     workers: Workers | None = None,
+    basemap: Path | None = None,
 ) -> ASGIApp:
     """The portal as an ASGI application; ``local`` when only this machine can reach it."""
-    state = PortalState(Library(store), Jobs(workers or Workers()), progress or list, vehicle)
+    jobs = Jobs(workers or Workers())
+    below = None if basemap is None else open_basemap(basemap)
+    state = PortalState(Library(store), jobs, progress or list, vehicle, below)
     one = "/api/scans/{drone}/{scan}"
     routes: list[Any] = [
         Route("/", _page),
@@ -111,6 +116,7 @@ def portal_app(
         Route(one, _label, methods=["PATCH"]),
         Route(one, _delete, methods=["DELETE"]),
         *file_routes(one),
+        *map_routes(),
         Route(one + "/exports", _export, methods=["POST"]),
         WebSocketRoute(one + "/live", _live),
         Route("/api/jobs", _jobs, methods=["GET"]),
@@ -242,7 +248,8 @@ def _delete(request: Request) -> Response:
             raise HTTPException(409, "this scan is being received; delete it some minutes later")
     if state.jobs.busy(state.library.folder(drone, scan)):
         raise HTTPException(409, "a deliverable of this scan is being made; wait for it")
-    state.coverages.forget(state.library.folder(drone, scan))
+    for kept in (state.coverages, state.maps):
+        kept.forget(state.library.folder(drone, scan))
     return JSONResponse({"bin": state.library.delete(drone, scan)})
 
 

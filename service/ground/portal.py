@@ -48,6 +48,7 @@ class PortalConfig:
     token: str = ""  # one, or lines of NAME TOKEN; empty: made at the start, only on this machine
     tls_certificate: str = ""
     tls_key: str = ""
+    basemap: Path | None = None  # an MBTiles or PMTiles file
 
     def __post_init__(self) -> None:
         """Raise InputError for an address open to others without a token."""
@@ -97,6 +98,7 @@ class Portal:
             progress,
             vehicle,
             self._workers,
+            config.basemap,
         )
         self._vehicle = vehicle
         self._listener: BoundedListener | None = None
@@ -211,6 +213,7 @@ def open_portal(
     tls: tuple[Path, Path] | None = None,
     vehicle: Vehicle | None = None,
     workers: Workers | None = None,
+    basemap: Path | None = None,
 ) -> Portal:
     """A started portal at ``HOST:PORT`` on the scans below ``store``.
 
@@ -223,7 +226,7 @@ def open_portal(
         if not path.is_file():
             raise InputError(f"portal certificate {path}: no such file")
     certificate, key = (str(path) for path in tls) if tls else ("", "")
-    config = PortalConfig(store, host, port, token, certificate, key)
+    config = PortalConfig(store, host, port, token, certificate, key, basemap)
     portal = Portal(config, progress, vehicle, workers)
     portal.start()
     return portal

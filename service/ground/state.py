@@ -14,7 +14,9 @@ from typing import Any
 from starlette.requests import HTTPConnection
 
 from service.errors import InputError, SkyreliefError
+from service.ground.basemap import Basemap
 from service.ground.library import Library
+from service.ground.live_map import LiveMaps
 from service.ground.vehicle import Vehicle
 from service.offline.exports import EXPORTERS
 from service.offline.exports.view import ExportOptions, ScanView, export
@@ -173,7 +175,9 @@ class PortalState:
     jobs: Jobs
     progress: Callable[[], list[dict[str, Any]]]  # one entry per scan being received
     vehicle: Vehicle | None
+    basemap: Basemap | None = None
     coverages: LiveCoverages = field(default_factory=LiveCoverages)
+    maps: LiveMaps = field(default_factory=LiveMaps)
     live_views: int = 0
     views_without_token: int = 0  # of these
     started: float = field(default_factory=time.monotonic)

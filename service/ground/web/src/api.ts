@@ -64,6 +64,10 @@ async function ask<T>(path: string, method = "GET", body?: unknown): Promise<T> 
 const place = (s: { drone: string; scan: string }): string =>
   `/api/scans/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`;
 
+/** The page that shows a scan on a map. */
+export const mapAddress = (s: { drone: string; scan: string }): string =>
+  `#/map/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`;
+
 /** Where everything of a scan lies. */
 export const scanAddress = place;
 

@@ -130,6 +130,7 @@ function card(s: api.Scan, again: () => void): HTMLElement {
     el(
       "p",
       { className: "acts" },
+      s.origin ? el("a", { href: api.mapAddress(s), textContent: "Map", className: "button" }) : null,
       el("button", { textContent: "Rename", onclick: () => rename(s, again) }),
       el("button", { textContent: "Tags", onclick: () => retag(s, again) }),
       makeMenu(s, again),

@@ -1,4 +1,4 @@
-// Two pages behind the address: the list of scans, and one scan in 3D.
+// Three pages behind the address: the list of scans, and one scan in 3D or on a map.
 
 import "./style.css";
 import { notify } from "./dom";
@@ -13,10 +13,10 @@ async function show(): Promise<void> {
   close();
   close = () => undefined;
   const [page, drone, scan, place] = location.hash.replace(/^#\//, "").split("/").map(decodeURIComponent);
-  const isView = page === "view" && drone && scan;
-  const end = isView
-    ? await (await import("./view")).showView(root, drone, scan, place)
-    : await showLibrary(root);
+  let end: () => void;
+  if (page === "view" && drone && scan) end = await (await import("./view")).showView(root, drone, scan, place);
+  else if (page === "map" && drone && scan) end = await (await import("./map")).showMap(root, drone, scan);
+  else end = await showLibrary(root);
   if (mine === turn) close = end;
   else end(); // another page was asked for meanwhile
 }

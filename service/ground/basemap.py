@@ -1,0 +1,163 @@
+"""A basemap that the operator gives: raster tiles of an MBTiles or a PMTiles (version 3) file.
+
+MBTiles 1.3 is a SQLite database with rows counted from the south. PMTiles orders tiles along a
+Hilbert curve; directories of runs of them lead to their bytes.
+"""
+
+from __future__ import annotations
+
+import gzip
+import sqlite3
+import struct
+from collections.abc import Callable
+from contextlib import closing
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Protocol
+
+from service.errors import InputError
+
+MEDIA = {"png": "image/png", "jpg": "image/jpeg", "jpeg": "image/jpeg", "webp": "image/webp"}
+PM_MEDIA = {2: "image/png", 3: "image/jpeg", 4: "image/webp"}
+PM_PLAIN, PM_GZIP = 1, 2
+PM_HEADER = struct.Struct("<7sB11Q6B4iB2i")
+MAX_DIRECTORY_BYTES = 1 << 26
+DEEPEST_DIRECTORY = 4
+
+
+class Basemap(Protocol):
+    """Raster tiles of a file."""
+
+    media_type: str
+    max_zoom: int
+    about: dict[str, Any]
+
+    def tile(self, zoom: int, x: int, y: int) -> bytes | None:
+        """The image of a tile, rows counted from the north; None where there is none."""
+        ...
+
+
+def open_basemap(path: Path) -> Basemap:
+    """The basemap in ``path``. Raises InputError, in one line, when it cannot be used."""
+    kinds: dict[str, Callable[[Path], Basemap]] = {".mbtiles": MBTiles, ".pmtiles": PMTiles}
+    if path.suffix.lower() not in kinds:
+        raise InputError(f"basemap {path}: name it .mbtiles or .pmtiles")
+    if not path.is_file():
+        raise InputError(f"basemap {path}: no such file")
+    try:
+        return kinds[path.suffix.lower()](path)
+    except (sqlite3.Error, OSError, ValueError, struct.error) as error:
+        raise InputError(f"basemap {path} cannot be read ({error})") from error
+
+
+class MBTiles:
+    """A file after the MBTiles specification."""
+
+    def __init__(self, path: Path) -> None:
+        self._uri = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
+        with closing(self._open()) as database:
+            about = dict(database.execute("SELECT name, value FROM metadata"))
+            zooms = database.execute("SELECT MIN(zoom_level), MAX(zoom_level) FROM tiles")
+            low, high = zooms.fetchone()
+        if about.get("format") not in MEDIA or high is None:
+            raise ValueError(f"its format is {about.get('format')}; images are needed")
+        self.media_type, self.max_zoom = MEDIA[about["format"]], int(high)
+        self.about = {"minzoom": int(low), "maxzoom": self.max_zoom, "name": path.stem}
+
+    def _open(self) -> sqlite3.Connection:
+        return sqlite3.connect(self._uri, uri=True)
+
+    def tile(self, zoom: int, x: int, y: int) -> bytes | None:
+        """See :class:`Basemap`."""
+        sql = "SELECT tile_data FROM tiles WHERE zoom_level=? AND tile_column=? AND tile_row=?"
+        with closing(self._open()) as database:
+            row = database.execute(sql, (zoom, x, (1 << zoom) - 1 - y)).fetchone()
+        return None if row is None else bytes(row[0])
+
+
+class PMTiles:
+    """A file after the PMTiles specification, version 3."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        head = PM_HEADER.unpack(self._read(0, PM_HEADER.size))
+        if head[:2] != (b"PMTiles", 3):
+            raise ValueError("it is no PMTiles of version 3")
+        root, root_bytes, _, _, self._leaves, _, self._data = head[2:9]
+        self._packing, packing, kind, low, self.max_zoom = head[14:19]
+        if kind not in PM_MEDIA or packing not in (0, PM_PLAIN):
+            raise ValueError("its tiles are no images")
+        if self._packing not in (PM_PLAIN, PM_GZIP):
+            raise ValueError("its directories are neither plain nor packed by gzip")
+        self.media_type = PM_MEDIA[kind]
+        self.about = {"minzoom": low, "maxzoom": self.max_zoom, "name": path.stem}
+        self._directory = lru_cache(maxsize=64)(self._directory_at)
+        self._root = root, root_bytes
+        self._directory(*self._root)
+
+    def tile(self, zoom: int, x: int, y: int) -> bytes | None:
+        """See :class:`Basemap`."""
+        wanted, where = tile_number(zoom, x, y), self._root
+        for _ in range(DEEPEST_DIRECTORY):
+            entries = self._directory(*where)
+            found = next((e for e in reversed(entries) if e[0] <= wanted), None)
+            if found is None:
+                return None
+            first, run, length, offset = found
+            if run:
+                inside = wanted < first + run
+                return self._read(self._data + offset, length) if inside else None
+            where = self._leaves + offset, length
+        return None
+
+    def _read(self, offset: int, length: int) -> bytes:
+        with open(self._path, "rb") as file:
+            file.seek(offset)
+            return file.read(length)
+
+    def _directory_at(self, offset: int, length: int) -> list[tuple[int, int, int, int]]:
+        """(first tile, run, bytes, offset) of each entry; a run of 0 is another directory."""
+        if length > MAX_DIRECTORY_BYTES:
+            raise ValueError("a directory is too large")
+        data = self._read(offset, length)
+        numbers = _varints(gzip.decompress(data) if self._packing == PM_GZIP else data)
+        n, rest = numbers[0], numbers[1:]
+        if len(rest) < 4 * n:
+            raise ValueError("a directory is cut short")
+        columns = [rest[k * n : (k + 1) * n] for k in range(4)]
+        out: list[tuple[int, int, int, int]] = []
+        first = at = 0
+        for step, run, size, place in zip(*columns, strict=True):
+            first += step
+            at = place - 1 if place else at  # 0: directly after the entry before
+            out.append((first, run, size, at))
+            at += size
+        return out
+
+
+def _varints(data: bytes) -> list[int]:
+    """Numbers of 7 bits a byte, the lowest first."""
+    out, value, shift = [], 0, 0
+    for byte in data:
+        value |= (byte & 127) << shift
+        shift += 7
+        if byte < 128:
+            out.append(value)
+            value = shift = 0
+    return out
+
+
+def tile_number(zoom: int, x: int, y: int) -> int:
+    """A tile's place on the Hilbert curve, after all tiles of coarser zooms."""
+    number: int = (4**zoom - 1) // 3
+    side = 1 << zoom
+    half = side // 2
+    while half:
+        rx, ry = int(x & half > 0), int(y & half > 0)
+        number += half * half * ((3 * rx) ^ ry)
+        if not ry:
+            if rx:
+                x, y = side - 1 - x, side - 1 - y
+            x, y = y, x
+        half //= 2
+    return number

@@ -1,0 +1,269 @@
+"""The map of a scan while it grows, as Web Mercator tiles drawn from its keyframes.
+
+A tile keeps the keyframes that it was drawn from: a new one is drawn into it, one that moved or
+became finer makes it anew. Each pixel has the height and the colour of its surest point.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from array import array
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from recon.mapping.cloud_fusion import cloud_of
+from recon.mapping.voxel_map import ground_sample_m
+from recon.surface.raster import Grid, Raster, fill_holes
+from recon.types import F32, F64, U8, Array, Keyframe
+from service.errors import InputError
+from service.georeference import LocalFrame
+from service.scans.main_piece import main_seqs
+from service.scans.track import local_frame
+from service.stream.ranges import RangeSet
+from service.stream.store import ScanStore
+
+SIDE, MARGIN = 256, 8
+WIDE = SIDE + 2 * MARGIN
+"""Pixels of a tile, and of the margin around it that shading and contours look at."""
+
+EQUATOR_M = 2.0 * math.pi * 6378137.0
+MAX_ZOOM = 24
+HOLE_PX = 4
+MAX_TILES = 150
+READ_S = 2.0
+"""Time that one request spends on keyframes that are new; the rest is for the next."""
+
+Tile = tuple[int, int, int]
+"""Zoom, column from west, row from north."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cells:
+    """What a tile and its margin show."""
+
+    height_m: F32  # (WIDE, WIDE) AMSL, NaN where unknown
+    rgb: U8  # (WIDE, WIDE, 3)
+
+
+def mercator(lat_deg: F64, lon_deg: F64) -> F64:
+    """(N, 2) places in the square of Web Mercator: 0 to 1 from west and from north."""
+    y = np.arcsinh(np.tan(np.radians(lat_deg))) / np.pi
+    return np.column_stack([lon_deg / 360.0 + 0.5, 0.5 - 0.5 * y])
+
+
+def degrees(x: float, y: float) -> tuple[float, float]:
+    """(latitude, longitude) of a place in that square."""
+    return math.degrees(math.atan(math.sinh(math.pi * (1.0 - 2.0 * y)))), 360.0 * (x - 0.5)
+
+
+def pixel_m(zoom: int, lat_deg: float) -> float:
+    """Length of a tile's pixel on the ground."""
+    return EQUATOR_M * math.cos(math.radians(lat_deg)) / (SIDE << zoom)
+
+
+@dataclass(slots=True, eq=False)
+class _Drawn:
+    """One tile, and the state of each keyframe that is in it."""
+
+    states: dict[int, int] = field(default_factory=dict)
+    sigma: F32 = field(default_factory=lambda: np.full(WIDE * WIDE, np.inf, np.float32))
+    height: F32 = field(default_factory=lambda: np.full(WIDE * WIDE, np.nan, np.float32))
+    rgb: U8 = field(default_factory=lambda: np.zeros((WIDE * WIDE, 3), np.uint8))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Points:
+    """A keyframe's points, the surest last."""
+
+    place: F64  # (N, 2) in the square of Web Mercator
+    height_m: F32
+    sigma_m: F32
+    rgb: U8
+
+
+class LiveMap:
+    """The map of one open store. Use it from one thread at a time."""
+
+    def __init__(self, store: ScanStore) -> None:
+        """Raises InputError for a scan without a georeference."""
+        frame = local_frame(store.header)
+        if frame is None:
+            raise InputError("no map: the scan has no georeference")
+        self._store, self._frame = store, frame
+        self.zoom: int | None = None  # the finest that is drawn; finer tiles are enlarged
+        self.version = 0  # counts the keyframes that came or changed
+        self._seqs, self._states = array("q"), array("q")
+        self._boxes = np.zeros((0, 4))
+        self._tiles: OrderedDict[Tile, _Drawn] = OrderedDict()
+        self._points = lru_cache(maxsize=64)(self._points_of)
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float] | None:
+        """(west, north, east, south) in the square of Web Mercator; None without surface."""
+        if not len(self._boxes) or not np.isfinite(self._boxes).any():
+            return None
+        west, north = np.nanmin(self._boxes[:, :2], axis=0).tolist()
+        east, south = np.nanmax(self._boxes[:, 2:], axis=0).tolist()
+        return west, north, east, south
+
+    def refresh(self) -> None:
+        """Take note of keyframes that are new, finer or moved, for READ_S at most."""
+        until = time.monotonic() + READ_S
+        fine = self._store.numbers().get("k1", RangeSet())
+        known = dict(zip(self._seqs, range(len(self._seqs)), strict=True))
+        for seq in main_seqs(self._store):
+            repose = self._store.repose(seq)
+            state = 2 * (0 if repose is None else repose.revision + 1) + (seq in fine)
+            at = known.get(seq)
+            if at is not None and self._states[at] == state:
+                continue
+            box = self._box(seq, state)
+            if at is None:
+                self._seqs.append(seq)
+                self._states.append(state)
+                self._boxes = np.vstack([self._boxes, box])
+            else:
+                self._states[at], self._boxes[at] = state, box
+            self.version += 1
+            if time.monotonic() > until:
+                return
+
+    def cells(self, tile: Tile) -> Cells:
+        """What is known of a tile at a zoom up to :attr:`zoom`."""
+        drawn = self._tiles.pop(tile, None) or _Drawn()
+        now = dict(self._within(tile))
+        if any(now.get(seq) != state for seq, state in drawn.states.items()):
+            drawn = _Drawn()
+        for seq in now.keys() - drawn.states.keys():
+            self._draw(self._points(seq, now[seq]), tile, drawn)
+        drawn.states = now
+        self._tiles[tile] = drawn
+        while len(self._tiles) > MAX_TILES:
+            self._tiles.popitem(last=False)
+        shape = (WIDE, WIDE)
+        grid = Grid(0.0, 0.0, pixel_m(tile[0], self._frame.lat_deg), shape)
+        raster = Raster(
+            grid, drawn.height.reshape(shape), drawn.sigma.reshape(shape),
+            drawn.rgb.reshape(*shape, 3),
+        )  # fmt: skip
+        closed = fill_holes(raster, HOLE_PX)
+        return Cells(closed.height_m, closed.rgb)
+
+    def _within(self, tile: Tile) -> list[tuple[int, int]]:
+        """Keyframes whose points may lie in a tile or its margin, with their states."""
+        west, north = _corner(tile)
+        side = WIDE / SIDE / (1 << tile[0])
+        if not len(self._boxes):
+            return []
+        b = self._boxes
+        hit = (b[:, 0] < west + side) & (b[:, 2] > west) & (b[:, 1] < north + side)
+        return [(self._seqs[i], self._states[i]) for i in np.flatnonzero(hit & (b[:, 3] > north))]
+
+    def _draw(self, points: _Points, tile: Tile, drawn: _Drawn) -> None:
+        """Put those points into a tile that are surer than what it shows."""
+        scale = float(SIDE << tile[0])
+        col, row = np.floor((points.place - _corner(tile)) * scale).astype(np.int64).T
+        inside = (col >= 0) & (col < WIDE) & (row >= 0) & (row < WIDE)
+        at = (row * WIDE + col)[inside]
+        sigma = np.full(WIDE * WIDE, np.inf, np.float32)
+        which = np.zeros(WIDE * WIDE, np.int64)
+        sigma[at], which[at] = points.sigma_m[inside], np.flatnonzero(inside)
+        new = np.flatnonzero(sigma < drawn.sigma)
+        drawn.sigma[new] = sigma[new]
+        drawn.height[new] = points.height_m[which[new]]
+        drawn.rgb[new] = points.rgb[which[new]]
+
+    def _box(self, seq: int, state: int) -> F64:
+        """(4,) bounds of a keyframe's points; NaN without any."""
+        place = self._points(seq, state).place
+        if not len(place):
+            return np.full(4, np.nan)
+        return np.concatenate([place.min(axis=0), place.max(axis=0)])
+
+    def _points_of(self, seq: int, state: int) -> _Points:
+        """The points of a keyframe in its ``state``."""
+        keyframe = self._store.keyframe(seq)
+        if keyframe is None:
+            empty = np.zeros(0, np.float32)
+            return _Points(np.zeros((0, 2)), empty, empty, np.zeros((0, 3), np.uint8))
+        self._choose_zoom(keyframe)
+        cloud = cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh)
+        order = np.argsort(-cloud.sigma_m)
+        place = on_map(self._frame, cloud.xyz_m[order].astype(np.float64))
+        return _Points(
+            place[:, :2], place[:, 2].astype(np.float32), cloud.sigma_m[order], cloud.rgb[order]
+        )
+
+    def _choose_zoom(self, keyframe: Keyframe) -> None:
+        sample_m = ground_sample_m(keyframe.depth)
+        if self.zoom is None and sample_m is not None:
+            lat = self._frame.lat_deg
+            finest = math.floor(math.log2(pixel_m(0, lat) / max(sample_m, 1e-3)))
+            self.zoom = min(max(finest, 0), MAX_ZOOM)
+
+
+def _corner(tile: Tile) -> F64:
+    """(2,) the north-west corner of a tile's margin."""
+    zoom, x, y = tile
+    return (np.array([x, y]) - MARGIN / SIDE) / (1 << zoom)
+
+
+def on_map(frame: LocalFrame, enu_m: F64) -> F64:
+    """(N, 3) place in the square of Web Mercator and AMSL metres of (N, 3) ENU metres.
+
+    By an affine map of the box around the points, which over some kilometres is exact to far
+    less than a pixel of their image.
+    """
+    if not len(enu_m):
+        return np.zeros((0, 3))
+    low, high = enu_m.min(axis=0), enu_m.max(axis=0) + 1.0
+    box = np.array(np.meshgrid(*np.column_stack([low, high]))).reshape(3, -1).T
+    geodetic = frame.to_geodetic(box)
+    known = np.column_stack([mercator(geodetic[:, 0], geodetic[:, 1]), geodetic[:, 2]])
+    middle, zero = box.mean(axis=0), known.mean(axis=0)
+    A: Array = np.linalg.lstsq(box - middle, known - zero, rcond=None)[0]
+    return np.asarray((enu_m - middle) @ A + zero)
+
+
+class LiveMaps:
+    """Maps of the scans viewed last. Thread-safe."""
+
+    def __init__(self, min_age_s: float = 1.0, max_scans: int = 3) -> None:
+        self._min_age_s, self._max_scans = min_age_s, max_scans
+        self.lock = threading.RLock()  # also of the maps
+        self._kept: OrderedDict[Path, tuple[LiveMap, ScanStore, float]] = OrderedDict()
+
+    def of(self, folder: Path) -> LiveMap:
+        """The map of the scan in ``folder``, at most ``min_age_s`` old. Hold :attr:`lock`.
+
+        Raises InputError when the folder holds no scan, or one without a georeference.
+        """
+        held = self._kept.pop(folder, None)
+        if held is None:
+            store = ScanStore.open(folder / "scan.db")
+            try:
+                held = (LiveMap(store), store, -math.inf)
+            except InputError:
+                store.close()
+                raise
+        found, store, then = held
+        if time.monotonic() - then >= self._min_age_s:
+            found.refresh()
+            then = time.monotonic()
+        self._kept[folder] = (found, store, then)
+        while len(self._kept) > self._max_scans:
+            self._kept.popitem(last=False)[1][1].close()
+        return found
+
+    def forget(self, folder: Path) -> None:
+        """Close the store of a folder, for example before it is deleted."""
+        with self.lock:
+            held = self._kept.pop(folder, None)
+            if held is not None:
+                held[1].close()

@@ -1,0 +1,333 @@
+"""Maps of a scan over HTTP: XYZ tiles in Web Mercator, TileJSON, KML.
+
+A layer comes from the exported raster where that is newer than the scan's other files, else from
+the keyframes as they arrive.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import escape
+
+import cv2
+import numpy as np
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+
+from recon.surface.raster import hillshade
+from recon.types import F32, U8
+from service.errors import InputError
+from service.ground.live_map import (
+    EQUATOR_M,
+    MARGIN,
+    MAX_ZOOM,
+    SIDE,
+    WIDE,
+    Cells,
+    LiveMap,
+    Tile,
+    degrees,
+    on_map,
+    pixel_m,
+)
+from service.ground.state import PortalState, names_of, state_of
+from service.scans.coverage import Coverage
+from service.scans.folder import SUMMARY
+
+RASTERS = {"ortho": "ortho.tif", "dsm": "dsm.tif", "contours": "dsm.tif"}
+"""The layers that a finished scan may have as rasters."""
+
+LAYERS = (*RASTERS, "coverage")
+INK = (40, 60, 110)  # BGR of contours
+SMOOTH_PX = 1.5
+CONTOUR_PX = 4.0
+"""Interval of contours in pixels on the ground, rounded up to 1, 2 or 5 times a power of ten."""
+
+KML_TILES = 4
+REFRESH_S = 5
+FRESH = {"cache-control": "max-age=2"}
+
+
+def map_routes() -> list[Route]:
+    """All routes of maps."""
+    one = "/tiles/{drone}/{scan}/{layer}"
+    return [
+        Route(one + ".json", _tile_json),
+        Route(one + ".kml", _kml),
+        Route(one + "/{z:int}/{x:int}/{y:int}.png", _tile),
+        Route("/tiles/basemap.json", _basemap_json),
+        Route("/tiles/basemap/{z:int}/{x:int}/{y:int}", _basemap),
+    ]
+
+
+async def _tile(request: Request) -> Response:
+    """A map tile of a scan: ortho, dsm, contours or coverage; clear where nothing is known."""
+    return await run_in_threadpool(_tile_png, request)
+
+
+def _tile_png(request: Request) -> Response:
+    state, folder, layer = _asked(request)
+    z, x, y = (request.path_params[name] for name in "zxy")
+    if not (z <= MAX_ZOOM and x < 1 << z and y < 1 << z):
+        raise InputError("no such tile")
+    image = tile_image(state, folder, layer, (z, x, y))
+    return Response(_png(image), media_type="image/png", headers=FRESH)
+
+
+def _asked(request: Request) -> tuple[PortalState, Path, str]:
+    """State, folder and layer of a request; InputError where there is none."""
+    state, layer = state_of(request), request.path_params["layer"]
+    if layer not in LAYERS:
+        raise InputError(f"no layer {layer[:40]}; there are {', '.join(LAYERS)}")
+    return state, state.library.folder(*names_of(request)), layer
+
+
+def _png(image: U8) -> bytes:
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def tile_image(state: PortalState, folder: Path, layer: str, tile: Tile) -> U8:
+    """(SIDE, SIDE, 4) BGRA of one tile."""
+    raster = newer_raster(folder, layer)
+    if raster is not None:
+        return _drawn(layer, _from_raster(raster, layer, tile), pixel_m(tile[0], _latitude(tile)))
+    if layer == "coverage":
+        found = state.coverages.of(folder)
+        return _clear() if found is None else coverage_image(found, tile)
+    with state.maps.lock:
+        live = state.maps.of(folder)
+        up = max(0, tile[0] - (tile[0] if live.zoom is None else live.zoom))
+        parent = tile[0] - up, tile[1] >> up, tile[2] >> up
+        cells = live.cells(parent)
+    image = _drawn(layer, cells, pixel_m(parent[0], _latitude(tile)))
+    return _enlarged(image, tile, up)
+
+
+def _clear() -> U8:
+    return np.zeros((SIDE, SIDE, 4), np.uint8)
+
+
+def _latitude(tile: Tile) -> float:
+    return degrees(0.5, (tile[2] + 0.5) / (1 << tile[0]))[0]
+
+
+def _enlarged(image: U8, tile: Tile, up: int) -> U8:
+    """The part of an ancestor's image, ``up`` zooms above, that a tile shows."""
+    if not up:
+        return image
+    side = SIDE / (1 << up)
+    left, top = ((tile[k] & ((1 << up) - 1)) * side for k in (1, 2))
+    shift = np.array([[side / SIDE, 0.0, left], [0.0, side / SIDE, top]])
+    shift[:, 2] += 0.5 * side / SIDE - 0.5  # centres of pixels
+    flags = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
+    return np.asarray(cv2.warpAffine(image, shift, (SIDE, SIDE), flags=flags,
+                                     borderMode=cv2.BORDER_REPLICATE), np.uint8)  # fmt: skip
+
+
+def newer_raster(folder: Path, layer: str) -> Path | None:
+    """The exported raster of a layer, unless the scan has changed since."""
+    try:
+        path = folder / RASTERS[layer]
+        is_newer = path.stat().st_mtime >= (folder / SUMMARY).stat().st_mtime
+        import rasterio  # noqa: F401
+    except (OSError, KeyError, ImportError):
+        return None
+    return path if is_newer else None
+
+
+def _from_raster(path: Path, layer: str, tile: Tile) -> Cells:
+    """A tile and its margin, from a GeoTIFF."""
+    import rasterio
+    from rasterio.enums import Resampling
+    from rasterio.transform import from_origin
+    from rasterio.vrt import WarpedVRT
+
+    step = EQUATOR_M / (SIDE << tile[0])
+    west = tile[1] * SIDE * step - 0.5 * EQUATOR_M - MARGIN * step
+    north = 0.5 * EQUATOR_M - tile[2] * SIDE * step + MARGIN * step
+    options: dict[str, Any] = {
+        "crs": "EPSG:3857",
+        "transform": from_origin(west, north, step, step),
+        "width": WIDE,
+        "height": WIDE,
+        "resampling": Resampling.bilinear,
+    }
+    with rasterio.open(path) as image:
+        if image.crs is None:
+            raise InputError("no map: the scan has no georeference")
+        with WarpedVRT(image, **options) as warped:
+            bands = warped.read()
+    if layer == "ortho":
+        height = np.where(bands[3] > 0, np.float32(0.0), np.float32(np.nan))
+        return Cells(height, np.ascontiguousarray(bands[:3].transpose(1, 2, 0)))
+    height = np.where(bands[0] == image.nodata, np.float32(np.nan), bands[0])
+    return Cells(height.astype(np.float32), np.zeros((WIDE, WIDE, 3), np.uint8))
+
+
+def _drawn(layer: str, cells: Cells, cell_m: float) -> U8:
+    """(SIDE, SIDE, 4) BGRA of a layer of the cells."""
+    out = np.zeros((WIDE, WIDE, 4), np.uint8)
+    known = np.isfinite(cells.height_m)
+    if layer == "ortho":
+        out[..., :3] = cells.rgb[..., ::-1]
+        out[..., 3] = np.where(known, 255, 0)
+    elif known.any():
+        height = _smooth(cells.height_m)
+        if layer == "dsm":
+            out[..., :3] = np.nan_to_num(255.0 * hillshade(height, cell_m))[..., None]
+            out[..., 3] = np.where(known, 255, 0)
+        else:
+            lines = contour_mask(height, interval_m(cell_m)) & known
+            out[lines] = (*INK, 255)
+    inner = slice(MARGIN, MARGIN + SIDE)
+    return np.ascontiguousarray(out[inner, inner])
+
+
+def _smooth(height_m: F32) -> F32:
+    """Heights without noise of single pixels; unknown ones stay unknown."""
+    known = np.isfinite(height_m)
+    middle = np.float32(np.median(height_m[known]))
+    weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), SMOOTH_PX)
+    sums = cv2.GaussianBlur(np.where(known, height_m - middle, 0.0), (0, 0), SMOOTH_PX)
+    smooth = middle + sums / np.maximum(weight, 1e-6)
+    return np.where(known, smooth, np.nan).astype(np.float32)
+
+
+def interval_m(cell_m: float) -> float:
+    """A round interval of contours for pixels of this length."""
+    wanted = CONTOUR_PX * cell_m
+    power = 10.0 ** np.floor(np.log10(wanted))
+    return float(next(power * n for n in (1, 2, 5, 10) if power * n >= wanted))
+
+
+def contour_mask(height_m: F32, step_m: float) -> np.ndarray:
+    """Pixels where a contour passes on to the next pixel east or south."""
+    level = np.floor(height_m / step_m)
+    mask = np.zeros(level.shape, np.bool_)
+    with np.errstate(invalid="ignore"):
+        mask[:, :-1] |= np.abs(np.diff(level, axis=1)) > 0
+        mask[:-1] |= np.abs(np.diff(level, axis=0)) > 0
+    return mask
+
+
+def coverage_image(found: Coverage, tile: Tile) -> U8:
+    """The coverage layer on one tile."""
+    if found.frame is None:
+        raise InputError("no map: the scan has no georeference")
+    west, south, east, north = found.bounds_m
+    corners = np.array([[west, north, 0.0], [east, north, 0.0], [west, south, 0.0]])
+    scale = float(SIDE << tile[0])
+    on_tile = on_map(found.frame, corners)[:, :2] * scale - np.array(tile[1:]) * SIDE - 0.5
+    image = found.image()
+    rows, cols = image.shape[:2]
+    ends = np.array([[-0.5, -0.5], [cols - 0.5, -0.5], [-0.5, rows - 0.5]], np.float32)
+    A = cv2.getAffineTransform(ends, on_tile.astype(np.float32))
+    out = cv2.warpAffine(np.ascontiguousarray(image), A, (SIDE, SIDE), flags=cv2.INTER_NEAREST)
+    return np.asarray(out, np.uint8)
+
+
+def _bounds(live: LiveMap) -> tuple[float, float, float, float]:
+    """(west, south, east, north) in degrees; InputError without surface."""
+    found = live.bounds
+    if found is None:
+        raise InputError("no surface yet")
+    west, north, east, south = found
+    (n, w), (s, e) = degrees(west, north), degrees(east, south)
+    return w, s, e, n
+
+
+async def _tile_json(request: Request) -> Response:
+    """A layer of a scan as TileJSON 3.0; ``version`` changes with the map."""
+    return await run_in_threadpool(_tile_json_of, request)
+
+
+def _tile_json_of(request: Request) -> Response:
+    state, folder, layer = _asked(request)
+    with state.maps.lock:
+        live = state.maps.of(folder)
+        bounds, version = _bounds(live), live.version
+    raster = newer_raster(folder, layer)
+    document = {
+        "tilejson": "3.0.0",
+        "name": f"{folder.name}, {layer}",
+        "tiles": [str(request.base_url) + _path(folder, layer) + "/{z}/{x}/{y}.png"],
+        "bounds": [round(v, 8) for v in bounds],
+        "minzoom": 0,
+        "maxzoom": MAX_ZOOM,
+        "version": f"{version}.0.{0 if raster is None else int(raster.stat().st_mtime)}",
+    }
+    return JSONResponse(document, headers=FRESH)
+
+
+def _path(folder: Path, layer: str) -> str:
+    return f"tiles/{folder.parent.name}/{folder.name}/{layer}"
+
+
+async def _kml(request: Request) -> Response:
+    """A layer as overlays for Google Earth and TAK, each fetched again every few seconds."""
+    return await run_in_threadpool(_kml_of, request)
+
+
+def _kml_of(request: Request) -> Response:
+    state, folder, layer = _asked(request)
+    with state.maps.lock:
+        found = state.maps.of(folder).bounds
+    if found is None:
+        raise InputError("no surface yet")
+    west, north, east, south = found
+    side = max(east - west, south - north)
+    zoom = min(MAX_ZOOM, max(0, int(np.floor(np.log2((KML_TILES - 1) / side)))))
+    n = 1 << zoom
+    overlays = "".join(
+        _overlay(f"{request.base_url}{_path(folder, layer)}/{zoom}/{x}/{y}.png", (zoom, x, y))
+        for x in range(int(west * n), int(east * n) + 1)
+        for y in range(int(north * n), int(south * n) + 1)
+    )
+    text = (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2">'
+        f"<Document><name>{escape(folder.name)}, {layer}</name>{overlays}</Document></kml>\n"
+    )
+    return Response(text, media_type="application/vnd.google-earth.kml+xml", headers=FRESH)
+
+
+def _overlay(address: str, tile: Tile) -> str:
+    zoom, x, y = tile
+    (north, west), (south, east) = (degrees((x + k) / (1 << zoom), (y + k) / (1 << zoom))
+                                    for k in (0, 1))  # fmt: skip
+    return (
+        f"<GroundOverlay><Icon><href>{escape(address)}</href><refreshMode>onInterval</refreshMode>"
+        f"<refreshInterval>{REFRESH_S}</refreshInterval></Icon><LatLonBox>"
+        f"<north>{north:.9f}</north><south>{south:.9f}</south><east>{east:.9f}</east>"
+        f"<west>{west:.9f}</west></LatLonBox></GroundOverlay>"
+    )
+
+
+def _basemap_json(request: Request) -> Response:
+    """The operator's own basemap as TileJSON; 404 where none was given."""
+    found = state_of(request).basemap
+    if found is None:
+        raise InputError("no basemap: start with 'skyrelief ground --basemap FILE'")
+    tiles = str(request.base_url) + "tiles/basemap/{z}/{x}/{y}"
+    return JSONResponse({"tilejson": "3.0.0", "tiles": [tiles], **found.about})
+
+
+def _basemap(request: Request) -> Response:
+    """A tile of the basemap; below its finest zoom enlarged, clear where it has none."""
+    found = state_of(request).basemap
+    if found is None:
+        raise InputError("no basemap")
+    z, x, y = (request.path_params[name] for name in "zxy")
+    up = max(0, z - found.max_zoom)
+    data = found.tile(z - up, x >> up, y >> up)
+    if data is None:
+        return Response(_png(_clear()), media_type="image/png")
+    if not up:
+        return Response(data, media_type=found.media_type)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise InputError("no image in this tile")
+    whole = np.asarray(cv2.resize(image, (SIDE, SIDE)), np.uint8)
+    return Response(_png(_enlarged(whole, (z, x, y), up)), media_type="image/png")

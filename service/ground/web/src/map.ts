@@ -1,0 +1,258 @@
+// A scan on a flat map: layers as XYZ tiles over the operator's own basemap; grows while it flies.
+
+import * as api from "./api";
+import { el, notify, svg } from "./dom";
+import * as units from "./units";
+
+const SIDE = 256;
+const MAX_ZOOM = 24;
+const REFRESH_MS = 2000;
+const FADE_MS = 4000; // after which a tile that does not load gives way
+const EQUATOR_M = 2 * Math.PI * 6378137;
+const LAYERS: [string, string, boolean][] = [
+  ["ortho", "Orthophoto", true],
+  ["dsm", "Surface (shaded)", false],
+  ["contours", "Contours", false],
+  ["coverage", "Coverage", false],
+];
+
+/** A place in the square of Web Mercator: 0 to 1 from west and from north. */
+interface Place {
+  x: number;
+  y: number;
+}
+
+interface TileJson {
+  bounds?: [number, number, number, number];
+  version?: string;
+}
+
+function placeOf(lat_deg: number, lon_deg: number): Place {
+  return { x: lon_deg / 360 + 0.5, y: 0.5 - Math.asinh(Math.tan((lat_deg * Math.PI) / 180)) / (2 * Math.PI) };
+}
+
+function degreesOf({ x, y }: Place): [number, number] {
+  return [(Math.atan(Math.sinh(Math.PI * (1 - 2 * y))) * 180) / Math.PI, 360 * (x - 0.5)];
+}
+
+/** The tiles of one layer in a box of their own. */
+class Layer {
+  readonly element = el("div", { className: "layer" });
+  shown = true;
+  version = "";
+  private readonly tiles = new Map<string, HTMLImageElement>();
+
+  constructor(private readonly address: (z: number, x: number, y: number) => string) {}
+
+  opacity(share: number): void {
+    this.element.style.opacity = String(share);
+  }
+
+  /** Places the tiles that a view needs; older ones stay below until theirs have come. */
+  draw(middle: Place, zoom: number, w: number, h: number): void {
+    this.element.hidden = !this.shown;
+    if (!this.shown) return;
+    const z = Math.max(0, Math.min(MAX_ZOOM, Math.round(zoom)));
+    const n = 2 ** z;
+    const scale = SIDE * 2 ** zoom;
+    const wanted = new Set<string>();
+    const range = (at: number, half: number): [number, number] => [
+      Math.max(0, Math.floor((at - half / scale) * n)),
+      Math.min(n - 1, Math.floor((at + half / scale) * n)),
+    ];
+    const [west, east] = range(middle.x, w / 2);
+    const [north, south] = range(middle.y, h / 2);
+    for (let x = west; x <= east; x++)
+      for (let y = north; y <= south; y++) {
+        const name = `${z}/${x}/${y}/${this.version}`;
+        wanted.add(name);
+        if (!this.tiles.has(name)) this.tiles.set(name, this.load(z, x, y));
+      }
+    const missing = [...wanted].some((name) => !this.tiles.get(name)!.complete);
+    for (const [name, image] of this.tiles) {
+      if (!wanted.has(name) && (!missing || !image.complete || Number(image.dataset["at"]) < performance.now() - FADE_MS)) {
+        image.remove();
+        this.tiles.delete(name);
+        continue;
+      }
+      const [tz, tx, ty] = name.split("/").map(Number) as [number, number, number];
+      // Whole pixels, so that neighbours leave no seam.
+      const edge = (n: number, at: number, half: number): number => Math.round((n / 2 ** tz - at) * scale + half);
+      const [left, top] = [edge(tx, middle.x, w / 2), edge(ty, middle.y, h / 2)];
+      image.style.transform = `translate(${left}px, ${top}px)`;
+      image.style.width = `${edge(tx + 1, middle.x, w / 2) - left}px`;
+      image.style.height = `${edge(ty + 1, middle.y, h / 2) - top}px`;
+      if (wanted.has(name)) image.dataset["at"] = String(performance.now());
+    }
+  }
+
+  private load(z: number, x: number, y: number): HTMLImageElement {
+    const image = new Image();
+    image.alt = "";
+    image.draggable = false;
+    image.onload = () => this.element.dispatchEvent(new Event("tile", { bubbles: true }));
+    image.src = `${this.address(z, x, y)}?v=${this.version}`;
+    this.element.append(image);
+    return image;
+  }
+
+  get loading(): boolean {
+    return this.shown && [...this.tiles.values()].some((image) => !image.complete);
+  }
+}
+
+/** Shows the map of a scan; gives what closes it. */
+export async function showMap(root: HTMLElement, drone: string, name: string): Promise<() => void> {
+  const scan = await api.scan(drone, name);
+  const id = { drone: scan.drone, scan: scan.scan };
+  const at = `/tiles/${encodeURIComponent(id.drone)}/${encodeURIComponent(id.scan)}`;
+  const host = el("main", { className: "map", tabIndex: 0 });
+  host.setAttribute("aria-label", "map: drag to move, plus and minus to zoom");
+  const cursor = el("output", { className: "cursor" });
+  const bar = svg("svg", { class: "scale", width: "200", height: "30" });
+  const none = el("p", { className: "blank", textContent: "No surface yet." });
+  const panel = el("fieldset", { className: "panel layers" }, el("legend", { textContent: "Layers" }));
+  const open = `#/view/${encodeURIComponent(id.drone)}/${encodeURIComponent(id.scan)}`;
+  const head = el(
+    "header",
+    {},
+    el("a", { href: "#/", textContent: "‹ Scans" }),
+    el("h1", { textContent: scan.title }),
+    el("a", { href: open, textContent: "3D" }),
+    el("a", { href: `${at}/ortho.kml`, textContent: "KML" }),
+  );
+  const layers: Layer[] = [];
+  let middle: Place = { x: 0.5, y: 0.5 };
+  let zoom = 2;
+  let isFree = true; // until somebody moves it the map shows the whole scan
+
+  const draw = (): void => {
+    const { clientWidth: w, clientHeight: h } = host;
+    for (const layer of layers) layer.draw(middle, zoom, w, h);
+    scaleBar(bar, middle, zoom);
+    document.body.dataset["map"] = layers.some((layer) => layer.loading) ? "loading" : "shown";
+  };
+  const zoomTo = (next: number, x = host.clientWidth / 2, y = host.clientHeight / 2): void => {
+    const before = under(x, y);
+    zoom = Math.max(1, Math.min(MAX_ZOOM, next));
+    const after = under(x, y);
+    middle = { x: middle.x + before.x - after.x, y: middle.y + before.y - after.y };
+    isFree = false;
+    draw();
+  };
+  const under = (x: number, y: number): Place => {
+    const scale = SIDE * 2 ** zoom;
+    return { x: middle.x + (x - host.clientWidth / 2) / scale, y: middle.y + (y - host.clientHeight / 2) / scale };
+  };
+  const move = (dx: number, dy: number): void => {
+    const scale = SIDE * 2 ** zoom;
+    middle = { x: middle.x - dx / scale, y: middle.y - dy / scale };
+    isFree = false;
+    draw();
+  };
+  const frame = ([west, south, east, north]: [number, number, number, number]): void => {
+    const [a, b] = [placeOf(north, west), placeOf(south, east)];
+    middle = { x: (a.x + b.x) / 2, y: (a.y + b.y) / 2 };
+    const fit = Math.min(host.clientWidth / (b.x - a.x), host.clientHeight / (b.y - a.y)) / SIDE;
+    zoom = Math.max(1, Math.min(MAX_ZOOM, Math.log2(fit * 0.9)));
+  };
+  const add = (layer: Layer, title: string, on: boolean): void => {
+    layer.shown = on;
+    layers.push(layer);
+    host.append(layer.element);
+    const box = el("input", { type: "checkbox", checked: on });
+    box.onchange = () => ((layer.shown = box.checked), draw());
+    const share = el("input", { type: "range", min: "0", max: "1", step: "0.05", value: "1" });
+    share.setAttribute("aria-label", `${title}, opacity`);
+    share.oninput = () => layer.opacity(Number(share.value));
+    panel.append(el("div", {}, el("label", {}, box, ` ${title}`), share));
+  };
+  const refresh = async (): Promise<void> => {
+    const found = (await fetch(`${at}/ortho.json`).then((r) => (r.ok ? r.json() : null), () => null)) as TileJson | null;
+    none.hidden = found !== null;
+    if (found?.bounds && isFree) frame(found.bounds);
+    for (const layer of layers.slice(-LAYERS.length)) layer.version = found?.version ?? "";
+    draw();
+  };
+
+  const basemap = (await fetch("/tiles/basemap.json").then((r) => (r.ok ? r.json() : null), () => null)) as TileJson | null;
+  root.replaceChildren(el("div", { className: "view flat" }, head, host, panel));
+  if (basemap) add(new Layer((z, x, y) => `/tiles/basemap/${z}/${x}/${y}`), "Basemap", true);
+  for (const [layer, title, on] of LAYERS)
+    add(new Layer((z, x, y) => `${at}/${layer}/${z}/${x}/${y}.png`), title, on);
+  const nearer = el("button", { textContent: "+", title: "nearer", onclick: () => zoomTo(zoom + 1) });
+  const farther = el("button", { textContent: "−", title: "farther", onclick: () => zoomTo(zoom - 1) });
+  host.append(none, cursor, bar, el("span", { className: "zoom" }, nearer, farther));
+  host.addEventListener("tile", draw);
+  listen(host, { move, zoomBy: (by, x, y) => zoomTo(zoom + by, x, y) }, (x, y) => {
+    const [lat, lon] = degreesOf(under(x, y));
+    cursor.value = `${lat.toFixed(7)}, ${lon.toFixed(7)}`;
+  });
+  const resized = new ResizeObserver(draw);
+  resized.observe(host);
+  await refresh().catch(notify);
+  const timer = setInterval(() => void (document.hidden || refresh()), REFRESH_MS);
+  return () => {
+    clearInterval(timer);
+    resized.disconnect();
+    delete document.body.dataset["map"];
+  };
+}
+
+interface Moves {
+  move: (dx: number, dy: number) => void;
+  zoomBy: (by: number, x: number, y: number) => void;
+}
+
+/** Mouse, fingers and keys of a map. */
+function listen(host: HTMLElement, { move, zoomBy }: Moves, hover: (x: number, y: number) => void): void {
+  const fingers = new Map<number, { x: number; y: number }>();
+  const local = (e: MouseEvent): [number, number] => {
+    const box = host.getBoundingClientRect();
+    return [e.clientX - box.left, e.clientY - box.top];
+  };
+  const apart = (): number => {
+    const [a, b] = [...fingers.values()];
+    return a && b ? Math.hypot(a.x - b.x, a.y - b.y) : 0;
+  };
+  host.addEventListener("pointerdown", (e) => {
+    if ((e.target as HTMLElement).closest("button")) return;
+    host.setPointerCapture(e.pointerId);
+    fingers.set(e.pointerId, { x: e.clientX, y: e.clientY });
+  });
+  host.addEventListener("pointermove", (e) => {
+    hover(...local(e));
+    const before = fingers.get(e.pointerId);
+    if (!before) return;
+    const was = apart();
+    fingers.set(e.pointerId, { x: e.clientX, y: e.clientY });
+    move((e.clientX - before.x) / fingers.size, (e.clientY - before.y) / fingers.size);
+    if (was && apart()) zoomBy(Math.log2(apart() / was), ...local(e));
+  });
+  for (const name of ["pointerup", "pointercancel"] as const) host.addEventListener(name, (e) => fingers.delete(e.pointerId));
+  host.addEventListener("wheel", (e) => (e.preventDefault(), zoomBy(-e.deltaY / 300, ...local(e))), { passive: false });
+  host.addEventListener("keydown", (e) => {
+    const [w, h] = [host.clientWidth, host.clientHeight];
+    const step: Record<string, [number, number]> = { ArrowLeft: [80, 0], ArrowRight: [-80, 0], ArrowUp: [0, 80], ArrowDown: [0, -80] };
+    if (step[e.key]) move(...step[e.key]!);
+    else if (e.key === "+") zoomBy(1, w / 2, h / 2);
+    else if (e.key === "-") zoomBy(-1, w / 2, h / 2);
+    else return;
+    e.preventDefault();
+  });
+}
+
+/** A round length on the ground at the middle of the map. */
+function scaleBar(bar: SVGElement, { y }: Place, zoom: number): void {
+  const [lat] = degreesOf({ x: 0.5, y });
+  const px_m = (EQUATOR_M * Math.cos((lat * Math.PI) / 180)) / (SIDE * 2 ** zoom);
+  const unit = units.imperial() ? 0.3048 : 1;
+  const most = (150 * px_m) / unit;
+  const power = 10 ** Math.floor(Math.log10(most));
+  const round = [5, 2, 1].map((n) => n * power).find((n) => n <= most)!;
+  const width = (round * unit) / px_m;
+  bar.replaceChildren(
+    svg("path", { d: `M1 12 V20 H${width + 1} V12` }),
+    svg("text", { x: "6", y: "14" }, units.length(round * unit, round < 1 ? 2 : 0)),
+  );
+}

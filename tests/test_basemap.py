@@ -1,0 +1,188 @@
+"""Basemaps that an operator gives: MBTiles and PMTiles, written here after their specifications."""
+
+from __future__ import annotations
+
+import gzip
+import sqlite3
+import struct
+from contextlib import closing
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from portal_client import TOKEN, Client
+
+from service.errors import InputError
+from service.ground.basemap import open_basemap, tile_number
+from service.ground.portal import Portal, PortalConfig
+
+Tiles = dict[tuple[int, int, int], bytes]
+
+
+def image(z: int, x: int, y: int) -> bytes:
+    """A PNG whose colour says which tile it is, its left half darker."""
+    whole = np.full((256, 256, 3), (40 * z + 10, 60 * x + 10, 60 * y + 10), np.uint8)
+    whole[:, :128] //= 2
+    return bytes(cv2.imencode(".png", whole)[1].tobytes())
+
+
+TILES: Tiles = {(z, x, y): image(z, x, y) for z in range(3) for x in range(1 << z)
+                for y in range(1 << z) if (z, x, y) != (2, 3, 3)}  # fmt: skip
+
+
+def mbtiles(path: Path, tiles: Tiles, kind: str = "png") -> Path:
+    with closing(sqlite3.connect(path)) as base:
+        base.execute("CREATE TABLE metadata (name TEXT, value TEXT)")
+        base.execute("CREATE TABLE tiles (zoom_level, tile_column, tile_row, tile_data)")
+        base.execute("INSERT INTO metadata VALUES ('format', ?)", (kind,))
+        for (z, x, y), data in tiles.items():
+            base.execute("INSERT INTO tiles VALUES (?, ?, ?, ?)", (z, x, (1 << z) - 1 - y, data))
+        base.commit()
+    return path
+
+
+def along(z: int, d: int) -> tuple[int, int]:
+    """Column and row of the ``d``-th tile of a zoom: the curve of the specification, forwards."""
+    x = y = 0
+    s = 1
+    while s < 1 << z:
+        rx = 1 & (d // 2)
+        ry = 1 & (d ^ rx)
+        if ry == 0:
+            if rx == 1:
+                x, y = s - 1 - x, s - 1 - y
+            x, y = y, x
+        x, y, d, s = x + s * rx, y + s * ry, d // 4, 2 * s
+    return x, y
+
+
+def number(z: int, x: int, y: int) -> int:
+    """A tile's number by looking for it."""
+    first = sum(4**k for k in range(z))
+    return first + next(d for d in range(4**z) if along(z, d) == (x, y))
+
+
+def varint(value: int) -> bytes:
+    out = b""
+    while value > 127:
+        out += bytes([value & 127 | 128])
+        value >>= 7
+    return out + bytes([value])
+
+
+def directory(entries: list[tuple[int, int, int, int]]) -> bytes:
+    """Of (first tile, run, bytes, offset)."""
+    steps = np.diff([0, *(e[0] for e in entries)]).tolist()
+    offsets, end = [], -1
+    for _, _, size, offset in entries:
+        offsets.append(0 if offset == end else offset + 1)
+        end = offset + size
+    columns = [steps, [e[1] for e in entries], [e[2] for e in entries], offsets]
+    body = b"".join(varint(int(v)) for column in columns for v in column)
+    return varint(len(entries)) + body
+
+
+def pmtiles(path: Path, tiles: Tiles, packed: bool = True, leaves: bool = False,
+            kind: int = 2) -> Path:  # fmt: skip
+    numbers = sorted((number(*tile), data) for tile, data in tiles.items())
+    entries, blob = [], b""
+    for n, data in numbers:
+        entries.append((n, 1, len(data), len(blob)))
+        blob += data
+    pack = gzip.compress if packed else bytes
+    leaf_bytes = b""
+    if leaves:
+        root_entries = []
+        for part in (entries[:6], entries[6:]):
+            leaf = pack(directory(part))
+            root_entries.append((part[0][0], 0, len(leaf), len(leaf_bytes)))
+            leaf_bytes += leaf
+        root = pack(directory(root_entries))
+    else:
+        root = pack(directory(entries))
+    n = len(entries)
+    at = 127
+    places = [at, len(root), at + len(root), 0, at + len(root), len(leaf_bytes),
+              at + len(root) + len(leaf_bytes), len(blob), n, n, n]  # fmt: skip
+    head = struct.pack("<7sB11Q", b"PMTiles", 3, *places)
+    head += bytes([1, 2 if packed else 1, 1, kind, 0, 2])
+    head += struct.pack("<4iB2i", *[0] * 7)
+    assert len(head) == 127
+    path.write_bytes(head + root + leaf_bytes + blob)
+    return path
+
+
+KINDS = ["mbtiles", "pmtiles", "plain", "leaves"]
+
+
+def given_as(kind: str, folder: Path) -> Path:
+    if kind == "mbtiles":
+        return mbtiles(folder / "a.mbtiles", TILES)
+    return pmtiles(folder / "a.pmtiles", TILES, kind != "plain", kind == "leaves")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_tile_is_found_at_its_place(tmp_path: Path, kind: str) -> None:
+    found = open_basemap(given_as(kind, tmp_path))
+    assert (found.max_zoom, found.media_type) == (2, "image/png")
+    for (z, x, y), data in TILES.items():
+        assert found.tile(z, x, y) == data, (z, x, y)
+    assert found.tile(2, 3, 3) is None and found.tile(3, 0, 0) is None
+
+
+def test_the_curve_is_that_of_the_specification() -> None:
+    assert [tile_number(*t) for t in [(0, 0, 0), (1, 0, 0), (1, 0, 1), (1, 1, 1), (1, 1, 0)]] == [
+        0, 1, 2, 3, 4,
+    ]  # fmt: skip
+    assert tile_number(12, 3423, 1763) == 19078479
+
+
+@given(st.integers(0, 5), st.data())
+def test_the_curve_backwards(z: int, data: st.DataObject) -> None:
+    x, y = (data.draw(st.integers(0, (1 << z) - 1)) for _ in range(2))
+    assert tile_number(z, x, y) == number(z, x, y)
+
+
+def test_what_cannot_be_used_is_said_in_one_line(tmp_path: Path) -> None:
+    broken = tmp_path / "b.pmtiles"
+    broken.write_bytes(b"PMTiles\x03" + b"\0" * 200)
+    text = tmp_path / "b.mbtiles"
+    text.write_text("no database")
+    for path, why in [
+        (tmp_path / "a.tif", "name it .mbtiles or .pmtiles"),
+        (tmp_path / "none.pmtiles", "no such file"),
+        (broken, "cannot be read"),
+        (text, "cannot be read"),
+        (mbtiles(tmp_path / "v.mbtiles", TILES, "pbf"), "images are needed"),
+        (pmtiles(tmp_path / "v.pmtiles", TILES, kind=1), "no images"),
+    ]:
+        with pytest.raises(InputError, match=why):
+            open_basemap(path)
+
+
+@pytest.mark.parametrize("kind", ["mbtiles", "leaves"])
+def test_the_portal_serves_it_also_below_its_finest_zoom(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "scans").mkdir()
+    config = PortalConfig(tmp_path / "scans", port=0, token=TOKEN, basemap=given_as(kind, tmp_path))
+    portal = Portal(config)
+    portal.start()
+    try:
+        client = Client(portal)
+        document = client.ask("/tiles/basemap.json")[1]
+        assert document["maxzoom"] == 2
+        assert document["tiles"] == [f"{client.base}/tiles/basemap/{{z}}/{{x}}/{{y}}"]
+        status, data, headers = client.ask("/tiles/basemap/2/1/2")
+        assert (status, data, headers["content-type"]) == (200, TILES[2, 1, 2], "image/png")
+        for x, halves in ((8, 2), (15, 1)):  # at zoom 5 each is an eighth of tile 2/1
+            data = client.ask(f"/tiles/basemap/5/{x}/16")[1]
+            shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+            want = np.array((90, 70, 130)) // halves
+            assert np.abs(shown[128, 128].astype(int) - want).max() <= 1
+        status, data, _ = client.ask("/tiles/basemap/2/3/3")
+        clear = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert status == 200 and not clear[..., 3].any()
+    finally:
+        portal.close()

@@ -1,0 +1,146 @@
+"""The map page in a real browser: layers, moving, growing, phone; nothing from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from conftest import HouseFlight
+from person import Browser
+from portal_client import NEEDS, TOKEN, browser, flown_store
+from test_basemap import TILES, mbtiles
+from test_portal_access import AXE, PHONE, SERIOUS
+
+from service.ground.portal import Portal, PortalConfig
+from service.stream.codec import encode
+from service.stream.store import ScanStore
+
+pytestmark = NEEDS
+__all__ = ["browser"]  # the fixture
+
+SHOWN = "document.body.dataset.map === 'shown'"
+BOX = "[...document.querySelectorAll('.layers label')].find(l => l.textContent.includes('{}'))"
+COLOURS = """(async () => {
+  const map = document.querySelector('.map').getBoundingClientRect();
+  const c = document.createElement('canvas'); [c.width, c.height] = [map.width, map.height];
+  const g = c.getContext('2d');
+  for (const i of document.querySelectorAll('.layer:not([hidden]) img')) {
+    const b = i.getBoundingClientRect();
+    g.drawImage(i, b.x - map.x, b.y - map.y, b.width, b.height); }
+  const d = g.getImageData(0, 0, c.width, c.height).data;
+  let known = 0, red = 0, left = 1e9, right = 0;
+  for (let p = 0; p < d.length; p += 4) { if (!d[p + 3]) continue; known++;
+    if (d[p] > 150 && d[p + 1] < 90) { red++; const x = (p / 4) % c.width;
+      left = Math.min(left, x); right = Math.max(right, x); } }
+  return { known, red, left, right };
+})()"""
+"""What the map shows: pixels with content, and those of the red roof."""
+
+
+@pytest.fixture
+def scans(tmp_path: Path, house: HouseFlight) -> Path:
+    return flown_store(tmp_path / "scans", house)
+
+
+@pytest.fixture
+def page(browser: Browser, tmp_path: Path, scans: Path) -> Iterator[Browser]:
+    below = mbtiles(tmp_path / "below.mbtiles", TILES)
+    portal = Portal(PortalConfig(scans, port=0, token=TOKEN, basemap=below))
+    portal.start()
+    browser.screen(1280, 800)
+    browser.open("about:blank")
+    browser.requests.clear()
+    browser.open(f"{portal.url.split('/?')[0]}/#/map/drone-1/test-1")
+    browser.wait(SHOWN)
+    yield browser
+    portal.close()
+
+
+def layer(page: Browser, name: str) -> None:
+    page.run(f"{BOX.format(name)}.querySelector('input').click()")
+    page.run("new Promise(r => setTimeout(r, 100))")
+    page.wait(SHOWN)
+
+
+def test_layers_lie_over_the_basemap_and_nothing_comes_from_outside(page: Browser) -> None:
+    with_base = page.wait(f"({COLOURS}).then(s => s.red && s)")
+    assert with_base["known"] == pytest.approx(1280 * (800 - 50), rel=0.03)  # the basemap is below
+    layer(page, "Basemap")
+    alone = page.run(COLOURS)
+    assert 0.1 < alone["known"] / with_base["known"] < 0.9 and alone["red"] > 1000
+    layer(page, "Surface")
+    assert page.run(COLOURS)["red"] == 0  # the shaded surface covers the roof
+    layer(page, "Orthophoto")
+    layer(page, "Surface")
+    layer(page, "Contours")
+    assert 0 < page.run(COLOURS)["known"] < 0.1 * alone["known"]
+    layer(page, "Coverage")
+    assert page.run(COLOURS)["known"] > 0.5 * alone["known"]
+    here = page.run("location.origin")
+    assert [u for u in page.requests if not u.startswith((here, "data:", "about:"))] == []
+
+
+def test_the_map_moves_and_zooms_about_the_pointer(page: Browser) -> None:
+    before = page.wait(f"({COLOURS}).then(s => s.red && s)")
+    page.mouse(600, 500, to=(700, 540))
+    page.wait(SHOWN)
+    moved = page.run(COLOURS)
+    assert moved["left"] - before["left"] == pytest.approx(100, abs=2)
+    x, y = moved["left"], 400
+    page.run(
+        "document.querySelector('.map').dispatchEvent(new WheelEvent('wheel', { deltaY: -300,"
+        f" clientX: {x}, clientY: {y}, bubbles: true, cancelable: true }}))"
+    )
+    page.run("new Promise(r => setTimeout(r, 200))")
+    page.wait(SHOWN)
+    near = page.run(COLOURS)
+    assert near["right"] - near["left"] == pytest.approx(
+        2 * (moved["right"] - moved["left"]), abs=12
+    )
+    assert near["left"] == pytest.approx(x, abs=8)
+    page.run("document.querySelector('.map').focus()")
+    page.key("ArrowRight")
+    page.wait(SHOWN)
+    assert page.run(COLOURS)["left"] == pytest.approx(near["left"] - 80, abs=2)
+
+
+def test_the_map_grows_while_one_looks(page: Browser, scans: Path, house: HouseFlight) -> None:
+    page.wait(f"({COLOURS}).then(s => s.red)")
+    layer(page, "Basemap")
+    page.run("document.querySelector('[title=farther]').click()")  # now the map stays there
+    page.wait(SHOWN)
+    before = page.run(COLOURS)["known"]
+    with ScanStore.open(scans / "drone-1/test-1/scan.db") as scan:
+        one = house.keyframe(5, 35.0)
+        scan.add_keyframe(5, encode(one, one.time_ns))
+    page.wait(f"({COLOURS}).then(s => s.known > 1.1 * {before})", 10)
+
+
+@pytest.mark.parametrize("size", [(1440, 900), PHONE])
+def test_the_map_is_reached_and_within_reach(
+    page: Browser, size: tuple[int, int], tmp_path: Path
+) -> None:
+    page.screen(*size, mobile=size == PHONE)
+    page.run("location.hash = '#/'")
+    page.wait("document.querySelectorAll('article').length === 1")
+    page.run(
+        "[...document.querySelectorAll('article a')].find(a => a.textContent === 'Map').click()"
+    )
+    page.wait(f"{SHOWN} && !!document.querySelector('.map')")
+    page.run("new Promise(r => setTimeout(r, 300))")
+    page.wait(SHOWN)
+    wide, high = page.run(
+        "[document.documentElement.scrollWidth, document.documentElement.scrollHeight]"
+    )
+    assert wide <= size[0] and high <= size[1]
+    assert page.run("document.querySelector('.map').clientHeight") > 0.5 * size[1]
+    if AXE.is_file():
+        page.run(AXE.read_text() + ";0")
+        assert page.run(SERIOUS) == []
+    page.image(tmp_path / "map.png")  # to look at
+
+
+def test_a_scan_that_is_not_there_is_said(page: Browser) -> None:
+    page.run("location.hash = '#/map/drone-1/none'")
+    page.wait("document.body.textContent.includes('no scan drone-1/none')")
