@@ -149,7 +149,10 @@ SURE_EVIDENCE = 0.6
 FILLED_CONFIDENCE = 0.05
 """Confidence of a pixel that only its neighbours speak for."""
 
-_CHUNK = 16
+LABEL_BITS = 10
+LABEL_MASK = (1 << LABEL_BITS) - 1
+"""Of a belief and its label as one number."""
+
 NOISE = 0.2 * COST_UNIT
 """Mean cost below which a window is taken for plain."""
 
@@ -169,8 +172,8 @@ def select(
     px = np.empty((height, width), np.float32)
     confidence = np.empty((height, width), np.float32)
     in_bands(
-        _select, -(-cost.shape[0] // _CHUNK), data, messages, cost, min_disparity, truncation,
-        float(min_evidence), px, confidence,
+        _select, height, data, messages, cost, min_disparity, 2 * truncation, float(min_evidence),
+        px, confidence,
     )  # fmt: skip
     return px, confidence
 
@@ -209,15 +212,18 @@ def _window_costs(
     labels, width = box.shape
     mean[:] = np.float32(0)
     for label in range(labels):
-        out = box[label]
-        out[:] = 0
-        for k in range(2 * RADIUS + 1):
-            source = sums[label, k : k + width]
-            for u in range(width):
-                out[u] += np.int32(source[u])
+        row, out = sums[label], box[label]
+        a, b, c, d = row[:width], row[1:][:width], row[2:][:width], row[3:][:width]
+        e, f, g = row[4:][:width], row[5:][:width], row[6:][:width]
+        for u in range(width):
+            left = np.int32(np.int32(a[u]) + np.int32(b[u]) + np.int32(c[u]))
+            right = np.int32(np.int32(e[u]) + np.int32(f[u]) + np.int32(g[u]))
+            out[u] = np.int32(left + np.int32(d[u]) + right)
         shift = label + min_disparity
-        for u in range(max(0, min(shift, width)), max(0, min(width, width + shift))):
-            mean[u] += np.float32(out[u])
+        first, last = max(0, min(shift, width)), max(0, min(width, width + shift))
+        total, part = mean[first:last], out[first:last]
+        for u in range(total.shape[0]):
+            total[u] += np.float32(part[u])
     for u in range(width):
         seen = min(labels - 1, u - min_disparity) - max(0, u - min_disparity - width + 1) + 1
         mean[u] /= np.float32(max(seen, 1))
@@ -225,12 +231,13 @@ def _window_costs(
 
 @njit(cache=True, nogil=True)
 def _best_labels(
-    data: Any, messages: Any, v: int, parity: int, belief: Any, best: Any, low: Any, second: Any
+    data: Any, messages: Any, v: int, parity: int, belief: Any, best: Any, second: Any
 ) -> None:  # pragma: no cover - compiled
-    """Winner, its belief and that of the best label not adjacent to it, of one parity of a row."""
+    """Of one parity of a row: the least of belief and label as one number, and the least belief of
+    the labels not adjacent to it. Only without a branch do vector registers take the cells."""
     _, _, labels, cells = data.shape
     count = cells - 1
-    low[:] = 32767
+    best[:] = 2**31 - 1
     for label in range(labels):
         b = belief[label, :count]
         d = data[v, parity, label, :count]
@@ -239,36 +246,65 @@ def _best_labels(
         m2 = messages[2, v + 1, 1 - parity, label, parity : parity + count]
         for i in range(count):
             b[i] = np.int16(np.int16(d[i] + m0[i]) + np.int16(m1[i] + m2[i]))
-        m3 = messages[3, v + 1, 1 - parity, label]
-        if parity == 1:
-            for i in range(count):
-                b[i] += m3[i]
-        else:
-            for i in range(1, count):
-                b[i] += m3[i - 1]
+        after = b[1 - parity :]  # nothing arrives from the left of a row's first cell
+        m3 = messages[3, v + 1, 1 - parity, label, : after.shape[0]]
+        for i in range(after.shape[0]):
+            after[i] += m3[i]
         for i in range(count):
-            better = b[i] < low[i]
-            low[i] = b[i] if better else low[i]
-            best[i] = np.int16(label) if better else best[i]
-    second[:] = 32767
+            best[i] = min(best[i], np.int32(np.int32(b[i]) << LABEL_BITS | np.int32(label)))
+    second[:] = 2**31 - 1
     for label in range(labels):
-        b = belief[label]
+        b = belief[label, :count]
         for i in range(count):
-            adjacent = abs(np.int16(best[i] - np.int16(label))) <= 1
-            second[i] = second[i] if adjacent else min(second[i], b[i])
+            apart = np.int32((best[i] & np.int32(LABEL_MASK)) - np.int32(label))
+            adjacent = np.int32(1 << 30) if (apart <= 1) & (apart >= -1) else np.int32(0)
+            second[i] = min(second[i], np.int32(np.int32(b[i]) + adjacent))
 
 
 @njit(cache=True, nogil=True)
-def _offset(box: Any, label: int, u: int) -> Any:  # pragma: no cover - compiled
-    """Where between the labels the summed cost is least: an equiangular V, -0.5 to 0.5."""
-    if label == 0 or label == box.shape[0] - 1:
-        return np.float32(0)
-    a = np.float32(box[label - 1, u] - box[label, u])
-    b = np.float32(box[label + 1, u] - box[label, u])
-    steep = max(a, b)
-    if steep <= 0:
-        return np.float32(0)
-    return min(max((a - b) / (np.float32(2) * steep), np.float32(-0.5)), np.float32(0.5))
+def _note_winners(
+    best: Any, second: Any, box: Any, parity: int, winner: Any, around: Any, lead: Any
+) -> None:  # pragma: no cover - compiled
+    """Of each pixel of one parity of a row: the winner, its cost and that of the labels below and
+    above it, and by how much it leads. An outermost label has no such neighbours."""
+    labels, width = box.shape
+    for i in range((width + 1 - parity) // 2):
+        u, label = 2 * i + parity, np.int64(best[i] & LABEL_MASK)
+        inner = 0 < label < labels - 1
+        winner[u] = label
+        lead[u] = second[i] - (best[i] >> LABEL_BITS)
+        around[0, u] = box[label - 1, u] if inner else box[label, u]
+        around[1, u] = box[label, u]
+        around[2, u] = box[label + 1, u] if inner else box[label, u]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _place_winners(
+    winner: Any, around: Any, lead: Any, mean: Any, min_disparity: int, sure_lead: int,
+    min_evidence: float, px: Any, confidence: Any,
+) -> None:  # fmt: skip  # pragma: no cover - compiled
+    """Where between the labels the summed cost is least, an equiangular V, and how sure that is.
+
+    Without a branch, so that a vector register takes several pixels.
+    """
+    width = px.shape[0]
+    noise = np.float32((2 * RADIUS + 1) ** 2) * np.float32(NOISE)
+    for u in range(width):
+        here = around[1, u]
+        a, b = np.float32(around[0, u] - here), np.float32(around[2, u] - here)
+        steep = max(a, b)
+        offset = (a - b) / (np.float32(2) * max(steep, np.float32(1)))
+        offset = min(max(offset, np.float32(-0.5)), np.float32(0.5))
+        offset = offset if steep > 0 else np.float32(0)
+        partner = np.int32(u) - winner[u] - np.int32(min_disparity)
+        visible = (partner >= 0) & (partner < np.int32(width))
+        px[u] = np.float32(winner[u]) + offset if visible else np.float32(np.nan)
+        evidence = (mean[u] - np.float32(here)) / (mean[u] + noise)
+        enough = (lead[u] > 0) & ((evidence >= min_evidence) | (min_evidence <= 0))
+        margin = min(np.float32(1), np.float32(lead[u]) / np.float32(sure_lead))
+        sure = max(evidence, np.float32(0.01)) / np.float32(SURE_EVIDENCE)
+        sure = margin * min(np.float32(1), sure)
+        confidence[u] = sure if visible & enough else np.float32(0)
 
 
 @njit(cache=True, nogil=True)
@@ -279,45 +315,34 @@ def _select(
     messages: Any,
     cost: Any,
     min_disparity: int,
-    truncation: int,
+    sure_lead: int,
     min_evidence: float,
     px: Any,
     confidence: Any,
 ) -> None:  # pragma: no cover - compiled
-    height, labels, width = cost.shape
+    _, labels, width = cost.shape
     cells = data.shape[3]
-    window = np.float32((2 * RADIUS + 1) ** 2)
-    for chunk in range(begin, end):
-        first = chunk * _CHUNK
-        sums = np.zeros((labels, width + 2 * RADIUS), np.int16)
-        box = np.empty((labels, width), np.int32)
-        mean = np.empty(width, np.float32)
-        belief = np.empty((labels, cells), np.int16)
-        best = np.zeros(cells, np.int16)
-        low = np.empty(cells, np.int16)
-        second = np.empty(cells, np.int16)
-        for v in range(first - RADIUS, first + RADIUS):
-            _add_row(cost, v, 1, sums)
-        for v in range(first, min(first + _CHUNK, height)):
-            _add_row(cost, v + RADIUS, 1, sums)
-            _window_costs(sums, min_disparity, box, mean)
-            _add_row(cost, v - RADIUS, -1, sums)
-            for parity in range(2):
-                _best_labels(data, messages, v, parity, belief, best, low, second)
-                for i in range((width + 1 - parity) // 2):
-                    u = 2 * i + parity
-                    label = np.int64(best[i])
-                    partner = u - label - min_disparity
-                    evidence = (mean[u] - box[label, u]) / (mean[u] + window * np.float32(NOISE))
-                    margin = np.float32(second[i] - low[i]) / np.float32(2 * truncation)
-                    confidence[v, u] = 0
-                    if partner < 0 or partner >= width:
-                        px[v, u] = np.nan
-                        continue
-                    px[v, u] = np.float32(label) + _offset(box, label, u)
-                    if margin > 0 and (evidence >= min_evidence or min_evidence <= 0):
-                        sure = max(evidence, np.float32(0.01)) / np.float32(SURE_EVIDENCE)
-                        confidence[v, u] = min(np.float32(1), margin) * min(np.float32(1), sure)
+    sums = np.zeros((labels, width + 2 * RADIUS), np.int16)
+    box = np.empty((labels, width), np.int32)
+    mean = np.empty(width, np.float32)
+    belief = np.empty((labels, cells), np.int16)
+    best = np.empty(cells, np.int32)  # each on its own: rows of one array lose their layout
+    second = np.empty(cells, np.int32)
+    winner = np.empty(width, np.int32)
+    lead = np.empty(width, np.int32)
+    around = np.empty((3, width), np.int32)
+    for v in range(begin - RADIUS, begin + RADIUS):
+        _add_row(cost, v, 1, sums)
+    for v in range(begin, end):
+        _add_row(cost, v + RADIUS, 1, sums)
+        _window_costs(sums, min_disparity, box, mean)
+        _add_row(cost, v - RADIUS, -1, sums)
+        for parity in range(2):
+            _best_labels(data, messages, v, parity, belief, best, second)
+            _note_winners(best, second, box, parity, winner, around, lead)
+        _place_winners(
+            winner, around, lead, mean, min_disparity, sure_lead, min_evidence, px[v], confidence[v]
+        )
 
 
 @njit(cache=True, nogil=True)

@@ -131,24 +131,31 @@ def census(image: U8) -> U64:
     """
     padded = np.pad(image, CENSUS_RADIUS, mode="edge")
     words = np.empty(image.shape, np.uint64)
-    _census(padded, words)
+    in_bands(_census, len(image), padded, words)
     return words
 
 
 @njit(cache=True, nogil=True)
-def _census(padded: Any, words: Any) -> None:  # pragma: no cover - compiled
-    height, width = words.shape
-    for v in range(height):
-        row = words[v]
-        row[:] = np.uint64(0)
+def _census(begin: int, end: int, padded: Any, words: Any) -> None:  # pragma: no cover - compiled
+    """Eight comparisons at a time in bytes, of which a vector register holds the most."""
+    width = words.shape[1]
+    parts = np.empty((_WINDOW * _WINDOW // 8, width), np.uint8)
+    for v in range(begin, end):
         centre = padded[v + CENSUS_RADIUS, CENSUS_RADIUS : CENSUS_RADIUS + width]
+        bit = 0
         for dv in range(_WINDOW):
             for du in range(_WINDOW):
                 if dv != CENSUS_RADIUS or du != CENSUS_RADIUS:
                     shifted = padded[v + dv, du : du + width]
+                    row = parts[bit // 8]
                     for u in range(width):
-                        darker = np.uint64(shifted[u] < centre[u])
-                        row[u] = (row[u] << np.uint64(1)) | darker
+                        row[u] = np.uint8(row[u] << 1) | np.uint8(shifted[u] < centre[u])
+                    bit += 1
+        for u in range(width):
+            word = np.uint64(0)
+            for k in range(parts.shape[0]):
+                word = (word << np.uint64(8)) | np.uint64(parts[k, u])
+            words[v, u] = word
 
 
 @intrinsic
