@@ -1,4 +1,4 @@
-"""Where ``skyrelief demo`` finds its flight."""
+"""Where ``skyrelief demo`` finds its flight, and when it compiles."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from loopback import until
 
 from service.commands import demo
 from service.errors import InputError
@@ -36,3 +37,16 @@ def test_an_installed_wheel_brings_the_flight(
 def test_a_named_flight_alone_counts(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nothing-here holds no frames"):
         demo._flight(tmp_path / "nothing-here")
+
+
+def test_stereo_is_compiled_meanwhile_the_first_time_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    (compiler,) = demo._compile_stereo()
+    try:
+        until(lambda: any(tmp_path.rglob("*.nbi")), 120.0)
+        assert demo._compile_stereo() == []
+    finally:
+        compiler.kill()
+        compiler.wait()

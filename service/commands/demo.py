@@ -20,6 +20,7 @@ from service.errors import InputError, OutsideError
 
 FLIGHT = Path("demo") / "caliterra"
 MARKER = ".skyrelief-demo"
+STEREO = "from recon.backends.cpu import warm_up; warm_up()"
 READY_S = 60.0
 DRAIN_S = 120.0
 
@@ -39,8 +40,11 @@ def demo(
     _prepare(out)
     began = time.monotonic()
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
-    _say(1, "ground station")
     portal = f"127.0.0.1:{_free_port()}" if _has_portal() else ""
+    compilers = _compile_stereo()
+    if compilers:
+        _say(1, "the first flight after an installation compiles its kernels: a minute or two")
+    _say(1, "ground station")
     ground = _start_ground(out, endpoint, portal)
     try:
         _said(ground, out, "ground station at ")
@@ -48,13 +52,12 @@ def demo(
             _say(1, f"open this page and see the map grow: {_said(ground, out, 'portal: ')}")
         images = sum(1 for _ in (source / "frames").iterdir())
         _say(2, f"flight: {images} images of {source}")
-        if not _are_kernels_compiled():
-            _say(2, "the first flight after an installation compiles its kernels: a minute or two")
         _replay(source, out, endpoint, set_ or [])
         _say(3, "ground station: takes what is left, writes its files")
         received = _wait_for_ground(ground, out)
     finally:
-        _stop(ground)
+        for process in (ground, *compilers):
+            _stop(process)
     report = _figures(out, received, time.monotonic() - began)
     print(json.dumps(report) if as_json else _in_words(report))
     if report["ground_points"] != report["points"]:
@@ -74,12 +77,14 @@ def _has_portal() -> bool:
     return all(find_spec(package) for package in ("starlette", "uvicorn", "websockets"))
 
 
-def _are_kernels_compiled() -> bool:
-    """True when numba has kept kernels of this installation."""
+def _compile_stereo() -> list[subprocess.Popen[str]]:
+    """A process that compiles stereo while the replay compiles tracking; none with a warm cache."""
     import recon
 
     folder = os.environ.get("NUMBA_CACHE_DIR") or Path(recon.__file__).parent
-    return any(Path(folder).rglob("*.nbi"))
+    if any(Path(folder).rglob("*.nbi")):
+        return []
+    return [subprocess.Popen([sys.executable, "-c", STEREO], stdin=subprocess.DEVNULL, text=True)]
 
 
 def _flight(flight: Path | None) -> Path:
