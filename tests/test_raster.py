@@ -45,6 +45,15 @@ def test_grid_covers_its_points_on_whole_multiples() -> None:
     np.testing.assert_allclose(px, [[0.0, 0.0]])
 
 
+def test_cells_of_places_on_and_off_the_grid() -> None:
+    grid = Grid(10.0, 50.0, 2.0, (3, 4))  # east 10 to 18, north 44 to 50
+    xy = np.array([[10.1, 49.9], [17.9, 44.1], [13.0, 47.0], [9.9, 47.0], [18.1, 43.9]])
+    assert grid.holds(xy).tolist() == [True, True, True, False, False]
+    rows, cols = grid.cells(xy)
+    assert rows.tolist() == [0, 2, 1, 1, 2] and cols.tolist() == [0, 3, 1, 0, 3]
+    assert grid.holds(np.array([[np.nan, 47.0], [12.0, np.inf]])).tolist() == [False, False]
+
+
 def test_a_cell_is_the_weighted_mean_of_its_top_layer() -> None:
     rng = np.random.default_rng(0)
     n = 4000

@@ -77,21 +77,20 @@ def mean_surface(xyz_m: F64, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:
     Unlike the upper surface it has no bias at the rim of an object: a cell that a roof covers by
     half counts half. Its sigma holds the scatter of its points as well.
     """
-    rows, cols = grid.shape
-    at = np.rint(grid.pixels(xyz_m[:, :2])).astype(np.int64)
-    inside = (at >= 0).all(axis=1) & (at[:, 0] < cols) & (at[:, 1] < rows)
-    cell = at[inside, 1] * cols + at[inside, 0]
+    inside = grid.holds(xyz_m[:, :2])
+    rows, cols = grid.cells(xyz_m[inside, :2])
+    cell, count = rows * grid.shape[1] + cols, grid.shape[0] * grid.shape[1]
     weight = 1.0 / np.maximum(sigma_m[inside].astype(np.float64), 1e-6) ** 2
     z = xyz_m[inside, 2].astype(np.float64)
     middle = float(np.median(z)) if len(z) else 0.0
 
     def total(values: F64) -> F64:
-        return np.asarray(np.bincount(cell, weight * values, rows * cols), np.float64)
+        return np.asarray(np.bincount(cell, weight * values, count), np.float64)
 
     sums = np.maximum(total(np.ones(len(z))), 1e-300)
     mean = total(z - middle) / sums
     scatter = np.maximum(total((z - middle) ** 2) / sums - mean**2, 0.0)
-    known = np.bincount(cell, minlength=rows * cols) > 0
+    known = np.bincount(cell, minlength=count) > 0
     layers = (mean + middle, np.sqrt(1.0 / sums + scatter))
     height, sigma = (np.where(known, x, np.nan).astype(np.float32) for x in layers)
     colour = np.stack([total(rgb[inside, k].astype(np.float64)) / sums for k in range(3)], axis=1)

@@ -12,9 +12,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 from recon.types import F32, F64, U8, Bool, PointCloud
+
+I64 = npt.NDArray[np.int64]
 
 TOP_SIGMAS = 4.0
 """Points this many of its sigmas below the highest point of a cell are its surface too."""
@@ -68,6 +71,16 @@ class Grid:
         col = (xy[:, 0] - self.west_m) / self.cell_m - 0.5
         row = (self.north_m - xy[:, 1]) / self.cell_m - 0.5
         return np.column_stack([col, row])
+
+    def holds(self, xy_m: F64) -> Bool:
+        """(N,) which of (N, 2) m lie on the grid; what is not finite does not."""
+        at = np.rint(self.pixels(xy_m))
+        return np.asarray(((at >= 0) & (at < self.shape[::-1])).all(axis=1))
+
+    def cells(self, xy_m: F64) -> tuple[I64, I64]:
+        """(N,) rows and (N,) columns of (N, 2) m, those outside at the nearest edge."""
+        cols, rows = np.rint(self.pixels(xy_m)).astype(np.int64).T
+        return np.clip(rows, 0, self.shape[0] - 1), np.clip(cols, 0, self.shape[1] - 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -183,15 +183,12 @@ def _per_cell(cloud: PointCloud, cell_m: float) -> tuple[F32, F32]:
     """Maximum views and minimum sigma of the points in each cell, NaN where there are none."""
     xy = cloud.xyz_m[:, :2].astype(np.float64)
     grid = grid_over(xy, cell_m)
-    col, row = np.rint(grid.pixels(xy)).astype(np.int64).T
-    at = np.clip(row, 0, grid.shape[0] - 1) * grid.shape[1] + np.clip(col, 0, grid.shape[1] - 1)
-    views = np.full(grid.shape[0] * grid.shape[1], -np.inf)
-    sigma = np.full(len(views), np.inf)
+    at = grid.cells(xy)
+    views, sigma = np.full(grid.shape, -np.inf), np.full(grid.shape, np.inf)
     np.maximum.at(views, at, cloud.views)
     np.minimum.at(sigma, at, cloud.sigma_m)
-    shaped = (np.where(np.isfinite(a), a, np.nan).reshape(grid.shape) for a in (views, sigma))
-    first, second = (a.astype(np.float32) for a in shaped)
-    return first, second
+    first, second = (np.where(np.isfinite(a), a, np.nan) for a in (views, sigma))
+    return first.astype(np.float32), second.astype(np.float32)
 
 
 def _curves(poses: Sequence[PoseRecord]) -> list[str]:

@@ -71,9 +71,7 @@ def classes(scan: ScanView) -> U8:
     """(N,) class of each point of the fused cloud after LAS 1.4: bare ground, or unclassified."""
     raster = surface_model(scan, None).raster
     height = everywhere(raster, ground_cells(raster))
-    col, row = np.rint(raster.grid.pixels(scan.xyz_m[:, :2])).astype(np.int64).T
-    rows, cols = raster.grid.shape
-    below = height[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)]
+    below = height[raster.grid.cells(scan.xyz_m[:, :2])]
     is_ground = np.abs(scan.xyz_m[:, 2] - below) <= GROUND_WITHIN_M
     return np.where(is_ground, GROUND, UNCLASSIFIED).astype(np.uint8)
 

@@ -235,10 +235,7 @@ def _surface(
 
 def _colour_at(vertices: F64, raster: Raster) -> U8:
     """(V, 3) colours of the cells below the vertices."""
-    px = np.rint(raster.grid.pixels(vertices[:, :2])).astype(np.int64)
-    rows, cols = raster.grid.shape
-    at = np.clip(px[:, 1], 0, rows - 1), np.clip(px[:, 0], 0, cols - 1)
-    return np.asarray(raster.rgb[at], np.uint8)
+    return np.asarray(raster.rgb[raster.grid.cells(vertices[:, :2])], np.uint8)
 
 
 def _seen_from(cloud: PointCloud, keyframes: Sequence[Keyframe]) -> F64:

@@ -142,13 +142,8 @@ def _inside(depth: DepthMap, cells: Bool, grid: Grid, frame: LocalFrame | None) 
     if not known.any():
         return out
     points, _ = points_of(depth, depth.T_world_camera)
-    at = np.rint(grid.pixels((points if frame is None else frame.to_utm(points))[:, :2]))
-    at = at.astype(np.int64)
-    rows, cols = grid.shape
-    inside = (at >= 0).all(axis=1) & (at[:, 0] < cols) & (at[:, 1] < rows)
-    hit = np.zeros(len(at), np.bool_)
-    hit[inside] = cells[at[inside, 1], at[inside, 0]]
-    out[known] = hit
+    xy = (points if frame is None else frame.to_utm(points))[:, :2]
+    out[known] = grid.holds(xy) & cells[grid.cells(xy)]
     return out
 
 
