@@ -39,14 +39,14 @@ def test_a_named_flight_alone_counts(tmp_path: Path) -> None:
         demo._flight(tmp_path / "nothing-here")
 
 
-def test_stereo_is_compiled_meanwhile_the_first_time_alone(
+def test_kernels_are_compiled_meanwhile_the_first_time_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    (compiler,) = demo._compile_stereo()
+    (compiler,) = demo._compile_meanwhile()
     try:
         until(lambda: any(tmp_path.rglob("*.nbi")), 120.0)
-        assert demo._compile_stereo() == []
+        assert demo._compile_meanwhile() == []
     finally:
         compiler.kill()
         compiler.wait()

@@ -20,7 +20,7 @@ from service.errors import InputError, OutsideError
 
 FLIGHT = Path("demo") / "caliterra"
 MARKER = ".skyrelief-demo"
-STEREO = "from recon.backends.cpu import warm_up; warm_up()"
+COMPILE = "from service.commands.demo import compile_kernels; compile_kernels()"
 READY_S = 60.0
 DRAIN_S = 120.0
 
@@ -41,7 +41,7 @@ def demo(
     began = time.monotonic()
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
     portal = f"127.0.0.1:{_free_port()}" if _has_portal() else ""
-    compilers = _compile_stereo()
+    compilers = _compile_meanwhile()
     if compilers:
         _say(1, "the first flight after an installation compiles its kernels: a minute or two")
     _say(1, "ground station")
@@ -77,14 +77,32 @@ def _has_portal() -> bool:
     return all(find_spec(package) for package in ("starlette", "uvicorn", "websockets"))
 
 
-def _compile_stereo() -> list[subprocess.Popen[str]]:
-    """A process that compiles stereo while the replay compiles tracking; none with a warm cache."""
+def compile_kernels() -> None:
+    """Compile the kernels of stereo, ICP and the codec, or load them from numba's cache."""
+    import numpy as np
+
+    from recon.backends.cpu import warm_up
+    from recon.types import DepthMap, Keyframe, Pose
+    from service.stream.codec import decode, encode
+
+    warm_up()
+    size = (90, 160)
+    depth = np.tile(np.linspace(50, 60, 160, dtype=np.float32), (90, 1))
+    K = np.array([[140.0, 0, 80], [0, 140, 45], [0, 0, 1]])
+    one = np.full(size, 0.1, np.float32), np.full(size, 2, np.uint8)
+    bgr, known = np.full((*size, 3), 120, np.uint8), np.indices(size).sum(axis=0) % 7 > 0
+    pose = Pose(np.eye(4), np.eye(6), ("vision",))
+    decode(encode(Keyframe(0, 0, DepthMap(depth, *one, K, np.eye(4)), bgr, pose, known), 0))
+
+
+def _compile_meanwhile() -> list[subprocess.Popen[str]]:
+    """A process that compiles what the replay needs later; none when numba has its kernels."""
     import recon
 
     folder = os.environ.get("NUMBA_CACHE_DIR") or Path(recon.__file__).parent
     if any(Path(folder).rglob("*.nbi")):
         return []
-    return [subprocess.Popen([sys.executable, "-c", STEREO], stdin=subprocess.DEVNULL, text=True)]
+    return [subprocess.Popen([sys.executable, "-c", COMPILE], stdin=subprocess.DEVNULL, text=True)]
 
 
 def _flight(flight: Path | None) -> Path:
