@@ -9,9 +9,11 @@ ground plane, so that 16 of them cover relief instead of empty air.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
+from numba import njit
 
 from recon import se3
 from recon.camera_model import rays, scaled_K
@@ -242,18 +244,28 @@ def _row_baseline(
 
 def drop_unseen(labels: DisparityMap, pair: RectifiedPair) -> DisparityMap:
     """``labels`` (h, w) of the pair without those that rest on nothing in either image."""
-    h, w = labels.px.shape
     if pair.left_seen is None or pair.right_seen is None:
         return labels
-    known = np.isfinite(labels.px)
-    partner = np.rint(np.arange(w) - np.where(known, labels.px, 0.0)).astype(np.int64)
-    inside = known & pair.left_seen & (partner >= 0) & (partner < w)
-    rows = np.arange(h)[:, None]
-    inside &= pair.right_seen[rows, np.clip(partner, 0, w - 1)]
-    return DisparityMap(
-        np.where(inside, labels.px, np.nan).astype(np.float32),
-        np.where(inside, labels.confidence, 0.0).astype(np.float32),
-    )
+    px, confidence = labels.px.copy(), labels.confidence.copy()
+    _drop_unseen(pair.left_seen, pair.right_seen, px, confidence)
+    return DisparityMap(px, confidence)
+
+
+@njit(cache=True, nogil=True)
+def _drop_unseen(
+    left_seen: Any, right_seen: Any, px: Any, confidence: Any
+) -> None:  # pragma: no cover - compiled
+    height, width = px.shape
+    for v in range(height):
+        for u in range(width):
+            if np.isnan(px[v, u]):
+                confidence[v, u] = 0
+                continue
+            partner = int(np.rint(u - px[v, u]))
+            seen = left_seen[v, u] and 0 <= partner < width
+            if not (seen and right_seen[v, partner]):
+                px[v, u] = np.nan
+                confidence[v, u] = 0
 
 
 def _rectifying_rotation(T_left_right: F64) -> F64:
