@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from service.cameras import CAMERAS, CameraFrame, CameraSource, open_camera, parse_source
-from service.cameras.video import PipeReader, index_at_end, parse_time_unix_ns
+from service.cameras.video import PipeReader, VideoSource, index_at_end, parse_time_unix_ns
 from service.errors import InputError
 
 SIZE_PX = (160, 96)
@@ -87,6 +87,16 @@ def test_file_keeps_images_and_times(tmp_path: Path, name: str, container_format
         assert abs(frame.time_ns - ms * 1_000_000) <= tolerance_ns
     assert source.warnings == []
     assert list(source) == []
+
+
+def test_images_that_are_not_wanted_are_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "v.mp4"
+    write_video(str(path), "mp4")
+    source = open_camera(str(path))
+    assert isinstance(source, VideoSource)
+    source.is_wanted = lambda time_ns: time_ns in (80_000_000, 1_000_000_000)
+    assert [(f.seq, f.time_ns) for f in source] == [(2, 80_000_000), (5, 1_000_000_000)]
+    assert source.warnings == []
 
 
 def test_file_epoch_is_the_creation_time(tmp_path: Path) -> None:

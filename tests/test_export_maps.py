@@ -56,6 +56,33 @@ def test_the_manifest_lists_every_file_as_it_is(maps: Path) -> None:
         assert entry["sha256"] == hashlib.sha256(data).hexdigest()
 
 
+def test_the_maps_share_what_they_are_made_from(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cloud, surface, bare ground and contours are computed once for all of them."""
+    from service.offline.exports import rasters, surface, view
+
+    made: list[str] = []
+
+    def counted(module: Any, name: str) -> None:
+        real = getattr(module, name)
+
+        def call(*args: Any) -> Any:
+            made.append(name)
+            return real(*args)
+
+        monkeypatch.setattr(module, name, call)
+
+    counted(view, "fused_cloud")
+    counted(surface, "_surface_model")
+    counted(surface, "terrain")
+    counted(rasters, "contour_lines")
+    house.flown(tmp_path / "scan").close()
+    with ScanView(tmp_path / "scan") as scan:
+        export(scan, "all", None, ExportOptions())
+    assert sorted(made) == ["_surface_model", "contour_lines", "fused_cloud", "terrain"]
+
+
 def test_the_ground_runs_on_below_the_house(maps: Path, house: HouseFlight) -> None:
     import rasterio
 

@@ -167,7 +167,7 @@ class FakeVideo:
     """Images twice as fine as the keyframes', one of them at each keyframe's second."""
 
     def __init__(self, house: HouseFlight, size_px: tuple[int, int] = (320, 180)) -> None:
-        self.size_px, self.closed, self.fps = size_px, False, 2.0
+        self.size_px, self.closed = size_px, False
         self._house = house
 
     def __iter__(self) -> Iterator[CameraFrame]:

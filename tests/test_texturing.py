@@ -12,7 +12,7 @@ from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh, cut, height_mesh
 from recon.surface.raster import Grid, Raster
 from recon.surface.texture_atlas import BORDER_PX, lay_out, pack
-from recon.surface.texture_views import CANDIDATES, Sightings, TextureView, consistent, look
+from recon.surface.texture_views import CANDIDATES, Sightings, TextureView, consistent, look, median
 from recon.surface.texturing import PENALTY, choose, face_neighbours, fading, levels, texture
 from recon.types import F64, U8, Array
 
@@ -274,3 +274,12 @@ def test_cutting_divides_triangles_at_the_border() -> None:
     for part in (west, east):
         assert (np.cross(*edges(part))[:, 2] > -1e-9).all() and part.rgb is not None
     assert len(cut(mesh, (50.0, 50.0, 60.0, 60.0)).faces) == 0
+
+
+def test_medians_are_those_of_numpy() -> None:
+    rng = np.random.default_rng(3)
+    values = rng.normal(size=(200, 9, 3)).astype(np.float32)
+    values[np.arange(9) >= rng.integers(1, 10, 200)[:, None]] = np.nan
+    values = values[:, rng.permutation(9)]
+    want = np.nanmedian(values, axis=1, keepdims=True)
+    assert np.allclose(median(values), want, atol=1e-6)

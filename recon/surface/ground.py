@@ -7,10 +7,12 @@ them lowers by more than the slope allows stands on the ground.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from scipy import ndimage
-from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from scipy.interpolate import LinearNDInterpolator
 
 from recon.surface.raster import Raster
 from recon.types import F32, Bool
@@ -52,25 +54,24 @@ def _steps(radius: int) -> int:
     return max(1, radius - round(radius / 1.5))
 
 
-def terrain(surface: Raster) -> tuple[F32, Bool]:
-    """Heights of the bare ground (NaN = unknown), and which known cells of it are bridged.
+@dataclass(frozen=True, slots=True, eq=False)
+class BareGround:
+    """The bare ground of a surface model.
 
-    Ground is bridged by triangles below what stands on it and in holes of the surface model; the
-    outline does not grow.
+    Ground is bridged by triangles below what stands on it and in holes of the surface model.
     """
+
+    everywhere_m: F32  # (rows, cols) beyond the outline that of the nearest; NaN without ground
+    is_inside: Bool  # (rows, cols) within the outline of the surface model, which does not grow
+    is_bridged: Bool  # (rows, cols) inside, and not seen as ground
+
+
+def terrain(surface: Raster) -> BareGround:
+    """The bare ground below ``surface``."""
     ground = ground_cells(surface)
     inside = np.asarray(ndimage.binary_fill_holes(surface.known)) & ground.any()
-    height = np.where(inside, everywhere(surface, ground), np.float32(np.nan)).astype(np.float32)
-    return height, inside & ~ground
-
-
-def everywhere(surface: Raster, ground: Bool) -> F32:
-    """Heights of the bare ground in all cells, beyond its outline those of the nearest.
-
-    ``ground`` (rows, cols) are the cells that show it; without any all heights are NaN.
-    """
     height = np.where(ground, surface.height_m, np.float32(np.nan)).astype(np.float32)
-    return _bridged(height, ground)
+    return BareGround(_bridged(height, ground), inside, inside & ~ground)
 
 
 def _lowest(height_m: F32, shrink: int) -> F32:
@@ -89,12 +90,10 @@ def _bridged(height_m: F32, known: Bool) -> F32:
     rim = known & ~ndimage.binary_erosion(known, np.ones((3, 3)), border_value=1)
     if not known.any() or known.all() or not rim.any():
         return height_m
+    near = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    out: F32 = height_m[tuple(near)]
     at = np.argwhere(rim)
-    unknown = np.argwhere(~known)
-    nearest = NearestNDInterpolator(at, height_m[rim])(unknown)
     if len(at) > 3 and (np.ptp(at, axis=0) > 0).all():
-        linear = LinearNDInterpolator(at, height_m[rim])(unknown)
-        nearest = np.where(np.isfinite(linear), linear, nearest)
-    out: F32 = height_m.copy()
-    out[~known] = nearest
+        linear = LinearNDInterpolator(at, height_m[rim])(np.argwhere(~known))
+        out[~known] = np.where(np.isfinite(linear), linear, out[~known])
     return out

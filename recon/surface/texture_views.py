@@ -141,9 +141,8 @@ def consistent(found: Sightings) -> Sightings:
     there = view >= 0
     rows = np.flatnonzero(there.sum(axis=1) >= 4)
     colour = np.where(there[rows, :, None], bgr[rows], np.nan)
-    middle = np.nanmedian(colour, axis=1, keepdims=True)
-    off = np.abs(colour - middle).max(axis=2)
-    spread = np.nanmedian(off, axis=1, keepdims=True)
+    off = np.abs(colour - median(colour)).max(axis=2)
+    spread = median(off[..., None])[..., 0]
     wrong = np.nan_to_num(off) > OUTLIER_LEVELS + OUTLIER_SPREADS * spread
     view[rows] = np.where(wrong, -1, view[rows])
     order = np.argsort(view < 0, axis=1, kind="stable")
@@ -152,6 +151,17 @@ def consistent(found: Sightings) -> Sightings:
         np.take_along_axis(px, order, 1),
         np.take_along_axis(bgr, order[..., None], 1),
     )
+
+
+def median(values: F32) -> F32:
+    """(R, 1, C) median of the known values of (R, N, C), of which each row has some.
+
+    Unknown (NaN) are the same ones in all C. Some ten times as fast as ``np.nanmedian``.
+    """
+    ordered = np.sort(values, axis=1)  # NaN last
+    count = np.isfinite(values[..., 0]).sum(axis=1)[:, None, None]
+    low, high = (np.take_along_axis(ordered, at // 2, 1) for at in (count - 1, count))
+    return np.asarray(0.5 * (low + high))
 
 
 def _projected(view: TextureView, xyz: F64) -> tuple[F64, F64]:

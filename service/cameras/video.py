@@ -61,6 +61,7 @@ class VideoSource:
         self._damaged = 0
         self._unordered = 0
         self._open = True
+        self.is_wanted: Callable[[int], bool] = lambda time_ns: True  # others are not converted
         if not container.streams.video:
             self.close()
             raise InputError(f"{description}: holds no video stream; give a video of the flight")
@@ -106,8 +107,9 @@ class VideoSource:
                     f"{time_ns / 1e9:.2f} s; the rest is skipped"
                 )
                 break
-            image = np.rot90(frame_bgr(frame), -(self.turned_deg // 90))
-            yield CameraFrame(np.ascontiguousarray(image), time_ns, seq, None, f"frame {seq}")
+            if self.is_wanted(time_ns):
+                image = np.rot90(frame_bgr(frame), -(self.turned_deg // 90))
+                yield CameraFrame(np.ascontiguousarray(image), time_ns, seq, None, f"frame {seq}")
             last_ns = time_ns
             seq += 1
         else:

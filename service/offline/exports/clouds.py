@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from recon.surface.ground import everywhere, ground_cells
 from recon.types import F64, U8
 from service.offline.exports.flight import writing_folder
-from service.offline.exports.surface import surface_model
+from service.offline.exports.surface import bare_ground, surface_model
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.fused_cloud import SCALE_M, las_header, point_record, write_laz
 from service.scans.writing import writing
@@ -70,7 +69,7 @@ GROUND_WITHIN_M = 0.3
 def classes(scan: ScanView) -> U8:
     """(N,) class of each point of the fused cloud after LAS 1.4: bare ground, or unclassified."""
     raster = surface_model(scan, None).raster
-    height = everywhere(raster, ground_cells(raster))
+    height = bare_ground(scan, None).everywhere_m
     below = height[raster.grid.cells(scan.xyz_m[:, :2])]
     is_ground = np.abs(scan.xyz_m[:, 2] - below) <= GROUND_WITHIN_M
     return np.where(is_ground, GROUND, UNCLASSIFIED).astype(np.uint8)

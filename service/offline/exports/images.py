@@ -15,6 +15,7 @@ from recon.surface.texture_views import TextureView
 from recon.types import U8, Camera, Keyframe
 from service.cameras import open_camera
 from service.cameras.source import CameraSource
+from service.cameras.video import VideoSource
 from service.errors import InputError, SkyreliefError
 from service.offline.exports.view import ExportOptions
 from service.progress import Progress
@@ -25,7 +26,6 @@ MAX_BYTES = 1_500_000_000
 """All images of one tile together; more are made smaller."""
 
 SAME_TIME_NS = 5_000_000
-USUAL_FPS = 30.0
 
 
 def stored_images(keyframes: Sequence[Keyframe]) -> list[TextureView]:
@@ -137,8 +137,14 @@ def video_images(
     shrink = min(1.0, (MAX_BYTES / (4.0 * np.prod(camera.size_px) * len(keyframes))) ** 0.5)
     times = np.array([k.time_ns for k in keyframes], np.int64)
     found: dict[int, TextureView] = {}
-    span_s = float(times.max() - start) / 1e9
-    frames = (progress or Progress()).over(source, round(span_s * (source.fps or USUAL_FPS)))
+
+    def is_wanted(time_ns: int) -> bool:
+        past = time_ns + start - times
+        return bool((np.abs(past) <= SAME_TIME_NS).any() or (past > SAME_TIME_NS).all())
+
+    if isinstance(source, VideoSource):
+        source.is_wanted = is_wanted
+    frames = (progress or Progress()).over((f for f in source if is_wanted(f.time_ns)), len(times))
     try:
         for frame in frames:
             time_ns = start + frame.time_ns

@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from recon.bands import threads
 from service.errors import InputError
 from service.offline.exports.rasters import contours_of, write_ortho
 from service.offline.exports.view import ExportOptions, ScanView
@@ -39,7 +40,7 @@ def write_contours_dxf(scan: ScanView, out: Path, options: ExportOptions) -> Non
 def write_contours_gpkg(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """Contours as a GeoPackage: layer ``contours`` in the scan's UTM zone."""
     epsg = scan.needs_place("a contour map").epsg
-    found = list(contours_of(scan, options))
+    found = contours_of(scan, options)
     heights = {"height_amsl_m": [height_m for height_m, _ in found]}
     write_lines(out, "contours", epsg, [line for _, line in found], heights)
 
@@ -84,6 +85,7 @@ def _in_degrees(path: Path) -> tuple[Any, tuple[float, float, float, float]]:
         reproject(
             rasterio.band(image, [1, 2, 3, 4]), bands, dst_transform=to, dst_crs="EPSG:4326",
             resampling=Resampling.average if shrink > 1.0 else Resampling.bilinear,
+            num_threads=threads(),
         )  # fmt: skip
     west, south, east, north = array_bounds(h, w, to)
     return bands[[2, 1, 0, 3]].transpose(1, 2, 0), (west, south, east, north)

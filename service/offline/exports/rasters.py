@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 
 from recon.mapping.voxel_map import ground_sample_m
-from recon.surface.ground import terrain
 from recon.surface.orthophoto import Terrain, orthophoto
 from recon.surface.raster import Grid, Raster, fill_holes, round_cell
 from recon.surface.texture_views import TextureView
@@ -21,7 +20,7 @@ from recon.types import F64, Array
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports.images import scan_images
-from service.offline.exports.surface import surface_model
+from service.offline.exports.surface import bare_ground, surface_model
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.coverage import coverage_of
 from service.scans.main_piece import main_keyframes
@@ -46,9 +45,9 @@ def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
 def write_dtm(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """Heights of the bare ground (float32, -9999 where unknown), and 1 where they are bridged."""
-    raster = surface_model(scan, options.cell_m).raster
-    height, is_bridged = terrain(raster)
-    image = np.where(np.isfinite(height), np.stack([height, is_bridged]), NODATA_M)
+    raster, found = surface_model(scan, options.cell_m).raster, bare_ground(scan, options.cell_m)
+    bands = np.stack([found.everywhere_m, found.is_bridged])
+    image = np.where(found.is_inside, bands, NODATA_M)
     names = ("ground AMSL, m", "bridged")
     write_cog(scan, out, raster.grid, image.astype(np.float32), names, nodata=NODATA_M)
 
@@ -152,10 +151,11 @@ def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """
     frame = scan.needs_place("a contour map")
     features = []
-    for height_m, line in contours_of(scan, options):
-        geodetic = frame.to_geodetic(
-            frame.from_utm(np.column_stack([line, np.full(len(line), height_m)]))
-        )
+    found = contours_of(scan, options)
+    places = [np.column_stack([line, np.full(len(line), height_m)]) for height_m, line in found]
+    ends = np.cumsum([len(line) for line in places])[:-1]
+    whole = frame.to_geodetic(frame.from_utm(np.concatenate([np.zeros((0, 3)), *places])))
+    for (height_m, _), geodetic in zip(found, np.split(whole, ends), strict=bool(found)):
         features.append(
             {
                 "type": "Feature",
@@ -170,10 +170,15 @@ def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
         part.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
 
 
-def contours_of(scan: ScanView, options: ExportOptions) -> Iterator[tuple[float, F64]]:
+def contours_of(scan: ScanView, options: ExportOptions) -> list[tuple[float, F64]]:
     """(height, (N, 2) UTM metres) of the contours; InputError without a georeference."""
     scan.needs_place("a contour map")
-    yield from contour_lines(fill_holes(scan.raster(options.cell_m)), options.contour_m)
+    key = ("contours", options.cell_m, options.contour_m)
+    if key not in scan.memo:
+        surface = fill_holes(scan.raster(options.cell_m))
+        scan.memo[key] = list(contour_lines(surface, options.contour_m))
+    found: list[tuple[float, F64]] = scan.memo[key]
+    return found
 
 
 def contour_lines(raster: Raster, step_m: float) -> Iterator[tuple[float, F64]]:

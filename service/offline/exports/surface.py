@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon.mapping.free_space import open_above
+from recon.surface.ground import BareGround, terrain
 from recon.surface.hole_filling import filled
 from recon.surface.raster import Raster, reliable, standing_height, without_cells
 from recon.types import Bool
@@ -40,6 +41,15 @@ def surface_model(scan: ScanView, cell_m: float | None, strict: bool = False) ->
     if key not in scan.memo:
         scan.memo[key] = _surface_model(scan, cell_m, strict)
     found: Surface = scan.memo[key]
+    return found
+
+
+def bare_ground(scan: ScanView, cell_m: float | None) -> BareGround:
+    """The bare ground below the surface model."""
+    key = ("ground", cell_m)
+    if key not in scan.memo:
+        scan.memo[key] = terrain(surface_model(scan, cell_m).raster)
+    found: BareGround = scan.memo[key]
     return found
 
 
