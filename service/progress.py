@@ -51,7 +51,7 @@ class Progress:
 
     @contextmanager
     def part(self, text: str, of_rest: float = 1.0) -> Iterator[None]:
-        """The work inside takes this share of what is left of the work around it."""
+        """The work inside takes this share of the remaining work around it."""
         end = self._end
         self._end = self.share + of_rest * (end - self.share)
         try:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import time
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -44,6 +46,23 @@ def test_a_scan_is_refined_from_the_portal(portal: Portal, tmp_path: Path) -> No
     assert "refined" in " ".join(client.ask(ONE)[1]["notes"])
     assert client.ask(f"/api/jobs/{job['number']}", "DELETE")[0] == 404
     assert client.ask("/api/jobs/1", "DELETE", token="")[0] == 401
+
+
+def test_all_maps_come_in_one_zip(portal: Portal, tmp_path: Path) -> None:
+    client = Client(portal)
+    assert client.ask(ONE + "/maps.zip")[0] == 404 and not client.ask(ONE)[1]["maps"]
+    maps = tmp_path / "drone-1/test-1/maps"
+    maps.mkdir()
+    files = {"manifest.json": b"{}", "dsm.tif": bytes(range(256)) * 9000, "empty.csv": b""}
+    for name, data in files.items():
+        (maps / name).write_bytes(data)
+    (maps / "token").symlink_to(tmp_path / "portal-token")  # left out
+    assert client.ask(ONE)[1]["maps"]
+    status, data, headers = client.ask(ONE + "/maps.zip")
+    assert status == 200 and "test-1-maps.zip" in headers["content-disposition"]
+    with zipfile.ZipFile(io.BytesIO(data)) as found:
+        assert found.testzip() is None
+        assert {name: found.read(name) for name in found.namelist()} == files
 
 
 @pytest.mark.parametrize("where", ["/", "/#/view/drone-1/test-1"])

@@ -125,6 +125,7 @@ class Library:
             "files": _files(folder),
             "preview": is_regular(folder / "preview.jpg"),
             "tiles": is_regular(folder / "3dtiles" / "tileset.json"),
+            "maps": is_regular(folder / "maps" / "manifest.json"),
             "started_unix_s": None,
             "origin": None,
             "finished": False,

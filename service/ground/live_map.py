@@ -1,7 +1,7 @@
 """The map of a scan while it grows, as Web Mercator tiles drawn from its keyframes.
 
 A tile keeps the keyframes that it was drawn from: a new one is drawn into it, one that moved or
-became finer makes it anew. Each pixel has the height and the colour of its surest point.
+became finer makes it again. Each pixel has the height and the colour of its surest point.
 """
 
 from __future__ import annotations

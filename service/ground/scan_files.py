@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import re
-from collections.abc import Iterable
+import zipfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from starlette.requests import Request
-from starlette.responses import FileResponse, Response
+from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from recon.mapping.cloud_fusion import cloud_of
@@ -16,12 +20,17 @@ from recon.types import U8, Bool, Keyframe
 from service.errors import InputError
 from service.ground.state import names_of, state_of
 from service.ground.storage import is_regular
+from service.offline.exports import EXPORTERS
+from service.offline.exports.bundle import MANIFEST
 from service.stream.store import ScanStore
 
 TILE = re.compile(r"[A-Za-z0-9_]{1,80}\.(json|pnts|b3dm|glb)")
 """Names that py3dtiles gives its files; all lie in one folder."""
 
 DEEPEST_TILE = 8
+MAPS_KIND = "all"
+MAPS = EXPORTERS[MAPS_KIND][1]
+ZIP_PART_BYTES = 1 << 20
 SEQ = re.compile(r"[0-9]{1,9}")
 
 JPEG_QUALITY = 82
@@ -39,6 +48,7 @@ def file_routes(one: str) -> list[Route]:
     """The routes below ``one``, the address of a scan."""
     return [
         Route(one + "/files/{name}", _file),
+        Route(one + "/maps.zip", _maps),
         Route(one + "/tiles/{name:path}", _tile),
         Route(one + "/keyframes/{seq}.jpg", _image),
         Route(one + "/coverage.png", _coverage),
@@ -54,6 +64,51 @@ def _file(request: Request) -> Response:
     if path.name in ("report.html", "change.html"):
         return FileResponse(path, headers=SANDBOX)
     return FileResponse(path, filename=f"{request.path_params['scan']}-{path.name}")
+
+
+def _maps(request: Request) -> Response:
+    """All maps in one zip, as the deliverable ``all`` has left them."""
+    folder = state_of(request).library.folder(*names_of(request)) / MAPS
+    if not is_regular(folder / MANIFEST):
+        raise InputError(f"no maps yet; make {MAPS_KIND!r} first")
+    name = f"{request.path_params['scan']}-maps.zip"
+    headers = {"content-disposition": f'attachment; filename="{name}"'}
+    return StreamingResponse(zip_parts(folder), media_type="application/zip", headers=headers)
+
+
+class _Pipe(io.RawIOBase):
+    """Keeps what is written until it is taken."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._kept: list[bytes] = []
+
+    def writable(self) -> bool:
+        """It is."""
+        return True
+
+    def write(self, data: Any) -> int:
+        """Keep ``data``."""
+        self._kept.append(bytes(data))
+        return len(self._kept[-1])
+
+    def take(self) -> bytes:
+        """What was written since the last call."""
+        out, self._kept = b"".join(self._kept), []
+        return out
+
+
+def zip_parts(folder: Path) -> Iterator[bytes]:
+    """The regular files of a folder as a zip, made while it is read."""
+    pipe = _Pipe()
+    with zipfile.ZipFile(pipe, "w") as whole:
+        for path in sorted(p for p in folder.iterdir() if is_regular(p)):
+            about = zipfile.ZipInfo.from_file(path, path.name)
+            with whole.open(about, "w", force_zip64=True) as out, open(path, "rb") as file:
+                while data := file.read(ZIP_PART_BYTES):
+                    out.write(data)
+                    yield pipe.take()
+    yield pipe.take()
 
 
 def _tile(request: Request) -> Response:

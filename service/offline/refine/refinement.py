@@ -79,7 +79,7 @@ LINK_LOG = "link.tlog"
 """The flight's telemetry that the daemon keeps next to a scan."""
 
 MATCHING, SEARCHING, ADJUSTING = 0.7, 0.7, 0.5
-"""Shares of what is left of a refinement that its steps take."""
+"""Shares of the remaining refinement that its steps take."""
 
 MIN_SIGMA_SCALE = 0.003
 BY_SURVEY = "control points"

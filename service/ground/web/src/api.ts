@@ -28,6 +28,7 @@ export interface Scan {
   files: { name: string; what: string; bytes: number }[];
   preview: boolean;
   tiles: boolean;
+  maps: boolean;
   started_unix_s: number | null;
   origin: Origin | null;
   finished: boolean;

@@ -168,10 +168,12 @@ function downloads(s: api.Scan): HTMLElement {
       ` ${f.what}, ${size(f.bytes)}`,
     ),
   );
+  const maps = el("a", { href: `${api.scanAddress(s)}/maps.zip`, textContent: "maps.zip", download: "" });
+  if (s.maps) rows.push(el("li", {}, maps, " all maps with a manifest"));
   return el(
     "details",
     {},
-    el("summary", { textContent: `${s.files.length} files` }),
+    el("summary", { textContent: `${rows.length} files` }),
     el("ul", {}, ...rows),
   );
 }
