@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from recon.camera_model import project
 from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh
 from recon.types import F32, F64, U8, Bool
@@ -83,15 +84,15 @@ def look(
     )
     for number, view in enumerate(views):
         progress(number / len(views))
-        px, depth = _projected(view, vertices)
-        inside = _inside(px, depth, view)
+        px = _projected(view, vertices)
+        inside = _inside(px, view)
         inside[inside] = _free(reach, view, vertices[inside], tolerance)
         faces = np.flatnonzero(inside[mesh.faces].all(axis=1))
         towards = view.T_world_camera[:3, 3] - middle[faces]
         facing = np.einsum("ij,ij->i", normal[faces], towards)
         faces = faces[facing > MIN_COSINE * 2.0 * area[faces] * np.linalg.norm(towards, axis=1)]
         faces = faces[_free(reach, view, middle[faces], tolerance)]
-        middle_px = _projected(view, middle[faces])[0]
+        middle_px = _projected(view, middle[faces])
         resolution = np.sqrt(_doubled_area(px[mesh.faces[faces]]) / (2.0 * area[faces]))
         places = np.concatenate([px[mesh.faces[faces]], middle_px[:, None]], axis=1)
         colour, seen = _mean_colour(view.bgra, places)
@@ -164,22 +165,19 @@ def median(values: F32) -> F32:
     return np.asarray(0.5 * (low + high))
 
 
-def _projected(view: TextureView, xyz: F64) -> tuple[F64, F64]:
-    """(N, 2) pixels, whole numbers at pixel centres, and (N,) depth; NaN behind the camera."""
+def _projected(view: TextureView, xyz: F64) -> F64:
+    """(N, 2) pixels, whole numbers at pixel centres; NaN behind the camera."""
     R, t = view.T_world_camera[:3, :3], view.T_world_camera[:3, 3]
-    local = (xyz - t) @ R
-    z = np.where(local[:, 2] > 1e-6, local[:, 2], np.nan)
-    px = local[:, :2] / z[:, None] * view.K[[0, 1], [0, 1]] + view.K[:2, 2]
-    return px, z
+    return project(view.K, (xyz - t) @ R)
 
 
-def _inside(px: F64, depth: F64, view: TextureView) -> Bool:
+def _inside(px: F64, view: TextureView) -> Bool:
     """(N,) places that fall into the image, a pixel away from its border."""
     h, w = view.bgra.shape[:2]
     with np.errstate(invalid="ignore"):
         u = (px[:, 0] >= EDGE_PX) & (px[:, 0] <= w - 1 - EDGE_PX)
         v = (px[:, 1] >= EDGE_PX) & (px[:, 1] <= h - 1 - EDGE_PX)
-    return np.asarray(u & v & np.isfinite(depth))
+    return np.asarray(u & v)
 
 
 def _free(reach: Rays, view: TextureView, xyz: F64, tolerance_m: float) -> Bool:

@@ -280,20 +280,9 @@ def first_hit(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cast_all(  # type: ignore[no-untyped-def]
-    begin,
-    end,
-    corners,
-    start,
-    items,
-    column_z,
-    block_z,
-    bounds,
-    cell_m,
-    origins,
-    directions,
-    t,
+    begin, end, corners, start, items, column_z, block_z, bounds, cell_m, origins, directions, t,
     hit,
-):
+):  # fmt: skip
     for n in range(begin, end):
         o, d = origins[n], directions[n]
         tn, m = first_hit(
@@ -351,21 +340,9 @@ def _column_distance2(column_z, bounds, cell_m, i, j, px, py, pz):  # type: igno
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _closest_all(  # type: ignore[no-untyped-def]
-    begin,
-    end,
-    corners,
-    start,
-    items,
-    column_z,
-    block_z,
-    bounds,
-    cell_m,
-    points,
-    max_m,
-    distance,
-    nearest,
-    hit,
-):
+    begin, end, corners, start, items, column_z, block_z, bounds, cell_m, points, max_m, distance,
+    nearest, hit,
+):  # fmt: skip
     ny, nx = column_z.shape[0], column_z.shape[1]
     for n in range(begin, end):
         px, py, pz = points[n, 0], points[n, 1], points[n, 2]

@@ -157,23 +157,9 @@ def _local(block, x, y):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _shadow(  # type: ignore[no-untyped-def]
-    begin,
-    end,
-    corners,
-    start,
-    items,
-    column_z,
-    block_z,
-    bounds,
-    cell_m,
-    gx,
-    gy,
-    z,
-    which,
-    blocks,
-    sun,
-    out,
-):
+    begin, end, corners, start, items, column_z, block_z, bounds, cell_m, gx, gy, z, which,
+    blocks, sun, out,
+):  # fmt: skip
     for j in range(begin, end):
         for i in range(gx.shape[1]):
             x, y, top = gx[j, i], gy[j, i], z[j, i]
