@@ -35,7 +35,7 @@ COLOURS = """(async () => {
       left = Math.min(left, x); right = Math.max(right, x); } }
   return { known, red, left, right };
 })()"""
-"""What the map shows: pixels with content, and those of the red roof."""
+"""Pixels of the map with content, and those of the red roof."""
 
 
 @pytest.fixture

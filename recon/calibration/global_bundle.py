@@ -396,7 +396,7 @@ class _Bundle:
         ).solve
 
     def _add_known(self, s: _State, S: F64, g: F64, Hp: F64, bp: F64) -> None:
-        """What fixes, attitudes, the placing and surveyed points add."""
+        """Add fixes, attitudes, the placing and surveyed points."""
         known, c = self._of.known, self._of.cauchy_sigmas
         fixes, attitude, placing, points = self._known_errors(s)
         R = s.T[:, :3, :3]

@@ -1,4 +1,4 @@
-"""What views see through: points that stereo invented, and places that are open to the sky.
+"""Space that views see through: points that stereo invented, and places open to the sky.
 
 A keyframe that sees surface well behind a point, all around the pixel where the point would
 be, says that the point's place is empty. One that sees surface at the point confirms it

@@ -1,4 +1,4 @@
-"""What surface is known already: voxels in a hash.
+"""Known surface: voxels in a hash.
 
 A voxel is named by its three indices, packed into one 64-bit key. Keys live in an open
 addressing table with linear probing that points into dense arrays, so memory grows with the

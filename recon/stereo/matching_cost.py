@@ -1,4 +1,4 @@
-"""What it costs to match a left pixel at a label: census and absolute difference, truncated.
+"""Cost of a left pixel at a label: census and absolute difference, truncated.
 
 Census (Zabih and Woodfill, https://doi.org/10.1007/BFb0028345) survives changes of exposure,
 the absolute difference keeps edges in their place. Costs are integers so that belief

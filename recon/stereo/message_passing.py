@@ -149,7 +149,7 @@ _space = Workspace()
 
 @dataclass(frozen=True, slots=True)
 class Smoothness:
-    """What a step between neighbouring labels costs, in integer units.
+    """Cost of a step between neighbouring labels, in integer units.
 
     ``slope`` per label, ``truncation`` at most; both fall, with the contrast of the two
     pixels, to ``floor`` of that at ``full_contrast`` gray levels and above.
@@ -413,7 +413,7 @@ def _sweep_band(
 def _sweep_gap(
     data: Any, messages: Any, edges: Any, width: int, iterations: int, edge: int
 ) -> None:  # pragma: no cover - compiled
-    """What the bands on both sides of row ``edge`` left out."""
+    """The messages that the bands on both sides of row ``edge`` left out."""
     labels, cells = data.shape[2], data.shape[3]
     masks = _masks(width, cells)
     scratch = np.empty(labels * 4 * LANES, np.int16)

@@ -429,7 +429,7 @@ PLACE = np.dtype(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Footprint:
-    """What a keyframe's image covers on level ground at its median height."""
+    """Ground that a keyframe's image covers, taken as level at its median height."""
 
     corners_m: F64  # (4, 2) east and north, around the image
     centre_m: F64  # (2,) where the middle of the image looks

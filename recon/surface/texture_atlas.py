@@ -136,7 +136,7 @@ def pack(size: I64) -> tuple[F64, tuple[int, int]]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Palette:
-    """What the texels are mixed from."""
+    """Images and weights that the texels are mixed from."""
 
     views: Sequence[TextureView]
     levels: F32  # (views, 3, 2) gain and offset, BGR

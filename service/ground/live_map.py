@@ -45,7 +45,7 @@ Tile = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """What a tile and its margin show."""
+    """Content of a tile and its margin."""
 
     height_m: F32  # (WIDE, WIDE) AMSL, NaN where unknown
     rgb: U8  # (WIDE, WIDE, 3)
@@ -135,7 +135,7 @@ class LiveMap:
                 return
 
     def cells(self, tile: Tile) -> Cells:
-        """What is known of a tile at a zoom up to :attr:`zoom`."""
+        """The known part of a tile at a zoom up to :attr:`zoom`."""
         drawn = self._tiles.pop(tile, None) or _Drawn()
         now = dict(self._within(tile))
         if any(now.get(seq) != state for seq, state in drawn.states.items()):

@@ -93,7 +93,7 @@ class _Pipe(io.RawIOBase):
         return len(self._kept[-1])
 
     def take(self) -> bytes:
-        """What was written since the last call."""
+        """The bytes written since the last call."""
         out, self._kept = b"".join(self._kept), []
         return out
 

@@ -33,7 +33,7 @@ SHOWN_S = 60.0
 
 REFINE = "refine"
 KINDS = (*EXPORTERS, REFINE)
-"""What a job may make."""
+"""Products that a job may make."""
 
 
 @dataclass(slots=True, eq=False)
