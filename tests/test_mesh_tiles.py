@@ -22,6 +22,7 @@ from recon.surface.meshing import Mesh
 from service.cameras import CameraFrame
 from service.cli import app
 from service.errors import InputError, OutsideError
+from service.georeference import LocalFrame
 from service.offline.exports import images, mesh_tiles, model
 from service.offline.exports.mesh_tiles import (
     Footprint,
@@ -31,7 +32,7 @@ from service.offline.exports.mesh_tiles import (
     run_tiles,
     tile_boxes,
 )
-from service.offline.exports.view import ExportOptions, ScanView
+from service.offline.exports.view import ExportOptions, ScanView, export
 from service.progress import Progress
 from service.stream.store import ScanStore
 
@@ -279,3 +280,31 @@ def test_a_recording_found_by_itself_that_does_not_fit_is_left(
     assert any("after all" in text for text in reported)
     with pytest.raises(InputError, match="its video cannot be used"):
         mesh_tile(job, noting(reported))
+
+
+def test_the_mesh_lies_on_the_globe_as_3d_tiles(tmp_path: Path, house: HouseFlight) -> None:
+    """Vertices of the glTF files, turned to z up and placed by the tileset, against PROJ."""
+    trimesh = pytest.importorskip("trimesh")
+    from pyproj import Transformer
+
+    house.flown(tmp_path).close()
+    with ScanView(tmp_path, 0.3) as scan:
+        folder = export(scan, "3dtiles-mesh", None, ExportOptions(voxel_m=0.3, stored=True))
+    tileset = json.loads((folder / "tileset.json").read_text())
+    assert tileset["asset"]["version"] == "1.1"
+    root = tileset["root"]
+    T = np.array(root["transform"]).reshape(4, 4).T
+    assert np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
+    assert tileset["geometricError"] > root["geometricError"] > 0.0
+    globe = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    for tile in root["children"]:
+        scene = trimesh.load(folder / tile["content"]["uri"])
+        xyz = np.concatenate([g.vertices for g in scene.geometry.values()])
+        up = np.column_stack([xyz[:, 0], -xyz[:, 2], xyz[:, 1]])
+        for box in (tile["boundingVolume"]["box"], root["boundingVolume"]["box"]):
+            middle, half = np.array(box[:3]), np.diag(np.array(box[3:]).reshape(3, 3))
+            assert (np.abs(up - middle) <= half + 1e-3).all()
+        lon, lat, height = globe.transform(*(up @ T[:3, :3].T + T[:3, 3]).T)
+        enu = LocalFrame(*house.origin).to_enu(np.column_stack([lat, lon, height]))
+        assert np.abs(enu - up).max() < 1e-3
+        assert up[:, 2].max() == pytest.approx(6.0, abs=0.5)  # the roof

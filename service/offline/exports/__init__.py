@@ -35,6 +35,11 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
         "Keyframes as a COLMAP text model with images.",
     ),
     "3dtiles": ("clouds:write_tiles", "3dtiles", "Point tiles for Cesium."),
+    "3dtiles-mesh": (
+        "mesh_tileset:write_mesh_tiles",
+        "3dtiles-mesh",
+        "Textured mesh, 3D Tiles 1.1.",
+    ),
     "glb": ("model:write_glb", "mesh.glb", "Textured mesh, binary glTF."),
     "all": ("bundle:write_all", "maps", "Clouds and maps with a manifest, one folder."),
     "mcap": ("recording:write_mcap", "flight.mcap", "Recording for Foxglove."),

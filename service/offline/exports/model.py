@@ -14,7 +14,7 @@ from recon.surface.meshing import Mesh
 from recon.types import U8
 from service.errors import InputError
 from service.offline.exports.images import check_video, recording_of
-from service.offline.exports.mesh_tiles import TileJob, footprints, run_tiles, tile_boxes
+from service.offline.exports.mesh_tiles import TileJob, TilePart, footprints, run_tiles, tile_boxes
 from service.offline.exports.view import ExportOptions, ScanView
 from service.packages import needing
 from service.scans.writing import writing
@@ -40,16 +40,36 @@ class MeshOptions:
 
 def write_glb(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """The mesh that ``skyrelief mesh`` makes by default."""
-    how = MeshOptions(
+    write_mesh(scan, out, default_mesh(options), options)
+
+
+def default_mesh(options: ExportOptions) -> MeshOptions:
+    """What ``skyrelief mesh`` does by default with these images."""
+    return MeshOptions(
         video=options.video, recording=not options.stored, video_epoch_ns=options.video_epoch_ns
     )
-    write_mesh(scan, out, how, options)
 
 
 def write_mesh(
     scan: ScanView, out: Path, how: MeshOptions, options: ExportOptions
 ) -> dict[str, Any]:
     """Mesh and texture the scan, and write it in local ENU metres; figures of the mesh.
+
+    Raises what :func:`mesh_parts` raises.
+    """
+    parts, figures = mesh_parts(scan, how, options)
+    scan.progress(f"writing {figures['faces']} triangles")
+    source = "store" if figures["pictures"] == "store" else "video"
+    with writing(out) as part:
+        extras = mesh_extras(scan) | figures | {"pictures": source}
+        part.write_bytes(glb([(p.mesh, p.image) for p in parts], extras))
+    return figures
+
+
+def mesh_parts(
+    scan: ScanView, how: MeshOptions, options: ExportOptions
+) -> tuple[list[TilePart], dict[str, Any]]:
+    """The textured tiles of the scan's mesh in ENU metres, and their figures.
 
     ``height`` is one sheet over the ground; ``poisson`` a surface through all points; ``auto``
     takes ``height`` unless many keyframes look sideways. Raises InputError when there is too
@@ -105,14 +125,10 @@ def write_mesh(
         "pictures": "store" if video is None else str(video),
         "texture_px": [p.figures["texture_px"] for p in parts],
     }
-    scan.progress(f"writing {figures['faces']} triangles")
-    with writing(out) as part:
-        extras = _extras(scan) | figures | {"pictures": "store" if video is None else "video"}
-        part.write_bytes(glb([(p.mesh, p.image) for p in parts], extras))
-    return figures
+    return parts, figures
 
 
-def _extras(scan: ScanView) -> dict[str, Any]:
+def mesh_extras(scan: ScanView) -> dict[str, Any]:
     """Where the mesh stands: its x is east, y up, -z north of this origin."""
     frame = scan.frame
     if frame is None:

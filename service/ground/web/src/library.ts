@@ -6,7 +6,7 @@ import { jobList } from "./jobs";
 import { vehicleStrip } from "./vehicle";
 
 const KINDS = [
-  "laz", "copc", "ply", "dsm", "dtm", "ortho", "contours", "gpkg", "dxf", "coverage", "kmz", "stac", "all", "glb", "3dtiles", "geojson", "kml",
+  "laz", "copc", "ply", "dsm", "dtm", "ortho", "contours", "gpkg", "dxf", "coverage", "kmz", "stac", "all", "glb", "3dtiles", "3dtiles-mesh", "geojson", "kml",
   "mcap", "refine",
 ];
 
