@@ -113,7 +113,7 @@ def self_calibrate(
     sigma = float(np.clip(np.median(first.errors_px) / RAYLEIGH_MEDIAN, 0.1, 2.0))
     seen = shared(seen, first.errors_px < config.gate_sigmas * sigma)
     found = adjusted(seen, sigma)
-    sigmas = np.sqrt(np.diag(found.camera_covariance))
+    sigmas = np.sqrt(np.abs(np.diag(found.camera_covariance)))
     focal = float(sigmas[:2].max() / found.camera.K[0, 0])
     return SelfCalibrated(
         found.camera, focal, (float(sigmas[4]), float(sigmas[5])),

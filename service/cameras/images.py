@@ -6,6 +6,7 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from copy import copy
 from pathlib import Path
 from statistics import median
 
@@ -62,6 +63,16 @@ class ImagesSource:
                 continue
             yield CameraFrame(image, time_ns, seq, tags.geotag, path.name)
             seq += 1
+
+    def __len__(self) -> int:
+        """Number of stills."""
+        return len(self._stills)
+
+    def middle(self, count: int) -> ImagesSource:
+        """The same source with ``count`` stills at most, about the middle one."""
+        some, skip = copy(self), max(len(self) - count, 0) // 2
+        some._stills = self._stills[skip : skip + count]
+        return some
 
     @property
     def times(self) -> dict[str, int]:

@@ -40,6 +40,10 @@ def replay(
     realtime: Annotated[
         bool, typer.Option("--realtime", help="at the video's pace, dropping what comes too fast")
     ] = False,
+    find_lens: Annotated[
+        bool,
+        typer.Option(help="of stills without a camera model, find it from 25 of them first"),
+    ] = True,
     config: ConfigFile = None,
     set_: Overrides = None,
     as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
@@ -58,7 +62,8 @@ def replay(
     try:
         if not (realtime or chosen.compute.model or is_given(WIDTH, config, overrides)):
             chosen = denser(chosen, source)
-        summary = _replay(source, camera, log, video_epoch, out, chosen, realtime, as_json)
+        own = None if camera or realtime or not find_lens else _own_lens(source, chosen)
+        summary = _replay(source, camera, own, log, video_epoch, out, chosen, realtime, as_json)
     finally:
         source.close()
     _report(summary, as_json)
@@ -102,6 +107,7 @@ def _load_telemetry(path: Path | None, config: Config) -> TelemetryLog | None:
 def _replay(
     source: CameraSource,
     camera: Camera | None,
+    own: Camera | None,
     log: TelemetryLog | None,
     video_epoch: float | None,
     out: Path | None,
@@ -117,7 +123,15 @@ def _replay(
 
     notes: list[str] = []
     assumed: tuple[str, ...] = ()
-    camera = _fitted(camera, source, notes) if camera else _tagged_camera(source, notes)
+    if camera:
+        camera = _fitted(camera, source, notes)
+    elif own:
+        camera = own
+        notes.append(
+            f"no camera model given: found from the images themselves ({own.K[0, 0]:.0f} px)"
+        )
+    else:
+        camera = _tagged_camera(source, notes)
     if camera is None:
         camera, assumed = _assumed_camera(source, notes), ("lens",)
     epoch_ns = _epoch(source, log, video_epoch, notes)
@@ -181,6 +195,20 @@ def _tagged_camera(source: CameraSource, notes: list[str]) -> Camera | None:
         "make one with 'skyrelief calibrate' for shapes to be true"
     )
     return source.camera
+
+
+def _own_lens(source: CameraSource, config: Config) -> Camera | None:
+    """The lens by the stills themselves, where their tags give no more than a focal length."""
+    from service.cameras.images import ImagesSource
+    from service.commands.stills_lens import lens_by_stills
+
+    if (
+        not isinstance(source, ImagesSource)
+        or source.camera is None
+        or source.camera.distortion.any()
+    ):
+        return None
+    return lens_by_stills(source, source.camera, config)
 
 
 def _assumed_camera(source: CameraSource, notes: list[str]) -> Camera:

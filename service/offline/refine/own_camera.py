@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
 from functools import lru_cache
 from itertools import combinations
 from pathlib import Path
@@ -60,6 +61,9 @@ MIN_SHOWN = 0.3
 """Of an image's ground, that such another image shows."""
 
 START = SelfCalibrationConfig()
+
+FOCAL_KNOWN = replace(START, sigma_focal=0.002)
+"""The same where the focal length given holds."""
 
 EXHAUSTIVE = 60
 """Of so many images all are compared, wherever they are said to look."""
@@ -179,12 +183,14 @@ def _on_ground(T: F64, ways: F64, ground_m: float) -> F64:
 
 def found_camera(
     images: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float, fixes: F64,
-    sigma_fixes: F64,
+    sigma_fixes: F64, otherwise: SelfCalibrationConfig | None = None,
 ) -> SelfCalibrated:  # fmt: skip
     """The camera estimated from the flight; InputError, in one line, when it is not determined."""
     landmarks, seen, poses = sightings(images, camera, poses, ground_m)
     try:
         found = self_calibrate(camera, poses, landmarks, seen, fixes, sigma_fixes)
+        if found.why_not and otherwise is not None:
+            found = self_calibrate(camera, poses, landmarks, seen, fixes, sigma_fixes, otherwise)
     except ValueError as error:
         raise InputError(f"--intrinsics: {error}") from error
     except (RuntimeError, np.linalg.LinAlgError) as error:  # an ill-posed problem

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from recon import se3
-from recon.calibration.flight import SelfCalibrated
+from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig
 from recon.posegraph.ground_control import (
     FIX_S,
     Adjusted,
@@ -144,6 +144,17 @@ def intrinsics(
     return own_camera.write(found, given, out or folder) | {"notes": job.notes}
 
 
+def lens(folder: Path, stills: Path) -> Camera:
+    """The camera by a scan's own stills. Where they leave the focal length open, the scan's holds.
+
+    Raises InputError, in one line, where they do not determine its distortion either.
+    """
+    _open_target(folder, None)
+    with ScanStore.open(folder / "scan.db") as store, Revisions(store) as revisions:
+        job = _Refinement(folder, store, revisions, RefineOptions())
+        return job.own_camera(stills, own_camera.FOCAL_KNOWN)[0].camera
+
+
 def _deliver(target: Path, figures: dict[str, Any]) -> dict[str, Any]:
     with ScanStore.open(target / "scan.db") as store:
         write_deliverables(target, store, {})
@@ -249,15 +260,22 @@ class _Refinement:
         changed = self.revisions.append(self._reposes(found), frames, header, figures)
         return figures | {"changed": changed}
 
-    def own_camera(self, video: Path) -> tuple[SelfCalibrated, Camera]:
-        """The camera by the flight's own images, and the one that it was flown with."""
+    def own_camera(
+        self, video: Path, otherwise: SelfCalibrationConfig | None = None
+    ) -> tuple[SelfCalibrated, Camera]:
+        """The camera by the flight's own images, and the one that it was flown with.
+
+        ``otherwise`` is tried where the flight does not determine the camera as usual.
+        """
         track, given = self._track(), own_camera.camera_of(self.header)
         times = [s.time_ns for s in self.states]
         images = own_camera.images_at(video, self.header.started_unix_ns, times)
         ahead = track.poses[:, :3, 2] * self._ahead_m()
         ground_m = float(np.median(track.poses[:, 2, 3] + ahead[:, 2]))
         fixes, sigma = fixes_of(track)
-        found = own_camera.found_camera(images, given, track.poses, ground_m, fixes, sigma)
+        found = own_camera.found_camera(
+            images, given, track.poses, ground_m, fixes, sigma, otherwise
+        )
         return found, given
 
     # ---- what goes in ------------------------------------------------------------------------

@@ -1,0 +1,59 @@
+"""``replay`` of stills whose tags give a focal length and no distortion."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from painted_ground import SIZE, K, pose, still
+from PIL import Image
+from typer.testing import CliRunner
+
+from service.cameras.images import open_images
+from service.cli import app
+from service.stream.store import ScanStore
+
+BENT = 0.1
+EXIF_FOCAL = 29  # mm of a 35 mm camera: 402 px
+
+
+def stills(folder: Path, count: int) -> Path:
+    """Two strips in opposite directions by a lens that bends."""
+    folder.mkdir()
+    v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]].astype(np.float64)
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1)[:, None]
+    lens = np.array([BENT, 0.0, 0.0, 0.0, 0.0])
+    straight = cv2.undistortPoints(pixels, K, lens, P=K).reshape(*u.shape, 2).astype(np.float32)
+    half = count // 2
+    for k in range(count):
+        east, yaw = (6.0 * k, 0.0) if k < half else (6.0 * (count - 1 - k), 180.0)
+        image = still(pose(east, yaw, 40.0 + k % 3, seed=k))
+        bent = cv2.remap(image, straight[..., 0], straight[..., 1], cv2.INTER_CUBIC)
+        tags = Image.Exif()
+        tags.get_ifd(0x8769)[41989] = EXIF_FOCAL
+        Image.fromarray(bent).convert("RGB").save(folder / f"{k:02d}.jpg", quality=97, exif=tags)
+    return folder
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_the_distortion_that_exif_does_not_give_is_found(tmp_path: Path, wanted: bool) -> None:
+    folder = stills(tmp_path / "stills", 10)
+    more = [] if wanted else ["--no-find-lens"]
+    command = ["replay", str(folder), "--out", str(tmp_path / "scan"), "--json", *more]
+    answer = CliRunner().invoke(app, command)
+    assert answer.exit_code == 0, answer.output
+    notes = json.loads(answer.stdout.splitlines()[-1])["warnings"]
+    assert any("found from the images themselves" in note for note in notes) == wanted
+    with ScanStore.open(tmp_path / "scan" / "scan.db") as store:
+        camera = store.header.camera
+    assert camera["distortion"][0] == pytest.approx(BENT if wanted else 0.0, abs=0.01)
+    assert camera["K"][0] == pytest.approx(402.0, rel=0.02)
+
+
+def test_the_stills_about_the_middle(tmp_path: Path) -> None:
+    source = open_images(str(stills(tmp_path / "stills", 6)), {})
+    assert [image.name for image in source.middle(3)] == ["01.jpg", "02.jpg", "03.jpg"]
+    assert len(source.middle(9)) == len(source) == 6
