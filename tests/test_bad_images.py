@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mavlink.telemetry.samples import VehicleState
-from recon import se3
+from recon import bands, se3
 from recon.backends import load_backend
 from recon.types import F64, U8, Camera, Frame, Keyframe
 from service.cameras.rig import Rig
@@ -175,3 +175,14 @@ def test_telemetry_goes_on_where_vision_was_lost() -> None:
     assert len(seen) > 30 and len(lost) > 8
     (a, before), (b, after) = seen[-1], lost[0]
     np.testing.assert_allclose(after - before, [STEP_M * (b - a), 0.0, 0.0], atol=0.6)
+
+
+def test_no_kernel_takes_more_threads_than_the_configuration_gives() -> None:
+    """And the next scan of the process does not inherit the limit."""
+    try:
+        for given, want in ((1, 1), (0, bands.cores())):
+            config = load_config(None, [f"compute.threads={given}"])
+            build_stages(CAMERA, config, load_backend("cpu"))
+            assert bands.threads() == want
+    finally:
+        bands.limit_threads(0)
