@@ -22,6 +22,7 @@ from service.cameras.camera_file import load_camera, save_camera
 
 DEMO = Path(__file__).resolve().parents[1] / "demo" / "caliterra"
 CPU = ("--set", "compute.backend=cpu")
+SPARSE = ("--set", "compute.stereo_width=160")
 NAMES = [f"IMG_{n}.jpg" for n in range(9365, 9370)]
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs the ffmpeg command")
@@ -51,7 +52,7 @@ def test_ground_holds_what_was_made_onboard(tmp_path: Path) -> None:
     for name in NAMES:
         shutil.copy(DEMO / "frames" / name, flight / "frames")
     out = tmp_path / "out"
-    done = skyrelief("demo", "--flight", str(flight), "--out", str(out), "--json", *CPU)
+    done = skyrelief("demo", "--flight", str(flight), "--out", str(out), "--json", *CPU, *SPARSE)
     assert done.returncode == 0, done.stderr + (out / "ground.log").read_text()
     report = json.loads(done.stdout.splitlines()[-1])
     assert "[1/3] open this page and see the map grow: http://127.0.0.1:" in done.stderr
@@ -99,7 +100,15 @@ def test_piped_video_gives_the_cloud_of_the_file(tmp_path: Path) -> None:
     model = tmp_path / "camera.yaml"
     save_camera(model, scaled(load_camera(DEMO / "camera.yaml"), (800, 600)))
     common = ["--camera-model", str(model), "--video-epoch", "1413742874"]
-    common += ["--set", "scan.assumed_agl_m=60", "--set", "compute.guide_width=640", "--json", *CPU]
+    common += [
+        "--set",
+        "scan.assumed_agl_m=60",
+        "--set",
+        "compute.guide_width=640",
+        "--json",
+        *CPU,
+        *SPARSE,
+    ]
     by_file = skyrelief("replay", str(video), "--out", str(tmp_path / "file"), *common)
     assert by_file.returncode == 0, by_file.stderr
     command = shlex.split(f"ffmpeg -v error -i {video} -c copy -f mpegts -")

@@ -22,6 +22,7 @@ EPOCH = 1777629600  # of the simulated video; a transport stream does not carry 
 Run = subprocess.CompletedProcess[str]
 
 SPARSE = ("--set", "compute.stereo_width=320")
+SPARSEST = ("--set", "compute.stereo_width=160", "--set", "compute.guide_width=320")
 
 
 def skyrelief(*arguments: str | Path, stdin: Any = subprocess.DEVNULL) -> Run:
@@ -96,7 +97,7 @@ def test_without_telemetry_it_still_reconstructs(flight: Path, tmp_path: Path) -
     out = tmp_path / "scan"
     done = skyrelief(
         "replay", flight / "flight.mp4", "--camera-model", flight / "camera.yaml",
-        "--out", out, "--json",
+        "--out", out, "--json", *SPARSEST,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout.splitlines()[-1])
@@ -139,6 +140,7 @@ def test_an_interrupt_closes_the_scan(flight: Path, tmp_path: Path) -> None:
     command = [
         sys.executable, "-m", "service.cli", "replay", str(flight / "flight.mp4"),
         "--camera-model", str(flight / "camera.yaml"), "--out", str(out), "--realtime", "--json",
+        *SPARSEST,
     ]  # fmt: skip
     running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     until((out / "scan.db").exists, 60.0)
@@ -210,7 +212,7 @@ def test_damaged_input_gives_a_smaller_scan_with_a_warning(flight: Path, tmp_pat
     (tmp_path / "damaged.tlog").write_bytes(log)
     done = skyrelief(
         "replay", flight / "flight.mp4", "--telemetry", tmp_path / "damaged.tlog",
-        "--camera-model", flight / "camera.yaml", "--out", tmp_path / "scan", "--json",
+        "--camera-model", flight / "camera.yaml", "--out", tmp_path / "scan", "--json", *SPARSEST,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout.splitlines()[-1])
