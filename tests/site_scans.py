@@ -53,6 +53,7 @@ class Errors:
     shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     growth: float = 1.0
+    bend_m: float = 0.0  # higher at both ends of the leg than in its middle
 
     def as_similarity(self) -> Similarity:
         """From the truth to where the scan has it, about 40 m below the cameras."""
@@ -136,7 +137,9 @@ def write_scan(
             one = view(seq, T, boxes, ground)
             d = one.depth
             grown = np.float32(wrong.growth)
-            placed = T_own_truth @ wrong.pose(T)
+            bend = (errors or Errors()).bend_m * (2.0 * seq / max(len(poses) - 1, 1) - 1.0) ** 2
+            lift = se3.compose(np.eye(3), np.array([0.0, 0.0, bend]))
+            placed = T_own_truth @ lift @ wrong.pose(T)
             depth = DepthMap(d.depth_m * grown, d.sigma_m * grown, d.views, d.K, placed)
             pose = Pose(placed, one.pose.covariance, one.pose.sources)
             placed_one = Keyframe(seq, one.time_ns, depth, one.bgr, pose, one.fresh)

@@ -71,6 +71,18 @@ def test_crossing_scans_meet_between_their_fixes(merged: tuple[Path, list[Path]]
     assert [s["placed"] for s in document["scans"]] == ["aligned", "aligned"]
 
 
+def test_a_track_that_bends_is_straightened_by_the_ties(tmp_path: Path) -> None:
+    there, back = leg(0.0, 12), leg(np.pi, 12)
+    bent = write_scan(tmp_path / "bent", there, Errors(bend_m=0.3))
+    straight = write_scan(tmp_path / "straight", back)
+    align_site([bent, straight], tmp_path / "site", deliver=False)
+    with ScanStore.open(tmp_path / "site" / "scan.db") as store:
+        found = list(store.keyframes())
+    poses = zip(found, [*there, *back], strict=True)
+    off = [one.depth.T_world_camera[2, 3] - T[2, 3] for one, T in poses]
+    assert np.ptp(np.subtract(off[:12], off[:11:-1])) < 0.15  # 0.3 m as flown
+
+
 def test_scans_themselves_stay_as_they_are(merged: tuple[Path, list[Path]]) -> None:
     site, (one, _) = merged
     with ScanStore.open(one / "scan.db") as store, ScanStore.open(site / "scan.db") as joined:

@@ -72,15 +72,6 @@ class SiteAlignment:
     factor: float  # errors of the used ties over their sigmas, rms, at least 1
     groups: list[int]  # (S,) scans that ties join have one number
 
-    def sigma_m(self, a: int, b: int, place_m: F64, priors: Sequence[ScanPrior]) -> F64:
-        """(3,) sigma of the motion between two scans at a place, by the ties and priors."""
-        J = np.zeros((3, len(self.covariance)))
-        for scan, sign in ((a, 1.0), (b, -1.0)):
-            centre = self.moves[scan].points(priors[scan].centre_m[None])[0]
-            rows = slice(UNKNOWNS * scan, UNKNOWNS * (scan + 1))
-            J[:, rows] = sign * _lever((place_m - centre)[None])
-        return np.asarray(np.sqrt(np.diag(J @ self.covariance @ J.T)))
-
 
 def align(ties: Sequence[Tie], priors: Sequence[ScanPrior]) -> SiteAlignment:
     """The alignment of as many scans as there are ``priors``. A scan without ties stays.

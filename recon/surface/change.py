@@ -1,43 +1,58 @@
 """Changes between two surface models of one place, with their sigmas.
 
-The difference of each cell is a mean over its neighbourhood; its sigma follows from the scatter
-of the differences there, from the cells' own sigmas and from the alignment. That is M3C2 with the
-vertical as its normal (Lague et al. 2013, doi:10.1016/j.isprsjprs.2013.04.009, Eq. 1). Steps that
-two surveys place a cell apart are no change: an object's core must stand out of the range of
-heights that the other date has around it.
+The difference of each cell is a mean over its neighbourhood, as in M3C2 with the vertical as its
+normal (Lague et al. 2013, doi:10.1016/j.isprsjprs.2013.04.009). What two flights' bending leaves
+of low frequency is estimated robustly and taken away. The sigma of a mean is what the surfaces'
+own sigmas say, times what most of the site shows: the empirical null of Efron 2004
+(doi:10.1198/016214504000000089), so correlated errors count. Steps that two surveys place some
+cells apart are no change: an object stands out of all heights that the other date has around it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from recon.surface.raster import Grid, Raster
+from recon.surface.raster import Grid, Raster, highest_lowest
 from recon.types import F32, F64, U8, Bool
 
 I32 = npt.NDArray[np.int32]
+
+BEND_CELLS, BEND_ROUNDS = 8, 8
+"""Blocks of a length over which flights bend, and rounds of its robust mean."""
+
+NOISE_REACH = 1.5
+"""Sigmas of a difference that noise alone raises the highest of the cells nearby above a cell."""
+
+MIN_VOLUME_SIGMAS = 3.0
+"""Of an object's volume."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChangeConfig:
     """Limits of what counts as a change."""
 
-    window: int = 3  # cells of a side, over which a difference is averaged
-    correlated_cells: float = 6.0  # cells whose errors stereo makes alike
-    level_sigmas: float = 1.96  # 95 %: a cell belongs to a change
-    core_sigmas: float = 3.5  # some cells of every object
-    min_core_cells: int = 3
+    windows: tuple[int, ...] = (3, 5)  # cells of a side, over which heights are averaged
+    level_sigmas: float = 2.58  # 99 %: a cell belongs to a change
+    core_sigmas: float = 4.0
+    min_core_cells: int = 3  # beyond core_sigmas, of every object
+    min_core_share: float = 0.3  # of an object's cells
     min_area_m2: float = 0.5
     min_height_m: float = 0.15
-    block_m: float = 8.0  # of blocks whose medians show what the alignment left
+    edge_cells: int = 3  # that a step may lie aside, by matching windows and by what is hidden
+    min_known: float = 0.95  # share of the ground around an object that both surfaces have
+    local_m: float = 8.0  # of blocks that may scatter more than others
+    bend_m: float = 10.0  # length over which flights bend, 1 sigma
+    block_m: float = 4.0  # of blocks whose medians show the rest of it
 
     def __post_init__(self) -> None:
         """Raise ValueError when a parameter makes no sense."""
-        if self.window < 1 or self.window % 2 == 0 or self.min_core_cells < 1:
-            raise ValueError("window must be odd, min_core_cells at least 1")
+        if any(w < 1 or w % 2 == 0 for w in self.windows) or self.min_core_cells < 1:
+            raise ValueError("windows must be odd, min_core_cells at least 1")
         if not 0 < self.level_sigmas <= self.core_sigmas:
             raise ValueError("level_sigmas must be positive, core_sigmas no less")
 
@@ -63,7 +78,7 @@ class Change:
     sigma_m: F32  # (rows, cols)
     labels: I32  # (rows, cols) 0: no change, else the number of a body
     bodies: tuple[Body, ...]
-    alignment_m: float  # sigma of the height that all cells share
+    alignment_m: float  # sigma of the height that the cells of an object share
 
     @property
     def compared_m2(self) -> float:
@@ -99,28 +114,56 @@ def mean_surface(xyz_m: F64, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:
     return Raster(grid, height.reshape(shape), sigma.reshape(shape), shown.reshape(*shape, 3))
 
 
-def change_between(
-    before: Raster, after: Raster, alignment_m: float, config: ChangeConfig | None = None
-) -> Change:
+def change_between(before: Raster, after: Raster, config: ChangeConfig | None = None) -> Change:
     """The change from ``before`` to ``after``, two rasters of one grid.
 
-    ``alignment_m`` is the sigma of the height between them; what the two show of it themselves
-    counts where it is larger. Raises ValueError for different grids.
+    Raises ValueError for different grids.
     """
     config = config or ChangeConfig()
     if before.grid != after.grid:
         raise ValueError("both surfaces must lie on one grid")
-    d = (after.height_m - before.height_m).astype(np.float32)
-    left = max(alignment_m, left_over_m(d, before.grid.cell_m, config.block_m))
-    mean, variance, count = _moments(d, config.window)
-    own = _moments(before.sigma_m**2 + after.sigma_m**2, config.window)[0]
-    cells = np.maximum(count / config.correlated_cells, 1.0)
-    sigma = np.sqrt(np.maximum(variance, own) / cells + left**2).astype(np.float32)
+    cell_m = before.grid.cell_m
+    bend = bending(after.height_m - before.height_m, cell_m, config.bend_m)
+    heights = (before.height_m + bend, after.height_m)
+    d = heights[1] - heights[0]
+    own = before.sigma_m**2 + after.sigma_m**2
+    labels = np.zeros(d.shape, np.int32)
+    scales = [_scale(heights, d, own, w, cell_m, config) for w in config.windows]
+    for sign in (1.0, -1.0):
+        _add_labels(labels, d, scales, sign, cell_m, config)
+    left = left_over_m(d, cell_m, config.block_m)
+    bodies = _bodies(d, scales[0], labels, left, cell_m, config)
+    return Change(before.grid, scales[0].mean, scales[0].sigma, labels, bodies, left)
+
+
+def bending(d: F32, cell_m: float, length_m: float) -> F32:
+    """(rows, cols) the robust mean of a difference over ``length_m`` (1 sigma) about each cell.
+
+    What stands out of it loses all weight (Geman and McClure), so the mean ignores changes.
+    """
     known = np.isfinite(d)
-    mean, sigma = (np.where(known, x, np.float32(np.nan)) for x in (mean, sigma))
-    labels = _labels(d, mean, sigma, before, after, config)
-    bodies = _bodies(d, sigma, labels, left, before.grid.cell_m, config)
-    return Change(before.grid, mean, sigma, labels, tuple(bodies), left)
+    if not known.any():
+        return np.zeros_like(d)
+    step = max(1, round(length_m / BEND_CELLS / cell_m))
+    size = (-(-d.shape[1] // step), -(-d.shape[0] // step))
+    share = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    total = cv2.resize(np.where(known, d, np.float32(0)), size, interpolation=cv2.INTER_AREA)
+    block = total / np.maximum(share, 1e-6)
+    middle = float(np.median(d[known]))
+    field = np.full(block.shape, middle, np.float32)
+
+    def blurred(x: F32) -> F32:
+        return np.asarray(
+            cv2.GaussianBlur(x, (0, 0), BEND_CELLS, borderType=cv2.BORDER_CONSTANT), np.float32
+        )
+
+    for _ in range(BEND_ROUNDS):
+        off = block - field
+        spread = max(float(np.median(np.abs(off[share > 0.5]))) / 0.6745, 1e-3)
+        weight = share / (1.0 + (off / (2.0 * spread)) ** 2) ** 2
+        field = (blurred(weight * block) + 1e-3 * middle) / (blurred(weight) + 1e-3)
+    rows, cols = d.shape
+    return np.asarray(cv2.resize(field, (cols, rows), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def left_over_m(d: F32, cell_m: float, block_m: float) -> float:
@@ -137,78 +180,145 @@ def left_over_m(d: F32, cell_m: float, block_m: float) -> float:
     return float(np.median(np.abs(middles)) / 0.6745)
 
 
-def _moments(x: F32, window: int) -> tuple[F32, F32, F32]:
-    """Mean, variance and number of the known cells in the window about each cell."""
-    known = np.isfinite(x)
-    size, border = (window, window), cv2.BORDER_CONSTANT
-    box = [
-        cv2.boxFilter(layer.astype(np.float64), -1, size, normalize=False, borderType=border)
-        for layer in (known, np.where(known, x, 0.0), np.where(known, x, 0.0) ** 2)
-    ]
-    count = np.maximum(box[0], 1.0)
-    mean = box[1] / count
-    variance = np.maximum(box[2] / count - mean**2, 0.0) * count / np.maximum(count - 1.0, 1.0)
-    return mean.astype(np.float32), variance.astype(np.float32), box[0].astype(np.float32)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scale:
+    """Two surfaces and their difference, averaged over one window; NaN where not in both."""
+
+    window: int  # cells
+    heights: tuple[F32, F32]
+    mean: F32
+    sigma: F32
 
 
-def _labels(
-    d: F32, mean: F32, sigma: F32, before: Raster, after: Raster, config: ChangeConfig
-) -> I32:
-    """Cells of each change, numbered from 1: connected, of one sign, with a core."""
-    out = np.zeros(d.shape, np.int32)
-    count = 0
-    for sign in (1.0, -1.0):
-        high, low = (after, before) if sign > 0 else (before, after)
-        standing = np.nan_to_num(sign * np.nan_to_num(mean, nan=0.0))
-        size = np.nan_to_num(standing / sigma, nan=0.0)
-        # The core stands out of all that the other date has within a cell.
-        above = high.height_m - _highest(low.height_m)
-        core = (size > config.core_sigmas) & (standing > config.min_height_m)
-        core &= np.nan_to_num(above, nan=-1.0) > config.level_sigmas * np.nan_to_num(sigma, nan=1.0)
-        member = (np.nan_to_num(sign * d, nan=0.0) > config.level_sigmas * np.nan_to_num(
-            sigma, nan=np.inf)) | core  # fmt: skip
-        number, found = cv2.connectedComponents(member.astype(np.uint8), connectivity=4)
-        cores = np.bincount(found[core], minlength=number)
-        cells = np.bincount(found.ravel(), minlength=number)
-        good = (cores >= config.min_core_cells) & (
-            cells * before.grid.cell_m**2 >= config.min_area_m2
-        )
-        good[0] = False
-        numbers = np.zeros(number, np.int32)
-        numbers[good] = count + 1 + np.arange(int(good.sum()))
-        count += int(good.sum())
-        out = np.where(numbers[found] > 0, numbers[found], out)
+def _scale(
+    heights: tuple[F32, F32], d: F32, own: F32, window: int, cell_m: float, config: ChangeConfig
+) -> _Scale:
+    known = np.isfinite(d)
+    mean, said = (
+        np.where(known, x, np.float32(np.nan))
+        for x in (_mean(d, window), np.sqrt(_mean(own, window)))
+    )
+    step = max(1, round(config.local_m / cell_m))
+    sigma = said * _scatter(mean / said, step, 2 * config.edge_cells)
+    return _Scale(window, (_mean(heights[0], window), _mean(heights[1], window)), mean, sigma)
+
+
+def _scatter(ratio: F32, step: int, lag: int) -> F32:
+    """(rows, cols) robust spread of a ratio: of the whole, or of the block of ``step`` cells.
+
+    A block's spread is that of differences ``lag`` cells apart, of which outlines of objects
+    in it touch few.
+    """
+    known = np.isfinite(ratio)
+    whole = float(np.median(np.abs(ratio[known]))) / 0.6745 if known.any() else 1.0
+    out = np.full(ratio.shape, whole, np.float32)
+    for r in range(0, ratio.shape[0], step):
+        for c in range(0, ratio.shape[1], step):
+            block = ratio[r : r + step, c : c + step]
+            steps = [
+                (block[lag:] - block[:-lag]).ravel(),
+                (block[:, lag:] - block[:, :-lag]).ravel(),
+            ]
+            some = np.concatenate(steps)
+            some = some[np.isfinite(some)]
+            if len(some) > step:
+                spread = float(np.median(np.abs(some))) / (0.6745 * np.sqrt(2.0))
+                out[r : r + step, c : c + step] = max(whole, spread)
     return out
 
 
-def _highest(height_m: F32) -> F32:
-    """Highest known height within a cell of each."""
-    filled = np.where(np.isfinite(height_m), height_m, np.float32(-1e6)).astype(np.float32)
-    return np.asarray(cv2.dilate(filled, np.ones((3, 3), np.uint8)), np.float32)
+def _mean(x: F32, window: int) -> F32:
+    """Mean of the known cells in the window about each cell; NaN without any."""
+    known = np.isfinite(x)
+    size, border = (window, window), cv2.BORDER_CONSTANT
+    middle = float(np.median(x[known])) if known.any() else 0.0
+    total, count = (
+        cv2.boxFilter(layer.astype(np.float64), -1, size, normalize=False, borderType=border)
+        for layer in (np.where(known, x - middle, 0.0), known)
+    )
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(count > 0.5, total / count + middle, np.nan), np.float32)
+
+
+def _add_labels(
+    labels: I32, d: F32, scales: Sequence[_Scale], sign: float, cell_m: float, config: ChangeConfig
+) -> None:  # fmt: skip
+    """Number the cells of each change of one sign: connected, with a core."""
+    core = np.zeros(labels.shape, np.bool_)
+    for scale in scales:
+        low, high = scale.heights if sign > 0 else scale.heights[::-1]
+        top = highest_lowest(low, config.edge_cells)[0] - NOISE_REACH * scale.sigma
+        above = high - np.fmax(low, top)
+        with np.errstate(invalid="ignore"):
+            core |= above > np.maximum(config.core_sigmas * scale.sigma, config.min_height_m)
+    typical = cv2.medianBlur(np.nan_to_num(sign * d, nan=0.0), 3)  # keeps outlines, not noise
+    with np.errstate(invalid="ignore"):
+        member = core | (typical > config.level_sigmas * scales[0].sigma)
+    number, found = cv2.connectedComponents(member.astype(np.uint8), connectivity=4)
+    cores = np.bincount(found[core], minlength=number)
+    cells = np.bincount(found.ravel(), minlength=number)
+    enough = np.maximum(config.min_core_cells, config.min_core_share * cells)
+    good = (cores >= enough) & (cells * cell_m**2 >= config.min_area_m2)
+    good[0] = False
+    numbers = np.zeros(number, np.int32)
+    numbers[good] = labels.max() + 1 + np.arange(int(good.sum()))
+    new = numbers[found]
+    labels[new > 0] = new[new > 0]
 
 
 def _bodies(
-    d: F32, sigma: F32, labels: I32, left_m: float, cell_m: float, config: ChangeConfig
-) -> list[Body]:
-    """Area and volume of each change; its rim, where the mean falls off, belongs to the volume."""
-    out = []
-    for label in range(1, int(labels.max(initial=0)) + 1):
-        inside = labels == label
-        rim = cv2.dilate(inside.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        rim &= np.isfinite(d) & ((labels == 0) | inside)
-        heights = d[inside & np.isfinite(d)].astype(np.float64)
-        volume = float(np.sum(d[rim], dtype=np.float64)) * cell_m**2
-        noise = np.maximum(sigma[rim].astype(np.float64) ** 2 - left_m**2, 0.0)
-        independent = float(np.sqrt(np.sum(noise))) * config.window * cell_m**2
-        shared = left_m * float(rim.sum()) * cell_m**2
-        peak = heights[np.argmax(np.abs(heights))]
-        out.append(
-            Body(
-                label, float(inside.sum()) * cell_m**2, volume,
-                float(np.hypot(independent, shared)), float(heights.mean()), float(peak),
-            )
-        )  # fmt: skip
-    return out
+    d: F32, scale: _Scale, labels: I32, left_m: float, cell_m: float, config: ChangeConfig
+) -> tuple[Body, ...]:
+    """The changes that are significant as a whole; the others leave ``labels``."""
+    found = (
+        _body(d, scale, labels, label, left_m, cell_m, config)
+        for label in range(1, int(labels.max(initial=0)) + 1)
+    )
+    bodies = tuple(body for body in found if body is not None)
+    labels[~np.isin(labels, [body.label for body in bodies])] = 0
+    return bodies
+
+
+def _body(
+    d: F32, scale: _Scale, labels: I32, label: int, left_m: float, cell_m: float,
+    config: ChangeConfig,
+) -> Body | None:  # fmt: skip
+    """Area and volume of a change above the ground around it; None when that is no significant one.
+
+    At the rim of what both flights saw, where few views reach, nothing is a change: the ground
+    around it must be known. The rim that stereo smears belongs to the volume. Sigma also holds
+    one cell all along the outline, as matching windows make what stands wider.
+    """
+    rim = config.edge_cells
+    rows, cols = np.nonzero(labels == label)
+    window = tuple(slice(max(x.min() - 4 * rim, 0), x.max() + 4 * rim + 1) for x in (rows, cols))
+    d, labels, sigma = d[window], labels[window], scale.sigma[window]
+    inside = labels == label
+    surround = _grown(inside, 2 * rim) & ~inside
+    if np.isfinite(d[surround]).mean() < config.min_known:
+        return None
+    grown = _grown(inside, rim) & np.isfinite(d) & ((labels == 0) | inside)
+    around = _grown(inside, 4 * rim) & ~_grown(labels > 0, rim) & np.isfinite(d)
+    ground = float(np.median(d[around])) if np.count_nonzero(around) > 8 * rim else 0.0
+    heights = d[inside & np.isfinite(d)].astype(np.float64) - ground
+    volume = float(np.sum(d[grown], dtype=np.float64) - ground * np.count_nonzero(grown))
+    independent = float(np.sqrt(np.sum(sigma[grown].astype(np.float64) ** 2))) * scale.window
+    noise = float(np.hypot(independent, left_m * np.count_nonzero(grown)))
+    if abs(volume) < MIN_VOLUME_SIGMAS * noise:
+        return None
+    border = inside & _grown(~inside, 1) & np.isfinite(d)
+    outline = float(np.abs(d[border] - ground).sum())
+    return Body(
+        label, float(inside.sum()) * cell_m**2, volume * cell_m**2,
+        float(np.hypot(noise, outline)) * cell_m**2, float(heights.mean()),
+        float(heights[np.argmax(np.abs(heights))]),
+    )  # fmt: skip
+
+
+def _grown(cells: Bool, by: int) -> Bool:
+    """The cells and those within ``by`` cells of them."""
+    square = np.ones((2 * by + 1, 2 * by + 1), np.uint8)
+    return np.asarray(cv2.dilate(cells.astype(np.uint8), square) > 0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -206,7 +206,7 @@ def reliable(raster: Raster) -> Raster:
     height = raster.height_m.copy()
     sigma = np.nan_to_num(raster.sigma_m, nan=1.0)
     for reach in SMEAR_CELLS:
-        high, low = _highest_lowest(height, reach)
+        high, low = highest_lowest(height, reach)
         limit = SMEAR_SLOPE * reach * raster.grid.cell_m + sigma
         height[(high - height > limit) & (height - low > limit)] = np.nan
     known = np.isfinite(height)
@@ -214,11 +214,11 @@ def reliable(raster: Raster) -> Raster:
     window = (9, 9)
     count = cv2.boxFilter(known.astype(np.float32), -1, window, normalize=False)
     mean = cv2.boxFilter(precision, -1, window, normalize=False) / np.maximum(count, 1.0)
-    above = height - _highest_lowest(height, EDGE_CELLS)[1] > STEP_M
+    above = height - highest_lowest(height, EDGE_CELLS)[1] > STEP_M
     height[above & (precision < EDGE_PRECISION * mean)] = np.nan
     known = np.isfinite(height)
     held = cv2.boxFilter(known.astype(np.float32), -1, (5, 5))
-    high = height - _highest_lowest(height, SPARSE_CELLS)[1] > STEP_M
+    high = height - highest_lowest(height, SPARSE_CELLS)[1] > STEP_M
     usual = float(np.median(held[known])) if known.any() else 1.0
     height[high & (held < SPARSE_SHARE * usual)] = np.nan
     return without_cells(raster, ~np.isfinite(height))
@@ -243,11 +243,11 @@ def standing_height(raster: Raster, reach_m: float = 2.0, share: float = 0.99) -
     if not known.any():
         return 0.0
     reach = max(1, round(reach_m / raster.grid.cell_m))
-    low = _highest_lowest(raster.height_m, reach)[1]
+    low = highest_lowest(raster.height_m, reach)[1]
     return float(np.quantile((raster.height_m - low)[known], share))
 
 
-def _highest_lowest(height_m: F32, reach_cells: int) -> tuple[F32, F32]:
+def highest_lowest(height_m: F32, reach_cells: int) -> tuple[F32, F32]:
     """Highest and lowest known height within ``reach_cells`` of each cell, in both axes."""
     known = np.isfinite(height_m)
     square = np.ones((2 * reach_cells + 1, 2 * reach_cells + 1), np.uint8)

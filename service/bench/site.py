@@ -83,12 +83,14 @@ def _simulated(folder: Path, options: BenchOptions) -> list[BenchResult]:
     later = _replayed(folder, flown, "later", 99, options)
     skyrelief("site", "compare", str(folder / "one-0"), str(later), "--out", str(folder / "change"))
     change = json.loads((folder / "change" / "change.json").read_text())
+    places = [read_truth(folder / name) for name in ("one", "later")]
+    off = seam_of(folder / "change", [folder / "one-0", later], places).site_m
     results = _seam_results(seams, truths[0].agl_m)
     results.append(
         BenchResult("site", "flights without change that show none", 100.0 * unchanged / seeds, "%",
                     note=f"{seeds} pairs; goal 95 %")
     )  # fmt: skip
-    return results + change_results(change, folder / "one", folder / "change" / "change.tif")
+    return results + change_results(change, folder / "one", folder / "change" / "change.tif", off)
 
 
 def _replayed(
@@ -199,15 +201,18 @@ def _seam_results(seams: Sequence[Seam], height_m: float) -> list[BenchResult]:
 # ---- changes ---------------------------------------------------------------------------------
 
 
-def change_results(change: dict[str, Any], flight: Path, map_: Path) -> list[BenchResult]:
+def change_results(
+    change: dict[str, Any], flight: Path, map_: Path, off_m: F64
+) -> list[BenchResult]:
     """Boxes found, false objects and volumes, of a comparison of date 1 with date 2.
 
-    A box counts where both flights have surface all around it, by ``map_``, the change.tif.
+    A box counts where both flights have surface all around it, by ``map_``, the change.tif. It is
+    sought where the site has it, which lies ``off_m`` (3,) from the truth by the fixes.
     """
     boxes = json.loads((flight / "truth" / "changes.json").read_text())
-    middles = ORIGIN.to_utm(np.array([[*np.mean(b["outline_m"], axis=0), 0.0] for b in boxes]))[
-        :, :2
-    ]
+    middles = ORIGIN.to_utm(
+        np.array([[*np.mean(b["outline_m"], axis=0), 0.0] for b in boxes]) + off_m
+    )[:, :2]
     places = np.array([[o["east_m"], o["north_m"]] for o in change["objects"]]).reshape(-1, 2)
     seen = [k for k, m in enumerate(middles) if _is_compared(map_, m)]
     found, used = [], set()

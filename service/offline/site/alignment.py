@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,17 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import rays
-from recon.posegraph.ground_control import Closure, Track, supported
+from recon.posegraph.ground_control import (
+    BatchConfig,
+    Closure,
+    Track,
+    adjust,
+    placed_by_points,
+    supported,
+)
 from recon.posegraph.site_alignment import ScanPrior, SiteAlignment, Tie, align
 from recon.posegraph.submap_loops import SubmapLoopConfig
-from recon.types import Bool, Keyframe
+from recon.types import F64, Bool, Keyframe
 from service.errors import InputError
 from service.offline.refine.stored_loops import BREAK_S, StoredLoops
 from service.offline.site.gather import Member, gather
@@ -40,6 +47,9 @@ MIN_SIGMA = np.array([0.003] * 3 + [0.05] * 3 + [0.003])
 SIGMA_SCALE = 0.01
 """Of a scan that does not say how sure its scale is."""
 
+SAME_SCALE = 1e-5
+"""Sigma of the scale along a scan: what a flight's scale varies by is shift of its keyframes."""
+
 KEPT = 128
 """Keyframes held in memory while ties are sought."""
 
@@ -54,7 +64,6 @@ class AlignedSite:
     folder: Path
     members: list[Member]
     alignment: SiteAlignment
-    priors: list[ScanPrior]
     document: dict[str, Any]  # the content of site.json
 
 
@@ -73,8 +82,8 @@ def align_site(folders: Sequence[Path], out: Path, deliver: bool = True) -> Alig
     try:
         members, notes = gather(unique, fresh, out.resolve().name)
         with ScanStore.open(fresh) as store:
-            found, priors, ties = _aligned(store, members)
-            store.add_reposes(_reposes(store, members, found))
+            found, priors, ties, adjusted = _aligned(store, members)
+            store.add_reposes(_reposes(store, members, found, adjusted))
             document = _document(store, members, found, priors, ties, notes, known)
             store.update_header(notes=tuple(document["notes"]))
         _replace(fresh, out / "scan.db")
@@ -87,7 +96,7 @@ def align_site(folders: Sequence[Path], out: Path, deliver: bool = True) -> Alig
     if deliver:
         with ScanStore.open(out / "scan.db") as store:
             write_deliverables(out, store, {})
-    return AlignedSite(out, members, found, priors, document)
+    return AlignedSite(out, members, found, document)
 
 
 def _known(out: Path) -> dict[str, Any]:
@@ -121,18 +130,51 @@ def _replace(fresh: Path, path: Path) -> None:
 
 def _aligned(
     store: ScanStore, members: Sequence[Member]
-) -> tuple[SiteAlignment, list[ScanPrior], list[Tie]]:
+) -> tuple[SiteAlignment, list[ScanPrior], list[Tie], dict[int, tuple[F64, F64]]]:
+    """The motions of the scans, their priors, the ties, and each keyframe's pose and covariance."""
     track, seqs, scans = _joined(store, members)
     keyframe = lru_cache(maxsize=KEPT)(lambda k: store.keyframe(seqs[k]))
-    ties = []
+    ties, kept = [], []
     if len(members) > 1:
         loops = StoredLoops(track, keyframe, SubmapLoopConfig(min_gap=1), scans).find()
         for loop in supported(loops, track.poses):
             one = keyframe(loop.b)
             assert one is not None
             ties.append(_tie(loop, track, one, scans))
+            kept.append(loop)
     priors = [_prior(track, np.array(scans) == k) for k in range(len(members))]
-    return align(ties, priors), priors, ties
+    found = align(ties, priors)
+    bent = zip(*_bent(track, scans, found, kept, ties), strict=True)
+    return found, priors, ties, dict(zip(seqs, bent, strict=True))
+
+
+def _bent(
+    track: Track, scans: Sequence[int], found: SiteAlignment, loops: Sequence[Closure],
+    ties: Sequence[Tie],
+) -> tuple[F64, F64]:  # fmt: skip
+    """Poses and covariances after the motions of the scans, adjusted to the ties.
+
+    What a receiver and vision err along a flight bends its track; the ties say where.
+    """
+    moved = np.array([found.moves[s].pose(T) for s, T in zip(scans, track.poses, strict=True)])
+    closures = []
+    for loop, tie, used in zip(loops, ties, found.used, strict=True):
+        if used:
+            at_a, at_b = found.moves[tie.a].points(tie.at_a), found.moves[tie.b].points(tie.at_b)
+            fit = placed_by_points(at_b, at_a)
+            assert fit is not None  # four corners of a view
+            D = se3.compose(fit[1], at_a.mean(axis=0) - fit[1] @ at_b.mean(axis=0))
+            T = se3.inverse(moved[loop.a]) @ D @ moved[loop.b]
+            closures.append(replace(loop, T_a_b=T))
+    if not closures:
+        return moved, track.covariances
+    config = BatchConfig(sigma_scale=SAME_SCALE, sigma_scale_walk=SAME_SCALE)
+    whole = Track(moved, track.times_s, track.covariances, loops=closures)
+    try:
+        adjusted = adjust(whole, config=config)
+    except RuntimeError as error:  # so the solver says that the system is ill-posed
+        raise InputError("the poses of these scans contradict each other too far") from error
+    return adjusted.poses, adjusted.covariances
 
 
 def _joined(store: ScanStore, members: Sequence[Member]) -> tuple[Track, list[int], list[int]]:
@@ -180,20 +222,18 @@ def _prior(track: Track, own: Bool) -> ScanPrior:
     return ScanPrior(centre, np.maximum(sigma, MIN_SIGMA))
 
 
-def _reposes(store: ScanStore, members: Sequence[Member], found: SiteAlignment) -> list[Repose]:
+def _reposes(
+    store: ScanStore, members: Sequence[Member], found: SiteAlignment,
+    adjusted: dict[int, tuple[F64, F64]],
+) -> list[Repose]:  # fmt: skip
     """The keyframes' poses after the alignment."""
     out = []
-    for k, (member, move) in enumerate(zip(members, found.moves, strict=True)):
-        rows = slice(7 * k, 7 * k + 6)
-        spread = found.covariance[rows, rows]
+    for member, move in zip(members, found.moves, strict=True):
         for seq in member.seqs:
-            one, now = store.keyframe(seq), store.repose(seq)
-            if one is None:
-                continue
-            scale = move.growth * (1.0 if now is None else now.scale)
-            T = move.pose(one.depth.T_world_camera)
-            lever = se3.adjoint(se3.compose(np.eye(3), T[:3, 3]))
-            out.append(Repose(seq, ALIGNED, T, scale, lever @ spread @ lever.T))
+            if seq in adjusted:
+                now = store.repose(seq)
+                scale = move.growth * (1.0 if now is None else now.scale)
+                out.append(Repose(seq, ALIGNED, adjusted[seq][0], scale, adjusted[seq][1]))
     return out
 
 

@@ -56,7 +56,7 @@ def compare(before: Path, after: Path, out: Path, cell_m: float | None = None) -
     one, two = _pair(site, before, after)
     with ScanView(out) as view:
         older, newer = surfaces(view, [site.members[one], site.members[two]], cell_m)
-        change = change_between(older, newer, vertical_sigma_m(site, one, two))
+        change = change_between(older, newer)
         if change.compared_m2 == 0.0:
             raise InputError(f"{before} and {after} share no ground")
         document = _document(site, change, one, two)
@@ -145,12 +145,6 @@ def _inside(depth: DepthMap, cells: Bool, grid: Grid, frame: LocalFrame | None) 
     xy = (points if frame is None else frame.to_utm(points))[:, :2]
     out[known] = grid.holds(xy) & cells[grid.cells(xy)]
     return out
-
-
-def vertical_sigma_m(site: AlignedSite, one: int, two: int) -> float:
-    """Sigma of the height between two members where both are."""
-    middle = 0.5 * (site.priors[one].centre_m + site.priors[two].centre_m)
-    return float(site.alignment.sigma_m(one, two, middle, site.priors)[2])
 
 
 def _document(site: AlignedSite, change: Change, one: int, two: int) -> dict[str, Any]:
