@@ -105,6 +105,9 @@ def test_a_image_tag_serves_when_there_is_no_telemetry() -> None:
     tag = GeoTag(30.0, -98.0, 300.0, ypr_deg=(90.0, -90.0, 0.0), relative_alt_m=80.0)
     prior = some.prior(None, tag)
     assert some.georeference == "exif" and prior.agl_m == 80.0
+    bare = rig().prior(None, replace(tag, relative_alt_m=None))
+    assert prior.sigma_position_m is not None and bare.sigma_position_m is not None
+    assert prior.sigma_position_m[2] < 10.0 < bare.sigma_position_m[2]  # a drone's barometer
     _, top, view = up_and_right(prior.R_world_camera)
     np.testing.assert_allclose(view, [0, 0, -1], atol=1e-9)
     np.testing.assert_allclose(top, [1, 0, 0], atol=1e-9)

@@ -31,6 +31,10 @@ AT_REST_M_S, ON_GROUND_M = 0.3, 2.0
 MIN_SIGMA_M, MAX_ALTITUDE_M = 0.005, 1e5
 """Limits of plausible accuracies and heights in tags."""
 
+TAG_HEIGHT_M, BAROMETER_M = 50.0, 5.0
+"""Sigma of an altitude in a still's tags: of a camera's receiver, and of a drone that also writes
+its height above the take-off point."""
+
 NO_YAW_RAD = 3.0
 """Sigma of an unknown heading."""
 
@@ -150,7 +154,8 @@ class Rig:
             )
         if state is None and tag is not None and self.georeference != "gnss":
             self.georeference = "exif"
-            return Fix(tag.lat_deg, tag.lon_deg, tag.alt_amsl_m, tag.sigma_h_m, 50.0)
+            sigma_v = TAG_HEIGHT_M if tag.relative_alt_m is None else BAROMETER_M
+            return Fix(tag.lat_deg, tag.lon_deg, tag.alt_amsl_m, tag.sigma_h_m, sigma_v)
         return None
 
     def _position(self, fix: Fix | None) -> tuple[F64 | None, F64 | None]:

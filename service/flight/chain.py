@@ -28,6 +28,9 @@ FARTHEST_M = 1e6
 
 HEADING_KNOWN_RAD = 1.0
 
+HEIGHT_KNOWN_M = 20.0
+"""Sigma of a fix's height below which it lays two stretches of one flight on each other."""
+
 
 class KeyframeStep(NamedTuple):
     """The step of the camera from the keyframe before, in units of the odometry."""
@@ -222,7 +225,9 @@ class Pieces:
             self._last.append(seq)
         self._last[-1] = seq
         self._points[segment] += points
-        if prior.sigma_position_m is not None and prior.sigma_yaw_rad < HEADING_KNOWN_RAD:
+        sigma = prior.sigma_position_m
+        is_known = sigma is not None and sigma[2] < HEIGHT_KNOWN_M
+        if is_known and prior.sigma_yaw_rad < HEADING_KNOWN_RAD:
             self._placed.add(segment)
 
     def apart(self, graph: PoseGraph) -> list[tuple[int, int]]:
@@ -237,7 +242,9 @@ class Pieces:
             if edge.accepted and a is not None and b is not None:
                 _join(piece, a, b)
                 looped |= {a, b}
-        fixed = [s for s in self._segments if s in self._placed or _rests_on_fixes(graph, s)]
+        heights = {s: sigma for s in piece if (sigma := _sigma_height_m(graph, s)) is not None}
+        loose = {s for s, sigma in heights.items() if sigma > HEIGHT_KNOWN_M}
+        fixed = [s for s in self._segments if s in self._placed or s in heights.keys() - loose]
         for segment in fixed[1:]:
             _join(piece, fixed[0], segment)
         if fixed:
@@ -252,7 +259,8 @@ class Pieces:
             (first, last)
             for segment, first, last in ends
             # A long flight forgets loops, and not which segments they tied.
-            if piece[segment] != main and (segment in looped or not graph.is_tied(segment))
+            if piece[segment] != main
+            and (segment in looped or segment in loose or not graph.is_tied(segment))
         ]
 
     def _segment_of(self, seq: int) -> int | None:
@@ -260,9 +268,12 @@ class Pieces:
         return self._segments[at] if at >= 0 else None
 
 
-def _rests_on_fixes(graph: PoseGraph, segment: int) -> bool:
+def _sigma_height_m(graph: PoseGraph, segment: int) -> float | None:
+    """Sigma of the height at which fixes place a segment; None where they do not."""
     found = graph.similarity(segment)
-    return found is not None and "gnss" in found.sources
+    if found is None or "gnss" not in found.sources:
+        return None
+    return float(np.sqrt(found.covariance[5, 5]))
 
 
 def _join(piece: dict[int, int], a: int, b: int) -> None:
