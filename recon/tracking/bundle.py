@@ -123,22 +123,9 @@ def linearise(P: F64, x: F64, uv: F64, k: F64, huber: float, Jc: F64, Jp: F64, r
 
 @njit(cache=True, nogil=True)
 def _normal_equations(
-    T: F64,
-    X: F64,
-    cam: I64,
-    start: I64,
-    uv: F64,
-    k: F64,
-    huber: float,
-    slot: I64,
-    n_free: int,
-    damping: float,
-    S: F64,
-    g: F64,
-    Hpp_inv: F64,
-    bp: F64,
-    W: F64,
-) -> None:
+    T: F64, X: F64, cam: I64, start: I64, uv: F64, k: F64, huber: float, slot: I64, n_free: int,
+    damping: float, S: F64, g: F64, Hpp_inv: F64, bp: F64, W: F64,
+) -> None:  # fmt: skip
     """Reduced camera system ``S`` (6F, 6F), ``g`` (6F,) and what back-substitution needs."""
     S[:, :] = 0.0
     g[:] = 0.0

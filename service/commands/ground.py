@@ -33,6 +33,16 @@ SHOW_S = 2.0
 CLOSING_S = 900.0
 """Writing deliverables at the end may take so long; then the init system ends it."""
 
+TokenFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--portal-token-file",
+        "--portal-token",
+        help="file of the portal's tokens, a line each: TOKEN or NAME TOKEN; "
+        "default: one is made and kept in STORE/portal-token",
+    ),
+]
+
 
 def ground(
     connect: Annotated[
@@ -68,15 +78,7 @@ def ground(
     portal: Annotated[
         str | None, typer.Option(help="serve the web portal at HOST:PORT, such as 127.0.0.1:8080")
     ] = None,
-    portal_token: Annotated[
-        Path | None,
-        typer.Option(
-            "--portal-token-file",
-            "--portal-token",
-            help="file of the portal's tokens, a line each: TOKEN or NAME TOKEN; "
-            "default: one is made and kept in STORE/portal-token",
-        ),
-    ] = None,
+    portal_token: TokenFile = None,
     portal_tls: Annotated[
         tuple[Path, Path] | None, typer.Option(help="the portal's certificate and key")
     ] = None,

@@ -386,15 +386,13 @@ def build_stages(
 ) -> Stages:
     """The stages that the configuration asks for. Raises ValueError for an unusable camera model.
 
-    ``live`` lets old work give way when reconstruction cannot keep up; otherwise nothing is
-    dropped. ``pages`` is a folder that the parts of the map flown long ago may go to; what
-    is kept of every view lies there too, in files without a name. None: keep all in memory, and
-    drop the oldest parts of the map. ``is_lens_assumed`` widens sigmas.
+    ``live`` drops old work when reconstruction cannot keep up. ``pages`` is a folder for the oldest
+    parts of the map and, in files without a name, for what is kept of every view. None: keep all
+    in memory, and drop the oldest parts of the map. ``is_lens_assumed`` widens sigmas.
     """
     compute, stopwatch, resources = config.compute, Stopwatch(), ExitStack()
     limit_threads(compute.threads)
-    refused: Counter[str] = Counter()
-    rejected: Counter[str] = Counter()
+    refused, rejected = Counter[str](), Counter[str]()
     debug: dict[str, Array] | None = {} if config.scan.keep_debug else None
     camera = with_shutter(camera, config.camera)
     undistort = Undistort(camera, compute.guide_width, stopwatch)
@@ -417,13 +415,16 @@ def build_stages(
     )
     pair = PairStages(backend, dense, debug, stopwatch)
     views = StereoViews(selection, odometry, undistort.camera, undistort.valid, refused)
+    surface = SurfaceMap(
+        pages, compute.map_voxels, config.scan.resolution_m, stopwatch, float(camera.K[0, 0]),
+        is_lens_assumed,
+    )  # fmt: skip
 
     def in_background(
         work: Callable[[StereoCandidate], Keyframe | None],
     ) -> BackgroundWorker[StereoCandidate, Keyframe | None]:
-        if debug is not None:
-            return BackgroundWorker(None, work, MAX_WAITING, live)
-        return BackgroundWorker("dense", work, MAX_WAITING, live)
+        name = "dense" if debug is None else None
+        return BackgroundWorker(name, work, MAX_WAITING, live)
 
     return Stages(
         undistort=undistort,
@@ -438,14 +439,7 @@ def build_stages(
         plausible=Plausible(rejected),
         register=Register(backend, stopwatch),
         chain=_chain(config, pages, track.is_settled, rejected, stopwatch, resources),
-        map=SurfaceMap(
-            pages,
-            compute.map_voxels,
-            config.scan.resolution_m,
-            stopwatch,
-            float(camera.K[0, 0]),
-            is_lens_assumed,
-        ),
+        map=surface,
         keyframe=MakeKeyframe(debug),
         in_background=in_background,
         stopwatch=stopwatch,
