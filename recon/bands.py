@@ -58,7 +58,7 @@ def in_bands(kernel: Callable[..., None], count: int, *arguments: Any) -> None:
     """Call ``kernel(first, end, *arguments)`` so that 0 to ``count`` is covered once.
 
     The bands run at the same time, so none may write what another reads. A band that no thread has
-    begun when the caller is done with its own is the caller's too: nobody waits for the work of
+    begun when the caller is done with its own is the caller's too: no caller waits for the work of
     others, and a band may share out rows itself. An exception of the kernel is raised after all
     bands have ended.
     """
