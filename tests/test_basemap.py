@@ -5,19 +5,19 @@ from __future__ import annotations
 import gzip
 import sqlite3
 import struct
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from portal_client import TOKEN, Client
 
 from recon.types import U8
 from service.errors import InputError
-from service.ground.basemap import open_basemap, tile_number
+from service.ground.basemap import open_basemap, tile_number, tile_of, tile_px
 from service.ground.portal import Portal, PortalConfig
 
 Tiles = dict[tuple[int, int, int], bytes]
@@ -169,6 +169,69 @@ def test_what_cannot_be_used_is_said_in_one_line(tmp_path: Path) -> None:
             open_basemap(path)
 
 
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(KINDS[1:]), st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255))),
+       st.integers(0, 400))  # fmt: skip
+def test_damaged_pmtiles_give_an_error_or_a_tile(
+    tmp_path: Path, kind: str, changes: list[tuple[int, int]], cut: int
+) -> None:
+    """Whatever header and directories claim, a request ends, with bytes of the file at most."""
+    data = bytearray(given_as(kind, tmp_path).read_bytes())
+    for at, value in changes:
+        data[at] = value
+    path = tmp_path / "damaged.pmtiles"
+    path.write_bytes(bytes(data[: len(data) - cut]))
+    with suppress(InputError):
+        found = open_basemap(path)
+        for z, x, y in TILES:
+            tile = tile_of(found, z, x, y)
+            assert tile is None or len(tile) <= len(data)
+
+
+def test_a_directory_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> None:
+    bomb = gzip.compress(bytes(4 << 20))
+    path = pmtiles(tmp_path / "bomb.pmtiles", TILES)
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<2Q", data, 8, len(data), len(bomb))
+    path.write_bytes(bytes(data) + bomb)
+    with pytest.raises(InputError, match="too large"):
+        open_basemap(path)
+
+
+def test_mbtiles_that_are_no_images_or_never_end_are_refused(tmp_path: Path) -> None:
+    path = mbtiles(tmp_path / "a.mbtiles", {})
+    with closing(sqlite3.connect(path)) as base:
+        base.execute("INSERT INTO tiles VALUES (0, 0, 0, 1000000000000)")
+        base.commit()
+    with pytest.raises(InputError, match="damaged"):
+        tile_of(open_basemap(path), 0, 0, 0)
+    with closing(sqlite3.connect(path)) as base:
+        base.execute("INSERT INTO tiles VALUES (1000000000, 0, 0, 0)")
+        base.commit()
+    with pytest.raises(InputError, match="zooms"):
+        open_basemap(path)
+    with closing(sqlite3.connect(path)) as base:
+        base.execute("DROP TABLE tiles")
+        endless = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i FROM n"
+        columns = "i AS zoom_level, 0 AS tile_column, 0 AS tile_row, 0 AS tile_data"
+        base.execute(f"CREATE VIEW tiles AS SELECT {columns} FROM ({endless})")
+        base.commit()
+    with pytest.raises(InputError, match="interrupted"):
+        open_basemap(path)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
+def test_the_size_of_a_tile_is_read_before_it_is_decoded(suffix: str) -> None:
+    shown = np.random.default_rng(0).integers(0, 255, (48, 96, 3), np.uint8)
+    for quality in ([], [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == ".webp" else []):
+        assert tile_px(cv2.imencode(suffix, shown, quality)[1].tobytes()) == (96, 48)
+    large = bytearray(cv2.imencode(".png", shown)[1].tobytes())
+    struct.pack_into(">II", large, 16, 1 << 20, 1 << 10)
+    for data in (bytes(large), b"", b"RIFF", b"text"):
+        with pytest.raises(ValueError, match="no image of a tile's size"):
+            tile_px(data)
+
+
 @pytest.mark.parametrize("kind", ["mbtiles", "leaves"])
 def test_the_portal_serves_it_also_below_its_finest_zoom(tmp_path: Path, kind: str) -> None:
     (tmp_path / "scans").mkdir()
@@ -187,6 +250,7 @@ def test_the_portal_serves_it_also_below_its_finest_zoom(tmp_path: Path, kind: s
             shown = decoded(data)
             want = np.array((90, 70, 130)) // halves
             assert np.abs(shown[128, 128, :3].astype(int) - want).max() <= 1
+        assert client.ask("/tiles/basemap/99999999999/0/0")[0] == 404
         status, data, _ = client.ask("/tiles/basemap/2/3/3")
         assert status == 200 and not decoded(data)[..., 3].any()
     finally:

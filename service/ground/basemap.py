@@ -1,14 +1,15 @@
 """A basemap that the operator gives: raster tiles of an MBTiles or a PMTiles (version 3) file.
 
 MBTiles 1.3 is a SQLite database with rows counted from the south. PMTiles orders tiles along a
-Hilbert curve; directories of runs of them lead to their bytes.
+Hilbert curve; directories of runs of them lead to their bytes. The file may be a stranger's: what
+it claims is checked before memory or time is spent on it.
 """
 
 from __future__ import annotations
 
-import gzip
 import sqlite3
 import struct
+import zlib
 from collections.abc import Callable
 from contextlib import closing
 from functools import lru_cache
@@ -16,13 +17,19 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from service.errors import InputError
+from service.stream.planes import image_size
 
 MEDIA = {"png": "image/png", "jpg": "image/jpeg", "jpeg": "image/jpeg", "webp": "image/webp"}
 PM_MEDIA = {2: "image/png", 3: "image/jpeg", 4: "image/webp"}
 PM_PLAIN, PM_GZIP = 1, 2
 PM_HEADER = struct.Struct("<7sB11Q6B4iB2i")
-MAX_DIRECTORY_BYTES = 1 << 26
-DEEPEST_DIRECTORY = 4
+MAX_DIRECTORY_BYTES, MAX_TILE_BYTES = 1 << 20, 1 << 23
+MAX_DIRECTORIES, DEEPEST_DIRECTORY = 16, 4
+MAX_ZOOM = 30
+MAX_SIDE_PX = 4096
+MAX_STEPS = 20_000_000
+"""Instructions of SQLite for one question; an index needs some hundred."""
+FAULTS = (sqlite3.Error, OSError, ValueError, struct.error, zlib.error)
 
 
 class Basemap(Protocol):
@@ -46,8 +53,35 @@ def open_basemap(path: Path) -> Basemap:
         raise InputError(f"basemap {path}: no such file")
     try:
         return kinds[path.suffix.lower()](path)
-    except (sqlite3.Error, OSError, ValueError, struct.error) as error:
+    except FAULTS as error:
         raise InputError(f"basemap {path} cannot be read ({error})") from error
+
+
+def tile_of(basemap: Basemap, zoom: int, x: int, y: int) -> bytes | None:
+    """A tile of a basemap; InputError where the file is damaged."""
+    try:
+        return basemap.tile(zoom, x, y)
+    except FAULTS as error:
+        raise InputError(f"the basemap is damaged ({error})") from error
+
+
+def tile_px(data: bytes) -> tuple[int, int]:
+    """(width, height) in the header of a PNG, JPEG or WebP image; ValueError for any other."""
+    kind = data[12:16]
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and kind == b"IHDR":
+        w, h = struct.unpack_from(">II", data, 16)
+    elif data[:4] == b"RIFF" and kind == b"VP8X":
+        w, h = (1 + int.from_bytes(data[at : at + 3], "little") for at in (24, 27))
+    elif data[:4] == b"RIFF" and kind == b"VP8L":
+        bits = int.from_bytes(data[21:25], "little")
+        w, h = 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+    elif data[:4] == b"RIFF" and kind == b"VP8 ":
+        w, h = (int.from_bytes(data[at : at + 2], "little") & 0x3FFF for at in (26, 28))
+    else:
+        w, h = image_size(data) or (0, 0)
+    if not (0 < w <= MAX_SIDE_PX and 0 < h <= MAX_SIDE_PX):
+        raise ValueError("a tile is no image of a tile's size")
+    return w, h
 
 
 class MBTiles:
@@ -59,39 +93,51 @@ class MBTiles:
             about = dict(database.execute("SELECT name, value FROM metadata"))
             zooms = database.execute("SELECT MIN(zoom_level), MAX(zoom_level) FROM tiles")
             low, high = zooms.fetchone()
+        if high is not None and not 0 <= int(low) <= int(high) <= MAX_ZOOM:
+            raise ValueError(f"its zooms are {low} to {high}")
         if about.get("format") not in MEDIA or high is None:
             raise ValueError(f"its format is {about.get('format')}; images are needed")
         self.media_type, self.max_zoom = MEDIA[about["format"]], int(high)
         self.about = {"minzoom": int(low), "maxzoom": self.max_zoom, "name": path.stem}
 
     def _open(self) -> sqlite3.Connection:
-        return sqlite3.connect(self._uri, uri=True)
+        database = sqlite3.connect(self._uri, uri=True)
+        database.set_progress_handler(lambda: 1, MAX_STEPS)  # tiles may be an endless view
+        return database
 
     def tile(self, zoom: int, x: int, y: int) -> bytes | None:
         """See :class:`Basemap`."""
-        sql = "SELECT tile_data FROM tiles WHERE zoom_level=? AND tile_column=? AND tile_row=?"
+        sql = (
+            "SELECT tile_data FROM tiles WHERE zoom_level=? AND tile_column=? AND tile_row=?"
+            " AND LENGTH(tile_data) <= ?"
+        )
         with closing(self._open()) as database:
-            row = database.execute(sql, (zoom, x, (1 << zoom) - 1 - y)).fetchone()
-        return None if row is None else bytes(row[0])
+            at = zoom, x, (1 << zoom) - 1 - y
+            row = database.execute(sql, (*at, MAX_TILE_BYTES)).fetchone()
+        if row is not None and not isinstance(row[0], bytes):
+            raise ValueError("a tile is no image")
+        return None if row is None else row[0]
 
 
 class PMTiles:
     """A file after the PMTiles specification, version 3."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self._path, self._size = path, path.stat().st_size
         head = PM_HEADER.unpack(self._read(0, PM_HEADER.size))
         if head[:2] != (b"PMTiles", 3):
             raise ValueError("it is no PMTiles of version 3")
         root, root_bytes, _, _, self._leaves, _, self._data = head[2:9]
         self._packing, packing, kind, low, self.max_zoom = head[14:19]
+        if not low <= self.max_zoom <= MAX_ZOOM:
+            raise ValueError(f"its zooms are {low} to {self.max_zoom}")
         if kind not in PM_MEDIA or packing not in (0, PM_PLAIN):
             raise ValueError("its tiles are no images")
         if self._packing not in (PM_PLAIN, PM_GZIP):
             raise ValueError("its directories are neither plain nor packed by gzip")
         self.media_type = PM_MEDIA[kind]
         self.about = {"minzoom": low, "maxzoom": self.max_zoom, "name": path.stem}
-        self._directory = lru_cache(maxsize=64)(self._directory_at)
+        self._directory = lru_cache(maxsize=MAX_DIRECTORIES)(self._directory_at)
         self._root = root, root_bytes
         self._directory(*self._root)
 
@@ -106,11 +152,15 @@ class PMTiles:
             first, run, length, offset = found
             if run:
                 inside = wanted < first + run
+                if length > MAX_TILE_BYTES:
+                    raise ValueError("a tile is too large")
                 return self._read(self._data + offset, length) if inside else None
             where = self._leaves + offset, length
         return None
 
     def _read(self, offset: int, length: int) -> bytes:
+        if offset + length > self._size:
+            raise ValueError("it is cut short")
         with open(self._path, "rb") as file:
             file.seek(offset)
             return file.read(length)
@@ -120,8 +170,12 @@ class PMTiles:
         if length > MAX_DIRECTORY_BYTES:
             raise ValueError("a directory is too large")
         data = self._read(offset, length)
-        numbers = _varints(gzip.decompress(data) if self._packing == PM_GZIP else data)
-        n, rest = numbers[0], numbers[1:]
+        if self._packing == PM_GZIP:
+            unpacker = zlib.decompressobj(wbits=31)
+            data = unpacker.decompress(data, MAX_DIRECTORY_BYTES)
+            if not unpacker.eof:
+                raise ValueError("a directory is too large, or cut short")
+        n, *rest = _varints(data) or [0]
         if len(rest) < 4 * n:
             raise ValueError("a directory is cut short")
         columns = [rest[k * n : (k + 1) * n] for k in range(4)]
@@ -136,9 +190,12 @@ class PMTiles:
 
 
 def _varints(data: bytes) -> list[int]:
-    """Numbers of 7 bits a byte, the lowest first."""
-    out, value, shift = [], 0, 0
+    """Numbers of 7 bits a byte, the lowest first; ValueError for more than 64 bits."""
+    out: list[int] = []
+    value = shift = 0
     for byte in data:
+        if shift > 63:
+            raise ValueError("a directory holds a number of more than 64 bits")
         value |= (byte & 127) << shift
         shift += 7
         if byte < 128:

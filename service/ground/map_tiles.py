@@ -20,6 +20,7 @@ from starlette.routing import Route
 from recon.surface.raster import hillshade
 from recon.types import F32, U8
 from service.errors import InputError
+from service.ground.basemap import tile_of, tile_px
 from service.ground.live_map import (
     EQUATOR_M,
     MARGIN,
@@ -70,11 +71,17 @@ async def _tile(request: Request) -> Response:
 
 def _tile_png(request: Request) -> Response:
     state, folder, layer = _asked(request)
+    z, x, y = _place(request)
+    image = tile_image(state, folder, layer, (z, x, y))
+    return Response(_png(image), media_type="image/png", headers=FRESH)
+
+
+def _place(request: Request) -> Tile:
+    """The tile of a request; InputError where the map has none such."""
     z, x, y = (request.path_params[name] for name in "zxy")
     if not (z <= MAX_ZOOM and x < 1 << z and y < 1 << z):
         raise InputError("no such tile")
-    image = tile_image(state, folder, layer, (z, x, y))
-    return Response(_png(image), media_type="image/png", headers=FRESH)
+    return z, x, y
 
 
 def _asked(request: Request) -> tuple[PortalState, Path, str]:
@@ -278,7 +285,7 @@ def _kml_of(request: Request) -> Response:
     if found is None:
         raise InputError("no surface yet")
     west, north, east, south = found
-    side = max(east - west, south - north)
+    side = max(east - west, south - north, 1e-9)
     zoom = min(MAX_ZOOM, max(0, int(np.floor(np.log2((KML_TILES - 1) / side)))))
     n = 1 << zoom
     overlays = "".join(
@@ -319,15 +326,17 @@ def _basemap(request: Request) -> Response:
     found = state_of(request).basemap
     if found is None:
         raise InputError("no basemap")
-    z, x, y = (request.path_params[name] for name in "zxy")
+    z, x, y = _place(request)
     up = max(0, z - found.max_zoom)
-    data = found.tile(z - up, x >> up, y >> up)
+    data = tile_of(found, z - up, x >> up, y >> up)
     if data is None:
         return Response(_png(_clear()), media_type="image/png")
     if not up:
         return Response(data, media_type=found.media_type)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        raise InputError("no image in this tile")
-    whole = np.asarray(cv2.resize(image, (SIDE, SIDE)), np.uint8)
+    try:
+        tile_px(data)
+        image = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), np.uint8)
+        whole = np.asarray(cv2.resize(image, (SIDE, SIDE)), np.uint8)
+    except (TypeError, ValueError, cv2.error) as error:  # TypeError: it is None
+        raise InputError("the basemap is damaged: no image in this tile") from error
     return Response(_png(_enlarged(whole, (z, x, y), up)), media_type="image/png")
