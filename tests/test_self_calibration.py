@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.calibration.flight import self_calibrate
+from recon.calibration.flight import SelfCalibrationConfig, camera_sigmas, doubt, self_calibrate
 from recon.calibration.global_bundle import Sightings
 from recon.types import F64, Camera
 
@@ -160,3 +160,10 @@ def test_wrong_calls_are_refused() -> None:
         self_calibrate(TRUE, poses, points, few, poses[:, :3, 3], poses[:, :3, 3])
     with pytest.raises(ValueError, match="three poses"):
         self_calibrate(TRUE, poses[:2], points, seen, poses[:2, :3, 3], poses[:2, :3, 3])
+
+
+def test_a_camera_with_a_negative_or_unknown_variance_is_refused() -> None:
+    for wrong in (-1e-9, np.nan):
+        sigmas = camera_sigmas(np.diag([wrong, *np.full(7, 1e-6)]))
+        assert sigmas[0] == np.inf and np.isfinite(sigmas[1:]).all()
+        assert "does not determine" in doubt(TRUE, TRUE, float(sigmas[0]), SelfCalibrationConfig())

@@ -113,7 +113,7 @@ def self_calibrate(
     sigma = float(np.clip(np.median(first.errors_px) / RAYLEIGH_MEDIAN, 0.1, 2.0))
     seen = shared(seen, first.errors_px < config.gate_sigmas * sigma)
     found = adjusted(seen, sigma)
-    sigmas = np.sqrt(np.abs(np.diag(found.camera_covariance)))
+    sigmas = camera_sigmas(found.camera_covariance)
     focal = float(sigmas[:2].max() / found.camera.K[0, 0])
     return SelfCalibrated(
         found.camera, focal, (float(sigmas[4]), float(sigmas[5])),
@@ -237,6 +237,12 @@ def camera_information(given: Camera, c: SelfCalibrationConfig) -> F64:
     spread = np.diag(sigma**2)
     spread[0, 1] = spread[1, 0] = f * f - 0.5 * (c.sigma_aspect * given.K[0, 0]) ** 2
     return np.asarray(np.linalg.inv(spread))
+
+
+def camera_sigmas(covariance: F64) -> F64:
+    """(8,) sigmas of a camera's parameters; infinite where sightings do not determine one."""
+    variances = np.diag(covariance)
+    return np.asarray(np.sqrt(np.where(variances >= 0.0, variances, np.inf)))
 
 
 def middle(errors_px: F64) -> float:

@@ -22,6 +22,7 @@ from recon.calibration.flight import (
     Network,
     SelfCalibrationConfig,
     camera_information,
+    camera_sigmas,
     doubt,
     first_held,
     loosely_placed,
@@ -133,7 +134,7 @@ def network_of(
     known = loosely_placed(poses, seen)
     held = camera_information(given, FREE)
     found = network(given, start, seen, known, held)
-    sigmas = np.sqrt(np.abs(np.diag(found.solution.camera_covariance)))
+    sigmas = camera_sigmas(found.solution.camera_covariance)
     focal = float(sigmas[:2].max() / found.solution.camera.K[0, 0])
     why = doubt(found.solution.camera, given, focal, FREE)
     if why:
