@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.surface.ground import ground_cells, terrain
+from recon.surface.ground import BareGround, ground_cells, terrain
 from recon.surface.raster import Grid, Raster
 from recon.types import F32, Bool
 
@@ -38,6 +38,11 @@ def raster(height: F32) -> Raster:
     return Raster(grid, height, sigma, np.zeros((*height.shape, 3), np.uint8))
 
 
+def within(bare: BareGround) -> F32:
+    """Heights within the outline; NaN beyond."""
+    return np.where(bare.is_inside, bare.everywhere_m, np.float32(np.nan)).astype(np.float32)
+
+
 def holes() -> Bool:
     return np.asarray(np.random.default_rng(4).random(X.shape) < 0.1)
 
@@ -49,7 +54,8 @@ def test_what_stands_on_a_hill_is_taken_off_and_the_hill_stays() -> None:
     assert not kept[above > 0.5].any()
     clear = np.hypot(X - 40, Y - 40) < 6.0
     assert kept[clear & np.isfinite(surface)].all()
-    found, is_bridged = terrain(raster(surface))
+    bare = terrain(raster(surface))
+    found, is_bridged = within(bare), bare.is_bridged
     inner = np.s_[4:-4, 4:-4]
     assert np.isfinite(found[inner]).all() and is_bridged[above > 0.5].all()
     error = found - ground
@@ -60,13 +66,22 @@ def test_what_stands_on_a_hill_is_taken_off_and_the_hill_stays() -> None:
 def test_the_outline_does_not_grow() -> None:
     surface = hill()
     surface[:, :100] = np.nan
-    found, _ = terrain(raster(surface))
+    bare = terrain(raster(surface))
+    found = within(bare)
     assert np.isnan(found[:, :100]).all() and np.isfinite(found[:, 100:]).all()
+    assert np.isfinite(bare.everywhere_m).all()  # beyond the outline that of the nearest
 
 
 @pytest.mark.parametrize("known", [0, 1])
 def test_a_model_of_nothing_or_one_cell_is_no_trouble(known: int) -> None:
     surface = np.full((9, 9), np.nan, np.float32)
     surface[4, 4 : 4 + known] = 3.0
-    found, is_bridged = terrain(raster(surface))
-    assert np.isfinite(found).sum() == known and not is_bridged.any()
+    bare = terrain(raster(surface))
+    assert np.isfinite(within(bare)).sum() == known and not bare.is_bridged.any()
+
+
+def test_ground_on_one_line_is_no_trouble() -> None:
+    surface = np.full((9, 9), np.nan, np.float32)
+    surface[np.arange(9), np.arange(9)] = 3.0
+    bare = terrain(raster(surface))
+    assert (bare.everywhere_m == 3.0).all() and bare.is_inside.sum() == 9

@@ -93,7 +93,7 @@ def _bridged(height_m: F32, known: Bool) -> F32:
     near = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     out: F32 = height_m[tuple(near)]
     at = np.argwhere(rim)
-    if len(at) > 3 and (np.ptp(at, axis=0) > 0).all():
+    if np.linalg.matrix_rank(at - at[0]) == 2:  # not all on one line
         linear = LinearNDInterpolator(at, height_m[rim])(np.argwhere(~known))
         out[~known] = np.where(np.isfinite(linear), linear, out[~known])
     return out
