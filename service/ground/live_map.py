@@ -7,7 +7,6 @@ became finer makes it again. Each pixel has the height and the colour of its sur
 from __future__ import annotations
 
 import math
-import threading
 import time
 from array import array
 from collections import OrderedDict
@@ -24,6 +23,7 @@ from recon.types import F32, F64, U8, Array, Keyframe
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.scans.main_piece import main_seqs
+from service.scans.open_scans import OpenScans
 from service.scans.track import local_frame
 from service.stream.ranges import RangeSet
 from service.stream.store import ScanStore
@@ -231,39 +231,15 @@ def on_map(frame: LocalFrame, enu_m: F64) -> F64:
     return np.asarray((enu_m - middle) @ A + zero)
 
 
-class LiveMaps:
-    """Maps of the scans viewed last. Thread-safe."""
+class LiveMaps(OpenScans[LiveMap]):
+    """Maps of the scans viewed last."""
 
     def __init__(self, min_age_s: float = 1.0, max_scans: int = 3) -> None:
-        self._min_age_s, self._max_scans = min_age_s, max_scans
-        self.lock = threading.RLock()  # also of the maps
-        self._kept: OrderedDict[Path, tuple[LiveMap, ScanStore, float]] = OrderedDict()
+        super().__init__(LiveMap, min_age_s, max_scans)
 
     def of(self, folder: Path) -> LiveMap:
         """The map of the scan in ``folder``, at most ``min_age_s`` old. Hold :attr:`lock`.
 
         Raises InputError when the folder holds no scan, or one without a georeference.
         """
-        held = self._kept.pop(folder, None)
-        if held is None:
-            store = ScanStore.open(folder / "scan.db")
-            try:
-                held = (LiveMap(store), store, -math.inf)
-            except InputError:
-                store.close()
-                raise
-        found, store, then = held
-        if time.monotonic() - then >= self._min_age_s:
-            found.refresh()
-            then = time.monotonic()
-        self._kept[folder] = (found, store, then)
-        while len(self._kept) > self._max_scans:
-            self._kept.popitem(last=False)[1][1].close()
-        return found
-
-    def forget(self, folder: Path) -> None:
-        """Close the store of a folder, for example before it is deleted."""
-        with self.lock:
-            held = self._kept.pop(folder, None)
-            if held is not None:
-                held[1].close()
+        return self.view(folder)

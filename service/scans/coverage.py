@@ -8,10 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
-import threading
-import time
 from array import array
-from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -34,6 +31,7 @@ from recon.types import U8, Array, DepthMap
 from service.georeference import LocalFrame
 from service.scans.file_ledger import FileLedger
 from service.scans.main_piece import Stretch, main_seqs, stretches_apart
+from service.scans.open_scans import OpenScans
 from service.scans.track import local_frame
 from service.scans.writing import writing
 from service.stream.ranges import RangeSet
@@ -165,6 +163,7 @@ class LiveCoverage:
         """``ledger`` stores rows of :data:`recon.surface.coverage.PLACE`; in memory by default."""
         self._store = store
         self._cell_m, self._ledger = cell_m, ledger
+        self.found: Coverage | None = None  # by the last refresh
         self._begin([])
 
     def _begin(self, apart: list[Stretch]) -> None:
@@ -179,7 +178,10 @@ class LiveCoverage:
 
     def refresh(self) -> Coverage | None:
         """The layer of the store's current content; None while it holds no surface."""
+        self.found = self._layer()
+        return self.found
 
+    def _layer(self) -> Coverage | None:
         apart = stretches_apart(self._store)
         if apart != self._apart:  # known once the scan is finished, or refined
             self._begin(apart)
@@ -282,45 +284,16 @@ class CoverageWriter:
             _write(self._folder, found)
 
 
-class LiveCoverages:
-    """Coverage of the scans viewed last; each is refreshed once it is older than ``min_age_s``.
-
-    Thread-safe; keeps the ``max_scans`` scans viewed last.
-    """
+class LiveCoverages(OpenScans[LiveCoverage]):
+    """Coverage of the scans viewed last."""
 
     def __init__(self, min_age_s: float = 3.0, max_scans: int = 4) -> None:
-        self._min_age_s, self._max_scans = min_age_s, max_scans
-        self._lock = threading.Lock()
-        self._kept: OrderedDict[Path, tuple[LiveCoverage, ScanStore, float, Coverage | None]] = (
-            OrderedDict()
-        )
+        super().__init__(LiveCoverage, min_age_s, max_scans)
 
     def of(self, folder: Path) -> Coverage | None:
         """The layer of the scan in ``folder``; None while it holds no surface.
 
         Raises InputError when the folder holds no scan.
         """
-        with self._lock:
-            held = self._kept.pop(folder, None)
-            if held is None:
-                store = ScanStore.open(folder / "scan.db")
-                held = (LiveCoverage(store), store, -np.inf, None)
-            live, store, then, found = held
-            if time.monotonic() - then >= self._min_age_s:
-                found, then = live.refresh(), time.monotonic()
-            self._kept[folder] = (live, store, then, found)
-            while len(self._kept) > self._max_scans:
-                self._kept.popitem(last=False)[1][1].close()
-            return found
-
-    def forget(self, folder: Path) -> None:
-        """Close the store of a folder, for example before it is deleted."""
-        with self._lock:
-            held = self._kept.pop(folder, None)
-            if held is not None:
-                held[1].close()
-
-    def close(self) -> None:
-        """Close all stores."""
-        for folder in list(self._kept):
-            self.forget(folder)
+        with self.lock:
+            return self.view(folder).found
