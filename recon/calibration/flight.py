@@ -157,9 +157,9 @@ def network(
             sigma = float(np.clip(np.median(errors) / RAYLEIGH_MEDIAN, 0.1, 2.0))
             gate = max(6.0 * sigma, 1.0)
         points = crossings(poses, camera, joint(seen, marks), count)
-        kept = _within(camera, poses, points, seen, gate)
+        kept = within(camera, poses, points, seen, gate)
         points = crossings(poses, camera, joint(kept, marks), count)
-        kept = _within(camera, poses, points, kept, np.inf)
+        kept = within(camera, poses, points, kept, np.inf)
         if len(kept.view) < MIN_SIGHTINGS:
             raise ValueError("too few places are found again in other images")
         points = np.where(np.isfinite(points), points, np.nan_to_num(known.surveyed))
@@ -174,7 +174,7 @@ def network(
     return Network(solution, kept, sigma)
 
 
-def _within(camera: Camera, poses: F64, points: F64, seen: Sightings, gate_px: float) -> Sightings:
+def within(camera: Camera, poses: F64, points: F64, seen: Sightings, gate_px: float) -> Sightings:
     """Sightings of known points that are off by less than ``gate_px``, two of each at least."""
     errors = errors_px(camera, poses, np.nan_to_num(points), seen)
     return shared(seen, np.isfinite(points[seen.landmark, 2]) & (errors < gate_px))

@@ -28,6 +28,7 @@ from recon.calibration.flight import (
     loosely_placed,
     network,
     self_calibrate,
+    within,
 )
 from recon.calibration.global_bundle import Sightings
 from recon.calibration.tracks import (
@@ -67,6 +68,9 @@ FOCAL_KNOWN = replace(START, sigma_focal=0.002)
 
 EXHAUSTIVE = 60
 """Of so many images all are compared, wherever they are said to look."""
+
+GROSS_PX = 15.0
+"""A sighting further from its landmark takes no part."""
 
 MIN_SHARE = 0.5
 """Of the keyframes, whose images the video must hold."""
@@ -144,6 +148,7 @@ def sightings(
     points = crossings(poses, own, found.seen, len(points))
     overlap = _overlapping(views, own, poses, float(np.nanmedian(points[:, 2])))
     seen = extended(stack, camera, own, poses, points, found.seen, overlap)
+    seen = within(own, poses, points, seen, GROSS_PX)
     return np.nan_to_num(points), seen, poses
 
 
