@@ -10,7 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
-from service.errors import InputError
 from service.stream.store import ScanStore
 
 
@@ -37,25 +36,28 @@ class OpenScans(Generic[V]):
     def view(self, folder: Path) -> V:
         """The view of the scan in ``folder``. Hold :attr:`lock` while it is used.
 
-        Raises InputError when the folder holds no scan, and what making the view raises.
+        Raises InputError when the folder holds no scan, and what the view raises.
         """
         with self.lock:
-            held = self._kept.pop(folder, None)
-            if held is None:
-                store = ScanStore.open(folder / "scan.db")
-                try:
-                    held = (self._view(store), store, -math.inf)
-                except InputError:
-                    store.close()
-                    raise
-            found, store, then = held
+            if folder not in self._kept:
+                self._kept[folder] = self._opened(folder)
+            found, store, then = self._kept[folder]
             if time.monotonic() - then >= self._min_age_s:
                 found.refresh()
                 then = time.monotonic()
             self._kept[folder] = (found, store, then)
+            self._kept.move_to_end(folder)
             while len(self._kept) > self._max_scans:
                 self._kept.popitem(last=False)[1][1].close()
             return found
+
+    def _opened(self, folder: Path) -> tuple[V, ScanStore, float]:
+        store = ScanStore.open(folder / "scan.db")
+        try:
+            return self._view(store), store, -math.inf
+        except Exception:
+            store.close()
+            raise
 
     def forget(self, folder: Path) -> None:
         """Close the store of a folder, for example before it is deleted."""
