@@ -46,9 +46,9 @@ def stretch(gray: U8, seen: Bool | None = None) -> U8:
 def sharpness(gray: U8) -> float:
     """Fine detail over coarse detail of ``gray`` (H, W) uint8: falls when the image is blurred.
 
-    Mean absolute Laplacian of the image at half its size over that at an eighth. The ratio
-    cancels contrast and exposure; what the scene shows stays in it, so that only images of
-    the same scene compare. NaN for an image without any detail.
+    Mean absolute Laplacian of the image at half its size over that at an eighth. The ratio cancels
+    contrast and exposure but not the scene's content, so only images of the same scene compare. NaN
+    for an image without any detail.
     """
     half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     eighth = cv2.resize(half, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)

@@ -205,7 +205,7 @@ def _polynomial(t: F64, twists: F64, degree: int) -> tuple[F64, F64]:
 
 
 def _by_telemetry(frame: FrameRows) -> F64:
-    """(6,) rate by the prior's turn and velocity; what it lacks is zero."""
+    """(6,) rate by the prior's rotation and velocity; unknown parts are zero."""
     rate = np.zeros(6)
     if frame.prior.turn_rad_s is not None:
         rate[:3] = -frame.prior.turn_rad_s

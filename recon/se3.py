@@ -72,8 +72,8 @@ def inverse(T: F64) -> F64:
 
 
 def project_to_so3(T: F64) -> F64:
-    """(4, 4) motion with the rotation nearest to what stands in ``T``, whose rounding errors are
-    gone (polar decomposition; Higham 1986, doi:10.1137/0907079).
+    """(4, 4) ``T`` with its rotation replaced by the nearest one, which removes rounding errors
+    (polar decomposition; Higham 1986, doi:10.1137/0907079).
 
     Where a pose is made of the one before it and of its inverse, they would double each time.
     """

@@ -91,7 +91,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """A camera pose with its uncertainty and what it was made from."""
+    """A camera pose with its uncertainty and its sources."""
 
     T_world_camera: F64  # (4, 4) m
     covariance: F64  # (6, 6) left perturbation in the world frame: rotation rad, translation m

@@ -35,7 +35,7 @@ class Progress:
         self._started = time.monotonic()
 
     def __call__(self, text: str) -> None:
-        """Say what is being done. Raises CancelledError after :meth:`cancel`."""
+        """Set the text of the current step. Raises CancelledError after :meth:`cancel`."""
         self.text = text
         self._report()
 
@@ -44,7 +44,7 @@ class Progress:
         self._is_cancelled = True
 
     def commit(self, text: str) -> None:
-        """Say what is being done; from here on the work cannot be cancelled."""
+        """Set the text of the current step; from here on the work cannot be cancelled."""
         self.text = text
         self._report()
         self._may_stop = False

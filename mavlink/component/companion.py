@@ -208,7 +208,7 @@ class Companion:
         return self._outbox.take()
 
     def tick(self, now_ns: int) -> None:
-        """Do what is due."""
+        """Send what is due and evaluate what arrived."""
         self._now_ns = max(self._now_ns, now_ns)
         self.presence.autopilots.look(now_ns)
         self.autopilot.follow()

@@ -87,10 +87,10 @@ BACKENDS: dict[str, str] = {
 def load_backend(name: str, engines: str | None = None) -> Backend:
     """The backend called ``name``, ready to run.
 
-    ``engines`` is a folder for what takes minutes to build and is the same at the next start:
-    TensorRT's engines, of the onnx backend. Raises ValueError for a name that is not in the
-    table, and whatever the backend raises when it cannot run here (ImportError, RuntimeError),
-    with the reason.
+    ``engines`` is a folder for TensorRT's engines (onnx backend), which take minutes to build and
+    are reused at the next start. Raises ValueError for a name that is not in the table, and
+    whatever the backend raises when it cannot run here (ImportError, RuntimeError), with the
+    reason.
     """
     if name not in BACKENDS:
         raise ValueError(f"no backend {name!r}; there are {', '.join(sorted(BACKENDS))}")

@@ -1,7 +1,7 @@
 """A learned stereo model that the operator brings, behind the backend protocol.
 
-Two rectified images in, one disparity out, by ONNX Runtime. What the model expects is declared
-and checked when it is loaded, before anything flies.
+Two rectified images in, one disparity out, by ONNX Runtime. The model's inputs are declared in a
+file and checked when it is loaded, before the flight.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from recon.types import F32, U8, DisparityMap
 
 @dataclass(frozen=True, slots=True)
 class LearnedStereoConfig:
-    """How the model is fed; described by the JSON file next to it."""
+    """How the model is fed; declared in the TOML file next to it."""
 
     height: int  # px of the images that it takes
     width: int

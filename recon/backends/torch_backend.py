@@ -104,7 +104,8 @@ class TorchBackend:
         T_world_camera: F64,
         stages: DenseStages,
     ) -> DepthMap | None:
-        """Depth of a keyframe without leaving the device; None for what is not done there."""
+        """Depth of a keyframe without leaving the device; None for settings that it does not
+        support."""
         if stages.matching.fill_occluded:
             return None
         if self._path is None or self._path[0] != stages:

@@ -199,8 +199,8 @@ MEDIAN_OF = 4000
 def solve(A: Tensor, B: Tensor) -> Tensor:
     """X (n, k) with ``A X = B``, A (n, n) symmetric and positive definite; Gauss and Jordan.
 
-    No pivot is looked for, as none is needed for such a matrix; what is not positive definite
-    gives numbers without a meaning, never an error.
+    No pivoting, because such a matrix needs none; one that is not positive definite gives
+    meaningless numbers, never an error.
     """
     n = A.shape[0]
     rows = torch.cat([A, B], 1)

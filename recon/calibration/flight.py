@@ -34,7 +34,7 @@ RAYLEIGH_MEDIAN = 1.1774
 
 @dataclass(frozen=True, slots=True)
 class SelfCalibrationConfig:
-    """How far the camera may be off, and what is asked of the flight."""
+    """Limits for the camera's error, and requirements on the flight."""
 
     sigma_focal: float = 0.05  # of the focal length beforehand, as a share
     sigma_aspect: float = 5e-4  # of height over width of a pixel: one focal length holds for both
@@ -231,7 +231,7 @@ def doubt(found: Camera, given: Camera, sigma_focal: float, c: SelfCalibrationCo
 
 
 def camera_information(given: Camera, c: SelfCalibrationConfig) -> F64:
-    """(8, 8) of fx, fy, cx, cy, k1, k2, p1, p2: what is known of a camera beforehand."""
+    """(8, 8) of fx, fy, cx, cy, k1, k2, p1, p2: the prior information about a camera."""
     f, centre = c.sigma_focal * given.K[0, 0], c.sigma_centre * given.size_px[0]
     sigma = np.array([f, f, centre, centre, c.sigma_k, c.sigma_k, c.sigma_p, c.sigma_p])
     spread = np.diag(sigma**2)

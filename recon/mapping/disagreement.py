@@ -1,4 +1,4 @@
-"""By how much depth images that show the same ground disagree, over what their sigmas say.
+"""How much depth images of the same ground disagree, relative to their sigmas.
 
 Stereo knows its own noise. That a lens is not quite as its model says, or that the poses a depth
 image was made with were off, tilts and bows the whole image; only other images of the same ground

@@ -12,7 +12,7 @@ TILT_SIGMAS = 2.0
 
 
 def plausible(depth: DepthMap, prior: PosePrior) -> DepthMap | None:
-    """``depth`` without what one pair alone sees above the horizon; None with nothing left.
+    """``depth`` without surface that only one pair sees above the horizon; None with nothing left.
 
     Below the horizon a ray ends at the ground. Above it there may be nothing but sky, so a
     surface there takes two pairs that agree.

@@ -1,11 +1,11 @@
 """The constant by which an autopilot's altitude is off, from all fixes of the GNSS receiver.
 
 An autopilot's altitude follows its barometer, whose zero is off by decimetres to metres. The
-receiver's own altitudes scatter more, but about another mean. What of the receiver's claimed
-sigma shows as scatter from fix to fix averages out; the rest wanders (first-order Gauss-Markov,
-as in :mod:`recon.posegraph.readings`) and stays. The autopilot's altitude rests on the same
-receiver, so the receiver's mean is taken over only as far as it is the better one. Where the
-scatter could be all of the sigma, it is taken to be.
+receiver's own altitudes scatter more, but about another mean. The part of the receiver's claimed
+sigma that shows as scatter from fix to fix averages out; the rest wanders (first-order
+Gauss-Markov, as in :mod:`recon.posegraph.readings`) and stays. The autopilot's altitude rests on
+the same receiver, so the receiver's mean is taken over only as far as it is the better one. Where
+the scatter could be all of the sigma, it is taken to be.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ LEAST = 3
 """Intervals between keyframes with fixes, under which nothing is said."""
 
 STEADY_SHARE = 0.1
-"""Of the claimed sigma, what always stays: a receiver has errors that one flight cannot show."""
+"""Share of the claimed sigma that always stays: one flight cannot show all errors of a receiver."""
 
 OFF_SIGMAS = 4.0
 """Intervals further from the median than so many of the scatter and the sigma do not count."""

@@ -101,8 +101,8 @@ def carried(
 ) -> F64:
     """(4, 4) pose by telemetry's motion since ``before``, when the camera was at ``T_before``.
 
-    What telemetry was off by then it is taken to be off by now, so that nothing jumps. Without
-    positions the camera goes on at ``velocity_m_s`` (3,) over the ``seconds`` between, if known.
+    Telemetry's error then is assumed to hold now, so that nothing jumps. Without positions the
+    camera continues at ``velocity_m_s`` (3,) for ``seconds``, if known.
     """
     T: F64 = T_before.copy()
     a, b = before.R_world_camera, now.R_world_camera

@@ -22,7 +22,7 @@ SIGMA_RAD = np.radians(2.0)
 """How well a camera is aligned before anything is known."""
 
 BOUND_RAD = np.radians(5.0)
-"""No boresight is larger; what looks like one is another fault."""
+"""A larger angle is no boresight but another fault."""
 
 LEAST = 8
 """Attitudes of a stretch under which it says nothing."""
@@ -48,7 +48,7 @@ class Boresight:
 
     @property
     def is_sure(self) -> bool:
-        """True when it is there beyond doubt; what is not is left alone."""
+        """True when it is significant; otherwise it is not applied."""
         return float(np.sum(np.square(self.turn / self.sigma))) > SURE
 
     def applied(self, prior: PosePrior) -> PosePrior:

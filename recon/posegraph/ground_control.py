@@ -205,8 +205,8 @@ def _crossing(poses: F64, marks: Sequence[Mark]) -> tuple[F64, float] | None:
 def consenting(surveyed_m: F64, mapped_m: F64, sigma_m: F64) -> Bool:
     """(N,) True for the largest set of points whose offsets from the map agree.
 
-    A map is off by nearly the same everywhere: what two points' offsets (N, 3) may differ by
-    is their sigmas (N,), 1 % of the distance between them and 0.1 m.
+    A map's error is nearly the same everywhere: the offsets (N, 3) of two points may differ by
+    their sigmas (N,), 1 % of the distance between them and 0.1 m.
     """
     offset = surveyed_m - mapped_m
     apart = np.linalg.norm(offset[:, None] - offset[None], axis=2)

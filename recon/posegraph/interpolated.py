@@ -1,9 +1,9 @@
 """Keyframes that are no nodes of the pose graph: carried by the nodes on both sides of them.
 
-From the node before it a keyframe goes on by vision. What vision then misses the next node by
-is spread evenly over the keyframes between, as a screw motion. Both nodes belong to the
-keyframe's segment, whose first and last keyframes are nodes. Where no node of its segment is
-left it stays as it was published last.
+A keyframe continues from the node before it by vision. The misclosure of vision at the next node is
+spread evenly over the keyframes between, as a screw motion. Both nodes belong to the keyframe's
+segment, whose first and last keyframes are nodes. Where no node of its segment is left it stays as
+it was published last.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ KEYFRAME = np.dtype(
         ("first_scale", np.float64),  # and as published first
     ]
 )
-"""A row of the ledger: what is kept of every keyframe of a scan."""
+"""A row of the file: the data of one keyframe."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

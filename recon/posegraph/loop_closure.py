@@ -87,7 +87,7 @@ class LoopClosure:
 def ground_seen(depth: DepthMap) -> F64:
     """(N, 3) what a camera sees, in its frame: a grid over the whole image.
 
-    Where nothing was measured lies the plane through what was.
+    Unmeasured parts are filled by the plane through the measured ones.
     """
     h, w = depth.depth_m.shape
     u, v = np.meshgrid(np.linspace(0, w - 1, 17), np.linspace(0, h - 1, 11))

@@ -272,7 +272,8 @@ class PoseGraph:
         self._solve(now=True, steps=MANY_STEPS)
 
     def _solve(self, now: bool = False, steps: int = STEPS) -> None:
-        """Solve what waits, when it is due; without a solution it stays as vision predicts it."""
+        """Solve the waiting factors when due; without a solution, poses stay as vision predicts
+        them."""
         try:
             self._smoother.update(now, steps)
         except RuntimeError as error:
@@ -357,7 +358,7 @@ class PoseGraph:
         a, b = self._nodes[loop.a].key, self._nodes[loop.b].key
         loop = loop.scaled(self.scale(loop.a))
         self._sources[b].add("loop")
-        # Not robust: two loops agreed, and what closes late would lose its weight by its size.
+        # Not robust: two loops agreed, and a late one with a large misclosure would lose weight.
         self._smoother.add_motion("loop", (a, b), loop.T_a_b, loop.covariance)
 
     def _newest(self) -> Node:

@@ -33,7 +33,7 @@ class PoseGraphConfig:
     huber_sigmas: float = 1.5
     sigma_link_m: float = 3.0  # per second without vision
     sigma_link_rad: float = 0.3
-    frame_drift: float = 0.003  # of the path flown, what a track may leave its frame by
+    frame_drift: float = 0.003  # share of the path flown by which a track may leave its frame
     loop_drift: float = 0.05  # of the path between its ends; a loop off by more is impossible
     loop_slack_m: float = 2.0  # and this
     loop_turn_rad: float = 0.5

@@ -47,7 +47,7 @@ class SegmentFrames:
         self._seen[node.segment] += 1
 
     def thin(self, nodes: Iterable[Node]) -> None:
-        """Keep these keyframes alone, and what is known of their segments."""
+        """Keep only these keyframes, and the data of their segments."""
         before, self.nodes = self.nodes, {}
         for node in nodes:
             self.nodes.setdefault(node.segment, []).append(node)

@@ -32,7 +32,7 @@ PRECISE_TAU_S = 10.0
 """Time constant of a receiver's wander with RTK or PPK."""
 
 MIN_WANDER = 0.25
-"""Of what a receiver claims, what it always wanders by."""
+"""Share of a receiver's claimed sigma by which it always wanders."""
 
 PRECISE_M = 0.3
 """Fixes of a smaller sigma are RTK's or PPK's."""

@@ -1,8 +1,8 @@
 """Constant difference of each sensor from the similarity that places a segment.
 
-The similarity weighs the sensors against each other over the whole segment. What then is left
-of each as a constant turn, stretch or shift has been decided; only what varies along the track
-may bend it. Readings are therefore freed of their constants before they enter the graph.
+The similarity weighs the sensors against each other over the whole segment. The constant rotation,
+scale or shift that remains of each sensor is settled by that; only variation along the track may
+bend it. So the constants are removed from the readings before they enter the graph.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Several scans of one site moved onto each other: one similarity each, all at once.
 
 The errors of one flight's receiver, heading and scale are nearly the same all along it, so one
-motion and one scale per scan is the cause of most of what two scans disagree by. Ties are places
-that both scans have; what the receivers claim of themselves is the prior, so the mean of several
-flights is better placed than each. Gauss-Newton with Cauchy weights (Barfoot 2017, ch. 5.3).
+motion and one scale per scan explains most of the disagreement of two scans. Ties are places that
+both scans have; the receivers' claimed sigmas are the prior, so the mean of several flights is
+better placed than each. Gauss-Newton with Cauchy weights (Barfoot 2017, ch. 5.3).
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 All factors of one kind are rows of one array, so a step is a few array operations and one sparse
 factorisation (SuperLU), during which other threads run. A step that does not lower the cost is
-damped (Marquardt 1963, doi:10.1137/0111030). Nothing is incremental: what waits is predicted, and
-more may wait the more is held, so that the mean cost of a pose stays flat. Huber's loss weighs
-factors again at each step.
+halved. Nothing is incremental: new poses are predicted until they are solved, and more may wait the
+more is held, so that the mean cost of a pose stays flat. Huber's loss weighs factors again at each
+step.
 
 A pose is perturbed by a rotation about its own camera and a shift, both in world axes.
 """
@@ -289,7 +289,7 @@ class Smoother:
         return len(self._held.at.logs) + len(self._fresh_logs) - 1
 
     def update(self, now: bool = False, steps: int = STEPS) -> bool:
-        """True when what waits was solved: enough of it waits, or ``now``.
+        """Solve the waiting factors if there are enough or ``now``; True when it did.
 
         Raises RuntimeError when there is no solution; all stays as predicted then.
         """

@@ -32,7 +32,7 @@ CENSUS_RADIUS = 3
 _WINDOW = 2 * CENSUS_RADIUS + 1
 
 MAX_SPARE = 8
-"""Memory this many times larger than what is asked for is given back."""
+"""Memory this many times larger than requested is released."""
 
 
 @dataclass(frozen=True, slots=True)

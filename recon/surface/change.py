@@ -1,9 +1,9 @@
 """Changes between two surface models of one place, with their sigmas.
 
 The difference of each cell is a mean over its neighbourhood, as in M3C2 with the vertical as its
-normal (Lague et al. 2013, doi:10.1016/j.isprsjprs.2013.04.009). What two flights' bending leaves
-of low frequency is estimated robustly and taken away. The sigma of a mean is what the surfaces'
-own sigmas say, times what most of the site shows: the empirical null of Efron 2004
+normal (Lague et al. 2013, doi:10.1016/j.isprsjprs.2013.04.009). The low-frequency difference left
+by the two flights' bending is estimated robustly and subtracted. The sigma of a mean is what the
+surfaces' own sigmas say, times what most of the site shows: the empirical null of Efron 2004
 (doi:10.1198/016214504000000089), so correlated errors count. Steps that two surveys place some
 cells apart are no change: an object stands out of all heights that the other date has around it.
 """
@@ -34,7 +34,7 @@ MIN_VOLUME_SIGMAS = 3.0
 
 @dataclass(frozen=True, slots=True)
 class ChangeConfig:
-    """Limits of what counts as a change."""
+    """Thresholds for a change."""
 
     windows: tuple[int, ...] = (3, 5)  # cells of a side, over which heights are averaged
     level_sigmas: float = 2.58  # 99 %: a cell belongs to a change
@@ -139,7 +139,7 @@ def change_between(before: Raster, after: Raster, config: ChangeConfig | None = 
 def bending(d: F32, cell_m: float, length_m: float) -> F32:
     """(rows, cols) the robust mean of a difference over ``length_m`` (1 sigma) about each cell.
 
-    What stands out of it loses all weight (Geman and McClure), so the mean ignores changes.
+    Outliers lose all weight (Geman and McClure), so the mean ignores changes.
     """
     known = np.isfinite(d)
     if not known.any():
@@ -167,7 +167,7 @@ def bending(d: F32, cell_m: float, length_m: float) -> F32:
 
 
 def left_over_m(d: F32, cell_m: float, block_m: float) -> float:
-    """Robust spread of the medians of blocks of a difference: what an alignment left, m."""
+    """Remaining misalignment in m: robust spread of the medians of blocks of a difference."""
     step = max(1, round(block_m / cell_m))
     middles = []
     for r in range(0, d.shape[0], step):

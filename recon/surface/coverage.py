@@ -91,7 +91,7 @@ class CoverageGrid:
         return np.asarray(self.core & (self.views < min_views))
 
     def unsure(self, max_sigma_m: float) -> Bool:
-        """(rows, cols) cells of what was flown whose surface is less sure than that."""
+        """(rows, cols) flown cells with a sigma above the limit."""
         with np.errstate(invalid="ignore"):
             return np.asarray(self.inside & (self.sigma_m > max_sigma_m))
 
@@ -231,7 +231,7 @@ class CoverageMap:
         self._stale = set()
 
     def grid(self) -> CoverageGrid | None:
-        """All tiles on one grid, cut to what was seen; None while there is nothing."""
+        """All tiles on one grid, cut to the seen area; None while there is nothing."""
         if not self._tiles:
             return None
         keys = _near(np.array(list(self._tiles)))

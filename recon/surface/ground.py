@@ -1,8 +1,8 @@
-"""The bare ground below a surface model: what stands on it is found and bridged.
+"""The bare ground below a surface model: objects on it are found and bridged.
 
-Simple morphological filter (Pingel, Clarke and McBride 2013,
-doi:10.1016/j.isprsjprs.2012.12.002): openings with growing windows lower the surface; what one of
-them lowers by more than the slope allows stands on the ground.
+Simple morphological filter (Pingel, Clarke and McBride 2013, doi:10.1016/j.isprsjprs.2012.12.002):
+openings with growing windows lower the surface; cells lowered by more than the slope allows are
+objects.
 """
 
 from __future__ import annotations

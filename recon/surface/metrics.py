@@ -110,8 +110,8 @@ def fit_surface(
 ) -> Fit:
     """The motion near ``start`` that best lays (N, 3) points onto the true surface.
 
-    Point-to-plane ICP against the mesh with Tukey's weights; at most 20 000 points are used.
-    The reach shrinks with the residuals, so that what lies nowhere near does not pull.
+    Point-to-plane ICP against the mesh with Tukey's weights; at most 20 000 points are used. The
+    reach shrinks with the residuals, so that distant points have no effect.
     """
     step = max(1, len(points) // 20_000)
     points = np.asarray(points[::step], np.float64)

@@ -234,10 +234,8 @@ def without_cells(raster: Raster, unknown: Bool) -> Raster:
 
 
 def standing_height(raster: Raster, reach_m: float = 2.0, share: float = 0.99) -> float:
-    """How high things stand on this ground: a high quantile of the height above what is near.
-
-    0 where nothing is known. ``share`` of the cells lie less high above the lowest known cell
-    within ``reach_m``.
+    """Height of objects on this ground: the quantile ``share`` of the heights above the lowest
+    known cell within ``reach_m``. 0 where nothing is known.
     """
     known = raster.known
     if not known.any():
@@ -260,9 +258,9 @@ def highest_lowest(height_m: F32, reach_cells: int) -> tuple[F32, F32]:
 def fill_holes(raster: Raster, largest_cells: int = 4) -> Raster:
     """``raster`` with its holes up to ``largest_cells`` wide filled by the mean around them.
 
-    Only holes are closed: the outline of the surveyed area does not grow into the unknown.
-    Filled cells carry the sigma of their surroundings, doubled. For what is looked at;
-    :mod:`recon.surface.hole_filling` is for what is measured.
+    Only holes are closed: the outline of the surveyed area does not grow into the unknown. Filled
+    cells carry the sigma of their surroundings, doubled. For display;
+    :mod:`recon.surface.hole_filling` is for measurement.
     """
     known = raster.known
     if largest_cells < 1 or known.all() or not known.any():

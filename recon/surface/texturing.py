@@ -28,7 +28,7 @@ LARGEST_ATLAS_PX = 8192
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Textured:
-    """A mesh with its image, and what the image is made of."""
+    """A mesh with its image, and the sources of the image."""
 
     mesh: Mesh  # uv set; vertices doubled where charts meet
     image: U8  # (h, w, 3) RGB

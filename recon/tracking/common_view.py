@@ -37,8 +37,8 @@ NEAR_SHARE = 0.06
 """Matches within this share of the width say how far a place is off the homography."""
 
 SIGNATURE_WIDTH_PX, SIGNATURE, SIGNATURE_STEPS = 320, 200, 400.0
-"""Width of the image and its features that say what it looks like, and steps of their
-descriptors in a byte."""
+"""Image width and number of features that describe a view's appearance, and levels of a
+descriptor's byte."""
 
 KEPT = 16
 """Images whose features are remembered."""

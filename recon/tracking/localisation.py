@@ -2,7 +2,7 @@
 
 Section 2.3 of the paper: the two views of the virtual stereo camera give the pose of the new frame
 (Eq. 6-7). DEVIATION: the paper averages a pose by each; here the landmarks of both, each searched
-once, give one, which is the average weighted by what each landmark says.
+once, give one, which is the average weighted by each landmark's information.
 """
 
 from __future__ import annotations

@@ -364,7 +364,7 @@ class Odometry:
                 self.readout.look(self.keyframes)
 
     def _forget(self) -> None:
-        """Drop what left the window: images, corners, and landmarks out of sight."""
+        """Drop images and corners that left the window, and landmarks out of sight."""
         window = self.keyframes[-self.config.window - 2 :]
         for old in self.keyframes[: -len(window)]:
             old.pyramid = matching.Pyramid(())

@@ -89,8 +89,8 @@ def run(options: BenchOptions) -> list[BenchResult]:
 
 
 def masking() -> tuple[float, float]:
-    """Share of the bytes that sending only what is new saves at 80 % overlap, and the bits per
-    point of such keyframes."""
+    """Share of the bytes saved by sending only new surface at 80 % overlap, and the bits per point
+    of such keyframes."""
     whole = sum(_size(make_keyframe(k, SIZE_PX, seed=1 + k)) for k in range(FRAMES))
     fresh = [strip(SIZE_PX, 20 + k) for k in range(FRAMES)]
     frames = [make_keyframe(k, SIZE_PX, f, seed=1 + k) for k, f in enumerate(fresh)]

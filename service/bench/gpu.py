@@ -30,7 +30,8 @@ GUIDE_ON_DEVICE = (2704, 1520)
 
 
 def run(options: BenchOptions) -> list[BenchResult]:
-    """Milliseconds of each stage in torch and ONNX Runtime; one line for what cannot run."""
+    """Milliseconds of each stage in torch and ONNX Runtime; one line for a backend that cannot
+    run."""
     compiled = load_backend("cpu")
     results: list[BenchResult] = []
     for name, measure in (("torch", torch_results), ("onnx", onnx_results)):

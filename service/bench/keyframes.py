@@ -60,8 +60,8 @@ def make_keyframe(
 
 
 def strip(size_px: tuple[int, int], seed: int = 1) -> Bool:
-    """(h, w) what is new at 80 % overlap: a ragged strip along the leading edge, and specks
-    of better surface elsewhere."""
+    """(h, w) new surface at 80 % overlap: a ragged strip along the leading edge, and specks of
+    better surface elsewhere."""
     w, h = size_px
     edge = (1 - OVERLAP) * h + 4 * natural(1, w, 1.5, seed)[0]
     new = np.arange(h)[:, None] < edge[None, :]

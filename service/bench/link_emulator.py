@@ -85,7 +85,8 @@ class _Pipe:
         return None
 
     def resumes(self, at: float, wait_s: float) -> float:
-        """When TCP gets through what it first sends at a time and again after doubling waits."""
+        """The time at which TCP succeeds, sending first at a given time and again after doubling
+        waits."""
         up = self.cut_end(at)
         while up is not None and at < up:
             at += wait_s
@@ -185,8 +186,8 @@ class LinkEmulator:
     ) -> None:
         """Carry one direction until its sender is done.
 
-        What comes out of a cut after the other end has closed is one segment, for that is
-        answered by a reset.
+        After a cut, data for an end that has closed meanwhile is sent as one segment, because a
+        reset answers it.
         """
         waiting: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue()
         task = self._loop.create_task(self._deliver(waiting, writer))

@@ -1,4 +1,5 @@
-"""Real flights: what a replayed scan shows of its own quality, and its truth where there is one.
+"""Real flights: the quality of a replayed scan, by itself and against surveyed truth where there is
+some.
 
 Each set is a folder below ``--data``; a set that is not there is left out. No figure needs a
 simulator. Seams compare the surfaces of two visits, targets are surveyed, the log is the
@@ -61,7 +62,7 @@ Check = Callable[[Flight], Iterator[tuple[str, float, str]]]
 
 @dataclass(frozen=True, slots=True)
 class RealSet:
-    """A set: where it lies, how it is replayed, and what is known of it."""
+    """A data set: its folder, how to replay it, and its known truth."""
 
     name: str
     source: str
@@ -112,7 +113,7 @@ def _skyrelief(*words: str) -> None:
         raise OutsideError(f"skyrelief {words[0]} of {words[1]} failed: {last}")
 
 
-# ---- what needs no truth -------------------------------------------------------------------
+# ---- figures without truth -------------------------------------------------------------------
 
 
 def _placed(flight: Flight) -> Iterator[tuple[str, float, str]]:
@@ -186,7 +187,7 @@ def _points(depth: DepthMap, known: npt.NDArray[np.intp]) -> F64:
     return np.asarray(rays(depth.K, np.stack([u, v], axis=1).astype(np.float64)) * z[:, None])
 
 
-# ---- what needs some -----------------------------------------------------------------------
+# ---- figures with truth -----------------------------------------------------------------------
 
 
 def from_log(flight: Flight) -> Iterator[tuple[str, float, str]]:

@@ -140,7 +140,8 @@ def seam_of(site: Path, scans: Sequence[Path], truths: Sequence[Truth]) -> Seam:
 
 
 def _errors(folder: Path, seqs: Sequence[int] | None, truth: Truth) -> list[tuple[F64, F64]]:
-    """True places and errors, in the truth's frame, of what the keyframes of a scan see."""
+    """True positions and errors, in the truth's frame, of the surface that a scan's keyframes
+    see."""
     with ScanStore.open(folder / "scan.db", read_only=True) as store:
         frame = local_frame(store.header)
         assert frame is not None  # the simulated flights have fixes
@@ -153,7 +154,7 @@ def _errors(folder: Path, seqs: Sequence[int] | None, truth: Truth) -> list[tupl
 
 
 def _ground_error(one: Keyframe, truth: Truth, frame: LocalFrame) -> tuple[F64, F64] | None:
-    """(3,) true place of what the keyframe sees, and (3,) median error of where it has that."""
+    """(3,) true centre of the surface that the keyframe sees, and (3,) its median error."""
     k = int(np.argmin(np.abs(truth.times_s - one.time_ns * 1e-9)))
     h, w = one.depth.depth_m.shape
     v, u = (x.ravel() for x in np.mgrid[4 : h - 4 : 9j, 4 : w - 4 : 13j].astype(np.int64))

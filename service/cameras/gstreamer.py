@@ -71,7 +71,7 @@ class _Complaints:
 
 
 def _open_command(command: list[str], stall_s: float) -> Any:
-    """A container of what ``command`` writes; closing it ends the command.
+    """A container with the output of ``command``; closing it ends the command.
 
     Raises OSError with the command's own complaint when it writes no video.
     """

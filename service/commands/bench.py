@@ -44,7 +44,7 @@ def bench(
 
 
 def _keep(folder: Path, names: list[str], report: dict[str, object]) -> Path:
-    """Write the result file; its name says what ran, when, and on which commit."""
+    """Write the result file; its name has the benchmarks, the date and the commit."""
     day = str(report["date"])[:10]
     path = folder / f"{day}-{str(report['commit']).rstrip('+')}-{'-'.join(names)}.json"
     try:

@@ -61,7 +61,7 @@ def _check(action: str, metres: float | None, timeout: float) -> None:
 
 
 def _watch(operator: Operator, seconds: float, as_json: bool) -> None:
-    """Print what the companion says until the time is over or Ctrl-C."""
+    """Print the companion's messages until the time is over or Ctrl-C."""
     for name, line in LINES.items():
         operator.subscribe(name, _printer(name, line, as_json))
     end = time.monotonic() + seconds if seconds > 0.0 else math.inf

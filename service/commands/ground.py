@@ -160,7 +160,8 @@ def _receive(
     config: ReceiverConfig, mavlink: list[str], portal: PortalOptions | None, take: list[Path],
     until: Until, as_json: bool,
 ) -> None:  # fmt: skip
-    """Receive until a signal, or as ``until`` says; then write what is due and report."""
+    """Receive until a signal, or as ``until`` decides; then write the files that are due, and
+    report."""
     from service.ground.receiver import Receiver
     from service.init_system import Notifier
     from service.radio import GROUND, RadioLink
@@ -211,7 +212,7 @@ def _limits(quota_mb: float | None, drone_share: float, reserve_mb: float | None
 
 
 def _take_in(store: Path, folders: list[Path]) -> None:
-    """Delete what a process that was killed left unfinished; take the folders' scans in."""
+    """Delete unfinished files of a killed process; take in the scans of the folders."""
     from service.ground.storage import clear_leftovers, take_in
 
     clear_leftovers(store)

@@ -171,7 +171,8 @@ def refly(
 def _flight(
     scan_dir: Path, limits: dict[str, Any], overlap: float, relative: bool, photos: bool
 ) -> Refly | None:
-    """Lines over what is weak by ``limits``, flown as the scan was; None where nothing is."""
+    """Lines over the cells that are weak by ``limits``, at the scan's height and speed; None
+    without any."""
     from dataclasses import replace
 
     import numpy as np

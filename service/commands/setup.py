@@ -77,7 +77,7 @@ def doctor(
     listen_s: Annotated[float, typer.Option(help="seconds to listen on the MAVLink links")] = 3.0,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
-    """Say what works, what does not, and what to do. Exit code 3 when something is bad."""
+    """Report what works, what does not, and the remedy. Exit code 3 when something is bad."""
     from service.daemon.diagnosis import BAD, examine
 
     chosen = config or (INSTALLED if INSTALLED.is_file() else None)
@@ -136,7 +136,7 @@ def keys(
 
 
 def _say_revoked(member: str, paths: list[Path], as_json: bool) -> None:
-    """Say what must be copied again before the revocation holds."""
+    """List the files to copy again before the revocation takes effect."""
     if as_json:
         print(json.dumps({"revoked": member, "copy": [str(path) for path in paths]}))
         return

@@ -39,9 +39,9 @@ def stereo(
 ) -> None:
     """Disparity of a rectified pair: left pixel (u, v) matches right pixel (u - d, v).
 
-    As complete as the pair allows: what the right image cannot see takes the disparity of the
-    surface behind; unknown stay blank areas and what lies outside the right image. With
-    --checked, as in flight, only what the pair proves is kept.
+    As complete as the pair allows: surface hidden from the right image takes the disparity of the
+    surface behind; only blank areas and surface outside the right image stay unknown. With
+    --checked, as in flight, only verified disparities are kept.
     """
     gray_left, gray_right = read_gray(left), read_gray(right)
     if gray_left.shape != gray_right.shape:

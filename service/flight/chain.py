@@ -71,7 +71,7 @@ class Chain:
         self._rejected, self._stopwatch = rejected, stopwatch
         self._pieces = Pieces()
         self._T_map = np.eye(4)  # of the last keyframe
-        self._seen: tuple[PosePrior, Placed, int] | None = None  # what vision placed last
+        self._seen: tuple[PosePrior, Placed, int] | None = None  # the last frame placed by vision
         self._news: dict[int, News] = {}  # by view, from thread to thread
         self._newest: Placed | None = None  # view of the chain; None again once all is done
         self._aligned = -1  # the newest segment that has a frame in the world
@@ -146,7 +146,7 @@ class Chain:
             self._pieces.add(keyframe.seq, view.segment, points, view.prior)
 
     def settle(self) -> None:
-        """Drop what is kept of keyframes that the odometry adjusts no longer."""
+        """Drop the data of keyframes that the odometry no longer adjusts."""
         self._carriers.settle(self._is_settled)
 
     def corrections(self, final: bool = False) -> tuple[Repose, ...]:

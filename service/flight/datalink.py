@@ -92,8 +92,8 @@ class DaemonLink:
         self.flying = open_datalink(store, config, self._radio)
 
     def land(self, config: Config, in_haste: bool = False) -> None:
-        """End the scan's sender. What it could not send the backlog will; by radio alone there
-        is none, and the rest is waited for unless the next scan is ``in_haste``."""
+        """End the scan's sender. The backlog sends the rest. By radio alone there is no backlog:
+        then wait for the rest, unless the next scan is ``in_haste``."""
         sender, self.flying = self.flying, None
         if sender is None:
             return

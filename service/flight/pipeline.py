@@ -63,7 +63,7 @@ class Pipeline:
         return Step(tracked, placed, is_view, anchor, keyframes, moved)
 
     def reconstruct(self, view: StereoCandidate) -> Keyframe | None:
-        """One view: its depth by all its partners, its pose, and what of its surface is new."""
+        """One view: its depth from all its partners, its pose, and its new surface."""
         s, depth = self.stages, None
         pairs, grid = s.rectify(view)  # virtual stereo pairs, section 2.1
         if pairs:

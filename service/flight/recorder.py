@@ -67,7 +67,7 @@ class Recorder:
         self.store.add_pose(self.last)
 
     def flush(self) -> None:
-        """Write what the pipeline still holds and correct the trajectory; call it once."""
+        """Write the pipeline's remaining results and correct the trajectory; call it once."""
         try:
             self._write_keyframes(self.pipeline.drain())
         finally:

@@ -207,7 +207,7 @@ class Scan:
                     progress(self)
 
     def close(self) -> dict[str, Any]:
-        """Write what is left and close the scan in the store; return its figures."""
+        """Write the remaining results and close the scan in the store; return its figures."""
         elapsed = max(time.monotonic() - self._started, 1e-9)
         self.check.finish()
         if self.tags is not None:

@@ -1,4 +1,4 @@
-"""The map of known surface: what of a view is new, with the parts flown long ago on disk.
+"""The map of known surface: finds the new surface of a view; parts flown long ago are on disk.
 
 A mission of hours sees more voxels than a companion computer should hold. Tiles that no view
 has touched for longest go to files, and come back before a view looks at their ground again.
@@ -151,8 +151,8 @@ class SurfaceMap:
     def __call__(
         self, view: StereoCandidate, depth: DepthMap, T_map_camera: F64
     ) -> tuple[F32, Bool]:
-        """((h, w) sigma widened by what views disagree and by an assumed lens, (h, w) surface that
-        is new or better)."""
+        """((h, w) sigma widened by disagreement between views and by an assumed lens, (h, w)
+        surface that is new or better)."""
         with self._stopwatch("map"):
             if view.segment != self._segment:
                 self._disagreement.forget()

@@ -30,7 +30,7 @@ WORTH_TELLING_MS = 10.0
 
 
 class TelemetryCheck:
-    """Feed it every tracked frame; it says when a frame was exposed, and what it found."""
+    """Takes every tracked frame; gives the exposure times of frames, and its findings."""
 
     def __init__(
         self,
@@ -133,7 +133,7 @@ class TelemetryCheck:
             self._once("latency", f"{text}, {self.applied_ms:.0f} ms is set")
 
     def _judge_frame(self, history: VehicleHistory) -> None:
-        """Correct what the gimbal claims when the images refute it."""
+        """Correct the gimbal's declared reference when the images refute it."""
         verdict, used = self.frame, history.gimbal_frame()
         if verdict is None or not verdict.decided or used not in verdict.refuted:
             return

@@ -22,7 +22,8 @@ class TrackingWatch:
         self._reasons: Counter[str] = Counter()
 
     def look(self, tracked: Tracked, time_ns: int) -> None:
-        """Take what a frame gave; times never go back. A camera that stands still is not lost."""
+        """Take the result of a frame; times never decrease. A camera that stands still is not
+        lost."""
         if tracked.state in FOUND:
             if self._is_reported:
                 self._warn("Tracking recovered")

@@ -30,7 +30,7 @@ class OdometryReport:
     """
 
     def __init__(self, camera: CameraConfig, send: Callable[[Odometry, int], object]) -> None:
-        """``send(odometry, time_ns)`` takes what comes out, at the frame's exposure."""
+        """``send(odometry, time_ns)`` takes the result, at the frame's exposure."""
         self._send = send
         rpy = np.radians([camera.mount_roll_deg, camera.mount_pitch_deg, camera.mount_yaw_deg])
         self._R_body_head = rotation_from_rpy(*map(float, rpy))

@@ -234,7 +234,7 @@ class Viewpoints:
         return sum(v.segment == view.segment for v in self._kept) >= 3
 
     def confirmed(self, view: Viewpoint) -> bool:
-        """False for a stretch of two views: what one pair alone claims, nothing contradicts.
+        """False for a stretch of two views: no other view can contradict a single pair.
 
         Clouds in the sky or a false first motion would otherwise become surface. A baseline
         that the operator fixed pairs each view once and is taken at its word.

@@ -1,8 +1,8 @@
 """A basemap that the operator gives: raster tiles of an MBTiles or a PMTiles (version 3) file.
 
 MBTiles 1.3 is a SQLite database with rows counted from the south. PMTiles orders tiles along a
-Hilbert curve; directories of runs of them lead to their bytes. The file may be a stranger's: what
-it claims is checked before memory or time is spent on it.
+Hilbert curve; directories of runs give their bytes. The file may be untrusted: its claims are
+checked before memory or time is spent on it.
 """
 
 from __future__ import annotations

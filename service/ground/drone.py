@@ -87,7 +87,7 @@ class DroneReceiver:
         return list(self._scans.values())
 
     def run(self, worker: Worker) -> None:
-        """Take in what comes until the worker is to stop."""
+        """Take in what arrives until the worker stops."""
         while not worker.stop.is_set():
             worker.beat()
             batch = self.inbox.take(TICK_S)
@@ -150,7 +150,7 @@ class DroneReceiver:
             self._rest(scan, str(error), now)
 
     def _rest(self, scan: ReceivedScan, trouble: str, now: float) -> None:
-        """Leave a scan alone that cannot be written; what is missed is asked for later."""
+        """Pause a scan that cannot be written; missing items are requested later."""
         if trouble != scan.trouble:
             log.error("%s; trying again every %.0f s", trouble, FULL_DISK_REST_S)
         scan.trouble, scan.rest_until = trouble, now + FULL_DISK_REST_S
@@ -323,7 +323,7 @@ class DroneReceiver:
                 self._tend(scan, now)
 
     def _tend(self, scan: ReceivedScan, now: float) -> None:
-        """Report, ask, and write what is complete."""
+        """Report, request missing items, and write complete scans."""
         pause = REPORT_S if scan.changed else REPORT_IDLE_S
         if now - scan.reported_at >= pause:
             scan.reported_at, scan.changed = now, False

@@ -36,7 +36,7 @@ class Batch:
 
 
 class Inbox:
-    """Takes messages from any thread; each method says False for what there is no room for."""
+    """Takes messages from any thread; each method returns False when there is no room."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -71,7 +71,7 @@ class Inbox:
             )
 
     def take(self, timeout_s: float) -> Batch:
-        """All that waits; what comes within the timeout when nothing does."""
+        """All waiting messages; without any, those that arrive within the timeout."""
         with self._changed:
             self._changed.wait_for(lambda: bool(self._batch), timeout_s)
             batch, self._batch = self._batch, Batch()

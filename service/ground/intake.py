@@ -1,8 +1,8 @@
 """The ground's side of the datalink for one scan, without sockets or clocks.
 
 A scan that a drone names gets a folder for a valid header only (:class:`Introduction`). From then
-on :class:`ScanIntake` knows what the drone says it has, stores what comes, and says what to ask
-for: what was not on its way a moment ago, small records first, then the newest and coarsest.
+on :class:`ScanIntake` stores what arrives and decides what to request: items that the drone has
+announced and that are not on their way, small records first, then the newest and coarsest.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Introduction:
         self._ask_at = 0.0
 
     def on_head(self, head: Head, now: float) -> None:
-        """The drone says what it has."""
+        """Take the drone's announcement of its items."""
         self.head, self.seen_at = head, now
 
     def next_ask(self, now: float) -> RangeSet | None:
@@ -138,7 +138,7 @@ class ScanIntake:
     # What comes
 
     def on_head(self, head: Head, now: float) -> None:
-        """The drone says what it has."""
+        """Take the drone's announcement of its items."""
         for kind, numbers in missing(head.numbers, self.store.numbers()).items():
             if kind.startswith("k"):
                 for number in islice(numbers.newest_first(), TIMED):
@@ -148,7 +148,7 @@ class ScanIntake:
         if now - self.head_at > SILENCE_S:
             self._requests.clear()
             self._rest_until.clear()
-        # What the very first head names was made before anybody listened: it is due at once.
+        # The first head names items made before this station listened: they are due at once.
         self._heads.append((now - GRACE_S if self.head is None else now, head))
         self.head, self.head_at = head, now
 
@@ -228,7 +228,7 @@ class ScanIntake:
         return self._assembler.held_bytes
 
     def forget_unfinished(self) -> None:
-        """Drop what came of unfinished records; they are asked for again."""
+        """Drop the parts of unfinished records; they are requested again."""
         self._assembler = Assembler()
 
     @property

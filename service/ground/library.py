@@ -96,7 +96,7 @@ class Library:
         clear_leftovers(store)
 
     def scans(self) -> list[dict[str, Any]]:
-        """One entry per scan, the newest first; a broken scan is listed with what is wrong."""
+        """One entry per scan, the newest first; a broken scan is listed with its fault."""
         entries = []
         for drone, scan in self._names():
             with contextlib.suppress(InputError):  # deleted meanwhile

@@ -95,7 +95,7 @@ class StoreIndex:
     """Contents of a store's file, also when another process writes it. Use from one thread."""
 
     RADIO = -1
-    """The layer that stands for what came by the narrow radio only."""
+    """The layer number of keyframes that came by the narrow radio only."""
 
     def __init__(self, path: Path) -> None:
         uri = f"{path.resolve().as_uri()}?mode=ro"
@@ -130,7 +130,7 @@ class StoreIndex:
 
 @dataclass(slots=True, eq=False)
 class LiveFeed:
-    """Says what is new in a store since it was asked before.
+    """Gives what is new in a store since the last call.
 
     One feed serves one browser. Keyframes come with the finest layer there is; when a finer
     one arrives later, it comes again and replaces the coarse one.
@@ -183,7 +183,7 @@ class LiveFeed:
         self._scale[seq] = 1.0 if repose is None else repose.scale
 
     def _corrections(self) -> Iterator[str]:
-        """Re-poses newer than what a sent chunk was placed with."""
+        """Re-poses newer than the pose that a chunk was sent with."""
         for seq, had in self._revision.items():
             repose = self.store.repose(seq)
             if repose is None or repose.revision <= had:

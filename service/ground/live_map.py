@@ -166,7 +166,7 @@ class LiveMap:
         return [(self._seqs[i], self._states[i]) for i in np.flatnonzero(hit & (b[:, 3] > north))]
 
     def _draw(self, points: _Points, tile: Tile, drawn: _Drawn) -> None:
-        """Put those points into a tile that are surer than what it shows."""
+        """Put those points into a tile whose sigma is smaller than that of the point it shows."""
         scale = float(SIDE << tile[0])
         col, row = np.floor((points.place - _corner(tile)) * scale).astype(np.int64).T
         inside = (col >= 0) & (col < WIDE) & (row >= 0) & (row < WIDE)

@@ -1,8 +1,8 @@
 """A scan's store from the MCAP that an aircraft recorded or exported.
 
-Reads what :mod:`service.offline.exports.recording` writes: points in the camera's frame become the
-depth image again that they came from. What an MCAP does not hold (covariances of rotation,
-re-poses, the scan's settings) is left at defaults and said in a note.
+Reads what :mod:`service.offline.exports.recording` writes: points in the camera's frame become a
+depth image again. Parts that an MCAP lacks (covariances of rotation, re-poses, the scan's settings)
+stay at defaults, with a note.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ _FIELDS: dict[str, list[tuple[str, int, int, str]]] = {
         ("frame_id", 9, _STRING, ""),
     ],
 }
-"""The fields of Foxglove's schemas that are read: name, number, type, and what it holds."""
+"""The fields of Foxglove's schemas that are read: name, number, type, and content."""
 
 
 def messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, Any]]:

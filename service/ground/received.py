@@ -34,7 +34,7 @@ def mark_due(folder: Path) -> None:
 
 
 def begin_files(folder: Path) -> None:
-    """Its files are being written; what comes from now on marks it again."""
+    """Note that its files are being written; later arrivals mark it again."""
     try:
         (folder / MARK).replace(folder / BEGUN)
     except OSError as error:
@@ -55,7 +55,7 @@ def folders_due(store: Path) -> list[Path]:
 
 
 def write_left(folder: Path) -> None:
-    """Write the files that a former process could not. Raises what that raises."""
+    """Write the files that a former process could not; its errors are passed on."""
     begin_files(folder)
     with ScanStore.open(folder / "scan.db") as store:
         write_deliverables(folder, store, {})

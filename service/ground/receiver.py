@@ -221,7 +221,7 @@ class Receiver:
             put(drone.inbox, place[1], sample.payload.to_bytes())
 
     def _look_around(self, session: zenoh.Session, now: float) -> None:
-        """Have the drones that are there say at once what they have."""
+        """Ask all present drones for their heads at once."""
         import zenoh
 
         if any(now - drone.heard_at < LOOK_AROUND_S for drone in self._drones.all):
@@ -308,7 +308,7 @@ class Receiver:
         self._writes.put(scan)
 
     def _write_all(self, worker: Worker) -> None:
-        """Write what is asked for, and in between what a former process left."""
+        """Write requested deliverables, and in between those that a former process left."""
         left = deque(folders_due(self._config.store))
         while True:
             try:

@@ -1,7 +1,7 @@
 """Facts about a scan for the library, read from files that may come from a stranger.
 
-Strict JSON into typed records with bounds: what does not fit raises ValueError or RecursionError
-here, and nothing odd (no NaN, no half letter) reaches the list.
+Strict JSON into typed records with bounds: anything else raises ValueError or RecursionError here,
+so that no NaN and no broken text reaches the list.
 """
 
 from __future__ import annotations

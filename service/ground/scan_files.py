@@ -143,8 +143,8 @@ def _image(request: Request) -> Response:
 def _completed(keyframe: Keyframe, earlier: Iterable[Keyframe]) -> tuple[U8, Bool]:
     """(H, W, 3) colours of a keyframe and (H, W) which are known.
 
-    A chunk has no colours where nothing is new. What is old there was in a keyframe before it:
-    those points are projected into this camera, the newest first, the nearest point to each pixel.
+    A chunk has no colours where nothing is new. Earlier keyframes have them: their points are
+    projected into this camera, the newest first, the nearest point to each pixel.
     """
     bgr, known = keyframe.bgr.copy(), keyframe.fresh.copy()
     K, T_camera_world = keyframe.depth.K, np.linalg.inv(keyframe.depth.T_world_camera)

@@ -1,9 +1,8 @@
-"""The folders of a ground station's store: what each drone may fill, which scan lies where, and
-scans copied in from a card.
+"""The folders of a ground station's store: the quota of each drone, the folder of each scan, and
+scans copied from a card.
 
-The card may come from a stranger: regular files of known names only, as many bytes as fit. Nothing
-in it is followed, nothing on it is written, and what was a pipe, a device or a symbolic link is
-left out.
+The card may come from a stranger: regular files of known names only, as many bytes as fit. Links in
+it are not followed, nothing on it is written, and pipes, devices and symbolic links are left out.
 """
 
 from __future__ import annotations
@@ -233,8 +232,8 @@ def take_in(store: Path, folder: Path) -> list[Path]:
     """The scan folders under ``store`` that now hold what those in ``folder`` hold.
 
     ``folder`` is a scan folder or a folder of them, such as a card's; nothing is written there.
-    What came by radio or network before is kept and completed. Raises InputError when there is
-    no scan, OutsideError when the disk is full.
+    Items received before by radio or network are kept and completed. Raises InputError when there
+    is no scan, OutsideError when the disk is full.
     """
     paths = [folder / STORE_FILES[0], *sorted(folder.glob(f"*/{STORE_FILES[0]}"))]
     paths = [path for path in paths if is_regular(path)]

@@ -271,7 +271,7 @@ class DatalinkSender:
             closed.wait(PROMPT_CLOSING_S)
 
     def _listen(self, session: zenoh.Session) -> list[Worker]:
-        """Workers that take what comes. They end with the session.
+        """Workers that take what arrives. They end with the session.
 
         Channels and threads of our own: a callback's thread would belong to the library, and
         end the process with an abort when it outlives the interpreter.

@@ -194,7 +194,7 @@ def _geometry(mesh: Mesh, textured: bool) -> Any:
 
 
 def _material() -> dict[str, Any]:
-    """Without light or back: what the image holds is shown from both sides."""
+    """Unlit and double-sided: the image's colours are shown from both sides."""
     return {
         "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
         "extensions": {"KHR_materials_unlit": {}},

@@ -1,4 +1,4 @@
-"""A second flight over what the first saw too little of, as a mission for ground stations.
+"""A second flight over the weak areas of the first, as a mission for ground stations.
 
 Lines run over the weak cells of the coverage layer at the height flown, as far apart as the
 camera's image and the wanted overlap allow. The camera starts before the first line and

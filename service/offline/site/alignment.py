@@ -42,7 +42,7 @@ MIN_TIES = 3
 """Between two scans; fewer may be chance."""
 
 MIN_SIGMA = np.array([0.003] * 3 + [0.05] * 3 + [0.003])
-"""Of what a scan knows of its placing: rad, m, share."""
+"""Sigmas of a scan's own position, heading and scale: rad, m, share."""
 
 SIGMA_SCALE = 0.01
 """Of a scan that does not say how sure its scale is."""
@@ -154,7 +154,8 @@ def _bent(
 ) -> tuple[F64, F64]:  # fmt: skip
     """Poses and covariances after the motions of the scans, adjusted to the ties.
 
-    What a receiver and vision err along a flight bends its track; the ties say where.
+    Errors of the receiver and of vision that change along a flight bend its track; the ties show
+    where.
     """
     moved = np.array([found.moves[s].pose(T) for s, T in zip(scans, track.poses, strict=True)])
     closures = []

@@ -111,7 +111,7 @@ def surfaces(view: ScanView, members: list[Member], cell_m: float | None) -> lis
 def hide_changed(path: Path, earlier: Member, change: Change) -> None:
     """Take what has changed since out of the earlier scan's keyframes in the site's store.
 
-    So the site's surface is not the mean of what was and what is. The scan itself keeps it.
+    Otherwise the site's surface would be the mean of both dates. The scan itself keeps it.
     """
     changed = cv2.dilate((change.labels > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     layers: dict[int, tuple[bytes, ...]] = {}
