@@ -83,6 +83,8 @@ ROWS: tuple[Row, ...] = (
     Row("replies", "answers that drones wait for", 2, None, "", _STALL_S, True, True),
     Row("drone", "the scans of one drone", 3, None, "", _STALL_S, True),
     Row("deliverables", "files of received scans", 4, restarts=True, is_essential=True),
+    Row("sites", "aligns finished scans with those of the same ground", 4, restarts=True),
+    Row("alignment", "process: one of them", 4),
     Row("exports", "deliverables asked for in the portal", 4, 20, "refuse", is_awaited=True),
     Row("vehicle", "looks for the vehicle that the portal steers", 5, restarts=True),
     Row("portal", "the web server", 5, None, "", 60.0, True, True),

@@ -93,6 +93,9 @@ def ground(
         list[Path] | None,
         typer.Option(help="scans from an aircraft's storage, taken in first; may be repeated"),
     ] = None,
+    sites: Annotated[
+        bool, typer.Option(help="align finished scans that show the same ground, in STORE/site")
+    ] = True,
     once: Annotated[bool, typer.Option("--once", help="end when a scan is complete")] = False,
     idle_exit_s: Annotated[
         float | None, typer.Option(help="end when nothing new came for so many seconds")
@@ -109,7 +112,7 @@ def ground(
     if portal is not None:
         page = PortalOptions(portal, portal_token, portal_tls, vehicle, basemap)
     _receive(
-        ReceiverConfig(store, session, limits, name, refresh),
+        ReceiverConfig(store, session, limits, name, refresh, sites),
         mavlink or [], page, take or [], Until(once, idle_exit_s), as_json,
     )  # fmt: skip
 
@@ -168,11 +171,13 @@ def _receive(
     from service.workers import Workers
 
     notifier = Notifier()
-    _take_in(config.store, take)
+    taken = _take_in(config.store, take)
     stop, workers = stop_by_signals(), Workers()
     receiver = Receiver(config, workers)
     radios = [RadioLink(endpoint, GROUND, receiver.add_radio) for endpoint in mavlink]
     receiver.start()
+    for folder in taken:
+        receiver.align(folder)
     where = ", ".join((*config.session.listen, *config.session.connect))
     print(f"ground station at {where}, scans in {config.store}", file=sys.stderr, flush=True)
     for radio in radios:
@@ -211,13 +216,15 @@ def _limits(quota_mb: float | None, drone_share: float, reserve_mb: float | None
     return Limits(quota, drone_share / 100.0, reserve)
 
 
-def _take_in(store: Path, folders: list[Path]) -> None:
+def _take_in(store: Path, folders: list[Path]) -> list[Path]:
     """Delete unfinished files of a killed process; take in the scans of the folders."""
     from service.ground.storage import clear_leftovers, take_in
 
     clear_leftovers(store)
-    for taken in (path for folder in folders for path in take_in(store, folder)):
-        print(f"taken in: {taken}", file=sys.stderr, flush=True)
+    taken = [path for folder in folders for path in take_in(store, folder)]
+    for path in taken:
+        print(f"taken in: {path}", file=sys.stderr, flush=True)
+    return taken
 
 
 def _open_portal(

@@ -5,7 +5,8 @@ finished scan is complete, and when the receiver closes, the deliverables are wr
 it. Everything may be killed at any time and started again.
 
 Threads, all of the table of workers: one that keeps the session, three that take messages
-from it, one per drone (:mod:`service.ground.drone`), one that writes deliverables.
+from it, one per drone (:mod:`service.ground.drone`), one that writes deliverables, and one that
+aligns finished scans (:mod:`service.ground.sites`).
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from service.ground.received import (
     folders_due,
     write_left,
 )
+from service.ground.sites import Sites
 from service.ground.storage import scan_folder
 from service.stream.naming import ROOT, place_of, station_name
 from service.stream.session import SessionConfig, check_endpoints, open_session
@@ -61,6 +63,7 @@ class ReceiverConfig:
     limits: Limits = field(default_factory=Limits)
     name: str = ""  # of this station; empty: made once and kept in the store
     refresh_s: float = 0.0  # write deliverables of growing scans so often; 0: when complete
+    sites: bool = False  # align finished scans that show the same ground
 
 
 class Receiver:
@@ -87,6 +90,7 @@ class Receiver:
         self._radio: deque[bytes] = deque(maxlen=MAX_RADIO_WAITING)
         self._tunnel = TunnelIntake()
         self._writes: queue.Queue[ReceivedScan | None] = queue.Queue()
+        self._sites = Sites(config.store, config.limits)
         self._running: list[Worker] = []
         self._refresh_at = -1e9
         self._dropped = 0
@@ -99,6 +103,7 @@ class Receiver:
             start("deliverables", self._write_all),
             start("replies", self._replies.run),
             start("receiver", self._run),
+            *([start("sites", self._sites.run)] if self._config.sites else ()),
         ]
         while not self._opened.wait(0.1):
             if self._failure is not None:
@@ -109,7 +114,7 @@ class Receiver:
         """End, and write the deliverables of what has changed."""
         if not self._running:
             return
-        writer, replies, main = self._running
+        writer, replies, main, *sites = self._running
         self._running = []
         main.join()
         replies.join()
@@ -119,6 +124,8 @@ class Receiver:
                 self.write(scan)
         self._writes.put(None)
         writer.join()
+        for worker in sites:
+            worker.join()
         for scan in scans:
             scan.intake.store.close()
 
@@ -302,6 +309,11 @@ class Receiver:
     def opened(self, scan: ReceivedScan) -> None:
         """A scan was opened; for those who watch."""
 
+    def align(self, folder: Path) -> None:
+        """Align a finished scan with those that show the same ground, where this is wanted."""
+        if self._config.sites:
+            self._sites.put(folder)
+
     def write(self, scan: ReceivedScan) -> None:
         """Have the scan's deliverables written."""
         scan.unwritten, scan.is_writing = False, True
@@ -324,6 +336,8 @@ class Receiver:
                 return
             begin_files(scan.folder)
             scan.trouble = guarded(f"deliverables of {scan.folder}", partial(deliver, scan))
+            if scan.intake.complete and not scan.trouble:
+                self.align(scan.folder)
             end_files(scan.folder)
             scan.is_written, scan.is_writing = True, False
             drone = self._drones.present(scan.drone)

@@ -7,7 +7,7 @@ so that no NaN and no broken text reaches the list.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 
@@ -19,6 +19,7 @@ from service.stream.store import ScanStore
 MAX_JSON_BYTES = 4_000_000
 SCHEMA = 1
 MAX_TROUBLE = 500
+T = TypeVar("T")
 
 UnixTime = Annotated[float, msgspec.Meta(ge=-1e11, le=1e11)]
 Figure = Annotated[float, msgspec.Meta(ge=-1e300, le=1e300)]
@@ -45,6 +46,33 @@ class TrustFacts(msgspec.Struct):
 
     level: Annotated[str, msgspec.Meta(max_length=40)]
     reasons: Annotated[list[Note], msgspec.Meta(max_length=100)]
+
+
+Corner = tuple[
+    Annotated[float, msgspec.Meta(ge=-90, le=90)], Annotated[float, msgspec.Meta(ge=-180, le=180)]
+]
+
+
+class Coverage(msgspec.Struct):
+    """The extent of what a scan measured."""
+
+    corners_lat_lon: tuple[Corner, Corner, Corner, Corner]
+
+
+class Ground(msgspec.Struct):
+    """When a scan was flown, and over which ground."""
+
+    times: Times
+    finished: bool
+    coverage: Coverage | None = None
+
+    @property
+    def box(self) -> tuple[Corner, Corner] | None:
+        """Lowest and highest latitude and longitude; None without a georeference."""
+        if self.coverage is None:
+            return None
+        lat, lon = zip(*self.coverage.corners_lat_lon, strict=True)
+        return (min(lat), min(lon)), (max(lat), max(lon))
 
 
 class Facts(msgspec.Struct):
@@ -93,12 +121,21 @@ def facts_of(source: Path | ScanStore) -> dict[str, Any]:
     return (_from_summary(source) if isinstance(source, Path) else _from_store(source)).shown()
 
 
+def ground_in(path: Path) -> Ground:
+    """When and where a scan was flown, from its ``scan.json``; errors as of :func:`facts_of`."""
+    return _decoded(path, Ground)
+
+
 def _from_summary(path: Path) -> Facts:
+    return _decoded(path, Facts)
+
+
+def _decoded(path: Path, kind: type[T]) -> T:
     data = _small(path)
     try:
         if msgspec.json.decode(data, type=_Schema).schema != SCHEMA:
             raise InputError(f"{path.name} was written by another version; update skyrelief")
-        return msgspec.json.decode(data, type=Facts)
+        return msgspec.json.decode(data, type=kind)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path.name} cannot be read: {error}") from error
 

@@ -27,6 +27,7 @@ from recon.posegraph.submap_loops import SubmapLoopConfig
 from recon.types import F64, Bool, Keyframe
 from service.errors import InputError
 from service.offline.refine.stored_loops import BREAK_S, StoredLoops
+from service.offline.site import SITE
 from service.offline.site.gather import Member, gather
 from service.scans.folder import write_deliverables
 from service.scans.track import local_frame
@@ -34,7 +35,6 @@ from service.scans.writing import writing
 from service.stream.records import Repose
 from service.stream.store import ScanStore
 
-SITE = "site.json"
 ALIGNED = 1
 """Revision of the poses by the alignment; 0 are the scans' own."""
 
@@ -74,25 +74,28 @@ def align_site(folders: Sequence[Path], out: Path, deliver: bool = True) -> Alig
     Raises InputError for scans that make no site, and when ``out`` holds anything else.
     """
     known = _known(out)
-    folders = [*(Path(s["folder"]) for s in known.get("scans", [])), *folders]
+    earlier = [Path(s["folder"]) for s in known.get("scans", [])]
+    gone = [f for f in earlier if not (f / "scan.db").is_file()]
+    folders = [*(f for f in earlier if f not in gone), *folders]
     unique = list(dict.fromkeys(f.resolve() for f in folders))
     out.mkdir(parents=True, exist_ok=True)
     fresh = out / ".scan.db.new"
     _remove(fresh)
     try:
         members, notes = gather(unique, fresh, out.resolve().name)
+        notes += [f"{f} is no longer there: left out" for f in gone]
         with ScanStore.open(fresh) as store:
             found, priors, ties, adjusted = _aligned(store, members)
             store.add_reposes(_reposes(store, members, found, adjusted))
             document = _document(store, members, found, priors, ties, notes, known)
             store.update_header(notes=tuple(document["notes"]))
+        with writing(out / SITE) as part:
+            part.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
         _replace(fresh, out / "scan.db")
     finally:
         _remove(fresh)
         if not any(out.iterdir()):
             out.rmdir()
-    with writing(out / SITE) as part:
-        part.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     if deliver:
         with ScanStore.open(out / "scan.db") as store:
             write_deliverables(out, store, {})
@@ -104,8 +107,8 @@ def _known(out: Path) -> dict[str, Any]:
     if not out.exists():
         return {}
     if not (out / SITE).is_file():
-        if out.is_dir() and not any(out.iterdir()):
-            return {}
+        if out.is_dir() and not any(path.name[0] != "." for path in out.iterdir()):
+            return {}  # empty, or left by a process that was killed
         raise InputError(f"{out} exists and is no site; choose another folder")
     try:
         document = json.loads((out / SITE).read_text(encoding="utf-8"))

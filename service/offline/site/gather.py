@@ -21,15 +21,13 @@ from recon import se3
 from recon.types import F64, Keyframe
 from service.errors import InputError
 from service.georeference import LocalFrame
+from service.offline.site import DRONE
 from service.scans.main_piece import main_seqs
 from service.scans.track import latest, local_frame
 from service.stream import codec
 from service.stream.records import PoseRecord, Repose, ScanHeader
 from service.stream.store import ScanStore
 from service.version import software
-
-DRONE = "site"
-"""Of a site's header: the folder between the library and its sites."""
 
 MAX_DISTANCE_M = 20_000.0
 """Between the origins of two scans of one site: their tangent planes still agree there."""

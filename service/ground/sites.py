@@ -1,0 +1,148 @@
+"""Sites by themselves: a scan that ends is aligned with the scans that show the same ground.
+
+A site lies in STORE/site/NAME, as a scan does, and grows with each scan that belongs to it. Every
+alignment is a process: a damaged scan or a large site takes nothing from reception.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import queue
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from subprocess import DEVNULL
+
+import msgspec
+
+from service.errors import InputError
+from service.ground.drone import Limits
+from service.ground.scan_facts import Ground, ground_in
+from service.ground.storage import DiskShare, is_regular
+from service.offline.site import DRONE, SITE
+from service.small_file import read_small
+from service.workers import Worker, end_process, guarded, open_process
+
+log = logging.getLogger(__name__)
+
+SAME_VISIT_S = 86_400.0
+"""Between the starts of two scans; ground seen further apart may differ, see ``site compare``."""
+
+MIN_SHARED = 0.05
+"""Of the smaller scan's extent, that the other covers as well."""
+
+SIZES = 3
+"""A site takes up to so many times the disk of its scans' stores, with its files."""
+
+ALIGN_S = 7200.0
+"""One alignment may take so long."""
+
+NICE = 10
+START = "from service.cli import main; main()"
+MAX_SITE_BYTES = 4_000_000
+UNREADABLE = (InputError, OSError, ValueError, RecursionError)
+
+
+class Sites:
+    """Aligns the scans put in, one after the other, on one thread."""
+
+    def __init__(self, store: Path, limits: Limits) -> None:
+        self._store = store
+        self._share = DiskShare(store / DRONE, limits.drone_share, limits.reserve_bytes)
+        self._waiting: queue.Queue[Path] = queue.Queue()
+
+    def put(self, folder: Path) -> None:
+        """Align a finished scan with its neighbours when its turn comes."""
+        self._waiting.put(folder)
+
+    def run(self, worker: Worker) -> None:
+        """Align until the stop, which also ends an alignment under way."""
+        while not worker.stop.is_set():
+            with contextlib.suppress(queue.Empty):
+                folder = self._waiting.get(timeout=0.5)
+                worker.fault = guarded(f"site of {folder}", partial(self._join, folder, worker))
+
+    def _join(self, folder: Path, worker: Worker) -> None:
+        """Raises InputError where the scans make no site, OutsideError for the disk."""
+        members = [*companions(self._store, folder), folder]
+        if len(members) == 1:
+            return
+        sizes = (path.stat().st_size for m in members for path in m.glob("scan.db*"))
+        self._share.check(SIZES * sum(sizes))
+        site = site_of(self._store, members)
+        words = ["site", "align", *map(str, members), "--out", str(site)]
+        with tempfile.TemporaryFile() as errors:
+            process = open_process(
+                "alignment", [sys.executable, "-c", START, *words],
+                stdin=DEVNULL, stdout=DEVNULL, stderr=errors,
+            )  # fmt: skip
+            with contextlib.suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, process.pid, NICE)
+            deadline = time.monotonic() + ALIGN_S
+            while process.poll() is None:
+                if worker.stop.wait(0.2) or time.monotonic() > deadline:
+                    end_process(process)
+                    return
+            if process.returncode:
+                errors.seek(max(errors.tell() - 2000, 0))
+                said = errors.read(2000).decode(errors="replace").strip().splitlines()
+                raise InputError(f"{site}: {said[-1] if said else 'no reason given'}")
+        log.info("%s: %d scans are aligned", site, len(members))
+
+
+def companions(store: Path, folder: Path) -> list[Path]:
+    """The finished scans of the same visit that share ground with the one in ``folder``."""
+    try:
+        own = ground_in(folder / "scan.json")
+    except UNREADABLE:
+        return []
+    others = ((path, ground) for path, ground in _grounds(store) if path != folder)
+    return [path for path, ground in others if _is_shared(own, ground)]
+
+
+def site_of(store: Path, members: Sequence[Path]) -> Path:
+    """The folder of the site that has one of the members; else a new one, by the first of them."""
+    known = {member.resolve() for member in members}
+    for path in sorted((store / DRONE).glob(f"*/{SITE}")):
+        with contextlib.suppress(*UNREADABLE):
+            site = msgspec.json.decode(read_small(path, MAX_SITE_BYTES, "site"), type=_Site)
+            if known & {Path(scan.folder) for scan in site.scans}:
+                return path.parent
+    first = min(members, key=lambda folder: (folder.name, folder.parent.name))
+    return store / DRONE / f"{first.parent.name}-{first.name}"[:100]
+
+
+class _Scan(msgspec.Struct):
+    folder: str
+
+
+class _Site(msgspec.Struct):
+    scans: list[_Scan]
+
+
+def _grounds(store: Path) -> Iterator[tuple[Path, Ground]]:
+    for path in sorted(store.glob("*/*/scan.json")):
+        drone = path.parent.parent.name
+        if drone == DRONE or drone.startswith(".") or not is_regular(path.parent / "scan.db"):
+            continue
+        with contextlib.suppress(*UNREADABLE):
+            yield path.parent, ground_in(path)
+
+
+def _is_shared(a: Ground, b: Ground) -> bool:
+    """True for finished scans of one visit whose extents overlap."""
+    if a.box is None or b.box is None or not (a.finished and b.finished):
+        return False
+    if abs(a.times.started_unix_s - b.times.started_unix_s) > SAME_VISIT_S:
+        return False
+    common, areas = 1.0, [1.0, 1.0]
+    for axis in range(2):
+        sides = [(box[0][axis], box[1][axis]) for box in (a.box, b.box)]
+        common *= max(min(end for _, end in sides) - max(begin for begin, _ in sides), 0.0)
+        areas = [area * (end - begin) for area, (begin, end) in zip(areas, sides, strict=True)]
+    return common > MIN_SHARED * min(areas)
