@@ -19,6 +19,9 @@ PEERS := $(VENV)/peers/installed
 demo: $(CORE)
 	@$(BIN)/skyrelief demo --out demo-output $(ARGS)
 
+# The tests start hundreds of Python processes; each would compile all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
+
 # A worker a core; JOBS=0: one after the other, in one process.
 JOBS ?= auto
 test: $(STAMP) $(PEERS)
