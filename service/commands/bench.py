@@ -13,10 +13,10 @@ from service.errors import InputError, OutsideError
 
 
 def bench(
-    names: Annotated[list[str] | None, typer.Argument(help="which; all when none is named")] = None,
+    names: Annotated[list[str] | None, typer.Argument(help="benchmarks; default: all")] = None,
     rounds: Annotated[int, typer.Option(help="timed rounds of each figure", min=1)] = 30,
     backend: Annotated[str, typer.Option(help="auto, cpu, torch or onnx")] = "cpu",
-    device: Annotated[str, typer.Option(help="of 'gpu': cuda or cpu; default: what is there")] = "",
+    device: Annotated[str, typer.Option(help="for 'gpu': cuda or cpu; default: auto")] = "",
     data: Annotated[Path | None, typer.Option(help="folder of sets to score on")] = None,
     keep: Annotated[Path | None, typer.Option(help="folder for a result file (JSON)")] = None,
     as_json: AsJson = False,

@@ -24,7 +24,7 @@ def export(
     ] = None,
     voxel_m: Voxel = None,
     cell_m: Annotated[
-        float | None, typer.Option("--cell-m", help="cell of dsm, ortho, contours")
+        float | None, typer.Option("--cell-m", help="cell size of dsm, ortho, contours")
     ] = None,
     contour_m: Annotated[float, typer.Option("--contour-m", help="contour interval")] = 1.0,
     strict: Annotated[
@@ -32,10 +32,10 @@ def export(
     ] = False,
     video: Annotated[
         Path | None,
-        typer.Option(help="of the flight, for ortho and glb; default: as scan.json names"),
+        typer.Option(help="the flight's, for ortho and glb; default: as named in scan.json"),
     ] = None,
     stored: Annotated[
-        bool, typer.Option("--stored", help="ortho and glb from the scan's own small images")
+        bool, typer.Option("--stored", help="make ortho and glb from the scan's own small images")
     ] = False,
     video_epoch: Annotated[
         float | None, typer.Option(help="unix seconds of its start; default: the scan's start")
@@ -87,7 +87,7 @@ def mesh(
     voxel_m: Voxel = None,
     video: Annotated[
         Path | None,
-        typer.Option(help="the flight's video or folder of images; default: as scan.json names"),
+        typer.Option(help="the flight's video or folder of images; default: as named in scan.json"),
     ] = None,
     stored: Annotated[
         bool, typer.Option("--stored", help="texture from the scan's own small images")
@@ -96,7 +96,7 @@ def mesh(
         float | None, typer.Option(help="unix seconds of its start; default: the scan's start")
     ] = None,
     tile_points: Annotated[
-        int, typer.Option(min=1000, help="points beyond which the site is cut into tiles")
+        int, typer.Option(min=1000, help="above this number of points the mesh is made in tiles")
     ] = 20_000_000,
     scheduler: Annotated[
         str | None, typer.Option(help="Dask scheduler that makes the tiles: tcp://HOST:8786")

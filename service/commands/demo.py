@@ -26,9 +26,10 @@ DRAIN_S = 120.0
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="folder for what the demo makes")] = Path("demo-output"),
+    out: Annotated[Path, typer.Option(help="folder for the output")] = Path("demo-output"),
     flight: Annotated[
-        Path | None, typer.Option(help="folder with frames/ and camera.yaml; else the repo's own")
+        Path | None,
+        typer.Option(help="folder with frames/ and camera.yaml; default: its own"),
     ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="section.key=value for the replay")
@@ -53,7 +54,7 @@ def demo(
         images = sum(1 for _ in (source / "frames").iterdir())
         _say(2, f"flight: {images} images of {source}")
         _replay(source, out, endpoint, set_ or [])
-        _say(3, "ground station: takes what is left, writes its files")
+        _say(3, "ground station: receives the rest, writes its files")
         received = _wait_for_ground(ground, out)
     finally:
         for process in (ground, *compilers):

@@ -60,20 +60,20 @@ def ground(
         bool, typer.Option("--plain", help="allow endpoints without TLS beyond this machine")
     ] = False,
     quota_mb: Annotated[
-        float | None, typer.Option(help="of one scan; beyond it only coarse layers are kept")
+        float | None, typer.Option(help="size of one scan; beyond it only coarse layers are kept")
     ] = None,
     drone_share: Annotated[
         float, typer.Option(help="percent of the disk that the scans of one drone may take")
     ] = 50.0,
     reserve_mb: Annotated[
-        float | None, typer.Option(help="of the disk, kept free; default: 5 %, at most 2 GiB")
+        float | None, typer.Option(help="disk space kept free; default: 5 %, at most 2 GiB")
     ] = None,
     mavlink: Annotated[
         list[str] | None,
         typer.Option(help="telemetry radio for the narrow fallback: udpin:0.0.0.0:14551"),
     ] = None,
     refresh_s: Annotated[
-        float | None, typer.Option(help="write clouds of growing scans so often")
+        float | None, typer.Option(help="interval for writing clouds of growing scans")
     ] = None,
     portal: Annotated[
         str | None, typer.Option(help="serve the web portal at HOST:PORT, such as 127.0.0.1:8080")
@@ -83,7 +83,7 @@ def ground(
         tuple[Path, Path] | None, typer.Option(help="the portal's certificate and key")
     ] = None,
     basemap: Annotated[
-        Path | None, typer.Option(help="MBTiles or PMTiles file below the portal's maps")
+        Path | None, typer.Option(help="MBTiles or PMTiles basemap of the portal's maps")
     ] = None,
     vehicle: Annotated[
         str | None,
@@ -91,14 +91,14 @@ def ground(
     ] = None,
     take: Annotated[
         list[Path] | None,
-        typer.Option(help="scans from an aircraft's storage, taken in first; may be repeated"),
+        typer.Option(help="scans of an aircraft's storage, imported first; may be repeated"),
     ] = None,
     sites: Annotated[
         bool, typer.Option(help="align finished scans that show the same ground, in STORE/site")
     ] = True,
     once: Annotated[bool, typer.Option("--once", help="end when a scan is complete")] = False,
     idle_exit_s: Annotated[
-        float | None, typer.Option(help="end when nothing new came for so many seconds")
+        float | None, typer.Option(help="end after so many seconds without new data")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
 ) -> None:

@@ -25,17 +25,15 @@ def refine(
     out: Annotated[
         Path | None, typer.Option(help="folder for the refined scan; default: in place")
     ] = None,
-    loops: Annotated[bool, typer.Option(help="search for places seen twice")] = True,
+    loops: Annotated[bool, typer.Option(help="search for loops")] = True,
     intrinsics: Annotated[
-        bool, typer.Option("--intrinsics", help="find the camera's model only; takes --video")
+        bool, typer.Option("--intrinsics", help="only estimate the camera model; needs --video")
     ] = False,
     video: Annotated[
         Path | None,
         typer.Option(help="the flight's recording or folder of stills: match its images again"),
     ] = None,
-    undo: Annotated[
-        bool, typer.Option("--undo", help="bring back the scan as it was flown")
-    ] = False,
+    undo: Annotated[bool, typer.Option("--undo", help="restore the scan as flown")] = False,
     as_json: AsJson = False,
 ) -> None:
     """All keyframes adjusted at once with loops, telemetry and ground control points.
@@ -50,7 +48,7 @@ def refine(
     from service.offline.refine.refinement import undo as run_undo
 
     if intrinsics and video is None:
-        raise InputError("--intrinsics takes --video FILE")
+        raise InputError("--intrinsics needs --video FILE")
     if intrinsics and video is not None:
         if gcp or undo:
             raise InputError("--intrinsics takes --video, --telemetry and --out only")
@@ -77,8 +75,8 @@ def _camera_lines(figures: dict[str, Any]) -> list[str]:
         f"k1 k2 {k_old[0]:.4f} {k_old[1]:.4f} -> {k_new[0]:.4f} {k_new[1]:.4f}, "
         f"p1 p2 {p_old[0]:.4f} {p_old[1]:.4f} -> {p_new[0]:.4f} {p_new[1]:.4f}; "
         f"pixels off by {before:.2f} -> {after:.2f} (rms)",
-        f"written to {figures['camera_file']}; the scan is as it was: replay the flight with "
-        "--camera-model and that file",
+        f"written to {figures['camera_file']}; the scan is unchanged: replay the flight with it as "
+        "--camera-model",
     ] + [f"note: {note}" for note in figures["notes"]]
 
 
@@ -133,12 +131,13 @@ def refly(
         Path | None,
         typer.Option(help=".plan (QGroundControl) or .waypoints; default: refly.plan in the scan"),
     ] = None,
-    overlap: Annotated[float, typer.Option(help="of neighbouring lines' images, 0 to 0.9")] = 0.6,
+    overlap: Annotated[float, typer.Option(help="overlap of neighbouring lines, 0 to 0.9")] = 0.6,
     views: Annotated[
-        int | None, typer.Option(help="images below which a place is weak; default 3")
+        int | None, typer.Option(help="a place in fewer images is weak; default 3")
     ] = None,
     sigma_m: Annotated[
-        float | None, typer.Option(help="sigma above which it is; default 3 times the median")
+        float | None,
+        typer.Option(help="a place of larger sigma is weak; default: 3 medians"),
     ] = None,
     relative: Annotated[
         bool, typer.Option("--relative", help="heights above home instead of sea level")
@@ -161,7 +160,7 @@ def refly(
     flight = _flight(scan_dir, limits, overlap, relative, photos)
     if flight is None:
         nothing = {"lines": 0, "weak_m2": 0.0, "plan": None}
-        print(json.dumps(nothing) if as_json else "nothing is weak; no flight is needed")
+        print(json.dumps(nothing) if as_json else "no place is weak; no flight is needed")
         return
     _write_plan(path, flight)
     figures = _plan_figures(path, flight)

@@ -38,11 +38,11 @@ def replay(
     out: Annotated[Path | None, typer.Option(help="scan folder to make")] = None,
     backend: Annotated[str | None, typer.Option(help="auto, cpu, torch or onnx")] = None,
     realtime: Annotated[
-        bool, typer.Option("--realtime", help="at the video's pace, dropping what comes too fast")
+        bool, typer.Option("--realtime", help="at the video's pace; late frames are dropped")
     ] = False,
     find_lens: Annotated[
         bool,
-        typer.Option(help="of stills without a camera model, find it from 25 of them first"),
+        typer.Option(help="for stills without a camera model: estimate it from 25 of them first"),
     ] = True,
     config: ConfigFile = None,
     set_: Overrides = None,

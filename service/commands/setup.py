@@ -100,12 +100,10 @@ def keys(
         list[str] | None, typer.Option(help="a ground station's name; may be repeated")
     ] = None,
     viewer: Annotated[
-        list[str] | None, typer.Option(help="one who may only look; may be repeated")
+        list[str] | None, typer.Option(help="a read-only viewer's name; may be repeated")
     ] = None,
-    revoke: Annotated[
-        str | None, typer.Option(help="a member whose certificate must not be valid any more")
-    ] = None,
-    days: Annotated[int, typer.Option(help="how long the certificates hold", min=1)] = 365,
+    revoke: Annotated[str | None, typer.Option(help="member whose certificate is revoked")] = None,
+    days: Annotated[int, typer.Option(help="validity of the certificates", min=1)] = 365,
     as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
 ) -> None:
     """Make keys for drones, ground stations and viewers; those that exist stay as they are.
@@ -140,7 +138,7 @@ def _say_revoked(member: str, paths: list[Path], as_json: bool) -> None:
     if as_json:
         print(json.dumps({"revoked": member, "copy": [str(path) for path in paths]}))
         return
-    print(f"revoked {member}; it holds when these are copied and every ground station restarts:")
+    print(f"revoked {member}; copy these files and restart every ground station:")
     for path in paths:
         print(f"  {path}")
 
@@ -160,4 +158,4 @@ def warm_up(
     if as_json:
         print(json.dumps({"seconds": round(seconds, 2), "keyframes": keyframes}))
     else:
-        print(f"warm after {seconds:.1f} s: {keyframes} keyframes of a made-up ground")
+        print(f"warm after {seconds:.1f} s: {keyframes} keyframes of synthetic ground")

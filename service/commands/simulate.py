@@ -27,13 +27,13 @@ PAIR = re.compile(r"^(-?[0-9.]+):(-?[0-9.]+)$")
 
 def simulate(
     out: Annotated[Path, typer.Option("--out", help="Folder for the flight and its truth.")],
-    seed: Annotated[int, typer.Option(help="Decides the place and every random number.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the site and of all random numbers.")] = 1,
     duration_s: Annotated[float, typer.Option(help="Length of the video.")] = 30.0,
     height_m: Annotated[float, typer.Option(help="Height above the ground at the start.")] = 60.0,
     speed_m_s: Annotated[float, typer.Option(help="Speed over ground.")] = 5.0,
     pattern: Annotated[str, typer.Option(help="nadir, oblique, legs, orbit or hover.")] = "nadir",
     legs: Annotated[int, typer.Option(help="Parallel legs of the pattern 'legs'.")] = 3,
-    spacing_m: Annotated[float | None, typer.Option(help="Between legs.")] = None,
+    spacing_m: Annotated[float | None, typer.Option(help="Distance between legs.")] = None,
     heading_deg: Annotated[float, typer.Option(help="First leg, from north over east.")] = 35.0,
     camera_pitch_deg: Annotated[float | None, typer.Option(help="-90 is straight down.")] = None,
     size: Annotated[str, typer.Option(help="Width x height in pixels.")] = "1280x720",
@@ -42,38 +42,38 @@ def simulate(
     distortion: Annotated[bool, typer.Option(help="Barrel distortion of the lens.")] = True,
     wobble_deg: Annotated[float, typer.Option(help="Unsteadiness of the gimbal.")] = 1.0,
     sway_m: Annotated[float, typer.Option(help="Unsteadiness of the path.")] = 0.15,
-    climb_m: Annotated[float, typer.Option(help="Higher at the end than at the start.")] = 0.0,
+    climb_m: Annotated[float, typer.Option(help="Height gained from start to end.")] = 0.0,
     swing_deg: Annotated[float, typer.Option(help="Swing of the camera at about 1 Hz.")] = 0.0,
     readout_ms: Annotated[
         float, typer.Option(help="Rolling shutter, first to last row; 0: global.")
     ] = 0.0,
     readout_direction: Annotated[
-        str, typer.Option(help="Way of the shutter: down, up, right, left.")
+        str, typer.Option(help="Readout direction: down, up, right, left.")
     ] = "down",
     relief_m: Annotated[float, typer.Option(help="Height of the hills; 0 is flat.")] = 8.0,
     water_m: Annotated[
         float | None, typer.Option(help="Level of a sea with waves, above the origin's ground.")
     ] = None,
-    density: Annotated[float, typer.Option(help="Houses and trees; 0 is open country.")] = 1.0,
+    density: Annotated[float, typer.Option(help="Density of houses and trees; 0: none.")] = 1.0,
     site_m: Annotated[
         float | None,
-        typer.Option(help="Side of the place, the flight in its middle: for several flights."),
+        typer.Option(help="Side of the site, the flight in its middle; for several flights."),
     ] = None,
     flight_seed: Annotated[
         int | None, typer.Option(help="Seed of motion and sensors; default: --seed.")
     ] = None,
     changes: Annotated[
-        int, typer.Option(help="Boxes of which half stand at --date 1, half at --date 2.")
+        int, typer.Option(help="Boxes; half stand at --date 1, half at --date 2.")
     ] = 0,
-    date: Annotated[int, typer.Option(help="1 or 2: which of the changes stand.")] = 1,
+    date: Annotated[int, typer.Option(help="1 or 2: which half of the boxes stands.")] = 1,
     photos: Annotated[Path | None, typer.Option(help="Aerial photos as the ground.")] = None,
     gps_noise_m: Annotated[float, typer.Option(help="Wander of the GPS.")] = 1.0,
     gnss_noise: Annotated[
         str,
-        typer.Option(help="wander: slowly; white: from fix to fix; exact: no sensor errs."),
+        typer.Option(help="wander: slow; white: from fix to fix; exact: no sensor errors."),
     ] = "wander",
     boresight_deg: Annotated[
-        str, typer.Option(help="RIGHT:UP degrees of the camera off the reported gimbal.")
+        str, typer.Option(help="RIGHT:UP degrees between camera and gimbal.")
     ] = "0:0",
     baro_noise_m: Annotated[float, typer.Option(help="Wander of the altitude.")] = 0.5,
     attitude_noise_deg: Annotated[float, typer.Option(help="Wander of roll and pitch.")] = 0.3,
@@ -86,15 +86,15 @@ def simulate(
     gnss_accuracy: Annotated[bool, typer.Option(help="GPS_RAW_INT carries h_acc.")] = True,
     home_above_m: Annotated[float, typer.Option(help="Take-off point above the site.")] = 0.0,
     telemetry_gap: Annotated[str, typer.Option(help="FROM:TO seconds without packets.")] = "",
-    log_lead_s: Annotated[float, typer.Option(help="How long the log begins earlier.")] = 0.0,
+    log_lead_s: Annotated[float, typer.Option(help="The log begins so much earlier.")] = 0.0,
     blank: Annotated[list[str] | None, typer.Option(help="FRAME:COUNT black frames.")] = None,
     exposure: Annotated[list[str] | None, typer.Option(help="SECOND:GAIN brightness step.")] = None,
     depth_frames: Annotated[int, typer.Option(help="How many depth maps to keep.")] = 12,
     crf: Annotated[int, typer.Option(help="H.264 quality; lower is better.")] = 18,
-    live: Annotated[bool, typer.Option("--live", help="Then play it in real time.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="Play the flight in real time.")] = False,
     video_to: Annotated[str, typer.Option(help="Live: where H.264 in MPEG-TS goes.")] = VIDEO_TO,
     mavlink_to: Annotated[str, typer.Option(help="Live: UDP host:port.")] = "127.0.0.1:14550",
-    loop: Annotated[bool, typer.Option("--loop", help="Live: again and again.")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="Live: repeat the flight.")] = False,
     until_stdin_ends: Annotated[bool, typer.Option("--until-stdin-ends", hidden=True)] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Report as one JSON object.")] = False,
 ) -> None:

@@ -18,7 +18,7 @@ def site(
     scans: Annotated[list[Path], typer.Argument(help="scan folders; compare: before and after")],
     out: Annotated[Path, typer.Option("--out", help="folder of the site")],
     cell_m: Annotated[
-        float | None, typer.Option("--cell-m", help="compare: cell; default: pixel on ground")
+        float | None, typer.Option("--cell-m", help="compare: cell size; default: pixel on ground")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
 ) -> None:

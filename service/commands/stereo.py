@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 def stereo(
     left: Annotated[Path, typer.Argument(help="left image, rectified")],
     right: Annotated[Path, typer.Argument(help="right image, of the same size")],
-    labels: Annotated[int, typer.Option(help="number of disparities that are tried")],
+    labels: Annotated[int, typer.Option(help="number of disparities")],
     out: Annotated[Path, typer.Option(help="float32 (h, w) pixels, NaN = unknown (.npy)")],
     min_disparity: Annotated[int, typer.Option(help="the smallest disparity, px")] = 0,
     iterations: Annotated[int, typer.Option(help="of belief propagation, per level")] = 5,
     backend: Annotated[str, typer.Option(help="auto, cpu, torch or onnx")] = "auto",
     model: Annotated[
-        Path | None, typer.Option(help="a learned model instead: the TOML that declares it")
+        Path | None, typer.Option(help="TOML file of a learned model to use instead")
     ] = None,
     checked: Annotated[
-        bool, typer.Option("--checked", help="unknown where the pair does not prove it")
+        bool, typer.Option("--checked", help="keep only verified disparities")
     ] = False,
     image: Annotated[
         Path | None, typer.Option("--image", "--picture", help="also write it in colour (.png)")
@@ -108,8 +108,8 @@ def _size(image: U8) -> str:
 
 
 def export_model(
-    out: Annotated[Path, typer.Option(help="where the model goes (.onnx)")],
-    size: Annotated[str, typer.Option(help="of the rectified pair, WIDTHxHEIGHT")] = "320x180",
+    out: Annotated[Path, typer.Option(help="model file to write (.onnx)")],
+    size: Annotated[str, typer.Option(help="size of the rectified pair, WIDTHxHEIGHT")] = "320x180",
     labels: Annotated[int, typer.Option(help="number of disparities")] = 16,
     min_disparity: Annotated[int, typer.Option(help="the smallest disparity, px")] = 0,
     iterations: Annotated[int, typer.Option(help="of belief propagation, per level")] = 5,

@@ -263,7 +263,7 @@ DOCUMENT: dict[str, Any] = {
     "info": {"title": "skyrelief on board", "version": "1"},
     "paths": {
         "/healthz": _get(
-            "Whether all is well.", "application/json", HEALTH,
+            "Whether the service is healthy.", "application/json", HEALTH,
             (200, "well"), (503, "needs attention"),
         ),
         "/status": _get("State of the service.", "application/json", STATUS, (200, "all values")),

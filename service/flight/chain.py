@@ -112,7 +112,7 @@ class Chain:
         if depth is not None and is_near:
             self.trajectory.publish(placed)
         elif depth is not None:
-            self._rejected["placed beyond all reach"] += 1
+            self._rejected["placed impossibly far away"] += 1
         self._news[view.seq] = News(
             placed, self.trajectory.similarity(view.segment) is not None,
             self._moved() if depth is not None else (), self.watch.look(),

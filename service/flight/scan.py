@@ -288,8 +288,8 @@ class Scan:
         if apart:
             out.append(
                 f"left out of the cloud: {len(apart)} of {self.pipeline.segments} "
-                "stretches of the flight, which neither fixes nor a place seen twice tie to the "
-                "rest; fly with GNSS or more overlap"
+                "stretches of the flight, which neither fixes nor loops tie to the rest; "
+                "fly with GNSS or more overlap"
             )
         if frames and self.recorder.keyframes == 0:
             top = self.pipeline.refusals().most_common(2)

@@ -327,7 +327,7 @@ async def _order(request: Request) -> Response:
     if vehicle is None:
         raise InputError("no vehicle: start with 'skyrelief ground --vehicle ENDPOINT'")
     if wanted.action != "stop" and not request.app.state.order_pace.take():
-        raise HTTPException(429, "too many orders; wait a second", {"retry-after": "1"})
+        raise HTTPException(429, "too many commands; wait a second", {"retry-after": "1"})
     return JSONResponse(await run_in_threadpool(vehicle.order, wanted.action, wanted.metres))
 
 

@@ -302,7 +302,7 @@ class Receiver:
                 timeout=ASK_TIMEOUT_S,
             )
         except zenoh.ZError as error:
-            log.debug("not asked: %s", error)
+            log.debug("request not sent: %s", error)
             return
         self._replies.add(replies, on_message, on_end)
 

@@ -85,7 +85,7 @@ def fused_cloud(
         cloud = fuse_strips(strips, edges, size)
         held.clear()
     if len(cloud):
-        with progress.part("taking out what is seen through"):
+        with progress.part("removing points that other images see through"):
             seqs = spread([e.seq for e in extents])
             keyframes = progress.over(map(store.keyframe, seqs), len(extents))
             cloud = without(cloud, seen_through(cloud, (k.depth for k in keyframes if k)))

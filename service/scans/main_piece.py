@@ -80,6 +80,6 @@ def in_words(store: Keyframes) -> str:
         return ""
     count = sum(is_apart(seq, apart) for seq in store.seqs())
     return (
-        f"left out: {count} of {len(store.seqs())} keyframes, which neither fixes nor a place "
-        "seen twice tie to the rest"
+        f"left out: {count} of {len(store.seqs())} keyframes, "
+        "which neither fixes nor loops tie to the rest"
     )

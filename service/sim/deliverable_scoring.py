@@ -321,7 +321,7 @@ def view_from_above(
     try:
         options = options_of(json.loads((truth / "params.json").read_text())["options"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{truth / 'params.json'}: does not say how the place is made") from error
+        raise InputError(f"{truth / 'params.json'}: does not say how to make the site") from error
     if options.photos is not None:
         raise InputError(f"{truth}: the ground was made of photographs, which are not kept there")
     simulation = prepare(options)

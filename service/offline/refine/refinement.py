@@ -236,7 +236,7 @@ class _Refinement:
         track = self._track()
         verified = 0
         if self.options.loops and self.images is None:
-            with self.progress.part("searching for places seen twice", SEARCHING):
+            with self.progress.part("searching for loops", SEARCHING):
                 track, verified = self._with_loops(track)
         with self.progress.part("adjusting all keyframes", ADJUSTING):
             found = self._adjusted(track, candidates)
@@ -301,7 +301,7 @@ class _Refinement:
         }
         if lost:
             names = ", ".join(sorted(lost))
-            self.notes.append(f"images without a place, their marks are left out: {names}")
+            self.notes.append(f"images without a pose, their marks are not used: {names}")
         return [
             replace(p, sightings=tuple(s for s in p.sightings if s.image not in lost))
             for p in survey
@@ -314,12 +314,12 @@ class _Refinement:
         self.states, self.frames = as_seen(images, self.states, self.frames, marked, self.keyframe)
         self.images = images
         if images.doubt:
-            self.notes.append(f"the camera given holds: {images.doubt}")
+            self.notes.append(f"the given camera is kept: {images.doubt}")
             return
         path = (self.options.out or self.folder) / own_camera.FILE
         save_camera(path, images.camera)
         self.notes.append(
-            f"the camera as the images have it: {path.name}; surfaces keep the one that they were "
+            f"the camera found from the images: {path.name}; surfaces keep the one that they were "
             "made with: replay the flight with --camera-model and that file"
         )
 
@@ -467,7 +467,7 @@ class _Refinement:
                 found = self._solved(track, points, marks, candidates)
             except RuntimeError as error:  # so the solver says that the system is ill-posed
                 raise InputError(
-                    "the poses of this scan contradict each other too far to be adjusted"
+                    "the poses of this scan contradict each other too much to be adjusted"
                 ) from error
             worst, by = None, 1.0
             for one in used:

@@ -177,7 +177,7 @@ def _bent(
     try:
         adjusted = adjust(whole, config=config)
     except RuntimeError as error:  # so the solver says that the system is ill-posed
-        raise InputError("the poses of these scans contradict each other too far") from error
+        raise InputError("the poses of these scans contradict each other too much") from error
     return adjusted.poses, adjusted.covariances
 
 
@@ -257,7 +257,7 @@ def _document(
         if len(members) > 1 and not any(member.name in (p["a"], p["b"]) for p in pairs):
             notes.append(f"{member.name} is tied to no other scan: it stays where its fixes put it")
         elif found.groups[k] != found.groups[0]:
-            notes.append(f"{member.name} is not tied to {members[0].name}, also not by others")
+            notes.append(f"{member.name} is not tied to {members[0].name}, nor through others")
     for pair in pairs:
         if pair["ties"] < MIN_TIES:
             notes.append(

@@ -84,8 +84,8 @@ def _pair(site: AlignedSite, before: Path, after: Path) -> tuple[int, int]:
         raise InputError(f"{before} and {after} are one scan")
     if site.alignment.groups[one] != site.alignment.groups[two]:
         raise InputError(
-            f"{before} and {after} could not be tied to each other: what differs may be their "
-            "placing (little overlap, another season or light)"
+            f"{before} and {after} have no ties: their differences may be "
+            "misalignment (little overlap, another season or light)"
         )
     return one, two
 

@@ -123,7 +123,7 @@ def _chosen(
         else:
             chosen.append((folder, store))
     if not chosen:
-        raise InputError("no scan is left to make a site of: " + "; ".join(notes))
+        raise InputError("no usable scan for a site: " + "; ".join(notes))
     origin = _frame(chosen[0][1].header)
     for folder, store in chosen:
         away = float(np.linalg.norm(between_frames(origin, _frame(store.header))[:3, 3]))
