@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,27 @@ def test_what_goes_in_comes_out(tmp_path: Path) -> None:
         assert direct is not None and back.time_ns == 123
         np.testing.assert_array_equal(back.depth.depth_m, direct.depth.depth_m)
         assert store.seqs()[-1] == 7
+
+
+def test_poses_at_once_are_those_one_by_one(tmp_path: Path) -> None:
+    poses = [pose(k) for k in (3, 1, 2)]
+    broken = PoseRecord(9, np.full((4, 4), np.nan), np.eye(6))
+    with (
+        ScanStore.create(tmp_path / "a.db", HEADER) as a,
+        ScanStore.create(tmp_path / "b.db", HEADER) as b,
+    ):
+        reported: list[tuple[str, int]] = []
+        b.listen(lambda kind, number: reported.append((kind, number)))
+        for one in poses:
+            a.add_pose(one)
+        uses = b.uses(threading.get_ident())
+        assert b.add_poses([*poses[:2], broken, poses[2]]) == 1
+        assert b.uses(threading.get_ident()) == uses + 2  # the next number, one transaction
+        assert reported == [("pose", 1), ("pose", 2), ("pose", 3)]
+        assert b.add_poses([]) == 4 == b.add_pose(broken)
+        assert a.numbers() == b.numbers()
+        for number in (1, 2, 3):
+            assert a.record("pose", number) == b.record("pose", number)
 
 
 def test_duplicates_and_order_do_not_matter(tmp_path: Path) -> None:
@@ -178,6 +200,7 @@ def test_a_damaged_file_gives_back_what_can_be_read(tmp_path: Path) -> None:
 
 WRITER = """
 import sys
+import threading
 from service.stream.store import ScanStore
 from service.stream.ranges import RangeSet
 from service.stream.records import ScanHeader, PoseRecord

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,9 @@ from service.stream.store import ScanStore
 
 REPUBLISH_M = 0.05
 """A frame's pose that moved by more than this until the end is written again."""
+
+BATCH = 256
+"""Poses written again in one transaction; each takes a synchronised write of the disk."""
 
 
 class Recorder:
@@ -86,11 +90,17 @@ class Recorder:
     def _correct_trajectory(self) -> None:
         """Write those poses again that corrections have moved; the newest of a time holds."""
         self._last, self.distance_m = None, 0.0
+        moved = self._moved()
+        while batch := list(islice(moved, BATCH)):
+            self.store.add_poses(batch)
+
+    def _moved(self) -> Iterator[PoseRecord]:
+        """The poses that corrections have moved."""
         for frame in self._frames.corrigible():
             assert frame.anchor is not None
             record = self._record(frame, self._chain.place(frame.anchor))
             if np.linalg.norm(record.T_world_camera[:3, 3] - frame.position_m) > REPUBLISH_M:
-                self.store.add_pose(record)
+                yield record
 
     def summary(self) -> dict[str, Any]:
         """Figures of the scan so far, fit for JSON."""

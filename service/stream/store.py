@@ -248,10 +248,22 @@ class ScanStore:
 
     def add_pose(self, pose: PoseRecord) -> int:
         """Store a pose under the next number; returns it."""
+        return self.add_poses([pose])
+
+    def add_poses(self, poses: Sequence[PoseRecord]) -> int:
+        """Store several poses in one transaction; returns the first number.
+
+        Those that receivers would reject are left out.
+        """
+        sql = "INSERT INTO poses VALUES (?, ?, ?)"
+        packed = [(p.time_unix_ns, pack_pose(p)) for p in poses]
+        packed = [row for row in packed if unpack_pose(row[1]) is not None]
         with self._lock:
-            number = self._next_id("poses")
-            self.put_pose(number, pack_pose(pose))
-            return number
+            first = self._next_id("poses")
+            self._db.write([(sql, (first + i, *row)) for i, row in enumerate(packed)])
+            for i in range(len(packed)):
+                self._inventory.note("pose", first + i)
+            return first
 
     def put_pose(self, number: int, data: bytes) -> bool:
         """Store a packed pose under the drone's number; False if already known."""
