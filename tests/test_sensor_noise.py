@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -150,3 +153,12 @@ def test_velocity_is_integrated_until_a_gap() -> None:
     assert after is not None and after.run != steps[1].run and after.seconds == 0.0
     back = odometer.take(19 * 10**9, faster).travel
     assert back is not None and back.run != after.run
+
+
+def test_a_flight_does_without_the_statistics_package() -> None:
+    script = "import sys, service.flight.scan; print('scipy.stats' in sys.modules)"
+    root = str(Path(__file__).resolve().parents[1])
+    run = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=root
+    )
+    assert run.stdout == "False\n"
