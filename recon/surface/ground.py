@@ -11,11 +11,15 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import numpy.typing as npt
+from numba import njit
 from scipy import ndimage
-from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import Delaunay
 
 from recon.surface.raster import Raster
 from recon.types import F32, Bool
+
+I64 = npt.NDArray[np.int64]
 
 LARGEST_OBJECT_M = 36.0
 """Width of the widest building that is taken off the ground."""
@@ -94,6 +98,34 @@ def _bridged(height_m: F32, known: Bool) -> F32:
     out: F32 = height_m[tuple(near)]
     at = np.argwhere(rim)
     if np.linalg.matrix_rank(at - at[0]) == 2:  # not all on one line
-        linear = LinearNDInterpolator(at, height_m[rim])(np.argwhere(~known))
-        out[~known] = np.where(np.isfinite(linear), linear, out[~known])
+        triangles = Delaunay(at).simplices.astype(np.int64)
+        _span(at.astype(np.int64), height_m[rim], triangles, known, out)
     return out
+
+
+@njit(cache=True, nogil=True)
+def _span(at: I64, height_m: F32, triangles: I64, known: Bool, out: F32) -> None:
+    """Interpolate ``out`` in the unknown cells of each triangle between the cells ``at`` (N, 2)."""
+    for n in range(len(triangles)):
+        corners = triangles[n]
+        r, c = at[corners, 0], at[corners, 1]
+        twice_area = (c[1] - c[0]) * (r[2] - r[0]) - (c[2] - c[0]) * (r[1] - r[0])
+        if twice_area == 0:
+            continue
+        for row in range(r.min(), r.max() + 1):
+            first, last = np.inf, -np.inf  # columns where the row crosses the sides
+            for k in range(3):
+                j = (k + 1) % 3
+                if r[k] == r[j] or (row - r[k]) * (row - r[j]) > 0:
+                    continue
+                crossing = c[k] + (row - r[k]) * (c[j] - c[k]) / (r[j] - r[k])
+                first, last = min(first, crossing), max(last, crossing)
+            for col in range(int(np.ceil(first - 1e-6)), int(np.floor(last + 1e-6)) + 1):
+                if known[row, col]:
+                    continue
+                total = 0.0
+                for k in range(3):
+                    i, j = (k + 1) % 3, (k + 2) % 3
+                    part = (c[j] - c[i]) * (row - r[i]) - (col - c[i]) * (r[j] - r[i])
+                    total += part * np.float64(height_m[corners[k]])
+                out[row, col] = total / twice_area

@@ -7,9 +7,11 @@ next to the step, where matching makes roofs too wide, it stays unknown.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numba import njit
 
+from recon.bands import in_bands
 from recon.surface.raster import Grid, Raster, rasterise_points, reliable
 from recon.types import F32, F64, U8, Bool
 
@@ -42,37 +44,42 @@ def filled(certain: Raster, measured: Raster, reach_m: float = REACH_M) -> tuple
     layers = np.dstack([certain.height_m, certain.sigma_m, certain.rgb]).astype(np.float32)
     doubtful = np.where(certain.known, np.float32(np.nan), measured.height_m)
     reach = max(1, round(reach_m / certain.grid.cell_m))
-    out = _fill(layers, doubtful.astype(np.float32), reach, SLOPE * certain.grid.cell_m)
+    near = cv2.dilate(certain.known.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1)))
+    holes = (near > 0) & ~certain.known
+    out = layers.copy()
+    rows, rise_m = len(layers), SLOPE * certain.grid.cell_m
+    in_bands(_fill, rows, layers, doubtful.astype(np.float32), holes, reach, rise_m, out)
     new = np.isfinite(out[..., 0]) & ~certain.known
     rgb = np.where(new[..., None], np.rint(out[..., 2:]), certain.rgb).astype(np.uint8)
     return Raster(certain.grid, out[..., 0].copy(), out[..., 1].copy(), rgb), new
 
 
 @njit(cache=True, nogil=True)
-def _fill(layers: F32, doubtful: F32, reach: int, rise_m: float) -> F32:
-    """``layers`` (rows, cols, 5: height, sigma, colour) with the holes filled."""
-    out: F32 = layers.copy()
+def _fill(
+    begin: int, end: int, layers: F32, doubtful: F32, holes: Bool, reach: int, rise_m: float,
+    out: F32,
+) -> None:  # fmt: skip
+    """Fill rows of ``out`` from ``layers`` (rows, cols, 5: height, sigma, colour)."""
     near = np.empty((DIRECTIONS, 4))
     above = np.empty((DIRECTIONS, 2))
-    for r in range(layers.shape[0]):
+    for r in range(begin, end):
         for c in range(layers.shape[1]):
-            if not np.isnan(layers[r, c, 0]):
+            if not holes[r, c]:
                 continue
             count, doubts = _around(layers, doubtful, r, c, reach, near, above)
             if count == 0:
                 continue
             ordered = near[:count][np.argsort(near[:count, 0])]
-            first, end = _surface(ordered, doubtful[r, c], rise_m)
-            one = ordered[first:end]
+            first, last = _surface(ordered, doubtful[r, c], rise_m)
+            one = ordered[first:last]
             height = np.sum(one[:, 0] / one[:, 1] ** 2) / np.sum(1.0 / one[:, 1] ** 2)
             tolerance = LEVEL_M + rise_m * one[:, 1].min()
             if one[-1, 0] - one[0, 0] > 3.0 * LEVEL_M:
                 continue
             if abs(doubtful[r, c] - height) > tolerance:
                 continue
-            if _to_higher(ordered[end:], above[:doubts], height) > EDGE_CELLS:
+            if _to_higher(ordered[last:], above[:doubts], height) > EDGE_CELLS:
                 _mean(layers, one, out[r, c])
-    return out
 
 
 @njit(cache=True, nogil=True)
@@ -84,8 +91,8 @@ def _around(
     Writes ``near`` (height, distance in cells, row, column) and ``above`` (height, distance);
     returns how many. None are near where too many neighbouring directions are open.
     """
-    count, doubts, is_open, max_open = 0, 0, 0, 0
-    for k in range(2 * DIRECTIONS):  # twice around, so that a run of open ones has no border
+    count, doubts, is_open, max_open, first_open = 0, 0, 0, 0, 0
+    for k in range(DIRECTIONS):
         angle = 2.0 * np.pi * k / DIRECTIONS
         is_open += 1
         doubted = False
@@ -94,17 +101,19 @@ def _around(
             if not (0 <= row < layers.shape[0] and 0 <= col < layers.shape[1]):
                 break
             if not np.isnan(layers[row, col, 0]):
+                if count == 0:
+                    first_open = k
                 is_open = 0
-                if k < DIRECTIONS:
-                    near[count, 0], near[count, 1] = layers[row, col, 0], step
-                    near[count, 2], near[count, 3] = row, col
-                    count += 1
+                near[count, 0], near[count, 1] = layers[row, col, 0], step
+                near[count, 2], near[count, 3] = row, col
+                count += 1
                 break
-            if k < DIRECTIONS and not doubted and not np.isnan(doubtful[row, col]):
+            if not doubted and not np.isnan(doubtful[row, col]):
                 above[doubts, 0], above[doubts, 1] = doubtful[row, col], step
                 doubts += 1
                 doubted = True
         max_open = max(max_open, is_open)
+    max_open = max(max_open, is_open + first_open)  # the last and the first are neighbours
     return (0, 0) if max_open > MAX_OPEN_DIRECTIONS else (count, doubts)
 
 
