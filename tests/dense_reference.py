@@ -10,9 +10,7 @@ import numpy.typing as npt
 
 from recon.stereo.message_passing import FULL_WEIGHT, Smoothness
 from recon.stereo.upsampling import MIN_CONFIDENCE, RANGE_FLOOR, UpsamplingConfig, guide_at_taps
-from recon.types import F64, U8, DisparityMap
-
-I64 = npt.NDArray[np.int64]
+from recon.types import F64, I64, U8, DisparityMap
 
 
 def beliefs(

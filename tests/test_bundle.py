@@ -8,8 +8,7 @@ import scipy.optimize
 
 from recon import se3
 from recon.tracking import bundle
-from recon.tracking.bundle import I64
-from recon.types import F64
+from recon.types import F64, I64
 
 K = np.array([[1000.0, 0, 640], [0, 1000.0, 360], [0, 0, 1]])
 

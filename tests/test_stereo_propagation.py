@@ -13,14 +13,13 @@ from recon import bands
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.matching_cost import (
     COST_UNIT,
-    I16,
     MatchingCostConfig,
     Workspace,
     census,
     matching_cost,
 )
 from recon.stereo.message_passing import propagate
-from recon.types import F64, U8, Array
+from recon.types import F64, I16, U8, Array
 
 ACCEPT_ALL = BeliefPropagationConfig(
     min_evidence=0, min_contrast=0, occlusion_tolerance=-1, speckle_px=0

@@ -9,7 +9,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.stream.plane_coders import U16, WEIGHTS, decode_codes, encode_codes
+from recon.types import U16
+from service.stream.plane_coders import WEIGHTS, decode_codes, encode_codes
 
 
 def bumpy(h: int, w: int, noise: float) -> U16:

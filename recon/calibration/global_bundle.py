@@ -16,9 +16,7 @@ import numpy.typing as npt
 from numba import njit
 
 from recon import se3
-from recon.types import F64, Camera
-
-I64 = npt.NDArray[np.int64]
+from recon.types import F64, I64, Camera
 
 CAMERA = 8
 """fx, fy, cx, cy, k1, k2, p1, p2; k3 stays."""

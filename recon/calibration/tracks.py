@@ -14,13 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from recon import se3
-from recon.calibration.global_bundle import I64, Sightings
+from recon.calibration.global_bundle import Sightings
 from recon.camera_model import project, rays
 from recon.tracking import robust_geometry
 from recon.tracking.common_view import Features, features, mutual
 from recon.tracking.matching import MatchingConfig, Pyramid, match
 from recon.tracking.prediction import by_homography
-from recon.types import F64, U8, Camera
+from recon.types import F64, I64, U8, Camera
 
 WIDTH_PX, FEATURES = 1920, 2500
 """Of the image that features are found on, and how many of them are kept."""

@@ -12,8 +12,8 @@ import numpy as np
 from numba import njit
 
 from recon.bands import at_once
-from recon.mapping.voxel_map import I32, I64, find_slot, rehash, voxel_key
-from recon.types import F32, F64, U8, Bool, DepthMap, PointCloud
+from recon.mapping.voxel_map import find_slot, rehash, voxel_key
+from recon.types import F32, F64, I32, I64, U8, Bool, DepthMap, PointCloud
 
 CORRELATION = 0.55
 """Of the errors of two keyframes at one place: they share frames, poses and texture."""

@@ -17,9 +17,8 @@ import numpy.typing as npt
 from numba import njit
 
 from recon.bands import in_bands
-from recon.types import F32, F64, U8, Bool, DepthMap, PointCloud
+from recon.types import F32, F64, I16, I64, U8, Bool, DepthMap, PointCloud
 
-I64 = npt.NDArray[np.int64]
 U32 = npt.NDArray[np.uint32]
 
 PLACES = 2048
@@ -110,8 +109,6 @@ def _planes(depth: DepthMap, slack_m: float) -> F64 | None:
     planes: F64 = inside @ np.linalg.inv(depth.T_world_camera)
     return planes
 
-
-I16 = npt.NDArray[np.int16]
 
 AGREES_SIGMAS = 2.5
 BEHIND_SIGMAS = 4.0

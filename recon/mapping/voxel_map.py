@@ -11,15 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from recon import se3
 from recon.camera_model import rays
-from recon.types import F32, F64, Bool, DepthMap
-
-I64 = npt.NDArray[np.int64]
-I32 = npt.NDArray[np.int32]
+from recon.types import F32, F64, I32, I64, Bool, DepthMap
 
 EMPTY = np.int64(-1)
 TILE_BITS = 7

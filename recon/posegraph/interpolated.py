@@ -11,13 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from recon import se3
 from recon.posegraph.ledger import Rows
-from recon.types import F64, Bool
-
-I64 = npt.NDArray[np.int64]
+from recon.types import F64, I64, Bool
 
 KEYFRAME = np.dtype(
     [

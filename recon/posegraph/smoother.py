@@ -17,16 +17,13 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from recon import se3
 from recon.posegraph.ledger import MemoryLedger, Rows
-from recon.types import F64
-
-I64 = npt.NDArray[np.int64]
+from recon.types import F64, I64
 
 MIN_WAIT, POSES_PER_WAIT = 2, 100
 """So many poses wait between two updates, and one more for each so many that are held."""

@@ -18,7 +18,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from recon.bands import in_bands
@@ -31,7 +30,7 @@ from recon.stereo.matching_cost import (
     plain,
 )
 from recon.stereo.message_passing import MAX_TRUNCATION, Smoothness, propagate
-from recon.types import F32, U8, DisparityMap
+from recon.types import F32, I16, U8, DisparityMap
 
 _space = Workspace()
 
@@ -137,8 +136,6 @@ def _drop_speckles(px: F32, smallest: int) -> None:
     cv2.filterSpeckles(coarse, unknown, smallest, SPECKLE_STEP)
     px[coarse == unknown] = np.nan
 
-
-I16 = npt.NDArray[np.int16]
 
 RADIUS = 3
 """Of the window whose summed cost places the minimum between labels."""

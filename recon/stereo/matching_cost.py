@@ -18,9 +18,8 @@ from numba import njit, types
 from numba.extending import intrinsic
 
 from recon.bands import in_bands
-from recon.types import U8
+from recon.types import I16, U8
 
-I16 = npt.NDArray[np.int16]
 U64 = npt.NDArray[np.uint64]
 
 COST_UNIT = 128

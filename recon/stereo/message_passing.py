@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
@@ -27,7 +26,7 @@ from numba.extending import intrinsic
 
 from recon.bands import in_bands, threads
 from recon.stereo.matching_cost import Workspace
-from recon.types import U8
+from recon.types import I16, U8
 
 LANES = 32
 """Cells that are updated together; LLVM spreads them over the registers that there are."""
@@ -130,8 +129,6 @@ class _Block:
         """The lesser of each lane."""
         return self.builder.select(self.builder.icmp_signed("<", a, b), a, b)
 
-
-I16 = npt.NDArray[np.int16]
 
 BAND_ROWS = 80
 """Rows that are worth a thread: waiting for it costs more than a smaller band."""

@@ -11,15 +11,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from numba import njit, types
 from numba.extending import intrinsic
 
 from recon.bands import in_bands
 from recon.stereo.matching_cost import plain
-from recon.types import F32, U8, DisparityMap
-
-I32 = npt.NDArray[np.int32]
+from recon.types import F32, I32, U8, DisparityMap
 
 PAPER_RATIO = 2704 / 320
 """Fine pixels per coarse pixel in the paper."""

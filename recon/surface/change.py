@@ -15,12 +15,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from recon.surface.raster import Grid, Raster, highest_lowest
-from recon.types import F32, F64, U8, Bool
-
-I32 = npt.NDArray[np.int32]
+from recon.types import F32, F64, I32, U8, Bool
 
 BEND_CELLS, BEND_ROUNDS = 8, 8
 """Blocks of a length over which flights bend, and rounds of its robust mean."""

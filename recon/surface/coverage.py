@@ -16,14 +16,13 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from recon import se3
 from recon.camera_model import rays
 from recon.posegraph.ledger import Ledger, MemoryLedger, Rows
 from recon.surface.raster import Grid
-from recon.types import F32, F64, Array, Bool, DepthMap
+from recon.types import F32, F64, I64, Array, Bool, DepthMap
 
 TILE = 64
 """Cells along a tile's side."""
@@ -42,7 +41,6 @@ LONGEST_CELLS = 1 << 15
 
 SMALLEST_CELL_M, LARGEST_CELL_M = 1e-3, 1e3
 
-I64 = npt.NDArray[np.int64]
 Tile = tuple[int, int]
 
 

@@ -6,12 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.surface.raster import Raster
-from recon.types import F32, F64, U8, Bool, PointCloud
-
-I32 = npt.NDArray[np.int32]
+from recon.types import F32, F64, I32, U8, Bool, PointCloud
 
 TRIM_SHARE = 0.03
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from recon.image_quality import sharpness
@@ -20,10 +19,7 @@ from recon.surface.raster import Grid, Raster
 from recon.surface.texture_atlas import flat, sample
 from recon.surface.texture_views import CANDIDATES, Sightings, TextureView, consistent, insert
 from recon.surface.texturing import levels
-from recon.types import F32, F64, U8, Bool
-
-I32 = npt.NDArray[np.int32]
-I64 = npt.NDArray[np.int64]
+from recon.types import F32, F64, I32, I64, U8, Bool
 
 CLEAR_M = 0.3
 """A surface this much above the line to a camera hides a place."""

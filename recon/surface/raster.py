@@ -12,12 +12,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
-from recon.types import F32, F64, U8, Bool, PointCloud
-
-I64 = npt.NDArray[np.int64]
+from recon.types import F32, F64, I64, U8, Bool, PointCloud
 
 TOP_SIGMAS = 4.0
 """Points this many of its sigmas below the highest point of a cell are its surface too."""

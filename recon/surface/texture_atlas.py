@@ -7,17 +7,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 from scipy import sparse
 from scipy.sparse import csgraph
 
 from recon.surface.meshing import Mesh
 from recon.surface.texture_views import Sightings, TextureView
-from recon.types import F32, F64, U8, Bool
-
-I32 = npt.NDArray[np.int32]
-I64 = npt.NDArray[np.int64]
+from recon.types import F32, F64, I32, I64, U8, Bool
 
 BORDER_PX = 2
 """Texels around a chart that carry its colours on, for filtering and the first mip levels."""

@@ -11,16 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from recon.camera_model import project
 from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh
-from recon.types import F32, F64, U8, Bool
-
-I32 = npt.NDArray[np.int32]
-I64 = npt.NDArray[np.int64]
+from recon.types import F32, F64, I32, I64, U8, Bool
 
 Rays = Callable[[F64, F64], F64]
 """Camera (3,) and unit directions (N, 3) to metres (N,) up to the mesh, infinite without a hit."""

@@ -12,16 +12,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 from scipy import sparse
 
 from recon.surface.meshing import Mesh
 from recon.surface.texture_atlas import Layout, Palette, lay_out, paint
 from recon.surface.texture_views import Sightings, TextureView, consistent, look
-from recon.types import F32, F64, U8
-
-I32 = npt.NDArray[np.int32]
+from recon.types import F32, F64, I32, U8
 
 LARGEST_ATLAS_PX = 8192
 

@@ -17,9 +17,7 @@ import numpy.typing as npt
 from numba import njit
 
 from recon.bands import in_bands
-from recon.types import F64
-
-I32 = npt.NDArray[np.int32]
+from recon.types import F64, I32
 
 BLOCK = 8  # columns along the side of a coarse block
 EDGE = 1e-9  # rays that graze a shared edge must not slip through

@@ -14,14 +14,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from recon import se3
 from recon.small_matrices import invert_3x3, solve_symmetric
-from recon.types import F64, Bool
-
-I64 = npt.NDArray[np.int64]
+from recon.types import F64, I64, Bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,14 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from recon import se3
 from recon.rolling_shutter import FrameRows
 from recon.tracking import bundle, matching, two_view
-from recon.types import F64, U8, Bool, PosePrior
-
-I64 = npt.NDArray[np.int64]
+from recon.types import F64, I64, U8, Bool, PosePrior
 
 
 class Landmarks:

@@ -17,9 +17,9 @@ from recon import se3
 from recon.rolling_shutter import FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, robust_geometry, two_view
 from recon.tracking.common_view import CommonView, FeatureCache, common_view
-from recon.tracking.keyframe_window import I64, OdometryKeyframe, TrackingFrame, landmarks
+from recon.tracking.keyframe_window import OdometryKeyframe, TrackingFrame, landmarks
 from recon.tracking.prediction import Motion
-from recon.types import F64, Bool, Camera, PosePrior
+from recon.types import F64, I64, Bool, Camera, PosePrior
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,6 @@ from recon.rolling_shutter import FrameRows, RowTrack
 from recon.tracking import matching, prediction, two_view
 from recon.tracking.common_view import FeatureCache
 from recon.tracking.keyframe_window import (
-    I64,
     Landmarks,
     OdometryKeyframe,
     TrackingFrame,
@@ -33,7 +32,7 @@ from recon.tracking.localisation import Bridge, FirstViews, Localiser, Located, 
 from recon.tracking.matching import Pyramid, harris_grid
 from recon.tracking.prediction import Motion
 from recon.tracking.readout_search import ReadoutSearch
-from recon.types import F64, U8, Bool, Camera, PosePrior
+from recon.types import F64, I64, U8, Bool, Camera, PosePrior
 
 OVERDUE = 1.3
 """A blurred frame becomes a keyframe when the last is this many steps away."""

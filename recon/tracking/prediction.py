@@ -12,8 +12,8 @@ from recon import se3
 from recon.camera_model import rays
 from recon.small_matrices import solve_symmetric
 from recon.tracking import robust_geometry, two_view
-from recon.tracking.keyframe_window import I64, OdometryKeyframe
-from recon.types import F64, Bool, PosePrior
+from recon.tracking.keyframe_window import OdometryKeyframe
+from recon.types import F64, I64, Bool, PosePrior
 
 MIN_MEASURED = 12
 """Landmarks that give a scale."""

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from recon.mapping.disagreement import Disagreement
-from recon.mapping.voxel_map import I64, VoxelMap, VoxelMapConfig, Voxels, tile_of, tiles_under
+from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, Voxels, tile_of, tiles_under
 from recon.stereo.reprojection import LABEL_SIGMA_PX
-from recon.types import F32, F64, Bool, DepthMap
+from recon.types import F32, F64, I64, Bool, DepthMap
 from service.compute.stopwatch import Stopwatch
 from service.flight.viewpoints import StereoCandidate
 

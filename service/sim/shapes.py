@@ -7,10 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from recon.types import F64
+from recon.types import F64, I32
 from service.sim.noise import value3
-
-I32 = npt.NDArray[np.int32]
 
 GROUND, TOP, WALL, CROWN = 0, 1, 2, 3
 """Materials of triangles: GROUND and TOP show the image from above, the others are solid."""

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from recon import se3
 from recon.surface import metrics, triangle_grid
 from recon.surface.triangle_grid import TriangleGrid
-from recon.types import F64
+from recon.types import F64, I32
 from service.errors import InputError
 from service.georeference import LocalFrame
 
@@ -135,7 +134,6 @@ def short(error: Exception) -> str:
     return " ".join(str(error).split())[:120]
 
 
-I32 = npt.NDArray[np.int32]
 FACE = np.dtype([("n", "u1"), ("v", "<i4", 3)])
 FORMAT = "binary_little_endian 1.0"
 HEADER = re.compile(

@@ -20,10 +20,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from recon.types import F64, U8, Bool
-
-U16 = npt.NDArray[np.uint16]
-I64 = npt.NDArray[np.int64]
+from recon.types import F64, I64, U8, U16, Bool
 
 CONTEXT = np.array(
     [

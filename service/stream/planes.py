@@ -11,12 +11,9 @@ from dataclasses import dataclass
 import cv2
 import imagecodecs
 import numpy as np
-import numpy.typing as npt
 
-from recon.types import F32, U8, Array, Bool, DepthMap
+from recon.types import F32, U8, U16, Array, Bool, DepthMap
 from service.stream import plane_coders, plane_kernels
-
-U16 = npt.NDArray[np.uint16]
 
 METHOD_JPEG_LS = 1
 METHOD_PREDICTION = 2

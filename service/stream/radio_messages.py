@@ -12,10 +12,9 @@ import zlib
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from recon import se3
-from recon.types import F32, F64, U8, Bool
+from recon.types import F32, F64, U8, U16, Bool
 from service.stream.naming import NAME, split_scan_name
 from service.stream.records import (
     PoseRecord,
@@ -26,8 +25,6 @@ from service.stream.records import (
     sources_of,
 )
 from service.stream.validity import is_on_globe, is_pinhole, is_time
-
-U16 = npt.NDArray[np.uint16]
 
 PAYLOAD_TYPE = 42_432
 """TUNNEL.payload_type of these messages; 32768 and above is for private use."""

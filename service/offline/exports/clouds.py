@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
-from recon.types import F64, U8
+from recon.types import F64, I64, U8
 from service.offline.exports.flight import writing_folder
 from service.offline.exports.surface import bare_ground, surface_model
 from service.offline.exports.view import ExportOptions, ScanView
@@ -74,8 +73,6 @@ def classes(scan: ScanView) -> U8:
     is_ground = np.abs(scan.xyz_m[:, 2] - below) <= GROUND_WITHIN_M
     return np.where(is_ground, GROUND, UNCLASSIFIED).astype(np.uint8)
 
-
-I64 = npt.NDArray[np.int64]
 
 SAMPLES_PER_SIDE = 128
 """A node above the leaves holds at most one point in each of its 128^3 cells."""
