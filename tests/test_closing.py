@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import ctypes
 import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 from loopback import until
 
 from mavlink.component.control import Phase
 from service.config import load_config
 from service.daemon import runtime
-from service.daemon.machine import KEPT_EACH, fill_small_caches, give_back, one_pool
+from service.daemon.machine import give_back, one_pool
 from service.daemon.runtime import Daemon
 from service.daemon.scan_run import ScanRun
 from service.daemon.scanning import Scanning
@@ -171,25 +169,6 @@ def test_an_arming_while_the_last_scan_is_closed_is_followed_then(
     scanning.follow_intent()
     assert not scanning.is_running  # the operator's stop holds until the next take-off
     hung.store.close()
-
-
-class _Mallinfo(ctypes.Structure):
-    """mallinfo2(3)."""
-
-    _fields_ = tuple((name, ctypes.c_size_t) for name in (*"abcdefg", "used", "free", "end"))
-
-
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="needs glibc 2.33")
-def test_small_arrays_take_nothing_more_once_the_caches_are_filled() -> None:
-    libc = ctypes.CDLL(None)
-    libc.mallinfo2.restype = _Mallinfo
-    fill_small_caches()
-    sizes = range(64, 1024)
-    before = int(libc.mallinfo2().used)
-    held = [np.empty(size, np.uint8) for size in sizes for _ in range(KEPT_EACH)]
-    data = sum(sizes) * KEPT_EACH
-    assert int(libc.mallinfo2().used) - before < 0.5 * data  # their heads
-    assert len(held) == len(sizes) * KEPT_EACH
 
 
 def test_memory_settings_are_taken_where_the_library_has_them() -> None:

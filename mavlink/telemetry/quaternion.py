@@ -11,8 +11,6 @@ from collections.abc import Sequence
 
 Quaternion = tuple[float, float, float, float]
 
-IDENTITY: Quaternion = (1.0, 0.0, 0.0, 0.0)
-
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     """The rotation b followed by a (``q_a_c`` of ``q_a_b`` and ``q_b_c``)."""

@@ -91,7 +91,7 @@ class OnnxBackend(CpuBackend):
         arrays: list[Array] = [coarse.px, coarse.confidence, guide_at_taps(guide, (h, w)), guide]
         for name, array in zip(given, arrays, strict=True):
             place(given[name], array)
-        px, sure = _run(session, given | tap_windows((h, w), (H, W), small, large, config))
+        px, sure = _run(session, given | tap_windows((h, w), (H, W), large, config))
         return DisparityMap(px[:H, :W].copy(), sure[:H, :W].copy())
 
     def _session(self, key: Any, model: Callable[[], bytes]) -> Any:

@@ -311,7 +311,7 @@ def upsampling_model(
         name: graph.constant(array)
         if fixed
         else graph.input(name, _KINDS[array.dtype.kind], array.shape)
-        for name, array in tap_windows(coarse, fine, coarse, fine, config).items()
+        for name, array in tap_windows(coarse, fine, fine, config).items()
     }
     unknown = graph.op("IsNaN", px)
     trust = graph.where(unknown, 0.0, confidence.at_least(MIN_CONFIDENCE))
@@ -353,7 +353,6 @@ def _row(graph: Graph, table: Value, k: int) -> Value:
 def tap_windows(
     coarse: tuple[int, int],
     fine: tuple[int, int],
-    coarse_room: tuple[int, int],
     fine_room: tuple[int, int],
     config: UpsamplingConfig,
 ) -> dict[str, Array]:

@@ -13,13 +13,12 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from recon import se3
 from recon.posegraph.sensor_noise import MIN_READINGS, Noise, drift_noise, wander_noise
 from recon.posegraph.track_alignment import umeyama
-from recon.types import F64, DepthMap, PosePrior
+from recon.types import F64, I64, DepthMap, PosePrior
 
 WANDER_SHARE = 0.4
 """Of a fix's sigma, what differs between fixes of one flight; the rest is common to all."""
@@ -59,8 +58,6 @@ MIN_FIX_M = 0.005
 
 MIN_WALK, MIN_RATE_M_S = 0.02, 0.01
 """The same of an integrated velocity: m / sqrt(s), and the constant part of its error."""
-
-I64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -490,7 +487,7 @@ def _starts(anchors: Sequence[Anchor], readings: _Readings) -> list[tuple[F64, F
     starts = [(R, np.asarray(np.median(readings.fix - x, axis=0)), 0.0)]
     if len(x) >= 4:
         weight = 1.0 / np.mean(readings.claimed**2, axis=1)
-        scale, turn, _ = umeyama(x, readings.fix, weight, True)
+        scale, turn, _ = umeyama(x, readings.fix, weight)
         if scale > 0:
             shift = np.asarray(np.median(readings.fix - scale * x @ turn.T, axis=0))
             starts.append((turn @ R, shift, float(np.log(scale))))

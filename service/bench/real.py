@@ -306,7 +306,7 @@ def _flat_rms(mapped: dict[str, F64], surveyed: dict[str, tuple[SurveyPoint, F64
     ours = np.array([[*mapped[n][:2], 0.0] for n in names])
     true = np.array([[*surveyed[n][1], 0.0] for n in names])
     true -= true.mean(axis=0)
-    scale, R, t = umeyama(ours, true, np.ones(len(ours)), level=True)
+    scale, R, t = umeyama(ours, true, np.ones(len(ours)))
     off = scale * ours @ R.T + t - true
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 

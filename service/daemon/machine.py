@@ -25,8 +25,6 @@ THROTTLED_NOW = 0b1111  # Raspberry Pi: under-voltage, frequency capped, throttl
 
 M_ARENA_MAX = -8  # mallopt(3)
 
-SMALL_BYTES, KEPT_EACH = 1024, 7
-
 
 @dataclass(frozen=True, slots=True)
 class Machine:
@@ -232,19 +230,6 @@ def one_pool() -> bool:
     os.environ.setdefault("NUMPY_MADVISE_HUGEPAGE", "0")
     libc = _libc("mallopt")
     return libc is not None and libc.mallopt(M_ARENA_MAX, 1) == 1
-
-
-def fill_small_caches() -> None:
-    """Allocate all of NumPy's cached small blocks at once.
-
-    NumPy keeps up to :data:`KEPT_EACH` freed blocks of every size below :data:`SMALL_BYTES`
-    (numpy/_core/src/multiarray/alloc.c): 3.5 MiB. Allocated one by one they would lie between
-    images and each pin a page of memory; allocated at once they are contiguous.
-    """
-    import numpy as np
-
-    held = [np.empty(size, np.uint8) for size in range(1, SMALL_BYTES) for _ in range(KEPT_EACH)]
-    held.clear()
 
 
 def give_back(collect: bool = False) -> bool:

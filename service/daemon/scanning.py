@@ -18,7 +18,7 @@ from mavlink.component.vehicle import VehicleLink
 from service.config import Config
 from service.daemon.intent import Intent, Resumption, Wanted
 from service.daemon.load_shedding import Level, lowered
-from service.daemon.machine import fill_small_caches, give_back
+from service.daemon.machine import give_back
 from service.daemon.scan_run import ScanRun
 from service.daemon.warm_up import is_warm
 from service.daemon.writing import ClosingWatch, Writings
@@ -79,7 +79,6 @@ class Scanning:
             )
         self.camera = load_camera(Path(self.config.camera.model))
         self._backend = open_backend(self.config.compute, self.camera.size_px)
-        fill_small_caches()
         log.info("ready: backend %s", self._backend.name)
 
     # ---- intent ------------------------------------------------------------------------------

@@ -50,7 +50,6 @@ Time = Annotated[int, Meta(ge=0, le=MAX_TIME_NS)]
 Epsg = Annotated[int, Meta(ge=0, le=999_999)]
 RunId = Annotated[str, Meta(pattern=r"^([0-9a-f]{32})?$")]
 Notes = Annotated[tuple[Text, ...], Meta(max_length=MAX_NOTES)]
-Sections = dict[str, Any]
 
 _Count = Annotated[int, Meta(ge=0, le=1 << 53)]
 _Side = Annotated[int, Meta(ge=1, le=65_535)]

@@ -402,5 +402,5 @@ def _placed(mapped_m: F64, surveyed_m: F64, level: bool) -> tuple[float, F64, F6
     flat = np.array([1.0, 1.0, 0.0])
     if np.ptp(mapped_m[:, :2], axis=0).max() < 1e-6:
         return None
-    scale, R, t = umeyama(mapped_m * flat, surveyed_m * flat, np.ones(len(mapped_m)), level=True)
+    scale, R, t = umeyama(mapped_m * flat, surveyed_m * flat, np.ones(len(mapped_m)))
     return scale, R, t
