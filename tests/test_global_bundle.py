@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.calibration.flight import SelfCalibrationConfig, camera_information, first_held, network
+from recon.calibration.flight import (
+    SelfCalibrationConfig,
+    camera_information,
+    first_held,
+    joint,
+    network,
+)
 from recon.calibration.global_bundle import (
     Knowledge,
     Problem,
@@ -163,6 +169,17 @@ def test_poses_that_are_metres_off_and_wild_sightings_do_no_harm() -> None:
     assert np.linalg.norm(s.poses[:, :3, 3] - T[:, :3, 3], axis=1).max() < 0.3
     assert found.sigma_px == pytest.approx(0.2, abs=0.06)
     assert len(found.seen.view) < len(uv) - 0.8 * len(wild)
+
+
+def test_a_landmark_whose_rays_cross_nowhere_has_no_place() -> None:
+    T, points, seen = scene(0.2)
+    stray = np.arange(4)
+    more = Sightings(stray, stray // 2 + len(points), np.array([[100.0, 80.0], [600.0, 300.0]] * 2))
+    known = known_by_survey(T, np.concatenate([points, np.zeros((2, 3))]))
+    found = network(TRUE, off(T), joint(seen, more), known, camera_information(TRUE, HELD))
+    assert np.isnan(found.solution.points[len(points) :]).all()
+    assert found.seen.landmark.max() < len(points)
+    assert np.linalg.norm(found.solution.poses[:, :3, 3] - T[:, :3, 3], axis=1).max() < 0.3
 
 
 def test_a_camera_that_starts_again_each_round_is_held_to_the_one_given() -> None:

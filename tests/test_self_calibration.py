@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.calibration.flight import SelfCalibrationConfig, camera_sigmas, doubt, self_calibrate
+from recon.calibration.flight import (
+    SelfCalibrationConfig,
+    camera_sigmas,
+    doubt,
+    self_calibrate,
+    shared,
+)
 from recon.calibration.global_bundle import Sightings
 from recon.types import F64, Camera
 
@@ -152,6 +158,15 @@ def test_a_camera_beyond_belief_and_wild_sightings() -> None:
     assert "chessboard" in self_calibrate(far, start, near, seen, fixes, sigma).why_not
 
 
+def test_an_adjustment_that_has_not_settled_is_refused() -> None:
+    poses = _oblique_turn()
+    points, seen = _seen(poses, TRUE)
+    start, near = _guess(points, poses)
+    fixes, sigma = poses[:, :3, 3], np.full((len(poses), 3), 0.3)
+    hasty = SelfCalibrationConfig(iterations=2)
+    assert "settle" in self_calibrate(WRONG, start, near, seen, fixes, sigma, hasty).why_not
+
+
 def test_wrong_calls_are_refused() -> None:
     poses = _nadir((60.0,))
     points, seen = _seen(poses, TRUE)
@@ -162,8 +177,27 @@ def test_wrong_calls_are_refused() -> None:
         self_calibrate(TRUE, poses[:2], points, seen, poses[:2, :3, 3], poses[:2, :3, 3])
 
 
-def test_a_camera_with_a_negative_or_unknown_variance_is_refused() -> None:
-    for wrong in (-1e-9, np.nan):
-        sigmas = camera_sigmas(np.diag([wrong, *np.full(7, 1e-6)]))
-        assert sigmas[0] == np.inf and np.isfinite(sigmas[1:]).all()
-        assert "does not determine" in doubt(TRUE, TRUE, float(sigmas[0]), SelfCalibrationConfig())
+def test_a_camera_whose_covariance_is_none_is_refused() -> None:
+    def without(i: int, j: int, value: float) -> F64:
+        out = np.diag(np.full(8, 1e-6))
+        out[i, j] = out[j, i] = value
+        return out
+
+    assert camera_sigmas(without(0, 1, 5e-7)) == pytest.approx(np.full(8, 1e-3))
+    for wrong in (without(6, 6, -1e-9), without(6, 6, np.nan), without(2, 6, 2e-6)):
+        focal = float(camera_sigmas(wrong)[0])
+        assert "does not determine" in doubt(TRUE, TRUE, focal, SelfCalibrationConfig())
+
+
+def test_landmarks_without_a_place_take_no_part() -> None:
+    poses = _oblique_turn()
+    points, seen = _seen(poses, TRUE)
+    start, near = _guess(points, poses)
+    fixes, sigma = poses[:, :3, 3], np.full((len(poses), 3), 0.5)
+    lost = np.arange(len(near)) % 5 == 0
+    without = shared(seen, ~lost[seen.landmark])
+    expected = self_calibrate(WRONG, start, near, without, fixes, sigma)
+    near[lost] = np.nan
+    found = self_calibrate(WRONG, start, near, seen, fixes, sigma)
+    assert len(found.errors_px) == len(expected.errors_px)
+    np.testing.assert_allclose(found.camera.K, expected.camera.K, atol=0.01)

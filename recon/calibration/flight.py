@@ -28,6 +28,9 @@ from recon.types import F64, Bool, Camera
 
 MIN_SIGHTINGS = 60
 
+MAX_STEP = 0.3
+"""Of a parameter's sigma, that one more step would move it by."""
+
 RAYLEIGH_MEDIAN = 1.1774
 """Median length of an error whose coordinates have a sigma of 1."""
 
@@ -80,7 +83,8 @@ def self_calibrate(
 
     Args:
         camera: the model given, a start and a bound.
-        poses: (N, 4, 4) T_world_camera to begin with; ``landmarks`` (P, 3) likewise, world.
+        poses: (N, 4, 4) T_world_camera to begin with; ``landmarks`` (P, 3) likewise, world,
+            NaN without a place.
         fixes: (N, 3) measured places of the cameras, NaN where there is none, with their
             sigmas ``sigma_fixes`` (N, 3) as of independent readings.
 
@@ -106,7 +110,7 @@ def self_calibrate(
             Problem(camera, camera, poses, landmarks, some, sigmas, known, held), config.iterations
         )
 
-    seen = shared(seen, np.ones(len(seen.view), np.bool_))
+    seen = within(camera, poses, landmarks, seen, np.inf)
     before = errors_px(camera, poses, landmarks, seen)
     first = adjusted(seen, config.pixel_sigma)
     # Once more without wild sightings and with the pixels' own scatter, on which sigmas rest.
@@ -115,10 +119,13 @@ def self_calibrate(
     found = adjusted(seen, sigma)
     sigmas = camera_sigmas(found.camera_covariance)
     focal = float(sigmas[:2].max() / found.camera.K[0, 0])
+    why_not = doubt(found.camera, camera, focal, config)
+    if not why_not and (np.abs(found.camera_step) > MAX_STEP * sigmas).any():
+        why_not = "the adjustment of the images does not settle"
     return SelfCalibrated(
         found.camera, focal, (float(sigmas[4]), float(sigmas[5])),
         (float(sigmas[6]), float(sigmas[7])), middle(before), middle(found.errors_px),
-        found.errors_px, found.poses, doubt(found.camera, camera, focal, config),
+        found.errors_px, found.poses, why_not,
     )  # fmt: skip
 
 
@@ -162,7 +169,7 @@ def network(
         kept = within(camera, poses, points, kept, np.inf)
         if len(kept.view) < MIN_SIGHTINGS:
             raise ValueError("too few places are found again in other images")
-        points = np.where(np.isfinite(points), points, np.nan_to_num(known.surveyed))
+        points = np.where(np.isfinite(points), points, known.surveyed)
         every = joint(kept, marks)
         sigmas = np.append(np.full(len(kept.view), sigma), np.full(len(marks.view), mark_px))
         solution = solve(
@@ -176,8 +183,7 @@ def network(
 
 def within(camera: Camera, poses: F64, points: F64, seen: Sightings, gate_px: float) -> Sightings:
     """Sightings of known points that are off by less than ``gate_px``, two of each at least."""
-    errors = errors_px(camera, poses, np.nan_to_num(points), seen)
-    return shared(seen, np.isfinite(points[seen.landmark, 2]) & (errors < gate_px))
+    return shared(seen, errors_px(camera, poses, points, seen) < gate_px)
 
 
 def joint(a: Sightings, b: Sightings) -> Sightings:
@@ -240,9 +246,12 @@ def camera_information(given: Camera, c: SelfCalibrationConfig) -> F64:
 
 
 def camera_sigmas(covariance: F64) -> F64:
-    """(8,) sigmas of a camera's parameters; infinite where sightings do not determine one."""
-    variances = np.diag(covariance)
-    return np.asarray(np.sqrt(np.where(variances >= 0.0, variances, np.inf)))
+    """(8,) sigmas of a camera's parameters; all infinite unless ``covariance`` (8, 8) is one."""
+    try:
+        known = np.isfinite(np.linalg.cholesky(covariance)).all()
+    except np.linalg.LinAlgError:  # not positive definite
+        known = False
+    return np.sqrt(np.diag(covariance)) if known else np.full(len(covariance), np.inf)
 
 
 def middle(errors_px: F64) -> float:

@@ -67,11 +67,12 @@ class Solution:
     """The adjusted flight."""
 
     poses: F64  # (N, 4, 4) T_world_camera
-    points: F64  # (P, 3) world, m
+    points: F64  # (P, 3) world, m; NaN where neither rays nor a survey place one
     camera: Camera
     errors_px: F64  # (M,) lengths, infinite behind the camera
     covariances: F64  # (N, 6, 6) left perturbation of T_world_camera; empty when not asked for
     camera_covariance: F64  # (8, 8) of CAMERA's parameters
+    camera_step: F64  # (8,) that the equations at the result still ask for
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +95,7 @@ class Problem:
 def _pixel(P: F64, X: F64, k: F64, k3: float, out: F64) -> bool:
     """Fill ``out`` with u, v, a, b, z, r2, radial; False behind the camera."""
     z = P[2, 0] * X[0] + P[2, 1] * X[1] + P[2, 2] * X[2] + P[2, 3]
-    if z < 1e-6:
+    if not z >= 1e-6:  # NaN: a point without a place
         return False
     a = (P[0, 0] * X[0] + P[0, 1] * X[1] + P[0, 2] * X[2] + P[0, 3]) / z
     b = (P[1, 0] * X[0] + P[1, 1] * X[1] + P[1, 2] * X[2] + P[1, 3]) / z
@@ -219,7 +220,7 @@ def _mark_pairs(view: I64, start: I64, met: npt.NDArray[np.bool_]) -> None:
 
 
 def errors_px(camera: Camera, poses: F64, points: F64, seen: Sightings) -> F64:
-    """(M,) lengths of the errors of sightings; infinite behind the camera."""
+    """(M,) lengths of the errors of sightings; infinite behind the camera, or of no point."""
     out = np.zeros(len(seen.view))
     T = np.array([se3.inverse(one) for one in poses])
     k, k3 = _vector(camera), float(camera.distortion[4])
@@ -424,7 +425,8 @@ class _Bundle:
         errors[self._order] = self._lengths(s)
         poses = np.array([se3.inverse(one) for one in s.T])
         known = self._covariances(eq, spread, poses) if covariances else np.zeros((0, 6, 6))
-        return Solution(poses, s.X, _camera(self._of.camera, s.k), errors, known, spread)
+        camera, step = _camera(self._of.camera, s.k), spread @ eq.gk
+        return Solution(poses, s.X, camera, errors, known, spread, step)
 
     def _covariances(self, eq: _Equations, spread: F64, poses: F64) -> F64:
         """(N, 6, 6) of a left perturbation of T_world_camera, the camera's own included."""
