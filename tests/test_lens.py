@@ -84,6 +84,17 @@ def test_the_focal_length_is_read(
     assert lens.camera((1600, 1200)).K[0, 0] == pytest.approx(fx_px, rel=1e-3)
 
 
+def test_whole_millimetres_are_less_sure_the_shorter_the_lens(tmp_path: Path) -> None:
+    sigma = {}
+    for mm in (12, 24, 200):
+        write_still(tmp_path / "a.jpg", (1600, 1200), {41989: mm})
+        lens = read_tags(tmp_path / "a.jpg").lens
+        assert lens is not None
+        sigma[mm] = lens.sigma_focal
+    assert sigma[12] == pytest.approx(np.hypot(0.01, 0.5 / 12 / np.sqrt(3.0)))
+    assert sigma[12] > 1.5 * sigma[24] > 1.8 * sigma[200] > 0.018
+
+
 def test_the_makers_distortion_and_middle_are_read(tmp_path: Path) -> None:
     photo = {40962: 5280, 40963: 3956}
     for flag, k1 in (("0", -0.269), ("1", 0.0)):

@@ -25,6 +25,9 @@ MIN_FOCAL, MAX_FOCAL = 0.2, 20.0
 SAME_SHAPE = 0.005
 """Relative tolerance of aspect ratios: sizes are whole pixels."""
 
+SIGMA_FOCAL = 0.01
+"""Of a focal length in tags, as a share: it is that of the model of the lens, and rounded."""
+
 AGREEMENT = 0.1
 """A focal length that differs more from the 35 mm equivalent belongs to another size of the image:
 programs that shrink images keep such tags unchanged."""
@@ -38,6 +41,7 @@ class Lens:
     principal: tuple[float, float] = (0.0, 0.0)  # offset from the image centre
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     source: str = ""  # "the maker's calibration", "the focal length in EXIF", ...
+    sigma_focal: float = SIGMA_FOCAL  # as a share
 
     def camera(self, size_px: tuple[int, int]) -> Camera:
         """The camera for images of ``size_px`` (W, H) that are not cropped."""
@@ -152,7 +156,9 @@ def _full_frame(photo: Mapping[int, Any], size_px: tuple[int, int]) -> Lens | No
     if focal is None:
         return None
     share = math.hypot(*size_px) / max(size_px) / DIAGONAL_35MM
-    return Lens(focal * share, source="the 35 mm equivalent in EXIF")
+    rounded = 0.5 / math.sqrt(3.0) / focal  # whole millimetres
+    sigma = math.hypot(SIGMA_FOCAL, rounded)
+    return Lens(focal * share, source="the 35 mm equivalent in EXIF", sigma_focal=sigma)
 
 
 def _taken_side(photo: Mapping[int, Any], size_px: tuple[int, int]) -> float:

@@ -43,7 +43,7 @@ def lens_by_stills(source: ImagesSource, camera: Camera, config: Config) -> Came
     from service.offline.refine.refinement import lens
 
     some = source.middle(STILLS)
-    if len(some) < MIN_STILLS:
+    if len(some) < MIN_STILLS or source.lens is None:
         return None
     for key, value in COARSE.items():
         config = change(config, key, str(value).lower())
@@ -58,7 +58,7 @@ def lens_by_stills(source: ImagesSource, camera: Camera, config: Config) -> Came
         finally:
             store.close()
         try:
-            return lens(folder, Path(source.description))
+            return lens(folder, Path(source.description), source.lens.sigma_focal)
         except InputError as error:
             log.info("the stills do not determine their lens: %s", error)
             return None

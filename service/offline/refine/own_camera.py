@@ -63,9 +63,6 @@ MIN_SHOWN = 0.3
 
 START = SelfCalibrationConfig()
 
-FOCAL_KNOWN = replace(START, sigma_focal=0.002)
-"""The same where the focal length given holds."""
-
 EXHAUSTIVE = 60
 """Of so many images all are compared, wherever they are said to look."""
 
@@ -115,11 +112,17 @@ def times_of_stills(folder: Path, start_unix_ns: int) -> dict[str, float]:
         return {name: (start_unix_ns + time_ns) / 1e9 for name, time_ns in source.times.items()}
 
 
+def by_tags(sigma_focal: float) -> SelfCalibrationConfig:
+    """A camera whose focal length is known to ``sigma_focal``, a share, and holds if left open."""
+    return replace(START, sigma_focal=sigma_focal, max_sigma_focal=2.0 * sigma_focal)
+
+
 def sightings(
-    images: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float
-) -> tuple[F64, Sightings, F64]:
-    """(P, 3) landmarks, where they are seen in the distorted images, and (N, 4, 4) poses that
-    agree with them.
+    images: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float,
+    config: SelfCalibrationConfig = START,
+) -> tuple[F64, Sightings, F64]:  # fmt: skip
+    """(P, 3) landmarks, NaN without a place, where they are seen in the distorted images, and
+    (N, 4, 4) poses that agree with them.
 
     ``images`` by view, with ``poses`` (N, 4, 4) of all views; the ground lies about
     ``ground_m`` up in the world. Images whose ground overlaps are compared, and of few
@@ -140,8 +143,8 @@ def sightings(
     seen = sharpened(stack, camera, seen)
     known = loosely_placed(poses, seen)
     try:
-        found = network(camera, poses, seen, known, camera_information(camera, START))
-    except ValueError as error:
+        found = network(camera, poses, seen, known, camera_information(camera, config))
+    except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
         raise InputError(f"{error}; is this the video?") from error
     poses, points = found.solution.poses, found.solution.points
     own = found.solution.camera
@@ -149,7 +152,7 @@ def sightings(
     overlap = _overlapping(views, own, poses, float(np.nanmedian(points[:, 2])))
     seen = extended(stack, camera, own, poses, points, found.seen, overlap)
     seen = within(own, poses, points, seen, GROSS_PX)
-    return np.nan_to_num(points), seen, poses
+    return points, seen, poses
 
 
 def _overlapping(
@@ -188,14 +191,12 @@ def _on_ground(T: F64, ways: F64, ground_m: float) -> F64:
 
 def found_camera(
     images: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float, fixes: F64,
-    sigma_fixes: F64, otherwise: SelfCalibrationConfig | None = None,
+    sigma_fixes: F64, config: SelfCalibrationConfig = START,
 ) -> SelfCalibrated:  # fmt: skip
     """The camera estimated from the flight; InputError, in one line, when it is not determined."""
-    landmarks, seen, poses = sightings(images, camera, poses, ground_m)
+    landmarks, seen, poses = sightings(images, camera, poses, ground_m, config)
     try:
-        found = self_calibrate(camera, poses, landmarks, seen, fixes, sigma_fixes)
-        if found.why_not and otherwise is not None:
-            found = self_calibrate(camera, poses, landmarks, seen, fixes, sigma_fixes, otherwise)
+        found = self_calibrate(camera, poses, landmarks, seen, fixes, sigma_fixes, config)
     except ValueError as error:
         raise InputError(f"--intrinsics: {error}") from error
     except (RuntimeError, np.linalg.LinAlgError) as error:  # an ill-posed problem

@@ -144,15 +144,15 @@ def intrinsics(
     return own_camera.write(found, given, out or folder) | {"notes": job.notes}
 
 
-def lens(folder: Path, stills: Path) -> Camera:
-    """The camera by a scan's own stills. Where they leave the focal length open, the scan's holds.
+def lens(folder: Path, stills: Path, sigma_focal: float) -> Camera:
+    """The camera by a scan's own stills; the scan's focal length is known to a share beforehand.
 
-    Raises InputError, in one line, where they do not determine its distortion either.
+    Raises InputError, in one line, where they do not determine its distortion.
     """
     _open_target(folder, None)
     with ScanStore.open(folder / "scan.db") as store, Revisions(store) as revisions:
         job = _Refinement(folder, store, revisions, RefineOptions())
-        return job.own_camera(stills, own_camera.FOCAL_KNOWN)[0].camera
+        return job.own_camera(stills, own_camera.by_tags(sigma_focal))[0].camera
 
 
 def _deliver(target: Path, figures: dict[str, Any]) -> dict[str, Any]:
@@ -261,21 +261,16 @@ class _Refinement:
         return figures | {"changed": changed}
 
     def own_camera(
-        self, video: Path, otherwise: SelfCalibrationConfig | None = None
+        self, video: Path, config: SelfCalibrationConfig = own_camera.START
     ) -> tuple[SelfCalibrated, Camera]:
-        """The camera by the flight's own images, and the one that it was flown with.
-
-        ``otherwise`` is tried where the flight does not determine the camera as usual.
-        """
+        """The camera by the flight's own images, and the one that it was flown with."""
         track, given = self._track(), own_camera.camera_of(self.header)
         times = [s.time_ns for s in self.states]
         images = own_camera.images_at(video, self.header.started_unix_ns, times)
         ahead = track.poses[:, :3, 2] * self._ahead_m()
         ground_m = float(np.median(track.poses[:, 2, 3] + ahead[:, 2]))
         fixes, sigma = fixes_of(track)
-        found = own_camera.found_camera(
-            images, given, track.poses, ground_m, fixes, sigma, otherwise
-        )
+        found = own_camera.found_camera(images, given, track.poses, ground_m, fixes, sigma, config)
         return found, given
 
     # ---- what goes in ------------------------------------------------------------------------
