@@ -163,18 +163,7 @@ def odometry_message(odometry: Odometry, boot_time_us: int) -> Any:
     upper = [float(rows[i][j]) for i in range(6) for j in range(i, 6)]
     nan = math.nan
     return dialect.MAVLink_odometry_message(
-        max(0, boot_time_us),
-        LOCAL_FRD,
-        BODY_FRD,
-        *odometry.position_ned_m,
-        list(odometry.q_ned_body),
-        *odometry.velocity_frd_m_s,
-        nan,
-        nan,
-        nan,
-        upper,
-        [nan] * CELLS,
-        odometry.reset_counter & 0xFF,
-        VISION,
-        max(-1, min(100, odometry.quality_percent)),
-    )
+        max(0, boot_time_us), LOCAL_FRD, BODY_FRD, *odometry.position_ned_m,
+        list(odometry.q_ned_body), *odometry.velocity_frd_m_s, nan, nan, nan, upper, [nan] * CELLS,
+        odometry.reset_counter & 0xFF, VISION, max(-1, min(100, odometry.quality_percent)),
+    )  # fmt: skip

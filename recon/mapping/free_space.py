@@ -217,17 +217,9 @@ def _pixel(x: float, y: float, z: float, K: F64, T: F64) -> tuple[int, int, floa
 
 @njit(cache=True, nogil=True)
 def _look_above(
-    tiles: I64,
-    first: I64,
-    xyz: F32,
-    up_m: F64,
-    depth: F32,
-    depth_sigma: F32,
-    K: F64,
-    T: F64,
-    seen: U8,
-    is_decided: Bool,
-) -> None:
+    tiles: I64, first: I64, xyz: F32, up_m: F64, depth: F32, depth_sigma: F32, K: F64, T: F64,
+    seen: U8, is_decided: Bool,
+) -> None:  # fmt: skip
     """Set bit j of ``seen`` where a keyframe sees through the place ``up_m[j]`` higher."""
     h, w = depth.shape
     everything = (1 << up_m.shape[0]) - 1
@@ -249,21 +241,9 @@ def _look_above(
 
 @njit(cache=True, nogil=True)
 def _vote(
-    begin: int,
-    end: int,
-    tiles: I64,
-    first: I64,
-    xyz: F32,
-    sigma: F32,
-    depth: F32,
-    depth_sigma: F32,
-    views: U8,
-    K: F64,
-    T: F64,
-    seers: I16,
-    asked: U8,
-    is_decided: Bool,
-) -> None:
+    begin: int, end: int, tiles: I64, first: I64, xyz: F32, sigma: F32, depth: F32,
+    depth_sigma: F32, views: U8, K: F64, T: F64, seers: I16, asked: U8, is_decided: Bool,
+) -> None:  # fmt: skip
     """Add one keyframe's votes on the points of ``tiles[begin:end]`` to ``seers``.
 
     A vote is the pairs that see less the pairs that see through; ``T`` is T_camera_world.

@@ -294,18 +294,9 @@ def _put(
 
 @njit(cache=True, nogil=True, fastmath=False)
 def _fresh(
-    keys: I64,
-    ids: I32,
-    held: F32,
-    depth: F32,
-    sigma: F32,
-    K: F64,
-    T: F64,
-    inverse: float,
-    better: float,
-    reach_sigma: float,
-    largest_reach: int,
-) -> Bool:
+    keys: I64, ids: I32, held: F32, depth: F32, sigma: F32, K: F64, T: F64, inverse: float,
+    better: float, reach_sigma: float, largest_reach: int,
+) -> Bool:  # fmt: skip
     """See VoxelMap.fresh; the ray is sampled every voxel, nearest samples first."""
     h, w = depth.shape
     out = np.zeros((h, w), np.bool_)
@@ -342,19 +333,9 @@ def _fresh(
 
 @njit(cache=True, nogil=True)
 def _insert(
-    keys: I64,
-    ids: I32,
-    held: F32,
-    seen: I32,
-    count: int,
-    turn: int,
-    depth: F32,
-    sigma: F32,
-    K: F64,
-    T: F64,
-    mask: Bool,
-    inverse: float,
-) -> int:
+    keys: I64, ids: I32, held: F32, seen: I32, count: int, turn: int, depth: F32, sigma: F32,
+    K: F64, T: F64, mask: Bool, inverse: float,
+) -> int:  # fmt: skip
     """See VoxelMap.insert; the new number of voxels."""
     h, w = depth.shape
     for v in range(h):

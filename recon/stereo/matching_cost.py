@@ -87,20 +87,11 @@ def matching_cost(
     height, width = left.shape
     cost = np.empty((height, labels, width), np.int16) if out is None else out
     in_bands(
-        _cost_volume,
-        height,
-        left,
-        right,
-        census(left),
-        census(right),
-        min_disparity,
-        round(config.census_weight * COST_UNIT),
-        config.census_truncation,
-        round(config.difference_weight * COST_UNIT),
-        config.difference_truncation,
-        round(config.unseen * COST_UNIT),
-        cost,
-    )
+        _cost_volume, height, left, right, census(left), census(right), min_disparity,
+        round(config.census_weight * COST_UNIT), config.census_truncation,
+        round(config.difference_weight * COST_UNIT), config.difference_truncation,
+        round(config.unseen * COST_UNIT), cost,
+    )  # fmt: skip
     return cost
 
 

@@ -52,18 +52,10 @@ def reproject(
     to_left = pair.K @ pair.R_left_keyframe @ np.linalg.inv(K)
     finer = np.array(disparity.px.shape, np.float64) / pair.left.shape
     in_bands(
-        _reproject,
-        h,
-        disparity.px,
-        disparity.confidence,
-        np.ascontiguousarray(to_left),
-        finer,
-        np.asarray(pair.plane, np.float64),
-        float(pair.slope),
-        float(pair.K[0, 0] * pair.baseline_m),
-        out.depth_m,
-        out.sigma_m,
-    )
+        _reproject, h, disparity.px, disparity.confidence, np.ascontiguousarray(to_left), finer,
+        np.asarray(pair.plane, np.float64), float(pair.slope),
+        float(pair.K[0, 0] * pair.baseline_m), out.depth_m, out.sigma_m,
+    )  # fmt: skip
     return out
 
 

@@ -77,14 +77,9 @@ class TriangleGrid:
     def arrays(self) -> tuple[Any, ...]:
         """The arguments that the compiled functions of this module begin with."""
         return (
-            self.corners,
-            self.start,
-            self.items,
-            self.column_z,
-            self.block_z,
-            self.bounds,
+            self.corners, self.start, self.items, self.column_z, self.block_z, self.bounds,
             self.cell_m,
-        )
+        )  # fmt: skip
 
 
 def build(vertices: F64, triangles: npt.NDArray[np.integer], cell_m: float = 1.0) -> TriangleGrid:

@@ -187,17 +187,9 @@ def _normal_equations(
 
 @njit(cache=True, nogil=True)
 def _adjust(
-    T: F64,
-    X: F64,
-    cam: I64,
-    start: I64,
-    uv: F64,
-    k: F64,
-    huber: float,
-    slot: I64,
-    n_free: int,
+    T: F64, X: F64, cam: I64, start: I64, uv: F64, k: F64, huber: float, slot: I64, n_free: int,
     iterations: int,
-) -> tuple[F64, F64, F64, F64, bool]:
+) -> tuple[F64, F64, F64, F64, bool]:  # fmt: skip
     M, N = cam.size, X.shape[0]
     pt = np.empty(M, np.int64)
     for p in range(N):

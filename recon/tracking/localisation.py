@@ -318,14 +318,10 @@ class Localiser:
             config = replace(config, max_return_px=np.inf)  # the pose refutes what is wrong
         index = np.flatnonzero(visible)
         found = matching.match(
-            key.pyramid,
-            key.uv[index].astype(np.float32),
-            new.pyramid,
-            guess.uv[index].astype(np.float32),
-            guess.radius_px,
-            guess.warp[index].astype(np.float32),
-            config,
-        )
+            key.pyramid, key.uv[index].astype(np.float32), new.pyramid,
+            guess.uv[index].astype(np.float32), guess.radius_px,
+            guess.warp[index].astype(np.float32), config,
+        )  # fmt: skip
         ok, uv = np.zeros(len(key.uv), np.bool_), guess.uv.copy()
         ok[index], uv[index] = found.ok, found.uv_px
         return Search(key, uv, ok, visible, mapped, in_view)
@@ -405,14 +401,10 @@ class FirstViews:
         best: tuple[F64, Bool] | None = None
         for guess in self._guesses(new, first, R_b_a, still):
             found = matching.match(
-                first.pyramid,
-                first.uv.astype(np.float32),
-                new.pyramid,
-                guess.uv.astype(np.float32),
-                guess.radius_px,
-                guess.warp.astype(np.float32),
+                first.pyramid, first.uv.astype(np.float32), new.pyramid,
+                guess.uv.astype(np.float32), guess.radius_px, guess.warp.astype(np.float32),
                 self._config,
-            )
+            )  # fmt: skip
             if best is None or found.ok.sum() > best[1].sum():
                 best = (found.uv_px.astype(np.float64), found.ok)
             if best[1].sum() > 0.5 * len(first.uv):

@@ -78,12 +78,9 @@ def _window_products(image: Any, row0: int, row1: int, sums: Any) -> None:
     for k in range(3):
         for r in range(rows):
             p0, p1, p2, p3, p4 = (
-                products[k, r],
-                products[k, r + 1],
-                products[k, r + 2],
-                products[k, r + 3],
+                products[k, r], products[k, r + 1], products[k, r + 2], products[k, r + 3],
                 products[k, r + 4],
-            )
+            )  # fmt: skip
             for x in range(W):
                 line[x] = p0[x] + p4[x] + np.float32(4) * (p1[x] + p3[x]) + np.float32(6) * p2[x]
             out = sums[k, r]
@@ -98,16 +95,9 @@ def _window_products(image: Any, row0: int, row1: int, sums: Any) -> None:
 
 @njit(cache=True, nogil=True, fastmath=True)
 def harris_cells(
-    begin: int,
-    end: int,
-    image: Any,
-    mask: Any,
-    columns: int,
-    rows: int,
-    margin: int,
-    k: float,
+    begin: int, end: int, image: Any, mask: Any, columns: int, rows: int, margin: int, k: float,
     found: Any,
-) -> None:
+) -> None:  # fmt: skip
     """Fill ``found`` (rows, columns, 3) with u, v and R of each cell's best local maximum.
 
     R is zero where the cell has none. ``mask`` is (H, W) uint8 or (0, 0) for none.
@@ -236,16 +226,9 @@ def harris_grid(gray: U8, config: MatchingConfig, mask: U8 | None = None) -> Cor
             allowed = np.asarray(cv2.erode(mask, np.ones((side, side), np.uint8)), np.uint8)
     cells = np.zeros((config.grid, config.grid, 3), np.float32)
     in_bands(
-        harris_cells,
-        config.grid,
-        np.ascontiguousarray(gray),
-        allowed,
-        config.grid,
-        config.grid,
-        margin,
-        config.harris_k,
-        cells,
-    )
+        harris_cells, config.grid, np.ascontiguousarray(gray), allowed, config.grid, config.grid,
+        margin, config.harris_k, cells,
+    )  # fmt: skip
     best = cells.reshape(-1, 3)
     best = best[best[:, 2] > config.min_response]
     return Corners(np.ascontiguousarray(best[:, :2]), np.ascontiguousarray(best[:, 2]))

@@ -101,11 +101,8 @@ def _scores(
     for y in range(n):
         for x in range(0, n, 4):
             t0, t1, t2, t3 = (
-                template[y, x],
-                template[y, x + 1],
-                template[y, x + 2],
-                template[y, x + 3],
-            )
+                template[y, x], template[y, x + 1], template[y, x + 2], template[y, x + 3],
+            )  # fmt: skip
             run = window[y * pitch + x :]
             for i in range(length):
                 flat[i] += t0 * run[i] + t1 * run[i + 1] + t2 * run[i + 2] + t3 * run[i + 3]

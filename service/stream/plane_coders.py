@@ -23,22 +23,9 @@ import numpy.typing as npt
 from recon.types import F64, I64, U8, U16, Bool
 
 CONTEXT = np.array(
-    [
-        [0, -1],
-        [0, -2],
-        [0, -3],
-        [-1, -2],
-        [-1, -1],
-        [-1, 0],
-        [-1, 1],
-        [-1, 2],
-        [-2, -1],
-        [-2, 0],
-        [-2, 1],
-        [-3, 0],
-    ],
-    np.int64,
-)
+    [[0, -1], [0, -2], [0, -3], [-1, -2], [-1, -1], [-1, 0], [-1, 1], [-1, 2], [-2, -1], [-2, 0],
+     [-2, 1], [-3, 0]], np.int64,
+)  # fmt: skip
 """(row, column) to the neighbours; the k-th is bit k of the context. Outside is unknown."""
 PROBABILITY_BITS = 12
 RATE = 4
