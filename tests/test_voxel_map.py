@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.mapping.cloud_fusion import CORRELATION, fuse, fuse_strips
+from recon.mapping.cloud_fusion import CORRELATION, cloud_of, fuse, fuse_strips
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, ground_sample_m
 from recon.types import F64, Bool, DepthMap, PointCloud
 
@@ -254,6 +254,24 @@ def test_unusable_points_are_left_out() -> None:
 def test_voxel_size_must_be_positive() -> None:
     with pytest.raises(ValueError, match="voxel_m"):
         fuse([], 0.0)
+
+
+def test_a_cloud_is_what_the_pinhole_formula_says_of_the_pixels_asked_for() -> None:
+    rng = np.random.default_rng(11)
+    flat = view(4.0, roof_m=6.0)
+    turned = se3.compose(se3.so3_exp(rng.normal(0, 1, 3)), np.array([30.0, -2000.0, 70.0]))
+    depth = DepthMap(flat.depth_m.copy(), flat.sigma_m.copy(), flat.views, K, turned)
+    depth.depth_m[:9], depth.depth_m[9:12], depth.sigma_m[12:15] = np.nan, -1.0, np.inf
+    bgr = rng.integers(0, 256, (90, 160, 3), np.uint8)
+    mask = rng.random((90, 160)) > 0.4
+    found = cloud_of(depth, bgr, mask)
+    known = mask.copy()
+    known[:15] = False
+    np.testing.assert_allclose(found.xyz_m, world_points(depth)[known], rtol=1e-6, atol=1e-5)
+    np.testing.assert_array_equal(found.rgb, bgr[known][:, ::-1])
+    np.testing.assert_array_equal(found.sigma_m, depth.sigma_m[known])
+    with pytest.raises(ValueError, match="colour"):
+        cloud_of(depth, bgr[1:])
 
 
 def test_fusing_in_strips_gives_the_same_points() -> None:

@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 from numba import njit
 
-from recon import se3
 from recon.camera_model import rays
 from recon.posegraph.ledger import Ledger, MemoryLedger, Rows
 from recon.surface.raster import Grid
@@ -300,15 +299,12 @@ class CoverageMap:
 
     def _points(self, depth: DepthMap) -> tuple[Array, F32, F32]:
         """(N, 2) cells, (N,) heights and (N,) sigmas of a keyframe's points."""
-        known = np.isfinite(depth.depth_m)
-        v, u = np.nonzero(known)
-        d = depth.depth_m[known].astype(np.float64)
-        xyz = se3.transform(
-            depth.T_world_camera, rays(depth.K, np.column_stack([u, v])) * d[:, None]
+        count = int(np.isfinite(depth.depth_m).sum())
+        arrays = (depth.depth_m, depth.sigma_m, depth.K, depth.T_world_camera)
+        points: tuple[I64, F32, F32] = _surface_points(
+            count, *map(np.ascontiguousarray, arrays), self.cell_m
         )
-        cells = np.floor(xyz[:, :2] / self.cell_m).astype(np.int64)
-        sigma = np.nan_to_num(depth.sigma_m[known], nan=1e3, posinf=1e3)
-        return cells, xyz[:, 2].astype(np.float32), np.maximum(sigma, 1e-4).astype(np.float32)
+        return points
 
     @staticmethod
     def _tiles_of(cells: Array) -> set[Tile]:
@@ -392,6 +388,29 @@ def _box(used: Bool) -> tuple[slice, slice]:
     if not len(rows):
         return slice(0, 1), slice(0, 1)
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
+
+
+@njit(cache=True, nogil=True)
+def _surface_points(
+    count: int, depth: F32, sigma: F32, K: F64, T: F64, cell_m: float
+) -> tuple[I64, F32, F32]:
+    """Cells, heights and sigmas of the pixels with depth; ``T`` is T_world_camera."""
+    cells = np.empty((count, 2), np.int64)
+    height, spread = np.empty(count, np.float32), np.empty(count, np.float32)
+    n = 0
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            z = float(depth[v, u])
+            if np.isfinite(z):
+                x, y = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z
+                for k in range(2):
+                    place = T[k, 0] * x + T[k, 1] * y + T[k, 2] * z + T[k, 3]
+                    cells[n, k] = int(np.floor(place / cell_m))
+                height[n] = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+                s = sigma[v, u]
+                spread[n] = max(s if np.isfinite(s) else np.float32(1e3), np.float32(1e-4))
+                n += 1
+    return cells, height, spread
 
 
 @njit(cache=True, nogil=True)

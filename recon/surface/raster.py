@@ -121,8 +121,8 @@ def grid_over(xy_m: F64, cell_m: float, margin_cells: int = 0) -> Grid:
     if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
         raise ValueError(f"expected points of shape (N, 2) with N > 0, got {xy.shape}")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        low = np.floor(xy.min(axis=0) / cell_m) - margin_cells
-        high = np.floor(xy.max(axis=0) / cell_m) + 1 + margin_cells
+        low = np.floor(np.array([c.min() for c in xy.T]) / cell_m) - margin_cells
+        high = np.floor(np.array([c.max() for c in xy.T]) / cell_m) + 1 + margin_cells
         cells = float(np.prod(high - low))
     if not cells <= min(LARGEST_CELLS, max(MIN_CELLS, CELLS_PER_POINT * len(xy))):
         raise ValueError(_too_large(high[1] - low[1], high[0] - low[0]))

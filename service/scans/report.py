@@ -183,12 +183,12 @@ def _per_cell(cloud: PointCloud, cell_m: float) -> tuple[F32, F32]:
     """Maximum views and minimum sigma of the points in each cell, NaN where there are none."""
     xy = cloud.xyz_m[:, :2].astype(np.float64)
     grid = grid_over(xy, cell_m)
-    at = grid.cells(xy)
-    views, sigma = np.full(grid.shape, -np.inf), np.full(grid.shape, np.inf)
-    np.maximum.at(views, at, cloud.views)
-    np.minimum.at(sigma, at, cloud.sigma_m)
-    first, second = (np.where(np.isfinite(a), a, np.nan) for a in (views, sigma))
-    return first.astype(np.float32), second.astype(np.float32)
+    at = np.ravel_multi_index(grid.cells(xy), grid.shape)
+    views, sigma = (np.full(grid.shape, far, np.float32) for far in (-np.inf, np.inf))
+    np.maximum.at(views.reshape(-1), at, cloud.views.astype(np.float32))
+    np.minimum.at(sigma.reshape(-1), at, cloud.sigma_m)
+    nan = np.float32(np.nan)
+    return np.where(np.isfinite(views), views, nan), np.where(np.isfinite(sigma), sigma, nan)
 
 
 def _curves(poses: Sequence[PoseRecord]) -> list[str]:
