@@ -8,10 +8,12 @@ import scipy.ndimage as ndi
 
 from recon.surface.change import (
     ChangeConfig,
+    SumErrors,
     change_between,
     left_over_m,
     mean_surface,
     outlines,
+    scatter_of_means,
     volumes,
 )
 from recon.surface.raster import Grid, Raster
@@ -74,6 +76,21 @@ def test_volumes_are_right_within_their_sigma() -> None:
         assert total.fill[0] == pytest.approx(true[0] * CELL_M**2, rel=0.05)
         assert total.fill[1] >= 0.01 * by_sign[0].area_m2
     assert float(np.sqrt(np.mean(np.square(ratios)))) < 1.5
+
+
+@pytest.mark.parametrize("reach", [0.0, 3.0, 8.0])
+def test_a_sum_over_cells_errs_by_what_they_share(reach: float) -> None:
+    rng = np.random.default_rng(4)
+    d = ndi.gaussian_filter(rng.normal(size=(600, 600)), reach)
+    d = (0.1 * d / d.std()).astype(np.float32)
+    window = ndi.uniform_filter(d, 3)
+    errors = SumErrors(np.full_like(d, window.std()), 3, scatter_of_means(d), 0.0)
+    cells = np.zeros(d.shape, np.bool_)
+    cells[100:118, 200:225] = True
+    sums = (18 * 25 * ndi.uniform_filter(d, (18, 25)))[20:-20, 20:-20]
+    assert errors.of_sum(cells) == pytest.approx(float(sums.std()), rel=0.15)
+    shared = SumErrors(errors.sigma, 3, errors.scatter, 0.5)
+    assert shared.of_sum(cells) == pytest.approx(0.5 * 18 * 25)
 
 
 def test_an_alignment_that_is_off_is_no_change() -> None:

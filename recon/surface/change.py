@@ -10,8 +10,9 @@ cells apart are no change: an object stands out of all heights that the other da
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -24,9 +25,6 @@ BEND_CELLS, BEND_ROUNDS = 8, 8
 
 NOISE_REACH = 1.5
 """Sigmas of a difference that noise alone raises the highest of the cells nearby above a cell."""
-
-MIN_VOLUME_SIGMAS = 3.0
-"""Of an object's volume."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +127,8 @@ def change_between(before: Raster, after: Raster, config: ChangeConfig | None = 
     for sign in (1.0, -1.0):
         _add_labels(labels, d, scales, sign, cell_m, config)
     left = left_over_m(d, cell_m, config.block_m)
-    bodies = _bodies(d, scales[0], labels, left, cell_m, config)
+    errors = SumErrors(scales[0].sigma, scales[0].window, scatter_of_means(d), left)
+    bodies = _bodies(d, errors, labels, cell_m, config)
     return Change(before.grid, scales[0].mean, scales[0].sigma, labels, bodies, left)
 
 
@@ -187,6 +186,44 @@ class _Scale:
     sigma: F32
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SumErrors:
+    """What the sum of a difference over an object's cells errs by.
+
+    Errors of neighbouring cells are correlated, so ``scatter`` of means over a square of the
+    object's size, by its side in cells, says how far they average out.
+    """
+
+    sigma: F32  # (rows, cols) of a mean over a window
+    window: int  # cells of its side
+    scatter: Callable[[int], float]
+    left_m: float  # sigma of the height that the cells of an object share
+
+    def of_sum(self, cells: Bool) -> float:
+        """Sigma of the sum over ``cells``, in cells times metres."""
+        count = float(np.count_nonzero(cells))
+        sigma = float(np.sqrt(np.mean(self.sigma[cells].astype(np.float64) ** 2)))
+        side = max(round(np.sqrt(count)), self.window)
+        shrunk = self.scatter(side) / max(self.scatter(self.window), 1e-9)
+        return count * max(sigma * shrunk, self.left_m)
+
+
+def scatter_of_means(d: F32) -> Callable[[int], float]:
+    """Robust spread of a difference's means over squares, by their side in cells."""
+    known = np.isfinite(d)
+
+    @cache
+    def spread(side: int) -> float:
+        return _robust(_mean(d, min(side, *d.shape))[known])
+
+    return spread
+
+
+def _robust(x: F32) -> float:
+    """Standard deviation about 0 by the median; 1 for nothing."""
+    return float(np.median(np.abs(x))) / 0.6745 if x.size else 1.0
+
+
 def _scale(
     heights: tuple[F32, F32], d: F32, own: F32, window: int, cell_m: float, config: ChangeConfig
 ) -> _Scale:
@@ -207,7 +244,7 @@ def _scatter(ratio: F32, step: int, lag: int) -> F32:
     in it touch few.
     """
     known = np.isfinite(ratio)
-    whole = float(np.median(np.abs(ratio[known]))) / 0.6745 if known.any() else 1.0
+    whole = _robust(ratio[known])
     out = np.full(ratio.shape, whole, np.float32)
     for r in range(0, ratio.shape[0], step):
         for c in range(0, ratio.shape[1], step):
@@ -264,11 +301,11 @@ def _add_labels(
 
 
 def _bodies(
-    d: F32, scale: _Scale, labels: I32, left_m: float, cell_m: float, config: ChangeConfig
+    d: F32, errors: SumErrors, labels: I32, cell_m: float, config: ChangeConfig
 ) -> tuple[Body, ...]:
     """The changes that are significant as a whole; the others leave ``labels``."""
     found = (
-        _body(d, scale, labels, label, left_m, cell_m, config)
+        _body(d, errors, labels, label, cell_m, config)
         for label in range(1, int(labels.max(initial=0)) + 1)
     )
     bodies = tuple(body for body in found if body is not None)
@@ -277,9 +314,8 @@ def _bodies(
 
 
 def _body(
-    d: F32, scale: _Scale, labels: I32, label: int, left_m: float, cell_m: float,
-    config: ChangeConfig,
-) -> Body | None:  # fmt: skip
+    d: F32, errors: SumErrors, labels: I32, label: int, cell_m: float, config: ChangeConfig
+) -> Body | None:
     """Area and volume of a change above the ground around it; None when that is no significant one.
 
     At the rim of what both flights saw, where few views reach, nothing is a change: the ground
@@ -289,7 +325,7 @@ def _body(
     rim = config.edge_cells
     rows, cols = np.nonzero(labels == label)
     window = tuple(slice(max(x.min() - 4 * rim, 0), x.max() + 4 * rim + 1) for x in (rows, cols))
-    d, labels, sigma = d[window], labels[window], scale.sigma[window]
+    d, labels, errors = d[window], labels[window], replace(errors, sigma=errors.sigma[window])
     inside = labels == label
     surround = _grown(inside, 2 * rim) & ~inside
     if np.isfinite(d[surround]).mean() < config.min_known:
@@ -299,9 +335,8 @@ def _body(
     ground = float(np.median(d[around])) if np.count_nonzero(around) > 8 * rim else 0.0
     heights = d[inside & np.isfinite(d)].astype(np.float64) - ground
     volume = float(np.sum(d[grown], dtype=np.float64) - ground * np.count_nonzero(grown))
-    independent = float(np.sqrt(np.sum(sigma[grown].astype(np.float64) ** 2))) * scale.window
-    noise = float(np.hypot(independent, left_m * np.count_nonzero(grown)))
-    if abs(volume) < MIN_VOLUME_SIGMAS * noise:
+    noise = errors.of_sum(grown)
+    if abs(volume) < config.level_sigmas * noise:
         return None
     border = inside & _grown(~inside, 1) & np.isfinite(d)
     outline = float(np.abs(d[border] - ground).sum())
