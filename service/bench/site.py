@@ -61,7 +61,7 @@ def flight_options(heading_deg: float, date: int) -> SimulationOptions:
     """A flight of three legs over the middle of the place."""
     plan = FlightPlan("legs", 40.0, heading_deg=heading_deg, spacing_m=25.0, centred=True)
     return SimulationOptions(
-        plan, seed=3, flight_seed=round(heading_deg), size_px=(640, 360), fps=5.0,
+        plan, seed=3, flight_seed=round(heading_deg), size_px=(1280, 720), fps=5.0,
         site_m=SITE_M, changes=CHANGES, date=date, depth_frames=2,
     )  # fmt: skip
 
