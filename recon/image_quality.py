@@ -28,8 +28,8 @@ def halved(image: U8, ratio: float) -> U8:
 def stretch(gray: U8, seen: Bool | None = None) -> U8:
     """The image (H, W) with its contrast raised to that of a well-lit scene.
 
-    One gain for the whole image, so that places are not moved; an image with contrast
-    enough comes back as it is. ``seen`` (H, W) says which pixels count.
+    One gain for the whole image, so that places are not moved; an image with contrast enough comes
+    back as it is. Only pixels in ``seen`` (H, W) count.
     """
     sample = gray[::4, ::4] if seen is None else gray[::4, ::4][seen[::4, ::4]]
     if sample.size == 0:

@@ -18,7 +18,7 @@ from recon.camera_model import rays
 from recon.types import F64, Camera, PosePrior
 
 NEAR_S = 0.25
-"""Frames further apart say nothing of the turn within a readout."""
+"""Frames further apart do not show the rotation within a readout."""
 
 STEADY_S = 0.15
 """All frames within it shape the motion; of those further away the two nearest on each side."""

@@ -1,7 +1,5 @@
-"""How far long work is, and whether it goes on: one object for the portal and the terminal.
-
-The work reports to it and is stopped by it: after :meth:`Progress.cancel` the next report raises
-:class:`CancelledError`.
+"""Progress and cancellation of long work, for the portal and the terminal. The work reports to it
+and is stopped by it: after :meth:`Progress.cancel` the next report raises :class:`CancelledError`.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ MIN_SHARE, MIN_S = 0.02, 2.0
 
 
 class CancelledError(Exception):
-    """The work was cancelled: no failure, so nothing that handles failures catches it."""
+    """The work was cancelled. It is no failure, so handlers of failures do not catch it."""
 
 
 class Progress:

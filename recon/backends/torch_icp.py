@@ -123,7 +123,7 @@ def descend(
 
 
 def _concluded(rows: F64, start: F64, config: IcpConfig) -> Registration:
-    """The registration from the numbers that came down."""
+    """The registration from the numbers read from the device."""
     ends = np.cumsum([36, 36, 6, 4, 1, 3, 1, 1, 1, 1, 16])
     H, common, g, sums, scale, centre, lever, partners, available, done, T, lags = np.split(
         rows, ends

@@ -292,7 +292,7 @@ UNKNOWN = -2048 * SPECKLE_STEP
 def drop_unreliable(
     left: Tensor, px: Tensor, confidence: Tensor, true: Tensor, config: BeliefPropagationConfig
 ) -> tuple[Tensor, Tensor]:
-    """Labels (h, w), NaN where nothing speaks for them, and their confidence.
+    """Labels (h, w), NaN where they are unreliable, and their confidence.
 
     Raises ValueError for ``fill_occluded``, which belongs to still pairs.
     """
@@ -376,7 +376,7 @@ def _of_neighbours(own: Tensor, across: Tensor, down: Tensor, none: int, best: o
 def drop_unseen(
     px: Tensor, confidence: Tensor, left_seen: Tensor, right_seen: Tensor, true: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The labels without those that rest on nothing in either image; masks are 0 or 1."""
+    """The labels without those on masked pixels of either image; masks are 0 or 1."""
     w = px.shape[1]
     known = px == px
     column = torch.arange(w, device=px.device)[None, :]

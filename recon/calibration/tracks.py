@@ -1,4 +1,4 @@
-"""Long tracks: places of the ground that many images show, and where they lie.
+"""Long tracks: points of the ground that many images show, and their positions.
 
 SIFT features of full-size images are matched pair by pair, checked against the essential matrix,
 and joined. They need no prediction, so that poses that are far off do not matter.

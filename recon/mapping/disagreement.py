@@ -53,7 +53,7 @@ class Disagreement:
         self._earlier: deque[_Samples] = deque(maxlen=IMAGES)
 
     def forget(self) -> None:
-        """Compare with nothing before: the world is another one now."""
+        """Forget earlier images: the world frame has changed."""
         self._earlier.clear()
 
     def take(self, depth: DepthMap) -> float:

@@ -1,9 +1,9 @@
 """Space that views see through: points that stereo invented, and places open to the sky.
 
-A keyframe that sees surface well behind a point, all around the pixel where the point would
-be, says that the point's place is empty. One that sees surface at the point confirms it
-(Merrell et al. 2007, doi:10.1109/ICCV.2007.4408984). A long scan has millions of points and a
-thousand keyframes, of which each sees a few tiles of the ground.
+A keyframe that sees surface well behind a point, all around the pixel where the point would be,
+shows that the point's place is empty. One that sees surface at the point confirms it (Merrell et
+al. 2007, doi:10.1109/ICCV.2007.4408984). A long scan has millions of points and a thousand
+keyframes, of which each sees a few tiles of the ground.
 """
 
 from __future__ import annotations

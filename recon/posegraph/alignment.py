@@ -118,7 +118,7 @@ class Scale:
 
 
 def height_above(points: F64, up: F64) -> tuple[float, float] | None:
-    """Height above the ground nearest below, and how far off the vertical that is seen.
+    """Height above the ground nearest below, and the deviation of that ground from the vertical.
 
     Args:
         points: (N, 3) ground in the camera's frame.

@@ -18,7 +18,7 @@ import numpy as np
 from recon.types import PosePrior
 
 LEAST = 3
-"""Intervals between keyframes with fixes, under which nothing is said."""
+"""Minimum number of intervals between keyframes with fixes."""
 
 STEADY_SHARE = 0.1
 """Share of the claimed sigma that always stays: one flight cannot show all errors of a receiver."""

@@ -25,7 +25,7 @@ BOUND_RAD = np.radians(5.0)
 """A larger angle is no boresight but another fault."""
 
 LEAST = 8
-"""Attitudes of a stretch under which it says nothing."""
+"""Minimum number of attitudes of a stretch."""
 
 HUBER = 2.5
 """Whitened residuals beyond this lose weight."""

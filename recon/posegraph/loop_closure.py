@@ -250,7 +250,7 @@ def _with_icp(
     a: LoopView, b: LoopView, T_a_b: F64, covariance: F64, solved: pnp.PnpResult,
     config: LoopConfig,
 ) -> LoopClosure | None:  # fmt: skip
-    """The loop after the depth maps had their say; None when they contradict."""
+    """The loop refined by ICP of the depth maps; None when they contradict it."""
     growth = _growth(a, b, T_a_b)
     if growth is None:
         return None

@@ -22,7 +22,7 @@ FASTEST_M_S = 100.0
 
 
 class Motions:
-    """Adds the motions of one graph to its smoother, and knows which scale each keyframe has."""
+    """Adds the motions of one graph to its smoother, and keeps the scale of each keyframe."""
 
     def __init__(
         self,

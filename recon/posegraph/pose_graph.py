@@ -67,7 +67,7 @@ class PoseGraph:
         prior: PosePrior,
         height: tuple[float, float] | None = None,
     ) -> Pose:
-        """The new keyframe's pose after all that is known.
+        """Add a keyframe; returns its pose by all evidence.
 
         Of more than ``max_nodes`` some older ones stop being nodes: their motions are those of
         the neighbouring nodes (:mod:`recon.posegraph.thinning`), and the graph is rebuilt.

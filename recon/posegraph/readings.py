@@ -61,8 +61,8 @@ class Readings:
     ) -> set[str]:
         """The sensors that took part; the keyframe is predicted at ``T`` +- ``spread``.
 
-        ``drift_m`` is how far the segment's track may have left its frame. None while there is
-        no such frame, without which only the attitude says something.
+        ``drift_m`` is how far the segment's track may have left its frame. None while there is no
+        such frame; then only the attitude is used.
         """
         is_placed = drift_m is not None
         used = {"attitude"} if self._attitude(node, T, spread, is_placed) else set()
@@ -136,7 +136,7 @@ class Readings:
         return True
 
     def _altitude(self, node: Node, T: F64) -> bool:
-        """The altitude less its offset; after a step it goes on from where the track is."""
+        """The altitude minus its offset; after a step it continues from the track."""
         prior = node.prior
         if prior.altitude_m is None:
             return False

@@ -27,7 +27,7 @@ class PoseGraphConfig:
     precise_fix_s: float = PRECISE_TAU_S  # and that of an RTK fix, under 0.3 m, with this one
     attitude_s: float = 40.0  # an attitude's
     altitude_s: float = 120.0  # a barometer's
-    altitude_slack_m: float = 3.0  # beyond its gate, until a barometer is said to have stepped
+    altitude_slack_m: float = 3.0  # beyond its gate, until the barometer counts as stepped
     blocks_per_height: float = 2.0  # heights over ground of so many blocks count as one
     gate_sigmas: float = 5.0  # readings further from the prediction are left out
     huber_sigmas: float = 1.5

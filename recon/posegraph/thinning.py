@@ -113,8 +113,8 @@ def thinned(nodes: Sequence[Node], gone: set[int]) -> tuple[list[Node], dict[int
 
 
 def over_gaps(nodes: Sequence[Node], poses: Mapping[int, F64]) -> list[Node]:
-    """The nodes, those that begin a segment with the motion since the node before as the
-    ``poses`` (4, 4) have it: from now on it rests on nothing that may be thinned out."""
+    """The nodes, those that begin a segment with the motion since the node before as the ``poses``
+    (4, 4) have it: from now on it does not depend on nodes that may be thinned out."""
     out = list(nodes[:1])
     for last, node in pairwise(nodes):
         if node.segment != last.segment and node.seq in poses:

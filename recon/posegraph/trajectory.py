@@ -1,8 +1,7 @@
 """The keyframes' poses: chained from vision and ICP, placed in the world by the pose graph.
 
-A scan may break into segments (the camera lost its way and found it again elsewhere). Each
-segment has a chain of its own; the graph (:mod:`recon.posegraph.pose_graph`) holds them all in one
-frame.
+A scan may break into segments (tracking was lost and started again elsewhere). Each segment has a
+chain of its own; the graph (:mod:`recon.posegraph.pose_graph`) holds them all in one frame.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from recon.posegraph.pose_graph import PoseGraph
 from recon.types import F64, PosePrior
 
 AT_ONCE = 200
-"""Interpolated keyframes looked at with one correction in flight, about; the rest comes with the
+"""Interpolated keyframes examined with one correction in flight, about; the rest follows with the
 next."""
 
 
@@ -175,7 +174,8 @@ class Trajectory:
         return row < len(self._seqs) and self._seqs[row] == seq
 
     def similarity(self, segment: int) -> Similarity | None:
-        """The segment's way to the world; None while it stands where telemetry first put it."""
+        """The segment's similarity to the world; None while it is placed by its first telemetry
+        only."""
         return self.graph.similarity(segment)
 
     def map_pose(self, seq: int) -> F64:

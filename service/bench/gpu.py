@@ -1,11 +1,10 @@
 """Every stage on a device, and the whole dense path, compared with the floor of that device.
 
-The floor is the larger of the bytes that a stage cannot but move over the bandwidth of a copy,
-and its operations over the rate of a matrix product, both measured in the same run. Figures
-"on the device" have their inputs there and leave their results there; figures "with uploads"
-start from images of the host and end with results on it. On a machine without a GPU all of
-it runs on the processor: the figures then show why ``auto`` leaves torch and ONNX Runtime
-alone there, and nothing about a GPU.
+The floor is the larger of the bytes that a stage must move over the bandwidth of a copy, and its
+operations over the rate of a matrix product, both measured in the same run. Figures "on the device"
+have their inputs there and leave their results there; figures "with uploads" start from images of
+the host and end with results on it. On a machine without a GPU all of it runs on the processor: the
+figures then show why ``auto`` leaves torch and ONNX Runtime alone there, and nothing about a GPU.
 """
 
 from __future__ import annotations
@@ -187,7 +186,7 @@ def finished(device: str, work: Callable[[], object]) -> Callable[[], None]:
 
 
 def measure_floor(device: str, options: BenchOptions) -> tuple[Floor, list[BenchResult]]:
-    """Rates of a large copy and of a float32 matrix product, and the lines that say so."""
+    """Rates of a large copy and of a float32 matrix product, and their results."""
     import torch
 
     source = torch.ones(COPY_MB[device] << 18, device=device)

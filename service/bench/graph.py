@@ -92,7 +92,7 @@ class _Flown:
 
 
 class _Tracking:
-    """Places a frame by the newest keyframe every millisecond, in a thread of its own."""
+    """Places a frame by the newest keyframe every millisecond, on a separate thread."""
 
     def __init__(self, flown: _Flown) -> None:
         self.stops: list[float] = []  # ms more than the pause, until the frame was placed

@@ -204,7 +204,7 @@ def _fly(trial: Trial, folder: Path) -> Outcome:
 
 
 def fly_plain(trial: Trial) -> Outcome:
-    """The same production put on Zenoh as it comes: no store, no budget, default settings."""
+    """The same data put on Zenoh at once: no store, no budget, default settings."""
     import zenoh
 
     from service.stream.session import zenoh_config

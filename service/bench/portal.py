@@ -82,7 +82,7 @@ class Page:
         return self._number
 
     def _note(self, event: dict[str, Any]) -> None:
-        """Called with what the page says unasked."""
+        """Called with each event of the page."""
 
     def run(self, script: str) -> Any:
         """The value of ``script``, awaited; RuntimeError when it throws."""

@@ -1,8 +1,8 @@
 """The coarse map over a telemetry radio: part of ``skyrelief bench link``.
 
 A flight of 100 m in 20 s. The drone's MAVLink link and the ground station's are two
-pseudo-terminals; between them a radio of 57,600 baud that loses packets and says in
-RADIO_STATUS how full its buffer is. There is no IP link.
+pseudo-terminals; between them a radio of 57,600 baud that loses packets and reports the state of
+its buffer in RADIO_STATUS. There is no IP link.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class _Radio:
 
 @dataclass(slots=True, eq=False)
 class _Flight:
-    """When keyframes were made, and when the first and the last of their tiles came."""
+    """When keyframes were made, and when the first and the last of their tiles arrived."""
 
     made: dict[int, float] = field(default_factory=dict)
     first: dict[int, float] = field(default_factory=dict)

@@ -128,7 +128,7 @@ def _placed(flight: Flight) -> Iterator[tuple[str, float, str]]:
 
 
 def seams(flight: Flight) -> Iterator[tuple[str, float, str]]:
-    """How far two visits of the same ground lie apart, in metres and in the sigmas they claim."""
+    """Distance between two visits of the same ground, in metres and in their claimed sigmas."""
     maps = _maps(flight)
     rng = np.random.default_rng(1)
     pairs = [(a, b) for a in range(len(maps)) for b in range(a + REVISIT, len(maps))]
@@ -230,7 +230,7 @@ def _off_fixes(
 
 
 def level_ground(flight: Flight) -> Iterator[tuple[str, float, str]]:
-    """How far points of ground that is nearly flat lie from one plane, robustly."""
+    """Robust distance of points on nearly flat ground from one plane."""
     points = []
     for depth in _maps(flight):
         known = np.flatnonzero(np.isfinite(depth.depth_m))[::97]

@@ -118,7 +118,7 @@ def _replayed(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seam:
-    """How two scans of a site lie to each other and to the truth."""
+    """Offsets of two scans of a site from each other and from the truth."""
 
     before_m: float  # median distance between the two where both see the ground
     after_m: float
@@ -208,7 +208,7 @@ def change_results(
     """Boxes found, false objects and volumes, of a comparison of date 1 with date 2.
 
     A box counts where both flights have surface all around it, by ``map_``, the change.tif. It is
-    sought where the site has it, which lies ``off_m`` (3,) from the truth by the fixes.
+    expected at its place in the site, which the fixes shift by ``off_m`` (3,) from the truth.
     """
     boxes = json.loads((flight / "truth" / "changes.json").read_text())
     middles = ORIGIN.to_utm(
@@ -242,7 +242,7 @@ def change_results(
 
 
 def _is_compared(map_: Path, middle: F64) -> bool:
-    """True where the map knows the difference all around a place."""
+    """True where the map has a difference all around a place."""
     import rasterio
 
     with rasterio.open(map_) as image:

@@ -81,7 +81,7 @@ def shutter_document(shutter: Shutter) -> dict[str, Any]:
 
 
 def with_shutter(camera: Camera, config: CameraConfig) -> Camera:
-    """The camera with the shutter that the configuration asks for, by default its own."""
+    """The camera with the configured shutter, by default its own."""
     if isinstance(config.readout_ms, str):
         return camera
     return replace(camera, shutter=shutter_of(config.readout_ms, config.readout_direction))

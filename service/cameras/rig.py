@@ -26,7 +26,7 @@ MOUNT_TILT_SIGMA_RAD = math.radians(6.0)
 """Sigma of the camera's tilt from its nominal mount without a known attitude."""
 
 AT_REST_M_S, ON_GROUND_M = 0.3, 2.0
-"""Below these a vehicle stands on the ground."""
+"""Below these a vehicle is on the ground."""
 
 MIN_SIGMA_M, MAX_ALTITUDE_M = 0.005, 1e5
 """Limits of plausible accuracies and heights in tags."""

@@ -147,8 +147,8 @@ def inspect(
 ) -> None:
     """Raw and rectified frames, anaglyph, disparity, depth and sigma of a keyframe.
 
-    The stages before the depth are there when the scan was made with
-    --set scan.keep_debug=true; otherwise what the store holds is shown.
+    The stages before the depth need a scan made with --set scan.keep_debug=true; otherwise the
+    stored keyframe is shown.
     """
     import cv2
     import numpy as np

@@ -142,7 +142,7 @@ def _skyrelief(*arguments: str) -> list[str]:
 
 
 def _start_ground(out: Path, endpoint: str, portal: str) -> subprocess.Popen[str]:
-    """A receiver that ends by itself when it holds a whole scan, with its report as JSON."""
+    """A receiver that ends when it holds a whole scan, with its report as JSON."""
     command = _skyrelief(
         "ground", "--store", str(out / "ground"), "--listen", endpoint, "--once", "--json"
     )
@@ -188,7 +188,7 @@ def _replay(flight: Path, out: Path, endpoint: str, overrides: list[str]) -> Non
 
 
 def _wait_for_ground(ground: subprocess.Popen[str], out: Path) -> Path:
-    """The scan folder at the ground, once the receiver says that it is complete."""
+    """The scan folder at the ground, once the receiver reports that it is complete."""
     try:
         report, _ = ground.communicate(timeout=DRAIN_S)
         (scan,) = json.loads(report.splitlines()[-1])["scans"]

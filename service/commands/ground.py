@@ -102,7 +102,7 @@ def ground(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
 ) -> None:
-    """Receive scans from drones; end with Ctrl-C. Scans lie in STORE/DRONE/SCAN."""
+    """Receive scans from drones; end with Ctrl-C. Scans are stored in STORE/DRONE/SCAN."""
     from service.ground.receiver import ReceiverConfig
 
     name, session = _session(connect or [], listen or [], keys, plain)
@@ -130,7 +130,7 @@ class PortalOptions:
 
 @dataclass(frozen=True, slots=True)
 class Until:
-    """When the station ends by itself."""
+    """The condition under which the station ends."""
 
     once: bool  # a scan is complete
     idle_s: float | None  # nothing new came for so long

@@ -169,7 +169,7 @@ def _replay(
 
 
 def _fitted(camera: Camera, source: CameraSource, notes: list[str]) -> Camera:
-    """The camera model for the source's images; a note says when it is of another size."""
+    """The camera model for the source's images; with a note if it is of another size."""
     from service.cameras.camera_file import check_size
     from service.cameras.lens import fitted
 
@@ -184,7 +184,7 @@ def _fitted(camera: Camera, source: CameraSource, notes: list[str]) -> Camera:
 
 
 def _tagged_camera(source: CameraSource, notes: list[str]) -> Camera | None:
-    """A pinhole by the images' own tags, with a note that says so; None where they have none."""
+    """A pinhole by the images' tags, with a note; None without tags."""
     from service.cameras.images import ImagesSource
 
     if not isinstance(source, ImagesSource) or source.lens is None or source.camera is None:
@@ -212,7 +212,7 @@ def _own_lens(source: CameraSource, config: Config) -> Camera | None:
 
 
 def _assumed_camera(source: CameraSource, notes: list[str]) -> Camera:
-    """A pinhole of 70 degrees, with a note that says so."""
+    """A pinhole of 70 degrees, with a note."""
     import numpy as np
 
     from recon.types import Camera

@@ -46,9 +46,8 @@ def run(
 
 
 def _configuration(path: Path | None, overrides: list[str]) -> tuple[Config, InputError | None]:
-    """The configuration, and why it cannot be used: then only its links are right, if they are.
-
-    Raises that fault where no init system would start us again: somebody reads it on a screen.
+    """The configuration, and why it cannot be used: then at most its links are valid. Raises that
+    fault where no init system would restart the service: a person reads it in a terminal.
     """
     from service.config import Config, load_config
     from service.errors import InputError
@@ -89,7 +88,7 @@ def _first_beats(config: Config) -> FirstBeats | None:
 
 
 def _simulated(config: Config) -> SimulatedFlight | None:
-    """The flight that ``camera.source = "sim:"`` asks for."""
+    """The flight of ``camera.source = "sim:"``."""
     if not config.camera.source.startswith("sim:"):
         return None
     from service.daemon.simulated import SimulatedFlight

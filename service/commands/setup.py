@@ -48,7 +48,7 @@ def config(
 
 
 def to_toml(values: Mapping[str, Mapping[str, Any]], documented: bool = False) -> str:
-    """A configuration's sections as TOML; a key that is not set stands as a comment."""
+    """A configuration's sections as TOML; a key that is not set is a comment."""
     lines: list[str] = []
     last = ""
     for section, field in configuration_keys():

@@ -1,7 +1,7 @@
 """Poses of frames relative to the odometry's keyframes, in little memory over a whole scan.
 
-A keyframe of the odometry is refined while it is in the window that is adjusted together, and
-holds images and corners meanwhile. Afterwards its pose is all that is wanted of it.
+A keyframe of the odometry is refined while it is in the window that is adjusted together, and holds
+images and corners meanwhile. Afterwards only its pose is needed.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Key(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SettledKey:
-    """A keyframe whose pose no longer changes, and nothing else of it."""
+    """The pose of a keyframe that no longer changes."""
 
     seq: int
     segment: int
@@ -64,7 +64,7 @@ class Anchorage:
         return np.asarray(self.key.T_odom_camera @ self.T_key_camera)
 
     def settled(self) -> Anchorage:
-        """The same with nothing of the keyframe but its pose of now, moved to the frame."""
+        """The same with only the keyframe's current pose, moved to the frame."""
         key = SettledKey(self.key.seq, self.key.segment, self.T_odom_camera)
         return Anchorage(self.seq, key, UNMOVED)
 

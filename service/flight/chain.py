@@ -64,7 +64,7 @@ class Chain:
         rejected: Counter[str],
         stopwatch: Stopwatch,
     ) -> None:
-        """``is_settled`` says which keyframes the odometry adjusts no longer."""
+        """``is_settled`` marks keyframes that the odometry no longer adjusts."""
         self.trajectory, self.watch = trajectory, GraphWatch(trajectory.graph)
         self.loops: LoopSearch | None = None
         self._carriers, self._is_settled = carriers, is_settled
@@ -189,7 +189,7 @@ class Chain:
         """A lost frame where telemetry alone says the camera is; None without attitude, heading
         or position.
 
-        Telemetry is off by as much as it was when vision was lost, so that the track goes on.
+        Telemetry's error when vision was lost is subtracted, so that the track continues.
         """
         prior = image.prior
         R, position, sigma = prior.R_world_camera, prior.position_m, prior.sigma_position_m

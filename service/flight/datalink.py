@@ -104,7 +104,7 @@ class DaemonLink:
     def offer_backlog(self, config: Config, is_idle: Callable[[], bool] = lambda: True) -> None:
         """Send earlier scans that the ground lacks until :meth:`take_off` or :meth:`rest`.
 
-        Nothing happens unless ``is_idle`` says so.
+        Only while ``is_idle`` is true.
         """
         with self._lock:
             if self._is_wanted or not is_idle():
@@ -115,7 +115,7 @@ class DaemonLink:
         PROCESS.start("backlog", lambda _: self._open_backlog(config, serial))
 
     def _open_backlog(self, config: Config, serial: int) -> None:
-        """Open it, which may read much of the disk, unless it is no longer wanted by then."""
+        """Open it, which may read much of the disk, unless it has been cancelled meanwhile."""
         try:
             sender = open_backlog(config)
         except SkyreliefError as error:
@@ -128,7 +128,7 @@ class DaemonLink:
             sender.close()
 
     def rest(self) -> None:
-        """End the backlog; what still has to be closed is closed on a thread of its own."""
+        """End the backlog; a separate thread closes the rest."""
         with self._lock:
             self._is_wanted = False
             sender, self._backlog = self._backlog, None

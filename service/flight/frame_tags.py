@@ -24,7 +24,7 @@ HEIGHTS = ("rangefinder", "terrain", "relative")
 
 
 class FrameTags:
-    """A CSV with one line per frame that telemetry knows something of; never raises."""
+    """A CSV with one line per frame that has telemetry; never raises."""
 
     def __init__(self, path: Path) -> None:
         self._file: TextIO | None = None

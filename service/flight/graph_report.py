@@ -13,13 +13,13 @@ from recon.types import F64
 from service.stream.records import pack_covariance, pack_motion
 
 LEAST = 5
-"""Readings of one kind left out before it is said."""
+"""Number of left-out readings of one kind that is reported."""
 
 SIGMAS, MIN_SHARE = 3.0, 0.03
 """Two scales disagree when they are further apart than both of these."""
 
 LOOK_GROWTH = 1.2
-"""The track is looked at again when its keyframes have grown by so much."""
+"""The track is examined again when its keyframes have grown by this share."""
 
 MIN_FIXES = 10
 """Fixes before the track is held against them."""

@@ -1,4 +1,4 @@
-"""Places seen before, looked for after each keyframe, on the thread that reconstructs."""
+"""The search for loops after each keyframe, on the thread that reconstructs."""
 
 from __future__ import annotations
 
@@ -169,7 +169,8 @@ class LoopSearch:
         return list(dict.fromkeys(self._by_look(new, seqs) + found))[:TRIES]
 
     def _by_look(self, new: _Kept, seqs: list[int]) -> list[int]:
-        """Earlier keyframes that look like this one, the most alike first; some of them a time.
+        """Earlier keyframes that look like this one, the most similar first; some of them at a
+        time.
 
         Where fixes or a loop locate the segment, its place is the better criterion.
         """

@@ -150,7 +150,7 @@ class Pipeline:
 
     @property
     def dropped(self) -> int:
-        """Views that were not reconstructed because newer ones came faster."""
+        """Views that were not reconstructed because newer ones arrived faster."""
         return self._background.dropped
 
     @property

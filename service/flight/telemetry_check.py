@@ -61,7 +61,7 @@ class TelemetryCheck:
         self._camera = camera
 
     def _wanted_ms(self) -> float:
-        """The latency to apply: as found if that is asked for, else as configured."""
+        """The latency to apply: the measured one if configured so, else the configured one."""
         if self._camera.latency == "auto":
             if self.latency is not None and self.latency.is_settled:
                 return self.latency.latency_ms
@@ -80,7 +80,7 @@ class TelemetryCheck:
     # ---- what the images say -------------------------------------------------------------
 
     def add(self, stamp_ns: int, tracked: Tracked) -> None:
-        """Take in a frame's pose by vision, at its stamp, and look at all of them now and then."""
+        """Add a frame's pose by vision, at its stamp; evaluate all of them now and then."""
         if self._history is None or tracked.state is Tracking.SKIPPED:
             return
         T = tracked.T_odom_camera

@@ -24,9 +24,9 @@ BEST_TRACKS = 200
 class OdometryReport:
     """Turns steps of the pipeline into odometry and hands it on.
 
-    Position and attitude are those of the body; the way from body to camera is neglected. With
-    a gimbal, telemetry says how the head stands on the body. The reset counter grows when
-    tracking starts again and when a correction moves the estimate.
+    Position and attitude are those of the body; the offset from body to camera is neglected. With a
+    gimbal, telemetry gives the head's attitude on the body. The reset counter grows when tracking
+    starts again and when a correction moves the estimate.
     """
 
     def __init__(self, camera: CameraConfig, send: Callable[[Odometry, int], object]) -> None:

@@ -27,7 +27,7 @@ from service.flight.anchorage import Anchorage
 
 KEPT = 6
 MIN_FRAMES_PER_STEP = 6.0
-"""A keyframe comes up to one part in so many late."""
+"""A keyframe may be late by one part in so many."""
 
 NEAREST_PARTNER, FARTHEST_PARTNER = 0.6, 2.2
 PARTNER_SPAN = FARTHEST_PARTNER - NEAREST_PARTNER
@@ -39,7 +39,7 @@ LAST_VIEW_SHARE = 0.1
 
 
 class Colour:
-    """A frame's image in colour, without distortion once that is asked for."""
+    """A frame's image in colour; undistorted on first use."""
 
     def __init__(self, image: U8, undistorter: Undistorter) -> None:
         """``image`` (H, W, 3) is distorted."""
@@ -168,10 +168,9 @@ class Viewpoints:
         return False
 
     def end_stretch(self, frame: Viewpoint | None) -> bool:
-        """True when the last frame of a stretch is to be a view: it shows more than the last one.
-
-        ``frame`` is that frame unless it is a view already. The ground that came into view
-        last is not in the view before; a frame between the two becomes its partner.
+        """True when the last frame of a stretch must be a view: it shows more than the last one.
+        ``frame`` is that frame unless it is a view already. The newest ground is not in the view
+        before; a frame between the two becomes its partner.
         """
         step = self._step(self._kept[-1].segment) if self._kept else None
         if step is None:

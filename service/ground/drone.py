@@ -1,7 +1,7 @@
 """The receiver's worker for one drone: its scans, its queue, its share of the disk.
 
-Each drone has a worker, so that none waits for the work of another. A scan is open only
-while it is in use, and has a folder only once its header came and is valid.
+Each drone has a worker, so that none waits for the work of another. A scan is open only while it is
+in use, and has a folder only once its valid header has arrived.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ REPORT_IDLE_S = 3.0
 DRONE_TIMEOUT_S, BUSY_S = 30.0, 10.0
 """A scan of which something was heard so lately, and that lacks something, stays open."""
 CLOSE_AFTER_S, CLOSE_WHOLE_AFTER_S = 600.0, 60.0
-"""A scan of which nothing was heard for so long is written and closed; a whole one sooner."""
+"""A scan without data for so long is written and closed; a whole one sooner."""
 MAX_UNFINISHED_BYTES = 1 << 25
 """Memory of the unfinished records of one drone's scans; beyond it the largest make way."""
 FULL_DISK_REST_S = 10.0

@@ -104,7 +104,7 @@ class Drones:
     def retire(self, now: float) -> None:
         """End the workers of drones that are silent and have nothing open, or that failed.
 
-        While drones are refused, the silent one that brought least makes way, with its scans.
+        While drones are refused, the silent one with least data is removed, with its scans.
         """
         with self._lock:
             gone = {

@@ -211,9 +211,9 @@ def _short(value: Any) -> Any:
 
 MAX_BODY_BYTES = 65_536
 BODY_S = 10.0
-"""A request's whole body comes within this time."""
+"""A request's whole body must arrive within this time."""
 STALL_S = 120.0
-"""A reader that has taken nothing for so long is gone."""
+"""A reader that has received nothing for so long is dropped."""
 CLOSE = {"connection": "close"}
 
 

@@ -143,7 +143,7 @@ def portal_app(
 
 
 def _description(routes: list[Any]) -> dict[str, Any]:
-    """The routes as an OpenAPI document: what a docstring says, and the bodies that are sent."""
+    """The routes as an OpenAPI document, from docstrings and bodies."""
     _, schemas = msgspec.json.schema_components(
         BODIES.values(), ref_template="#/components/schemas/{name}"
     )
@@ -182,9 +182,8 @@ def _operation(endpoint: Callable[..., Any], method: str) -> dict[str, Any]:
 
 
 def _said(request: HTTPConnection, error: Exception) -> Response:
-    """An error of ours as JSON: 404 for what is not there, 400 otherwise, 503 for the world.
-
-    409 where someone else was faster.
+    """One of our errors as JSON: 404 for a missing resource, 409 for a conflict with a newer
+    change, 503 for an outside failure, else 400.
     """
     if isinstance(error, OutsideError):
         return JSONResponse({"error": str(error)}, 503)

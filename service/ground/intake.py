@@ -52,7 +52,7 @@ class Introduction:
         return wanted
 
     def on_items(self, message: bytes, now: float) -> ScanHeader | None:
-        """The scan's header once it is whole, valid and says the drone and scan of its key."""
+        """The scan's header once it is whole, valid and names the drone and scan of its key."""
         wanted = RangeSet() if self.head is None else self.head.numbers.get("header", RangeSet())
         for part in parse(message):
             if part.kind != "header":
@@ -79,14 +79,14 @@ SMALL, FINE = range(2)
 """The two requests that may be under way: small records and coarse layers; fine layers."""
 
 GRACE_S = 1.0
-"""An item the drone has had for less than this may still come by itself."""
+"""An item that the drone has had for less than this may still arrive unrequested."""
 STALL_S = 4.0
 SILENCE_S = 4.0
-"""A drone silent for so long was away, or the link was; it knows no requests."""
+"""A drone silent for so long was away, or its link was down; it has forgotten all requests."""
 TIMED, MAX_TIMED = 64, 4096
 """Number of new layers of one kind in a head that are timed, the newest, and of all."""
 REST_S = 2.0
-"""Pause after a request that brought nothing."""
+"""Pause after a request without an answer."""
 
 BATCH = {"header": 1, "summary": 1, "repose": 64, "pose": 64, "k0": 8}
 """Items of a kind that one request names, in the order of asking."""
@@ -195,14 +195,14 @@ class ScanIntake:
         return head is not None and (f"k{head.layer}", head.seq) == (kind, number)
 
     def _give_up(self, kind: str, number: int) -> None:
-        """Ask for an item no more. Too many are forgotten, and asked for again."""
+        """Stop requesting an item. Beyond a maximum they are forgotten, and requested again."""
         given_up = self._given_up.setdefault(kind, RangeSet())
         if given_up.range_count >= MAX_RANGES:
             given_up = self._given_up[kind] = RangeSet()
         given_up.add(number)
 
     def _note_lag(self, kind: str, number: int, now: float) -> None:
-        """Note how long after the drone named it an item came, if that was timed."""
+        """Note the time between an item's announcement and its arrival, if it was timed."""
         seen = self._seen.pop((kind, number), None)
         is_named = self.head is not None and number in self.head.numbers.get(kind, RangeSet())
         if seen is None and is_named:

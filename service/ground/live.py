@@ -132,8 +132,8 @@ class StoreIndex:
 class LiveFeed:
     """Gives what is new in a store since the last call.
 
-    One feed serves one browser. Keyframes come with the finest layer there is; when a finer
-    one arrives later, it comes again and replaces the coarse one.
+    One feed serves one browser. Keyframes are sent in their finest layer; a finer one that arrives
+    later is sent again and replaces it.
     """
 
     store: ScanStore

@@ -65,7 +65,8 @@ def map_routes() -> list[Route]:
 
 
 async def _tile(request: Request) -> Response:
-    """A map tile of a scan: ortho, dsm, contours or coverage; clear where nothing is known."""
+    """A map tile of a scan: ortho, dsm, contours or coverage; transparent where nothing is
+    known."""
     return await run_in_threadpool(_tile_png, request)
 
 

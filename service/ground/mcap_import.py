@@ -151,7 +151,7 @@ def _depth(points: Any, K: F64, size: tuple[int, int], T: F64) -> DepthMap:
 
 
 class _Track:
-    """The trajectory, with distance and speed from its positions, stored as it comes."""
+    """The trajectory, with distance and speed from its positions, stored as it is read."""
 
     def __init__(self, store: ScanStore) -> None:
         self._store = store

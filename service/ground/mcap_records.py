@@ -30,7 +30,7 @@ MAX_MESSAGE_BYTES = {
     "/fix": SMALL_BYTES,
     "/log": SMALL_BYTES,
 }
-"""Topics of a scan, and the most that one message of each can have to say."""
+"""Topics of a scan, and the maximum size of one message of each."""
 MAX_RECORD_BYTES = MAX_MESSAGE_BYTES["/points"] + (1 << 20)
 MAX_RATIO, FREE_BYTES = 200, 1 << 20
 """A chunk unpacks to so many times its size, or FREE_BYTES; floats of depth shrink ten times."""
@@ -66,7 +66,7 @@ _FIELDS: dict[str, list[tuple[str, int, int, str]]] = {
 
 
 def messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, Any]]:
-    """(topic, time, message) in the order of the file; others than ``topics`` are passed over.
+    """(topic, time, message) in the order of the file; other topics are skipped.
 
     Raises InputError for a file that is no valid MCAP or asks for more memory than a scan does,
     OutsideError without the ``mcap`` package.

@@ -207,7 +207,7 @@ class Operator:
         return lambda: self._direct.unsubscribe_message(handle)
 
     def request(self, number: int, name: str, component: int, wait_s: float) -> dict[str, Any]:
-        """One message of a kind, asked for; empty when it does not come in time."""
+        """Request one message of a kind; empty when it does not arrive in time."""
         found: dict[str, Any] = {}
         there = threading.Event()
 

@@ -1,7 +1,7 @@
 """A scan that is being received: its state, its deliverables, and which are yet to be written.
 
-A mark in the scan's folder says that it grew since its files were written. It moves aside while
-they are written and goes with them, so a kill at any time leaves one of the two.
+A marker file in the scan's folder shows that it grew since its files were written. It is renamed
+while they are written and deleted afterwards, so a kill at any time leaves one of the two names.
 """
 
 from __future__ import annotations

@@ -310,7 +310,7 @@ class Receiver:
         """A scan was opened; for those who watch."""
 
     def align(self, folder: Path) -> None:
-        """Align a finished scan with those that show the same ground, where this is wanted."""
+        """Align a finished scan with those that show the same ground, if configured."""
         if self._config.sites:
             self._sites.put(folder)
 

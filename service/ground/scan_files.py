@@ -25,7 +25,7 @@ from service.offline.exports.bundle import MANIFEST
 from service.stream.store import ScanStore
 
 TILE = re.compile(r"[A-Za-z0-9_]{1,80}\.(json|pnts|b3dm|glb)")
-"""Names that py3dtiles gives its files; all lie in one folder."""
+"""Names that py3dtiles gives its files; all are in one folder."""
 
 DEEPEST_TILE = 8
 MAPS_KIND = "all"

@@ -1,6 +1,6 @@
 """Sites by themselves: a scan that ends is aligned with the scans that show the same ground.
 
-A site lies in STORE/site/NAME, as a scan does, and grows with each scan that belongs to it. Every
+A site is stored in STORE/site/NAME, like a scan, and grows with each scan that belongs to it. Every
 alignment is a process: a damaged scan or a large site takes nothing from reception.
 """
 

@@ -38,7 +38,7 @@ KINDS = (*EXPORTERS, REFINE)
 
 @dataclass(slots=True, eq=False)
 class Job:
-    """One deliverable that is asked for."""
+    """One requested deliverable."""
 
     number: int
     folder: Path
@@ -52,7 +52,7 @@ class Job:
 
     @property
     def has_ended(self) -> bool:
-        """Whether nothing more happens."""
+        """Whether the job has ended, successfully or not."""
         return self.state not in ("waiting", "running")
 
     def end(self, state: str, error: str | None = None) -> None:
@@ -78,7 +78,7 @@ class Job:
 
 
 def carry_out(job: Job) -> str:
-    """Make what the job asks for; the name of the file. Raises what that raises."""
+    """Make the job's deliverable; the name of the file. Errors are passed on."""
     if job.kind == REFINE:
         from service.offline.refine.refinement import RefineOptions, refine
 

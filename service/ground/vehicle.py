@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 BUTTONS = ("start", "stop", "pause", "resume", "photo", "baseline")
-"""Orders that the portal offers; all but ``baseline`` take nothing."""
+"""Commands that the portal offers; only ``baseline`` takes a value."""
 
 SEARCH_S = 5.0
 STALE_S = 10.0

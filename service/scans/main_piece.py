@@ -1,4 +1,4 @@
-"""The piece of a scan that its deliverables show, without stretches that nothing ties to it."""
+"""The part of a scan that its deliverables show, without stretches that are not tied to it."""
 
 from __future__ import annotations
 

@@ -205,7 +205,7 @@ def _render(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _is_edge(depth, body, u, v):  # type: ignore[no-untyped-def]
-    """True where a neighbour belongs to another body or lies at another depth."""
+    """True where a neighbour belongs to another body or depth."""
     for dv, du in ((0, 1), (0, -1), (1, 0), (-1, 0)):
         a, b = v + dv, u + du
         if 0 <= a < depth.shape[0] and 0 <= b < depth.shape[1]:

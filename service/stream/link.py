@@ -67,12 +67,11 @@ class LinkProgress:
 
 
 class DatalinkSender:
-    """Publishes a scan while it grows, and answers what ground stations ask for.
-
-    All puts happen on a thread of its own. Without endpoints in ``config`` nothing is opened.
-    Raises InputError when an endpoint or a name cannot be used; a ground station that is not
-    there yet is waited for. Between flights ``store`` is None and ``drone`` says whose scans
-    :meth:`add` will bring. ``radio`` carries the narrow fallback.
+    """Publishes a scan while it grows, and answers requests of ground stations. All puts happen on
+    its own thread. Without endpoints in ``config`` nothing is opened. Raises InputError when an
+    endpoint or a name cannot be used; a ground station that is not there yet is waited for. Between
+    flights ``store`` is None and ``drone`` says whose scans :meth:`add` will bring. ``radio``
+    carries the narrow fallback.
     """
 
     def __init__(
@@ -148,7 +147,7 @@ class DatalinkSender:
         self._wake.set()
 
     def remove(self, store: ScanStore) -> None:
-        """Offer a scan no more; the store stays open."""
+        """Stop offering a scan; the store stays open."""
         with self._lock:
             self._outbox.remove(store.header.name)
         for entry in [entry for entry in self._stores if entry[0] is store]:
@@ -252,7 +251,7 @@ class DatalinkSender:
                 self._close_session(session, pumps)
 
     def _close_session(self, session: zenoh.Session, pumps: list[Worker]) -> None:
-        """Close it on a thread of its own: over a dead link that takes long."""
+        """Close it on a separate thread: over a dead link that takes long."""
         self._queries.clear()
         self._asks.clear()
         closed = threading.Event()

@@ -139,7 +139,7 @@ def _extra_bytes(header: laspy.LasHeader) -> copclib.EbVlr:
 
 
 def octree(xyz: F64, low: F64, side: float) -> Iterator[tuple[tuple[int, int, int, int], I64]]:
-    """(depth, x, y, z) of each node and the rows of its points; every row comes once."""
+    """(depth, x, y, z) of each node and the rows of its points; every row appears once."""
     rows = np.arange(len(xyz))
     unit = (xyz - low) / side
     for depth in range(DEEPEST + 1):

@@ -141,10 +141,8 @@ def _image_lines(one: Keyframe, camera: int) -> str:
 
 @contextmanager
 def writing_folder(path: Path) -> Iterator[Path]:
-    """An empty folder next to ``path``, renamed onto it when all went well.
-
-    A folder that is there already is replaced only then. A failure of the disk becomes an
-    OutsideError.
+    """An empty folder next to ``path``, renamed onto it on success. An existing folder is replaced
+    only then. A failure of the disk becomes an OutsideError.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -51,8 +51,8 @@ class Recording:
 def recording_of(folder: Path, header: ScanHeader) -> Recording:
     """The video or folder of stills that a scan was made from, when it still is where it was.
 
-    ``scan.json`` names it (``run.source``). A relative path is looked for from here, from the
-    scan folder and from the folder that holds it. Never raises.
+    ``scan.json`` names it (``run.source``). A relative path is tried from the working directory,
+    the scan folder and its parent. Never raises.
     """
     stored = "textures from the scan's own images, at the depth's resolution"
     try:
@@ -82,7 +82,8 @@ def scan_images(
     options: ExportOptions,
     progress: Progress,
 ) -> list[TextureView]:
-    """A view per keyframe: of the recording that the options name or the scan knows, else stored.
+    """A view per keyframe: from the recording that the options or the scan name, else from the
+    store.
 
     Raises InputError or OutsideError when the named recording cannot be used.
     """

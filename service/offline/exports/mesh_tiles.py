@@ -257,9 +257,9 @@ def _seen_from(cloud: PointCloud, keyframes: Sequence[Keyframe]) -> F64:
 def run_tiles(jobs: Sequence[TileJob], scheduler: str | None, progress: Progress) -> list[TilePart]:
     """All tiles with surface, in their order.
 
-    With ``scheduler`` (``tcp://HOST:8786``) they are made by a Dask cluster. OutsideError when
-    it cannot be reached. When it goes away on the way, that is said in one line and the tiles
-    it did not deliver are made here.
+    With ``scheduler`` (``tcp://HOST:8786``) they are made by a Dask cluster. OutsideError when it
+    cannot be reached. If it disconnects meanwhile, one line reports it and the missing tiles are
+    made here.
     """
     done: dict[int, TilePart | None] = {}
     if scheduler is not None:

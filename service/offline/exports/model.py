@@ -129,7 +129,7 @@ def mesh_parts(
 
 
 def mesh_extras(scan: ScanView) -> dict[str, Any]:
-    """Where the mesh stands: its x is east, y up, -z north of this origin."""
+    """The mesh's origin: x is east, y up, -z north of it."""
     frame = scan.frame
     if frame is None:
         return {"scan": scan.store.header.scan_id, "origin": None}

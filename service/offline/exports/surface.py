@@ -18,9 +18,9 @@ from service.scans.main_piece import main_keyframes
 OPEN_STEP_M = 2
 SIDEWAYS_DEG = 15.0
 MAX_OPEN_M, MAX_OPEN_SIDEWAYS_M = 4, 6
-"""Free air above a cell that is asked for at most: trees and eaves overhang higher up as well,
-but every metre costs ground at the border of the survey. Looking sideways one sees more of
-the ground below them."""
+"""Maximum height of free air required above a cell: trees and eaves overhang higher up as well, but
+every metre costs ground at the border of the survey. Looking sideways one sees more of the ground
+below them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,8 +34,8 @@ class Surface:
 def surface_model(scan: ScanView, cell_m: float | None, strict: bool = False) -> Surface:
     """The surface where it is certain and the air above it was seen, its holes filled.
 
-    ``strict`` leaves the holes unknown. :func:`recon.surface.raster.reliable` says what is
-    uncertain, :func:`recon.surface.hole_filling.filled` which holes are filled.
+    ``strict`` leaves the holes unknown. :func:`recon.surface.raster.reliable` removes uncertain
+    cells, :func:`recon.surface.hole_filling.filled` fills holes.
     """
     key = ("surface", cell_m, strict)
     if key not in scan.memo:

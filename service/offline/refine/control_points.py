@@ -56,7 +56,7 @@ class Candidate:
 
     @property
     def usable(self) -> bool:
-        """True while nothing speaks against it."""
+        """True while no reason against it is known."""
         return not self.why_not
 
     @property
@@ -315,7 +315,7 @@ def clustered(candidates: Sequence[Candidate], places_m: F64) -> str:
 
 
 def _far(one: Candidate, frame: LocalFrame) -> str:
-    """The fault of a point that lies nowhere near its place in the map; else empty."""
+    """The fault of a point far from its place in the map; else empty."""
     assert one.surveyed_m is not None and one.before_m is not None
     off = one.surveyed_m - one.before_m
     flat, up = float(np.linalg.norm(off[:2])), float(off[2])

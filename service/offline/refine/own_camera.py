@@ -64,7 +64,7 @@ MIN_SHOWN = 0.3
 START = SelfCalibrationConfig()
 
 EXHAUSTIVE = 60
-"""Of so many images all are compared, wherever they are said to look."""
+"""Up to so many images, all pairs are compared, regardless of their poses."""
 
 GROSS_PX = 15.0
 """A sighting further from its landmark takes no part."""

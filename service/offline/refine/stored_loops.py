@@ -1,7 +1,7 @@
-"""Places seen twice, looked for among all keyframes of a finished scan.
+"""The search for loops among all keyframes of a finished scan.
 
-A kept keyframe holds only surface that was new. Each is filled with what its neighbours on the
-same stretch measured, and verified against every earlier one that sees the same ground.
+A kept keyframe holds only surface that was new. Each is filled from its neighbours on the same
+stretch, and verified against every earlier one that sees the same ground.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ MIN_SIGMA = np.array([0.003] * 3 + [0.05] * 3 + [0.003])
 """Sigmas of a scan's own position, heading and scale: rad, m, share."""
 
 SIGMA_SCALE = 0.01
-"""Of a scan that does not say how sure its scale is."""
+"""Sigma of the scale of a scan that states none."""
 
 SAME_SCALE = 1e-5
 """Sigma of the scale along a scan: what a flight's scale varies by is shift of its keyframes."""
