@@ -4,6 +4,7 @@ and is stopped by it: after :meth:`Progress.cancel` the next report raises :clas
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -21,7 +22,8 @@ class CancelledError(Exception):
 
 
 class Progress:
-    """The share of some work that is done. One thread works; any thread may read and cancel."""
+    """The share of some work that is done. One thread works, or several with :meth:`branches`;
+    any thread may read and cancel."""
 
     def __init__(self, show: Callable[[Progress], None] = lambda _: None) -> None:
         """``show`` is called after every report."""
@@ -76,6 +78,23 @@ class Progress:
             self(text)
 
         return say
+
+    def branches(self, number: int) -> list[Progress]:
+        """One object for each of several threads, as equal shares of the current part."""
+        start, width = self.share, self._end - self.share
+        out: list[Progress] = []
+        said: dict[Progress, str] = {}
+        lock = threading.Lock()
+
+        def show(one: Progress) -> None:
+            with lock:
+                self.share = start + width * sum(b.share for b in out) / number
+                is_new = said.get(one) != one.text
+                said[one] = one.text
+                self(one.text if is_new else self.text)
+
+        out += [Progress(show) for _ in range(number)]
+        return out
 
     @property
     def left_s(self) -> float | None:

@@ -7,6 +7,7 @@ import json
 import sqlite3
 import struct
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
@@ -16,9 +17,11 @@ import laspy
 import numpy as np
 import pytest
 
-from recon.types import F64
+from recon.types import F64, Keyframe
 from service.georeference import LocalFrame
 from service.offline.exports.view import ExportOptions, ScanView, export
+from service.stream import codec
+from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
     from conftest import HouseFlight
@@ -81,6 +84,35 @@ def test_the_maps_share_what_they_are_made_from(
     with ScanView(tmp_path / "scan") as scan:
         export(scan, "all", None, ExportOptions())
     assert sorted(made) == ["_surface_model", "contour_lines", "fused_cloud", "terrain"]
+
+
+def test_each_keyframe_is_decoded_once_and_stays_as_it_is(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded = []
+    real = codec.decode
+
+    def decode(layers: Sequence[bytes]) -> Keyframe | None:
+        decoded.append(real(layers))
+        return decoded[-1]
+
+    monkeypatch.setattr(codec, "decode", decode)
+    house.flown(tmp_path / "scan").close()
+    with ScanView(tmp_path / "scan") as scan:
+        decoded.clear()
+        export(scan, "all", None, ExportOptions())
+        keyframes = len(scan.store.seqs())
+    assert len(decoded) == keyframes
+    with ScanStore.open(tmp_path / "scan" / "scan.db") as store:
+        fresh = {k.seq: k for k in store.keyframes()}
+    for one in decoded[:keyframes]:
+        assert one is not None
+        for name in ("depth_m", "sigma_m", "views"):
+            np.testing.assert_array_equal(
+                getattr(one.depth, name), getattr(fresh[one.seq].depth, name)
+            )
+        np.testing.assert_array_equal(one.bgr, fresh[one.seq].bgr)
+        np.testing.assert_array_equal(one.fresh, fresh[one.seq].fresh)
 
 
 def test_the_ground_runs_on_below_the_house(maps: Path, house: HouseFlight) -> None:

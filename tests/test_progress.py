@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING
 
 import pytest
@@ -41,6 +42,48 @@ def test_shares_grow_up_to_one_however_parts_are_nested(work: object) -> None:
         do(work)
     assert progress.share == pytest.approx(1.0)
     assert seen == sorted(seen) and min(seen) >= 0.0 and max(seen) <= 1.0 + 1e-9
+
+
+def test_branches_share_the_work_of_several_threads() -> None:
+    seen: list[float] = []
+    progress = Progress(lambda now: seen.append(now.share))
+
+    def do(branch: Progress) -> None:
+        for _ in branch.over(range(50), 50):
+            pass
+        branch.share = 1.0
+        branch("done")
+
+    with progress.part("first", 0.5):
+        pass
+    with progress.part("both at once"):
+        branches = progress.branches(2)
+        threads = [Thread(target=do, args=(branch,)) for branch in branches]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert progress.share == pytest.approx(1.0) and progress.text == "done"
+    assert seen == sorted(seen) and 0.5 < seen[60] < 1.0
+
+
+def test_a_cancelled_work_stops_in_every_branch() -> None:
+    progress = Progress()
+    for branch in progress.branches(2):
+        branch("goes on")
+    progress.cancel()
+    for branch in progress.branches(2):
+        with pytest.raises(CancelledError):
+            branch("ends")
+
+
+def test_branches_say_what_is_new_once() -> None:
+    said: list[str] = []
+    progress = Progress(lambda now: said.append(now.text))
+    one, other = progress.branches(2)
+    for branch in (one, other, one, other):
+        branch("left" if branch is one else "right")
+    assert said == ["left", "right", "right", "right"]
 
 
 def test_equal_parts_take_equal_shares() -> None:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numba import njit
 
+from recon.bands import in_bands
 from recon.image_quality import sharpness
 from recon.surface.raster import Grid, Raster
 from recon.surface.texture_atlas import flat, sample
@@ -64,10 +65,10 @@ def orthophoto(
         (old.north_m - grid.north_m + 0.5 * grid.cell_m) / old.cell_m - 0.5,
         grid.cell_m / old.cell_m,
     )
-    _paint(
-        np.ascontiguousarray(terrain.places_m), terrain.raster.height_m, terrain.raster.rgb,
-        np.ascontiguousarray(label), *_cameras(views), levels(found, len(views)), pixels, start,
-        sides, to_cell, rgb, known,
+    in_bands(
+        _paint, len(rgb), np.ascontiguousarray(terrain.places_m), terrain.raster.height_m,
+        terrain.raster.rgb, np.ascontiguousarray(label), *_cameras(views),
+        levels(found, len(views)), pixels, start, sides, to_cell, rgb, known,
     )  # fmt: skip
     return rgb, known
 
@@ -100,9 +101,9 @@ def _sightings(
         eye = terrain.raster.grid.pixels(terrain.eyes_m[number : number + 1, :2])[0]
         at = (float(eye[0]), float(eye[1]), float(terrain.eyes_m[number, 2]))
         centre = np.ascontiguousarray(view.T_world_camera[:3, 3])
-        _look(
-            np.ascontiguousarray(terrain.places_m), height, highest, at, centre, K[number],
-            T[number], view.bgra, score, bgr,
+        in_bands(
+            _look, len(height), np.ascontiguousarray(terrain.places_m), height, highest, at,
+            centre, K[number], T[number], view.bgra, score, bgr,
         )  # fmt: skip
         cells = np.flatnonzero(score > 0.0)
         insert(
@@ -126,15 +127,15 @@ def _sharpness(views: Sequence[TextureView]) -> F64:
 
 @njit(cache=True, nogil=True)
 def _look(
-    places: F64, height: F32, highest: float, eye: tuple[float, float, float], centre: F64, K: F64,
-    T: F64, bgra: U8, score: F32, bgr: F32,
+    begin: int, end: int, places: F64, height: F32, highest: float, eye: tuple[float, float, float],
+    centre: F64, K: F64, T: F64, bgra: U8, score: F32, bgr: F32,
 ) -> None:  # fmt: skip
-    """Score and colour of each cell in one view; the score stays 0 where it is not seen."""
-    rows, cols = height.shape
+    """Score and colour of rows of cells in one view; the score stays 0 where it is not seen."""
+    cols = height.shape[1]
     colour = np.empty(3)
     flat_pixels = bgra.reshape(-1)
     h, w = bgra.shape[0], bgra.shape[1]
-    for r in range(rows):
+    for r in range(begin, end):
         for c in range(cols):
             if np.isnan(height[r, c]):
                 continue
@@ -183,13 +184,14 @@ def _is_hidden(
 
 @njit(cache=True, nogil=True)
 def _paint(
-    places: F64, height: F32, fallback: U8, label: I32, K: F64, T: F64, levels: F32, pixels: U8,
-    start: I64, sides: I64, to_cell: tuple[float, float, float], rgb: U8, known: Bool,
+    begin: int, end: int, places: F64, height: F32, fallback: U8, label: I32, K: F64, T: F64,
+    levels: F32, pixels: U8, start: I64, sides: I64, to_cell: tuple[float, float, float], rgb: U8,
+    known: Bool,
 ) -> None:  # fmt: skip
-    """Fill ``rgb`` and ``known``, whose cells are those of the model by offset and scale."""
+    """Fill rows of ``rgb`` and ``known``; their cells are the model's by offset and scale."""
     rows, cols = height.shape
     share, place, colour, mixed = np.empty(4), np.empty(3), np.empty(3), np.empty(3)
-    for i in range(rgb.shape[0]):
+    for i in range(begin, end):
         y = min(max(to_cell[1] + i * to_cell[2], 0.0), rows - 1.0)
         r = min(int(y), rows - 2)
         for j in range(rgb.shape[1]):

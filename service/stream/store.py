@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 from recon.types import Keyframe
@@ -47,6 +48,8 @@ from service.stream.validity import summary_from_json
 
 _NOT_TOO_LARGE = f"LENGTH(data) <= {codec.MAX_LAYER_BYTES}"
 _IS_LAYER = f"typeof(layer) = 'integer' AND layer BETWEEN 0 AND {codec.MAX_LAYERS - 1}"
+DECODED_BYTES = 13
+"""A pixel of a keyframe: depth, sigma, views, colour, mask."""
 MAX_HELD_PEERS = 8
 """Maximum ground stations whose items are noted."""
 
@@ -78,6 +81,9 @@ class ScanStore:
         self.chunk_bytes = int(total[0]) if total else 0
         self._inventory = Inventory(self._db)
         self._radio = RadioStore(self._db)
+        self._held: dict[tuple[int, int], Keyframe] = {}  # by number and layer
+        self._held_room: int | None = None  # bytes; None: nothing is held
+        self._decoding = Lock()
 
     @classmethod
     def create(
@@ -223,13 +229,32 @@ class ScanStore:
         """
         sql = f"SELECT layer FROM chunks WHERE seq = ? AND {_IS_LAYER} ORDER BY layer DESC"
         for (number,) in self._db.all(sql, (seq,)):
-            decoded = codec.decode([self.chunk(seq, number) or b""])
+            decoded = self._decoded(seq, number)
             if decoded is not None and decoded.seq == seq:
                 break
         else:
             decoded = self._radio.keyframe(seq)
         repose = self.repose(seq)
         return decoded if decoded is None or repose is None else repose.applied_to(decoded)
+
+    def hold_decoded(self, max_bytes: int) -> None:
+        """Hold decoded layers in memory, for who reads all keyframes several times; they must not
+        be written into."""
+        self._held_room = max_bytes
+
+    def _decoded(self, seq: int, number: int) -> Keyframe | None:
+        """A layer's keyframe, as it was sent."""
+        if self._held_room is None:
+            return codec.decode([self.chunk(seq, number) or b""])
+        with self._decoding:  # a second thread takes what the first has decoded
+            found = self._held.get((seq, number))
+            if found is None:
+                found = codec.decode([self.chunk(seq, number) or b""])
+                size = 0 if found is None else DECODED_BYTES * found.fresh.size
+                if found is not None and size <= self._held_room:
+                    self._held_room -= size
+                    self._held[seq, number] = found
+            return found
 
     def keyframes(self) -> Iterator[Keyframe]:
         """All keyframes in order of their number, as :meth:`keyframe` gives them."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from recon.bands import at_once
 from service.errors import SkyreliefError
 from service.offline.exports import EXPORTERS
 from service.offline.exports.view import ExportOptions, ScanView, export
@@ -14,7 +16,10 @@ from service.version import software
 
 MAPS = ("laz", "dsm", "dtm", "ortho", "contours", "gpkg", "dxf", "coverage", "geojson", "kml",
         "kmz", "stac")  # fmt: skip
-"""In this order: kmz and stac use the rasters."""
+FROM_IMAGES = ("ortho", "kmz")
+"""Made at the same time as the others, in this order: kmz uses the orthophoto."""
+LAST = ("stac",)
+"""What describes the others."""
 
 MANIFEST = "manifest.json"
 
@@ -25,28 +30,44 @@ def write_all(scan: ScanView, out: Path, options: ExportOptions) -> None:
     A kind that fails does not stop the others. Raises the last error when none is written.
     """
     out.mkdir(parents=True, exist_ok=True)
-    files, failed = [], {}
-    trouble: SkyreliefError | None = None
-    for number, kind in enumerate(MAPS):
-        try:
-            with scan.progress.part(kind, 1.0 / (len(MAPS) - number)):
-                path = export(scan, kind, out / EXPORTERS[kind][1], options)
-            files.append(_entry(kind, path))
-        except SkyreliefError as error:
-            trouble = error
-            failed[kind] = str(error)
-    if trouble is not None and not files:
-        raise trouble
+    done: dict[str, Path | SkyreliefError] = {}
+    rest = tuple(kind for kind in MAPS if kind not in (*FROM_IMAGES, *LAST))
+    branches = scan.progress.branches(2)
+    views = [scan.with_progress(branch) for branch in branches]
+    at_once(
+        lambda: _write(views[0], rest, out, options, done),
+        lambda: _write(views[1], FROM_IMAGES, out, options, done),
+    )
+    _write(scan, LAST, out, options, done)
+    failures = {k: error for k in MAPS if isinstance(error := done[k], SkyreliefError)}
+    if len(failures) == len(MAPS):
+        raise failures[MAPS[-1]]
     frame = scan.frame
     document = {
         "scan": scan.store.header.scan_id,
         "software": software(),
         "epsg": None if frame is None else frame.epsg,
         "heights": HEIGHTS if frame is not None else "metres above the scan's origin",
-        "files": files,
-        "failed": failed,
+        "files": [_entry(k, path) for k in MAPS if isinstance(path := done[k], Path)],
+        "failed": {kind: str(error) for kind, error in failures.items()},
     }
     (out / MANIFEST).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+
+
+def _write(
+    scan: ScanView,
+    kinds: Sequence[str],
+    out: Path,
+    options: ExportOptions,
+    done: dict[str, Path | SkyreliefError],
+) -> None:
+    """Write some kinds, one after the other; ``done`` takes each one's path, or its error."""
+    for number, kind in enumerate(kinds):
+        try:
+            with scan.progress.part(kind, 1.0 / (len(kinds) - number)):
+                done[kind] = export(scan, kind, out / EXPORTERS[kind][1], options)
+        except SkyreliefError as error:
+            done[kind] = error
 
 
 HEIGHTS = (

@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from recon.bands import threads
 from recon.mapping.voxel_map import ground_sample_m
 from recon.surface.orthophoto import Terrain, orthophoto
 from recon.surface.raster import Grid, Raster, fill_holes, round_cell
@@ -140,7 +141,8 @@ def write_cog(
                 image.colorinterp = kinds
         with memory.open() as image:
             predictor = "YES" if bands.dtype.kind == "f" else "STANDARD"
-            copy(image, str(part), driver="COG", compress="DEFLATE", predictor=predictor)
+            how = {"driver": "COG", "compress": "DEFLATE", "predictor": predictor}
+            copy(image, str(part), **how, num_threads=threads())
 
 
 def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
@@ -173,12 +175,12 @@ def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
 def contours_of(scan: ScanView, options: ExportOptions) -> list[tuple[float, F64]]:
     """(height, (N, 2) UTM metres) of the contours; InputError without a georeference."""
     scan.needs_place("a contour map")
-    key = ("contours", options.cell_m, options.contour_m)
-    if key not in scan.memo:
+
+    def lines() -> list[tuple[float, F64]]:
         surface = fill_holes(scan.raster(options.cell_m))
-        scan.memo[key] = list(contour_lines(surface, options.contour_m))
-    found: list[tuple[float, F64]] = scan.memo[key]
-    return found
+        return list(contour_lines(surface, options.contour_m))
+
+    return scan.shared(("contours", options.cell_m, options.contour_m), lines)
 
 
 def contour_lines(raster: Raster, step_m: float) -> Iterator[tuple[float, F64]]:

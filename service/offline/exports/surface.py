@@ -38,19 +38,12 @@ def surface_model(scan: ScanView, cell_m: float | None, strict: bool = False) ->
     cells, :func:`recon.surface.hole_filling.filled` fills holes.
     """
     key = ("surface", cell_m, strict)
-    if key not in scan.memo:
-        scan.memo[key] = _surface_model(scan, cell_m, strict)
-    found: Surface = scan.memo[key]
-    return found
+    return scan.shared(key, lambda: _surface_model(scan, cell_m, strict))
 
 
 def bare_ground(scan: ScanView, cell_m: float | None) -> BareGround:
     """The bare ground below the surface model."""
-    key = ("ground", cell_m)
-    if key not in scan.memo:
-        scan.memo[key] = terrain(surface_model(scan, cell_m).raster)
-    found: BareGround = scan.memo[key]
-    return found
+    return scan.shared(("ground", cell_m), lambda: terrain(surface_model(scan, cell_m).raster))
 
 
 def _surface_model(scan: ScanView, cell_m: float | None, strict: bool) -> Surface:

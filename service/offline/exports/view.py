@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import copy
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -23,6 +26,11 @@ from service.scans.main_piece import main_keyframes, main_poses, stretches_apart
 from service.scans.track import latest, local_frame
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
+
+T = TypeVar("T")
+
+HELD_BYTES = 500_000_000
+"""Decoded keyframes that are held, as several deliverables go over all of them."""
 
 OBLIQUE_SHARE = 0.25
 """Share of the keyframes looking sideways above which a scan counts as oblique."""
@@ -66,7 +74,9 @@ class ScanView:
         self.store = ScanStore.open(folder / "scan.db")
         self._voxel_m = voxel_m
         self.progress = progress or Progress()
-        self.memo: dict[Any, Any] = {}  # what several deliverables are made from
+        self._shared: dict[Any, Any] = {}
+        self._lock = threading.RLock()
+        self.store.hold_decoded(HELD_BYTES)
 
     def __enter__(self) -> ScanView:
         return self
@@ -78,6 +88,20 @@ class ScanView:
         trace: TracebackType | None,
     ) -> None:
         self.store.close()
+
+    def with_progress(self, progress: Progress) -> ScanView:
+        """The same view for another thread, which shares what deliverables are made from."""
+        other = copy.copy(self)
+        other.progress = progress
+        return other
+
+    def shared(self, key: Any, make: Callable[[], T]) -> T:
+        """What several deliverables are made from, made once; other threads wait for it."""
+        with self._lock:
+            if key not in self._shared:
+                self._shared[key] = make()
+            found: T = self._shared[key]
+            return found
 
     @cached_property
     def frame(self) -> LocalFrame | None:
@@ -101,19 +125,22 @@ class ScanView:
         down = [-k.depth.T_world_camera[2, 2] for k in main_keyframes(self.store)]
         return np.asarray(np.degrees(np.arccos(np.clip(down, -1.0, 1.0))), np.float64)
 
-    @cached_property
+    @property
     def fused(self) -> FusedCloud:
         """The fused cloud in ENU metres; InputError when there is not a single point."""
+        return self.shared("fused", self._fuse)
+
+    def _fuse(self) -> FusedCloud:
         with self.progress.part("fusing the cloud", FUSING):
             fused = fused_cloud(self.store, self._voxel_m, self.progress)
         if not len(fused.cloud):
             raise InputError(f"{self.folder} holds no points yet; nothing to export")
         return fused
 
-    @cached_property
+    @property
     def xyz_m(self) -> F64:
         """(N, 3) of the fused cloud in UTM with AMSL heights; ENU without georeference."""
-        return placed(self.fused.cloud, self.frame)
+        return self.shared("xyz", lambda: placed(self.fused.cloud, self.frame))
 
     def grid(self, cell_m: float | None) -> Grid:
         """A grid over ``xyz_m``, by default of round cells as large as the voxels at least."""
