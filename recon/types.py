@@ -15,11 +15,11 @@ import numpy.typing as npt
 
 F64 = npt.NDArray[np.float64]
 F32 = npt.NDArray[np.float32]
+I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
 U16 = npt.NDArray[np.uint16]
 I16 = npt.NDArray[np.int16]
 I32 = npt.NDArray[np.int32]
-I64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 Array = npt.NDArray[Any]
 
@@ -195,6 +195,7 @@ class PointCloud:
     sigma_m: F32  # (N,)
     views: U8  # (N,)
     frame: str = "world"
+    time_ns: I64 | None = None  # (N,) unix time of the image that knows each point best
 
     def __len__(self) -> int:
         return int(self.xyz_m.shape[0])

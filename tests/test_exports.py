@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,8 @@ from service.georeference import LocalFrame
 from service.offline.exports import EXPORTERS
 from service.offline.exports.clouds import octree
 from service.offline.exports.view import ExportOptions, ScanView, export
+from service.scans.fused_cloud import adjusted_gps_s
+from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
     from conftest import HouseFlight
@@ -69,6 +72,34 @@ def test_las_and_laz(scan_dir: Path, tmp_path: Path, house: HouseFlight, name: s
     cloud = laspy.read(tmp_path / name)
     assert cloud.header.are_points_compressed == name.endswith("laz")
     assert_is_the_house(to_enu(np.column_stack([cloud.x, cloud.y, cloud.z]), 32632, house), house)
+
+
+@pytest.mark.parametrize("kind", ["laz", "copc"])
+def test_points_have_the_gps_time_of_their_keyframe(
+    scan_dir: Path, house: HouseFlight, kind: str
+) -> None:
+    if kind == "copc":
+        pytest.importorskip("copclib")
+    cloud = laspy.read(written(scan_dir, kind))
+    assert cloud.header.global_encoding.gps_time_type == laspy.header.GpsTimeType.STANDARD
+    epoch = dt.datetime(1980, 1, 6, tzinfo=dt.timezone.utc).timestamp()
+    with ScanStore.open(scan_dir / "scan.db") as store:
+        # GPS is 18 s ahead of UTC since 2017.
+        times = [k.time_ns / 1e9 - epoch + 18 - 1e9 for k in store.keyframes()]
+    found = np.unique(np.asarray(cloud.gps_time))
+    assert len(found) > 1
+    assert np.abs(found[:, None] - np.array(times)).min(axis=1).max() < 1e-6
+
+
+def test_gps_time_counts_the_leap_seconds() -> None:
+    def at(*when: int) -> float:
+        unix = dt.datetime(*when, tzinfo=dt.timezone.utc).timestamp()  # type: ignore[misc,arg-type]
+        return float(adjusted_gps_s(np.array([round(unix * 1e9)]))[0])
+
+    assert at(1980, 1, 6) == -1e9
+    assert at(2011, 9, 14, 1, 46, 25) == 0.0  # GPS second 1e9, by IERS: 15 s ahead
+    assert at(2015, 7, 1) - at(2015, 6, 30, 23, 59, 59) == 2.0
+    assert at(2017, 1, 1) - at(1980, 1, 6) == 13_510 * 86_400 + 18
 
 
 def test_copc_of_a_scan_without_a_place(tmp_path: Path, house: HouseFlight) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -283,12 +284,25 @@ def test_fusing_in_strips_gives_the_same_points() -> None:
             rng.integers(0, 256, (n, 3), dtype=np.uint8),
             rng.uniform(0.05, 0.5, n).astype(np.float32),
             rng.integers(1, 3, n).astype(np.uint8),
+            time_ns=np.full(n, 100 + number),
         )
-        for _ in range(5)
+        for number in range(5)
     ]
     whole = fuse(clouds, 0.7)
     edges = [-np.inf, -11.3, 0.0, 0.1, 6.66, np.inf]
     parts = fuse_strips([lambda: clouds] * 5, edges, 0.7)
     assert len(whole) < 5 * n
-    for name in ("xyz_m", "rgb", "sigma_m", "views"):
+    for name in ("xyz_m", "rgb", "sigma_m", "views", "time_ns"):
         np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
+
+
+def test_a_point_has_the_time_of_the_image_that_knows_it_best() -> None:
+    places = [[0.1, 0.1, 0.1], [5.1, 0.1, 0.1], [9.1, 0.1, 0.1]]
+    clouds = [
+        replace(cloud(places[:2], [0.3, 0.1]), time_ns=np.full(2, 10)),
+        replace(cloud(places, [0.2, 0.2, 0.2]), time_ns=np.full(3, 20)),
+        replace(cloud(places[:1], [0.4]), time_ns=np.full(1, 30)),
+    ]
+    fused = fuse(clouds, 0.5)
+    assert fused.time_ns is not None and fused.time_ns.tolist() == [20, 10, 20]
+    assert fuse([*clouds, cloud(places, [0.1] * 3)], 0.5).time_ns is None

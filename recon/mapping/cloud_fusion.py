@@ -53,20 +53,37 @@ def fuse_strips(
 
     def fused(strip: Callable[[], Iterable[PointCloud]], low: float, high: float) -> _Fused:
         sums = _Sums()
+        times: list[I64 | None] = []
         for number, cloud in enumerate(strip()):
+            times.append(cloud.time_ns)
             sums.add(cloud, number, voxel_m, low, high)
-        return sums.means()
+        return sums.means(_first_of_each(times))
 
     rows = zip(strips, borders[:-1], borders[1:], strict=True)
     keys, clouds = zip(*at_once(*(partial(fused, *row) for row in rows)), strict=True)
     whole = PointCloud(
-        *(
-            np.concatenate([getattr(cloud, name) for cloud in clouds])
-            for name in ("xyz_m", "rgb", "sigma_m", "views")
-        )
+        np.concatenate([cloud.xyz_m for cloud in clouds]),
+        np.concatenate([cloud.rgb for cloud in clouds]),
+        np.concatenate([cloud.sigma_m for cloud in clouds]),
+        np.concatenate([cloud.views for cloud in clouds]),
+        time_ns=_joined([cloud.time_ns for cloud in clouds]),
     )
     lone = _lone_contradicted(np.concatenate(keys), whole.xyz_m, whole.sigma_m, whole.views)
     return whole if not lone.any() else without(whole, lone)
+
+
+def _first_of_each(times_ns: Sequence[I64 | None]) -> I64 | None:
+    """The time of each cloud (0 for an empty one); None when one does not know it."""
+    known = [t for t in times_ns if t is not None]
+    if len(known) < len(times_ns):
+        return None
+    return np.array([t[0] if len(t) else 0 for t in known], np.int64)
+
+
+def _joined(times_ns: Sequence[I64 | None]) -> I64 | None:
+    """One array of all; None when one is None."""
+    known = [t for t in times_ns if t is not None]
+    return np.concatenate(known) if len(known) == len(times_ns) else None
 
 
 def without(cloud: PointCloud, mask: Bool) -> PointCloud:
@@ -75,6 +92,7 @@ def without(cloud: PointCloud, mask: Bool) -> PointCloud:
     return PointCloud(
         cloud.xyz_m.take(keep, 0), cloud.rgb.take(keep, 0), cloud.sigma_m.take(keep),
         cloud.views.take(keep), cloud.frame,
+        None if cloud.time_ns is None else cloud.time_ns.take(keep),
     )  # fmt: skip
 
 
@@ -95,7 +113,7 @@ class _Sums:
             if old:
                 new[:old] = getattr(self, name)[:old]
             setattr(self, name, new)
-        tags = np.zeros((rows, 3), np.int32)
+        tags = np.zeros((rows, 4), np.int32)
         if old:
             tags[:old] = self.tags[:old]
         self.tags = tags
@@ -103,7 +121,7 @@ class _Sums:
     xyzw: F64  # sum of w x, w y, w z, w over points
     rgb: F32  # sum of w colour
     info: F64  # sum over clouds of the best w; best w of the last cloud; best w of all
-    tags: I32  # last cloud; sum over clouds of the most views; most views in the last cloud
+    tags: I32  # last cloud; sum over clouds of the most views; most in the last; cloud of best w
 
     def add(self, cloud: PointCloud, number: int, voxel_m: float, low: float, high: float) -> None:
         """Add one cloud's points whose voxel's x index lies in [low, high)."""
@@ -132,12 +150,14 @@ class _Sums:
             self.tags,
         )
 
-    def means(self) -> _Fused:
-        """The voxel keys, sorted, and the mean point of each."""
+    def means(self, times_ns: I64 | None) -> _Fused:
+        """The voxel keys, sorted, and the mean point of each; ``times_ns`` of the clouds."""
         at = np.flatnonzero(self.keys != -1)
         at = at[np.argsort(self.keys[at])]
         keys, rows = self.keys[at], self.ids[at]
-        return keys, PointCloud(*_means(rows, self.xyzw, self.rgb, self.info, self.tags))
+        time_ns = None if times_ns is None else times_ns[self.tags[rows, 3] - 1]
+        xyz, rgb, sigma, views = _means(rows, self.xyzw, self.rgb, self.info, self.tags)
+        return keys, PointCloud(xyz, rgb, sigma, views, time_ns=time_ns)
 
 
 @njit(cache=True, nogil=True)
@@ -212,6 +232,7 @@ def _accumulate(
             info[r, 1] = w
         if w > info[r, 2]:
             info[r, 2] = w
+            tags[r, 3] = number
         if views[n] > tags[r, 2]:
             tags[r, 1] += views[n] - tags[r, 2]
             tags[r, 2] = views[n]
@@ -248,7 +269,9 @@ def _lone_contradicted(keys: I64, xyz: F32, sigma: F32, views: U8) -> Bool:
     return out
 
 
-def cloud_of(depth: DepthMap, bgr: U8, mask: Bool | None = None) -> PointCloud:
+def cloud_of(
+    depth: DepthMap, bgr: U8, mask: Bool | None = None, time_ns: int | None = None
+) -> PointCloud:
     """World points of the pixels with depth, in row order, where ``mask`` if given.
 
     ``bgr`` is (h, w, 3) on the grid of the depth. Raises ValueError when sizes differ.
@@ -260,7 +283,8 @@ def cloud_of(depth: DepthMap, bgr: U8, mask: Bool | None = None) -> PointCloud:
         known &= mask
     arrays = (depth.depth_m, bgr, depth.K, depth.T_world_camera)
     xyz, rgb = _coloured_places(known, int(known.sum()), *map(np.ascontiguousarray, arrays))
-    return PointCloud(xyz, rgb, depth.sigma_m[known], depth.views[known])
+    times = None if time_ns is None else np.broadcast_to(np.int64(time_ns), (len(xyz),))
+    return PointCloud(xyz, rgb, depth.sigma_m[known], depth.views[known], time_ns=times)
 
 
 @njit(cache=True, nogil=True)

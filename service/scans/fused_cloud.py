@@ -1,6 +1,7 @@
 """The fused cloud of a scan, from the keyframes in its store; LAS and LAZ output.
 
-Files are LAS 1.4, point format 7, with sigma_m and views per point.
+Files are LAS 1.4, point format 7, with sigma_m and views per point. A point's GPS time is that of
+the keyframe that knows it best.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from recon.bands import threads
 from recon.mapping.cloud_fusion import cloud_of, fuse_strips, without
 from recon.mapping.free_space import seen_through, spread
 from recon.mapping.voxel_map import ground_sample_m
-from recon.types import F64, U8, PointCloud
+from recon.types import F64, I64, U8, PointCloud
 from service.georeference import LocalFrame
 from service.progress import Progress
 from service.scans.main_piece import Keyframes, main_keyframes
@@ -99,7 +100,7 @@ def _extents(store: Keyframes, progress: Progress) -> tuple[list[_Extent], dict[
     room = STRIP_POINTS
     for keyframe in progress.over(main_keyframes(store), len(store.seqs())):
         sample = ground_sample_m(keyframe.depth)
-        cloud = cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh)
+        cloud = cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh, keyframe.time_ns)
         if sample is not None and len(cloud):
             x = cloud.xyz_m[:, 0]
             out.append(_Extent(keyframe.seq, len(cloud), sample, float(x.min()), float(x.max())))
@@ -144,7 +145,7 @@ def _strip(
             if seq in held:
                 yield held[seq]
             elif (keyframe := store.keyframe(seq)) is not None:
-                yield cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh)
+                yield cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh, keyframe.time_ns)
 
     return clouds
 
@@ -177,6 +178,7 @@ def las_header(xyz_m: F64, frame: LocalFrame | None, started_unix_ns: int) -> la
     header.system_identifier = "camera stereo"
     when = dt.datetime.fromtimestamp(started_unix_ns / 1e9, dt.timezone.utc)
     header.creation_date = when.date()
+    header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     header.global_encoding.wkt = True  # LAS 1.4 requires it with this format, even without a CRS
     if frame is not None:
         header.add_crs(CRS.from_epsg(frame.epsg))
@@ -190,11 +192,13 @@ def write_laz(
     started_unix_ns: int,
     laz: bool = True,
     classes: U8 | None = None,
+    xyz_m: F64 | None = None,
 ) -> None:
     """Write ``cloud`` (ENU metres) to ``path``, in UTM with AMSL heights when there is a frame.
 
     RGB are 16 bits as the format requires (8-bit value times 257). ``classes`` (N,) are codes of
-    LAS 1.4; without them points were never classified.
+    LAS 1.4; without them points were never classified. ``xyz_m`` are the places in UTM, where
+    known.
     """
     import laspy
 
@@ -204,14 +208,18 @@ def write_laz(
         for at in range(0, len(cloud), CHUNK_POINTS):
             cut = slice(at, at + CHUNK_POINTS)
             part = _cut(cloud, cut)
-            record = point_record(header, placed(part, frame), part)
+            places = placed(part, frame) if xyz_m is None else xyz_m[cut]
+            record = point_record(header, places, part)
             if classes is not None:
                 record["classification"] = classes[cut]
             out.write_points(record)
 
 
 def _cut(cloud: PointCloud, cut: slice) -> PointCloud:
-    return PointCloud(cloud.xyz_m[cut], cloud.rgb[cut], cloud.sigma_m[cut], cloud.views[cut])
+    time_ns = None if cloud.time_ns is None else cloud.time_ns[cut]
+    return PointCloud(
+        cloud.xyz_m[cut], cloud.rgb[cut], cloud.sigma_m[cut], cloud.views[cut], time_ns=time_ns
+    )
 
 
 def point_record(
@@ -228,4 +236,23 @@ def point_record(
     record["number_of_returns"] = np.ones(len(record), np.uint8)
     record["sigma_m"] = cloud.sigma_m
     record["views"] = cloud.views
+    if cloud.time_ns is not None:
+        record["gps_time"] = adjusted_gps_s(cloud.time_ns)
     return record
+
+
+GPS_EPOCH_UNIX_S = 315_964_800
+LEAP_UNIX_S = (
+    362_793_600, 394_329_600, 425_865_600, 489_024_000, 567_993_600, 631_152_000, 662_688_000,
+    709_948_800, 741_484_800, 773_020_800, 820_454_400, 867_715_200, 915_148_800, 1_136_073_600,
+    1_230_768_000, 1_341_100_800, 1_435_708_800, 1_483_228_800,
+)  # fmt: skip
+"""Unix times at which GPS time gained a second on UTC (IERS Bulletin C, none since 2017)."""
+
+GPS_SHIFT_S = 1e9
+
+
+def adjusted_gps_s(unix_ns: I64) -> F64:
+    """(N,) adjusted standard GPS time of LAS 1.4: GPS seconds less 1e9."""
+    leaps = np.searchsorted(np.array(LEAP_UNIX_S) * 1_000_000_000, unix_ns, side="right")
+    return (unix_ns - GPS_EPOCH_UNIX_S * 1_000_000_000) / 1e9 + leaps - GPS_SHIFT_S

@@ -58,7 +58,8 @@ def write_laz_file(scan: ScanView, out: Path, options: ExportOptions) -> None:
     laz = out.suffix.lower() != ".las"
     started_ns = scan.store.header.started_unix_ns
     with writing(out) as part:
-        write_laz(part, scan.fused.cloud, scan.frame, started_ns, laz, classes(scan))
+        kinds, places = classes(scan), scan.xyz_m
+        write_laz(part, scan.fused.cloud, scan.frame, started_ns, laz, kinds, places)
 
 
 UNCLASSIFIED, GROUND = 1, 2
@@ -120,6 +121,7 @@ def _config(
     config.las_header.min = vector(list(map(float, xyz.min(axis=0))))
     config.las_header.max = vector(list(map(float, xyz.max(axis=0))))
     config.las_header.generating_software = "skyrelief"
+    config.las_header.SetGpsTimeBit()  # standard time
     info = config.copc_info
     info.center_x, info.center_y, info.center_z = map(float, centre)
     info.halfsize = half
