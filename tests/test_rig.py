@@ -181,6 +181,20 @@ def test_the_turn_of_the_camera_is_in_its_own_frame() -> None:
         np.testing.assert_allclose(found, math.radians(50.0) * np.array(axis), atol=1e-9)
 
 
+def test_the_turn_is_known_where_telemetry_begins_and_ends() -> None:
+    def at(time_ns: int) -> VehicleState | None:
+        if not 0 <= time_ns <= 1_000_000_000:
+            return None
+        yaw = q(0, 0, 30.0 * time_ns * 1e-9)
+        return VehicleState(time_ns, q_ned_body_wxyz=yaw, sigma_yaw_rad=0.1)
+
+    for time_ns in (0, 10_000_000, 500_000_000, 1_000_000_000):
+        found = rig().turn_at(at, time_ns)
+        assert found is not None
+        np.testing.assert_allclose(found, [0, 0, math.radians(30.0)], atol=1e-9)
+    assert rig().turn_at(at, 2_000_000_000) is None
+
+
 def test_without_attitude_or_time_the_turn_is_unknown() -> None:
     state = VehicleState(0, q_ned_body_wxyz=q(0, 0, 0), sigma_yaw_rad=0.1)
     assert rig().turn(state, state) is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -34,6 +35,9 @@ MIN_SIGMA_M, MAX_ALTITUDE_M = 0.005, 1e5
 TAG_HEIGHT_M, BAROMETER_M = 50.0, 5.0
 """Sigma of an altitude in a still's tags: of a camera's receiver, and of a drone that also writes
 its height above the take-off point."""
+
+TURN_NS = 20_000_000
+"""Before and after an exposure: how telemetry's attitude changes there is the camera's turn."""
 
 NO_YAW_RAD = 3.0
 """Sigma of an unknown heading."""
@@ -107,6 +111,14 @@ class Rig:
             altitude = state.alt_amsl_m
             prior = replace(prior, altitude_m=None if altitude is None else altitude + lever[2])
         return prior
+
+    def turn_at(self, state_at: Callable[[int], VehicleState | None], time_ns: int) -> F64 | None:
+        """(3,) rad/s of the camera in its own frame; by one side where telemetry begins or ends."""
+        for begin, end in ((-TURN_NS, TURN_NS), (0, TURN_NS), (-TURN_NS, 0)):
+            turn = self.turn(state_at(time_ns + begin), state_at(time_ns + end))
+            if turn is not None:
+                return turn
+        return None
 
     def turn(self, before: VehicleState | None, after: VehicleState | None) -> F64 | None:
         """(3,) rad/s of the camera in its own frame between two states; None without attitude."""

@@ -42,10 +42,6 @@ TIME_STEP_NS = 100_000
 """Frame times are rounded to this; no camera's clock is finer."""
 
 
-TURN_NS = 20_000_000
-"""Before and after an exposure: how telemetry's attitude changes there is the camera's turn."""
-
-
 class Datalink(Protocol):
     """The sending end, as a scan needs it."""
 
@@ -179,8 +175,7 @@ class Scan:
         history = self.inputs.history
         if history is None:
             return None
-        before, after = (history.state_at(exposed_ns + d) for d in (-TURN_NS, TURN_NS))
-        return self.rig.turn(before, after)
+        return self.rig.turn_at(history.state_at, exposed_ns)
 
     def run(
         self,
