@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
+import tempfile
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -73,10 +76,17 @@ class Client:
 
 def flown_store(root: Path, house: HouseFlight) -> Path:
     """``root`` with the scan drone-1/test-1 and its files in it."""
-    folder = root / "drone-1" / "test-1"
-    with house.flown(folder) as scan:
-        write_deliverables(folder, scan, {})
+    shutil.copytree(_finished(house).name, root / "drone-1" / "test-1")
     return root
+
+
+@cache
+def _finished(house: HouseFlight) -> tempfile.TemporaryDirectory[str]:
+    """The scan and its files, made once."""
+    folder = tempfile.TemporaryDirectory()
+    with house.flown(Path(folder.name)) as scan:
+        write_deliverables(Path(folder.name), scan, {})
+    return folder
 
 
 @contextlib.contextmanager

@@ -15,6 +15,7 @@ from typing import Any
 import laspy
 import numpy as np
 import pytest
+from command_line import skyrelief
 from loopback import until
 
 EPOCH = 1777629600  # of the simulated video; a transport stream does not carry it
@@ -25,7 +26,8 @@ SPARSE = ("--set", "compute.stereo_width=320")
 SPARSEST = ("--set", "compute.stereo_width=160", "--set", "compute.guide_width=320")
 
 
-def skyrelief(*arguments: str | Path, stdin: Any = subprocess.DEVNULL) -> Run:
+def process(*arguments: str | Path, stdin: Any = subprocess.DEVNULL) -> Run:
+    """``skyrelief`` as a process of its own."""
     command = [sys.executable, "-m", "service.cli", *map(str, arguments)]
     return subprocess.run(command, stdin=stdin, capture_output=True, text=True, timeout=240)
 
@@ -42,18 +44,19 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def replay_of(flight: Path, out: Path, *more: str | Path) -> Run:
-    return skyrelief(
+def replay_of(flight: Path, out: Path) -> list[str | Path]:
+    """The command that replays the flight with its telemetry."""
+    return [
         "replay", flight / "flight.mp4", "--telemetry", flight / "flight.tlog",
-        "--camera-model", flight / "camera.yaml", "--out", out, "--json", *SPARSE, *more,
-    )  # fmt: skip
+        "--camera-model", flight / "camera.yaml", "--out", out, "--json", *SPARSE,
+    ]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def scan(flight: Path) -> tuple[Path, dict[str, Any]]:
     """The flight replayed with telemetry."""
     out = flight.parent / "scan"
-    done = replay_of(flight, out)
+    done = process(*replay_of(flight, out))
     assert done.returncode == 0, done.stderr
     return out, json.loads(done.stdout.splitlines()[-1])
 
@@ -116,7 +119,7 @@ def test_a_pipe_gives_the_same_cloud_as_the_file(
          "-c", "copy", "-f", "mpegts", "-"],
         stdout=subprocess.PIPE, stdin=subprocess.DEVNULL,
     )  # fmt: skip
-    done = skyrelief(
+    done = process(
         "replay", "-", "--telemetry", flight / "flight.tlog", "--camera-model",
         flight / "camera.yaml", "--out", tmp_path / "scan", "--json",
         "--video-epoch", str(EPOCH), *SPARSE, stdin=muxed.stdout,
@@ -130,7 +133,7 @@ def test_a_second_run_into_the_same_folder_is_refused(
     flight: Path, scan: tuple[Path, dict[str, Any]]
 ) -> None:
     before = points(scan[0])
-    again = replay_of(flight, scan[0])
+    again = skyrelief(*replay_of(flight, scan[0]))
     assert again.returncode == 2 and "already holds a scan" in again.stderr
     np.testing.assert_array_equal(points(scan[0]), before)
 
@@ -196,7 +199,7 @@ CASES = (
 def test_bad_input_gets_one_line_and_exit_code_two(case: str, flight: Path, tmp_path: Path) -> None:
     arguments, words = bad_inputs(flight, tmp_path)[case]
     more: list[str | Path] = [] if "--out" in arguments else ["--out", tmp_path / "scan"]
-    done = skyrelief("replay", *arguments, *more)
+    done = (process if case == "unknown key" else skyrelief)("replay", *arguments, *more)
     last = done.stderr.strip().splitlines()[-1]
     assert done.returncode == 2, done.stderr
     assert last.startswith("skyrelief: ") and words in last, last
@@ -225,5 +228,5 @@ def test_an_unreadable_folder_loses_nothing(flight: Path, tmp_path: Path) -> Non
         pytest.skip("root may write everywhere")
     closed = tmp_path / "closed"
     closed.mkdir(mode=0o500)
-    done = replay_of(flight, closed / "scan")
+    done = skyrelief(*replay_of(flight, closed / "scan"))
     assert done.returncode == 2 and "closed" in done.stderr
