@@ -30,30 +30,24 @@ def mesh(seed: int = 0) -> tuple[F64, Array]:
 
 def brute_cast(corners: F64, origin: F64, direction: F64) -> float:
     """Nearest hit by solving every triangle's 3x3 system."""
-    best = np.inf
-    for p, e1, e2 in corners.reshape(-1, 3, 3):
-        M = np.stack([e1, e2, -direction], axis=1)
-        if abs(np.linalg.det(M)) < 1e-12:
-            continue
-        u, v, t = np.linalg.solve(M, origin - p)
-        if u >= 0 and v >= 0 and u + v <= 1 and t > 1e-9:
-            best = min(best, float(t))
-    return best
+    p, e1, e2 = np.moveaxis(corners.reshape(-1, 3, 3), 1, 0)
+    M = np.stack([e1, e2, np.broadcast_to(-direction, e1.shape)], axis=-1)
+    able = np.abs(np.linalg.det(M)) >= 1e-12
+    u, v, t = np.linalg.solve(M[able], (origin - p[able])[..., None])[..., 0].T
+    hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-9)
+    return float(t[hit].min(initial=np.inf))
 
 
 def brute_closest(corners: F64, point: F64) -> float:
     """Distance by clamped projection onto every triangle's plane and edges."""
-    best = np.inf
-    for p, e1, e2 in corners.reshape(-1, 3, 3):
-        solution = np.linalg.lstsq(np.stack([e1, e2], axis=1), point - p, rcond=None)[0]
-        candidates = []
-        if solution.min() >= 0 and solution.sum() <= 1:
-            candidates.append(p + solution[0] * e1 + solution[1] * e2)
-        for start, edge in ((p, e1), (p, e2), (p + e1, e2 - e1)):
-            share = np.clip((point - start) @ edge / (edge @ edge), 0, 1)
-            candidates.append(start + share * edge)
-        best = min(best, *(float(np.linalg.norm(point - c)) for c in candidates))
-    return best
+    p, e1, e2 = np.moveaxis(corners.reshape(-1, 3, 3), 1, 0)
+    u, v = (np.linalg.pinv(np.stack([e1, e2], axis=-1)) @ (point - p)[..., None])[..., 0].T
+    inside = (u >= 0) & (v >= 0) & (u + v <= 1)
+    candidates = [(p + u[:, None] * e1 + v[:, None] * e2)[inside]]
+    for start, edge in ((p, e1), (p, e2), (p + e1, e2 - e1)):
+        share = np.clip(np.sum((point - start) * edge, 1) / np.sum(edge * edge, 1), 0, 1)
+        candidates.append(start + share[:, None] * edge)
+    return float(np.linalg.norm(np.concatenate(candidates) - point, axis=1).min())
 
 
 @pytest.mark.parametrize("cell_m", [0.4, 1.0, 3.7])
