@@ -97,6 +97,24 @@ def house() -> HouseFlight:
     return HouseFlight()
 
 
+FIRST = (
+    "test_replay", "test_refine_images", "test_pose_graph", "test_refine",
+    "test_graph_hard_flights", "test_own_camera", "test_graph_dropped", "test_doc_commands_run",
+    "test_trial_service", "test_replay_backends", "test_trial_attack", "test_sim_recording",
+    "test_trial_soak", "test_demo", "test_trial_load", "test_calibration", "test_trial_closing",
+    "test_ground_hostile", "test_trial_ground", "test_hostile_scans", "test_simulated",
+    "test_ground_killed", "test_ground_receiver", "test_bench_real", "test_mavlink_flight",
+)  # fmt: skip
+"""The files that take longest. A replay compiles the kernels that the trials' processes load; files
+that wait lie between those that compute."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest files, so that no worker is left alone with one of them."""
+    place = {name: k for k, name in enumerate(FIRST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(FIRST)))
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--device cuda`` runs the tests of the backends on a GPU."""
     parser.addoption("--device", default="cpu", choices=("cpu", "cuda"), help="of the backends")
