@@ -146,13 +146,13 @@ def test_reported_covariance_holds() -> None:
     last: list[float] = []
     middle: list[float] = []
     for seed in range(24):
-        f = flight(50, seed=seed)
+        f = flight(30, seed=seed, turn_every=18)
         graph, pose = fly(f)
-        for i, values in ((49, last), (25, middle)):
+        for i, values in ((29, last), (15, middle)):
             p = graph.pose(i)
             error = se3.log(p.T_world_camera @ se3.inverse(f.truth[i]))
             values.append(float(error @ np.linalg.solve(p.covariance, error)))
-        np.testing.assert_allclose(pose.T_world_camera, graph.pose(49).T_world_camera)
+        np.testing.assert_allclose(pose.T_world_camera, graph.pose(29).T_world_camera)
     # The mean of 24 chi-squares of six degrees has a standard deviation of 0.7.
     assert 4.0 < np.mean(last) < 8.5
     assert 4.0 < np.mean(middle) < 8.5
@@ -352,7 +352,7 @@ def to_and_fro(breaks: int, seed: int) -> PoseGraph:
     return graph
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_breaks_in_vision_do_not_swing_the_track(seed: int) -> None:
     """A turn that nothing knows at the break must not become a way at the end of its lever."""
     z_m = to_and_fro(5, seed).pose_array()[:, 2, 3]
