@@ -6,6 +6,7 @@ import csv
 import json
 import struct
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -106,18 +107,20 @@ def wrong(T: F64) -> F64:
     return se3.compose(se3.so3_exp(TURN), SHIFT) @ T
 
 
+@cache
+def seen(keyframes: int) -> tuple[F64, list[F64]]:
+    """(N, 4, 4) poses on two legs over the country, and the depth from each."""
+    half = keyframes // 2
+    places = [
+        (6.0 * min(k, keyframes - 1 - k), 0.0 if k < half else 20.0, 40.0) for k in range(keyframes)
+    ]
+    truth = np.array([se3.compose(DOWN, np.array(place)) for place in places])
+    return truth, [ground_depth(T) for T in truth]
+
+
 def fly(folder: Path, placed: bool = True, finished: bool = True, keyframes: int = 16) -> Flight:
     """Two legs over the country, stored with poses that are off."""
-    half = keyframes // 2
-    truth = np.array(
-        [
-            se3.compose(
-                DOWN,
-                np.array([6.0 * min(k, keyframes - 1 - k), 0.0 if k < half else 20.0, 40.0]),
-            )
-            for k in range(keyframes)
-        ]
-    )
+    truth, depths = seen(keyframes)
     camera = {"width": SIZE[0], "height": SIZE[1], "K": K.ravel().tolist(), "distortion": [0.0] * 5}
     header = ScanHeader("test-1", "drone-1", START_NS, camera=camera)
     if placed:
@@ -125,12 +128,12 @@ def fly(folder: Path, placed: bool = True, finished: bool = True, keyframes: int
             header, origin_lat_deg=FRAME.lat_deg, origin_lon_deg=FRAME.lon_deg,
             origin_alt_amsl_m=FRAME.alt_amsl_m, epsg=FRAME.epsg, georeference="gnss",
         )  # fmt: skip
-    flight = Flight(folder, truth, placed)
+    flight = Flight(folder, truth.copy(), placed)
     spread = np.diag([0.01**2] * 3 + [1.5**2] * 3)
     with ScanStore.create(flight.scan / "scan.db", header) as store:
         for k, T in enumerate(truth):
             time_ns = START_NS + k * 10**9
-            depth = ground_depth(T).astype(np.float32)
+            depth = depths[k].astype(np.float32)
             sigma = np.full(depth.shape, 0.05, np.float32)
             views = np.full(depth.shape, 3, np.uint8)
             bgr = np.full((*depth.shape, 3), 120, np.uint8)

@@ -154,7 +154,7 @@ def flown(
     autopilot.armed.clear()
     limit_s = max(PATIENCE_S, long_s)  # closing a long scan takes minutes next to other work
     service.until(lambda: service.get().get("state") == "idle", "landing", limit_s)
-    time.sleep(5.0)  # until what the scan held is given back
+    time.sleep(5.0 if WHOLE else 0.0)  # until what the scan held is given back
     now = held(service.process.pid)
     hours = (time.monotonic() - begin_s) / 3600.0
     (folder,) = set(scan_folders(service.scans)) - scans
