@@ -67,8 +67,9 @@ def fly(images: list[U8]) -> tuple[list[Keyframe], Counter[str], Pipeline]:
     rig = Rig(config.camera, config.scan, config.fusion)
     keyframes: list[Keyframe] = []
     for i, image in enumerate(images):
-        frame = Frame(image, i * 40_000_000, i, rig.prior(state(i), None))
-        keyframes += pipeline.step(frame).keyframes
+        time_ns, prior = i * 40_000_000, rig.prior(state(i), None)
+        step = pipeline.skip(time_ns, prior) or pipeline.step(Frame(image, time_ns, i, prior))
+        keyframes += step.keyframes
     keyframes += pipeline.finish().keyframes
     return keyframes, pipeline.refusals(), pipeline
 

@@ -5,11 +5,18 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from recon.backends.cpu import CpuBackend
+from recon.tracking.odometry import Tracked, Tracking
+from recon.types import U8, Camera
 from service.cameras.source import CameraFrame, ahead
+from service.config import load_config
+from service.flight.pipeline import Step
+from service.flight.scan import Scan, ScanInputs, create_store
 
 
 class Recording:
@@ -54,3 +61,32 @@ def test_no_more_than_a_few_are_decoded_ahead_and_a_stop_ends_the_thread() -> No
     assert recording.taken <= 1 + 3 + 1
     frames.close()
     assert not any(t.name == "decoder" for t in threading.enumerate())
+
+
+class Unseen:
+    """An image that nothing may look at."""
+
+    shape = (90, 160, 3)
+
+    def __call__(self) -> U8:
+        raise AssertionError("looked at")
+
+
+def test_a_frame_that_tracking_skips_is_not_looked_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    K = np.array([[140.0, 0.0, 79.5], [0.0, 140.0, 44.5], [0.0, 0.0, 1.0]])
+    inputs = ScanInputs(
+        Recording(0), Camera(K, np.zeros(5), (160, 90)), load_config(None, []), CpuBackend(),
+        tmp_path, "scan", 0,
+    )  # fmt: skip
+    with create_store(inputs) as store:
+        scan = Scan(inputs, store)
+        frame = CameraFrame(Unseen(), 0, 0, None, "frame 0")
+        with pytest.raises(AssertionError, match="looked at"):
+            scan.feed(frame)
+        skipped = Step(Tracked(Tracking.SKIPPED, 0))
+        monkeypatch.setattr(scan.pipeline, "skip", lambda time_ns, prior: skipped)
+        assert scan.feed(frame) is skipped
+        assert scan.recorder.states[Tracking.SKIPPED] == 1
+        scan.pipeline.finish()

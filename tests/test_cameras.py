@@ -14,7 +14,8 @@ import av
 import numpy as np
 import pytest
 
-from service.cameras import CAMERAS, CameraFrame, CameraSource, open_camera, parse_source
+from recon.types import U8
+from service.cameras import CAMERAS, CameraFrame, CameraSource, open_camera, parse_source, video
 from service.cameras.video import PipeReader, VideoSource, index_at_end, parse_time_unix_ns
 from service.errors import InputError
 
@@ -87,6 +88,23 @@ def test_file_keeps_images_and_times(tmp_path: Path, name: str, container_format
         assert abs(frame.time_ns - ms * 1_000_000) <= tolerance_ns
     assert source.warnings == []
     assert list(source) == []
+
+
+def test_an_image_that_is_not_looked_at_is_not_converted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "v.mp4"
+    write_video(str(path), "mp4")
+    looked_at: list[int] = []
+
+    def convert(frame: av.VideoFrame) -> U8:
+        looked_at.append(int(frame.pts or 0))
+        return np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
+
+    monkeypatch.setattr(video, "frame_bgr", convert)
+    frames = list(open_camera(str(path)))
+    assert [f.size_px for f in frames] == [SIZE_PX] * len(TIMES_MS) and not looked_at
+    assert frames[2].image.shape == (*SIZE_PX[::-1], 3) and len(looked_at) == 1
 
 
 def test_images_that_are_not_wanted_are_passed_over(tmp_path: Path) -> None:

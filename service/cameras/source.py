@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from threading import Event
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+
 from recon.types import U8
 from service.background import Channel
 from service.workers import PROCESS, Worker
@@ -27,15 +29,38 @@ class GeoTag:
     relative_alt_m: float | None = None  # above the take-off point
 
 
+class Unconverted(Protocol):
+    """An image that is made when it is asked for: of a video only some are looked at."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(H, W, 3)."""
+        ...
+
+    def __call__(self) -> U8:
+        """(H, W, 3) BGR."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraFrame:
     """One image of a source."""
 
-    image: U8  # (H, W, 3) BGR
+    pixels: U8 | Unconverted  # (H, W, 3) BGR
     time_ns: int  # presentation time, ns since the start of the stream
     seq: int  # 0, 1, 2 … of the delivered images
     geotag: GeoTag | None
     name: str  # file name of a still, else "frame <seq>"
+
+    @property
+    def image(self) -> U8:
+        """(H, W, 3) BGR."""
+        return self.pixels if isinstance(self.pixels, np.ndarray) else self.pixels()
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(W, H)."""
+        return self.pixels.shape[1], self.pixels.shape[0]
 
 
 @runtime_checkable

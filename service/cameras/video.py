@@ -11,6 +11,7 @@ import itertools
 import logging
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from fractions import Fraction
 from pathlib import Path
@@ -37,6 +38,25 @@ EARLIEST_UNIX_S = 946_684_800  # 2000-01-01: cameras without a clock write 1904 
 OPTIONS = ("format", "video_size", "pixel_format", "framerate")
 
 HEAD_BYTES = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """An image as the decoder gave it, in BGR once that is asked for."""
+
+    frame: av.VideoFrame
+    turned_deg: int  # clockwise
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(H, W, 3) as turned."""
+        stored = int(self.frame.width), int(self.frame.height)
+        W, H = stored[::-1] if self.turned_deg % 180 else stored
+        return H, W, 3
+
+    def __call__(self) -> U8:
+        """(H, W, 3) BGR."""
+        return np.ascontiguousarray(np.rot90(frame_bgr(self.frame), -(self.turned_deg // 90)))
 
 
 class VideoSource:
@@ -108,8 +128,8 @@ class VideoSource:
                 )
                 break
             if self.is_wanted(time_ns):
-                image = np.rot90(frame_bgr(frame), -(self.turned_deg // 90))
-                yield CameraFrame(np.ascontiguousarray(image), time_ns, seq, None, f"frame {seq}")
+                pixels = Decoded(frame, self.turned_deg)
+                yield CameraFrame(pixels, time_ns, seq, None, f"frame {seq}")
             last_ns = time_ns
             seq += 1
         else:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 from recon.posegraph.trajectory import Placed
 from recon.tracking.odometry import Tracked, Tracking
-from recon.types import Frame, Keyframe
+from recon.types import Frame, Keyframe, PosePrior
 from service.config import ComputeConfig, ScanConfig
 from service.flight.anchorage import Anchorage
 from service.flight.stages import Stages
@@ -42,14 +42,19 @@ class Pipeline:
 
     # ---- the figure --------------------------------------------------------------------
 
+    def skip(self, time_ns: int, prior: PosePrior) -> Step | None:
+        """The step of a frame that need not be seen; None for one that :meth:`step` must take."""
+        track = self.stages.track  # frames are followed as fast as the image moves
+        if not track.can_skip(time_ns, prior):
+            return None
+        return Step(Tracked(Tracking.SKIPPED, track.segment))
+
     def step(self, frame: Frame) -> Step:
         """One frame: where the camera is, and which views have their partners by now.
 
         Raises ValueError when the image is not of the camera model's size.
         """
         s = self.stages
-        if s.track.can_skip(frame):  # frames are followed as fast as the image moves
-            return Step(Tracked(Tracking.SKIPPED, s.track.segment))
         image = s.undistort(frame)  # section 2.1
         tracked = s.track(image)  # Harris and ZSSD (Eq. 4-5), EPnP (Eq. 6-7)
         anchor, is_view = s.views.take(image, tracked)  # virtual stereo camera, section 2.3

@@ -143,8 +143,7 @@ class Scan:
     def feed(self, frame: CameraFrame) -> Step | None:
         """One frame through the pipeline; None when its size is not the camera's."""
         inputs = self.inputs
-        H, W = frame.image.shape[:2]
-        if inputs.camera.size_px != (W, H):
+        if frame.size_px != inputs.camera.size_px:
             self.odd_sized += 1
             return None
         time_ns = self.epoch_ns + frame.time_ns
@@ -160,7 +159,9 @@ class Scan:
         prior = self._odometer.take(exposed_ns, self.rig.prior(state, frame.geotag))
         if self._is_rolling:
             prior = replace(prior, turn_rad_s=self._turn(exposed_ns))
-        step = self.pipeline.step(Frame(frame.image, exposed_ns, frame.seq, prior))
+        step = self.pipeline.skip(exposed_ns, prior)
+        if step is None:
+            step = self.pipeline.step(Frame(frame.image, exposed_ns, frame.seq, prior))
         self.check.add(time_ns, step.tracked)
         self.tracking.look(step.tracked, time_ns)
         for doubt in self.pipeline.stages.chain.new_doubts():

@@ -49,6 +49,7 @@ from recon.types import (
     Keyframe,
     PolarPair,
     Pose,
+    PosePrior,
     RectifiedPair,
     StereoPair,
     Verdict,
@@ -128,9 +129,9 @@ class Track:
         self.odometry, self._selection = odometry, selection
         self._refused, self._stopwatch = refused, stopwatch
 
-    def can_skip(self, frame: Frame) -> bool:
+    def can_skip(self, time_ns: int, prior: PosePrior) -> bool:
         """True for a frame so close to the last one that nothing needs its pose."""
-        return self.odometry.can_skip(frame.time_ns, frame.prior, self._selection.frames_per_step)
+        return self.odometry.can_skip(time_ns, prior, self._selection.frames_per_step)
 
     def __call__(self, image: UndistortedFrame) -> Tracked:
         """The frame's pose, or why there is none."""
