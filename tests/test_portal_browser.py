@@ -66,7 +66,7 @@ def test_rename_download_delete_and_bring_back(browser: Browser, portal: Portal)
     assert size > 10_000
     browser.click("Delete")
     browser.wait("document.querySelectorAll('article').length === 0")
-    browser.click("Bring back")
+    browser.click("Restore")
     browser.wait("document.querySelectorAll('article').length === 1")
     assert browser.run("document.querySelector('h2').textContent").startswith("<img")
 

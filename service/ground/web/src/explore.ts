@@ -159,7 +159,7 @@ export class Images {
     cameras.show(seq, image);
     stage.touch();
     const text = this.chosen === null ? `latest keyframe, ${seq}` : `keyframe ${seq}`;
-    const back = el("button", { textContent: "Latest", title: "the newest keyframe again" });
+    const back = el("button", { textContent: "Latest", title: "back to the newest keyframe" });
     back.onclick = () => ((this.chosen = null), this.refresh());
     this.element.hidden = false;
     this.element.replaceChildren(image, el("figcaption", {}, text, this.chosen !== null && back));

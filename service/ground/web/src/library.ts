@@ -94,7 +94,7 @@ function empty(filtered: boolean): HTMLElement {
     "div",
     { className: "empty" },
     el("h2", { textContent: "No scans yet" }),
-    el("p", { textContent: "They appear here as soon as a drone calls. A scan folder or an MCAP from an aircraft's storage can be imported above." }),
+    el("p", { textContent: "They appear here as soon as a drone connects. You can import a scan folder or an MCAP from an aircraft's storage above." }),
   );
 }
 
@@ -217,7 +217,7 @@ function binRows(names: string[], again: () => void): HTMLElement[] {
       name.split("~").slice(0, 2).join(" / "),
       " ",
       el("button", {
-        textContent: "Bring back",
+        textContent: "Restore",
         onclick: () => void api.restore(name).then(again, notify),
       }),
     ),

@@ -92,7 +92,7 @@ export class LiveView {
     };
     socket.onclose = ({ code, reason }) => {
       if (this.closed) return;
-      this.onState(code === 1008 ? reason || "refused" : "the portal does not answer, trying again");
+      this.onState(code === 1008 ? reason || "refused" : "the portal does not answer; trying again");
       if (code !== 1008) setTimeout(() => this.closed || this.open(), 1500);
     };
   }

@@ -155,13 +155,13 @@ export class Ruler {
     const acts = el(
       "p",
       { className: "acts" },
-      button("Undo", "take back the last point (Backspace)", !n, () => this.back()),
-      button("Clear", "take back all points (Esc)", !n, () => this.clear()),
+      button("Undo", "remove the last point (Backspace)", !n, () => this.back()),
+      button("Clear", "remove all points (Esc)", !n, () => this.clear()),
       button("Copy", out, !n || homeless, () => void copy(this.geojson()).then(() => notify("copied"), notify)),
       button("GeoJSON", out, !n || homeless, () => save("measurement.geojson", this.geojson())),
     );
     if (n < 2) {
-      const hint = n ? "Click the next point." : "Click a point. Backspace takes the last one back, Esc ends.";
+      const hint = n ? "Click the next point." : "Click a point. Backspace removes the last one, Esc all.";
       return [el("p", { textContent: hint }), acts];
     }
     const facts = Object.entries(this.words()).flatMap(([k, v]) => [

@@ -26,12 +26,12 @@ export function toolbar(parts: Parts): HTMLElement {
   const bar = el("span", { className: "tools" });
   const follow = el("button", {
     textContent: "Follow",
-    title: "go along with the aircraft",
+    title: "follow the aircraft",
     onclick: () => void (stage.follow = true),
   });
   const whole = el("button", {
     textContent: "Whole site",
-    title: "see all of it; W A S D R F fly",
+    title: "show all of it; W A S D R F fly",
     onclick: () => ((stage.follow = false), stage.frame()),
   });
   bar.append(
