@@ -35,6 +35,7 @@ from recon.mapping.registration import (
     MIN_PARTNERS,
     Equations,
     IcpConfig,
+    arrays_of,
     conclude,
 )
 from recon.types import F64, Array, DepthMap, Registration
@@ -56,7 +57,7 @@ class DeviceIcp:
         start = np.array(T_target_source, np.float64)
         if start.shape != (4, 4) or not np.isfinite(start).all():
             raise ValueError("T_target_source must be (4, 4) finite numbers")
-        given = [*_inputs(source), *_inputs(target), start]
+        given: list[Array] = [*arrays_of(source), *arrays_of(target), start]
         key = (source.depth_m.shape, target.depth_m.shape, config)
         with torch.inference_mode():
             plan = kept(
@@ -70,17 +71,6 @@ class DeviceIcp:
     def plan(self) -> Plan:
         """Of the last new pair of sizes, with its inputs on the device."""
         return list(self._plans.values())[-1]
-
-
-def _inputs(depth: DepthMap) -> list[Array]:
-    """Depth, sigma and intrinsics; ValueError when shapes disagree."""
-    h, w = depth.depth_m.shape
-    if depth.sigma_m.shape != (h, w) or min(h, w) < 8:
-        raise ValueError(f"depth {h, w} and sigma {depth.sigma_m.shape} do not fit")
-    K = depth.K
-    intrinsics = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], np.float64)
-    z, sigma = (np.ascontiguousarray(a, np.float32) for a in (depth.depth_m, depth.sigma_m))
-    return [z, sigma, intrinsics]
 
 
 def _descent(config: IcpConfig) -> Callable[..., tuple[Tensor, ...]]:

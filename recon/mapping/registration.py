@@ -17,16 +17,6 @@ from recon.camera_model import rays
 from recon.mapping import icp_kernels
 from recon.types import F32, F64, Bool, DepthMap, Registration, Verdict
 
-__all__ = [
-    "Equations",
-    "IcpConfig",
-    "Surface",
-    "conclude",
-    "register_projective",
-    "register_surfaces",
-]
-
-
 # Variance that the residuals do not show: edges half seen, errors of the normals; measured.
 _UNSEEN_VARIANCE = 1.5
 
@@ -68,6 +58,15 @@ class IcpConfig:
             raise ValueError("weak_slope and unknown_sigma_m must be positive")
 
 
+def arrays_of(depth: DepthMap) -> tuple[F32, F32, F64]:
+    """Depth and sigma (h, w) and (4,) fx fy cx cy; ValueError when shapes disagree."""
+    h, w = depth.depth_m.shape
+    if depth.sigma_m.shape != (h, w) or min(h, w) < 8:
+        raise ValueError(f"depth {h, w} and sigma {depth.sigma_m.shape} do not fit")
+    z, sigma = (np.ascontiguousarray(a, np.float32) for a in (depth.depth_m, depth.sigma_m))
+    return z, sigma, depth.K[[0, 1, 0, 1], [0, 1, 2, 2]]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
     """A depth map with its surface elements, ready to be aligned many times."""
@@ -80,13 +79,8 @@ class Surface:
     @staticmethod
     def build(depth: DepthMap, config: IcpConfig) -> Surface:
         """The surface of ``depth``; raises ValueError when its shapes disagree."""
-        h, w = depth.depth_m.shape
-        if depth.sigma_m.shape != (h, w) or min(h, w) < 8:
-            raise ValueError(f"depth {h, w} and sigma {depth.sigma_m.shape} do not fit")
-        K = depth.K
-        z = np.ascontiguousarray(depth.depth_m, np.float32)
-        sigma = np.ascontiguousarray(depth.sigma_m, np.float32)
-        intrinsics = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+        z, sigma, intrinsics = arrays_of(depth)
+        h, w = z.shape
         elements = np.zeros((h, w, 6), np.float32)
         inverse = 1.0 / np.where(z > 0, z, np.float32(np.nan)).astype(np.float64)
         chunks = -(-h // icp_kernels.CHUNK)
@@ -96,7 +90,7 @@ class Surface:
         )  # fmt: skip
         v, u = np.nonzero(elements[::4, ::4, 4])
         some = z[4 * v, 4 * u].astype(np.float64)
-        points = some[:, None] * rays(K, np.column_stack([4.0 * u, 4.0 * v]))
+        points = some[:, None] * rays(depth.K, np.column_stack([4.0 * u, 4.0 * v]))
         centre = points.mean(axis=0) if len(points) else np.zeros(3)
         lever = np.sqrt(np.mean(np.sum((points - centre) ** 2, axis=1))) if len(points) else 1.0
         return Surface(elements, intrinsics, centre, max(float(lever), 1e-6))

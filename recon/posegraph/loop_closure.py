@@ -27,16 +27,7 @@ MIN_RAD, MIN_SHARE = 2e-4, 0.1
 """A loop's sigmas are no less than this, and than this share of its depths' sigma: what the
 points of one depth map have in common does not average out."""
 
-__all__ = [
-    "LoopClosure",
-    "LoopConfig",
-    "LoopView",
-    "candidates",
-    "ground_seen",
-    "landmarks",
-    "verify",
-    "warps",
-]
+__all__ = ["LoopClosure", "LoopConfig", "LoopView"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,6 +25,7 @@ from mavlink.component.vehicle import VehicleConfig, VehicleLink
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
 from recon import se3
+from recon.posegraph.submap_loops import points_of
 from recon.types import F64, DepthMap, Keyframe, Pose
 from service.bench import idle_control
 from service.bench.link_emulator import free_port
@@ -214,16 +215,6 @@ def _keyframe(seq: int) -> Keyframe:
     return Keyframe(seq, 0, depth, bgr, Pose(T, np.eye(6) * 1e-4), fresh)
 
 
-def _points(frame: Keyframe) -> F64:
-    """(n, 3) points in the world."""
-    depth = frame.depth
-    v, u = np.nonzero(np.isfinite(depth.depth_m))
-    z = depth.depth_m[v, u].astype(np.float64)
-    K = depth.K
-    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(len(u))], axis=1)
-    return se3.transform(depth.T_world_camera, rays * z[:, None])
-
-
 def _cells(frames: list[F64]) -> set[tuple[int, int]]:
     return {(int(x // CELL_M), int(y // CELL_M)) for points in frames for x, y in points[:, :2]}
 
@@ -231,8 +222,11 @@ def _cells(frames: list[F64]) -> set[tuple[int, int]]:
 def _outcome(
     onboard: ScanStore, ground: ScanStore, flight: _Flight, sent: dict[int, int]
 ) -> RadioOutcome:
-    there = [_points(frame) for frame in ground.keyframes()]
-    seen = _cells([_points(frame) for frame in onboard.keyframes()])
+    there, here = (
+        [points_of(k.depth, k.depth.T_world_camera)[0] for k in store.keyframes()]
+        for store in (ground, onboard)
+    )
+    seen = _cells(here)
     points = np.concatenate(there)
     error = points[:, 2] - _ground_m(points[:, 0], points[:, 1])
     whole = BYTES_S * FLIGHT_S

@@ -5,7 +5,6 @@ EXIF 2.32 (CIPA DC-008-2019) sections 4.6.5 and 4.6.6; XMP names as DJI writes t
 
 from __future__ import annotations
 
-import math
 import re
 import struct
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from service.cameras.lens import Lens, lens_of
+from service.cameras.lens import Lens, finite_number, finite_numbers, lens_of
 from service.cameras.source import GeoTag
 
 XMP_BYTES = 1 << 18  # DJI's block sits in the first 64 KiB
@@ -118,7 +117,7 @@ def _offset_ns(text: str) -> int | None:
 
 
 def _gps_unix_ns(gps: dict[int, Any]) -> int | None:
-    clock = _numbers(gps.get(7), 3)
+    clock = finite_numbers(gps.get(7), 3)
     try:
         day = datetime.strptime(str(gps.get(29, "")).strip("\0 "), "%Y:%m:%d")
     except ValueError:
@@ -139,11 +138,11 @@ def _geotag(gps: dict[int, Any], xmp: dict[str, str]) -> GeoTag | None:
         )
     if lat is None or lon is None or abs(lat) > 90 or abs(lon) > 180 or (lat == 0 and lon == 0):
         return None
-    altitude = _number(gps.get(6))
+    altitude = finite_number(gps.get(6))
     if altitude is not None and gps.get(5) in (1, b"\x01"):
         altitude = -altitude
     rtk = [_xmp_number(xmp, "RtkStdLat"), _xmp_number(xmp, "RtkStdLon")]
-    stated = max((s for s in rtk if s), default=None) or _number(gps.get(31))
+    stated = max((s for s in rtk if s), default=None) or finite_number(gps.get(31))
     return GeoTag(
         lat_deg=lat,
         lon_deg=lon,
@@ -178,37 +177,18 @@ def _xmp(path: Path) -> dict[str, str]:
 
 def _xmp_number(xmp: dict[str, str], *names: str) -> float | None:
     for name in names:
-        value = _number(xmp.get(name))
+        value = finite_number(xmp.get(name))
         if value is not None:
             return value
     return None
 
 
 def _degrees(value: Any, reference: Any, negative: str) -> float | None:
-    parts = _numbers(value, 3)
+    parts = finite_numbers(value, 3)
     if parts is None:
         return None
     degrees = parts[0] + parts[1] / 60 + parts[2] / 3600
     return -degrees if str(reference).strip("\0 ").upper() == negative else degrees
-
-
-def _numbers(value: Any, count: int) -> list[float] | None:
-    try:
-        numbers = [_number(part) for part in value]
-    except TypeError:
-        return None
-    if len(numbers) != count or any(n is None for n in numbers):
-        return None
-    return [n for n in numbers if n is not None]
-
-
-def _number(value: Any) -> float | None:
-    """A finite float of an EXIF rational or a text; None for x/0 and the like."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if math.isfinite(number) else None
 
 
 def _unix_ns(moment: datetime) -> int:

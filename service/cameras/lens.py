@@ -177,19 +177,26 @@ def _pixels_per_mm(photo: Mapping[int, Any]) -> float | None:
 
 
 def _numbers(text: str, count: int) -> list[float] | None:
-    parts = [_float(part) for part in re.split(r"[,\s]+", text.strip())]
-    if len(parts) != count or any(n is None for n in parts):
-        return None
-    return [n for n in parts if n is not None]
+    return finite_numbers(re.split(r"[,\s]+", text.strip()), count)
 
 
 def _number(value: Any) -> float | None:
     """A positive finite number of an EXIF rational or a text."""
-    number = _float(value)
+    number = finite_number(value)
     return number if number is not None and number > 0 else None
 
 
-def _float(value: Any) -> float | None:
+def finite_numbers(values: Any, count: int) -> list[float] | None:
+    """The ``count`` finite numbers of EXIF rationals or texts; None for anything else."""
+    try:
+        numbers = [n for value in values if (n := finite_number(value)) is not None]
+        return numbers if len(numbers) == len(values) == count else None
+    except TypeError:
+        return None
+
+
+def finite_number(value: Any) -> float | None:
+    """The finite number of an EXIF rational or a text; None for x/0 and the like."""
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError):

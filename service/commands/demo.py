@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -37,11 +36,13 @@ def demo(
     as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
 ) -> None:
     """Replay a small real flight onboard while the ground receiver takes it over the datalink."""
+    from service.bench.link_emulator import free_port
+
     source = _flight(flight)
     _prepare(out)
     began = time.monotonic()
-    endpoint = f"tcp/127.0.0.1:{_free_port()}"
-    portal = f"127.0.0.1:{_free_port()}" if _has_portal() else ""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    portal = f"127.0.0.1:{free_port()}" if _has_portal() else ""
     compilers = _compile_meanwhile()
     if compilers:
         _say(1, "the first flight after an installation compiles its kernels: a minute or two")
@@ -129,12 +130,6 @@ def _prepare(out: Path) -> None:
         raise InputError(
             f"{out} cannot be written: {error.strerror}; give another --out"
         ) from error
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def _skyrelief(*arguments: str) -> list[str]:
