@@ -79,7 +79,7 @@ def on_device(
 @pytest.mark.parametrize("gaps", [0.0, 0.15])
 def test_surface_elements_are_the_compiled_ones(device: str, gaps: float) -> None:
     """Whole windows, windows with holes, borders, edges of depth; centre and lever too."""
-    from recon.backends.torch_surface import build
+    from recon.backends.torch_icp import build
 
     depth = seen(se3.compose(DOWN, np.array([0.0, 0.0, 40.0])), "hills", 3, gaps)
     depth.depth_m[40:60, 70:100] -= 6
@@ -153,8 +153,7 @@ def test_residuals_that_err_together_are_counted_alike(device: str) -> None:
     """White, smooth and holey fields against the compiled sum of autocorrelations."""
     import cv2
 
-    from recon.backends.torch_icp import _area
-    from recon.backends.torch_surface import correlation_sums
+    from recon.backends.torch_icp import _area, correlation_sums
 
     rng = np.random.default_rng(0)
     none = np.zeros((20, 30))
