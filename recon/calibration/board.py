@@ -77,7 +77,7 @@ class Calibration:
 
 
 AS_WELL = 1.02
-"""A model whose rms is no more than so many times another's fits as well."""
+"""A model fits as well as another if its rms is at most so many times the other's."""
 
 
 def find_board(gray: U8, board: Board) -> F32 | None:

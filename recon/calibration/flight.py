@@ -32,7 +32,7 @@ MAX_STEP = 0.3
 """Of a parameter's sigma, that one more step would move it by."""
 
 RAYLEIGH_MEDIAN = 1.1774
-"""Median length of an error whose coordinates have a sigma of 1."""
+"""Median length of an error whose coordinates have sigma 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +187,7 @@ def within(camera: Camera, poses: F64, points: F64, seen: Sightings, gate_px: fl
 
 
 def joint(a: Sightings, b: Sightings) -> Sightings:
-    """The sightings of both."""
+    """The sightings of both sets."""
     return Sightings(
         np.append(a.view, b.view), np.append(a.landmark, b.landmark),
         np.concatenate([a.uv_px, b.uv_px]),

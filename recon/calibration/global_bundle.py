@@ -22,7 +22,7 @@ CAMERA = 8
 """fx, fy, cx, cy, k1, k2, p1, p2; k3 stays."""
 
 MAX_COVARIANCES = 100
-"""Poses whose covariance is computed; the others take that of the nearest of them."""
+"""Number of poses whose covariance is computed; the others take that of the nearest one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,13 +23,13 @@ from recon.tracking.prediction import by_homography
 from recon.types import F64, I64, U8, Camera
 
 WIDTH_PX, FEATURES = 1920, 2500
-"""Of the image that features are found on, and how many of them are kept."""
+"""Width of the image in which features are detected, and maximum number of features."""
 
 LIKELY, MIN_ALIKE = 600, 10
 """Number of strongest features compared, and of matches needed, for two images to be alike."""
 
 THRESHOLD_PX = 2.0
-"""Distance to the epipolar line, at most."""
+"""Maximum distance to the epipolar line."""
 
 MIN_MATCHES = 15
 
@@ -74,7 +74,7 @@ def are_alike(a: Image, b: Image) -> bool:
 
 
 def matches(a: Image, b: Image, camera: Camera) -> tuple[I64, I64] | None:
-    """Places of ``a`` and ``b`` that are the same ground; None when too few surely are."""
+    """Matching features of ``a`` and ``b``; None when too few are verified."""
     rows_a, rows_b = mutual(a.features.descriptors, b.features.descriptors)
     if len(rows_a) < MIN_MATCHES:
         return None

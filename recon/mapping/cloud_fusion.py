@@ -16,7 +16,7 @@ from recon.mapping.voxel_map import find_slot, rehash, voxel_key
 from recon.types import F32, F64, I32, I64, U8, Bool, DepthMap, PointCloud
 
 CORRELATION = 0.55
-"""Of the errors of two keyframes at one place: they share frames, poses and texture."""
+"""Correlation of the errors of two keyframes at one place: they share frames, poses and texture."""
 
 _Fused = tuple[I64, PointCloud]
 """Keys of voxels, sorted, and the mean point of each."""
@@ -44,8 +44,8 @@ def fuse_strips(
     """As :func:`fuse`, in strips of x, so that the sums of one per core are held.
 
     ``strips[n]`` gives the clouds that reach into ``edges_m[n] <= x < edges_m[n + 1]``; their
-    points outside are passed over. Finite edges are moved to the voxel border below them, so
-    the result is that of the whole.
+    points outside are skipped. Finite edges are moved to the voxel border below them, so the result
+    is that of the whole.
     """
     if not (np.isfinite(voxel_m) and voxel_m > 0.0):
         raise ValueError(f"voxel_m is {voxel_m}, must be positive")

@@ -22,10 +22,10 @@ NORMAL_MEDIAN = 0.6745
 
 
 IMAGES, ROWS = 32, 24
-"""The last images are remembered, by so many rows of samples each."""
+"""Number of images that are kept, and rows of samples of each."""
 
 MIN_COMMON = 60
-"""Samples of two images that show the same ground, at least."""
+"""Minimum number of samples that two images share."""
 
 NEIGHBOURS_CORRELATION = (0.55, 0.28)
 """Correlation of the errors of an image and of the one before it, and the one before that.
@@ -34,7 +34,7 @@ They share frames. Measured on simulated flights at three widths (docs/reports/a
 images apart it is 0."""
 
 MAX_FACTOR = 30.0
-"""More is other ground."""
+"""A larger difference is other ground."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,19 +22,19 @@ from recon.types import F32, F64, I16, I64, U8, Bool, DepthMap, PointCloud
 U32 = npt.NDArray[np.uint32]
 
 PLACES = 2048
-"""In a tile, about."""
+"""Points in a tile, about."""
 
 SAMPLED = 100_000
 """Number of places that the size of a tile is estimated from."""
 
 HALF = 1 << 15
-"""Rows and columns of tiles to either side; what lies farther off shares the last."""
+"""Rows and columns of tiles to either side; farther points share the last ones."""
 
 
 class Tiles:
     """``xyz_m`` (N, 3) float32 are the places in the order of their tiles, ``order`` (N,) where
-    they were; tile ``t`` holds those from ``first[t]`` to ``first[t + 1]``. Who has no more to
-    ask about a tile sets ``is_decided[t]``.
+    they were; tile ``t`` holds those from ``first[t]`` to ``first[t + 1]``. A caller that is done
+    with a tile sets ``is_decided[t]``.
     """
 
     def __init__(self, xyz_m: F32 | F64) -> None:
@@ -89,7 +89,7 @@ def _keys(xyz_m: F32 | F64) -> U32:
 
 
 def _planes(depth: DepthMap, slack_m: float) -> F64 | None:
-    """(6, 4) planes about what the depth map holds, positive inside; None without any depth."""
+    """(6, 4) planes around the depth map's surface, positive inside; None without any depth."""
     known = np.isfinite(depth.depth_m)
     if not known.any():
         return None
@@ -118,15 +118,15 @@ WINDOW_PX = 2
 KNOWN_SHARE = 0.5
 
 MAX_VIEWS = 100
-"""Keyframes asked about a point at most: a camera that stays over one place has thousands.
-Their pairs, 255 at most each, are counted in 16 bits."""
+"""Maximum number of keyframes consulted per point: a camera that stays over one place has
+thousands. Their pairs, at most 255 each, are counted in 16 bits."""
 
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 T = TypeVar("T")
 
 
 def spread(views: Sequence[T]) -> list[T]:
-    """The same views in an order of which every beginning is spread evenly over the whole.
+    """The same views in an order whose every beginning is spread evenly over the whole.
 
     By the golden ratio: Weyl's sequence of low discrepancy.
     """

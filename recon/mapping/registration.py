@@ -21,11 +21,12 @@ from recon.types import F32, F64, Bool, DepthMap, Registration, Verdict
 _UNSEEN_VARIANCE = 1.5
 
 AREA_SIGMAS, AREA_LAGS = 4.685, 12
-"""Residuals beyond so many sigmas say nothing of how neighbours err; the longest distance asked."""
+"""Residuals beyond so many sigmas do not count for the correlation of neighbours; its longest
+lag."""
 
 
 MIN_PARTNERS = 50
-"""Fewer are no overlap."""
+"""Minimum number of partners; fewer are no overlap."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +212,7 @@ def conclude(
 def register_projective(
     source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig | None = None
 ) -> Registration:
-    """The motion that lays ``source`` onto ``target``, starting from ``T_target_source`` (4, 4).
+    """The motion that aligns ``source`` with ``target``, starting from ``T_target_source`` (4, 4).
 
     The maps' own poses are not used. Directions that the surface does not determine (on flat
     ground: both horizontal shifts and the turn about the vertical) keep the start, get

@@ -27,7 +27,7 @@ LARGEST_INDEX = _OFFSET - 1
 
 @dataclass(frozen=True, slots=True)
 class VoxelMapConfig:
-    """How finely the map remembers, and when surface counts as better.
+    """The map's resolution, and when surface counts as better.
 
     ``voxel_m`` of about twice the ground sample distance keeps the gaps between the pixels of
     two keyframes from looking like new surface.
@@ -40,7 +40,7 @@ class VoxelMapConfig:
     """Held surface within this many sigma along the pixel's ray is the same surface."""
     largest_reach_voxels: int = 6
     largest_voxels: int = 8_000_000
-    """Above this the half that was seen longest ago is forgotten (it would be sent again)."""
+    """Above this the half seen longest ago is dropped (and would be sent again)."""
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.voxel_m) and self.voxel_m > 0.0):

@@ -21,10 +21,10 @@ from recon.surface.raster import Grid, Raster, highest_lowest
 from recon.types import F32, F64, I32, U8, Bool
 
 BEND_CELLS, BEND_ROUNDS = 8, 8
-"""Blocks of a length over which flights bend, and rounds of its robust mean."""
+"""Blocks per length over which flights bend, and iterations of the robust mean."""
 
 NOISE_REACH = 1.5
-"""Sigmas of a difference that noise alone raises the highest of the cells nearby above a cell."""
+"""Sigmas by which noise alone raises the highest nearby cell above a cell."""
 
 
 @dataclass(frozen=True, slots=True)

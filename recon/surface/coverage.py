@@ -1,4 +1,4 @@
-"""How well each piece of ground was seen, kept up to date keyframe by keyframe.
+"""How well each piece of ground was seen, updated with each keyframe.
 
 The ground is cut into square cells, held in tiles that exist only where something was seen,
 so memory follows the area. Per cell: in how many keyframes' images it lies, the best sigma
@@ -27,16 +27,17 @@ TILE = 64
 """Cells along a tile's side."""
 
 CELL_SAMPLES = 4.0
-"""A cell is about so many pixels of a keyframe wide on the ground."""
+"""Width of a cell on the ground, in pixels of a keyframe, about."""
 
 MAX_TILES = 5_000
 """Tiles at most (20 million cells, 400 MB); what lies beyond them is counted."""
 
 MAX_CELLS = 25_000_000
-"""Of the rectangle about all tiles (500 MB); of a larger one only its middle is shown."""
+"""Maximum size of the rectangle about all tiles (500 MB); of a larger one only the middle is
+shown."""
 
 LONGEST_CELLS = 1 << 15
-"""Of a footprint along either axis: an image is some hundred cells across."""
+"""Maximum size of a footprint along either axis: an image is some hundred cells across."""
 
 SMALLEST_CELL_M, LARGEST_CELL_M = 1e-3, 1e3
 
@@ -111,7 +112,7 @@ def usual_cell_m(depth: DepthMap) -> float | None:
 def _near(keys: I64) -> I64:
     """The (N, 2) tiles whose rectangle has at most MAX_CELLS: all, or those about the middle.
 
-    A track that diverged must not ask for a grid from here to the moon.
+    A diverged track must not allocate an unbounded grid.
     """
     if float(np.prod((np.ptp(keys, axis=0) + 1.0) * TILE)) <= MAX_CELLS:
         return keys
@@ -152,10 +153,10 @@ class CoverageMap:
         return len(self._tiles)
 
     def put(self, seq: int, time_ns: int, depth: DepthMap, finer: bool = False) -> None:
-        """Add a keyframe, or put it where it is now known to have been.
+        """Add a keyframe, or move it to its corrected pose.
 
         A keyframe that moved leaves stale tiles; :meth:`refill` recomputes them. So does one with
-        ``finer`` depth than before. One without any depth is passed over.
+        ``finer`` depth than before. One without any depth is skipped.
         """
         place = footprint(depth)
         if place is None:
@@ -261,7 +262,7 @@ class CoverageMap:
     # ---- footprints ------------------------------------------------------------------------
 
     def _same(self, a: Footprint, b: Footprint) -> bool:
-        """True when a keyframe moved by so little that no cell would notice."""
+        """True when a keyframe moved too little to change any cell."""
         return bool(np.abs(a.corners_m - b.corners_m).max() < 0.25 * self.cell_m)
 
     def _count(self, place: Footprint, change: int) -> None:
@@ -428,7 +429,7 @@ def _merge(
 
 
 FARTHEST = 3.0
-"""Images count as seeing the ground out to this many times their median depth."""
+"""An image sees the ground up to this many times its median depth."""
 
 PLACE = np.dtype(
     [

@@ -22,12 +22,12 @@ from recon.types import F32, Bool
 I64 = npt.NDArray[np.int64]
 
 LARGEST_OBJECT_M = 36.0
-"""Width of the widest building that is taken off the ground."""
+"""Width of the widest building that is removed."""
 
 SLOPE = 0.2
 STEP_M = 0.25
 MARGIN_M = 0.75
-"""Around what stands on the ground: matching makes it wider than it is."""
+"""Margin around objects: matching widens them."""
 
 WORKING_CELL_M = 0.5
 

@@ -17,7 +17,8 @@ from recon.types import F32, F64, U8, Bool
 
 DIRECTIONS = 16
 MAX_OPEN_DIRECTIONS = 5
-"""Neighbouring directions without a known cell; with more the cell lies outside the survey."""
+"""Maximum number of neighbouring directions without a known cell; with more the cell is outside the
+survey."""
 
 REACH_M = 2.0
 LEVEL_M = 0.4
@@ -26,7 +27,7 @@ SLOPE = 0.3
 surfaces."""
 
 EDGE_CELLS = 2
-"""As close as this to something higher a cell next to a step may be roof or ground."""
+"""This close to something higher, a cell next to a step may be roof or ground."""
 
 
 def surface_model(xyz_m: F64 | F32, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:

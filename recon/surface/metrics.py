@@ -1,4 +1,4 @@
-"""How far a reconstruction lies from the truth: surface, completeness, trajectory, honesty.
+"""Errors of a reconstruction against the truth: surface, completeness, trajectory, honesty.
 
 Everything here compares arrays in one frame; bringing a scan into the truth's frame through
 geodetic coordinates is the caller's part.
@@ -82,9 +82,9 @@ class TrajectoryErrors:
 def fit_trajectory(scan: F64, truth: F64, with_scale: bool) -> Fit:
     """The motion that best brings poses (N, 4, 4) of a scan onto those of the truth.
 
-    Rotation from orientations and positions together (orthogonal Procrustes; 0.01 rad weigh
-    as much as 0.5 m), so that a straight flight leaves nothing open. Raises ValueError for
-    other shapes or fewer than two poses.
+    Rotation from orientations and positions together (orthogonal Procrustes; 0.01 rad weigh as much
+    as 0.5 m), so that a straight flight determines the rotation fully. Raises ValueError for other
+    shapes or fewer than two poses.
     """
     if scan.shape != truth.shape or scan.ndim != 3 or len(scan) < 2:
         raise ValueError(f"poses must be two (N, 4, 4), N >= 2; got {scan.shape}, {truth.shape}")
@@ -108,7 +108,7 @@ def fit_trajectory(scan: F64, truth: F64, with_scale: bool) -> Fit:
 def fit_surface(
     points: F64, surface: TriangleGrid, start: Fit, with_scale: bool, reach_m: float = 5.0
 ) -> Fit:
-    """The motion near ``start`` that best lays (N, 3) points onto the true surface.
+    """The motion near ``start`` that best moves (N, 3) points onto the true surface.
 
     Point-to-plane ICP against the mesh with Tukey's weights; at most 20 000 points are used. The
     reach shrinks with the residuals, so that distant points have no effect.
@@ -288,7 +288,7 @@ BROAD_PX = 8.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchShifts:
-    """Where patches of an image lie, against the same patches of the other."""
+    """Shifts of an image's patches against the same patches of the other image."""
 
     middle_px: F64  # (N, 2) column and row
     shift_px: F64  # (N, 2) column and row: where the content is, less where it should be
@@ -359,7 +359,8 @@ def _peak(surface: F32) -> tuple[float, F64]:
 
 
 def _vertex(three: F32) -> float:
-    """Where the parabola through three equidistant heights has its top, from the middle one."""
+    """Offset of the vertex of the parabola through three equidistant heights, from the middle
+    one."""
     left, middle, right = (float(v) for v in three)
     bend = left - 2.0 * middle + right
     return 0.0 if bend >= 0.0 else float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5))

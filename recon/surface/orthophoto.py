@@ -23,10 +23,10 @@ from recon.surface.texturing import levels
 from recon.types import F32, F64, I32, I64, U8, Bool
 
 CLEAR_M = 0.3
-"""A surface this much above the line to a camera hides a place."""
+"""A surface this far above the line to a camera hides a place."""
 
 STEP_M = 0.5
-"""Cells whose heights differ by more from the nearest one's are not interpolated."""
+"""Neighbours whose heights differ by more from the nearest cell's are not interpolated."""
 
 EDGE_PX = 1.0
 SHARP_REACH = 3
@@ -168,7 +168,7 @@ def _project(K: F64, T: F64, x: float, y: float, z: float) -> tuple[float, float
 def _is_hidden(
     height: F32, highest: float, r: int, c: int, eye: tuple[float, float, float]
 ) -> bool:
-    """Whether a surface stands between a cell and the eye (column, row, height)."""
+    """Whether a surface hides a cell from the eye (column, row, height)."""
     dc, dr = eye[0] - c, eye[1] - r
     steps = int(max(abs(dc), abs(dr)))
     for s in range(1, steps + 1):

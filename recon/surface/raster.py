@@ -32,8 +32,8 @@ SPARSE_SHARE = 0.5
 LARGEST_CELLS = 200_000_000
 
 CELLS_PER_POINT, MIN_CELLS = 1000, 10_000_000
-"""A rectangle with more cells than the larger of the two is empty but for strays: points that lie
-anywhere must not choose how much memory is asked for."""
+"""A rectangle with more cells than the larger of the two holds only stray points, which must not
+determine the memory."""
 
 
 @dataclass(frozen=True, slots=True)

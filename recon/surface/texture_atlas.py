@@ -16,7 +16,7 @@ from recon.surface.texture_views import Sightings, TextureView
 from recon.types import F32, F64, I32, I64, U8, Bool
 
 BORDER_PX = 2
-"""Texels around a chart that carry its colours on, for filtering and the first mip levels."""
+"""Texels around a chart that repeat its colours, for filtering and the first mip levels."""
 
 MAX_SCALE = 2.0
 CELL_PX = 4
@@ -38,8 +38,8 @@ def lay_out(
 ) -> Layout:
     """The atlas of triangles labelled with their view (-1: none), no side above ``largest_px``.
 
-    A chart is a connected piece of one label, laid as the view sees it. Charts are packed in
-    shelves by height; when they do not fit, all are made smaller alike.
+    A chart is a connected piece of one label, as the view sees it. Charts are packed in shelves by
+    height; when they do not fit, all are scaled down.
     """
     chart = _charts(label, neighbours)
     uv = _seen_uv(mesh, views, label)

@@ -22,18 +22,18 @@ Rays = Callable[[F64, F64], F64]
 """Camera (3,) and unit directions (N, 3) to metres (N,) up to the mesh, infinite without a hit."""
 
 LARGEST_GRID = 4000
-"""Columns along a side of our own ray casting's grid."""
+"""Columns along a side of the grid of our own ray casting."""
 
 CANDIDATES = 6
 """Views kept per triangle, the finest."""
 
 MIN_COSINE = 0.1
-"""Flatter than this a view says nothing of a triangle."""
+"""A flatter view of a triangle is not used."""
 
 EDGE_PX = 1.0
 OUTLIER_LEVELS = 25.0
-"""A view's colour of a triangle may differ from the others' median by this, and by
-OUTLIER_SPREADS of their spread: beyond, something else stood before it (a car, a person)."""
+"""A view's colour of a triangle may differ from the others' median by this, and by OUTLIER_SPREADS
+of their spread: beyond, something else was in front of it (a car, a person)."""
 
 OUTLIER_SPREADS = 4.0
 
@@ -61,9 +61,8 @@ def look(
 ) -> Sightings:
     """The sightings of every triangle of ``mesh``.
 
-    A view sees a triangle when no surface stands before its corners and its middle, it faces
-    the camera, and at least half of those four places have colour. ``progress`` receives the
-    share done.
+    A view sees a triangle when no surface hides its corners and its middle, it faces the camera,
+    and at least half of those four places have colour. ``progress`` receives the share done.
     """
     reach = _rays(mesh)
     vertices = np.asarray(mesh.vertices_m, np.float64)

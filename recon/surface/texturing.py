@@ -182,7 +182,7 @@ def _propagated(view: I32, cost: F32, neighbours: I32, penalty: float, iteration
 
 @njit(cache=True, nogil=True)
 def _settle(view: I32, cost: F32, neighbours: I32, penalty: float, slot: I32) -> None:
-    """Iterated conditional modes: each triangle takes its best view as its neighbours stand."""
+    """Iterated conditional modes: each triangle takes the best view given its neighbours'."""
     faces, slots = view.shape
     for _ in range(20):
         changed = 0
@@ -209,10 +209,10 @@ HUBER_LEVELS = 8.0
 ROUNDS = 5
 MAX_SAMPLES = 300_000
 PULL = 0.004
-"""Weight of gain 1 and offset 0 for each view, as a share of its observations."""
+"""Weight of the prior gain 1 and offset 0 of each view, as a share of its observations."""
 
 FADE_RINGS = 4
-"""Across how many rings of triangles on each side of a seam the views fade."""
+"""Rings of triangles on each side of a seam across which the views fade."""
 
 BLENDED_VIEWS = 3
 
