@@ -21,7 +21,7 @@ from recon.posegraph.track_alignment import umeyama
 from recon.types import F64, I64, DepthMap, PosePrior
 
 WANDER_SHARE = 0.4
-"""Of a fix's sigma, what differs between fixes of one flight; the rest is common to all."""
+"""Share of a fix's sigma that differs between fixes of one flight; the rest is common to all."""
 
 INDEPENDENT_HEIGHTS = 4.0
 """Heights of one flight count as so many: they share the ground's relief."""

@@ -35,7 +35,7 @@ ATTITUDE_S, FIX_S = 40.0, 60.0
 """Errors of attitude and fixes wander with these time constants."""
 
 STEPS = 60
-"""Of the solution, at most."""
+"""Maximum number of steps of the solution."""
 
 HELD, HELD_PLACE, HELD_SIGMA = "held", "held place", 1e-5
 """Kinds of factors that hold what is no unknown; rad and m."""

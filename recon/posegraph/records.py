@@ -12,7 +12,7 @@ from recon.posegraph.sensor_noise import PRECISE_TAU_S
 from recon.types import F64, PosePrior
 
 MIN_NODES = 50
-"""Of a pose graph's keyframes, what its bound may not go below."""
+"""Lower limit for the maximum number of nodes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,7 +38,7 @@ PRECISE_M = 0.3
 """Fixes of a smaller sigma are RTK's or PPK's."""
 
 LAG_SHARE = 1.0 / 6.0
-"""Of the span, the longest lag: a fit to the readings hides what they share over longer ones."""
+"""Longest lag as a share of the span: a fit to the readings hides correlations over longer lags."""
 
 LAGS = 12
 

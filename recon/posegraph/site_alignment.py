@@ -18,10 +18,10 @@ from recon.types import F64, Bool
 
 STEPS = 12
 CAUCHY_SIGMAS = 2.0
-"""Of a tie's error, per number in it: beyond it a tie loses weight."""
+"""Sigmas of a tie's error, per component, beyond which it loses weight."""
 
 UNKNOWNS = 7
-"""Of a scan: rotation vector, shift of its centre, logarithm of the scale."""
+"""Unknowns of a scan: rotation vector, shift of its centre, logarithm of the scale."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

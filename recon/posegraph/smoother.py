@@ -26,16 +26,16 @@ from recon.posegraph.ledger import MemoryLedger, Rows
 from recon.types import F64, I64
 
 MIN_WAIT, POSES_PER_WAIT = 2, 100
-"""So many poses wait between two updates, and one more for each so many that are held."""
+"""Poses that wait between two updates, and poses held for each further one."""
 
 STEPS, MANY_STEPS = 1, 10
-"""Of an update, at most, and where many poses may move far."""
+"""Maximum number of steps of an update, and where many poses may move far."""
 
 SMALL_STEP = 1e-3
 """rad, m and log scale; none follows a step that is smaller."""
 
 SHARES = 0.5 ** np.arange(8)
-"""Of a step, from the whole one on, until the cost falls."""
+"""Shares of a step, tried in turn until the cost falls."""
 
 NO_SCALE = 0
 """Key of a scale that is held at 1."""

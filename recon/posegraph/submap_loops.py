@@ -151,7 +151,7 @@ def _covariance(T: F64, here: F64, there: F64, sigma: F64, inside: Bool) -> F64:
 
 
 MIN_NEIGHBOURS = 5
-"""Of a pixel's eight, that must be known for it to be filled."""
+"""Number of a pixel's eight neighbours that must be known for it to be filled."""
 
 
 def filled(own: Keyframe, others: Sequence[Keyframe]) -> Keyframe:

@@ -26,10 +26,10 @@ from recon.posegraph.smoother import reversed_motion
 from recon.types import F64, PosePrior
 
 NEWEST_SHARE = 0.25
-"""Of the nodes, the newest, which always stay: vision's next motions and loops start from them."""
+"""Share of the newest nodes, which always stay: the next motions and loops start from them."""
 
 GONE_SHARE = 0.25
-"""Of the nodes, how many go at once, so that rebuilding is rare."""
+"""Share of the nodes removed at once, so that rebuilding is rare."""
 
 MAX_WORSE = 2.0
 """A fix whose sigma is so many times that of another spoils their mean."""

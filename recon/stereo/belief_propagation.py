@@ -138,7 +138,7 @@ def _drop_speckles(px: F32, smallest: int) -> None:
 
 
 RADIUS = 3
-"""Of the window whose summed cost places the minimum between labels."""
+"""Radius of the window whose summed cost places the minimum between labels."""
 
 SURE_EVIDENCE = 0.6
 """Evidence of a well textured match; confidence grows up to it."""
@@ -148,7 +148,7 @@ FILLED_CONFIDENCE = 0.05
 
 LABEL_BITS = 10
 LABEL_MASK = (1 << LABEL_BITS) - 1
-"""Of a belief and its label as one number."""
+"""Bits of the label in a number that holds belief and label."""
 
 NOISE = 0.2 * COST_UNIT
 """Mean cost below which a window is taken for plain."""

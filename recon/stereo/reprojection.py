@@ -16,7 +16,7 @@ LABEL_SIGMA_PX = 0.075
 """Sigma of a label of full confidence, in pixels of the grid that was matched."""
 
 MIN_CONFIDENCE = 0.05
-"""Below it a label is not trusted at all."""
+"""A label with a lower confidence is not used."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,7 @@ from recon.tracking.prediction import Prediction, by_homography
 from recon.types import F32, F64, U8
 
 WIDTH_PX = 480
-"""Of the image that features are found on: 0.1 s on one core."""
+"""Width of the image in which features are detected: 0.1 s on one core."""
 
 MOST = 1000
 """Features of an image."""

@@ -55,7 +55,7 @@ FEATURE_SHARE = 0.03
 """Search radius around places that features predict."""
 
 CLEAR_SHARE = 0.6
-"""Of the corners searched: so many found leave no need for another start."""
+"""Share of the corners searched: if so many are found, no other start is tried."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

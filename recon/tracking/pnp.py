@@ -70,7 +70,7 @@ class Fit:
 
 
 STEPS = 10
-"""Of Gauss-Newton, at most."""
+"""Maximum number of Gauss-Newton steps."""
 
 
 def solve(

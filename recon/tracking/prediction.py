@@ -121,7 +121,8 @@ def relative_rotation(a: PosePrior, b: PosePrior) -> F64 | None:
 
 
 NEAR_QUANTILE = 0.85
-"""Of the matches' motion: where a camera looks at the horizon most of what it sees is far."""
+"""Quantile of the matches' motion: a camera that looks at the horizon sees mostly distant
+points."""
 
 
 def base_to_height(uv_a: F64, uv_b: F64, K: F64, R_b_a: F64 | None) -> float:

@@ -19,13 +19,13 @@ from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.types import F64
 
 KEYFRAMES = 5
-"""Of a window; the next one begins at its last."""
+"""Keyframes of a window; the next window begins at its last one."""
 
 COARSE_S = 1e-3 * np.arange(-40.0, 41.0, 10.0)
 """Readouts that are tried while none is sure."""
 
 STEP_S = 5e-3
-"""About the one in use, once it is sure."""
+"""Spacing of the readouts tried around the one in use, once it is sure."""
 
 NEAR_S = 1e-3
 """A readout further from the one in use starts the search again."""

@@ -132,7 +132,7 @@ def flown_pair(guide_px: tuple[int, int]) -> StereoPair:
 
 
 SIZE, LABELS = (320, 180), 16
-"""Of a rectified pair (w, h)."""
+"""Size (w, h) and labels of the rectified pair."""
 
 COPY_MB = {"cuda": 1024, "cpu": 64}
 PRODUCT = {"cuda": 8192, "cpu": 768}

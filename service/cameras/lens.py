@@ -26,7 +26,7 @@ SAME_SHAPE = 0.005
 """Relative tolerance of aspect ratios: sizes are whole pixels."""
 
 SIGMA_FOCAL = 0.01
-"""Of a focal length in tags, as a share: it is that of the model of the lens, and rounded."""
+"""Relative sigma of a focal length in tags: it is that of the lens's model, and rounded."""
 
 AGREEMENT = 0.1
 """A focal length that differs more from the 35 mm equivalent belongs to another size of the image:

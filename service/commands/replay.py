@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 WIDTH, STEREO_WIDTH_PX = "compute.stereo_width", 640
-"""Of a replay that has the time for it."""
+"""Largest stereo width of a replay that is not tied to real time."""
 
 
 def replay(

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 STILLS = 25
-"""About the middle of a flight, by which its lens is found."""
+"""Number of stills around the middle of a flight from which the lens is estimated."""
 
 MIN_STILLS = 6
-"""Fewer determine no lens."""
+"""Fewer stills do not determine a lens."""
 
 COARSE = {"compute.stereo_width": 320, "compute.upsample": False, "fusion.loops": False}
 """Poses are all that is needed."""

@@ -24,7 +24,7 @@ from service.flight.viewpoints import StereoCandidate, UndistortedFrame
 from service.stream.records import Repose
 
 FARTHEST_M = 1e6
-"""From the scan's origin."""
+"""Maximum distance from the scan's origin."""
 
 HEADING_KNOWN_RAD = 1.0
 

@@ -23,7 +23,7 @@ from recon.tracking.common_view import Signatures, alike
 from recon.types import F64, U8, DepthMap
 
 WIDTH_PX = 640
-"""Of the images kept; loops need no finer ones."""
+"""Width of the images kept; loops need no finer ones."""
 
 MIN_DEPTH_PX = 120
 """A depth image at least twice as wide is kept at half its size."""

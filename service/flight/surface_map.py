@@ -23,8 +23,8 @@ from service.flight.viewpoints import StereoCandidate
 log = logging.getLogger(__name__)
 
 RECORDED_SIGMA_PX = 0.11
-"""Of a match, in pixels of the recording: where stereo's pixels are as small, its labels are no
-better (docs/reports/accuracy.md)."""
+"""Sigma of a match, in pixels of the recording: where stereo's pixels are as small, its labels are
+no better (docs/reports/accuracy.md)."""
 
 ASSUMED_LENS_SHARE = 0.02
 """Sigma of depth over depth where a lens without distortion is assumed: lenses of action cameras

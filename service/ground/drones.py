@@ -28,9 +28,9 @@ DESCRIPTORS_PER_SCAN, DESCRIPTOR_SHARE = 3, 4
 MAX_RESTING = 256
 """Drones without a worker whose figures are kept."""
 STRANGER_S = 1.0
-"""A drone without any scan makes way for another after so long without a message."""
+"""A drone without any scan is replaced by another after so long without a message."""
 REFUSAL_S = 60.0
-"""From one warning about a drone that is not received to the next."""
+"""Interval between two warnings about a drone that is not received."""
 
 
 @dataclass(slots=True, eq=False)

@@ -21,7 +21,7 @@ from service.stream.store import ScanStore
 log = logging.getLogger(__name__)
 
 HEADER_REST_S = 1.0
-"""From one request for the header to the next."""
+"""Interval between two requests for the header."""
 MAX_KEPT_BYTES = 1 << 18
 """Items that may come before the header."""
 

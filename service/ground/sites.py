@@ -34,7 +34,7 @@ SAME_VISIT_S = 86_400.0
 """Between the starts of two scans; ground seen further apart may differ, see ``site compare``."""
 
 MIN_SHARED = 0.05
-"""Of the smaller scan's extent, that the other covers as well."""
+"""Minimum share of the smaller scan's extent that the other covers as well."""
 
 SIZES = 3
 """A site takes up to so many times the disk of its scans' stores, with its files."""

@@ -306,7 +306,7 @@ _READERS: dict[str, tuple[str, Callable[[Path, Truth, F64, Fits], dict[str, Any]
 
 
 HEIGHT_M = 200_000.0
-"""Of the eye: relief of 20 m at 500 m from the middle is displaced by 5 cm."""
+"""Height of the eye: relief of 20 m at 500 m from the middle is displaced by 5 cm."""
 
 
 def view_from_above(

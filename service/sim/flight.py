@@ -18,7 +18,7 @@ LEAD_S = 5.0
 STEP_S = 0.02
 G_M_S2 = 9.81
 SWING_HZ = np.array([1.0, 0.9, 0.0])
-"""Of a head that swings: about the axes of its roll and pitch."""
+"""Frequencies of a swinging head about its roll and pitch axes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,7 +40,7 @@ UNKNOWN_HEIGHT_M = 1e4
 """Sigma of the height of a point that was surveyed horizontally only."""
 
 MIN_SPAN = 0.5
-"""Of the track's length, that control points should span."""
+"""Share of the track's length that control points should span."""
 
 
 @dataclass(slots=True, eq=False)

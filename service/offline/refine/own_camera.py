@@ -59,7 +59,7 @@ ACROSS = 8
 """And in so many others that show the same ground, those that are turned most to it."""
 
 MIN_SHOWN = 0.3
-"""Of an image's ground, that such another image shows."""
+"""Minimum share of an image's ground that such another image shows."""
 
 START = SelfCalibrationConfig()
 
@@ -70,7 +70,7 @@ GROSS_PX = 15.0
 """A sighting further from its landmark takes no part."""
 
 MIN_SHARE = 0.5
-"""Of the keyframes, whose images the video must hold."""
+"""Share of the keyframes whose images the video must hold."""
 
 
 def camera_of(header: ScanHeader) -> Camera:

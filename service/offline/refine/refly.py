@@ -28,10 +28,10 @@ TAKEOFF, WAYPOINT, RETURN, SPEED = 22, 16, 20, 178
 VIDEO_START, VIDEO_STOP, PHOTO_START, PHOTO_STOP = 2500, 2501, 2000, 2001
 AMSL, MISSION, RELATIVE = 0, 2, 3  # MAV_FRAME
 SMALLEST_SHARE = 0.005
-"""Weak patches smaller than this share of an image are left to chance."""
+"""Weak patches smaller than this share of an image are ignored."""
 
 FORWARD_OVERLAP = 0.8
-"""Of two photographs one after the other, when photographs are taken."""
+"""Overlap of consecutive photographs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
