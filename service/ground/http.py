@@ -38,6 +38,7 @@ from service.ground.map_tiles import map_routes
 from service.ground.scan_files import file_routes
 from service.ground.state import KINDS, Jobs, PortalState, names_of, state_of
 from service.ground.vehicle import BUTTONS, Vehicle
+from service.scans.annotations import Spot, as_json, read_annotations
 from service.workers import Workers
 
 T = TypeVar("T")
@@ -71,6 +72,13 @@ class LabelChange(msgspec.Struct, forbid_unknown_fields=True):
     title: str | None = None
     tags: list[str] | None = None
     edition: int | None = None
+
+
+class NewAnnotation(msgspec.Struct, forbid_unknown_fields=True):
+    """A place (longitude, latitude, AMSL metres) and what is to be said of it."""
+
+    coordinates: Spot
+    text: str
 
 
 class ExportOrder(msgspec.Struct, forbid_unknown_fields=True):
@@ -115,6 +123,9 @@ def portal_app(
         Route(one, _scan, methods=["GET"]),
         Route(one, _label, methods=["PATCH"]),
         Route(one, _delete, methods=["DELETE"]),
+        Route(one + "/annotations", _annotations, methods=["GET"]),
+        Route(one + "/annotations", _annotate, methods=["POST"]),
+        Route(one + "/annotations/{number:int}", _erase_annotation, methods=["DELETE"]),
         *file_routes(one),
         *map_routes(),
         Route(one + "/exports", _export, methods=["POST"]),
@@ -252,6 +263,32 @@ def _delete(request: Request) -> Response:
     return JSONResponse({"bin": state.library.delete(drone, scan)})
 
 
+def _annotations(request: Request) -> Response:
+    """The annotations of a scan as GeoJSON."""
+    folder = state_of(request).library.folder(*names_of(request))
+    return JSONResponse(as_json(read_annotations(folder)))
+
+
+async def _annotate(request: Request) -> Response:
+    """Add a place with a text; the feature."""
+    drone, scan = names_of(request)
+    note(request, "annotate", scan=f"{drone}/{scan}")
+    new = await _body(request, NewAnnotation)
+    note(request, "annotate", text=new.text)
+    by = str(request.scope[WHO]).partition(".")[0]
+    library = state_of(request).library
+    made = await run_in_threadpool(library.annotate, drone, scan, new.coordinates, new.text, by)
+    return JSONResponse(as_json(made), 201)
+
+
+def _erase_annotation(request: Request) -> Response:
+    """Delete an annotation."""
+    (drone, scan), number = names_of(request), request.path_params["number"]
+    note(request, "erase annotation", scan=f"{drone}/{scan}", number=number)
+    state_of(request).library.erase_annotation(drone, scan, number)
+    return JSONResponse({})
+
+
 async def _export(request: Request) -> Response:
     """Make a deliverable in the background, or refine the scan; the job."""
     state, (drone, scan) = state_of(request), names_of(request)
@@ -374,6 +411,7 @@ async def _live(socket: WebSocket) -> None:
 
 BODIES: dict[Callable[..., Any], type[msgspec.Struct]] = {
     _label: LabelChange,
+    _annotate: NewAnnotation,
     _export: ExportOrder,
     _import: ImportOrder,
     _order: VehicleOrder,

@@ -30,6 +30,7 @@ from service.ground.storage import (
     run_folder,
     workplace,
 )
+from service.scans.annotations import Annotation, Spot, add_annotation, delete_annotation
 from service.scans.folder import SUMMARY, write_deliverables
 from service.scans.writing import writing
 from service.stream.records import ScanHeader
@@ -65,6 +66,7 @@ FILES: dict[str, str] = {
     "flight.geojson": "flight, GeoJSON",
     "flight.kml": "flight, KML",
     "flight.mcap": "recording, MCAP",
+    "annotations.geojson": "annotations, GeoJSON",
     "report.html": "report",
     "site.json": "site: its scans, motions, ties",
     "change.html": "change, page",
@@ -171,6 +173,18 @@ class Library:
             with writing(folder / LABELS) as part:
                 part.write_bytes(msgspec.json.encode(new))
         return new
+
+    def annotate(self, drone: str, scan: str, spot: Spot, text: str, by: str) -> Annotation:
+        """Add a place with a text to a scan. Raises InputError for an unfit text, or too many."""
+        folder = self.folder(drone, scan)
+        with self._lock:
+            return add_annotation(folder, spot, text, by, time.time())
+
+    def erase_annotation(self, drone: str, scan: str, number: int) -> None:
+        """Delete one annotation. Raises InputError when there is none of this number."""
+        folder = self.folder(drone, scan)
+        with self._lock:
+            delete_annotation(folder, number)
 
     def delete(self, drone: str, scan: str) -> str:
         """Move a scan to the bin; the name it has there."""

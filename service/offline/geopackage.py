@@ -1,10 +1,11 @@
-"""Polygons or lines as a GeoPackage (OGC 12-128r18): an SQLite file with geometries in WKB."""
+"""Polygons, lines and points as a GeoPackage (OGC 12-128r18): SQLite with geometries in WKB."""
 
 from __future__ import annotations
 
 import sqlite3
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,17 @@ Columns = Mapping[str, Sequence[float | str]]
 """Values of each shape by name, real or text."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Layer:
+    """Shapes in WKB, all of one kind, their places in map metres, and their columns."""
+
+    table: str
+    kind: str
+    shapes: Sequence[bytes]
+    places: Sequence[F64]  # (N, 2) each
+    columns: Columns
+
+
 def write_polygons(
     path: Path, table: str, epsg: int, shapes: Sequence[Sequence[Sequence[F64]]], columns: Columns
 ) -> None:
@@ -42,25 +54,26 @@ def write_polygons(
 
     ``shapes[n]`` are polygons, each an outer ring and its holes, (N, 2) map metres, closed.
     """
-    points = [ring for shape in shapes for rings in shape for ring in rings]
-    _write(path, table, epsg, "MULTIPOLYGON", [_polygons(s) for s in shapes], points, columns)
+    places = [ring for shape in shapes for rings in shape for ring in rings]
+    wkb = [_polygons(shape) for shape in shapes]
+    write_layers(path, epsg, [Layer(table, "MULTIPOLYGON", wkb, places, columns)])
 
 
-def write_lines(path: Path, table: str, epsg: int, lines: Sequence[F64], columns: Columns) -> None:
-    """Write lines, (N, 2) map metres each, with their columns as one layer."""
-    _write(path, table, epsg, "LINESTRING", [_line(line) for line in lines], lines, columns)
+def lines(table: str, shapes: Sequence[F64], columns: Columns) -> Layer:
+    """A layer of lines, (N, 2) map metres each."""
+    return Layer(table, "LINESTRING", [_line(line) for line in shapes], shapes, columns)
 
 
-def _write(
-    path: Path, table: str, epsg: int, kind: str, shapes: Sequence[bytes], points: Sequence[F64],
-    columns: Columns,
-) -> None:  # fmt: skip
-    """Write one layer of shapes in WKB, all of one kind, that have these points."""
+def points(table: str, places: F64, columns: Columns) -> Layer:
+    """A layer of points, (N, 2) map metres."""
+    wkb = [struct.pack("<BIdd", 1, 1, x, y) for x, y in places.tolist()]
+    return Layer(table, "POINT", wkb, [places], columns)
+
+
+def write_layers(path: Path, epsg: int, layers: Sequence[Layer]) -> None:
+    """Write the layers as one file."""
     from pyproj import CRS
 
-    kinds = {n: "TEXT" if v and isinstance(v[0], str) else "DOUBLE" for n, v in columns.items()}
-    ends = np.concatenate(points) if len(points) else np.full((1, 2), np.nan)  # SQLite: NULL
-    box = (*ends.min(axis=0).tolist(), *ends.max(axis=0).tolist())
     with writing(path) as part:
         part.unlink(missing_ok=True)
         db = sqlite3.connect(part)
@@ -76,30 +89,39 @@ def _write(
                 (system.name, epsg, "EPSG", epsg, system.to_wkt("WKT1_GDAL"), None),
             ]
             db.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?)", known)
-            db.execute(
-                "INSERT INTO gpkg_contents (table_name, data_type, identifier, min_x, min_y, "
-                "max_x, max_y, srs_id) VALUES (?, 'features', ?, ?, ?, ?, ?, ?)",
-                (table, table, *box, epsg),
-            )
-            db.execute(
-                "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)",
-                (table, kind, epsg),
-            )
-            typed = "".join(f', "{n}" {of}' for n, of in kinds.items())
-            db.execute(
-                f'CREATE TABLE "{table}" (fid INTEGER PRIMARY KEY AUTOINCREMENT, '
-                f"geom {kind}{typed})"
-            )
-            marks = ", ".join("?" * (1 + len(columns)))
-            names = "".join(f', "{n}"' for n in columns)
-            rows = [
-                (b"GP\x00\x01" + struct.pack("<i", epsg) + shape, *(v[n] for v in columns.values()))
-                for n, shape in enumerate(shapes)
-            ]
-            db.executemany(f'INSERT INTO "{table}" (geom{names}) VALUES ({marks})', rows)
+            for layer in layers:
+                _put(db, epsg, layer)
             db.commit()
         finally:
             db.close()
+
+
+def _put(db: sqlite3.Connection, epsg: int, layer: Layer) -> None:
+    """Put one layer into the file."""
+    table, kind, columns = layer.table, layer.kind, layer.columns
+    kinds = {n: "TEXT" if v and isinstance(v[0], str) else "DOUBLE" for n, v in columns.items()}
+    ends = np.concatenate([*layer.places, np.zeros((0, 2))])
+    ends = ends if len(ends) else np.full((1, 2), np.nan)  # SQLite: NULL
+    box = (*ends.min(axis=0).tolist(), *ends.max(axis=0).tolist())
+    db.execute(
+        "INSERT INTO gpkg_contents (table_name, data_type, identifier, min_x, min_y, "
+        "max_x, max_y, srs_id) VALUES (?, 'features', ?, ?, ?, ?, ?, ?)",
+        (table, table, *box, epsg),
+    )
+    db.execute(
+        "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)", (table, kind, epsg)
+    )
+    typed = "".join(f', "{n}" {of}' for n, of in kinds.items())
+    db.execute(
+        f'CREATE TABLE "{table}" (fid INTEGER PRIMARY KEY AUTOINCREMENT, geom {kind}{typed})'
+    )
+    marks = ", ".join("?" * (1 + len(columns)))
+    names = "".join(f', "{n}"' for n in columns)
+    rows = [
+        (b"GP\x00\x01" + struct.pack("<i", epsg) + shape, *(v[n] for v in columns.values()))
+        for n, shape in enumerate(layer.shapes)
+    ]
+    db.executemany(f'INSERT INTO "{table}" (geom{names}) VALUES ({marks})', rows)
 
 
 def _polygons(polygons: Sequence[Sequence[F64]]) -> bytes:

@@ -16,7 +16,8 @@ from recon.bands import threads
 from service.errors import InputError
 from service.offline.exports.rasters import contours_of, write_ortho
 from service.offline.exports.view import ExportOptions, ScanView
-from service.offline.geopackage import write_lines
+from service.offline.geopackage import lines, points, write_layers
+from service.scans.annotations import read_annotations
 from service.scans.writing import writing
 
 MAX_OVERLAY_PX = 4096
@@ -38,11 +39,23 @@ def write_contours_dxf(scan: ScanView, out: Path, options: ExportOptions) -> Non
 
 
 def write_contours_gpkg(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """Contours as a GeoPackage: layer ``contours`` in the scan's UTM zone."""
-    epsg = scan.needs_place("a contour map").epsg
+    """Contours and annotations as a GeoPackage: a layer each, in the scan's UTM zone."""
+    frame = scan.needs_place("a contour map")
     found = contours_of(scan, options)
     heights = {"height_amsl_m": [height_m for height_m, _ in found]}
-    write_lines(out, "contours", epsg, [line for _, line in found], heights)
+    layers = [lines("contours", [line for _, line in found], heights)]
+    notes = read_annotations(scan.folder).features
+    if notes:
+        spots = np.array([one.geometry.coordinates for one in notes])
+        about = {
+            "height_amsl_m": spots[:, 2].tolist(),
+            "text": [one.properties.text for one in notes],
+            "by": [one.properties.by for one in notes],
+            "made_unix_s": [one.properties.made_unix_s for one in notes],
+        }
+        places = frame.to_utm(frame.to_enu(spots[:, [1, 0, 2]]))[:, :2]
+        layers.append(points("annotations", places, about))
+    write_layers(out, frame.epsg, layers)
 
 
 def write_kmz(scan: ScanView, out: Path, options: ExportOptions) -> None:

@@ -92,6 +92,20 @@ export async function finished(s: Scan, kind: string): Promise<Scan> {
   }
 }
 
+/** A place (longitude, latitude, metres above mean sea level) with a text. */
+export interface Annotation {
+  id: number;
+  geometry: { coordinates: [number, number, number] };
+  properties: { text: string; by: string; made_unix_s: number };
+}
+
+export const annotations = (s: { drone: string; scan: string }): Promise<{ features: Annotation[] }> =>
+  ask(`${place(s)}/annotations`);
+export const annotate = (s: { drone: string; scan: string }, coordinates: number[], text: string): Promise<Annotation> =>
+  ask(`${place(s)}/annotations`, "POST", { coordinates, text });
+export const eraseAnnotation = (s: { drone: string; scan: string }, number: number): Promise<unknown> =>
+  ask(`${place(s)}/annotations/${number}`, "DELETE");
+
 export const jobs = (): Promise<Job[]> => ask("/api/jobs");
 export const cancel = (number: number): Promise<Job> => ask(`/api/jobs/${number}`, "DELETE");
 export const bin = (): Promise<string[]> => ask("/api/bin");

@@ -22,6 +22,11 @@ export function notify(error: unknown): void {
   setTimeout(() => note.remove(), 6000);
 }
 
+const SHOWN_LETTERS = 30;
+
+/** The beginning of a text, for a label. */
+export const short = (text: string): string => (text.length > SHOWN_LETTERS ? `${text.slice(0, SHOWN_LETTERS - 1)}…` : text);
+
 export const count = (n: number | null | undefined): string =>
   n === null || n === undefined ? "?" : Math.round(n).toLocaleString("en");
 

@@ -49,6 +49,12 @@ export function placeOf(origin: Origin, point: THREE.Vector3): Place {
   return { lat_deg: lat / RAD, lon_deg: Math.atan2(y, x) / RAD, alt_m };
 }
 
+/** Metres east, north and up of `origin` of a longitude, latitude and height above mean sea level. */
+export function pointOf(origin: Origin, [lon_deg, lat_deg, alt_m]: [number, number, number]): THREE.Vector3 {
+  const there = eastNorthUp({ lat_deg, lon_deg, alt_amsl_m: alt_m });
+  return new THREE.Vector3().setFromMatrixPosition(there).applyMatrix4(eastNorthUp(origin).invert());
+}
+
 /** The zone of a place, with the wider ones of Norway and Svalbard; null near the poles. */
 function zoneOf({ lat_deg: lat, lon_deg: lon }: Place): number | null {
   if (lat >= 84 || lat < -80) return null;

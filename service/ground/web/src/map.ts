@@ -1,7 +1,7 @@
 // A scan on a flat map: layers as XYZ tiles over the operator's own basemap; grows while it flies.
 
 import * as api from "./api";
-import { el, notify, svg } from "./dom";
+import { el, notify, short, svg } from "./dom";
 import * as units from "./units";
 
 const SIDE = 256;
@@ -121,6 +121,8 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     el("a", { href: open, textContent: "3D" }),
     el("a", { href: `${at}/ortho.kml`, textContent: "KML" }),
   );
+  const marks = svg("svg", { class: "overlay notes" });
+  let notes: { place: Place; text: string }[] = [];
   const layers: Layer[] = [];
   let middle: Place = { x: 0.5, y: 0.5 };
   let zoom = 2;
@@ -130,6 +132,14 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     const { clientWidth: w, clientHeight: h } = host;
     for (const layer of layers) layer.draw(middle, zoom, w, h);
     scaleBar(bar, middle, zoom);
+    const scale = SIDE * 2 ** zoom;
+    marks.replaceChildren(
+      ...notes.flatMap(({ place, text }) => {
+        const [x, y] = [(place.x - middle.x) * scale + w / 2, (place.y - middle.y) * scale + h / 2];
+        const at = { cx: x.toFixed(1), cy: y.toFixed(1), r: "5" };
+        return [svg("circle", at), svg("text", { x: at.cx, y: (y - 10).toFixed(1) }, text)];
+      }),
+    );
     document.body.dataset["map"] = layers.some((layer) => layer.loading) ? "loading" : "shown";
   };
   const zoomTo = (next: number, x = host.clientWidth / 2, y = host.clientHeight / 2): void => {
@@ -170,6 +180,11 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   const refresh = async (): Promise<void> => {
     const found = (await fetch(`${at}/ortho.json`).then((r) => (r.ok ? r.json() : null), () => null)) as TileJson | null;
     none.hidden = found !== null;
+    const { features } = await api.annotations(id).catch(() => ({ features: [] }));
+    notes = features.map(({ geometry: { coordinates }, properties }) => ({
+      place: placeOf(coordinates[1], coordinates[0]),
+      text: short(properties.text),
+    }));
     if (found?.bounds && isFree) frame(found.bounds);
     for (const layer of layers.slice(-LAYERS.length)) layer.version = found?.version ?? "";
     draw();
@@ -182,7 +197,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     add(new Layer((z, x, y) => `${at}/${layer}/${z}/${x}/${y}.png`), title, on);
   const nearer = el("button", { textContent: "+", title: "nearer", onclick: () => zoomTo(zoom + 1) });
   const farther = el("button", { textContent: "−", title: "farther", onclick: () => zoomTo(zoom - 1) });
-  host.append(none, cursor, bar, el("span", { className: "zoom" }, nearer, farther));
+  host.append(none, marks, cursor, bar, el("span", { className: "zoom" }, nearer, farther));
   host.addEventListener("tile", draw);
   listen(host, { move, zoomBy: (by, x, y) => zoomTo(zoom + by, x, y) }, (x, y) => {
     const [lat, lon] = degreesOf(under(x, y));

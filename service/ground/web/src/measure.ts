@@ -21,6 +21,28 @@ export interface Scene {
   origin: Origin | null;
 }
 
+let down = { x: 0, y: 0 };
+addEventListener("pointerdown", (e) => (down = { x: e.clientX, y: e.clientY }), { capture: true });
+
+/** Whether the pointer has not moved since it went down: it turned no view. */
+export const wasClick = (e: MouseEvent): boolean => Math.hypot(e.clientX - down.x, e.clientY - down.y) <= CLICK_PX;
+
+/** The place of the scene at a place of the page; null where there is none. */
+export function pickAt({ canvas, camera, target }: Scene, x: number, y: number, limit?: number): THREE.Vector3 | null {
+  const box = canvas.getBoundingClientRect();
+  const pointer = new THREE.Vector2((2 * (x - box.left)) / box.width - 1, 1 - (2 * (y - box.top)) / box.height);
+  return pick(target(), camera, pointer, new THREE.Vector2(box.width, box.height), limit);
+}
+
+/** Where the canvas shows a place, in CSS pixels; null behind the camera. */
+export function onScreen({ canvas, camera }: Scene, place: THREE.Vector3): { x: number; y: number } | null {
+  camera.updateMatrixWorld();
+  const q = place.clone().applyMatrix4(camera.matrixWorldInverse);
+  if (q.z > -1e-3) return null;
+  q.applyMatrix4(camera.projectionMatrix);
+  return { x: (canvas.clientWidth / 2) * (1 + q.x), y: (canvas.clientHeight / 2) * (1 - q.y) };
+}
+
 export class Ruler {
   active = false;
   readonly panel = el("section", { className: "panel measure", hidden: true });
@@ -31,14 +53,12 @@ export class Ruler {
   private readonly places: THREE.Vector3[] = [];
   private volume: Volume | null = null;
   private heights: Float64Array | null = null;
-  private down: { x: number; y: number } | null = null;
   private hovered = 0;
 
   constructor(private readonly scene: Scene) {
     this.panel.setAttribute("aria-label", "measurement");
     this.overlay.setAttribute("aria-hidden", "true");
     const { canvas } = scene;
-    canvas.addEventListener("pointerdown", (e) => (this.down = { x: e.clientX, y: e.clientY }));
     canvas.addEventListener("click", (e) => this.click(e));
     canvas.addEventListener("pointermove", (e) => this.hover(e));
     canvas.addEventListener("pointerleave", () => (this.cursor.value = ""));
@@ -58,15 +78,7 @@ export class Ruler {
 
   /** Draws lines and labels where the places are seen now. */
   readonly draw = (): void => {
-    const { clientWidth: w, clientHeight: h } = this.scene.canvas;
-    const { camera } = this.scene;
-    camera.updateMatrixWorld();
-    const seen = this.places.map((p) => {
-      const q = p.clone().applyMatrix4(camera.matrixWorldInverse);
-      if (q.z > -1e-3) return null; // behind the camera
-      q.applyMatrix4(camera.projectionMatrix);
-      return { x: (w / 2) * (1 + q.x), y: (h / 2) * (1 - q.y) };
-    });
+    const seen = this.places.map((place) => onScreen(this.scene, place));
     const inFront = seen.filter((p) => p !== null);
     const parts: SVGElement[] = [];
     const n = seen.length;
@@ -92,18 +104,9 @@ export class Ruler {
     this.measure();
   }
 
-  private at(event: MouseEvent, limit?: number): THREE.Vector3 | null {
-    const { canvas, camera, target } = this.scene;
-    const box = canvas.getBoundingClientRect();
-    const x = (2 * (event.clientX - box.left)) / box.width - 1;
-    const y = 1 - (2 * (event.clientY - box.top)) / box.height;
-    return pick(target(), camera, new THREE.Vector2(x, y), new THREE.Vector2(box.width, box.height), limit);
-  }
-
   private click(event: MouseEvent): void {
-    const { down } = this;
-    if (!down || Math.hypot(event.clientX - down.x, event.clientY - down.y) > CLICK_PX) return;
-    const place = this.at(event);
+    if (!wasClick(event)) return;
+    const place = pickAt(this.scene, event.clientX, event.clientY);
     this.cursor.value = place ? coordinates(this.scene.origin, place) : "";
     if (!this.active) return;
     if (!place) return notify("no point there");
@@ -114,7 +117,7 @@ export class Ruler {
   private hover(event: PointerEvent): void {
     if (event.buttons || event.pointerType === "touch" || event.timeStamp - this.hovered < HOVER_MS) return;
     this.hovered = event.timeStamp;
-    const place = this.at(event, HOVER_POINTS);
+    const place = pickAt(this.scene, event.clientX, event.clientY, HOVER_POINTS);
     this.cursor.value = place ? coordinates(this.scene.origin, place) : "";
   }
 

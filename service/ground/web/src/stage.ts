@@ -112,6 +112,14 @@ export class Stage {
     this.camera.position.copy(looked).add(offset);
   }
 
+  /** Turns about a place from now on; the view keeps its direction and distance. */
+  lookAt(point: THREE.Vector3): void {
+    this.follow = false;
+    this.camera.position.add(point).sub(this.controls.target);
+    this.controls.target.copy(point);
+    this.touch();
+  }
+
   /** Looks at everything there is, from the south and above. */
   frame(): void {
     const box = new THREE.Box3();

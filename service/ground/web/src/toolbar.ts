@@ -6,6 +6,7 @@ import type { Cameras } from "./cameras";
 import { el, notify } from "./dom";
 import { clipBox, linkButton } from "./explore";
 import type { Ruler } from "./measure";
+import type { Notes } from "./notes";
 import { COLOURS, type Cloud, type Colour } from "./points";
 import { BACKGROUND, LIGHT, type Stage } from "./stage";
 import * as units from "./units";
@@ -15,6 +16,7 @@ export interface Parts {
   cloud: Cloud;
   cameras: Cameras;
   ruler: Ruler;
+  notes: Notes;
   legend: HTMLElement;
   coverage: HTMLElement;
   id: { drone: string; scan: string };
@@ -37,7 +39,7 @@ export function toolbar(parts: Parts): HTMLElement {
   bar.append(
     group(colours(parts)),
     group(follow, whole, linkButton(parts)),
-    group(measure(parts.ruler), cameraButton(parts.cameras), coverageButton(parts)),
+    group(...measure(parts), cameraButton(parts.cameras), coverageButton(parts)),
     showGroup(parts),
     clipBox(parts),
     settings(parts),
@@ -69,14 +71,22 @@ function colours({ cloud, legend }: Parts): HTMLElement {
   return select;
 }
 
-function measure(ruler: Ruler): HTMLElement {
-  const button = el("button", {
+/** The ruler and the notes: both take clicks, so one at a time. */
+function measure({ ruler, notes }: Parts): HTMLElement[] {
+  const length = el("button", {
     textContent: "Measure",
     title: "click points: distance, height, slope, area, volume, profile",
-    onclick: () => ruler.toggle(),
+    onclick: () => ((notes.active && notes.toggle()), ruler.toggle()),
   });
-  ruler.changed = () => pressed(button, ruler.active);
-  return button;
+  const words = el("button", {
+    textContent: "Notes",
+    title: "places with a text, kept with the scan",
+    hidden: !notes.isPossible,
+    onclick: () => ((ruler.active && ruler.toggle()), notes.toggle()),
+  });
+  ruler.changed = () => pressed(length, ruler.active);
+  notes.changed = () => pressed(words, notes.active);
+  return [length, words];
 }
 
 /** Marks a button that stays down, also for those who do not see it. */

@@ -8,6 +8,7 @@ import { jobList } from "./jobs";
 import { LinkState } from "./link";
 import { LiveView, type LastPose, type News } from "./live";
 import { Ruler } from "./measure";
+import { Notes } from "./notes";
 import { Cloud } from "./points";
 import { canDraw, Stage } from "./stage";
 import { toolbar } from "./toolbar";
@@ -72,25 +73,27 @@ function view(root: HTMLElement, scan: api.Scan, place?: string): () => void {
   }
   const stage = new Stage(host);
   const cameras = new Cameras();
-  const ruler = new Ruler({
+  const scene = {
     camera: stage.camera,
     canvas: stage.renderer.domElement,
     target: () => (stage.model.children.length ? stage.model : cloud.group),
     cloud: cloud.group,
     origin: scan.origin,
-  });
-  host.append(ruler.overlay, ruler.cursor);
-  side.prepend(ruler.panel);
+  };
+  const ruler = new Ruler(scene);
+  const notes = new Notes(scene, id, (point) => stage.lookAt(point));
+  host.append(notes.overlay, ruler.overlay, ruler.cursor);
+  side.prepend(ruler.panel, notes.panel);
   const site = { stage, cloud, cameras, id };
-  const images = new Images(site, () => !ruler.active);
+  const images = new Images(site, () => !ruler.active && !notes.active);
   const time = timeSlider(site);
   side.append(images.element);
   host.append(time.element);
-  stage.before.push(ruler.draw, () => cloud.screen(stage.renderer.domElement.height / 2));
+  stage.before.push(ruler.draw, notes.draw, () => cloud.screen(stage.renderer.domElement.height / 2));
   stage.drawGradually(cloud);
   stage.add(cameras.group);
   stage.addAgain(cloud.group);
-  bar.append(toolbar({ ...site, ruler, legend, coverage }));
+  bar.append(toolbar({ ...site, ruler, notes, legend, coverage }));
 
   let last: LastPose | undefined;
   let framed = takeView(stage, place);
@@ -148,6 +151,7 @@ function view(root: HTMLElement, scan: api.Scan, place?: string): () => void {
     images.close();
     live.close();
     ruler.close();
+    notes.close();
     stage.close();
   };
 }

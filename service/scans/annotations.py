@@ -1,0 +1,106 @@
+"""Annotations of a scan: places with a text, kept as GeoJSON in its folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from service.errors import InputError
+from service.scans.writing import writing
+from service.small_file import read_small
+
+ANNOTATIONS = "annotations.geojson"
+MAX_ANNOTATIONS = 200
+MAX_TEXT = 500
+MAX_BYTES = 1_000_000
+
+Spot = tuple[
+    Annotated[float, msgspec.Meta(ge=-180, le=180)],
+    Annotated[float, msgspec.Meta(ge=-90, le=90)],
+    Annotated[float, msgspec.Meta(ge=-1e5, le=1e6)],
+]
+"""Longitude and latitude in degrees, AMSL metres."""
+
+
+class Point(msgspec.Struct, forbid_unknown_fields=True):
+    """A place in GeoJSON."""
+
+    type: Literal["Point"]
+    coordinates: Spot
+
+
+class About(msgspec.Struct, forbid_unknown_fields=True):
+    """What is said of a place, by whom and when."""
+
+    text: Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_TEXT)]
+    by: Annotated[str, msgspec.Meta(max_length=100)]
+    made_unix_s: Annotated[float, msgspec.Meta(ge=-1e11, le=1e11)]
+
+
+class Annotation(msgspec.Struct, forbid_unknown_fields=True):
+    """One annotation as a feature of GeoJSON."""
+
+    type: Literal["Feature"]
+    id: Annotated[int, msgspec.Meta(ge=1, le=2**53)]
+    geometry: Point
+    properties: About
+
+
+class Annotations(msgspec.Struct, forbid_unknown_fields=True):
+    """All of a scan; an identifier comes once."""
+
+    type: Literal["FeatureCollection"] = "FeatureCollection"
+    features: Annotated[list[Annotation], msgspec.Meta(max_length=MAX_ANNOTATIONS)] = []
+
+
+def read_annotations(folder: Path) -> Annotations:
+    """The annotations of a scan folder, none without the file; InputError for an unfit file."""
+    path = folder / ANNOTATIONS
+    if not path.exists():
+        return Annotations()
+    try:
+        return msgspec.json.decode(read_small(path, MAX_BYTES, "GeoJSON"), type=Annotations)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{ANNOTATIONS} cannot be read: {error}"[:300]) from error
+
+
+def add_annotation(folder: Path, spot: Spot, text: str, by: str, unix_s: float) -> Annotation:
+    """Append one and write the file. InputError for an unfit text or when there are too many."""
+    found = read_annotations(folder)
+    if len(found.features) >= MAX_ANNOTATIONS:
+        raise InputError(f"a scan holds at most {MAX_ANNOTATIONS} annotations; delete some")
+    number = max((one.id for one in found.features), default=0) + 1
+    about = About(_text(text), by[:100], round(unix_s, 3))
+    new = Annotation("Feature", number, Point("Point", spot), about)
+    _write(folder, [*found.features, new])
+    return new
+
+
+def delete_annotation(folder: Path, number: int) -> None:
+    """Take one out and write the file. InputError when there is none of this number."""
+    found = read_annotations(folder).features
+    rest = [one for one in found if one.id != number]
+    if len(rest) == len(found):
+        raise InputError(f"no annotation {number}")
+    _write(folder, rest)
+
+
+def _text(text: str) -> str:
+    if any(0xD800 <= ord(letter) <= 0xDFFF for letter in text):
+        raise InputError("the text holds an invalid character (a lone surrogate)")
+    one_line = " ".join(text.split())
+    if not 0 < len(one_line) <= MAX_TEXT:
+        raise InputError(f"an annotation is a text of 1 to {MAX_TEXT} letters")
+    return one_line
+
+
+def _write(folder: Path, features: list[Annotation]) -> None:
+    with writing(folder / ANNOTATIONS) as part:
+        part.write_bytes(msgspec.json.encode(Annotations(features=features)))
+
+
+def as_json(document: Annotation | Annotations) -> Any:
+    """The GeoJSON of one or all."""
+    return msgspec.to_builtins(document)
