@@ -24,7 +24,6 @@ from mavlink.telemetry.quaternion import (
     multiply,
     normalised,
     to_rpy,
-    yaw_of,
 )
 from mavlink.telemetry.samples import GimbalFrame
 
@@ -72,7 +71,7 @@ def to_earth(q: Quaternion, frame: GimbalFrame, q_ned_body: Quaternion) -> Quate
         return multiply(q_ned_body, q)
     if frame is GimbalFrame.SERVO:
         return multiply(q_ned_body, _of_servos(q))
-    return multiply(from_rpy(0.0, 0.0, yaw_of(q_ned_body)), q)
+    return multiply(from_rpy(0.0, 0.0, to_rpy(q_ned_body)[2]), q)
 
 
 def _of_servos(q: Quaternion) -> Quaternion:

@@ -64,11 +64,6 @@ def to_rpy(q: Quaternion) -> tuple[float, float, float]:
     return roll, pitch, yaw
 
 
-def yaw_of(q_ned_body: Quaternion) -> float:
-    """Heading in rad of the vehicle's x axis; stable through pitch +-90 degrees."""
-    return to_rpy(q_ned_body)[2]
-
-
 def down_component(q_ned_body: Quaternion) -> float:
     """Cosine between the body's z axis and straight down: 1 when level."""
     _, x, y, _ = q_ned_body

@@ -23,7 +23,7 @@ from recon.posegraph.readings import Readings, is_frozen, sound
 from recon.posegraph.records import Loop, Node, PoseGraphConfig
 from recon.posegraph.segment_frames import SegmentFrames
 from recon.posegraph.sensor_offsets import Constants
-from recon.posegraph.smoother import MANY_STEPS, STEPS, Smoother, moved_covariance, reversed_motion
+from recon.posegraph.smoother import MANY_STEPS, STEPS, Smoother, left_covariance, reversed_motion
 from recon.posegraph.thinning import GONE_SHARE, thin
 from recon.types import F64, Pose, PosePrior
 
@@ -320,7 +320,7 @@ class PoseGraph:
             motion, covariance = self._motions.add(node, last, T_last)
             T = se3.project_to_so3(T_last @ motion)
             self._path[-1] += float(np.linalg.norm(motion[:3, 3]))
-            spread = moved_covariance(spread_last, T_last, covariance)
+            spread = spread_last + left_covariance(T_last, covariance)
         self._smoother.append_pose(T, spread)
         frame = self._segments.known(node.segment)
         drift_m = None if frame is None else self.config.frame_drift * self._path[node.key]

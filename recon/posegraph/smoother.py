@@ -355,8 +355,3 @@ def reversed_motion(T: F64, covariance: F64) -> tuple[F64, F64]:
     """T_b_a and its (6, 6) covariance in b's frame, from T_a_b and that in a's frame."""
     back = se3.inverse(T)
     return back, left_covariance(back, covariance)
-
-
-def moved_covariance(spread: F64, T: F64, covariance: F64) -> F64:
-    """(6, 6) left covariance after a motion with left ``covariance`` in the frame of ``T``."""
-    return spread + left_covariance(T, covariance)

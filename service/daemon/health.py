@@ -99,16 +99,12 @@ def metrics_text(snapshot: dict[str, Any], prefix: str = PREFIX) -> str:
     """Prometheus text of the numbers in ``snapshot``; nested names are joined by ``_``."""
     lines = []
     for name, value in snapshot.items():
-        full = f"{prefix}{_metric_name(name)}"
+        full = prefix + "".join(c if c.isascii() and c.isalnum() else "_" for c in name)
         if isinstance(value, dict):
             lines.append(metrics_text(value, f"{full}_").rstrip("\n"))
         elif isinstance(value, bool | int | float):
             lines.append(f"# TYPE {full} gauge\n{full} {float(value):.10g}")
     return "\n".join(line for line in lines if line) + "\n"
-
-
-def _metric_name(name: str) -> str:
-    return "".join(c if c.isascii() and c.isalnum() else "_" for c in name)
 
 
 def _handler(snapshot: Snapshot, own_names: OwnNames) -> type[BaseHTTPRequestHandler]:

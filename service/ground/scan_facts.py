@@ -118,16 +118,12 @@ def facts_of(source: Path | ScanStore) -> dict[str, Any]:
 
     Raises InputError, ValueError, RecursionError or OSError for what cannot be read.
     """
-    return (_from_summary(source) if isinstance(source, Path) else _from_store(source)).shown()
+    return (_decoded(source, Facts) if isinstance(source, Path) else _from_store(source)).shown()
 
 
 def ground_in(path: Path) -> Ground:
     """When and where a scan was flown, from its ``scan.json``; errors as of :func:`facts_of`."""
     return _decoded(path, Ground)
-
-
-def _from_summary(path: Path) -> Facts:
-    return _decoded(path, Facts)
 
 
 def _decoded(path: Path, kind: type[T]) -> T:

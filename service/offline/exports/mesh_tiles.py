@@ -21,7 +21,7 @@ from recon.mapping.cloud_fusion import cloud_of, fuse, without
 from recon.mapping.free_space import seen_through, spread
 from recon.mapping.voxel_map import ground_sample_m
 from recon.surface.meshing import Mesh, cut, height_mesh, poisson_mesh
-from recon.surface.raster import Raster, fill_holes, grid_over, rasterise, smoothed
+from recon.surface.raster import fill_holes, grid_over, rasterise, smoothed
 from recon.surface.texture_views import TextureView
 from recon.surface.texturing import texture
 from recon.types import F64, U8, Keyframe, PointCloud
@@ -230,12 +230,8 @@ def _surface(
     raster = fill_holes(rasterise(cloud, grid), largest_cells=8)
     progress("triangles")
     mesh = height_mesh(smoothed(raster), job.largest_faces)
-    return Mesh(mesh.vertices_m, mesh.faces, None, _colour_at(mesh.vertices_m, raster))
-
-
-def _colour_at(vertices: F64, raster: Raster) -> U8:
-    """(V, 3) colours of the cells below the vertices."""
-    return np.asarray(raster.rgb[raster.grid.cells(vertices[:, :2])], np.uint8)
+    rgb = raster.rgb[raster.grid.cells(mesh.vertices_m[:, :2])]
+    return Mesh(mesh.vertices_m, mesh.faces, None, rgb)
 
 
 def _seen_from(cloud: PointCloud, keyframes: Sequence[Keyframe]) -> F64:
