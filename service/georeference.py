@@ -20,7 +20,7 @@ import numpy as np
 from recon.types import F64, Array
 
 if TYPE_CHECKING:
-    from pyproj import Transformer
+    from pyproj import CRS, Transformer
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +66,24 @@ class LocalFrame:
 
     def _geodetic_enu(self) -> Transformer:
         return _topocentric(float(self.lat_deg), float(self.lon_deg), float(self.alt_amsl_m))
+
+
+VERTICAL_DATUMS = {"ellipsoid": None, "EGM96": 5773, "EGM2008": 3855}
+"""Names of what heights may be above, and the EPSG code of a geoid model's heights."""
+
+
+def map_crs(epsg: int, vertical: str | None = None) -> CRS:
+    """The map's coordinate system; with a name of VERTICAL_DATUMS that of its heights as well.
+
+    Nothing is converted, so no geoid grid is needed.
+    """
+    from pyproj import CRS
+
+    flat = CRS.from_epsg(epsg)
+    if vertical is None:
+        return flat
+    heights = VERTICAL_DATUMS[vertical]
+    return flat.to_3d() if heights is None else CRS(f"EPSG:{epsg}+{heights}")
 
 
 def utm_epsg(lat_deg: float, lon_deg: float) -> int:

@@ -11,7 +11,7 @@ import cv2
 import laspy
 import numpy as np
 import pytest
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 from typer.testing import CliRunner
 
 from recon.types import F64
@@ -81,6 +81,7 @@ def test_points_have_the_gps_time_of_their_keyframe(
     if kind == "copc":
         pytest.importorskip("copclib")
     cloud = laspy.read(written(scan_dir, kind))
+    assert set(cloud.classification) == {1, 2}
     assert cloud.header.global_encoding.gps_time_type == laspy.header.GpsTimeType.STANDARD
     epoch = dt.datetime(1980, 1, 6, tzinfo=dt.timezone.utc).timestamp()
     with ScanStore.open(scan_dir / "scan.db") as store:
@@ -89,6 +90,35 @@ def test_points_have_the_gps_time_of_their_keyframe(
     found = np.unique(np.asarray(cloud.gps_time))
     assert len(found) > 1
     assert np.abs(found[:, None] - np.array(times)).min(axis=1).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("datum", "codes"), [("EGM96", [32632, 5773]), ("EGM2008", [32632, 3855]), ("ellipsoid", [])]
+)
+@pytest.mark.parametrize("kind", ["laz", "copc", "dsm", "dtm"])
+def test_the_operator_says_what_heights_are_above(
+    scan_dir: Path, kind: str, datum: str, codes: list[int]
+) -> None:
+    rasterio = pytest.importorskip("rasterio", exc_type=ImportError)
+    if kind == "copc":
+        pytest.importorskip("copclib")
+    path = written(scan_dir, kind, ExportOptions(vertical_datum=datum))
+    if path.suffix == ".tif":
+        with rasterio.open(path) as image:
+            crs = CRS.from_wkt(image.crs.to_wkt())
+            assert image.tags()["HEIGHTS"] == f"metres above {datum}"
+    else:
+        crs = laspy.read(path).header.parse_crs()
+    assert [part.to_epsg() for part in crs.sub_crs_list] == codes
+    if path.suffix != ".tif" or codes:
+        assert len(crs.axis_info) == 3 and crs.axis_info[2].direction == "up"
+    assert codes or crs.to_2d().to_epsg() == 32632
+
+
+def test_an_unknown_datum_is_refused(scan_dir: Path) -> None:
+    ask = ["export", str(scan_dir), "--to", "dsm", "--vertical-datum", "NN"]
+    answer = CliRunner().invoke(app, ask)
+    assert isinstance(answer.exception, InputError) and "EGM2008" in str(answer.exception)
 
 
 def test_gps_time_counts_the_leap_seconds() -> None:

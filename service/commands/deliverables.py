@@ -40,6 +40,10 @@ def export(
     video_epoch: Annotated[
         float | None, typer.Option(help="unix seconds of its start; default: the scan's start")
     ] = None,
+    vertical_datum: Annotated[
+        str | None,
+        typer.Option(help="what the heights are above, if known: ellipsoid, EGM96 or EGM2008"),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Write deliverables of a scan: clouds, surface model, orthophoto, tiles, mesh, flight."""
@@ -60,6 +64,7 @@ def export(
             video,
             stored,
             _epoch_ns(video_epoch),
+            vertical_datum,
         )
     except ValueError as error:
         raise InputError(f"export: {error}") from error

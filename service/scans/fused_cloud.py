@@ -21,7 +21,7 @@ from recon.mapping.cloud_fusion import cloud_of, fuse_strips, without
 from recon.mapping.free_space import seen_through, spread
 from recon.mapping.voxel_map import ground_sample_m
 from recon.types import F64, I64, U8, PointCloud
-from service.georeference import LocalFrame
+from service.georeference import LocalFrame, map_crs
 from service.progress import Progress
 from service.scans.main_piece import Keyframes, main_keyframes
 
@@ -160,10 +160,14 @@ def placed(cloud: PointCloud, frame: LocalFrame | None) -> F64:
     return enu if frame is None or not len(enu) else frame.to_utm(enu)
 
 
-def las_header(xyz_m: F64, frame: LocalFrame | None, started_unix_ns: int) -> laspy.LasHeader:
-    """The header for points near ``xyz_m``; its dates come from the scan, not from the clock."""
+def las_header(
+    xyz_m: F64, frame: LocalFrame | None, started_unix_ns: int, vertical: str | None = None
+) -> laspy.LasHeader:
+    """The header for points near ``xyz_m``; its dates come from the scan, not from the clock.
+
+    ``vertical`` is what :func:`service.georeference.map_crs` takes.
+    """
     import laspy
-    from pyproj import CRS
 
     header = laspy.LasHeader(version="1.4", point_format=7)
     header.add_extra_dims(
@@ -181,7 +185,7 @@ def las_header(xyz_m: F64, frame: LocalFrame | None, started_unix_ns: int) -> la
     header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     header.global_encoding.wkt = True  # LAS 1.4 requires it with this format, even without a CRS
     if frame is not None:
-        header.add_crs(CRS.from_epsg(frame.epsg))
+        header.add_crs(map_crs(frame.epsg, vertical))
     return header
 
 
@@ -193,6 +197,7 @@ def write_laz(
     laz: bool = True,
     classes: U8 | None = None,
     xyz_m: F64 | None = None,
+    vertical: str | None = None,
 ) -> None:
     """Write ``cloud`` (ENU metres) to ``path``, in UTM with AMSL heights when there is a frame.
 
@@ -202,7 +207,8 @@ def write_laz(
     """
     import laspy
 
-    header = las_header(placed(_cut(cloud, slice(0, 1)), frame), frame, started_unix_ns)
+    first = placed(_cut(cloud, slice(0, 1)), frame)
+    header = las_header(first, frame, started_unix_ns, vertical)
     kind: dict[str, Any] = {"do_compress": laz, "closefd": False}
     with open(path, "wb") as file, laspy.open(file, "w", header=header, **kind) as out:
         for at in range(0, len(cloud), CHUNK_POINTS):

@@ -47,7 +47,7 @@ def write_all(scan: ScanView, out: Path, options: ExportOptions) -> None:
         "scan": scan.store.header.scan_id,
         "software": software(),
         "epsg": None if frame is None else frame.epsg,
-        "heights": HEIGHTS if frame is not None else "metres above the scan's origin",
+        "heights": _heights(scan, options),
         "files": [_entry(k, path) for k in MAPS if isinstance(path := done[k], Path)],
         "failed": {kind: str(error) for kind, error in failures.items()},
     }
@@ -74,6 +74,13 @@ HEIGHTS = (
     "metres above mean sea level as the autopilot reports it (usually EGM96); "
     "no vertical coordinate system is declared"
 )
+
+
+def _heights(scan: ScanView, options: ExportOptions) -> str:
+    if scan.frame is None:
+        return "metres above the scan's origin"
+    datum = options.vertical_datum
+    return HEIGHTS if datum is None else f"metres above {datum}, as the operator says"
 
 
 def _entry(kind: str, path: Path) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from recon.types import F64, I64, U8
+from service.georeference import map_crs
 from service.offline.exports.flight import writing_folder
 from service.offline.exports.surface import bare_ground, surface_model
 from service.offline.exports.view import ExportOptions, ScanView
@@ -58,8 +59,10 @@ def write_laz_file(scan: ScanView, out: Path, options: ExportOptions) -> None:
     laz = out.suffix.lower() != ".las"
     started_ns = scan.store.header.started_unix_ns
     with writing(out) as part:
-        kinds, places = classes(scan), scan.xyz_m
-        write_laz(part, scan.fused.cloud, scan.frame, started_ns, laz, kinds, places)
+        write_laz(
+            part, scan.fused.cloud, scan.frame, started_ns, laz, classes(scan), scan.xyz_m,
+            options.vertical_datum,
+        )  # fmt: skip
 
 
 UNCLASSIFIED, GROUND = 1, 2
@@ -86,13 +89,15 @@ def write_copc(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """The fused cloud as COPC, with sigma_m and views and the EPSG code as WKT."""
     import copclib
 
-    header = las_header(scan.xyz_m, scan.frame, scan.store.header.started_unix_ns)
+    vertical = options.vertical_datum
+    header = las_header(scan.xyz_m, scan.frame, scan.store.header.started_unix_ns, vertical)
     record = point_record(header, scan.xyz_m, scan.fused.cloud)
+    record["classification"] = classes(scan)
     raw = np.frombuffer(record.memoryview(), np.int8).reshape(len(record), -1)
     xyz = np.column_stack([record.x, record.y, record.z])
     centre, half = _cube(xyz)
     with writing(out) as part:
-        writer = copclib.FileWriter(str(part), _config(header, scan, xyz, centre, half))
+        writer = copclib.FileWriter(str(part), _config(header, scan, xyz, centre, half, vertical))
         for key, rows in octree(xyz, centre - half, 2.0 * half):
             data = copclib.VectorChar(raw[rows].ravel())
             writer.AddNode(copclib.VoxelKey(*key), data)
@@ -106,15 +111,22 @@ def _cube(xyz: F64) -> tuple[F64, float]:
 
 
 def _config(
-    header: laspy.LasHeader, scan: ScanView, xyz: F64, centre: F64, half: float
+    header: laspy.LasHeader,
+    scan: ScanView,
+    xyz: F64,
+    centre: F64,
+    half: float,
+    vertical: str | None,
 ) -> copclib.CopcConfigWriter:
     """COPC's header for these points."""
     import copclib
-    from pyproj import CRS
 
     extra = _extra_bytes(header)
     vector = copclib.Vector3
-    wkt = "" if scan.frame is None else CRS.from_epsg(scan.frame.epsg).to_wkt("WKT1_GDAL")
+    wkt = ""
+    if scan.frame is not None:  # WKT1 knows no ellipsoidal heights of a map
+        version = "WKT2_2019" if vertical == "ellipsoid" else "WKT1_GDAL"
+        wkt = map_crs(scan.frame.epsg, vertical).to_wkt(version)
     config = copclib.CopcConfigWriter(
         7, vector([SCALE_M] * 3), vector(list(map(float, header.offsets))), wkt, extra, False
     )

@@ -19,7 +19,7 @@ from recon.surface.raster import Grid, Raster, fill_holes, round_cell
 from recon.surface.texture_views import TextureView
 from recon.types import F64, Array
 from service.errors import InputError
-from service.georeference import LocalFrame
+from service.georeference import LocalFrame, map_crs
 from service.offline.exports.images import scan_images
 from service.offline.exports.surface import bare_ground, surface_model
 from service.offline.exports.view import ExportOptions, ScanView
@@ -41,7 +41,7 @@ def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
     bands = [surface.raster.height_m, surface.raster.sigma_m, surface.is_filled]
     image = np.where(known, np.stack(bands), NODATA_M).astype(np.float32)
     names = ("height AMSL, m", "sigma, m", "filled")
-    write_cog(scan, out, surface.raster.grid, image, names, nodata=NODATA_M)
+    write_cog(scan, out, surface.raster.grid, image, names, NODATA_M, options.vertical_datum)
 
 
 def write_dtm(scan: ScanView, out: Path, options: ExportOptions) -> None:
@@ -50,7 +50,8 @@ def write_dtm(scan: ScanView, out: Path, options: ExportOptions) -> None:
     bands = np.stack([found.everywhere_m, found.is_bridged])
     image = np.where(found.is_inside, bands, NODATA_M)
     names = ("ground AMSL, m", "bridged")
-    write_cog(scan, out, raster.grid, image.astype(np.float32), names, nodata=NODATA_M)
+    image = image.astype(np.float32)
+    write_cog(scan, out, raster.grid, image, names, NODATA_M, options.vertical_datum)
 
 
 def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
@@ -111,8 +112,13 @@ def write_cog(
     bands: Array,
     names: tuple[str, ...],
     nodata: float | None = None,
+    vertical: str | None = None,
 ) -> None:
-    """Write (bands, rows, cols) as Cloud Optimized GeoTIFF in the scan's UTM zone."""
+    """Write (bands, rows, cols) as Cloud Optimized GeoTIFF in the scan's UTM zone.
+
+    ``vertical`` is what :func:`service.georeference.map_crs` takes; heights above the ellipsoid
+    are a tag only.
+    """
     import rasterio
     from rasterio.enums import ColorInterp
     from rasterio.io import MemoryFile
@@ -129,8 +135,11 @@ def write_cog(
         "nodata": nodata,
     }
     if scan.frame is not None:
-        profile["crs"] = rasterio.crs.CRS.from_epsg(scan.frame.epsg)
+        coded = None if vertical == "ellipsoid" else vertical  # GeoTIFF has no code for it on a map
+        profile["crs"] = rasterio.crs.CRS.from_wkt(map_crs(scan.frame.epsg, coded).to_wkt())
     heights = "metres above mean sea level" if scan.frame else "metres above the scan's origin"
+    if scan.frame is not None and vertical is not None:
+        heights = f"metres above {vertical}"
     with writing(out) as part, MemoryFile() as memory:
         with memory.open(**profile) as image:
             image.write(bands)

@@ -17,7 +17,7 @@ import numpy as np
 from recon.surface.raster import Grid, Raster, grid_over, rasterise_points, round_cell
 from recon.types import F64
 from service.errors import InputError
-from service.georeference import LocalFrame
+from service.georeference import VERTICAL_DATUMS, LocalFrame
 from service.offline.exports import EXPORTERS
 from service.packages import needing
 from service.progress import Progress
@@ -50,9 +50,13 @@ class ExportOptions:
     video: Path | None = None  # None: the scan's recording, when it is still there
     stored: bool = False  # never look for the recording
     video_epoch_ns: int | None = None
+    vertical_datum: str | None = None  # what the heights are above, where the operator knows it
 
     def __post_init__(self) -> None:
-        """Raise ValueError for sizes that are not positive."""
+        """Raise ValueError for sizes that are not positive, and for an unknown datum."""
+        if self.vertical_datum not in (None, *VERTICAL_DATUMS):
+            known = ", ".join(VERTICAL_DATUMS)
+            raise ValueError(f"--vertical-datum {self.vertical_datum}: give {known}")
         for name in ("voxel_m", "cell_m", "contour_m"):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0.0):
