@@ -115,6 +115,29 @@ def test_small_holes_are_filled_and_the_outline_stays() -> None:
     np.testing.assert_array_equal(filled.height_m[kept], height[kept])
 
 
+def test_a_hole_takes_the_mean_of_the_smallest_window_that_knows_anything() -> None:
+    rng = np.random.default_rng(4)
+    known = rng.random((40, 50)) > 0.4
+    known[12:16, 20:25] = False
+    height = np.where(known, rng.normal(5, 1, known.shape), np.nan).astype(np.float32)
+    raster = raster_of(height)
+    raster.rgb[:] = rng.integers(0, 256, raster.rgb.shape)
+    filled = fill_holes(raster, largest_cells=4)
+    holes = np.argwhere(filled.known & ~known)
+    assert len(holes) > 500
+    for r, c in holes:
+        for reach in range(1, 5):
+            here = (
+                slice(max(r - reach, 0), r + reach + 1),
+                slice(max(c - reach, 0), c + reach + 1),
+            )
+            if known[here].any():
+                break
+        assert filled.height_m[r, c] == pytest.approx(height[here][known[here]].mean(), abs=1e-5)
+        mean = raster.rgb[here][known[here]].mean(axis=0)
+        np.testing.assert_allclose(filled.rgb[r, c], mean, atol=0.51)
+
+
 @pytest.mark.parametrize(("east", "north"), [(0.0, 0.0), (0.3, 0.0), (0.0, -0.5), (0.2, 0.4)])
 def test_shading_of_a_plane_is_the_cosine_to_the_sun(east: float, north: float) -> None:
     rows, cols = np.mgrid[0:20, 0:30].astype(float)

@@ -268,39 +268,36 @@ def fill_holes(raster: Raster, largest_cells: int = 4) -> Raster:
     mask = np.pad(known, pad).astype(np.uint8)
     closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel)[pad:-pad, pad:-pad] > 0
     holes = closed & ~known
-    layers = np.dstack(
-        [np.nan_to_num(raster.height_m), np.nan_to_num(raster.sigma_m), raster.rgb]
-    ).astype(np.float32)
-    smooth, fill = _normalised_blur(layers, known, holes, largest_cells)
     height, sigma, rgb = raster.height_m.copy(), raster.sigma_m.copy(), raster.rgb.copy()
-    height[fill] = smooth[fill, 0]
-    sigma[fill] = 2.0 * smooth[fill, 1]
-    rgb[fill] = np.clip(np.rint(smooth[fill, 2:]), 0, 255).astype(np.uint8)
+    _fill(np.argwhere(holes), known, largest_cells, height, sigma, rgb)
     return Raster(raster.grid, height, sigma, rgb)
 
 
-def _normalised_blur(layers: F32, known: Bool, holes: Bool, largest_cells: int) -> tuple[F32, Bool]:
-    """Mean of the known cells around each hole, from the smallest window that has any.
-
-    The mask says which holes have one.
-    """
-    out = layers.copy()
-    filled = np.zeros_like(holes)
-    weight = known.astype(np.float32)
-    weighted = layers * weight[..., None]
-    for radius in range(1, largest_cells + 1):
-        if (filled == holes).all():
-            break
-        window = (2 * radius + 1, 2 * radius + 1)
-        total = cv2.boxFilter(weight, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        new = holes & ~filled & (total > 0.5)
-        if new.any():
-            sums = cv2.boxFilter(
-                weighted, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT
-            )
-            out[new] = sums[new] / total[new][:, None]
-            filled |= new
-    return out, filled
+@njit(cache=True, nogil=True)
+def _fill(
+    holes: I64, known: Bool, largest_cells: int, height: F32, sigma: F32, rgb: U8
+) -> None:  # pragma: no cover - compiled
+    """Fill the cells ``holes`` (N, 2) by the mean of the smallest window with a known cell."""
+    rows, cols = known.shape
+    sums = np.empty(5)
+    for r, c in holes:
+        for reach in range(1, largest_cells + 1):
+            count = 0
+            sums[:] = 0.0
+            for v in range(max(r - reach, 0), min(r + reach + 1, rows)):
+                for u in range(max(c - reach, 0), min(c + reach + 1, cols)):
+                    if known[v, u]:
+                        count += 1
+                        sums[0] += height[v, u]
+                        sums[1] += sigma[v, u]
+                        for k in range(3):
+                            sums[2 + k] += rgb[v, u, k]
+            if count:
+                height[r, c] = sums[0] / count
+                sigma[r, c] = 2.0 * sums[1] / count
+                for k in range(3):
+                    rgb[r, c, k] = np.rint(sums[2 + k] / count)
+                break
 
 
 def smoothed(raster: Raster, sigma_cells: float = 1.5) -> Raster:
