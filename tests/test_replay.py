@@ -230,3 +230,17 @@ def test_an_unreadable_folder_loses_nothing(flight: Path, tmp_path: Path) -> Non
     closed.mkdir(mode=0o500)
     done = skyrelief(*replay_of(flight, closed / "scan"))
     assert done.returncode == 2 and "closed" in done.stderr
+
+
+def test_memory_is_pooled_before_anything_large_is_loaded() -> None:
+    script = (
+        "import sys\n"
+        "sys.argv = ['skyrelief', 'replay', 'no-such-video']\n"
+        "import service.daemon.machine as machine\n"
+        "machine.one_pool = lambda: print('numpy' in sys.modules)\n"
+        "from service.cli import main\n"
+        "main()\n"
+    )
+    root = Path(__file__).resolve().parents[1]
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=root)
+    assert run.stdout == "False\n" and "no such file" in run.stderr

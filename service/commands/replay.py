@@ -49,6 +49,9 @@ def replay(
     as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
 ) -> None:
     """Recorded video, a folder of images or a pipe through the onboard path into a scan."""
+    from service.daemon.machine import one_pool
+
+    one_pool()
     from service.cameras import open_camera
     from service.config import is_given, load_config
 
@@ -117,6 +120,7 @@ def _replay(
 ) -> dict[str, Any]:
     from service.cameras.source import Paced
     from service.compute.backend_choice import open_backend
+    from service.daemon.machine import give_back
     from service.flight.datalink import open_datalink
     from service.flight.scan import Scan, ScanInputs, create_store
     from service.scans.folder import write_deliverables
@@ -163,6 +167,7 @@ def _replay(
         if link is not None:
             summary["datalink_complete"] = link.drain(config.datalink.drain_s)
             link.close()
+        give_back(collect=True)
         summary |= write_deliverables(folder, store, {})
         store.close()
     return summary | {"scan_folder": str(folder)}
