@@ -162,6 +162,10 @@ def test_the_command_cuts_a_large_site(tmp_path: Path, house: HouseFlight) -> No
     scene = trimesh.load(tmp_path / "mesh.glb")
     assert len(scene.geometry) == figures["tiles"]
     assert sum(len(g.faces) for g in scene.geometry.values()) == figures["faces"]
+    data = (tmp_path / "mesh.glb").read_bytes()
+    tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    uses = [view.get("target") for view in tree["bufferViews"]]  # indices, vertices, images
+    assert uses.count(34963) == figures["tiles"] and uses.count(None) == len(tree["images"])
 
 
 class FakeVideo:

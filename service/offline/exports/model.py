@@ -139,6 +139,7 @@ def mesh_extras(scan: ScanView) -> dict[str, Any]:
 
 LARGEST_TEXTURE_PX = 8192
 CLAMP_TO_EDGE, TRILINEAR = 33071, 9987
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 
 def glb(parts: Sequence[tuple[Mesh, U8 | None]], extras: dict[str, Any]) -> bytes:
@@ -172,7 +173,18 @@ def glb(parts: Sequence[tuple[Mesh, U8 | None]], extras: dict[str, Any]) -> byte
         tree["extensionsUsed"] = ["KHR_materials_unlit"]
         tree["asset"] |= {"generator": "skyrelief", "extras": extras}
 
-    return bytes(export_glb(scene, include_normals=False, buffer_postprocessor=add_textures))
+    hooks = {"buffer_postprocessor": add_textures, "tree_postprocessor": _name_uses}
+    return bytes(export_glb(scene, include_normals=False, **hooks))
+
+
+def _name_uses(tree: dict[str, Any]) -> None:
+    """Say of each view of the buffer whether it holds vertices or their numbers."""
+    accessors, views = tree["accessors"], tree["bufferViews"]
+    for mesh in tree["meshes"]:
+        for one in mesh["primitives"]:
+            for accessor in one["attributes"].values():
+                views[accessors[accessor]["bufferView"]]["target"] = ARRAY_BUFFER
+            views[accessors[one["indices"]]["bufferView"]]["target"] = ELEMENT_ARRAY_BUFFER
 
 
 def _geometry(mesh: Mesh, textured: bool) -> Any:
