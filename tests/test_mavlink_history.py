@@ -35,6 +35,7 @@ from mavlink.telemetry.track import Track
 
 MS = 1_000_000
 S = 1_000_000_000
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
 T0 = 1_700_000_000 * S
 
 
@@ -170,7 +171,7 @@ def test_attitude_sigma_grows_with_the_gap() -> None:
     for gap_ms in (20, 200, 400, 800, 1000):
         history = VehicleHistory()
         for k in range(3):
-            history.add(AttitudeSample(None, quaternion.IDENTITY), T0 + k * gap_ms * MS)
+            history.add(AttitudeSample(None, IDENTITY), T0 + k * gap_ms * MS)
         state = history.state_at(T0 + gap_ms * MS * 3 // 2)
         assert state is not None and state.sigma_attitude_rad and state.sigma_yaw_rad
         sigmas.append(state.sigma_attitude_rad)
@@ -184,7 +185,7 @@ def test_nothing_is_known_of_an_empty_history_or_another_time() -> None:
     history = VehicleHistory()
     assert history.state_at(T0) is None
     assert history.first_ns is None and history.last_ns is None
-    history.add(AttitudeSample(None, quaternion.IDENTITY), T0)
+    history.add(AttitudeSample(None, IDENTITY), T0)
     assert history.state_at(T0 + 21 * MS) is None
     assert history.state_at(T0 - 21 * MS) is None
     assert history.state_at(T0 + 20 * MS) is not None
@@ -319,7 +320,7 @@ def test_servo_angles_are_composed_in_the_order_of_the_servos(tilt_deg: float) -
     roll, tilt = 0.2, math.radians(tilt_deg)
     sent = quaternion.from_rpy(roll, tilt, 0.0)  # as ArduPilot encodes servo angles
     truth = Rotation.from_euler("X", roll) * Rotation.from_euler("Y", tilt)
-    got = to_earth(sent, GimbalFrame.SERVO, quaternion.IDENTITY)
+    got = to_earth(sent, GimbalFrame.SERVO, IDENTITY)
     assert angle(got, of_scipy(truth)) < 1e-5
 
 
@@ -369,14 +370,14 @@ def test_configuration_overrides_every_claim() -> None:
 
 
 def test_too_little_sway_decides_nothing() -> None:
-    level = [quaternion.IDENTITY] * 200
+    level = [IDENTITY] * 200
     assert steadiest_frame(level, level) is None
 
 
 def test_the_gimbal_itself_is_accepted_before_its_relay_and_before_older_messages() -> None:
     history = VehicleHistory()
     for t in (T0, T0 + 100 * MS):
-        history.add(AttitudeSample(None, quaternion.IDENTITY), t)
+        history.add(AttitudeSample(None, IDENTITY), t)
         for component, rank, pitch in ((1, 0, -0.1), (154, 0, -0.2), (154, 1, -0.3)):
             q = quaternion.from_rpy(0.0, pitch, 0.0)
             history.add(GimbalSample(None, q, GimbalFrame.EARTH, component, rank), t)
@@ -419,11 +420,11 @@ def test_the_images_decide_between_frames() -> None:
 
 
 def test_judging_needs_matching_lists() -> None:
-    ends = (quaternion.IDENTITY, quaternion.IDENTITY)
+    ends = (IDENTITY, IDENTITY)
     with pytest.raises(ValueError, match="as many of each"):
         judge_frame([ends], [], [])
     assert judge_frame([], [], []) is None
-    still = judge_frame([ends], [ends], [quaternion.IDENTITY])
+    still = judge_frame([ends], [ends], [IDENTITY])
     assert still is not None and not still.decided
 
 
@@ -431,7 +432,7 @@ def test_a_live_history_waits_for_the_far_side_of_a_frame() -> None:
     history = VehicleHistory(patience_s=5.0)
     now = time.monotonic_ns()
     for k in range(10):
-        history.add(AttitudeSample(None, quaternion.IDENTITY), now - (600 - 50 * k) * MS)
+        history.add(AttitudeSample(None, IDENTITY), now - (600 - 50 * k) * MS)
     frame = now - 90 * MS  # the newest attitude is 60 ms older than the frame
     late = AttitudeSample(None, quaternion.from_rpy(0.0, 0.0, 0.3))
     timer = threading.Timer(0.05, lambda: history.add(late, now - 50 * MS))
@@ -446,10 +447,10 @@ def test_a_live_history_waits_for_the_far_side_of_a_frame() -> None:
 def test_a_live_history_does_not_wait_in_vain() -> None:
     impatient = VehicleHistory(patience_s=0.01)
     now = time.monotonic_ns()
-    impatient.add(AttitudeSample(None, quaternion.IDENTITY), now - 100 * MS)
+    impatient.add(AttitudeSample(None, IDENTITY), now - 100 * MS)
     assert impatient.state_at(now - 20 * MS) is None  # nothing comes
     history = VehicleHistory(patience_s=1000.0)  # would stand still for ever if it waited
-    history.add(AttitudeSample(None, quaternion.IDENTITY), now)
+    history.add(AttitudeSample(None, IDENTITY), now)
     assert history.state_at(now) is not None  # there already
     assert history.state_at(now + 2000 * S) is None  # far ahead
     assert history.state_at(now - 3 * S) is None  # long past
@@ -460,7 +461,7 @@ def test_a_live_history_does_not_wait_in_vain() -> None:
 def test_a_live_history_forgets_and_a_wrong_sample_is_refused() -> None:
     history = VehicleHistory(HistoryConfig(keep_s=2.0))
     for k in range(2000):
-        history.add(AttitudeSample(None, quaternion.IDENTITY), T0 + k * 10 * MS)
+        history.add(AttitudeSample(None, IDENTITY), T0 + k * 10 * MS)
     assert len(history) < 700
     assert history.state_at(T0 + 19 * S) is not None
     with pytest.raises(ValueError, match="positive"):
