@@ -185,7 +185,9 @@ def open_above(places_m: F64, heights_m: Sequence[float], views: Iterable[DepthM
     for depth in views:
         reached = tiles.in_view(depth, up_m=float(up.max()))
         if len(reached):
-            _look_above(
+            in_bands(
+                _look_above,
+                len(reached),
                 reached,
                 tiles.first,
                 tiles.xyz_m,
@@ -217,13 +219,14 @@ def _pixel(x: float, y: float, z: float, K: F64, T: F64) -> tuple[int, int, floa
 
 @njit(cache=True, nogil=True)
 def _look_above(
-    tiles: I64, first: I64, xyz: F32, up_m: F64, depth: F32, depth_sigma: F32, K: F64, T: F64,
-    seen: U8, is_decided: Bool,
+    begin: int, end: int, tiles: I64, first: I64, xyz: F32, up_m: F64, depth: F32,
+    depth_sigma: F32, K: F64, T: F64, seen: U8, is_decided: Bool,
 ) -> None:  # fmt: skip
-    """Set bit j of ``seen`` where a keyframe sees through the place ``up_m[j]`` higher."""
+    """Set bit j of ``seen`` where a keyframe sees through the place ``up_m[j]`` higher, for the
+    places of ``tiles[begin:end]``."""
     h, w = depth.shape
     everything = (1 << up_m.shape[0]) - 1
-    for tile in tiles:
+    for tile in tiles[begin:end]:
         left = 0
         for p in range(first[tile], first[tile + 1]):
             for j in range(up_m.shape[0]):
