@@ -167,5 +167,6 @@ def test_a_note_is_written_where_one_clicks(
     browser.open(f"{portal.url.split('/?')[0]}/#/map/drone-1/test-1")
     words = "document.querySelector('.map .notes text')?.textContent"
     browser.wait(f"{words} === 'by the keyboard alone'")
+    browser.wait("document.body.dataset.map === 'shown'")
     browser.image(tmp_path / "notes-map.png")
     portal.close()

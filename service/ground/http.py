@@ -75,7 +75,7 @@ class LabelChange(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class NewAnnotation(msgspec.Struct, forbid_unknown_fields=True):
-    """A place (longitude, latitude, AMSL metres) and what is to be said of it."""
+    """A place (longitude, latitude, AMSL metres) and its text."""
 
     coordinates: Spot
     text: str

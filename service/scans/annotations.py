@@ -32,7 +32,7 @@ class Point(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class About(msgspec.Struct, forbid_unknown_fields=True):
-    """What is said of a place, by whom and when."""
+    """The text of a place, who wrote it and when."""
 
     text: Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_TEXT)]
     by: Annotated[str, msgspec.Meta(max_length=100)]

@@ -178,7 +178,7 @@ def glb(parts: Sequence[tuple[Mesh, U8 | None]], extras: dict[str, Any]) -> byte
 
 
 def _name_uses(tree: dict[str, Any]) -> None:
-    """Say of each view of the buffer whether it holds vertices or their numbers."""
+    """Mark each view of the buffer that holds vertices or their numbers."""
     accessors, views = tree["accessors"], tree["bufferViews"]
     for mesh in tree["meshes"]:
         for one in mesh["primitives"]:
