@@ -143,6 +143,11 @@ class RowTrack:
         """False for a global shutter."""
         return self._clock is not None
 
+    def stop(self) -> None:
+        """The shutter is global: frames to come need no motion of their rows."""
+        self._clock = None
+        self._frames.clear()
+
     def begin(self) -> None:
         """Forget the segment before."""
         self._frames.clear()

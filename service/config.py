@@ -56,8 +56,8 @@ class CameraConfig:
     )
     readout_ms: float | Literal["model", "auto"] = key(
         "model",
-        "rolling shutter, first to last row; 0: global shutter; model: as the camera model says; "
-        "auto: found in flight",
+        "rolling shutter, first to last row; 0: global shutter; model: as the camera model says, "
+        "else auto; auto: found in flight",
     )
     readout_direction: Literal["down", "up", "right", "left"] = key(
         "down", "readout order of the rows or columns, used if readout_ms is a number"

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from recon.types import Camera, Shutter
-from service.cameras.camera_file import load_camera, save_camera, with_shutter
+from service.cameras.camera_file import load_camera, save_camera, seeks_readout, with_shutter
 from service.config import CameraConfig
 from service.errors import InputError, OutsideError
 
@@ -178,3 +178,13 @@ def test_the_configuration_overrules_the_camera_file() -> None:
     assert with_shutter(rolling, chosen).shutter == Shutter(0.033, "right")
     with pytest.raises(ValueError, match=r"camera\.readout_ms"):
         CameraConfig(readout_ms=300.0)
+
+
+def test_a_readout_that_nobody_states_is_sought() -> None:
+    rolling = replace(CAMERA, shutter=Shutter(0.02, "up"))
+    sought = [
+        seeks_readout(camera, CameraConfig(readout_ms=asked))
+        for camera in (CAMERA, rolling)
+        for asked in ("model", "auto", 0.0, 20.0)
+    ]
+    assert sought == [True, True, False, False, False, True, False, False]

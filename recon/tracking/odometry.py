@@ -359,8 +359,15 @@ class Odometry:
         if self._unsettled is not None and self._unsettled.moving.is_settled:
             adjust_window(self.keyframes, self.K)
             self._unsettled = None
-            if self.readout is not None:
-                self.readout.look(self.keyframes)
+            if self.readout is not None and self._row_track.is_rolling:
+                self._seek(self.readout)
+
+    def _seek(self, readout: ReadoutSearch) -> None:
+        """Look for the readout, until it is known that there is none."""
+        readout.look(self.keyframes)
+        if readout.estimate is not None and readout.estimate.is_none:
+            self._row_track.stop()
+            self._max_gap_s = MAX_GAP_S
 
     def _forget(self) -> None:
         """Drop images and corners that left the window, and landmarks out of sight."""

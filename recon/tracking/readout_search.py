@@ -41,6 +41,12 @@ FLOOR_S = 1e-4
 BENT = 0.1
 """Of the way from the readout in use, by which the rows' motion was bent: a sigma."""
 
+MIN_WINDOWS = 2
+"""Fewer make nothing sure."""
+
+GLOBAL_S = 5e-4
+"""A readout and a sigma below it show a global shutter."""
+
 HUBER_PX = 1.0
 
 
@@ -57,7 +63,14 @@ class ReadoutEstimate:
 
     @property
     def is_sure(self) -> bool:
-        return self.windows >= 2 and abs(self.readout_s) > MIN_SIGMAS * self.sigma_s
+        is_known = self.windows >= MIN_WINDOWS
+        return is_known and abs(self.readout_s) > MIN_SIGMAS * self.sigma_s
+
+    @property
+    def is_none(self) -> bool:
+        """True where the images show a global shutter."""
+        is_known = self.windows >= MIN_WINDOWS and self.sigma_s < GLOBAL_S
+        return is_known and abs(self.readout_s) < GLOBAL_S
 
 
 class ReadoutSearch:

@@ -87,6 +87,12 @@ def with_shutter(camera: Camera, config: CameraConfig) -> Camera:
     return replace(camera, shutter=shutter_of(config.readout_ms, config.readout_direction))
 
 
+def seeks_readout(camera: Camera, config: CameraConfig) -> bool:
+    """True where the readout is to be found in flight."""
+    is_unknown = config.readout_ms == "model" and not camera.shutter.readout_s
+    return config.readout_ms == "auto" or is_unknown
+
+
 def check_size(camera: Camera, size_px: tuple[int, int], source: str) -> None:
     """InputError when the image size (W, H) of ``source`` differs from the camera model's."""
     if camera.size_px != size_px:

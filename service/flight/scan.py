@@ -17,7 +17,7 @@ from mavlink.telemetry.samples import VehicleState
 from recon.backends import Backend
 from recon.posegraph.between_keyframes import Odometer
 from recon.types import F64, Camera, Frame, Keyframe, Shutter
-from service.cameras.camera_file import shutter_document, with_shutter
+from service.cameras.camera_file import seeks_readout, shutter_document, with_shutter
 from service.cameras.rig import ASSUMED_AGL_M, Rig
 from service.cameras.source import CameraFrame, CameraSource, ahead
 from service.config import Config
@@ -125,7 +125,7 @@ class Scan:
             )
         )
         self._is_rolling = (
-            config.camera.readout_ms == "auto"
+            seeks_readout(inputs.camera, config.camera)
             or with_shutter(inputs.camera, config.camera).shutter.readout_s > 0
         )
         self.rig, self._odometer = Rig(config.camera, config.scan, config.fusion), Odometer()

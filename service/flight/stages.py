@@ -55,7 +55,7 @@ from recon.types import (
     Verdict,
 )
 from service.background import BackgroundWorker
-from service.cameras.camera_file import with_shutter
+from service.cameras.camera_file import seeks_readout, with_shutter
 from service.compute.stopwatch import Stopwatch
 from service.config import ComputeConfig, Config
 from service.flight.anchorage import VIEW, Carriers, Key
@@ -401,7 +401,7 @@ def build_stages(
         undistort.tracking_camera,
         OdometryConfig(base_to_height=config.scan.base_to_height),
         camera,
-        seeks_readout=config.camera.readout_ms == "auto",
+        seeks_readout=seeks_readout(camera, config.camera),
     )
     selection = Viewpoints(config.scan, compute.pairs)
     track = Track(odometry, selection, refused, stopwatch)
