@@ -137,7 +137,7 @@ def test_a_scan_without_a_place_takes_its_images_along(tmp_path: Path) -> None:
     assert answer.exit_code == 0, answer.output
     figures = json.loads(answer.stdout.splitlines()[-1])
     assert figures["check"]["rms_h_after_m"] < 0.05 and figures["check"]["rms_v_after_m"] < 0.1
-    assert any("left out: 10.png" in note for note in figures["notes"])
+    assert any("not used: 10.png" in note for note in figures["notes"])
     points.write_text(text.replace("0.png", "IMG_0.jpg"), encoding="utf-8")
     for video, why in (([], "needs --video"), (command[2:4], "IMG_0.jpg is not in the folder")):
         refused = CliRunner().invoke(app, ["refine", str(scan), *video, "--gcp", str(points)])
