@@ -22,8 +22,8 @@ demo: $(CORE)
 # The tests start hundreds of Python processes; each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-# A worker a core and one more, as many tests wait; JOBS=0: one after the other, in one process.
-JOBS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
+# A worker a core; JOBS=0: one after the other, in one process.
+JOBS ?= $(shell $(PYTHON) -c 'import os; print(os.cpu_count() or 1)')
 test: $(STAMP) $(PEERS)
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder $(ARGS)
 

@@ -40,7 +40,7 @@ def without_libusb(folder: Path, *command: str) -> subprocess.CompletedProcess[s
         command = (*hide, *command)
     return subprocess.run(
         command, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True,
-        text=True, timeout=240, check=False,
+        text=True, timeout=500, check=False,
     )  # fmt: skip
 
 

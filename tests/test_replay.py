@@ -29,7 +29,7 @@ SPARSEST = ("--set", "compute.stereo_width=160", "--set", "compute.guide_width=3
 def process(*arguments: str | Path, stdin: Any = subprocess.DEVNULL) -> Run:
     """``skyrelief`` as a process of its own."""
     command = [sys.executable, "-m", "service.cli", *map(str, arguments)]
-    return subprocess.run(command, stdin=stdin, capture_output=True, text=True, timeout=240)
+    return subprocess.run(command, stdin=stdin, capture_output=True, text=True, timeout=500)
 
 
 @pytest.fixture(scope="module")

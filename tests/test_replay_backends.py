@@ -20,7 +20,7 @@ def skyrelief(*arguments: str | Path) -> dict[str, Any]:
     """The JSON that the command ends with."""
     done = subprocess.run(
         [sys.executable, "-m", "service.cli", *map(str, arguments), "--json"],
-        capture_output=True, text=True, timeout=240, check=False,
+        capture_output=True, text=True, timeout=500, check=False,
         env=os.environ | {"OMP_NUM_THREADS": "1"},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
