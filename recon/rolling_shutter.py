@@ -143,6 +143,11 @@ class RowTrack:
         """False for a global shutter."""
         return self._clock is not None
 
+    def needs_telemetry(self, time_ns: int) -> bool:
+        """True where too few frames are near ``time_ns`` to show the turn within a readout."""
+        near = sum(abs(f.time_ns - time_ns) < NEAR_S * 1e9 for f in self._frames)
+        return self.is_rolling and near < 2
+
     def stop(self) -> None:
         """The shutter is global: frames to come need no motion of their rows."""
         self._clock = None

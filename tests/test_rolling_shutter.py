@@ -114,6 +114,20 @@ def test_telemetry_speaks_for_frames_far_apart() -> None:
         np.testing.assert_allclose(se3.so3_log(turned), 0.01 * turn, atol=1e-9)
 
 
+def test_telemetry_is_asked_where_frames_say_too_little() -> None:
+    track = RowTrack(replace(PLAIN, shutter=Shutter(0.03)))
+    asked = []
+    for i in range(4):
+        time_ns = int(i * 1e9 / 15)
+        asked.append(track.needs_telemetry(time_ns))
+        track.add(track.expect(time_ns, PosePrior(), swinging(i / 15)), swinging(i / 15))
+    assert asked == [True, True, False, False]
+    assert track.needs_telemetry(2_000_000_000)
+    track.stop()
+    assert not track.needs_telemetry(2_000_000_000)
+    assert not RowTrack(LENS).needs_telemetry(0)
+
+
 def test_a_global_shutter_has_no_rows() -> None:
     track = RowTrack(LENS)
     frame = track.expect(0, PosePrior(turn_rad_s=np.ones(3)), swinging(0.0))

@@ -117,6 +117,10 @@ class Odometry:
         shift, gap_s = self._motion.shift(time_ns, prior, self._depth)
         return gap_s < self._max_gap_s and shift < self.config.base_to_height / frames_per_step
 
+    def needs_turn(self, time_ns: int) -> bool:
+        """True where the prior of a frame should hold the camera's angular velocity."""
+        return self._row_track.needs_telemetry(time_ns)
+
     def track(
         self,
         gray: U8,

@@ -17,7 +17,7 @@ from mavlink.telemetry.samples import VehicleState
 from recon.backends import Backend
 from recon.posegraph.between_keyframes import Odometer
 from recon.types import F64, Camera, Frame, Keyframe, Shutter
-from service.cameras.camera_file import seeks_readout, shutter_document, with_shutter
+from service.cameras.camera_file import shutter_document, with_shutter
 from service.cameras.rig import ASSUMED_AGL_M, Rig
 from service.cameras.source import CameraFrame, CameraSource, ahead
 from service.config import Config
@@ -124,10 +124,6 @@ class Scan:
                 is_lens_assumed="lens" in inputs.assumed,
             )
         )
-        self._is_rolling = (
-            seeks_readout(inputs.camera, config.camera)
-            or with_shutter(inputs.camera, config.camera).shutter.readout_s > 0
-        )
         self.rig, self._odometer = Rig(config.camera, config.scan, config.fusion), Odometer()
         self.recorder = Recorder(
             store, self.pipeline, self.rig, inputs.unix_offset_ns, inputs.on_keyframe
@@ -157,7 +153,7 @@ class Scan:
         self.heights += self.rig.height_known(state, frame.geotag)
         self.attitudes += self.rig.attitude_known(state, frame.geotag)
         prior = self._odometer.take(exposed_ns, self.rig.prior(state, frame.geotag))
-        if self._is_rolling:
+        if self.pipeline.stages.track.odometry.needs_turn(exposed_ns):
             prior = replace(prior, turn_rad_s=self._turn(exposed_ns))
         step = self.pipeline.skip(exposed_ns, prior)
         if step is None:
