@@ -117,6 +117,11 @@ class FrameRows:
     is_settled: bool = True  # no frame to come changes it
     is_measured: bool = False  # by neighbouring frames
 
+    @property
+    def is_awaited(self) -> bool:
+        """True where frames to come still change what a rolling shutter does to this one."""
+        return self.rows is not None and bool(self.rows.clock.readout_s) and not self.is_settled
+
     def at_middle(self, K: F64, uv: F64, inverse_depth: F64) -> F64:
         """(N, 2) where the frame's pixels (N, 2) would be at the middle row's time."""
         return uv if self.rows is None else self.rows.at_middle(K, uv, inverse_depth)
@@ -192,7 +197,7 @@ class RowTrack:
             near = np.flatnonzero(chosen & (times != 0) & (np.abs(times) < NEAR_S))
             after = int((times[near] > 0).sum())
         since_s = float(times[-1]) if times.size else 0.0
-        frame.is_settled = since_s >= NEAR_S or (after >= 2 and since_s >= STEADY_S)
+        frame.is_settled = abs(since_s) >= NEAR_S or (after >= 2 and since_s >= STEADY_S)
         frame.is_measured = near.size >= 2
         if near.size < (1 if frame.prior.turn_rad_s is None else 2):
             frame.rows = Rows(self._clock, _by_telemetry(frame), np.zeros(6))

@@ -226,7 +226,7 @@ class Viewpoints:
         if self._kept[-1].segment != view.segment:
             return True
         newest = self._kept[-1].moving
-        if newest is not None and not newest.is_settled:
+        if newest is not None and newest.is_awaited:
             return False
         if self._mode != "auto":
             return True
