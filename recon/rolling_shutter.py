@@ -197,7 +197,7 @@ class RowTrack:
             near = np.flatnonzero(chosen & (times != 0) & (np.abs(times) < NEAR_S))
             after = int((times[near] > 0).sum())
         since_s = float(times[-1]) if times.size else 0.0
-        frame.is_settled = abs(since_s) >= NEAR_S or (after >= 2 and since_s >= STEADY_S)
+        frame.is_settled = since_s >= NEAR_S or (after >= 2 and since_s >= STEADY_S)
         frame.is_measured = near.size >= 2
         if near.size < (1 if frame.prior.turn_rad_s is None else 2):
             frame.rows = Rows(self._clock, _by_telemetry(frame), np.zeros(6))
